@@ -1,0 +1,43 @@
+"""ceres-cal: calibrate a camera over a flat field, to the millimetre and honestly.
+
+The names are loaded when they are first used, so that `import ceres_cal` costs nothing.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from ceres_cal.calibrate import calibrate as calibrate
+    from ceres_cal.calibration import Calibration as Calibration
+    from ceres_cal.camera import Camera as Camera
+    from ceres_cal.errors import CalibrationError as CalibrationError
+    from ceres_cal.errors import DegenerateError as DegenerateError
+    from ceres_cal.errors import InputError as InputError
+    from ceres_cal.errors import SolutionError as SolutionError
+    from ceres_cal.observations import Observations as Observations
+    from ceres_cal.observations import Prior as Prior
+    from ceres_cal.parameters import Options as Options
+    from ceres_cal.transforms import Pose as Pose
+
+_HOME = {
+    "calibrate": "calibrate",
+    "Calibration": "calibration",
+    "Camera": "camera",
+    "CalibrationError": "errors",
+    "DegenerateError": "errors",
+    "InputError": "errors",
+    "SolutionError": "errors",
+    "Observations": "observations",
+    "Prior": "observations",
+    "Options": "parameters",
+    "Pose": "transforms",
+}
+__all__ = list(_HOME)  # noqa: PLE0604
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module 'ceres_cal' has no attribute {name!r}")
+    value = getattr(import_module(f"ceres_cal.{_HOME[name]}"), name)
+    globals()[name] = value  # the module of the same name must not hide it
+    return value

@@ -1,0 +1,277 @@
+"""The result: calibrated cameras, stations and placements, how they came about, and their file."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from functools import cached_property
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from ceres_cal.camera import Camera
+from ceres_cal.errors import InputError
+from ceres_cal.files import convert, read_json, write_json
+from ceres_cal.lens import make_lens
+from ceres_cal.observations import prior_from_json, prior_to_json
+from ceres_cal.parameters import Estimate, Options, Station
+from ceres_cal.transforms import Pose, euler_from_rotation
+
+FORMAT, VERSION = "ceres-cal/calibration", 1
+
+
+@dataclass(frozen=True)
+class Rejected:
+    """One observation that was taken out: its permanent id (kind and row), what it shows, and why it was taken out."""
+
+    kind: str
+    row: int
+    frame: str
+    feature: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class Fit:
+    """How well the observations fit.
+
+    Attributes:
+        points, curves: numbers of observations that took part.
+        points_rms_px: root mean square length of the points' residual vectors, of those that took part (OpenCV's rms).
+            curves_rms_px: the same of the distances to the curves. They say how consistent the data are with the model,
+            not how well the camera is known.
+        point_scale, curve_scale: estimated factors on the stated sigmas.
+        unknowns: free numbers.
+    """
+
+    points: int
+    curves: int
+    points_rms_px: float
+    curves_rms_px: float
+    point_scale: float
+    curve_scale: float
+    unknowns: int
+
+    @property
+    def rms_px(self) -> float:
+        """Root mean square residual over points and curves together."""
+        total = self.points * self.points_rms_px**2 + self.curves * self.curves_rms_px**2
+        return float((total / max(self.points + self.curves, 1)) ** 0.5)
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """Calibrated cameras and where they stood.
+
+    Attributes:
+        estimate: cameras, stations, placements.
+        fit: residuals and noise. rejected: every observation that was taken out.
+        termination: why the last solve stopped. converged: whether it had come to rest.
+        rounds: solves it took. history: cost at each iteration of the last one.
+        phi_from: camera -> "fixed", "views", "prior" or "guess": what the start for phi rested on.
+        options: how it was solved. digest: SHA-256 of the observations. versions: of the packages that solved it.
+    """
+
+    estimate: Estimate
+    fit: Fit
+    rejected: tuple[Rejected, ...]
+    termination: str
+    converged: bool
+    rounds: int
+    history: tuple[float, ...]
+    phi_from: Mapping[str, str]
+    options: Options
+    digest: str
+    versions: Mapping[str, str] = field(default_factory=lambda: package_versions())
+
+    @property
+    def cameras(self) -> Mapping[str, Camera]:
+        """Cameras by name, at no particular pose."""
+        return self.estimate.cameras
+
+    @cached_property
+    def stations(self) -> Mapping[str, Camera]:
+        """The camera at each station, by the station's name."""
+        return {name: self.estimate.camera_at(name) for name in self.estimate.stations}
+
+    @property
+    def placements(self) -> Mapping[str, Pose]:
+        """world_from_target of each placement."""
+        return self.estimate.placements
+
+    def station(self, name: str | None = None) -> Camera:
+        """The camera at a station; without a name, at the only one there is.
+
+        Raises:
+            InputError: no such station, or no name where there are several.
+        """
+        if name is None and len(self.stations) == 1:
+            return next(iter(self.stations.values()))
+        if name not in self.stations:
+            raise InputError(f"station {name!r} is not there: there are {', '.join(map(repr, self.stations))}")
+        return self.stations[name]
+
+    @property
+    def rms_px(self) -> float:
+        """Root mean square residual over all observations that took part, px."""
+        return self.fit.rms_px
+
+    def save(self, path: str | Path) -> None:
+        """Write the calibration as JSON; every number comes back exactly."""
+        write_json(path, calibration_to_json(self))
+
+    @classmethod
+    def load(cls, path: str | Path) -> Calibration:
+        """Read a calibration.
+
+        Raises:
+            InputError: one line that names the file and the place; also for a lens that folds over inside the image.
+        """
+        data = convert(read_json(path, FORMAT, VERSION), _CalibrationFile, str(path))
+        try:
+            return _from_file(data)
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from None
+
+
+def package_versions() -> dict[str, str]:
+    """Versions of what the numbers depend on."""
+    found = {}
+    for name in ("ceres-cal", "pyceres", "numpy", "numba"):
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "not installed"
+    return found
+
+
+class _LensFile(msgspec.Struct, forbid_unknown_fields=True):
+    kind: str
+    coefficients: dict[str, float]
+    powers: tuple[int, ...] | None = None
+
+
+class _CameraFile(msgspec.Struct, forbid_unknown_fields=True):
+    image_size: tuple[int, int]
+    phi: float
+    aspect: float
+    principal_point: tuple[float, float]
+    lens: _LensFile
+
+
+_Vector = tuple[float, float, float]
+
+
+class _StationFile(msgspec.Struct, forbid_unknown_fields=True):
+    camera: str
+    rotation: tuple[_Vector, _Vector, _Vector]
+    translation_m: _Vector
+    position_m: _Vector
+    euler_rad: _Vector
+
+
+class _PlacementFile(msgspec.Struct, forbid_unknown_fields=True):
+    rotation: tuple[_Vector, _Vector, _Vector]
+    translation_m: _Vector
+
+
+class _CalibrationFile(msgspec.Struct, forbid_unknown_fields=True):
+    format: str
+    version: int
+    units: str
+    pixel_origin: str
+    cameras: dict[str, _CameraFile]
+    stations: dict[str, _StationFile]
+    placements: dict[str, _PlacementFile]
+    fit: Fit
+    rejected: list[Rejected]
+    termination: str
+    converged: bool
+    rounds: int
+    history: tuple[float, ...]
+    phi_from: dict[str, str]
+    options: dict[str, Any]
+    digest: str
+    versions: dict[str, str]
+
+
+def camera_to_json(camera: Camera) -> dict[str, Any]:
+    """A camera's intrinsics as the files have them."""
+    lens: dict[str, Any] = {"kind": camera.lens.kind, "coefficients": camera.lens.coefficients}
+    if camera.lens.kind == "radial":
+        lens["powers"] = list(camera.lens.radius_powers)
+    return {
+        "image_size": list(camera.image_size),
+        "phi": camera.phi,
+        "aspect": camera.aspect,
+        "principal_point": list(camera.principal_point),
+        "lens": lens,
+    }
+
+
+def calibration_to_json(calibration: Calibration) -> dict[str, Any]:
+    """The calibration as its file has it. Position and Euler angles (the paper's) are there for people."""
+    estimate = calibration.estimate
+    options = {**asdict(calibration.options), "priors": [prior_to_json(p) for p in calibration.options.priors]}
+    return {
+        "format": FORMAT,
+        "version": VERSION,
+        "units": "metres, radians, pixels",
+        "pixel_origin": "centre of the top-left pixel",
+        "cameras": {name: camera_to_json(camera) for name, camera in estimate.cameras.items()},
+        "stations": {
+            name: {
+                "camera": station.camera,
+                **_pose_to_json(station.cam_from_world),
+                "position_m": station.cam_from_world.position.tolist(),
+                "euler_rad": list(euler_from_rotation(station.cam_from_world.rotation)),
+            }
+            for name, station in estimate.stations.items()
+        },
+        "placements": {name: _pose_to_json(pose) for name, pose in estimate.placements.items()},
+        "fit": asdict(calibration.fit),
+        "rejected": [asdict(entry) for entry in calibration.rejected],
+        "termination": calibration.termination,
+        "converged": calibration.converged,
+        "rounds": calibration.rounds,
+        "history": list(calibration.history),
+        "phi_from": dict(calibration.phi_from),
+        "options": options,
+        "digest": calibration.digest,
+        "versions": dict(calibration.versions),
+    }
+
+
+def _pose_to_json(pose: Pose) -> dict[str, Any]:
+    return {"rotation": pose.rotation.tolist(), "translation_m": pose.translation.tolist()}
+
+
+def _from_file(data: _CalibrationFile) -> Calibration:
+    cameras = {}
+    for name, entry in data.cameras.items():
+        lens = make_lens(entry.lens.kind, entry.lens.powers or (2, 3), entry.lens.coefficients)
+        cameras[name] = Camera(entry.image_size, entry.phi, entry.principal_point, lens, entry.aspect)
+        cameras[name].require_monotone(name)
+    stations = {}
+    for name, station in data.stations.items():
+        if station.camera not in cameras:
+            raise InputError(f"station {name!r} names camera {station.camera!r}, which is not there")
+        stations[name] = Station(station.camera, Pose(station.rotation, station.translation_m))  # type: ignore[arg-type]
+    placements = {name: Pose(p.rotation, p.translation_m) for name, p in data.placements.items()}  # type: ignore[arg-type]
+    options = dict(data.options)
+    options["priors"] = tuple(prior_from_json(entry, "options.priors") for entry in options.get("priors", []))
+    return Calibration(
+        Estimate(cameras, stations, placements),
+        data.fit,
+        tuple(data.rejected),
+        data.termination,
+        data.converged,
+        data.rounds,
+        data.history,
+        data.phi_from,
+        convert(options, Options, "options"),
+        data.digest,
+        data.versions,
+    )

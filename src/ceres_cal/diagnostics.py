@@ -1,0 +1,89 @@
+"""Reading the residuals: how large the noise is, and which observations do not belong.
+
+Residuals are taken in units of their stated sigma; the noise scale is the factor by which the stated sigmas of a kind
+(points, curves) must be multiplied to describe what is seen.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ceres_cal.observations import Observations
+from ceres_cal.residuals import Residuals
+from ceres_cal.sights import Mask
+from ceres_cal.transforms import Array
+
+_LEAST_FREEDOM = 8.0  # spare equations below which a spread says nothing
+_LEAST_SCALE_PX = 1e-4  # no image is measured better than that
+_RAYLEIGH_MEDIAN = 1.177410022515474  # of the length of a two-dimensional standard normal
+_NORMAL_MEDIAN = 0.674489750196082  # of the absolute value of a standard normal
+
+
+@dataclass(frozen=True, eq=False)
+class Inliers:
+    """Which observations take part, and the noise scales they were judged by.
+
+    Attributes:
+        points: (N,), curves: (M,) bool. point_scale, curve_scale: factors on the stated sigmas.
+        point_sigmas, curve_sigmas: how many standard deviations each residual is long; infinite where the estimate
+            cannot show the observation.
+    """
+
+    points: Mask
+    curves: Mask
+    point_scale: float
+    curve_scale: float
+    point_sigmas: Array
+    curve_sigmas: Array
+
+    def same_as(self, other: Inliers) -> bool:
+        """Whether nothing worth another solve changed: the same rows, scales within a thousandth."""
+        return (
+            np.array_equal(self.points, other.points)
+            and np.array_equal(self.curves, other.curves)
+            and abs(self.point_scale - other.point_scale) <= 1e-3 * other.point_scale
+            and abs(self.curve_scale - other.curve_scale) <= 1e-3 * other.curve_scale
+        )
+
+
+def relative_lengths(observations: Observations, residuals: Residuals) -> tuple[Array, Array]:
+    """Lengths of the residuals of points and of curves in their stated sigmas; infinite where there is none."""
+    points = np.linalg.norm(residuals.points, axis=1) / observations.points.sigma_px
+    curves = np.abs(residuals.curves) / observations.curves.sigma_px
+    return np.where(np.isfinite(points), points, np.inf), np.where(np.isfinite(curves), curves, np.inf)
+
+
+def judge(
+    observations: Observations, residuals: Residuals, unknowns: int, reject_sigma: float, *, estimate_noise: bool
+) -> Inliers:
+    """Noise scales and inliers at one estimate.
+
+    The median gives a first scale that half the data may not spoil, the inliers' own spread the final one.
+
+    Args:
+        unknowns: free numbers; they use up equations in proportion.
+        reject_sigma: longer residuals are outliers. estimate_noise: else the stated sigmas hold (scale 1).
+    """
+    points, curves = relative_lengths(observations, residuals)
+    if not estimate_noise:
+        return Inliers(points <= reject_sigma, curves <= reject_sigma, 1.0, 1.0, points, curves)
+    spare = 1.0 - unknowns / max(2.0 * len(points) + len(curves), 1.0)
+    point_scale = _scale(points, 2, _RAYLEIGH_MEDIAN, spare, reject_sigma)
+    curve_scale = _scale(curves, 1, _NORMAL_MEDIAN, spare, reject_sigma)
+    # A kind with too few spare equations borrows the other's scale; if both have, the stated sigmas are all there is.
+    known = [scale for scale in (point_scale, curve_scale) if scale is not None]
+    fallback = known[0] if known else 1.0
+    p = fallback if point_scale is None else point_scale
+    c = fallback if curve_scale is None else curve_scale
+    return Inliers(points <= reject_sigma * p, curves <= reject_sigma * c, p, c, points / p, curves / c)
+
+
+def _scale(lengths: Array, dimensions: int, median_of_one: float, spare: float, reject_sigma: float) -> float | None:
+    seen = lengths[np.isfinite(lengths)]
+    if dimensions * len(seen) * spare < _LEAST_FREEDOM:
+        return None
+    scale = float(np.median(seen)) / median_of_one
+    inside = seen[seen <= reject_sigma * max(scale, _LEAST_SCALE_PX)]
+    return max(float(np.sqrt(np.sum(inside**2) / (dimensions * len(inside) * spare))), _LEAST_SCALE_PX)

@@ -1,0 +1,21 @@
+"""What can go wrong, as errors whose text is written for people: one line, what is wrong, what to do."""
+
+
+class CalibrationError(Exception):
+    """Base of every failure of the package. `str(error)` is one line; `exit_code` is what the commands exit with."""
+
+    exit_code = 2
+
+
+class InputError(CalibrationError):
+    """A file, an option or an observation is wrong: nothing was computed."""
+
+
+class DegenerateError(CalibrationError):
+    """The observations are well formed but cannot determine what was asked for."""
+
+
+class SolutionError(CalibrationError):
+    """The solve ended without a usable camera."""
+
+    exit_code = 3

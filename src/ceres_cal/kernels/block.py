@@ -1,0 +1,179 @@
+"""The compressed block of one sight, as Ceres asks for it (design, section 6).
+
+A = sum w [J e]^T [J e] over [free intrinsics | 6 pose | e] is factored as A = U^T U; the rows of U are the Jacobian that
+Ceres sees, their last column its residual. Station and placement follow by the chain rule on U.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ceres_cal.kernels.jit import jit
+from ceres_cal.kernels.sight import normal_equations
+
+
+@jit
+def _cholesky(normal: Any, upper: Any) -> None:
+    """U with U^T U = A from A's lower triangle; where A is singular the row of U is zero."""
+    size = len(normal)
+    upper[:] = 0.0
+    for k in range(size):
+        pivot = normal[k, k]
+        for j in range(k):
+            pivot -= upper[j, k] * upper[j, k]
+        if not pivot > 1e-15 * normal[k, k]:
+            continue
+        root = np.sqrt(pivot)
+        upper[k, k] = root
+        for i in range(k + 1, size):
+            total = normal[i, k]
+            for j in range(k):
+                total -= upper[j, k] * upper[j, i]
+            upper[k, i] = total / root
+
+
+@jit
+def _rotation(w: Any, out: Any) -> None:
+    """Rodrigues' formula, into the left (3, 3) of `out`."""
+    angle2 = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
+    angle = np.sqrt(angle2)
+    sine, versine = 1.0 - angle2 / 6.0, 0.5 - angle2 / 24.0
+    if angle > 1e-4:
+        half = np.sin(0.5 * angle) / angle
+        sine, versine = np.sin(angle) / angle, 2.0 * half * half
+    for j in range(3):
+        for k in range(3):
+            out[j, k] = versine * w[j] * w[k]
+        out[j, j] += 1.0 - versine * angle2
+    x, y, z = sine * w[0], sine * w[1], sine * w[2]
+    out[0, 1] -= z
+    out[1, 0] += z
+    out[0, 2] += y
+    out[2, 0] -= y
+    out[1, 2] -= x
+    out[2, 1] += x
+
+
+@jit
+def _left_jacobian(w: Any, out: Any) -> None:
+    """J with exp(w + dw) = exp(J dw) exp(w), (3, 3)."""
+    angle2 = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
+    angle = np.sqrt(angle2)
+    versine, rest = 0.5 - angle2 / 24.0, 1.0 / 6.0 - angle2 / 120.0
+    if angle > 1e-4:
+        half = np.sin(0.5 * angle) / angle
+        versine, rest = 2.0 * half * half, (angle - np.sin(angle)) / (angle * angle2)
+    for j in range(3):
+        for k in range(3):
+            out[j, k] = rest * w[j] * w[k]
+        out[j, j] += 1.0 - rest * angle2
+    x, y, z = versine * w[0], versine * w[1], versine * w[2]
+    out[0, 1] -= z
+    out[1, 0] += z
+    out[0, 2] += y
+    out[2, 0] -= y
+    out[1, 2] -= x
+    out[2, 1] += x
+
+
+@jit
+def _chain(station: Any, placement: Any, pose: Any, to_station: Any, to_placement: Any) -> None:
+    """pose = station @ placement, and the left perturbation of pose that a change of either vector makes, (6, 6) each.
+
+    With R = R_s R_p and t = R_s t_p + t_s: dw = dw_s + R_s dw_p, dt = dw_s x (R_s t_p) + dt_s + R_s dt_p.
+    """
+    first, second = np.empty((3, 3)), np.empty((3, 3))
+    left = np.empty((3, 3))
+    _rotation(station, first)
+    _rotation(placement, second)
+    for j in range(3):
+        for k in range(3):
+            pose[j, k] = first[j, 0] * second[0, k] + first[j, 1] * second[1, k] + first[j, 2] * second[2, k]
+        pose[j, 3] = first[j, 0] * placement[3] + first[j, 1] * placement[4] + first[j, 2] * placement[5]
+    turned = (pose[0, 3], pose[1, 3], pose[2, 3])
+    to_station[:] = 0.0
+    to_placement[:] = 0.0
+    _left_jacobian(station, left)
+    for k in range(3):
+        to_station[0, k], to_station[1, k], to_station[2, k] = left[0, k], left[1, k], left[2, k]
+        to_station[3, k] = left[1, k] * turned[2] - left[2, k] * turned[1]
+        to_station[4, k] = left[2, k] * turned[0] - left[0, k] * turned[2]
+        to_station[5, k] = left[0, k] * turned[1] - left[1, k] * turned[0]
+        to_station[3 + k, 3 + k] = 1.0
+        pose[k, 3] += station[3 + k]
+    _left_jacobian(placement, left)
+    for j in range(3):
+        for k in range(3):
+            to_placement[j, k] = first[j, 0] * left[0, k] + first[j, 1] * left[1, k] + first[j, 2] * left[2, k]
+            to_placement[3 + j, 3 + k] = first[j, k]
+
+
+@jit
+def _copy_columns(upper: Any, free: int, chain: Any, jacobian: Any) -> None:
+    """Rows of U's pose columns times the chain rule, as the row-major Jacobian of one 6-vector block."""
+    for row in range(len(upper) - 1):
+        for k in range(6):
+            total = 0.0
+            for j in range(6):
+                total += upper[row, free + j] * chain[j, k]
+            jacobian[6 * row + k] = total
+
+
+@jit
+def evaluate_block(
+    lens: int, fixed_intrinsics: Any, free: Any, powers: Any, unit: float, points: Any, pixels: Any, weights: Any,
+    tracks: Any, is_arc: Any, track: Any, curve_pixels: Any, curve_weights: Any, s: Any, loss: int, scale: float,
+    camera: Any, station: Any, placement: Any, wants_jacobian: bool, residuals: Any,
+    camera_jacobian: Any, station_jacobian: Any, placement_jacobian: Any,
+) -> bool:  # fmt: skip
+    """What Ceres asks of the block of one sight (design, section 6); False where an observation cannot be projected.
+
+    Args:
+        fixed_intrinsics: the whole intrinsics vector; `camera` replaces its entries `free`.
+        station, placement: 6-vectors of cam_from_world and world_from_target.
+        residuals: (free + 7,): the rows of U, then what is missing from the robust cost; with the cost alone wanted,
+            all of it in the first entry.
+        *_jacobian: row-major, (free + 7) x the block's size; empty where that block is held.
+    """
+    count = len(free)
+    intrinsics = fixed_intrinsics.copy()
+    for k in range(count):
+        intrinsics[free[k]] = camera[k]
+    pose, to_station, to_placement = np.empty((3, 4)), np.empty((6, 6)), np.empty((6, 6))
+    _chain(station, placement, pose, to_station, to_placement)
+    rows = np.empty(count + 7, np.int64)
+    rows[:count] = free
+    rows[count:] = np.arange(len(intrinsics), len(intrinsics) + 7)
+    normal = np.empty((count + 7, count + 7))
+    cost = normal_equations(
+        lens, intrinsics, powers, unit, pose, points, pixels, weights, tracks, is_arc, track, curve_pixels,
+        curve_weights, s, loss, scale, rows, wants_jacobian, normal,
+    )  # fmt: skip
+    if not np.isfinite(cost):
+        return False
+    residuals[:] = 0.0
+    if not wants_jacobian:
+        residuals[0] = np.sqrt(cost)
+        return True
+    upper = np.empty((count + 7, count + 7))
+    _cholesky(normal, upper)
+    last = count + 6
+    missing = cost
+    for row in range(last):
+        residuals[row] = upper[row, last]
+        missing -= upper[row, last] * upper[row, last]
+    residuals[last] = np.sqrt(max(missing, 0.0))
+    if len(camera_jacobian) > 0:
+        camera_jacobian[:] = 0.0
+        for row in range(last):
+            for k in range(count):
+                camera_jacobian[count * row + k] = upper[row, k]
+    if len(station_jacobian) > 0:
+        station_jacobian[:] = 0.0
+        _copy_columns(upper, count, to_station, station_jacobian)
+    if len(placement_jacobian) > 0:
+        placement_jacobian[:] = 0.0
+        _copy_columns(upper, count, to_placement, placement_jacobian)
+    return True

@@ -1,0 +1,296 @@
+"""All observations of one sight: residuals in measured pixels, robust weights and the normal equations (design, 5 and 6).
+
+The observations are walked in chunks laid out number by number, so that the compiler can use SIMD registers. The pose
+columns are left perturbations in the camera frame, (dw x R X) + dt. `lenses` names the working arrays.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ceres_cal.kernels.jit import jit
+from ceres_cal.kernels.lenses import answer_limit, distort, intrinsics_rows, one_dimensional
+
+LOSS_CODES = {"trivial": 0, "huber": 1, "soft_l1": 2, "cauchy": 3, "tukey": 4}
+
+_TRIVIAL, _HUBER, _SOFT_L1, _CAUCHY = 0, 1, 2, 3
+_CHUNK = 64
+_FOOT_STEPS = 30
+_FOOT_TOLERANCE_PX = 1e-9
+
+
+@jit
+def _to_camera(n: int, pose: Any, points: Any, rotated: Any, rays: Any) -> None:
+    """rotated = R X and rays = R X + t of points (3, n); pose is (3, 4), [R t]."""
+    for j in range(3):
+        for i in range(n):
+            rotated[j, i] = pose[j, 0] * points[0, i] + pose[j, 1] * points[1, i] + pose[j, 2] * points[2, i]
+            rays[j, i] = rotated[j, i] + pose[j, 3]
+
+
+@jit
+def _pose_rows(n: int, first: int, aspect: float, rotated: Any, image: Any, jacobian: Any) -> None:
+    """Derivatives of the pixel with respect to a left perturbation of the pose: three of rotation, three of translation."""
+    for c in range(2):
+        scale = 1.0 if c == 0 else aspect
+        for i in range(n):
+            dx = scale * (image[2, i] if c == 0 else image[3, i])
+            dy = scale * (image[3, i] if c == 0 else image[4, i])
+            dz = scale * image[5 + c, i]
+            x, y, z = rotated[0, i], rotated[1, i], rotated[2, i]
+            jacobian[first, c, i] = dz * y - dy * z
+            jacobian[first + 1, c, i] = dx * z - dz * x
+            jacobian[first + 2, c, i] = dy * x - dx * y
+            jacobian[first + 3, c, i], jacobian[first + 4, c, i], jacobian[first + 5, c, i] = dx, dy, dz
+
+
+@jit
+def _on_curves(n: int, start: int, tracks: Any, is_arc: Any, track: Any, s: Any, points: Any, tangents: Any) -> None:
+    """C(s) and dC/ds, (3, n) each: c + s a on a segment, c + a cos s + b sin s on an arc."""
+    for i in range(n):
+        k, value = track[start + i], s[start + i]
+        f, g, df, dg = value, 0.0, 1.0, 0.0
+        if is_arc[k]:
+            f, g = np.cos(value), np.sin(value)
+            df, dg = -g, f
+        for j in range(3):
+            points[j, i] = tracks[k, 0, j] + f * tracks[k, 1, j] + g * tracks[k, 2, j]
+            tangents[j, i] = df * tracks[k, 1, j] + dg * tracks[k, 2, j]
+
+
+@jit
+def _feet(
+    lens: int, n: int, start: int, intrinsics: Any, dense: Any, unit: float, limit: float, pose: Any,
+    tracks: Any, is_arc: Any, track: Any, pixels: Any, s: Any,
+    points: Any, rotated: Any, rays: Any, image: Any, work: Any, foot: Any,
+) -> bool:  # fmt: skip
+    """Move s to the feet of the perpendiculars: tau . (project(C(s)) - p) = 0 (design, section 5).
+
+    Gauss-Newton steps whose slope is corrected by the secant, so that the curve's own bend is seen without second
+    derivatives. Leaves in `foot` (8, n): tau in px (0, 1), residual vector (2, 3), its dot product with tau (4), the
+    previous s and dot product (5, 6), |tau|^2 (7).
+    """
+    aspect, cx, cy = intrinsics[1], intrinsics[2], intrinsics[3]
+    for step in range(_FOOT_STEPS):
+        _on_curves(n, start, tracks, is_arc, track, s, points, foot[8:])
+        _to_camera(n, pose, points, rotated, rays)
+        if not distort(lens, n, intrinsics, dense, unit, limit, rays, image, work):
+            return False
+        worst = 0.0
+        for i in range(n):
+            tx, ty, tz = foot[8, i], foot[9, i], foot[10, i]
+            x = pose[0, 0] * tx + pose[0, 1] * ty + pose[0, 2] * tz
+            y = pose[1, 0] * tx + pose[1, 1] * ty + pose[1, 2] * tz
+            z = pose[2, 0] * tx + pose[2, 1] * ty + pose[2, 2] * tz
+            tau_x = image[2, i] * x + image[3, i] * y + image[5, i] * z
+            tau_y = aspect * (image[3, i] * x + image[4, i] * y + image[6, i] * z)
+            dx = cx + image[0, i] - pixels[start + i, 0]
+            dy = cy + aspect * image[1, i] - pixels[start + i, 1]
+            along, length2 = tau_x * dx + tau_y * dy, tau_x * tau_x + tau_y * tau_y
+            slope = length2
+            if step > 0 and s[start + i] != foot[5, i]:
+                secant = (along - foot[6, i]) / (s[start + i] - foot[5, i])
+                slope = max(0.25 * length2, min(secant, 4.0 * length2))
+            foot[0, i], foot[1, i], foot[2, i], foot[3, i] = tau_x, tau_y, dx, dy
+            foot[5, i], foot[6, i], foot[7, i] = s[start + i], along, length2
+            foot[4, i] = max(-0.5, min(-along / slope, 0.5))
+            worst = max(worst, abs(foot[4, i]) * np.sqrt(length2))
+        if worst < _FOOT_TOLERANCE_PX:
+            break
+        for i in range(n):
+            s[start + i] += foot[4, i]
+    return True
+
+
+# ---- losses ---------------------------------------------------------------------------------------------------------
+
+
+@jit
+def _loss(code: int, scale: float, squared: float) -> tuple[float, float]:
+    """rho and its derivative at the squared residual, as Ceres defines its losses."""
+    b = scale * scale
+    if code == _TRIVIAL:
+        return squared, 1.0
+    if code == _HUBER:
+        if squared <= b:
+            return squared, 1.0
+        root = np.sqrt(squared)
+        return 2.0 * scale * root - b, scale / root
+    if code == _SOFT_L1:
+        root = np.sqrt(1.0 + squared / b)
+        return 2.0 * b * (root - 1.0), 1.0 / root
+    if code == _CAUCHY:
+        return b * np.log(1.0 + squared / b), 1.0 / (1.0 + squared / b)
+    if squared >= b:
+        return b / 3.0, 0.0
+    rest = 1.0 - squared / b
+    return b / 3.0 * (1.0 - rest * rest * rest), rest * rest
+
+
+# ---- one sight ------------------------------------------------------------------------------------------------------
+
+
+@jit
+def _add_products(n: int, components: int, rows: Any, jacobian: Any, normal: Any) -> None:
+    """normal += J J^T over the chosen rows, lower triangle."""
+    for k in range(len(rows)):
+        for l in range(k + 1):
+            total = 0.0
+            for c in range(components):
+                for i in range(n):
+                    total += jacobian[rows[k], c, i] * jacobian[rows[l], c, i]
+            normal[k, l] += total
+
+
+@jit
+def _add_points(
+    lens: int, intrinsics: Any, powers: Any, dense: Any, unit: float, limit: float, pose: Any, points: Any, pixels: Any,
+    weights: Any, loss: int, scale: float, rows: Any, wants_normal: bool, normal: Any, jacobian: Any, scratch: Any,
+) -> float:  # fmt: skip
+    """Sum of rho over the point observations, NaN where one cannot be projected; their share of `normal`."""
+    residual_row = jacobian.shape[0] - 1
+    local, rotated, rays, image, work = scratch[:3], scratch[3:6], scratch[6:9], scratch[9:16], scratch[16:21]
+    cost = 0.0
+    for start in range(0, len(points), _CHUNK):
+        n = min(_CHUNK, len(points) - start)
+        for i in range(n):
+            for j in range(3):
+                local[j, i] = points[start + i, j]
+        _to_camera(n, pose, local, rotated, rays)
+        if not distort(lens, n, intrinsics, dense, unit, limit, rays, image, work):
+            return np.nan
+        for i in range(n):
+            w = weights[start + i]
+            dx = w * (intrinsics[2] + image[0, i] - pixels[start + i, 0])
+            dy = w * (intrinsics[3] + intrinsics[1] * image[1, i] - pixels[start + i, 1])
+            rho, slope = _loss(loss, scale, dx * dx + dy * dy)
+            cost += rho
+            root = np.sqrt(slope)
+            jacobian[residual_row, 0, i], jacobian[residual_row, 1, i] = root * dx, root * dy
+            local[0, i] = root * w
+        if wants_normal:
+            intrinsics_rows(lens, n, intrinsics, powers, unit, image, work, jacobian)
+            _pose_rows(n, residual_row - 6, intrinsics[1], rotated, image, jacobian)
+            for k in rows[:-1]:
+                for i in range(n):
+                    jacobian[k, 0, i] *= local[0, i]
+                    jacobian[k, 1, i] *= local[0, i]
+            _add_products(n, 2, rows, jacobian, normal)
+    return cost
+
+
+@jit
+def _add_curves(
+    lens: int, intrinsics: Any, powers: Any, dense: Any, unit: float, limit: float, pose: Any, tracks: Any, is_arc: Any, track: Any,
+    pixels: Any, weights: Any, s: Any, loss: int, scale: float, rows: Any, wants_normal: bool, normal: Any,
+    jacobian: Any, scratch: Any,
+) -> float:  # fmt: skip
+    """The same for the curve observations: one residual each, the distance along the image normal at the foot.
+
+    By the envelope theorem its derivative is that of the projected foot with s held, along the normal.
+    """
+    residual_row = jacobian.shape[0] - 1
+    local, rotated, rays, image, work, foot = (
+        scratch[:3], scratch[3:6], scratch[6:9], scratch[9:16], scratch[16:21], scratch[21:],
+    )  # fmt: skip
+    cost = 0.0
+    for start in range(0, len(pixels), _CHUNK):
+        n = min(_CHUNK, len(pixels) - start)
+        if not _feet(
+            lens, n, start, intrinsics, dense, unit, limit, pose, tracks, is_arc, track, pixels, s,
+            local, rotated, rays, image, work, foot,
+        ):  # fmt: skip
+            return np.nan
+        for i in range(n):
+            length = np.sqrt(foot[7, i])
+            nx, ny = -foot[1, i] / length, foot[0, i] / length
+            e = weights[start + i] * (nx * foot[2, i] + ny * foot[3, i])
+            rho, slope = _loss(loss, scale, e * e)
+            cost += rho
+            root = np.sqrt(slope)
+            jacobian[residual_row, 0, i] = root * e
+            local[0, i], local[1, i] = root * weights[start + i] * nx, root * weights[start + i] * ny
+        if wants_normal:
+            intrinsics_rows(lens, n, intrinsics, powers, unit, image, work, jacobian)
+            _pose_rows(n, residual_row - 6, intrinsics[1], rotated, image, jacobian)
+            for k in rows[:-1]:
+                for i in range(n):
+                    jacobian[k, 0, i] = local[0, i] * jacobian[k, 0, i] + local[1, i] * jacobian[k, 1, i]
+            _add_products(n, 1, rows, jacobian, normal)
+    return cost
+
+
+@jit
+def normal_equations(
+    lens: int, intrinsics: Any, powers: Any, unit: float, pose: Any, points: Any, pixels: Any, weights: Any,
+    tracks: Any, is_arc: Any, track: Any, curve_pixels: Any, curve_weights: Any, s: Any,
+    loss: int, scale: float, rows: Any, wants_normal: bool, normal: Any,
+) -> float:  # fmt: skip
+    """Sum of rho over one sight, NaN where an observation cannot be projected; A added up in `normal`'s lower triangle.
+
+    Args:
+        lens: a LENS_CODES value; intrinsics: phi, aspect, cx, cy, scaled coefficients; powers: those of the
+            one-dimensional map of the lens; unit: half the image diagonal, px; pose: (3, 4) [R t] of cam_from_frame.
+        points (N, 3) m, pixels (N, 2), weights (N,) = 1 / (noise scale * sigma).
+        tracks (T, 3, 3), is_arc (T,), track (M,) index into tracks, curve_pixels (M, 2), curve_weights (M,),
+            s (M,): place on the track, read as a start and left at the foot.
+        loss, scale: a LOSS_CODES value and its scale in standard deviations.
+        rows: which numbers take part: indices into [intrinsics | 6 pose | residual], the last one the residual's.
+        wants_normal: whether A is wanted or only the cost.
+    """
+    jacobian = np.empty((len(intrinsics) + 7, 2, _CHUNK))
+    scratch = np.empty((32, _CHUNK))
+    dense = one_dimensional(lens, intrinsics, powers)
+    limit = answer_limit(lens, dense)
+    if wants_normal:
+        normal[:] = 0.0
+    cost = 0.0
+    if len(points) > 0:
+        cost += _add_points(
+            lens, intrinsics, powers, dense, unit, limit, pose, points, pixels, weights, loss, scale, rows,
+            wants_normal, normal, jacobian, scratch,
+        )  # fmt: skip
+    if len(curve_pixels) > 0:
+        cost += _add_curves(
+            lens, intrinsics, powers, dense, unit, limit, pose, tracks, is_arc, track, curve_pixels, curve_weights, s,
+            loss, scale, rows, wants_normal, normal, jacobian, scratch,
+        )  # fmt: skip
+    return cost
+
+
+@jit
+def point_residuals(
+    lens: int, intrinsics: Any, powers: Any, unit: float, pose: Any, points: Any, pixels: Any, residuals: Any
+) -> None:
+    """project(X) - p in px, (N, 2); NaN where a point cannot be projected."""
+    scratch = np.empty((21, 1))
+    dense = one_dimensional(lens, intrinsics, powers)
+    limit = answer_limit(lens, dense)
+    for k in range(len(points)):
+        for j in range(3):
+            scratch[j, 0] = points[k, j]
+        _to_camera(1, pose, scratch[:3], scratch[3:6], scratch[6:9])
+        good = distort(lens, 1, intrinsics, dense, unit, limit, scratch[6:9], scratch[9:16], scratch[16:])
+        residuals[k, 0] = intrinsics[2] + scratch[9, 0] - pixels[k, 0] if good else np.nan
+        residuals[k, 1] = intrinsics[3] + intrinsics[1] * scratch[10, 0] - pixels[k, 1] if good else np.nan
+
+
+@jit
+def curve_residuals(
+    lens: int, intrinsics: Any, powers: Any, unit: float, pose: Any, tracks: Any, is_arc: Any, track: Any, pixels: Any,
+    s: Any, residuals: Any,
+) -> None:  # fmt: skip
+    """Signed distance from each pixel to its curve in px, (M,), and s moved to the foot; NaN where there is none."""
+    scratch = np.empty((32, 1))
+    dense = one_dimensional(lens, intrinsics, powers)
+    limit = answer_limit(lens, dense)
+    foot = scratch[21:]
+    for k in range(len(pixels)):
+        good = _feet(
+            lens, 1, k, intrinsics, dense, unit, limit, pose, tracks, is_arc, track, pixels, s,
+            scratch[:3], scratch[3:6], scratch[6:9], scratch[9:16], scratch[16:21], foot,
+        )  # fmt: skip
+        distance = (foot[0, 0] * foot[3, 0] - foot[1, 0] * foot[2, 0]) / np.sqrt(foot[7, 0])
+        residuals[k] = distance if good else np.nan

@@ -1,0 +1,202 @@
+"""Which numbers are free, fixed, shared or under a prior: the one owner of the solver's layout.
+
+The solver sees one block per camera with its free intrinsics (in the order of `intrinsic_names`, coefficients scaled to
+be of order one) and one 6-vector (rotation vector, translation) per free station and per placement.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ceres_cal.camera import Camera
+from ceres_cal.errors import InputError
+from ceres_cal.lens import LENS_KINDS, Lens, make_lens
+from ceres_cal.observations import Observations, Prior
+from ceres_cal.transforms import Array, Pose
+
+LOSSES = ("trivial", "huber", "soft_l1", "cauchy", "tukey")
+
+
+@dataclass(frozen=True)
+class Options:
+    """What to solve for and how.
+
+    Attributes:
+        lens: "radial", "brown" or "kannala-brandt"; powers: those of the radial lens.
+        free_principal_point: else it is held at the image centre, or where `fixed` says.
+        free_aspect: whether fy / fx is free; else 1, or what `fixed` says.
+        fixed: numbers held, by name: phi, aspect, cx, cy (px) and the lens's coefficients in the units of the files.
+            They hold for every camera.
+        priors: what is known beforehand, besides the observations' own.
+        loss: robust loss of each observation: one of LOSSES. loss_scale: where it starts to bend, in standard
+            deviations.
+        reject_sigma: observations farther off than this many standard deviations are taken out and listed.
+        noise_scale: "estimate" the factor on the stated sigmas of points and curves from the residuals, or "stated".
+        max_iterations: of each solve. threads: of the solver; 0 chooses.
+    """
+
+    lens: str = "radial"
+    powers: tuple[int, ...] = (2, 3)
+    free_principal_point: bool = True
+    free_aspect: bool = False
+    fixed: Mapping[str, float] = field(default_factory=dict)
+    priors: tuple[Prior, ...] = ()
+    loss: str = "huber"
+    loss_scale: float = 3.0
+    reject_sigma: float = 5.0
+    noise_scale: str = "estimate"
+    max_iterations: int = 100
+    threads: int = 0
+
+    def __post_init__(self) -> None:
+        if self.lens not in LENS_KINDS:
+            raise InputError(f"unknown lens {self.lens!r}: choose one of {', '.join(LENS_KINDS)}")
+        if self.loss not in LOSSES:
+            raise InputError(f"unknown loss {self.loss!r}: choose one of {', '.join(LOSSES)}")
+        if self.noise_scale not in ("estimate", "stated"):
+            raise InputError(f"noise_scale must be 'estimate' or 'stated', not {self.noise_scale!r}")
+        names = intrinsic_names(self.blank_lens)
+        for name, value in self.fixed.items():
+            if name not in names:
+                raise InputError(f"cannot fix {name!r}: the {self.lens} lens has {', '.join(names)}")
+            if not np.isfinite(value):
+                raise InputError(f"cannot fix {name} at {value}: give a finite number")
+        for name in ("loss_scale", "reject_sigma", "max_iterations"):
+            if not getattr(self, name) > 0:
+                raise InputError(f"{name} must be above 0, not {getattr(self, name)}")
+
+    @property
+    def blank_lens(self) -> Lens:
+        """The chosen lens with its fixed coefficients; the others are 0."""
+        names = make_lens(self.lens, self.powers).names
+        return make_lens(self.lens, self.powers, {k: v for k, v in self.fixed.items() if k in names})
+
+
+def intrinsic_names(lens: Lens) -> tuple[str, ...]:
+    """Names of a camera's intrinsics in the order of the solver's vector."""
+    return ("phi", "aspect", "cx", "cy", *lens.names)
+
+
+def unit_px(camera: Camera) -> float:
+    """Half the image diagonal: the unit of radius in which the solver's coefficients are of order one."""
+    return 0.5 * float(np.hypot(*camera.image_size))
+
+
+def intrinsics_vector(camera: Camera) -> Array:
+    """The solver's numbers of a camera, (4 + coefficients,)."""
+    scaled = np.asarray(camera.lens.values) * camera.lens.scales(unit_px(camera))
+    return np.array([camera.phi, camera.aspect, *camera.principal_point, *scaled])
+
+
+def intrinsics_scales(camera: Camera) -> Array:
+    """What a camera's numbers in the files' units are multiplied with to become the solver's."""
+    return np.concatenate([np.ones(4), camera.lens.scales(unit_px(camera))])
+
+
+def with_intrinsics(camera: Camera, vector: Array) -> Camera:
+    """The camera with the solver's numbers put in."""
+    phi, aspect, cx, cy = (float(v) for v in vector[:4])
+    lens = camera.lens.with_values(vector[4:] / camera.lens.scales(unit_px(camera)))
+    return replace(camera, phi=phi, aspect=aspect, principal_point=(cx, cy), lens=lens)
+
+
+@dataclass(frozen=True)
+class Station:
+    """One fixed pose of a camera over the field."""
+
+    camera: str
+    cam_from_world: Pose
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A value for everything the solve is about: cameras (at no particular pose), stations, placements, by name."""
+
+    cameras: Mapping[str, Camera]
+    stations: Mapping[str, Station]
+    placements: Mapping[str, Pose]
+    """world_from_target of each placement."""
+
+    def camera_at(self, station: str, placement: str | None = None) -> Camera:
+        """The station's camera in the world, or in the frame of a placement (its cam_from_world is cam_from_target)."""
+        pose = self.stations[station].cam_from_world
+        if placement is not None:
+            pose = pose @ self.placements[placement]
+        return self.cameras[self.stations[station].camera].at(pose)
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Which numbers the solver may move.
+
+    Attributes:
+        free: camera -> indices into its intrinsics vector.
+        stations, placements: names of the poses that are free.
+        priors: on free numbers.
+    """
+
+    free: Mapping[str, NDArray[np.int64]]
+    stations: frozenset[str]
+    placements: frozenset[str]
+    priors: tuple[Prior, ...] = ()
+
+    @property
+    def size(self) -> int:
+        """Number of free numbers."""
+        return sum(len(f) for f in self.free.values()) + 6 * (len(self.stations) + len(self.placements))
+
+
+def make_layout(observations: Observations, options: Options) -> Layout:
+    """The layout of a calibration: everything free but what the options fix and what nothing can tell.
+
+    Raises:
+        InputError: a prior names a quantity that the camera does not have.
+    """
+    names = intrinsic_names(options.blank_lens)
+    held = set(options.fixed)
+    if not options.free_principal_point:
+        held |= {"cx", "cy"}
+    if not options.free_aspect:
+        held |= {"aspect"}
+    free = np.array([i for i, name in enumerate(names) if name not in held], dtype=np.int64)
+    priors = (*observations.priors, *options.priors)
+    for prior in priors:
+        if prior.owner == "camera" and prior.quantity not in (*names, "principal_point"):
+            raise InputError(f"prior on camera {prior.name!r}: it has no {prior.quantity!r}, only {', '.join(names)}")
+    return Layout(
+        {camera: free for camera in observations.cameras},
+        frozenset(observations.stations) - anchored_stations(observations),
+        frozenset(observations.placements),
+        priors,
+    )
+
+
+def anchored_stations(observations: Observations) -> frozenset[str]:
+    """One station of each group that no view ties to the world: its camera frame serves as the world.
+
+    Boards alone tell poses among themselves only; holding one station removes that freedom.
+    """
+    group = {name: name for name in observations.stations}
+    first_seen: dict[str, str] = {}
+    tied: set[str] = set()
+
+    def root(name: str) -> str:
+        while group[name] != name:
+            name = group[name]
+        return name
+
+    for view in observations.views:
+        if view.placement is None:
+            tied.add(view.station)
+        else:
+            group[root(view.station)] = root(first_seen.setdefault(view.placement, view.station))
+    tied_groups = {root(name) for name in tied}
+    anchors = {}
+    for name in observations.stations:
+        if root(name) not in tied_groups:
+            anchors.setdefault(root(name), name)
+    return frozenset(anchors.values())

@@ -1,0 +1,185 @@
+"""The usual scenes, put together from a few parts: fields, boards and rings before any number of stations."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from ceres_cal.camera import Camera
+from ceres_cal.errors import InputError
+from ceres_cal.simulate.scene import Scene, Station, ViewPlan
+from ceres_cal.targets import Target
+from ceres_cal.transforms import Array, Pose, rotation_exp
+
+_MARGIN_PX = 5.0  # a board stays this far inside the image, so that noise moves no corner out
+_TRIES = 5_000
+
+
+def overhead_pose(
+    x_m: float = 0.0,
+    y_m: float = 0.0,
+    height_m: float = 4.0,
+    tilt_x_deg: float = 0.0,
+    tilt_y_deg: float = 0.0,
+    yaw_deg: float = 0.0,
+) -> Pose:
+    """cam_from_world of a camera that looks down at the floor.
+
+    At yaw 0 and without tilt the image's x runs along the field's x and the image's y against the field's y. Yaw turns
+    the camera counter-clockwise as seen from above. Tilt is one rotation about (tilt_x, tilt_y) in the image, so its
+    size is hypot(tilt_x, tilt_y): a positive tilt_x looks further down the image, a positive tilt_y further left.
+    """
+    yaw = np.deg2rad(yaw_deg)
+    down = np.diag([1.0, -1.0, -1.0]) @ rotation_exp([0.0, 0.0, -yaw])
+    tilt = rotation_exp(np.deg2rad([tilt_x_deg, tilt_y_deg, 0.0]))
+    return Pose.looking((x_m, y_m, height_m), tilt @ down)
+
+
+def board_placements(
+    board: Target,
+    cameras: Sequence[Camera],
+    count: int,
+    seed: int,
+    distance_m: tuple[float, float] = (1.0, 2.5),
+    tilt_deg: tuple[float, float] = (15.0, 45.0),
+) -> list[Pose]:
+    """world_from_target of a board at random places where every one of the posed cameras sees all of its points.
+
+    Args:
+        distance_m: range of the distance from the first camera to the middle of the board.
+        tilt_deg: range of the angle between the board's normal and the first camera's line of sight to its middle.
+
+    Raises:
+        InputError: no such place is found.
+    """
+    rng = np.random.default_rng(seed)
+    found: list[Pose] = []
+    for _ in range(_TRIES):
+        if len(found) == count:
+            return found
+        cam_from_board = _random_board_pose(board, cameras[0], distance_m, tilt_deg, rng)
+        placement = cameras[0].cam_from_world.inverse @ cam_from_board
+        if all(_sees_all(camera, placement.transform(board.point_array)) for camera in cameras):
+            found.append(placement)
+    raise InputError(
+        f"no {count} places found where {len(cameras)} camera(s) see a whole {board.kind}: "
+        "take a smaller board, a larger distance or less tilt"
+    )
+
+
+def _random_board_pose(
+    board: Target,
+    camera: Camera,
+    distance_m: tuple[float, float],
+    tilt_deg: tuple[float, float],
+    rng: np.random.Generator,
+) -> Pose:
+    """cam_from_board with the board's middle at a random pixel.
+
+    Its normal points away from the camera, so that columns run right and rows down before it is turned.
+    """
+    line_of_sight = camera.rays(rng.uniform((0.0, 0.0), camera.image_size)[None])[0]
+    across = np.array([-line_of_sight[1], line_of_sight[0], 0.0])  # z x line of sight
+    sine = np.linalg.norm(across)
+    facing = rotation_exp(across / max(sine, 1e-12) * np.arctan2(sine, line_of_sight[2]))
+    direction, spin = rng.uniform(0.0, 2.0 * np.pi, size=2)
+    tilt = np.deg2rad(rng.uniform(*tilt_deg))
+    leaning = rotation_exp((tilt * np.cos(direction), tilt * np.sin(direction), 0.0))
+    rotation = facing @ leaning @ rotation_exp((0.0, 0.0, spin))
+    middle = board.point_array.mean(axis=0)
+    return Pose(rotation, line_of_sight * rng.uniform(*distance_m) - rotation @ middle)
+
+
+def _sees_all(camera: Camera, points_world: Array) -> bool:
+    if np.any(camera.cam_from_world.transform(points_world)[:, 2] <= 0.0):
+        return False
+    pixels = camera.project(points_world)
+    return bool(np.all((pixels >= _MARGIN_PX) & (pixels <= np.array(camera.image_size) - 1.0 - _MARGIN_PX)))
+
+
+def field_scene(
+    field: Target,
+    cameras: Mapping[str, Camera],
+    stations: Mapping[str, Station],
+    frames: int = 1,
+    *,
+    points: tuple[str, ...] | None = None,
+    curves: tuple[str, ...] | None = None,
+    spacing_m: float = 0.1,
+    name: str = "field",
+) -> Scene:
+    """A target that lies in the world, seen in `frames` frames from every station.
+
+    Frames are numbered for each camera, "0001" first: cameras that see the field at once share the names, a camera at
+    several stations takes one frame after the other.
+    """
+    taken: Counter[str] = Counter()
+    views = []
+    for station_name, station in stations.items():
+        first = taken[station.camera] + 1
+        taken[station.camera] += frames
+        names = tuple(f"{number:04d}" for number in range(first, first + frames))
+        views.append(ViewPlan(names, station_name, name, None, points, curves, spacing_m))
+    return Scene({name: field}, cameras, stations, {}, tuple(views))
+
+
+def board_scene(
+    board: Target,
+    cameras: Mapping[str, Camera],
+    stations: Mapping[str, Station],
+    count: int,
+    seed: int,
+    *,
+    distance_m: tuple[float, float] = (1.0, 2.5),
+    tilt_deg: tuple[float, float] = (15.0, 45.0),
+    name: str = "board",
+) -> Scene:
+    """A board held at `count` places, each seen whole from every station at once (see `board_placements`)."""
+    posed = [cameras[station.camera].at(station.cam_from_world) for station in stations.values()]
+    poses = board_placements(board, posed, count, seed, distance_m, tilt_deg)
+    placements = {f"{name}_{number:02d}": pose for number, pose in enumerate(poses, start=1)}
+    views = tuple(ViewPlan((held,), station, name, held) for held in placements for station in stations)
+    return Scene({name: board}, cameras, stations, placements, views)
+
+
+def rings_scene(
+    sheet: Target,
+    cameras: Mapping[str, Camera],
+    stations: Mapping[str, Station],
+    cam_from_sheet: Pose,
+    *,
+    spacing_m: float = 0.02,
+    name: str = "rings",
+) -> Scene:
+    """A sheet of concentric rings before the first station: the paper's figure 2. The view has no points."""
+    station_name, station = next(iter(stations.items()))
+    placement = station.cam_from_world.inverse @ cam_from_sheet
+    view = ViewPlan((name,), station_name, name, name, points=(), spacing_m=spacing_m)
+    return Scene({name: sheet}, cameras, stations, {name: placement}, (view,))
+
+
+def join(*scenes: Scene) -> Scene:
+    """Several scenes as one: their views one after the other.
+
+    Raises:
+        InputError: a name means different things in two scenes.
+    """
+
+    def together(what: str) -> dict[str, Any]:
+        merged: dict[str, Any] = {}
+        for scene in scenes:
+            for name, value in getattr(scene, what).items():
+                if merged.setdefault(name, value) != value:
+                    raise InputError(f"{what}: {name!r} means different things in two scenes: give one another name")
+        return merged
+
+    return Scene(
+        together("targets"),
+        together("cameras"),
+        together("stations"),
+        together("placements"),
+        tuple(plan for scene in scenes for plan in scene.views),
+    )

@@ -1,0 +1,286 @@
+"""Scenes and truths as files: people write a scene, the truth lies beside the simulated observations."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ceres_cal.camera import Camera
+from ceres_cal.errors import InputError
+from ceres_cal.files import check_header, convert, read_json, write_json
+from ceres_cal.lens import Radial, make_lens
+from ceres_cal.simulate.scene import Disturbance, Scene, Station, ViewPlan
+from ceres_cal.simulate.simulation import OUTLIER, WRONG_LABEL, Simulation, Truth
+from ceres_cal.targets import target_from_spec
+from ceres_cal.transforms import Array, Pose, euler_from_rotation, rotation_exp, rotation_from_euler, rotation_log
+
+SCENE_FORMAT, SCENE_VERSION = "ceres-cal/scene", 1
+TRUTH_FORMAT, TRUTH_VERSION = "ceres-cal/truth", 1
+UNITS = "metres, radians, pixels"
+
+Vector = tuple[float, float, float]
+
+
+class _LensFile(msgspec.Struct, forbid_unknown_fields=True):
+    kind: str
+    powers: tuple[int, ...] = (2, 3)
+    coefficients: dict[str, float] = {}
+
+
+class _CameraFile(msgspec.Struct, forbid_unknown_fields=True):
+    image_size: tuple[int, int]
+    phi: float
+    principal_point: tuple[float, float]
+    lens: _LensFile
+    aspect: float = 1.0
+
+
+class _RotationFile(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
+    euler_rad: Vector | None = None
+    rotation_vector: Vector | None = None
+
+
+class _StationFile(_RotationFile, forbid_unknown_fields=True, kw_only=True):
+    camera: str
+    position_m: Vector
+
+
+class _PlacementFile(_RotationFile, forbid_unknown_fields=True, kw_only=True):
+    translation_m: Vector
+
+
+class _ViewFile(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True):
+    frames: tuple[str, ...]
+    station: str
+    target: str
+    placement: str | None = None
+    points: tuple[str, ...] | None = None
+    curves: tuple[str, ...] | None = None
+    spacing_m: float = 0.1
+    side: str = "centre"
+
+
+class _SceneFile(msgspec.Struct, forbid_unknown_fields=True):
+    format: str
+    version: int
+    targets: dict[str, Any]
+    cameras: dict[str, Any]
+    stations: dict[str, Any]
+    views: list[Any]
+    placements: dict[str, Any] = {}
+    disturbance: dict[str, Any] = {}
+    units: str = UNITS
+
+
+@contextmanager
+def _naming(where: str) -> Iterator[None]:
+    """Put `where` before the line of an InputError."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from None
+
+
+# ---- reading a scene ------------------------------------------------------------------------------------------------
+
+
+def load_scene(path: str | Path) -> tuple[Scene, Disturbance]:
+    """A scene file and the disturbance in it.
+
+    Raises:
+        InputError: one line that names the file and the place in it.
+    """
+    return scene_from_json(read_json(path, SCENE_FORMAT, SCENE_VERSION), str(path))
+
+
+def scene_from_json(data: Mapping[str, Any], where: str) -> tuple[Scene, Disturbance]:
+    """The scene and the disturbance that a file describes: the inverse of `scene_to_json`.
+
+    A station has its camera's `position_m`, a placement the `translation_m` of world_from_target; both have one of
+    `euler_rad` (the paper's angles) and `rotation_vector`, of cam_from_world and world_from_target. A view without
+    `points` or `curves` looks for all that its target has.
+
+    Args:
+        data: the file as plain data.
+        where: how to name the file in messages.
+
+    Raises:
+        InputError: one line that names `where` and the place in it.
+    """
+    file = convert(check_header(data, where, SCENE_FORMAT, SCENE_VERSION), _SceneFile, where)
+    with _naming(where):
+        scene = Scene(
+            {name: target_from_spec(spec, f"target {name!r}") for name, spec in file.targets.items()},
+            {name: _camera(entry, f"camera {name!r}") for name, entry in file.cameras.items()},
+            {name: _station(entry, f"station {name!r}") for name, entry in file.stations.items()},
+            {name: _placement(entry, f"placement {name!r}") for name, entry in file.placements.items()},
+            tuple(_plan(entry, f"view {number}") for number, entry in enumerate(file.views)),
+        )
+        return scene, _disturbance(file.disturbance)
+
+
+def _camera(entry: Any, here: str) -> Camera:
+    file = convert(entry, _CameraFile, here)
+    with _naming(here):
+        lens = make_lens(file.lens.kind, file.lens.powers, file.lens.coefficients)
+        return Camera(file.image_size, file.phi, file.principal_point, lens, file.aspect)
+
+
+def _rotation(file: _RotationFile, here: str) -> Array:
+    if file.euler_rad is not None and file.rotation_vector is None:
+        return rotation_from_euler(*file.euler_rad)
+    if file.rotation_vector is not None and file.euler_rad is None:
+        return rotation_exp(file.rotation_vector)
+    raise InputError(f"{here}: give its rotation as one of euler_rad and rotation_vector")
+
+
+def _station(entry: Any, here: str) -> Station:
+    file = convert(entry, _StationFile, here)
+    return Station(file.camera, Pose.looking(file.position_m, _rotation(file, here)))
+
+
+def _placement(entry: Any, here: str) -> Pose:
+    file = convert(entry, _PlacementFile, here)
+    return Pose(_rotation(file, here), np.array(file.translation_m))
+
+
+def _plan(entry: Any, here: str) -> ViewPlan:
+    return ViewPlan(**msgspec.structs.asdict(convert(entry, _ViewFile, here)))
+
+
+def _disturbance(entry: dict[str, Any]) -> Disturbance:
+    known = [field.name for field in fields(Disturbance)]
+    for name in entry:
+        if name not in known:
+            raise InputError(f"disturbance: {name!r} is unknown: there are {', '.join(known)}")
+    return convert(entry, Disturbance, "disturbance")
+
+
+# ---- writing --------------------------------------------------------------------------------------------------------
+
+
+def scene_to_json(scene: Scene, disturbance: Disturbance | None = None) -> dict[str, Any]:
+    """A scene and its disturbance as a file has them; poses come back to rounding, everything else exactly."""
+    views = [_ViewFile(**vars(plan)) for plan in scene.views]
+    return {
+        "format": SCENE_FORMAT,
+        "version": SCENE_VERSION,
+        "units": UNITS,
+        "targets": {name: dict(target.spec) for name, target in scene.targets.items()},
+        "cameras": {name: _camera_to_json(camera) for name, camera in scene.cameras.items()},
+        "stations": {
+            name: {
+                "camera": station.camera,
+                "position_m": station.cam_from_world.position.tolist(),
+                "rotation_vector": rotation_log(station.cam_from_world.rotation).tolist(),
+            }
+            for name, station in scene.stations.items()
+        },
+        "placements": {
+            name: {
+                "translation_m": pose.translation.tolist(),
+                "rotation_vector": rotation_log(pose.rotation).tolist(),
+            }
+            for name, pose in scene.placements.items()
+        },
+        "views": msgspec.to_builtins(views),
+        "disturbance": vars(disturbance or Disturbance()).copy(),
+    }
+
+
+def _camera_to_json(camera: Camera) -> dict[str, Any]:
+    lens = camera.lens
+    return {
+        "image_size": list(camera.image_size),
+        "phi": camera.phi,
+        "principal_point": list(camera.principal_point),
+        "aspect": camera.aspect,
+        "lens": {
+            "kind": lens.kind,
+            **({"powers": list(lens.powers)} if isinstance(lens, Radial) else {}),
+            "coefficients": lens.coefficients,
+        },
+    }
+
+
+def truth_to_json(simulations: Mapping[str, Simulation]) -> dict[str, Any]:
+    """What is true of simulated observations: intrinsics, stations, placements, and the disturbed rows of each file.
+
+    Poses are given to 1e-10 m and rad, intrinsics with every digit.
+
+    Args:
+        simulations: name of the file of observations -> what was simulated. Their scenes must agree on shared names.
+    """
+    truth: dict[str, Any] = {
+        "format": TRUTH_FORMAT,
+        "version": TRUTH_VERSION,
+        "units": UNITS,
+        "cameras": {},
+        "stations": {},
+        "placements": {},
+        "files": {},
+    }
+    for file_name, simulation in simulations.items():
+        scene = simulation.scene
+        truth["cameras"] |= {name: _camera_to_json(camera) for name, camera in scene.cameras.items()}
+        truth["stations"] |= {name: _station_truth(station) for name, station in scene.stations.items()}
+        truth["placements"] |= {name: _placement_truth(pose) for name, pose in scene.placements.items()}
+        truth["files"][file_name] = {
+            "seed": simulation.seed,
+            "disturbance": vars(simulation.disturbance).copy(),
+            "points": _rows_truth(simulation.points),
+            "curves": _rows_truth(simulation.curves),
+        }
+    return truth
+
+
+def _station_truth(station: Station) -> dict[str, Any]:
+    pose = station.cam_from_world
+    return {
+        "camera": station.camera,
+        "position_m": _tidy(pose.position),
+        "rotation": _tidy(pose.rotation),
+        "euler_rad": _tidy(euler_from_rotation(pose.rotation)),
+    }
+
+
+def _placement_truth(pose: Pose) -> dict[str, Any]:
+    return {"translation_m": _tidy(pose.translation), "rotation": _tidy(pose.rotation)}
+
+
+def _tidy(numbers: ArrayLike) -> Any:
+    """Metres or radians to 1e-10, far below what can be measured: the same digits on every machine."""
+    return (np.round(np.asarray(numbers, dtype=float), 10) + 0.0).tolist()  # + 0.0 turns -0.0 into 0.0
+
+
+def _rows_truth(truth: Truth) -> dict[str, Any]:
+    outliers, wrong = truth.rows(OUTLIER).tolist(), truth.rows(WRONG_LABEL).tolist()
+    return {
+        "count": len(truth.flag),
+        "outlier_count": len(outliers),
+        "wrong_label_count": len(wrong),
+        "outlier_rows": outliers,
+        "wrong_label_rows": wrong,
+    }
+
+
+def write_simulation(simulation: Simulation, folder: str | Path) -> None:
+    """Write `observations.json` and `truth.json` into a folder, which is made where it is missing.
+
+    Raises:
+        InputError: it cannot be written.
+    """
+    folder = Path(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be made: {error.strerror}") from None
+    simulation.observations.save(folder / "observations.json")
+    write_json(folder / "truth.json", truth_to_json({"observations.json": simulation}))

@@ -1,0 +1,296 @@
+"""From a scene to its observations: what each frame shows, with noise, outliers, wrong labels and hidden stretches."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ceres_cal.camera import Camera
+from ceres_cal.observations import Curves, Observations, Points, View
+from ceres_cal.simulate.scene import Disturbance, Scene, ViewPlan
+from ceres_cal.targets import SIDES, Arc, Target, along_track, nearest_on_track
+from ceres_cal.transforms import Array
+
+CLEAN, OUTLIER, WRONG_LABEL = 0, 1, 2
+
+Ints = NDArray[np.int32]
+Bools = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """What the rows of the points or of the curves of a simulation show in truth.
+
+    Attributes:
+        flag: (N,) CLEAN, OUTLIER or WRONG_LABEL.
+        feature: (N,) index of the feature that is seen; differs from the observation's where the label is wrong.
+        pixels: (N, 2) where it is seen without noise, px.
+    """
+
+    flag: NDArray[np.int8]
+    feature: Ints
+    pixels: Array
+
+    def rows(self, flag: int) -> NDArray[np.intp]:
+        """Numbers of the rows with this flag."""
+        return np.flatnonzero(self.flag == flag)
+
+
+@dataclass(frozen=True, eq=False)
+class Simulation:
+    """Observations of a scene, and their truth row by row."""
+
+    scene: Scene
+    disturbance: Disturbance
+    seed: int
+    observations: Observations
+    points: Truth
+    curves: Truth
+
+
+@dataclass(frozen=True, eq=False)
+class _InView:
+    """The N places on a target that a plan's camera can see: what all frames of the plan choose from.
+
+    `position_m` is the place along the plan's curves laid end to end, and ascends; `neighbour` is the curve next to the
+    place. Points have neither. `features` is how many names a wrong label can be drawn from.
+    """
+
+    feature: Ints
+    pixels: Array
+    features: int
+    position_m: Array | None = None
+    neighbour: Ints | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class _Rows:
+    """Columns of the observations of one plan, with their truth; `view` counts from the first view of all plans."""
+
+    view: Ints
+    feature: Ints
+    pixels: Array
+    sigma_px: Array
+    side: NDArray[np.int8]
+    flag: NDArray[np.int8]
+    true_feature: Ints
+    true_pixels: Array
+
+
+def simulate(scene: Scene, disturbance: Disturbance | None = None, seed: int = 0) -> Simulation:
+    """Observe a scene.
+
+    Only what is in front of the camera, within the lens's monotone radius and inside the image is observed; an
+    observation that its noise moves out of the image is lost. Views without any observation are left out. `sigma_px` of
+    the observations is the disturbance's, 1 where that is 0. The same scene, disturbance and seed give the same rows.
+
+    Raises:
+        InputError: a camera sees nothing at all.
+    """
+    disturbance = disturbance or Disturbance()
+    point_rng, curve_rng = np.random.default_rng(seed).spawn(2)
+    views: list[View] = []
+    point_rows, curve_rows = [], []
+    for plan in scene.views:
+        camera = scene.camera_at(plan.station)
+        points, curves = _points_in_view(scene, plan, camera), _curves_in_view(scene, plan, camera)
+        hidden_points = _hidden_points(points, len(plan.frames), disturbance, point_rng)
+        hidden_curves = _hidden_stretches(curves, len(plan.frames), disturbance, curve_rng)
+        first, side, size = len(views), SIDES[plan.side], camera.image_size
+        point_rows.append(
+            _observe(points, hidden_points, first, 0, disturbance.points_sigma_px, disturbance, size, point_rng)
+        )
+        curve_rows.append(
+            _observe(curves, hidden_curves, first, side, disturbance.curves_sigma_px, disturbance, size, curve_rng)
+        )
+        camera_name = scene.stations[plan.station].camera
+        views.extend(View(frame, camera_name, plan.station, plan.target, plan.placement) for frame in plan.frames)
+    return _assemble(scene, disturbance, seed, views, point_rows, curve_rows)
+
+
+# ---- what can be seen -----------------------------------------------------------------------------------------------
+
+
+def _inside(pixels: Array, image_size: tuple[int, int]) -> Bools:
+    """Whether pixels (N, 2) lie inside the image: within half a pixel of a pixel's centre."""
+    return np.asarray(np.all((pixels >= -0.5) & (pixels <= np.array(image_size) - 0.5), axis=1))
+
+
+def _project_seen(scene: Scene, plan: ViewPlan, camera: Camera, points: Array) -> tuple[NDArray[np.intp], Array]:
+    """Which of the target's points (N, 3) the camera sees, and their pixels."""
+    points_world = scene.world_from_target(plan.placement).transform(points)
+    ahead = np.flatnonzero(camera.cam_from_world.transform(points_world)[:, 2] > 0.0)
+    pixels = camera.project(points_world[ahead])
+    seen = _inside(pixels, camera.image_size)  # False for the NaN beyond the lens
+    return ahead[seen], pixels[seen]
+
+
+def _chosen(names: tuple[str, ...] | None, known: tuple[str, ...]) -> Ints:
+    """Indices of the chosen features, ascending."""
+    if names is None:
+        return np.arange(len(known), dtype=np.int32)
+    index = {name: i for i, name in enumerate(known)}
+    return np.array(sorted(index[name] for name in names), dtype=np.int32)
+
+
+def _points_in_view(scene: Scene, plan: ViewPlan, camera: Camera) -> _InView:
+    target = scene.targets[plan.target]
+    chosen = _chosen(plan.points, target.point_names)
+    rows, pixels = _project_seen(scene, plan, camera, target.point_array[chosen])
+    return _InView(chosen[rows], pixels, len(target.points))
+
+
+def _curves_in_view(scene: Scene, plan: ViewPlan, camera: Camera) -> _InView:
+    target = scene.targets[plan.target]
+    chosen = _chosen(plan.curves, target.curve_names)
+    places, positions, features, start = [np.empty((0, 3))], [np.empty(0)], [chosen[:0]], 0.0
+    for i in chosen:
+        curve = target.curves[target.curve_names[i]]
+        # Places in the middle of equal pieces: none at an end, and none twice on a closed circle.
+        pieces = max(1, round(curve.length_m / plan.spacing_m))
+        share = (np.arange(pieces) + 0.5) / pieces
+        low, high = curve.parameter_range
+        places.append(
+            along_track(target.tracks[SIDES[plan.side], i], isinstance(curve, Arc), low + share * (high - low))
+        )
+        positions.append(start + share * curve.length_m)
+        features.append(np.full(pieces, i, dtype=np.int32))
+        start += curve.length_m
+    there, feature = np.concatenate(places), np.concatenate(features)
+    rows, pixels = _project_seen(scene, plan, camera, there)
+    neighbour = _neighbours(target, feature[rows], there[rows])
+    return _InView(feature[rows], pixels, len(chosen), np.concatenate(positions)[rows], neighbour)
+
+
+def _neighbours(target: Target, feature: Ints, places: Array) -> Ints:
+    """For each place (N, 3) on a curve, the nearest other curve of the target; the same one where there is no other."""
+    nearest, distance = feature.copy(), np.full(len(places), np.inf)
+    for i, curve in enumerate(target.curves.values()):
+        track, is_arc = target.tracks[0, i], isinstance(curve, Arc)
+        low, high = sorted(curve.parameter_range)
+        s = nearest_on_track(np.broadcast_to(track, (len(places), 3, 3)), np.full(len(places), is_arc), places)
+        if is_arc:
+            s = low + np.mod(s - low, 2.0 * np.pi)
+            # Past its end an arc is left over by the nearer of its two ends.
+            s = np.where(s <= high, s, np.where(s - high < low + 2.0 * np.pi - s, high, low))
+        there = along_track(track, is_arc, np.clip(s, low, high))
+        away = np.linalg.norm(places - there, axis=1)
+        nearer = (away < distance) & (feature != i)
+        nearest[nearer], distance[nearer] = i, away[nearer]
+    return nearest
+
+
+# ---- what is seen ---------------------------------------------------------------------------------------------------
+
+
+def _hidden_points(in_view: _InView, frames: int, disturbance: Disturbance, rng: np.random.Generator) -> Bools:
+    """(frames, N) which points are hidden."""
+    shape = frames, len(in_view.feature)
+    if disturbance.hidden_points == 0.0:
+        return np.zeros(shape, dtype=bool)
+    return rng.random(shape) < disturbance.hidden_points
+
+
+def _hidden_stretches(in_view: _InView, frames: int, disturbance: Disturbance, rng: np.random.Generator) -> Bools:
+    """(frames, N) which places on curves are hidden: each stretch lies around one of the places in view."""
+    count, stretches, position = len(in_view.feature), disturbance.hidden_stretches, in_view.position_m
+    if position is None or count == 0 or stretches == 0:
+        return np.zeros((frames, count), dtype=bool)
+    middle = rng.integers(count, size=(frames, stretches))
+    curve_start = np.searchsorted(in_view.feature, in_view.feature, side="left")
+    curve_end = np.searchsorted(in_view.feature, in_view.feature, side="right")
+    reach = 0.5 * disturbance.hidden_length_m
+    start = np.maximum(curve_start[middle], np.searchsorted(position, position[middle] - reach, side="left"))
+    end = np.minimum(curve_end[middle], np.searchsorted(position, position[middle] + reach, side="right"))
+    # How many stretches cover a place: one more from each start on, one less from each end on.
+    change = np.zeros((frames, count + 1), dtype=np.int32)
+    frame = np.arange(frames)[:, None]
+    np.add.at(change, (frame, start), 1)
+    np.add.at(change, (frame, end), -1)
+    return np.asarray(np.cumsum(change[:, :-1], axis=1) > 0)
+
+
+def _observe(
+    in_view: _InView,
+    hidden: Bools,
+    first_view: int,
+    side: int,
+    sigma_px: float,
+    disturbance: Disturbance,
+    image_size: tuple[int, int],
+    rng: np.random.Generator,
+) -> _Rows:
+    """The observations of all frames of a plan."""
+    frame, place = np.nonzero(~hidden)
+    lot = rng.random(len(place))
+    flag = np.zeros(len(place), dtype=np.int8)
+    flag[lot < disturbance.outliers + disturbance.wrong_labels] = WRONG_LABEL
+    flag[lot < disturbance.outliers] = OUTLIER
+    true_pixels = in_view.pixels[place]
+    pixels = true_pixels.copy()
+    if sigma_px > 0.0:
+        pixels += sigma_px * rng.standard_normal(pixels.shape)
+    far = np.flatnonzero(flag == OUTLIER)
+    pixels[far] += disturbance.outlier_spread_px * rng.standard_normal((len(far), 2))
+    true_feature = in_view.feature[place]
+    feature = _mislabel(in_view, place, flag, rng)
+    flag[(flag == WRONG_LABEL) & (feature == true_feature)] = CLEAN  # there is no other name
+    rows = _Rows(
+        view=(first_view + frame).astype(np.int32),
+        feature=feature,
+        pixels=pixels,
+        sigma_px=np.full(len(place), sigma_px or 1.0),
+        side=np.full(len(place), side, dtype=np.int8),
+        flag=flag,
+        true_feature=true_feature,
+        true_pixels=true_pixels,
+    )
+    kept = _inside(pixels, image_size)
+    return rows if np.all(kept) else _Rows(**{name: column[kept] for name, column in vars(rows).items()})
+
+
+def _mislabel(in_view: _InView, place: NDArray[np.intp], flag: NDArray[np.int8], rng: np.random.Generator) -> Ints:
+    """The features as they are named: those of WRONG_LABEL rows by another name, where there is one."""
+    feature = in_view.feature[place]
+    wrong = np.flatnonzero(flag == WRONG_LABEL)
+    if in_view.neighbour is not None:
+        feature[wrong] = in_view.neighbour[place[wrong]]
+    elif in_view.features > 1:
+        feature[wrong] = (feature[wrong] + rng.integers(1, in_view.features, size=len(wrong))) % in_view.features
+    return feature
+
+
+# ---- all together ---------------------------------------------------------------------------------------------------
+
+
+def _assemble(
+    scene: Scene,
+    disturbance: Disturbance,
+    seed: int,
+    views: Sequence[View],
+    point_rows: Sequence[_Rows],
+    curve_rows: Sequence[_Rows],
+) -> Simulation:
+    points, curves = _joined(point_rows), _joined(curve_rows)
+    used = np.zeros(len(views), dtype=bool)
+    used[points.view] = used[curves.view] = True
+    number = (np.cumsum(used) - 1).astype(np.int32)
+    kept_views = tuple(view for view, keep in zip(views, used, strict=True) if keep)
+    observations = Observations(
+        {name: target for name, target in scene.targets.items() if any(view.target == name for view in kept_views)},
+        {name: camera.image_size for name, camera in scene.cameras.items()},
+        kept_views,
+        Points(number[points.view], points.feature, points.pixels, points.sigma_px),
+        Curves(number[curves.view], curves.feature, curves.pixels, curves.sigma_px, curves.side),
+    )
+    truths = [Truth(rows.flag, rows.true_feature, rows.true_pixels) for rows in (points, curves)]
+    return Simulation(scene, disturbance, seed, observations, *truths)
+
+
+def _joined(parts: Sequence[_Rows]) -> _Rows:
+    if len(parts) == 1:
+        return parts[0]
+    return _Rows(**{name: np.concatenate([getattr(rows, name) for rows in parts]) for name in vars(parts[0])})

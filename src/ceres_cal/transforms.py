@@ -1,0 +1,173 @@
+"""Rigid transforms between named frames.
+
+A pose named `cam_from_world` maps world coordinates to camera coordinates, so frames chain in names:
+`cam_from_board = cam_from_world @ world_from_board`. Rotations are 3 x 3 matrices, lengths metres, angles radians.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+_SMALL_ANGLE = 1e-4  # below it the series below are exact to rounding
+
+
+def skew(v: ArrayLike) -> Array:
+    """The matrix [v]x with [v]x w = v x w, shape (3, 3)."""
+    x, y, z = np.asarray(v, dtype=float)
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+def rotation_exp(rotation_vector: ArrayLike) -> Array:
+    """Rotation matrix of a rotation vector (axis times angle, rad): Rodrigues' formula."""
+    w = np.asarray(rotation_vector, dtype=float)
+    angle = float(np.linalg.norm(w))
+    if angle < _SMALL_ANGLE:
+        sine, versine = 1.0 - angle**2 / 6.0, 0.5 - angle**2 / 24.0
+    else:
+        sine, versine = np.sin(angle) / angle, 2.0 * (np.sin(0.5 * angle) / angle) ** 2
+    hat = skew(w)
+    return np.asarray(np.eye(3) + sine * hat + versine * hat @ hat)
+
+
+def rotation_log(rotation: ArrayLike) -> Array:
+    """Rotation vector (rad, length at most pi) of a rotation matrix, by way of the quaternion: exact up to angle pi."""
+    r = np.asarray(rotation, dtype=float)
+    trace = np.trace(r)
+    # The four squared quaternion components times four; dividing by the largest one never loses digits.
+    squares = np.array([1.0 + trace, *(1.0 - trace + 2.0 * np.diag(r))])
+    largest = int(np.argmax(squares))
+    w_xyz = np.array([r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]])
+    if largest == 0:
+        q = np.array([squares[0], *w_xyz])
+    else:
+        i = largest - 1
+        q = np.array([w_xyz[i], *(r[i] + r[:, i])])
+        q[largest] = squares[largest]
+    q /= np.linalg.norm(q)
+    if q[0] < 0.0:
+        q = -q
+    sine = float(np.linalg.norm(q[1:]))
+    if sine < 1e-12:
+        return np.asarray(2.0 * q[1:])
+    return np.asarray(2.0 * np.arctan2(sine, q[0]) / sine * q[1:])
+
+
+def left_jacobian(rotation_vector: ArrayLike) -> Array:
+    """J with exp(w + dw) = exp(J dw) exp(w) to first order, shape (3, 3)."""
+    w = np.asarray(rotation_vector, dtype=float)
+    angle = float(np.linalg.norm(w))
+    if angle < _SMALL_ANGLE:
+        versine, rest = 0.5 - angle**2 / 24.0, 1.0 / 6.0 - angle**2 / 120.0
+    else:
+        versine = 2.0 * (np.sin(0.5 * angle) / angle) ** 2
+        rest = (angle - np.sin(angle)) / angle**3
+    hat = skew(w)
+    return np.asarray(np.eye(3) + versine * hat + rest * hat @ hat)
+
+
+def nearest_rotation(matrix: ArrayLike) -> Array:
+    """The rotation matrix nearest to a 3 x 3 matrix in the Frobenius norm (polar factor, determinant +1)."""
+    u, _, vt = np.linalg.svd(np.asarray(matrix, dtype=float))
+    return np.asarray(u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt)
+
+
+def rotation_from_euler(alpha: float, beta: float, gamma: float) -> Array:
+    """The paper's rotation matrix R(alpha, beta, gamma) (section 3.6), angles in radians."""
+    ca, cb, cg = np.cos([alpha, beta, gamma])
+    sa, sb, sg = np.sin([alpha, beta, gamma])
+    return np.array(
+        [
+            [cb * cg, cb * sg, -sb],
+            [sa * sb * cg - sg * ca, sa * sb * sg + ca * cg, sa * cb],
+            [ca * sb * cg + sa * sg, ca * sb * sg - sa * cg, ca * cb],
+        ]
+    )
+
+
+def euler_from_rotation(rotation: ArrayLike) -> tuple[float, float, float]:
+    """The paper's angles (alpha, beta, gamma), rad; beta within +-pi/2.
+
+    At beta = +-pi/2 alpha and gamma are not separable; gamma is then 0.
+    """
+    r = np.asarray(rotation, dtype=float)
+    cos_beta = np.hypot(r[0, 0], r[0, 1])
+    gamma = np.arctan2(r[0, 1], r[0, 0]) if cos_beta > 1e-15 else 0.0
+    # alpha from the rotation with gamma taken out: near beta = +-pi/2 it then makes up for what gamma has lost.
+    s, c = np.sin(gamma), np.cos(gamma)
+    alpha = np.arctan2(s * r[2, 0] - c * r[2, 1], c * r[1, 1] - s * r[1, 0])
+    return float(alpha), float(np.arctan2(-r[0, 2], cos_beta)), float(gamma)
+
+
+@dataclass(frozen=True, eq=False)
+class Pose:
+    """A rigid transform b_from_a: x_b = rotation @ x_a + translation.
+
+    Attributes:
+        rotation: (3, 3) rotation matrix.
+        translation: (3,) metres, in frame b.
+    """
+
+    rotation: Array
+    translation: Array
+
+    def __post_init__(self) -> None:
+        for name, shape in (("rotation", (3, 3)), ("translation", (3,))):
+            value = np.array(getattr(self, name), dtype=float)
+            if value.shape != shape:
+                raise ValueError(f"{name} must have shape {shape}, not {value.shape}")
+            value.setflags(write=False)
+            object.__setattr__(self, name, value)
+
+    @classmethod
+    def identity(cls) -> Pose:
+        return cls(np.eye(3), np.zeros(3))
+
+    @classmethod
+    def exp(cls, vector: ArrayLike) -> Pose:
+        """The pose of a 6-vector (rotation vector in rad, translation in metres): the solver's block of a pose."""
+        v = np.asarray(vector, dtype=float)
+        return cls(rotation_exp(v[:3]), v[3:])
+
+    def log(self) -> Array:
+        """The 6-vector (rotation vector, translation) of this pose: the inverse of `exp`."""
+        return np.concatenate([rotation_log(self.rotation), self.translation])
+
+    @classmethod
+    def looking(cls, position: ArrayLike, rotation: ArrayLike) -> Pose:
+        """cam_from_world of a camera at `position` (the paper's t): x_cam = R (x_world - t)."""
+        r = np.asarray(rotation, dtype=float)
+        return cls(r, -r @ np.asarray(position, dtype=float))
+
+    @cached_property
+    def position(self) -> Array:
+        """Where frame b's origin lies in frame a, (3,) metres: of a cam_from_world, the camera's position (paper's t)."""
+        position = np.asarray(-self.rotation.T @ self.translation)
+        position.setflags(write=False)
+        return position
+
+    @cached_property
+    def inverse(self) -> Pose:
+        return Pose(self.rotation.T, self.position)
+
+    def __matmul__(self, other: Pose) -> Pose:
+        """c_from_b @ b_from_a = c_from_a."""
+        return Pose(self.rotation @ other.rotation, self.rotation @ other.translation + self.translation)
+
+    def transform(self, points: ArrayLike) -> Array:
+        """Points (..., 3) of frame a, in frame b."""
+        return np.asarray(np.asarray(points, dtype=float) @ self.rotation.T + self.translation)
+
+    def __eq__(self, other: object) -> bool:
+        return (
+            isinstance(other, Pose)
+            and np.array_equal(self.rotation, other.rotation)
+            and np.array_equal(self.translation, other.translation)
+        )
+
+    __hash__ = None  # type: ignore[assignment]

@@ -1,0 +1,125 @@
+"""The house: imports go downwards only, heavy libraries have one door each, and modules stay small."""
+
+import ast
+import subprocess
+import sys
+from collections.abc import Iterator
+from graphlib import CycleError, TopologicalSorter
+from pathlib import Path
+
+import pytest
+
+PACKAGE = "ceres_cal"
+SRC = Path(__file__).parents[1] / "src"
+MAX_LINES = 450
+
+# A new module, or a package with all that is in it, is one line here.
+FLOORS = {
+    "errors": 0,
+    "transforms": 0,
+    "lens": 0,
+    "targets": 0,
+    "camera": 1,
+    "observations": 1,
+    "kernels": 1,
+    "initialise": 2,
+    "parameters": 2,
+    "simulate": 2,
+    "detect": 2,
+    "bundle": 3,
+    "uncertainty": 4,
+    "diagnostics": 4,
+    "calibrate": 5,
+    "formats": 6,
+    "report": 6,
+    "cli": 6,
+}
+
+# Library: who may import it, at the top or inside a function.
+DOORS = {
+    "pyceres": {"bundle"},
+    "numba": {"kernels"},
+    "cv2": {"detect", "simulate", "formats"},
+    "pycolmap": {"initialise", "formats"},
+    "matplotlib": {"report"},
+    "scipy": set(),  # for the tests only
+}
+
+
+def dotted(path: Path) -> str:
+    """src/ceres_cal/detect/boards.py -> ceres_cal.detect.boards"""
+    parts = path.relative_to(SRC).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def room(name: str) -> str:
+    """ceres_cal.detect.boards -> detect: what FLOORS and DOORS speak of"""
+    return (name + ".").split(".")[1]
+
+
+def imports(path: Path) -> Iterator[tuple[int, str]]:
+    """Line and absolute dotted name of everything a module imports, wherever in the file it does so."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"), str(path))):
+        if isinstance(node, ast.Import):
+            yield from ((node.lineno, alias.name) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            package = path.relative_to(SRC).parent.parts
+            above = package[: len(package) - node.level + 1] if node.level else ()
+            base = ".".join((*above, node.module) if node.module else above)
+            yield from ((node.lineno, f"{base}.{alias.name}") for alias in node.names)
+
+
+MODULES = {dotted(path): path for path in sorted((SRC / PACKAGE).rglob("*.py"))}
+each_module = pytest.mark.parametrize("name", MODULES)
+
+
+def module_of(target: str) -> str | None:
+    """ceres_cal.detect.boards.find -> ceres_cal.detect.boards; None for what is not ours (or not yet there)"""
+    while target and target not in MODULES:
+        target = target.rpartition(".")[0]
+    return target or None
+
+
+@each_module
+def test_imports_go_downwards(name: str) -> None:
+    if name == PACKAGE:
+        return
+    floor = FLOORS.get(room(name))
+    assert floor is not None, f"{name} has no floor: give it a line in FLOORS (design: floor 0 knows nobody)"
+    for line, target in imports(MODULES[name]):
+        if target.split(".")[0] != PACKAGE:
+            continue
+        where, below = f"{name}, line {line}", FLOORS.get(room(target))
+        assert below is not None, f"{where} imports {target}: import from the module that defines it, by its full name"
+        assert below <= floor, (
+            f"{where} (floor {floor}) imports {target} from floor {below}: move what is shared down, or hand it in"
+        )
+
+
+def test_no_cycles() -> None:
+    graph = {name: {module_of(target) for _, target in imports(path)} - {None} for name, path in MODULES.items()}
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        pytest.fail(f"imports run in a circle, {' <- '.join(error.args[1])}: move what both need into a module below")
+
+
+@each_module
+def test_libraries_come_in_by_their_door(name: str) -> None:
+    for line, target in imports(MODULES[name]):
+        library = target.split(".")[0]
+        assert room(name) in DOORS.get(library, {room(name)}), (
+            f"{name}, line {line}, imports {library}, which only {sorted(DOORS[library]) or 'tests'} may: use those"
+        )
+
+
+def test_importing_the_package_is_light() -> None:
+    code = f"import sys, {PACKAGE}; print(*sorted({set(DOORS)} & sys.modules.keys()))"
+    heavy = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
+    assert not heavy, f"import {PACKAGE} brings in {heavy}: import them, or the module that does, where they are used"
+
+
+@each_module
+def test_modules_stay_small(name: str) -> None:
+    lines = len(MODULES[name].read_text(encoding="utf-8").splitlines())
+    assert lines <= MAX_LINES, f"{name} has {lines} lines, more than {MAX_LINES}: split off a part that has a name"
