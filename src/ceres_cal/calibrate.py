@@ -9,13 +9,13 @@ import numpy as np
 
 from ceres_cal.bundle import Progress, Solution, Weighting, solve
 from ceres_cal.calibration import Calibration, Fit, Rejected
-from ceres_cal.diagnostics import Inliers, judge
+from ceres_cal.diagnostics import Inliers, judge, start_weights
 from ceres_cal.errors import SolutionError
 from ceres_cal.initialise import initialise
 from ceres_cal.observations import Observations
 from ceres_cal.parameters import Estimate, Layout, Options, make_layout
 from ceres_cal.residuals import Residuals, residuals
-from ceres_cal.sights import Mask, Sight, gather_sights
+from ceres_cal.sights import Sight, gather_sights
 
 _MOST_ROUNDS = 15
 
@@ -71,7 +71,11 @@ def _settle(
     options: Options,
     progress: Callable[[Progress], None] | None,
 ) -> _Settled:
-    """Solve, judge the noise and the outliers, solve again, until nothing changes."""
+    """Solve, judge the noise and the outliers, solve again, until nothing changes.
+
+    A start is off by more than the noise, so the first solve rejects nothing that the start can show: a redescending
+    loss at the residuals' median keeps gross errors from deciding.
+    """
 
     def judged(at: Estimate) -> tuple[Residuals, Inliers]:
         found = residuals(observations, sights, at)
@@ -79,17 +83,18 @@ def _settle(
             observations, found, layout.size, options.reject_sigma, estimate_noise=options.noise_scale == "estimate"
         )
 
-    # A start is off by more than the noise: nothing that it can show is an outlier yet.
-    found, inliers = judged(estimate)
-    used: tuple[Mask, Mask] = np.isfinite(inliers.point_sigmas), np.isfinite(inliers.curve_sigmas)
-    for rounds in range(1, _MOST_ROUNDS + 1):
-        weighting = Weighting(inliers.point_scale, inliers.curve_scale, options.loss, options.loss_scale)
-        solution = solve(gather_sights(observations, *used), estimate, layout, weighting, options, progress)
-        before, estimate = inliers, solution.estimate
-        found, inliers = judged(estimate)
-        if rounds > 1 and inliers.same_as(before):
+    def solved(at: Estimate, by: Inliers, loss: str, loss_scale: float) -> Solution:
+        weighting = Weighting(by.point_scale, by.curve_scale, loss, loss_scale)
+        return solve(gather_sights(observations, by.points, by.curves), at, layout, weighting, options, progress)
+
+    solution = solved(estimate, start_weights(observations, residuals(observations, sights, estimate)), "cauchy", 1.0)
+    found, inliers = judged(solution.estimate)
+    for rounds in range(2, _MOST_ROUNDS + 1):
+        solution = solved(solution.estimate, inliers, options.loss, options.loss_scale)
+        before = inliers
+        found, inliers = judged(solution.estimate)
+        if inliers.same_as(before):
             break
-        used = inliers.points, inliers.curves
     return _Settled(solution, inliers, found, rounds)
 
 

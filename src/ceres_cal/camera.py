@@ -89,9 +89,10 @@ class Camera:
     def require_monotone(self, name: str) -> None:
         """Raise InputError naming the camera where its lens folds over inside the image."""
         if self.folds:
+            radius = self.lens.monotone_radius(self.phi)
             raise InputError(
-                f"camera {name!r}: the {self.lens.kind} lens folds over at {self.lens.monotone_radius(self.phi):.1f} px "
-                f"from the principal point, inside the image (its corner is at {self.corner_radius:.1f} px): "
+                f"camera {name!r}: the {self.lens.kind} lens folds over at {radius:.1f} px from the principal point, "
+                f"inside the image (its corner is at {self.corner_radius:.1f} px): "
                 "use other coefficients, fewer of them, or observations that reach the image's corners"
             )
 
@@ -133,7 +134,7 @@ class Camera:
         return np.column_stack([pose.rotation[:, :2], pose.translation + height_m * pose.rotation[:, 2]])
 
     def inverse_homography(self, height_m: float = 0.0) -> Array:
-        """The paper's G (3, 3), the inverse of `homography`: from the image plane at depth 1 to the field (section 3.1).
+        """The paper's G (3, 3), the inverse of `homography`: from the image plane at depth 1 to the field (its 3.1).
 
         Raises:
             DegenerateError: the camera lies in that plane.

@@ -55,6 +55,19 @@ def relative_lengths(observations: Observations, residuals: Residuals) -> tuple[
     return np.where(np.isfinite(points), points, np.inf), np.where(np.isfinite(curves), curves, np.inf)
 
 
+def start_weights(observations: Observations, residuals: Residuals) -> Inliers:
+    """Everything that a start can show, at the scale of its median residual: what the first solve works with."""
+    points, curves = relative_lengths(observations, residuals)
+    shown_points, shown_curves = np.isfinite(points), np.isfinite(curves)
+    p = _median_scale(points[shown_points], _RAYLEIGH_MEDIAN)
+    c = _median_scale(curves[shown_curves], _NORMAL_MEDIAN)
+    return Inliers(shown_points, shown_curves, p, c, points / p, curves / c)
+
+
+def _median_scale(lengths: Array, median_of_one: float) -> float:
+    return max(float(np.median(lengths)) / median_of_one, _LEAST_SCALE_PX) if len(lengths) else 1.0
+
+
 def judge(
     observations: Observations, residuals: Residuals, unknowns: int, reject_sigma: float, *, estimate_noise: bool
 ) -> Inliers:
@@ -84,6 +97,5 @@ def _scale(lengths: Array, dimensions: int, median_of_one: float, spare: float, 
     seen = lengths[np.isfinite(lengths)]
     if dimensions * len(seen) * spare < _LEAST_FREEDOM:
         return None
-    scale = float(np.median(seen)) / median_of_one
-    inside = seen[seen <= reject_sigma * max(scale, _LEAST_SCALE_PX)]
+    inside = seen[seen <= reject_sigma * _median_scale(seen, median_of_one)]
     return max(float(np.sqrt(np.sum(inside**2) / (dimensions * len(inside) * spare))), _LEAST_SCALE_PX)

@@ -6,6 +6,9 @@ class CalibrationError(Exception):
 
     exit_code = 2
 
+    def __str__(self) -> str:
+        return " ".join(super().__str__().splitlines())  # names out of a file may hold line breaks
+
 
 class InputError(CalibrationError):
     """A file, an option or an observation is wrong: nothing was computed."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import tempfile
 from pathlib import Path
@@ -34,9 +35,11 @@ def write_bytes(path: str | Path, content: bytes) -> None:
     Raises:
         InputError: the folder is missing or cannot be written.
     """
-    path = Path(path)
     try:
-        handle, beside = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
+        place = Path(path).resolve()  # behind a symbolic link, which stays
+        if place.exists() and not place.is_file():
+            raise InputError(f"{path}: cannot be written: it is a folder or a device")
+        handle, beside = tempfile.mkstemp(dir=place.parent, prefix=f".{place.name}.", suffix=".part")
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {error.strerror}") from None
     try:
@@ -45,7 +48,7 @@ def write_bytes(path: str | Path, content: bytes) -> None:
             stream.flush()
             os.fsync(stream.fileno())
         Path(beside).chmod(0o644)
-        Path(beside).replace(path)
+        Path(beside).replace(place)
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {error.strerror}") from None
     finally:
@@ -62,10 +65,13 @@ def read_json(path: str | Path, format_name: str, version: int) -> dict[str, Any
 
 
 def parse_json(content: bytes, where: str) -> Any:
-    """JSON text as plain data; InputError naming `where` if it is none."""
+    """JSON text as plain data; InputError naming `where` if it is none.
+
+    NaN and Infinity, as Python's own writer spells them, are let through to the checks that can name their place.
+    """
     try:
-        return msgspec.json.decode(content)
-    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        return json.loads(content)
+    except (ValueError, RecursionError) as error:
         raise InputError(f"{where}: not valid JSON (cut short?): {error}") from None
 
 
@@ -75,7 +81,8 @@ def check_header(data: Any, where: str, format_name: str, version: int) -> dict[
     if found != format_name:
         raise InputError(f'{where}: "format" must be "{format_name}", not {found!r}')
     if data.get("version") != version:
-        raise InputError(f"{where}: version {data.get('version')!r} is not known here, only {version}: update ceres-cal")
+        found = data.get("version")
+        raise InputError(f"{where}: version {found!r} is not known here, only {version}: update ceres-cal")
     return dict(data)
 
 

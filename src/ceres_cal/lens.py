@@ -201,7 +201,7 @@ class Lens(ABC):
         """
 
     def scales(self, unit_px: float) -> Array:
-        """What to multiply each coefficient with so that it is of order one, as the solver sees it (design, section 4)."""
+        """What to multiply each coefficient with so that it is of order one, for the solver (design, section 4)."""
         return np.ones(len(self.names))
 
 

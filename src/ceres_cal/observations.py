@@ -54,6 +54,21 @@ class Prior:
     value: tuple[float, ...]
     sigma: tuple[float, ...]
 
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "value", tuple(float(v) for v in self.value))
+        object.__setattr__(self, "sigma", tuple(float(s) for s in self.sigma))
+
+
+_TYPES = {"view": np.int32, "feature": np.int32, "pixels": np.float64, "sigma_px": np.float64, "side": np.int8}
+
+
+def _freeze(columns: Columns) -> None:
+    """Own, read-only columns of the types that the files have."""
+    for name, values in vars(columns).items():
+        column = np.array(values, dtype=_TYPES[name])
+        column.setflags(write=False)
+        object.__setattr__(columns, name, column)
+
 
 @dataclass(frozen=True, eq=False)
 class Points:
@@ -63,6 +78,9 @@ class Points:
     feature: Ints
     pixels: Array
     sigma_px: Array
+
+    def __post_init__(self) -> None:
+        _freeze(self)
 
     def __len__(self) -> int:
         return len(self.view)
@@ -77,6 +95,9 @@ class Curves:
     pixels: Array
     sigma_px: Array
     side: NDArray[np.int8]
+
+    def __post_init__(self) -> None:
+        _freeze(self)
 
     def __len__(self) -> int:
         return len(self.view)
@@ -93,10 +114,10 @@ class Observations:
         targets: by name.
         cameras: name -> (width, height) px.
         views: what frame shows which target.
-        points: point observations, in pixels with (0, 0) at the centre of the top-left pixel. `sigma_px` is the
+        points: point observations, in the order of their views, in pixels with (0, 0) at the centre of the top-left pixel. `sigma_px` is the
             standard deviation of each coordinate, 1 where nobody stated one (only ratios matter then: the solve
             estimates the scale).
-        curves: curve observations; `sigma_px` is that of the distance to the curve.
+        curves: curve observations, in the order of their views; `sigma_px` is that of the distance to the curve.
         priors: what is known beforehand.
 
     Raises:
@@ -112,9 +133,6 @@ class Observations:
     priors: tuple[Prior, ...] = ()
 
     def __post_init__(self) -> None:
-        for column in (self.points, self.curves):
-            for array in vars(column).values():
-                array.setflags(write=False)
         self._check_names()
         self._check_columns("point", self.points)
         self._check_columns("curve", self.curves)
@@ -142,10 +160,10 @@ class Observations:
     @cached_property
     def digest(self) -> str:
         """SHA-256 of the content, the same for the JSON and the NPZ file: where a calibration came from."""
-        content = hashlib.sha256(msgspec.json.encode(_header(self), order="sorted"))
+        content = hashlib.sha256(msgspec.json.encode(_header(self)))
         for column in (self.points, self.curves):
             for array in vars(column).values():
-                content.update(np.ascontiguousarray(array).tobytes())
+                content.update(array.tobytes())
         return content.hexdigest()
 
     # ---- reading ------------------------------------------------------------------------------------------------
@@ -176,7 +194,7 @@ class Observations:
         owner: dict[str, str] = {}
         placed: dict[str, str] = {}
         for number, view in enumerate(self.views):
-            here = f"view {number} (frame {view.frame!r})"
+            here = _here(number, self.views)
             if view.camera not in self.cameras:
                 raise InputError(f"{here} names camera {view.camera!r}, which is not there: {_listed(self.cameras)}")
             if view.target not in self.targets:
@@ -195,27 +213,31 @@ class Observations:
             raise InputError(f"the columns of the {kind} observations differ in length: write them again")
         if count == 0:
             return
-        if column.view.min() < 0 or column.view.max() >= len(self.views):
-            raise InputError(f"a {kind} observation names view {column.view.max()}, but there are {len(self.views)}")
-        is_point = kind == "point"
+        if np.any(wrong := (column.view < 0) | (column.view >= len(self.views))):
+            raise InputError(
+                f"a {kind} observation names view {column.view[np.argmax(wrong)]}, but there are {len(self.views)}"
+            )
+        if np.any(np.diff(column.view) < 0):
+            raise InputError(f"the {kind} observations must come in the order of their views: sort their columns by view")
         targets = [self.targets[view.target] for view in self.views]
-        known = np.array([len(t.points if is_point else t.curves) for t in targets])
-        wrong = (column.feature < 0) | (column.feature >= known[column.view])
-        if np.any(wrong):
+        known = np.array([len(target.points if kind == "point" else target.curves) for target in targets])
+        if np.any(wrong := (column.feature < 0) | (column.feature >= known[column.view])):
             row = int(np.argmax(wrong))
-            view = self.views[column.view[row]]
-            raise InputError(f"view {column.view[row]} (frame {view.frame!r}): {kind} feature {column.feature[row]} is unknown")
+            here, target = _here(column.view[row], self.views), self.views[column.view[row]].target
+            raise InputError(
+                f"{here}: {kind} feature number {column.feature[row]} is unknown in target {target!r}, "
+                f"which has {known[column.view[row]]}"
+            )
+        side = column.side if isinstance(column, Curves) else np.zeros(1, np.int8)
         for what, bad in (
             ("its pixel is not finite", ~np.all(np.isfinite(column.pixels), axis=1)),
             ("its sigma_px must be positive and finite", ~(np.isfinite(column.sigma_px) & (column.sigma_px > 0.0))),
+            ("its side must be 0, 1 or -1", np.abs(side) > 1),
         ):
             if np.any(bad):
                 row = int(np.argmax(bad))
-                number = int(column.view[row])
-                raise InputError(
-                    f"view {number} (frame {self.views[number].frame!r}), {kind} {self.feature_name(kind, row)!r}: "
-                    f"{what}: correct or remove it"
-                )
+                here = _here(column.view[row], self.views)
+                raise InputError(f"{here}, {kind} {self.feature_name(kind, row)!r}: {what}: correct or remove it")
 
     def _check_priors(self) -> None:
         for prior in self.priors:
@@ -223,7 +245,11 @@ class Observations:
             if prior.name not in names:
                 raise InputError(f"a prior names {prior.owner} {prior.name!r}, which is not there: {_listed(names)}")
             if not np.all(np.isfinite(prior.value)) or not np.all(np.isfinite(prior.sigma)) or min(prior.sigma) <= 0.0:
-                raise InputError(f"prior on {prior.quantity} of {prior.name!r}: give finite numbers and a sigma above 0")
+                raise InputError(f"prior on {prior.quantity!r} of {prior.name!r}: finite numbers and a sigma above 0")
+
+
+def _here(number: int, views: Sequence[View]) -> str:
+    return f"view {number} (frame {views[number].frame!r})"
 
 
 def _listed(names: Iterable[str]) -> str:
@@ -313,7 +339,7 @@ def load_observations(path: Path) -> Observations:
         return _from_json(content, str(path))
     except InputError as error:
         text = str(error)
-        raise InputError(text if text.startswith(str(path)) else f"{path}: {text}") from None
+        raise InputError(text if text.startswith(f"{path}: ") else f"{path}: {text}") from None
 
 
 def save_observations(observations: Observations, path: Path) -> None:
@@ -395,18 +421,16 @@ def _read_header(data: dict[str, Any]) -> tuple[dict[str, Target], dict[str, tup
 
 
 def _view(entry: _ViewFile) -> View:
-    return View(entry.frame, entry.camera, entry.station or entry.camera, entry.target, entry.placement)
+    station = entry.camera if entry.station is None else entry.station
+    return View(entry.frame, entry.camera, station, entry.target, entry.placement)
 
 
 def _from_json(content: bytes, where: str) -> Observations:
     try:
-        # The typed decoder is several times faster than the plain one; its success says that the shape is right.
-        data = msgspec.json.decode(content, type=_ObservationsFile)
-    except msgspec.ValidationError as error:
-        check_header(parse_json(content, where), where, FORMAT, VERSION)
-        raise InputError(f"{where}: {error}") from None
-    except (msgspec.DecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{where}: not valid JSON (cut short?): {error}") from None
+        data = msgspec.json.decode(content, type=_ObservationsFile)  # several times faster than by way of plain data
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+        plain = check_header(parse_json(content, where), where, FORMAT, VERSION)
+        data = convert(plain, _ObservationsFile, where)
     check_header({"format": data.format, "version": data.version}, where, FORMAT, VERSION)
     cameras = {name: {"image_size": entry.image_size} for name, entry in data.cameras.items()}
     targets, sizes, priors = _read_header({"targets": data.targets, "cameras": cameras, "priors": data.priors})
@@ -414,13 +438,13 @@ def _from_json(content: bytes, where: str) -> Observations:
     for number, view in enumerate(views):
         if view.target not in targets:
             raise InputError(
-                f"view {number} (frame {view.frame!r}) names target {view.target!r}, which is not there: {_listed(targets)}"
+                f"{_here(number, views)} names target {view.target!r}, which is not there: {_listed(targets)}"
             )
     points = [(i, entry.points) for i, entry in enumerate(data.views) if entry.points is not None]
     curves = [(i, entry.curves) for i, entry in enumerate(data.views) if entry.curves is not None]
     point_index = {name: {f: i for i, f in enumerate(target.point_names)} for name, target in targets.items()}
     curve_index = {name: {f: i for i, f in enumerate(target.curve_names)} for name, target in targets.items()}
-    sides = [_sides(entry, _here(i, views[i])) for i, entry in curves]
+    sides = [_sides(entry, _here(i, views)) for i, entry in curves]
     return Observations(
         targets,
         sizes,
@@ -429,10 +453,6 @@ def _from_json(content: bytes, where: str) -> Observations:
         Curves(**_columns(curves, views, curve_index, "curve"), side=_concatenate(sides, np.int8)),
         priors,
     )
-
-
-def _here(number: int, view: View) -> str:
-    return f"view {number} (frame {view.frame!r})"
 
 
 def _concatenate(parts: Sequence[Any], dtype: Any) -> NDArray[Any]:
@@ -449,7 +469,7 @@ def _columns(
     view, feature, sigma = [], [], []
     pixels: list[tuple[float, float]] = []
     for number, entry in entries:
-        here, count = _here(number, views[number]), len(entry.features)
+        here, count = _here(number, views), len(entry.features)
         if len(entry.pixels) != count:
             raise InputError(f"{here}: {count} {kind} features but {len(entry.pixels)} pixels")
         names = index[views[number].target]
@@ -505,9 +525,7 @@ def _to_json(observations: Observations) -> bytes:
             }
             if isinstance(column, Curves) and np.any(column.side[rows]):
                 side = _same_or_list(column.side[rows])
-                entry[kind]["side"] = (
-                    [_SIDE_NAMES[s] for s in side] if isinstance(side, list) else _SIDE_NAMES[side]
-                )
+                entry[kind]["side"] = [_SIDE_NAMES[s] for s in side] if isinstance(side, list) else _SIDE_NAMES[side]
     views = data.pop("views")
     head = msgspec.json.format(msgspec.json.encode(data), indent=1).rstrip(b"}\n")
     lines = b",\n  ".join(msgspec.json.encode(entry) for entry in views)
@@ -523,37 +541,45 @@ def _to_npz(observations: Observations) -> bytes:
     return stream.getvalue()
 
 
-_NPZ_TYPES = {"view": np.int32, "feature": np.int32, "pixels": np.float64, "sigma_px": np.float64, "side": np.int8}
+def _arrays(content: bytes, where: str) -> dict[str, NDArray[Any]]:
+    """What an NPZ file holds, by name."""
+    reason = "it is cut short or no NPZ file"
+    try:
+        if zipfile.is_zipfile(io.BytesIO(content)):
+            with np.load(io.BytesIO(content), allow_pickle=False) as archive:
+                return {name: archive[name] for name in archive.files}
+    except Exception as error:  # zipfile, zlib and NumPy raise a dozen kinds for a broken archive
+        if "allow_pickle" in str(error):
+            reason = "it holds pickled objects"
+    raise InputError(f"{where}: cannot be read, {reason}: write it again with Observations.save")
+
+
+def _taken(arrays: dict[str, NDArray[Any]], kind: str, names: Sequence[str], where: str) -> dict[str, Any]:
+    """The columns of one kind, taken out of the arrays."""
+    found = {}
+    for name in names:
+        array, dtype, ndim = arrays.pop(f"{kind}_{name}", None), np.dtype(_TYPES[name]), 2 if name == "pixels" else 1
+        if array is None:
+            raise InputError(f"{where}: column {kind}_{name} is missing")
+        if array.dtype != dtype or array.ndim != ndim:
+            raise InputError(
+                f"{where}: column {kind}_{name} must be {dtype} with {ndim} dimensions, not {array.dtype} with {array.ndim}"
+            )
+        found[name] = array
+    return found
 
 
 def _from_npz(content: bytes, where: str) -> Observations:
-    try:
-        with np.load(io.BytesIO(content), allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files}
-    except (ValueError, OSError, EOFError, KeyError, zipfile.BadZipFile) as error:
-        reason = "it holds pickled objects" if "pickle" in str(error).lower() else "it is cut short or no NPZ file"
-        raise InputError(f"{where}: cannot be read, {reason}: write it again with Observations.save") from None
-
-    def column(kind: str, names: Sequence[str]) -> dict[str, Any]:
-        found = {}
-        for name in names:
-            array = arrays.get(f"{kind}_{name}")
-            if array is None or array.dtype != _NPZ_TYPES[name] or array.ndim != (2 if name == "pixels" else 1):
-                raise InputError(f"{where}: column {kind}_{name} is missing or of the wrong type")
-            found[name] = np.ascontiguousarray(array)
-        return found
-
-    if "header" not in arrays or arrays["header"].dtype != np.uint8:
+    arrays = _arrays(content, where)
+    header = arrays.pop("header", None)
+    if header is None or header.dtype != np.uint8:
         raise InputError(f"{where}: no header: this is not a file of observations")
-    header = check_header(parse_json(arrays["header"].tobytes(), where), where, FORMAT, VERSION)
-    typed = convert(header, _ObservationsFile, where)
-    targets, cameras, priors = _read_header(header)
+    plain = check_header(parse_json(header.tobytes(), where), where, FORMAT, VERSION)
+    typed = convert(plain, _ObservationsFile, where)
+    targets, cameras, priors = _read_header(plain)
     names = ("view", "feature", "pixels", "sigma_px")
-    return Observations(
-        targets,
-        cameras,
-        tuple(_view(entry) for entry in typed.views),
-        Points(**column("points", names)),
-        Curves(**column("curves", (*names, "side"))),
-        priors,
-    )
+    points = Points(**_taken(arrays, "points", names, where))
+    curves = Curves(**_taken(arrays, "curves", (*names, "side"), where))
+    if arrays:
+        raise InputError(f"{where}: unknown column {min(arrays)!r}")
+    return Observations(targets, cameras, tuple(_view(entry) for entry in typed.views), points, curves, priors)

@@ -24,6 +24,17 @@ SIDES = {"centre": 0, "left": 1, "right": -1}
 `end` of a segment, counter-clockwise on an arc (so left is the inside)."""
 
 
+def _xyz(values: Sequence[float]) -> tuple[float, float, float]:
+    x, y, z = (float(v) for v in values)
+    return x, y, z
+
+
+def _settle(curve: Any, *places: str) -> None:
+    """Plain floats in a frozen curve, whatever kinds of numbers it was made of: what a file would give back."""
+    for name, value in vars(curve).items():
+        object.__setattr__(curve, name, _xyz(value) if name in places else float(value))
+
+
 @dataclass(frozen=True)
 class Segment:
     """A straight line from `start` to `end`, (x, y, z) m; `width_m` is that of the paint, 0 for a bare edge."""
@@ -31,6 +42,9 @@ class Segment:
     start: tuple[float, float, float]
     end: tuple[float, float, float]
     width_m: float = 0.0
+
+    def __post_init__(self) -> None:
+        _settle(self, "start", "end")
 
     @property
     def parameter_range(self) -> tuple[float, float]:
@@ -59,13 +73,16 @@ class Arc:
     to_rad: float = 2.0 * np.pi
     width_m: float = 0.0
 
+    def __post_init__(self) -> None:
+        _settle(self, "centre")
+
     @property
     def parameter_range(self) -> tuple[float, float]:
         return self.from_rad, self.to_rad
 
     @property
     def length_m(self) -> float:
-        return float(self.radius_m * abs(self.to_rad - self.from_rad))
+        return self.radius_m * (self.to_rad - self.from_rad)
 
     def track(self, side: int = 0) -> Array:
         """(3, 3) rows c, a, b of C(s) = c + a cos s + b sin s."""
@@ -91,7 +108,7 @@ def nearest_on_track(tracks: Array, is_arc: Array, points: Array) -> Array:
     away = points - c
     straight = np.sum(away * a, axis=1) / np.sum(a * a, axis=1)
     turned = np.arctan2(np.sum(away * b, axis=1), np.sum(away * a, axis=1))
-    return np.where(is_arc, turned, straight)
+    return np.asarray(np.where(is_arc, turned, straight))
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +116,8 @@ class Target:
     """A rigid thing of known geometry.
 
     Attributes:
-        spec: what a file says of it, `{"kind": ..., ...}`; two targets are equal when their specs are.
+        spec: what a file says of it, `{"kind": ..., ...}`; two targets are equal when their specs are and their
+            features come in the same order (observations number them).
         points: name -> (x, y, z) m.
         curves: name -> Segment or Arc.
     """
@@ -109,7 +127,12 @@ class Target:
     curves: Mapping[str, Curve]
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, Target) and self.spec == other.spec
+        return (
+            isinstance(other, Target)
+            and self.spec == other.spec
+            and self.point_names == other.point_names
+            and self.curve_names == other.curve_names
+        )
 
     __hash__ = None  # type: ignore[assignment]
 
@@ -190,13 +213,14 @@ def ssl_field(division: str | None = None, **dimensions_m: float) -> Target:
     names = tuple(_DIVISIONS["A"])
     if unknown := [name for name in dimensions_m if name not in names]:
         raise InputError(f"ssl-field: unknown dimension {unknown[0]!r}: the dimensions are {', '.join(names)}")
-    dimensions = {**(_DIVISIONS[division] if division else {}), **dimensions_m}
+    given = {name: float(value) for name, value in dimensions_m.items()}
+    dimensions = {**(_DIVISIONS[division] if division else {}), **given}
     if missing := [name for name in names if name not in dimensions]:
         raise InputError(f"ssl-field: {missing[0]} is missing: name a division or give every dimension")
     for name, value in dimensions.items():
         if not (np.isfinite(value) and value > 0.0):
             raise InputError(f"ssl-field: {name} must be a positive number of metres, not {value}")
-    spec = {"kind": "ssl-field", **({"division": division} if division else {}), **dimensions_m}
+    spec = {"kind": "ssl-field", **({"division": division} if division else {}), **given}
     return Target(spec, _ssl_points(dimensions), _ssl_curves(dimensions))
 
 
@@ -269,10 +293,10 @@ def checkerboard(columns: int, rows: int, square_m: float) -> Target:
         InputError: fewer than 2 corners a side, or a square that is not a positive number of metres.
     """
     if columns < 2 or rows < 2:
-        raise InputError(f"checkerboard: columns and rows count inner corners and must be at least 2, not {columns}, {rows}")
+        raise InputError(f"checkerboard: columns and rows count inner corners, at least 2, not {columns} and {rows}")
     if not (np.isfinite(square_m) and square_m > 0.0):
         raise InputError(f"checkerboard: square_m must be a positive number of metres, not {square_m}")
-    spec = {"kind": "checkerboard", "columns": columns, "rows": rows, "square_m": square_m}
+    spec = {"kind": "checkerboard", "columns": int(columns), "rows": int(rows), "square_m": float(square_m)}
     points = {f"{c},{r}": (c * square_m, r * square_m, 0.0) for r in range(rows) for c in range(columns)}
     return Target(spec, points, {})
 
@@ -317,20 +341,21 @@ def custom(
     """A target given in full.
 
     Raises:
-        InputError: no features at all, a number that is not finite, or a curve without length.
+        InputError: no features at all, a number that is not finite, a curve without length, or paint that covers the
+            centre of its arc.
     """
-    points, curves = dict(points or {}), dict(curves or {})
+    points, curves = {name: _xyz(place) for name, place in (points or {}).items()}, dict(curves or {})
     if not points and not curves:
         raise InputError("custom target: give at least one point, segment or arc")
-    for name, xyz in points.items():
-        if not np.all(np.isfinite(xyz)):
-            raise InputError(f"custom target: point {name!r} must have three finite numbers, not {xyz}")
+    for name, place in points.items():
+        if not np.all(np.isfinite(place)):
+            raise InputError(f"custom target: point {name!r} must have three finite numbers, not {place}")
     for name, curve in curves.items():
-        if not np.all(np.isfinite(curve.track())) or curve.length_m <= 0.0 or not curve.width_m >= 0.0:
+        if not (np.all(np.isfinite(curve.track(1))) and 0.0 < curve.length_m < np.inf and curve.width_m >= 0.0):
             raise InputError(f"custom target: curve {name!r} needs finite numbers, a length and a width_m from 0 on")
-    segments = {
-        name: _SegmentSpec(c.start, c.end, c.width_m) for name, c in curves.items() if isinstance(c, Segment)
-    }
+        if isinstance(curve, Arc) and not curve.radius_m > 0.5 * curve.width_m:
+            raise InputError(f"custom target: arc {name!r} must have a radius of more than half its width")
+    segments = {name: _SegmentSpec(c.start, c.end, c.width_m) for name, c in curves.items() if isinstance(c, Segment)}
     arcs = {
         name: _ArcSpec(c.centre, c.radius_m, c.from_rad, c.to_rad, c.width_m)
         for name, c in curves.items()
@@ -356,7 +381,7 @@ class _RingsSpec(msgspec.Struct, forbid_unknown_fields=True):
 def _ssl_from_spec(spec: dict[str, Any], where: str) -> Target:
     data = {name: value for name, value in spec.items() if name != "kind"}
     division = convert(data.pop("division", None), str | None, f"{where}.division")  # type: ignore[arg-type]
-    return ssl_field(division, **convert(data, dict[str, float], where))
+    return ssl_field(division, **{name: convert(value, float, f"{where}: {name}") for name, value in data.items()})
 
 
 def _checkerboard_from_spec(spec: dict[str, Any], where: str) -> Target:
@@ -397,7 +422,7 @@ def target_from_spec(spec: Any, where: str) -> Target:
         InputError: unknown kind, or a description that does not fit its kind.
     """
     kind = spec.get("kind") if isinstance(spec, dict) else None
-    if kind not in _KINDS:
+    if not isinstance(kind, str) or kind not in _KINDS:
         raise InputError(f"{where}: unknown kind {kind!r}: choose one of {', '.join(_KINDS)}")
     try:
         return _KINDS[kind](spec, where)

@@ -146,7 +146,7 @@ class Pose:
 
     @cached_property
     def position(self) -> Array:
-        """Where frame b's origin lies in frame a, (3,) metres: of a cam_from_world, the camera's position (paper's t)."""
+        """Where frame b's origin lies in frame a, (3,) metres: of cam_from_world, the camera's position (paper's t)."""
         position = np.asarray(-self.rotation.T @ self.translation)
         position.setflags(write=False)
         return position
