@@ -32,7 +32,7 @@ _HOME = {
     "Options": "parameters",
     "Pose": "transforms",
 }
-__all__ = list(_HOME)  # noqa: PLE0604
+__all__ = list(_HOME)
 
 
 def __getattr__(name: str) -> Any:

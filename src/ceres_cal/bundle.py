@@ -113,7 +113,7 @@ class _Run:
 _NOTHING = np.empty(0)
 
 
-class _SightCost(pyceres.CostFunction):  # type: ignore[misc]
+class _SightCost(pyceres.CostFunction):
     """The compressed block of one sight."""
 
     def __init__(self, run: _Run, sight: Sight, estimate: Estimate, layout: Layout, weighting: Weighting) -> None:
@@ -174,10 +174,10 @@ class _SightCost(pyceres.CostFunction):  # type: ignore[misc]
             return False
 
 
-class _LinearPriorCost(pyceres.CostFunction):  # type: ignore[misc]
+class _LinearPriorCost(pyceres.CostFunction):
     """(value - mean) / sigma of some free intrinsics of one camera."""
 
-    def __init__(self, places: Array, mean: Array, sigma: Array, size: int) -> None:
+    def __init__(self, places: NDArray[np.int64], mean: Array, sigma: Array, size: int) -> None:
         super().__init__()
         self._places, self._mean, self._sigma = places, mean, sigma
         self.set_num_residuals(len(places))
@@ -192,10 +192,10 @@ class _LinearPriorCost(pyceres.CostFunction):  # type: ignore[misc]
         return True
 
 
-class _PositionPriorCost(pyceres.CostFunction):  # type: ignore[misc]
+class _PositionPriorCost(pyceres.CostFunction):
     """(position - mean) / sigma of a station, on some axes: position = -R^T t."""
 
-    def __init__(self, axes: Array, mean: Array, sigma: Array) -> None:
+    def __init__(self, axes: NDArray[np.int64], mean: Array, sigma: Array) -> None:
         super().__init__()
         self._axes, self._mean, self._sigma = axes, mean, sigma
         self.set_num_residuals(len(axes))
@@ -211,7 +211,7 @@ class _PositionPriorCost(pyceres.CostFunction):  # type: ignore[misc]
         return True
 
 
-class _Watcher(pyceres.IterationCallback):  # type: ignore[misc]
+class _Watcher(pyceres.IterationCallback):
     """Passes progress on, and ends the solve when a callback has failed or Ctrl-C was pressed."""
 
     def __init__(self, run: _Run, progress: Callable[[Progress], None] | None) -> None:

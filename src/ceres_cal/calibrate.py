@@ -103,8 +103,8 @@ def _require_usable(solution: Solution) -> None:
         if camera.folds:
             raise SolutionError(
                 f"camera {name!r}: the solved {camera.lens.kind} lens folds over at "
-                f"{camera.lens.monotone_radius(camera.phi):.0f} px from the principal point, inside the image (corner at "
-                f"{camera.corner_radius:.0f} px): choose fewer or other coefficients, or observe nearer to the corners"
+                f"{camera.lens.monotone_radius(camera.phi):.0f} px from the principal point, inside the image (corner "
+                f"at {camera.corner_radius:.0f} px): choose fewer or other coefficients, or observe nearer to the corners"
             )
     if not solution.converged and not np.isfinite(solution.cost):
         raise SolutionError(f"the solve failed ({solution.termination}): check labels and target dimensions")

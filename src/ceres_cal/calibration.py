@@ -109,7 +109,7 @@ class Calibration:
         """
         if name is None and len(self.stations) == 1:
             return next(iter(self.stations.values()))
-        if name not in self.stations:
+        if name is None or name not in self.stations:
             raise InputError(f"station {name!r} is not there: there are {', '.join(map(repr, self.stations))}")
         return self.stations[name]
 

@@ -12,10 +12,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ceres_cal.errors import DegenerateError
 from ceres_cal.transforms import Array, Pose, nearest_rotation
+
+Ints = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -108,7 +110,7 @@ def max_norm_pose(homography: Array) -> Pose:
 
 
 def polar_pose(homography: Array) -> Pose:
-    """The pose that minimises the paper's E = |h1 / lambda - r1|^2 + |h2 / lambda - r2|^2 (section 3.6), in closed form.
+    """The pose that minimises the paper's E = |h1 / lambda - r1|^2 + |h2 / lambda - r2|^2 (section 3.6).
 
     With [h1 h2] = U S V^T: [r1 r2] = U V^T and 1 / lambda = tr(S) / tr(S^2).
     """
@@ -148,7 +150,7 @@ class PlaneData:
         sight: (N,) number of the sight, not decreasing. plane: (N, 2) m. offsets: (N, 2) px.
     """
 
-    sight: Array
+    sight: Ints
     plane: Array
     offsets: Array
 
@@ -160,7 +162,7 @@ def radial_alignment(data: PlaneData, count: int, unit_px: float, terms: int, ro
     r (h3 . X) - q sum c_k r^2k = q with q = (h1 . X, h2 . X) . p / r is linear in h3 of each sight and in the shared c.
     Iterated reweighting keeps wrong labels from deciding. Fewer than six points in a sight leave its answer to chance.
     """
-    starts = np.searchsorted(data.sight, np.arange(count))
+    starts = np.searchsorted(data.sight, np.arange(count)).astype(np.int64)
     x, restore = _normalised_by_sight(data, starts, count)
     p = data.offsets / unit_px
     radius = np.linalg.norm(p, axis=1)
@@ -182,7 +184,7 @@ def radial_alignment(data: PlaneData, count: int, unit_px: float, terms: int, ro
     return Profile(tuple(c), unit_px), homographies
 
 
-def _normalised_by_sight(data: PlaneData, starts: Array, count: int) -> tuple[Array, Array]:
+def _normalised_by_sight(data: PlaneData, starts: Ints, count: int) -> tuple[Array, Array]:
     """Homogeneous plane points with each sight's centroid at 0 and unit spread, and the (count, 3, 3) that did it."""
     number = np.diff([*starts, len(data.sight)])[:, None]
     centre = np.add.reduceat(data.plane, starts) / number
@@ -196,7 +198,7 @@ def _normalised_by_sight(data: PlaneData, starts: Array, count: int) -> tuple[Ar
     return x, restore
 
 
-def _alignment(x: Array, p: Array, weights: Array, starts: Array) -> Array:
+def _alignment(x: Array, p: Array, weights: Array, starts: Ints) -> Array:
     """(count, 2, 3): h1 and h2 of each sight, scaled so that |(h1 . X, h2 . X)| is |p| on average."""
     rows = np.hstack([-p[:, 1:] * x, p[:, :1] * x]) * np.sqrt(weights)[:, None]
     moments = np.add.reduceat(rows[:, :, None] * rows[:, None, :], starts)
@@ -209,7 +211,7 @@ def _alignment(x: Array, p: Array, weights: Array, starts: Array) -> Array:
 
 
 def _depth_and_profile(
-    x: Array, radius: Array, q: Array, weights: Array, starts: Array, sight: Array, terms: int
+    x: Array, radius: Array, q: Array, weights: Array, starts: Ints, sight: Ints, terms: int
 ) -> tuple[Array, Array]:
     """c (terms,) and h3 (count, 3) of r (h3 . X) - q sum c_k r^2k = q, by elimination of each sight's h3."""
     root = np.sqrt(weights)[:, None]
@@ -231,8 +233,8 @@ def line_moments(lines: Array, offsets: Array, weights: Array, unit_px: float, t
     """(2 + terms + 1 groups of 3)^2 moment matrix of l . (g1 p_x + g2 p_y + g3 (1 + sum c_k r^2k)) = 0.
 
     Args:
-        lines: (N, 3) homogeneous lines of the (normalised) plane. offsets: (N, 2) px, seen on those lines. A point is two
-            lines that cross in it.
+        lines: (N, 3) homogeneous lines of the (normalised) plane. offsets: (N, 2) px, seen on those lines. A point is
+            two lines that cross in it.
     """
     p = offsets / unit_px
     squared = np.sum(p * p, axis=1)
@@ -242,7 +244,7 @@ def line_moments(lines: Array, offsets: Array, weights: Array, unit_px: float, t
 
 
 def inverse_homography_from_moments(moments: Array, c: Sequence[float]) -> tuple[Array, float, float]:
-    """G (3, 3), columns g1 g2 g3, for a given profile: the null vector; with its residual and the next singular value."""
+    """G (3, 3) = (g1 g2 g3) for a given profile: the null vector; with its residual and the next singular value."""
     mix = np.zeros((9, len(moments)))
     mix[:6, :6] = np.eye(6)
     for k, factor in enumerate((1.0, *c)):

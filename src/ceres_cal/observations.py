@@ -114,9 +114,9 @@ class Observations:
         targets: by name.
         cameras: name -> (width, height) px.
         views: what frame shows which target.
-        points: point observations, in the order of their views, in pixels with (0, 0) at the centre of the top-left pixel. `sigma_px` is the
-            standard deviation of each coordinate, 1 where nobody stated one (only ratios matter then: the solve
-            estimates the scale).
+        points: point observations, in the order of their views and in pixels with (0, 0) at the centre of the top-left
+            pixel. `sigma_px` is the standard deviation of each coordinate, 1 where nobody stated one (only ratios
+            matter then: the solve estimates the scale).
         curves: curve observations, in the order of their views; `sigma_px` is that of the distance to the curve.
         priors: what is known beforehand.
 
@@ -218,7 +218,7 @@ class Observations:
                 f"a {kind} observation names view {column.view[np.argmax(wrong)]}, but there are {len(self.views)}"
             )
         if np.any(np.diff(column.view) < 0):
-            raise InputError(f"the {kind} observations must come in the order of their views: sort their columns by view")
+            raise InputError(f"the {kind} observations are not in the order of their views: sort the columns by view")
         targets = [self.targets[view.target] for view in self.views]
         known = np.array([len(target.points if kind == "point" else target.curves) for target in targets])
         if np.any(wrong := (column.feature < 0) | (column.feature >= known[column.view])):
@@ -563,7 +563,7 @@ def _taken(arrays: dict[str, NDArray[Any]], kind: str, names: Sequence[str], whe
             raise InputError(f"{where}: column {kind}_{name} is missing")
         if array.dtype != dtype or array.ndim != ndim:
             raise InputError(
-                f"{where}: column {kind}_{name} must be {dtype} with {ndim} dimensions, not {array.dtype} with {array.ndim}"
+                f"{where}: column {kind}_{name} must be {dtype} in {ndim} dimensions, not {array.dtype} in {array.ndim}"
             )
         found[name] = array
     return found

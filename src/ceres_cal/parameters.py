@@ -195,7 +195,7 @@ def anchored_stations(observations: Observations) -> frozenset[str]:
         else:
             group[root(view.station)] = root(first_seen.setdefault(view.placement, view.station))
     tied_groups = {root(name) for name in tied}
-    anchors = {}
+    anchors: dict[str, str] = {}
     for name in observations.stations:
         if root(name) not in tied_groups:
             anchors.setdefault(root(name), name)

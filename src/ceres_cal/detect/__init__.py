@@ -1,0 +1,1 @@
+"""Observations out of images, with OpenCV."""

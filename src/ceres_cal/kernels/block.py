@@ -1,7 +1,7 @@
 """The compressed block of one sight, as Ceres asks for it (design, section 6).
 
-A = sum w [J e]^T [J e] over [free intrinsics | 6 pose | e] is factored as A = U^T U; the rows of U are the Jacobian that
-Ceres sees, their last column its residual. Station and placement follow by the chain rule on U.
+A = sum w [J e]^T [J e] over [free intrinsics | 6 pose | e] is factored as A = U^T U; the rows of U are the Jacobian
+that Ceres sees, their last column its residual. Station and placement follow by the chain rule on U.
 """
 
 from __future__ import annotations

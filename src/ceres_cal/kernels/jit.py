@@ -10,15 +10,15 @@ import hashlib
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from numba import config, njit
 
-Function = TypeVar("Function", bound=Callable[..., Any])
+_CONFIG: Any = config  # numba makes its settings at import; no stub knows them
 
 
 def _cache_folder() -> Path:
-    base = config.CACHE_DIR or os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    base = _CONFIG.CACHE_DIR or os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     sources = hashlib.sha256()
     for path in sorted(Path(__file__).parent.glob("*.py")):
         sources.update(path.read_bytes())
@@ -39,14 +39,14 @@ def _is_writable(folder: Path) -> bool:
 _CACHED = _is_writable(CACHE_FOLDER)
 
 
-def jit(function: Function) -> Function:
+def jit(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile without the GIL; reassoc and contract let sums be vectorised, NaN and infinity keep their meaning."""
-    others = config.CACHE_DIR
-    config.CACHE_DIR = str(CACHE_FOLDER)
+    others = _CONFIG.CACHE_DIR
+    _CONFIG.CACHE_DIR = str(CACHE_FOLDER)
     try:
-        compiled: Function = njit(
+        compiled: Callable[..., Any] = njit(
             cache=_CACHED, nogil=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"}
         )(function)
     finally:
-        config.CACHE_DIR = others
+        _CONFIG.CACHE_DIR = others
     return compiled

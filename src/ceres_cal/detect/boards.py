@@ -1,0 +1,286 @@
+"""Chessboard and ChArUco corners from image files, as observations.
+
+OpenCV finds the board; `saddles` then measures every corner.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ceres_cal.detect.saddles import measure_saddles
+from ceres_cal.errors import InputError
+from ceres_cal.files import read_bytes
+from ceres_cal.observations import Curves, Observations, Points, View
+from ceres_cal.targets import Target
+from ceres_cal.transforms import Array
+
+Image = NDArray[Any]
+Progress = Callable[[int, int, str], None]
+
+MIN_CORNERS = 6
+TARGET_NAME = "board"
+_LARGE_PX, _ENLARGED_PX = 2e6, 8e6  # images above the first are also searched at that size, below the second at twice theirs
+
+
+@dataclass(frozen=True)
+class CharucoSpec:
+    """The markers of a ChArUco board; its squares are those of the checkerboard target.
+
+    Attributes:
+        dictionary: OpenCV's name of the marker dictionary, such as "DICT_4X4_50".
+        marker_m: side of a marker, less than that of a square.
+        legacy_pattern: made with OpenCV before 4.6, which began boards of an even number of rows otherwise.
+    """
+
+    dictionary: str
+    marker_m: float
+    legacy_pattern: bool = False
+
+
+@dataclass(frozen=True)
+class BoardDetections:
+    """What `detect_boards` found.
+
+    Attributes:
+        observations: one view per image that shows the board.
+        found: paths of these images, in the order of the views.
+        missed: path and reason of every other image.
+    """
+
+    observations: Observations
+    found: tuple[str, ...]
+    missed: tuple[tuple[str, str], ...]
+
+
+def detect_boards(
+    images: Sequence[Path],
+    board: Target,
+    camera: str = "camera",
+    station: str | None = None,
+    charuco: CharucoSpec | None = None,
+    progress: Progress | None = None,
+) -> BoardDetections:
+    """Chessboard or ChArUco corners of one camera's images.
+
+    Each image is one view; its frame is the file's stem, its placement too (with as much of the folders as tells
+    equal stems apart). Corners are named so that the labelling is never mirrored: the board's x along columns, y along
+    rows and z away from the camera. Which end of a plain chessboard is "0,0" is settled where its picture says so, by
+    columns + rows being odd: then the square between "0,0" and "1,1" is dark; otherwise two turns are possible, and
+    either is a placement.
+
+    `sigma_px` is left at 1: the fit of a corner is good to about 0.01 px, but what an unflat board and an unmodelled
+    lens add is several times that in real sets, and only the solve can tell.
+
+    Args:
+        images: files of any kind OpenCV reads, colour or grey, 8 or 16 bit, all of one size. A rotation noted in the
+            file is ignored: intrinsics belong to the pixels as the sensor has them, not to how a viewer turns them.
+        board: a checkerboard target.
+        camera: name of the camera.
+        station: name of the station, that of the camera by default.
+        charuco: the markers, when the board has any. Boards may then be partly seen.
+        progress: called after each image with (images done, images in all, file name).
+
+    Raises:
+        InputError: an image cannot be read or has another size (each named), the target is no checkerboard or too
+            small, the markers do not fit it, or no image shows the board.
+    """
+    if not images:
+        raise InputError("detect_boards: no images were given: name at least one file")
+    find = _finder(board, charuco)
+    size: tuple[int, int] | None = None
+    found: list[tuple[Path, Array]] = []
+    missed: list[tuple[str, str]] = []
+    for number, path in enumerate(images, start=1):
+        image = read_grey(path)
+        size = size or (image.shape[1], image.shape[0])
+        if (image.shape[1], image.shape[0]) != size:
+            raise InputError(
+                f"{path}: {image.shape[1]} x {image.shape[0]} px, but {images[0]} has {size[0]} x {size[1]}: "
+                "images of another size are another camera's, detect them on their own"
+            )
+        grid = find(image)
+        if isinstance(grid, str):
+            missed.append((str(path), grid))
+        else:
+            found.append((path, grid))
+        if progress is not None:
+            progress(number, len(images), Path(path).name)
+    if not found or size is None:
+        raise InputError(
+            f"no board with {board.spec['columns']} x {board.spec['rows']} inner corners in any of {len(images)} images, "
+            f"{missed[0][0]}: {missed[0][1]}: count the corners between squares, not the squares"
+        )
+    names = _placement_names([Path(path) for path in images])
+    views = tuple(
+        View(Path(path).stem, camera, station or camera, TARGET_NAME, names[Path(path)]) for path, _ in found
+    )
+    observations = Observations(
+        {TARGET_NAME: board}, {camera: size}, views, _points([grid for _, grid in found], board), _no_curves()
+    )
+    return BoardDetections(observations, tuple(str(path) for path, _ in found), tuple(missed))
+
+
+def read_grey(path: str | Path) -> Image:
+    """An image as (height, width) grey levels of its own depth, its pixels as stored (any noted rotation ignored).
+
+    Raises:
+        InputError: the file is missing or no image.
+    """
+    content = np.frombuffer(read_bytes(path), np.uint8)
+    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+    image = cv2.imdecode(content, flags) if content.size else None
+    if image is None:
+        raise InputError(f"{path}: not an image that OpenCV can read (cut short?): convert it to PNG or leave it out")
+    return image
+
+
+# ---- finding --------------------------------------------------------------------------------------------------------
+
+Finder = Callable[[Image], "Array | str"]
+"""Image -> measured grid (rows, columns, 2) px, NaN where a corner was not seen, or the reason why there is none."""
+
+
+def _finder(board: Target, charuco: CharucoSpec | None) -> Finder:
+    if board.kind != "checkerboard":
+        raise InputError(f"target of kind {board.kind!r}: boards are detected with a target of kind 'checkerboard'")
+    columns, rows = int(board.spec["columns"]), int(board.spec["rows"])
+    if min(columns, rows) < 3:
+        raise InputError(f"a board to be found in images needs 3 inner corners a side or more, not {columns} x {rows}")
+    if charuco is None:
+        return lambda image: _measured_chessboard(image, columns, rows)
+    detector = _charuco_detector(charuco, columns, rows, float(board.spec["square_m"]))
+    margin = 0.5 * (1.0 - charuco.marker_m / float(board.spec["square_m"]))  # white around a marker, in squares
+    return lambda image: _measured_charuco(image, detector, columns, rows, margin)
+
+
+def _measured_chessboard(image: Image, columns: int, rows: int) -> Array | str:
+    seen = _find_chessboard(_as_8_bit(image), columns, rows)
+    if seen is None:
+        return f"no chessboard of {columns} x {rows} inner corners found"
+    along_row, along_column = np.diff(seen, axis=1)[:-1], np.diff(seen, axis=0)[:, :-1]
+    turn = along_row[..., 0] * along_column[..., 1] - along_row[..., 1] * along_column[..., 0]
+    if np.sum(turn) < 0.0:
+        seen = seen[:, ::-1]
+    saddles = measure_saddles(image, seen)
+    grid = saddles.grid
+    if (columns + rows) % 2 == 1:
+        parity = np.where(np.indices((rows, columns)).sum(axis=0) % 2 == 0, 1.0, -1.0)
+        if np.nansum(parity * saddles.contrast) < 0.0:
+            grid = grid[::-1, ::-1]
+    return _enough(grid)
+
+
+def _find_chessboard(image: NDArray[np.uint8], columns: int, rows: int) -> Array | None:
+    """Roughly where the corners are, (rows, columns, 2) px, by OpenCV's two detectors at several scales."""
+    legacy = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
+    for scale in _scales(image.size):
+        how = cv2.INTER_AREA if scale < 1.0 else cv2.INTER_CUBIC
+        scaled = image if scale == 1.0 else cv2.resize(image, None, fx=scale, fy=scale, interpolation=how)
+        # The newer detector is the better one; where it misses a board the older one may still see it.
+        found, corners = cv2.findChessboardCornersSB(scaled, (columns, rows))
+        if not found:
+            found, corners = cv2.findChessboardCorners(scaled, (columns, rows), flags=legacy)
+        if found:
+            ratio = np.array(image.shape[::-1]) / np.array(scaled.shape[::-1])
+            return np.asarray((corners.reshape(rows, columns, 2).astype(float) + 0.5) * ratio - 0.5)
+    return None
+
+
+def _scales(pixels: int) -> Iterator[float]:
+    if pixels > _LARGE_PX:
+        yield float(np.sqrt(_LARGE_PX / pixels))
+    yield 1.0
+    if 4 * pixels <= _ENLARGED_PX:
+        yield 2.0
+
+
+def _charuco_detector(charuco: CharucoSpec, columns: int, rows: int, square_m: float) -> cv2.aruco.CharucoDetector:
+    code = getattr(cv2.aruco, charuco.dictionary, None)
+    if not charuco.dictionary.startswith("DICT_") or not isinstance(code, int):
+        raise InputError(f"unknown marker dictionary {charuco.dictionary!r}: name one of OpenCV's, such as 'DICT_4X4_50'")
+    if not 0.0 < charuco.marker_m < square_m:
+        raise InputError(f"marker_m must be between 0 and the square's {square_m} m, not {charuco.marker_m}")
+    dictionary = cv2.aruco.getPredefinedDictionary(code)
+    needed = (columns + 1) * (rows + 1) // 2
+    if len(dictionary.bytesList) < needed:
+        raise InputError(
+            f"{charuco.dictionary} has {len(dictionary.bytesList)} markers, but a board of {columns + 1} x {rows + 1} "
+            f"squares needs {needed}: name the dictionary that was printed"
+        )
+    board = cv2.aruco.CharucoBoard((columns + 1, rows + 1), square_m, charuco.marker_m, dictionary)
+    board.setLegacyPattern(charuco.legacy_pattern)
+    return cv2.aruco.CharucoDetector(board)
+
+
+def _measured_charuco(
+    image: Image, detector: cv2.aruco.CharucoDetector, columns: int, rows: int, margin: float
+) -> Array | str:
+    corners, ids, _, _ = detector.detectBoard(_as_8_bit(image))
+    if ids is None or len(ids) == 0:
+        return "no ChArUco corners found"
+    seen = np.full((rows * columns, 2), np.nan)
+    seen[ids.ravel()] = corners.reshape(-1, 2)
+    # The disc around a corner must end before the markers on both sides of it begin.
+    reach = min(0.6, float(np.sqrt(2.0)) * margin)
+    return _enough(measure_saddles(image, seen.reshape(rows, columns, 2), reach).grid)
+
+
+def _enough(grid: Array) -> Array | str:
+    """The grid, or why its corners cannot place a board: too few, or (but for one) all on one line."""
+    row, column = np.nonzero(~np.isnan(grid[..., 0]))
+    if len(row) < MIN_CORNERS:
+        return f"only {len(row)} corners, {MIN_CORNERS} are needed"
+    if max(np.bincount(row).max(), np.bincount(column).max()) >= len(row) - 1:
+        return f"its {len(row)} corners lie on one line"
+    return grid
+
+
+def _as_8_bit(image: Image) -> NDArray[np.uint8]:
+    """What OpenCV's detectors take; deeper images are stretched, but for half a percent at either end."""
+    if image.dtype == np.uint8:
+        return image
+    low, high = np.percentile(image, [0.5, 99.5])
+    return np.clip((image - low) * (255.0 / max(high - low, 1e-12)), 0.0, 255.0).astype(np.uint8)
+
+
+# ---- observations ---------------------------------------------------------------------------------------------------
+
+
+def _placement_names(paths: Sequence[Path]) -> dict[Path, str]:
+    """Name by path: the stem, and of equal stems as many folders as tell them apart."""
+    if len(set(paths)) < len(paths):
+        twice = next(path for number, path in enumerate(paths) if path in paths[:number])
+        raise InputError(f"{twice}: given twice: name every image once")
+    names = {path: path.stem for path in paths}
+    for depth in range(2, max(len(path.parts) for path in paths) + 2):
+        taken = list(names.values())
+        for path in paths:
+            if taken.count(names[path]) > 1:
+                names[path] = "/".join((*path.parts[-depth:-1], path.stem if depth <= len(path.parts) else path.name))
+    return names
+
+
+def _points(grids: Sequence[Array], board: Target) -> Points:
+    rows, columns = grids[0].shape[:2]
+    index = {name: i for i, name in enumerate(board.point_names)}
+    features = np.array([[index[f"{c},{r}"] for c in range(columns)] for r in range(rows)], dtype=np.int32)
+    seen = [~np.isnan(grid[..., 0]) for grid in grids]
+    count = [int(np.count_nonzero(s)) for s in seen]
+    return Points(
+        view=np.repeat(np.arange(len(grids), dtype=np.int32), count),
+        feature=np.concatenate([features[s] for s in seen]),
+        pixels=np.concatenate([grid[s] for grid, s in zip(grids, seen, strict=True)]),
+        sigma_px=np.ones(sum(count)),
+    )
+
+
+def _no_curves() -> Curves:
+    nothing = np.empty(0, np.int32)
+    return Curves(nothing, nothing.copy(), np.empty((0, 2)), np.empty(0), np.empty(0, np.int8))

@@ -1,0 +1,222 @@
+"""Where the corners of a chessboard are, to a hundredth of a pixel: a model of the picture fitted around each corner.
+
+Around a corner the picture is a saddle: two dark and two bright squares, parted by two edges that cross in the corner,
+
+    I(p) = m + g . (p - x) + (a + h . (p - x)) tanh(s d1(p)) tanh(s d2(p)),
+
+with x the corner, d1 and d2 the signed distances to the edges, s their sharpness, and (m, g), (a, h) the mean level and
+the contrast of uneven light, to first order. The directions of the edges are free; their curvature (lens distortion
+bends them) is that of the grid of neighbouring corners. The eleven numbers are fitted by least squares to all pixels of
+a disc around the corner.
+
+The picture is first smoothed by one pixel. That spreads every edge over a few pixels, so that what the camera did to
+its profile (sharpening, pixels, motion) is symmetric about the edge wherever the edge lies between two pixels, and
+moves nothing; without it, sharpened edges along the pixel grid were off by up to 0.2 px.
+
+Measured, rms per coordinate on rendered boards with known corners (lens distortion, tilt, blur of 0.7 px, noise of
+2 grey levels at a contrast of 160): 0.006 px, where `cv2.cornerSubPix` gives 0.020 px and
+`cv2.findChessboardCornersSB` 0.04 px. `cornerSubPix` is off in a way that averages badly: in the geometry of a real
+13-image set it made the focal length 0.5 to 1.0 px of 700 too short, this fit 0.06 px.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ceres_cal.transforms import Array
+
+_SMOOTHING_PX = 1.0
+_REACH = 0.6  # radius of the disc, as a part of the distance to the next edges
+_RADIUS_PX = (3.0, 15.0)
+_LOST = 0.5  # a corner that moved further, as a part of that distance, followed something else
+_SHARPNESS = (0.05, 3.0)  # 1 / px; beyond, s says nothing any more
+_STEPS = 20
+_SETTLED_PX = 1e-3  # the steps shrink quadratically: the last one is smaller by far than the noise
+
+# Places in a row of parameters.
+_X, _Y, _ANGLE, _SHARP, _MEAN, _MEAN_SLOPE, _CONTRAST, _CONTRAST_SLOPE, _SIZE = 0, 1, 2, 4, 5, 6, 8, 9, 11
+
+
+@dataclass(frozen=True, eq=False)
+class Saddles:
+    """Measured corners of one board.
+
+    Attributes:
+        grid: (rows, columns, 2) px; NaN where no corner was measured.
+        contrast: (rows, columns) grey levels, half the step from dark to bright; positive where the square towards the
+            next row and column is dark. Neighbours differ in sign.
+    """
+
+    grid: Array
+    contrast: Array
+
+
+def measure_saddles(image: NDArray[Any], grid: Array, reach: float = _REACH) -> Saddles:
+    """The corners of a board near where a detector saw them.
+
+    A corner is left out (NaN) where the fit walks away from its start, where the contrast has the wrong sign for its
+    place on the board, or where no neighbour tells the direction of its edges: never by how well it suits a camera.
+
+    Args:
+        image: (height, width), any depth.
+        grid: (rows, columns, 2) px, right-handed (columns x rows > 0 in the image), good to a few pixels; NaN where
+            nothing was seen.
+        reach: radius of the disc around a corner as a part of the distance to the next edges.
+    """
+    smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), _SMOOTHING_PX)
+    measured, contrast = grid, np.full(grid.shape[:2], np.nan)
+    for curved in (False, True):  # where the edges bend is known only after a first fit
+        measured, contrast = _fit_grid(smooth, measured, grid, reach, curved)
+    rows, columns = np.indices(contrast.shape)
+    signed = np.where((rows + columns) % 2 == 0, contrast, -contrast)
+    wrong = ~(signed * np.nansum(signed) > 0.0)
+    return Saddles(np.where(wrong[..., None], np.nan, measured), np.where(wrong, np.nan, contrast))
+
+
+def _fit_grid(smooth: NDArray[Any], start: Array, seen: Array, reach: float, curved: bool) -> tuple[Array, Array]:
+    """Grid and contrasts of one fit from `start`; NaN where a corner got lost on its way from where it was `seen`."""
+    along_row, row_bend, row_step = _line_geometry(start, axis=1)
+    along_column, column_bend, column_step = _line_geometry(start, axis=0)
+    turn = _cross(along_row, along_column)  # sine of the angle between the edges
+    distance = np.minimum(row_step, column_step) * np.abs(turn)
+    known = np.isfinite(distance)
+    result, contrast = np.full(start.shape, np.nan), np.full(distance.shape, np.nan)
+    if not np.any(known):
+        return result, contrast
+    bends = np.stack([row_bend[known], column_bend[known]], axis=1) * curved
+    patches = _Patches.cut(smooth, start[known], np.clip(reach * distance[known], *_RADIUS_PX), bends)
+    params = _fit(patches, _first_guess(patches, start[known], along_row[known], along_column[known]))
+    moved = np.linalg.norm(params[:, :2] - seen[known], axis=1)
+    kept = moved < _LOST * distance[known]
+    result[known] = np.where(kept[:, None], params[:, :2], np.nan)
+    contrast[known] = np.where(kept, params[:, _CONTRAST], np.nan)
+    return result, contrast
+
+
+def _line_geometry(grid: Array, axis: int) -> tuple[Array, Array, Array]:
+    """Unit tangent (.., 2), curvature (1 / px) and distance to the next corner (px) of the grid's lines along `axis`."""
+    line = np.moveaxis(grid, axis, 0)
+    gap = np.full((1, *line.shape[1:]), np.nan)
+    ahead = np.concatenate([np.diff(line, axis=0), gap])
+    behind = np.concatenate([gap, np.diff(line, axis=0)])
+    alone_ahead, alone_behind = np.isnan(behind), np.isnan(ahead)
+    chord = np.where(alone_ahead, ahead, np.where(alone_behind, behind, 0.5 * (ahead + behind)))
+    length = np.linalg.norm(chord, axis=-1)
+    tangent = chord / length[..., None]
+    bend = _cross(tangent, ahead - behind) / length**2
+    # At the ends of a line the next corner's curvature serves; where nothing is known the line is straight.
+    after, before = np.concatenate([bend[1:], gap[..., 0]]), np.concatenate([gap[..., 0], bend[:-1]])
+    for other in (after, before, np.zeros_like(bend)):
+        bend = np.where(np.isnan(bend), other, bend)
+    step = np.fmin(np.linalg.norm(ahead, axis=-1), np.linalg.norm(behind, axis=-1))
+    return np.moveaxis(tangent, 0, axis), np.moveaxis(bend, 0, axis), np.moveaxis(step, 0, axis)
+
+
+def _cross(a: Array, b: Array) -> Array:
+    return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])
+
+
+@dataclass(frozen=True, eq=False)
+class _Patches:
+    """The pixels around n corners: columns, rows, grey levels and weights (n, pixels), and the edges' bends (n, 2)."""
+
+    x: Array
+    y: Array
+    values: Array
+    weights: Array
+    bends: Array
+
+    @classmethod
+    def cut(cls, image: NDArray[Any], corners: Array, radius: Array, bends: Array) -> _Patches:
+        height, width = image.shape
+        half = int(np.ceil(radius.max()))
+        dy, dx = (d.ravel() for d in np.mgrid[-half : half + 1, -half : half + 1])
+        middle = np.rint(corners).astype(int)
+        x, y = middle[:, :1] + dx, middle[:, 1:] + dy
+        inside = (x >= 0) & (y >= 0) & (x < width) & (y < height)
+        near = (x - corners[:, :1]) ** 2 + (y - corners[:, 1:]) ** 2 <= radius[:, None] ** 2
+        values = image[np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)]
+        return cls(*(a.astype(float) for a in (x, y, values, inside & near)), bends=bends)
+
+
+def _first_guess(patches: _Patches, corners: Array, along_row: Array, along_column: Array) -> Array:
+    params = np.zeros((len(corners), _SIZE))
+    params[:, :2] = corners
+    for i, tangent in enumerate((along_row, along_column)):
+        params[:, _ANGLE + i] = np.arctan2(tangent[:, 1], tangent[:, 0])
+    params[:, _SHARP] = 0.7
+    weights, values = patches.weights, patches.values
+    params[:, _MEAN] = np.sum(weights * values, axis=1) / np.sum(weights, axis=1)
+    shape = _model(params, patches)[1][..., _CONTRAST]
+    above = weights * (values - params[:, _MEAN, None]) * shape
+    params[:, _CONTRAST] = np.sum(above, axis=1) / np.sum(weights * shape**2, axis=1)
+    return params
+
+
+def _model(params: Array, patches: _Patches) -> tuple[Array, Array]:
+    """Grey levels (n, pixels) and their derivatives (n, pixels, 11) by the parameters (n, 11)."""
+    dx, dy = patches.x - params[:, _X, None], patches.y - params[:, _Y, None]
+    sharp = params[:, _SHARP, None]
+    contrast = _plane(params, _CONTRAST, dx, dy)
+    edges = [_edge(params[:, _ANGLE + i, None], sharp, patches.bends[:, i, None], dx, dy) for i in (0, 1)]
+    steps = [np.tanh(sharp * distance) for distance, _ in edges]
+    shape = steps[0] * steps[1]
+    jacobian = np.zeros((*dx.shape, _SIZE))
+    for i, (distance, by_place) in enumerate(edges):
+        slope = contrast * steps[1 - i] * (1.0 - steps[i] ** 2)
+        jacobian[..., _X] += slope * by_place[0]
+        jacobian[..., _Y] += slope * by_place[1]
+        jacobian[..., _ANGLE + i] = slope * by_place[2]
+        jacobian[..., _SHARP] += slope * distance
+    for first, factor in ((_MEAN, np.ones_like(dx)), (_CONTRAST, shape)):
+        jacobian[..., first], jacobian[..., first + 1], jacobian[..., first + 2] = factor, factor * dx, factor * dy
+        jacobian[..., _X] -= params[:, first + 1, None] * factor
+        jacobian[..., _Y] -= params[:, first + 2, None] * factor
+    return _plane(params, _MEAN, dx, dy) + contrast * shape, jacobian
+
+
+def _plane(params: Array, first: int, dx: Array, dy: Array) -> Array:
+    level, by_x, by_y = (params[:, first + i, None] for i in range(3))
+    return np.asarray(level + by_x * dx + by_y * dy)
+
+
+def _edge(angle: Array, sharp: Array, bend: Array, dx: Array, dy: Array) -> tuple[Array, tuple[Array, Array, Array]]:
+    """Signed distance (px) of each pixel to a bent edge, and sharpness times its derivatives by x, y and angle."""
+    cosine, sine = np.cos(angle), np.sin(angle)
+    along, across = cosine * dx + sine * dy, cosine * dy - sine * dx
+    turn = bend * along
+    by_place = (sharp * (sine + turn * cosine), sharp * (turn * sine - cosine), -sharp * (along + turn * across))
+    return across - 0.5 * turn * along, by_place
+
+
+def _fit(patches: _Patches, params: Array) -> Array:
+    """Levenberg-Marquardt on all corners side by side, each with its own damping."""
+    weights, identity = patches.weights, np.eye(_SIZE)
+    damping = np.full(len(params), 1e-3)
+    model, jacobian = _model(params, patches)
+    cost = np.sum(weights * (patches.values - model) ** 2, axis=1)
+    for _ in range(_STEPS):
+        weighted = (jacobian * weights[..., None]).transpose(0, 2, 1)
+        normal = weighted @ jacobian
+        # The last term keeps a patch without any contrast solvable; it then stays where it is.
+        scale = damping[:, None] * np.einsum("nii->ni", normal) + 1e-12
+        step = np.linalg.solve(normal + scale[..., None] * identity, weighted @ (patches.values - model)[..., None])[
+            ..., 0
+        ]
+        trial = params + step
+        trial[:, _SHARP] = np.clip(trial[:, _SHARP], *_SHARPNESS)
+        trial_model, trial_jacobian = _model(trial, patches)
+        trial_cost = np.sum(weights * (patches.values - trial_model) ** 2, axis=1)
+        better = trial_cost < cost
+        params = np.where(better[:, None], trial, params)
+        model, cost = np.where(better[:, None], trial_model, model), np.where(better, trial_cost, cost)
+        jacobian = np.where(better[:, None, None], trial_jacobian, jacobian)
+        damping = np.where(better, 0.1 * damping, 10.0 * damping)
+        if np.all(np.abs(step[:, :2]) < _SETTLED_PX):
+            break
+    return params
