@@ -15,7 +15,7 @@ from ceres_cal.initialise import initialise
 from ceres_cal.observations import Observations
 from ceres_cal.parameters import Estimate, Layout, Options, make_layout
 from ceres_cal.residuals import Residuals, residuals
-from ceres_cal.sights import Sight, gather_sights
+from ceres_cal.sights import Sights, gather_sights
 
 _MOST_ROUNDS = 15
 
@@ -65,7 +65,7 @@ class _Settled:
 
 def _settle(
     observations: Observations,
-    sights: tuple[Sight, ...],
+    sights: Sights,
     estimate: Estimate,
     layout: Layout,
     options: Options,
@@ -85,7 +85,7 @@ def _settle(
 
     def solved(at: Estimate, by: Inliers, loss: str, loss_scale: float) -> Solution:
         weighting = Weighting(by.point_scale, by.curve_scale, loss, loss_scale)
-        return solve(gather_sights(observations, by.points, by.curves), at, layout, weighting, options, progress)
+        return solve(sights.used(by.points, by.curves), at, layout, weighting, options, progress)
 
     solution = solved(estimate, start_weights(observations, residuals(observations, sights, estimate)), "cauchy", 1.0)
     found, inliers = judged(solution.estimate)

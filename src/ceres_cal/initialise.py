@@ -6,7 +6,7 @@ into stations and placements. Nothing here is the answer: the bundle is.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,7 +18,7 @@ from ceres_cal.lens import Brown, KannalaBrandt, Lens, Radial
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.parameters import Estimate, Options, Station, anchored_stations
 from ceres_cal.planes import PlaneSight, on_plane, profile_and_homographies
-from ceres_cal.sights import Sight
+from ceres_cal.sights import Sights
 from ceres_cal.transforms import Array, Pose
 
 _PHI_RANGE = np.geomspace(0.15, 15.0, 120)  # in half image diagonals
@@ -33,7 +33,7 @@ class Start:
     phi_from: Mapping[str, str]
 
 
-def initialise(observations: Observations, sights: Sequence[Sight], options: Options) -> Start:
+def initialise(observations: Observations, sights: Sights, options: Options) -> Start:
     """A start for everything the observations show.
 
     Raises:
@@ -44,10 +44,10 @@ def initialise(observations: Observations, sights: Sequence[Sight], options: Opt
     poses: dict[int, Pose] = {}
     priors = (*observations.priors, *options.priors)
     for name, image_size in observations.cameras.items():
-        own = [number for number, sight in enumerate(sights) if sight.camera == name]
-        start = _start_camera(name, image_size, [sights[i] for i in own], options, priors)
+        own = np.array([number for number, key in enumerate(sights.keys) if key.camera == name])
+        start = _start_camera(name, image_size, sights.take(own), options, priors)
         cameras[name], phi_from[name] = start.camera, start.phi_from
-        poses |= {own[i]: pose for i, pose in start.poses.items()}
+        poses |= {int(own[i]): pose for i, pose in start.poses.items()}
     stations, placements = _chain_poses(observations, sights, poses)
     return Start(Estimate(cameras, stations, placements), phi_from)
 
@@ -63,15 +63,15 @@ class _CameraStart:
 
 
 def _start_camera(
-    name: str, image_size: tuple[int, int], sights: Sequence[Sight], options: Options, priors: Sequence[Prior]
+    name: str, image_size: tuple[int, int], sights: Sights, options: Options, priors: Sequence[Prior]
 ) -> _CameraStart:
     blank = _blank_camera(name, image_size, options, priors)
     unit = 0.5 * float(np.hypot(*image_size))
     planes = [on_plane(sight, blank) for sight in sights]
     profile, homographies = profile_and_homographies(planes, sights, blank, unit)
-    own_priors = [p for p in priors if p.name == (name if p.owner == "camera" else sights[0].station)]
+    own_priors = [p for p in priors if p.name == (name if p.owner == "camera" else sights.keys[0].station)]
     phi, phi_from = _choose_phi(planes, homographies, unit, options, own_priors)
-    reach = max(float(np.max(np.linalg.norm(_all_offsets(s, blank), axis=1))) for s in sights)
+    reach = float(np.max(np.linalg.norm(_all_offsets(sights, blank), axis=1)))
     camera = replace(blank, phi=phi, lens=_fit_lens(blank.lens, profile, phi, reach, options.fixed))
     flat = np.diag([1.0 / phi, 1.0 / phi, 1.0])
     poses = {}
@@ -98,8 +98,8 @@ def _blank_camera(name: str, image_size: tuple[int, int], options: Options, prio
     return Camera(image_size, 1.0, (cx, cy), options.blank_lens, aspect)
 
 
-def _all_offsets(sight: Sight, camera: Camera) -> Array:
-    return camera.offsets(np.vstack([sight.pixels, sight.curve_pixels]))
+def _all_offsets(sights: Sights, camera: Camera) -> Array:
+    return camera.offsets(np.vstack([sights.pixels, sights.curve_pixels]))
 
 
 # ---- phi and lens ---------------------------------------------------------------------------------------------------
@@ -148,7 +148,7 @@ def _prior_cost(prior: Prior, phi: Array, planes: Sequence[PlaneSight], homograp
     heights = [
         [polar_pose(np.diag([1.0 / f, 1.0 / f, 1.0]) @ h).position[2] + planes[i].height_m for f in phi]
         for i, h in homographies.items()
-        if planes[i].sight.placement is None and planes[i].sight.station == prior.name
+        if planes[i].sight.key.placement is None and planes[i].sight.key.station == prior.name
     ]
     if not heights:
         return np.zeros(len(phi))
@@ -194,17 +194,18 @@ def _lens_equations(lens: Lens, r: Array, w: Array, phi: float) -> tuple[dict[st
 
 
 def _chain_poses(
-    observations: Observations, sights: Sequence[Sight], poses: Mapping[int, Pose]
+    observations: Observations, sights: Sights, poses: Mapping[int, Pose]
 ) -> tuple[dict[str, Station], dict[str, Pose]]:
     """Stations and placements from the sights' poses: best-seen sights first, each one extending what is known."""
     stations = {name: Pose.identity() for name in anchored_stations(observations)}
     placements: dict[str, Pose] = {}
-    waiting = sorted(poses, key=lambda i: -len(sights[i].point_rows) - len(sights[i].curve_rows))
+    sizes = np.diff(sights.point_bounds) + np.diff(sights.curve_bounds)
+    waiting = sorted(poses, key=lambda i: -sizes[i])
     progress = True
     while progress:
         progress = False
         for i in list(waiting):
-            sight, pose = sights[i], poses[i]
+            sight, pose = sights.keys[i], poses[i]
             station_known = sight.station in stations
             if sight.placement is None or sight.placement in placements:
                 if not station_known:
@@ -222,13 +223,14 @@ def _chain_poses(
 
 
 def _require_all(
-    observations: Observations, sights: Sequence[Sight], stations: Iterable[str], placements: Iterable[str]
+    observations: Observations, sights: Sights, stations: Container[str], placements: Container[str]
 ) -> None:
-    for sight in sights:
-        if sight.station in stations and (sight.placement is None or sight.placement in placements):
+    for number, key in enumerate(sights.keys):
+        if key.station in stations and (key.placement is None or key.placement in placements):
             continue
-        frames = ", ".join(repr(observations.views[i].frame) for i in sight.views[:3])
+        sight = sights[number]
+        frames = ", ".join(repr(observations.views[i].frame) for i in sight.views[0][:3])
         raise DegenerateError(
-            f"frame {frames} ({sight.frame_name}): {len(sight.point_rows)} points and {len(sight.curve_rows)} curve "
+            f"frame {frames} ({key}): {len(sight.point_rows)} points and {len(sight.curve_rows)} curve "
             "observations cannot fix its pose: give at least four points, not on one line, or remove the view"
         )

@@ -196,8 +196,7 @@ class Lens(ABC):
     def monotone_radius(self, phi: float) -> float:
         """Measured radius (px) up to which the model is monotone and so has one answer; infinity where it always has.
 
-        For `brown` this is the radius of the radial part; its decentring terms move the place where the map folds by
-        about 3 phi |p| r^2, r the ideal radius there: a few pixels for |p| = 1e-3.
+        For `brown` it is that of the direction in which the decentring terms make it least.
         """
 
     def scales(self, unit_px: float) -> Array:
@@ -296,8 +295,10 @@ class Brown(Lens):
 
     @property
     def _polynomial(self) -> Array:
-        k1, k2, _, _, k3 = self.values
-        return _dense((k1, k2, k3), self.radius_powers)
+        # In the worst direction the decentring terms take 3 |p| r^2 off the radius. While what is left grows, the
+        # derivative of the whole map, which is symmetric, is positive definite in every direction: no two answers.
+        k1, k2, p1, p2, k3 = self.values
+        return _dense((-3.0 * np.hypot(p1, p2), k1, k2, k3), (2, *self.radius_powers))
 
     def _map(self, ideal: Array) -> Array:
         k1, k2, p1, p2, k3 = self.values
@@ -323,22 +324,20 @@ class Brown(Lens):
         yy = radial + y * y * slope + 6.0 * p1 * y + 2.0 * p2 * x
         return xx, xy, yy
 
-    def _one_to_one(self, ideal: Array) -> Array:
-        """Ideal points (N, 2), NaN where the map has folded: past the limit, or by the decentring terms just before."""
-        xx, xy, yy = self._jacobian(ideal)
-        upright = (np.hypot(ideal[:, 0], ideal[:, 1]) <= self._limit) & (xx * yy > xy * xy)
-        return np.where(upright[:, None], ideal, np.nan)
+    def _within(self, ideal: Array) -> Array:
+        """Ideal points (N, 2), NaN past the limit."""
+        return np.where(np.hypot(ideal[:, :1], ideal[:, 1:]) <= self._limit, ideal, np.nan)
 
     def _distort(self, rays: Array, phi: float) -> Array:
-        return np.asarray(phi * self._map(self._one_to_one(rays[:, :2] / _ahead(rays))))
+        return np.asarray(phi * self._map(self._within(rays[:, :2] / _ahead(rays))))
 
     def _undistort(self, offsets: Array, phi: float) -> Array:
         measured = offsets / phi
         radius = np.hypot(measured[:, 0], measured[:, 1])
-        # At the rim the decentring terms can push a point past what the radial part alone answers: start just inside.
+        # Other directions reach farther than the worst: from beyond its rim, start just inside.
         start = _invert_increasing(self._polynomial, np.minimum(radius, self._rim * (1.0 - 1e-6)), self._limit)
         ideal = self._newton(measured * np.where(radius > 0.0, start / radius, 1.0)[:, None], measured)
-        return _unit_rays(self._one_to_one(ideal), 1.0)
+        return _unit_rays(self._within(ideal), 1.0)
 
     def _newton(self, start: Array, measured: Array) -> Array:
         """Ideal points (N, 2) whose image is `measured`; NaN where Newton's method does not get there."""
@@ -353,7 +352,8 @@ class Brown(Lens):
             rows = rows[np.any(np.abs(step) > 1e-13, axis=1)]
             if not len(rows):
                 break
-        solved = np.all(np.abs(self._map(ideal) - measured) <= 1e-12 * (1.0 + np.abs(measured)), axis=1)
+        error = np.max(np.abs(self._map(ideal) - measured), axis=1)
+        solved = error <= 1e-12 * (1.0 + np.max(np.abs(measured), axis=1))
         return np.where(solved[:, None], ideal, np.nan)
 
     def monotone_radius(self, phi: float) -> float:

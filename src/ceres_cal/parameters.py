@@ -6,7 +6,7 @@ be of order one) and one 6-vector (rotation vector, translation) per free statio
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -16,6 +16,7 @@ from ceres_cal.camera import Camera
 from ceres_cal.errors import InputError
 from ceres_cal.lens import LENS_KINDS, Lens, make_lens
 from ceres_cal.observations import Observations, Prior
+from ceres_cal.sights import SightKey
 from ceres_cal.transforms import Array, Pose
 
 LOSSES = ("trivial", "huber", "soft_l1", "cauchy", "tukey")
@@ -128,6 +129,17 @@ class Estimate:
             pose = pose @ self.placements[placement]
         return self.cameras[self.stations[station].camera].at(pose)
 
+    def pose_stack(self, keys: Sequence[SightKey]) -> Array:
+        """cam_from_frame of each sight as [R t], (S, 3, 4)."""
+        stations = {name: station.cam_from_world for name, station in self.stations.items()}
+        frames = {**self.placements, None: Pose.identity()}
+        first = np.array([stations[key.station].rotation for key in keys])
+        offset = np.array([stations[key.station].translation for key in keys])
+        second = np.array([frames[key.placement].rotation for key in keys])
+        moved = np.array([frames[key.placement].translation for key in keys])
+        translations = np.einsum("sij,sj->si", first, moved) + offset
+        return np.concatenate([first @ second, translations[:, :, None]], axis=2)
+
 
 @dataclass(frozen=True)
 class Layout:
@@ -168,7 +180,7 @@ def make_layout(observations: Observations, options: Options) -> Layout:
         if prior.owner == "camera" and prior.quantity not in (*names, "principal_point"):
             raise InputError(f"prior on camera {prior.name!r}: it has no {prior.quantity!r}, only {', '.join(names)}")
     return Layout(
-        {camera: free for camera in observations.cameras},
+        dict.fromkeys(observations.cameras, free),
         frozenset(observations.stations) - anchored_stations(observations),
         frozenset(observations.placements),
         priors,

@@ -25,7 +25,7 @@ from ceres_cal.closed_forms import (
     ring_profile,
 )
 from ceres_cal.errors import DegenerateError
-from ceres_cal.sights import Sight
+from ceres_cal.sights import Sights
 from ceres_cal.transforms import Array
 
 _MOST = 1500  # observations of one kind in a sight beyond which a start learns nothing more
@@ -35,7 +35,7 @@ _MOST = 1500  # observations of one kind in a sight beyond which a start learns 
 class PlaneSight:
     """A sight's observations on its plane z = height: points and straight segments, offsets in px."""
 
-    sight: Sight
+    sight: Sights
     height_m: float
     points: Array
     offsets: Array
@@ -55,7 +55,7 @@ class PlaneSight:
         return float(np.sqrt(np.mean(np.sum((every - every.mean(axis=0)) ** 2, axis=1))))
 
 
-def on_plane(sight: Sight, camera: Camera) -> PlaneSight:
+def on_plane(sight: Sights, camera: Camera) -> PlaneSight:
     """The observations on the plane that holds most of them, thinned where there are very many."""
     segments = ~sight.is_arc[sight.track]
     tracks = sight.tracks[sight.track]
@@ -79,7 +79,7 @@ def on_plane(sight: Sight, camera: Camera) -> PlaneSight:
 
 
 def profile_and_homographies(
-    planes: Sequence[PlaneSight], sights: Sequence[Sight], camera: Camera, unit: float
+    planes: Sequence[PlaneSight], sights: Sights, camera: Camera, unit: float
 ) -> tuple[Profile, dict[int, Array]]:
     """The camera's radial profile and the homography of each sight that can tell one."""
     pure = [i for i, plane in enumerate(planes) if len(plane.points) >= 6 and not len(plane.lines)]
@@ -167,7 +167,7 @@ def _homography_of(plane: PlaneSight, profile: Profile) -> Array:
     inverse, _, distinct = _solve_plane(plane, profile, rounds=6)
     if distinct < 1e-6:
         raise DegenerateError(
-            f"{plane.sight.frame_name}: its {len(plane.points)} points and {len(np.unique(plane.lines, axis=0))} lines "
+            f"{plane.sight.key}: its {len(plane.points)} points and {len(np.unique(plane.lines, axis=0))} lines "
             "cannot fix the plane's pose (all on one line, or parallel): add points or lines in other directions"
         )
     homography = np.diag([profile.unit_px, profile.unit_px, 1.0]) @ np.linalg.inv(inverse)
@@ -199,7 +199,7 @@ def _profile_from_lines(planes: Sequence[PlaneSight], unit: float) -> Profile:
 _RADII = np.linspace(0.0, 1.0, 21)
 
 
-def _from_rings(sight: Sight, camera: Camera, unit: float) -> tuple[Profile, Array]:
+def _from_rings(sight: Sights, camera: Camera, unit: float) -> tuple[Profile, Array]:
     """Profile and homography of concentric rings seen about frontally (paper, section 2)."""
     offsets = camera.offsets(sight.curve_pixels)
     radii = np.linalg.norm(sight.tracks[sight.track, 1], axis=1)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +10,7 @@ from ceres_cal import kernels
 from ceres_cal.camera import Camera
 from ceres_cal.observations import Observations
 from ceres_cal.parameters import Estimate, intrinsics_vector, unit_px
-from ceres_cal.sights import Sight, nearest_places
+from ceres_cal.sights import Sights, nearest_places
 from ceres_cal.transforms import Array
 
 
@@ -37,28 +36,25 @@ def lens_arguments(camera: Camera) -> tuple[int, Array, Array, float]:
     )
 
 
-def pose_matrix(camera: Camera) -> Array:
-    """[R t], (3, 4)."""
-    pose = camera.cam_from_world
-    return np.column_stack([pose.rotation, pose.translation])
-
-
-def residuals(observations: Observations, sights: Iterable[Sight], estimate: Estimate) -> Residuals:
+def residuals(observations: Observations, sights: Sights, estimate: Estimate) -> Residuals:
     """Residuals of every observation in the sights; NaN for rows in none of them."""
     points = np.full((len(observations.points), 2), np.nan)
     curves = np.full(len(observations.curves), np.nan)
-    for sight in sights:
-        camera = estimate.camera_at(sight.station, sight.placement)
-        optics, pose = lens_arguments(camera), pose_matrix(camera)
-        if len(sight.point_rows):
-            found = np.empty((len(sight.point_rows), 2))
-            kernels.point_residuals(*optics, pose, sight.points, sight.pixels, found)
-            points[sight.point_rows] = found
-        if len(sight.curve_rows):
-            distances = np.empty(len(sight.curve_rows))
-            places = nearest_places(sight, camera)
+    poses = estimate.pose_stack(sights.keys)
+    owners = np.array([key.camera for key in sights.keys])
+    for name in np.unique(owners):
+        numbers = np.flatnonzero(owners == name)
+        own = sights if len(numbers) == len(sights) else sights.take(numbers)
+        optics = lens_arguments(estimate.cameras[name])
+        offsets = np.empty((len(own.point_rows), 2))
+        kernels.point_residuals(*optics, poses[numbers], own.point_bounds, own.points, own.pixels, offsets)
+        points[own.point_rows] = offsets
+        if len(own.curve_rows):
+            distances = np.empty(len(own.curve_rows))
+            places = [nearest_places(s, estimate.camera_at(s.key.station, s.key.placement)) for s in own]
             kernels.curve_residuals(
-                *optics, pose, sight.tracks, sight.is_arc, sight.track, sight.curve_pixels, places, distances
-            )
-            curves[sight.curve_rows] = distances
+                *optics, poses[numbers], own.curve_bounds, own.tracks, own.is_arc, own.track, own.curve_pixels,
+                np.concatenate(places), distances,
+            )  # fmt: skip
+            curves[own.curve_rows] = distances
     return Residuals(points, curves)

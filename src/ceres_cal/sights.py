@@ -6,7 +6,9 @@ its own. Rows are kept so that residuals find their way back to the observations
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,108 +21,178 @@ Rows = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 
-@dataclass(frozen=True, eq=False)
-class Sight:
-    """The observations of one camera at one station of one frame; `placement` None is the world.
-
-    Attributes:
-        point_rows, curve_rows: (N,), (M,) rows of the observations' columns.
-        points: (N, 3) m in the frame. pixels: (N, 2). sigma_px: (N,).
-        tracks: (T, 3, 3) and is_arc: (T,): every curve and side of every target (see `targets.along_track`).
-        track: (M,) index into tracks. curve_pixels: (M, 2). curve_sigma_px: (M,).
-    """
+class SightKey(NamedTuple):
+    """Camera, station and frame of a sight; `placement` None is the world."""
 
     camera: str
     station: str
     placement: str | None
-    views: tuple[int, ...]
+
+    def __str__(self) -> str:
+        return f"station {self.station!r}" + (f", placement {self.placement!r}" if self.placement is not None else "")
+
+
+@dataclass(frozen=True, eq=False)
+class Sights(Sequence["Sights"]):
+    """Some sights, their observations one after the other; one sight is a `Sights` of length one.
+
+    Attributes:
+        keys: of each of the S sights. views: numbers of the views that each sight gathers.
+        point_bounds: (S + 1,) where each sight's points begin. point_rows: (N,) rows of the observations' columns.
+        points: (N, 3) m in the sight's frame. pixels: (N, 2). sigma_px: (N,).
+        curve_bounds, curve_rows, curve_pixels, curve_sigma_px: the same of the M curve observations.
+        track: (M,) index into tracks (T, 3, 3) and is_arc (T,): every curve and side of every target (see
+            `targets.along_track`).
+    """
+
+    keys: tuple[SightKey, ...]
+    views: tuple[tuple[int, ...], ...]
+    point_bounds: Rows
     point_rows: Rows
     points: Array
     pixels: Array
     sigma_px: Array
+    curve_bounds: Rows
     curve_rows: Rows
-    tracks: Array
-    is_arc: Mask
     track: NDArray[np.int32]
     curve_pixels: Array
     curve_sigma_px: Array
+    tracks: Array
+    is_arc: Mask
+
+    def __len__(self) -> int:
+        return len(self.keys)
+
+    def __getitem__(self, number: int | slice) -> Sights:  # type: ignore[override]
+        if isinstance(number, slice):
+            return self.take(np.arange(len(self))[number])
+        if not -len(self) <= number < len(self):
+            raise IndexError(number)
+        number %= len(self)
+        p = slice(self.point_bounds[number], self.point_bounds[number + 1])
+        c = slice(self.curve_bounds[number], self.curve_bounds[number + 1])
+        return Sights(
+            (self.keys[number],),
+            (self.views[number],),
+            np.array([0, p.stop - p.start]),
+            self.point_rows[p],
+            self.points[p],
+            self.pixels[p],
+            self.sigma_px[p],
+            np.array([0, c.stop - c.start]),
+            self.curve_rows[c],
+            self.track[c],
+            self.curve_pixels[c],
+            self.curve_sigma_px[c],
+            self.tracks,
+            self.is_arc,
+        )
 
     @property
-    def frame_name(self) -> str:
-        """How messages name the sight."""
-        return f"station {self.station!r}" + (f", placement {self.placement!r}" if self.placement is not None else "")
+    def key(self) -> SightKey:
+        """The key of a single sight."""
+        (key,) = self.keys
+        return key
+
+    def take(self, numbers: Rows) -> Sights:
+        """The sights with these numbers, in this order."""
+        p, c = _ranges(self.point_bounds, numbers), _ranges(self.curve_bounds, numbers)
+        return self._rows(numbers, p, c, np.diff(self.point_bounds)[numbers], np.diff(self.curve_bounds)[numbers])
+
+    def used(self, points: Mask, curves: Mask) -> Sights:
+        """What is left of every sight when only these rows of the observations count; empty sights are left out."""
+        if points.all() and curves.all():
+            return self
+        p, c = np.flatnonzero(points[self.point_rows]), np.flatnonzero(curves[self.curve_rows])
+        point_sizes = np.diff(np.searchsorted(p, self.point_bounds))
+        curve_sizes = np.diff(np.searchsorted(c, self.curve_bounds))
+        numbers = np.flatnonzero(point_sizes + curve_sizes)
+        return self._rows(numbers, p, c, point_sizes[numbers], curve_sizes[numbers])
+
+    def _rows(self, numbers: Rows, p: Rows, c: Rows, point_sizes: Rows, curve_sizes: Rows) -> Sights:
+        return Sights(
+            tuple(self.keys[i] for i in numbers),
+            tuple(self.views[i] for i in numbers),
+            np.concatenate([[0], np.cumsum(point_sizes)]),
+            self.point_rows[p],
+            self.points[p],
+            self.pixels[p],
+            self.sigma_px[p],
+            np.concatenate([[0], np.cumsum(curve_sizes)]),
+            self.curve_rows[c],
+            self.track[c],
+            self.curve_pixels[c],
+            self.curve_sigma_px[c],
+            self.tracks,
+            self.is_arc,
+        )
 
 
-def gather_sights(
-    observations: Observations, points_used: Mask | None = None, curves_used: Mask | None = None
-) -> tuple[Sight, ...]:
-    """The sights of all observations, or of those rows that are used; sights without any observation are left out."""
-    keys = [(view.camera, view.station, view.placement) for view in observations.views]
+def _ranges(bounds: Rows, numbers: Rows) -> Rows:
+    """All row numbers from bounds[i] to bounds[i + 1], for each i of numbers in turn."""
+    sizes = np.diff(bounds)[numbers]
+    starts = np.repeat(bounds[numbers] - np.concatenate([[0], np.cumsum(sizes)[:-1]]), sizes)
+    return np.asarray(starts + np.arange(sizes.sum()))
+
+
+def gather_sights(observations: Observations) -> Sights:
+    """The sights of all observations; a sight without any observation is left out."""
+    keys = [SightKey(view.camera, view.station, view.placement) for view in observations.views]
     order = {key: number for number, key in enumerate(dict.fromkeys(keys))}
     sight_of_view = np.array([order[key] for key in keys], dtype=np.int64)
     views_of: list[list[int]] = [[] for _ in order]
-    for number, key in enumerate(keys):
-        views_of[order[key]].append(number)
+    for number, sight in enumerate(sight_of_view):
+        views_of[sight].append(number)
 
-    names = list(observations.targets)
-    targets = [observations.targets[name] for name in names]
-    target_of_view = np.array([names.index(view.target) for view in observations.views], dtype=np.int64)
+    names = {name: number for number, name in enumerate(observations.targets)}
+    targets = list(observations.targets.values())
+    target_of_view = np.array([names[view.target] for view in observations.views], dtype=np.int64)
     first_point = np.cumsum([0, *(len(t.points) for t in targets)])
     first_track = np.cumsum([0, *(3 * len(t.curves) for t in targets)])
-    all_points = np.concatenate([t.point_array for t in targets])
-    all_tracks = np.concatenate([t.tracks.reshape(-1, 3, 3) for t in targets])
-    all_arcs = np.concatenate([np.tile(t.is_arc, 3) for t in targets])
     curve_count = np.array([len(t.curves) for t in targets], dtype=np.int64)
 
     points, curves = observations.points, observations.curves
-    point_rows, point_bounds = _grouped(points, sight_of_view, len(order), points_used)
-    curve_rows, curve_bounds = _grouped(curves, sight_of_view, len(order), curves_used)
+    point_rows, point_bounds = _grouped(points, sight_of_view, len(order))
+    curve_rows, curve_bounds = _grouped(curves, sight_of_view, len(order))
     of_point = target_of_view[points.view[point_rows]]
     of_curve = target_of_view[curves.view[curve_rows]]
-    xyz = all_points[first_point[of_point] + points.feature[point_rows]]
     side = curves.side[curve_rows] % 3  # -1 is the last of a target's three sets of tracks
     track = first_track[of_curve] + side * curve_count[of_curve] + curves.feature[curve_rows]
-
-    sights = []
-    for number, (camera, station, placement) in enumerate(order):
-        p = slice(point_bounds[number], point_bounds[number + 1])
-        c = slice(curve_bounds[number], curve_bounds[number + 1])
-        if p.start == p.stop and c.start == c.stop:
-            continue
-        sights.append(
-            Sight(
-                camera,
-                station,
-                placement,
-                tuple(views_of[number]),
-                point_rows[p],
-                xyz[p],
-                points.pixels[point_rows[p]],
-                points.sigma_px[point_rows[p]],
-                curve_rows[c],
-                all_tracks,
-                all_arcs,
-                track[c].astype(np.int32),
-                curves.pixels[curve_rows[c]],
-                curves.sigma_px[curve_rows[c]],
-            )
-        )
-    return tuple(sights)
+    every = Sights(
+        tuple(order),
+        tuple(tuple(views) for views in views_of),
+        point_bounds,
+        point_rows,
+        np.concatenate([t.point_array for t in targets])[first_point[of_point] + points.feature[point_rows]],
+        points.pixels[point_rows],
+        points.sigma_px[point_rows],
+        curve_bounds,
+        curve_rows,
+        track.astype(np.int32),
+        curves.pixels[curve_rows],
+        curves.sigma_px[curve_rows],
+        np.concatenate([t.tracks.reshape(-1, 3, 3) for t in targets]),
+        np.concatenate([np.tile(t.is_arc, 3) for t in targets]),
+    )
+    filled = np.flatnonzero(np.diff(point_bounds) + np.diff(curve_bounds))
+    return every if len(filled) == len(every) else every.take(filled)
 
 
-def _grouped(columns: Columns, sight_of_view: Rows, count: int, used: Mask | None) -> tuple[Rows, Rows]:
+def _grouped(columns: Columns, sight_of_view: Rows, count: int) -> tuple[Rows, Rows]:
     """Rows in the order of their sights, and where each sight begins."""
-    rows = np.arange(len(columns)) if used is None else np.flatnonzero(used)
-    sight = sight_of_view[columns.view[rows]]
+    sight = sight_of_view[columns.view]
     order = np.argsort(sight, kind="stable")
-    return rows[order], np.searchsorted(sight[order], np.arange(count + 1))
+    return order, np.searchsorted(sight[order], np.arange(count + 1))
 
 
-def nearest_places(sight: Sight, camera: Camera) -> Array:
+def nearest_places(sight: Sights, camera: Camera) -> Array:
     """Where on its track each curve observation's ray passes nearest, (M,): the start of the search for the foot.
 
-    `camera` stands in the sight's own frame (cam_from_frame). Where the lens has no ray the track's origin is taken.
+    `camera` stands in the frame of the single sight (cam_from_frame). Where the lens has no ray the track's origin is
+    taken.
     """
+    if not len(sight.curve_pixels):
+        return np.empty(0)
     rays = np.nan_to_num(camera.rays(sight.curve_pixels) @ camera.cam_from_world.rotation)
     tracks, is_arc = sight.tracks[sight.track], sight.is_arc[sight.track]
     c, a = tracks[:, 0], tracks[:, 1]

@@ -74,7 +74,7 @@ def left_jacobian(rotation_vector: ArrayLike) -> Array:
 def nearest_rotation(matrix: ArrayLike) -> Array:
     """The rotation matrix nearest to a 3 x 3 matrix in the Frobenius norm (polar factor, determinant +1)."""
     u, _, vt = np.linalg.svd(np.asarray(matrix, dtype=float))
-    return np.asarray(u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt)
+    return np.asarray(u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt)
 
 
 def rotation_from_euler(alpha: float, beta: float, gamma: float) -> Array:

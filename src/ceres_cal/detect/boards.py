@@ -26,7 +26,8 @@ Progress = Callable[[int, int, str], None]
 
 MIN_CORNERS = 6
 TARGET_NAME = "board"
-_LARGE_PX, _ENLARGED_PX = 2e6, 8e6  # images above the first are also searched at that size, below the second at twice theirs
+_LARGE_PX = 2e6  # larger images are searched at this size first: faster, and with less of noise and blur
+_SMALL_PX = 2e6  # smaller ones also at twice their size, where the squares are few pixels wide
 
 
 @dataclass(frozen=True)
@@ -91,40 +92,18 @@ def detect_boards(
         InputError: an image cannot be read or has another size (each named), the target is no checkerboard or too
             small, the markers do not fit it, or no image shows the board.
     """
-    if not images:
-        raise InputError("detect_boards: no images were given: name at least one file")
-    find = _finder(board, charuco)
-    size: tuple[int, int] | None = None
-    found: list[tuple[Path, Array]] = []
-    missed: list[tuple[str, str]] = []
-    for number, path in enumerate(images, start=1):
-        image = read_grey(path)
-        size = size or (image.shape[1], image.shape[0])
-        if (image.shape[1], image.shape[0]) != size:
-            raise InputError(
-                f"{path}: {image.shape[1]} x {image.shape[0]} px, but {images[0]} has {size[0]} x {size[1]}: "
-                "images of another size are another camera's, detect them on their own"
-            )
-        grid = find(image)
-        if isinstance(grid, str):
-            missed.append((str(path), grid))
-        else:
-            found.append((path, grid))
-        if progress is not None:
-            progress(number, len(images), Path(path).name)
-    if not found or size is None:
+    paths = [Path(path) for path in images]
+    placements = _placement_names(paths)
+    size, found, missed = _find_all(paths, _finder(board, charuco), progress)
+    if not found:
         raise InputError(
-            f"no board with {board.spec['columns']} x {board.spec['rows']} inner corners in any of {len(images)} images, "
-            f"{missed[0][0]}: {missed[0][1]}: count the corners between squares, not the squares"
+            f"no board of {board.spec['columns']} x {board.spec['rows']} inner corners in any of {len(paths)} images "
+            f"(count the corners between squares, not the squares); {missed[0][0]}: {missed[0][1]}"
         )
-    names = _placement_names([Path(path) for path in images])
-    views = tuple(
-        View(Path(path).stem, camera, station or camera, TARGET_NAME, names[Path(path)]) for path, _ in found
-    )
-    observations = Observations(
-        {TARGET_NAME: board}, {camera: size}, views, _points([grid for _, grid in found], board), _no_curves()
-    )
-    return BoardDetections(observations, tuple(str(path) for path, _ in found), tuple(missed))
+    views = tuple(View(path.stem, camera, station or camera, TARGET_NAME, placements[path]) for path in found)
+    points = _points(list(found.values()), board)
+    observations = Observations({TARGET_NAME: board}, {camera: size}, views, points, _no_curves())
+    return BoardDetections(observations, tuple(map(str, found)), tuple(missed))
 
 
 def read_grey(path: str | Path) -> Image:
@@ -143,8 +122,34 @@ def read_grey(path: str | Path) -> Image:
 
 # ---- finding --------------------------------------------------------------------------------------------------------
 
-Finder = Callable[[Image], "Array | str"]
+Finder = Callable[[Image], Array | str]
 """Image -> measured grid (rows, columns, 2) px, NaN where a corner was not seen, or the reason why there is none."""
+
+
+def _find_all(
+    paths: Sequence[Path], find: Finder, progress: Progress | None
+) -> tuple[tuple[int, int], dict[Path, Array], list[tuple[str, str]]]:
+    """The images' (width, height), the grid in each image that shows the board, and (path, reason) of the others."""
+    size = (0, 0)
+    found: dict[Path, Array] = {}
+    missed: list[tuple[str, str]] = []
+    for number, path in enumerate(paths, start=1):
+        image = read_grey(path)
+        own_size = (image.shape[1], image.shape[0])
+        size = own_size if number == 1 else size
+        if own_size != size:
+            raise InputError(
+                f"{path}: {own_size[0]} x {own_size[1]} px, but {paths[0]} has {size[0]} x {size[1]}: "
+                "images of another size are another camera's, detect them on their own"
+            )
+        grid = find(image)
+        if isinstance(grid, str):
+            missed.append((str(path), grid))
+        else:
+            found[path] = grid
+        if progress is not None:
+            progress(number, len(paths), path.name)
+    return size, found, missed
 
 
 def _finder(board: Target, charuco: CharucoSpec | None) -> Finder:
@@ -197,14 +202,14 @@ def _scales(pixels: int) -> Iterator[float]:
     if pixels > _LARGE_PX:
         yield float(np.sqrt(_LARGE_PX / pixels))
     yield 1.0
-    if 4 * pixels <= _ENLARGED_PX:
+    if pixels <= _SMALL_PX:
         yield 2.0
 
 
 def _charuco_detector(charuco: CharucoSpec, columns: int, rows: int, square_m: float) -> cv2.aruco.CharucoDetector:
     code = getattr(cv2.aruco, charuco.dictionary, None)
     if not charuco.dictionary.startswith("DICT_") or not isinstance(code, int):
-        raise InputError(f"unknown marker dictionary {charuco.dictionary!r}: name one of OpenCV's, such as 'DICT_4X4_50'")
+        raise InputError(f"unknown marker dictionary {charuco.dictionary!r}: name one of OpenCV's, such as DICT_4X4_50")
     if not 0.0 < charuco.marker_m < square_m:
         raise InputError(f"marker_m must be between 0 and the square's {square_m} m, not {charuco.marker_m}")
     dictionary = cv2.aruco.getPredefinedDictionary(code)
@@ -245,7 +250,7 @@ def _enough(grid: Array) -> Array | str:
 def _as_8_bit(image: Image) -> NDArray[np.uint8]:
     """What OpenCV's detectors take; deeper images are stretched, but for half a percent at either end."""
     if image.dtype == np.uint8:
-        return image
+        return np.asarray(image, np.uint8)
     low, high = np.percentile(image, [0.5, 99.5])
     return np.clip((image - low) * (255.0 / max(high - low, 1e-12)), 0.0, 255.0).astype(np.uint8)
 
@@ -255,6 +260,8 @@ def _as_8_bit(image: Image) -> NDArray[np.uint8]:
 
 def _placement_names(paths: Sequence[Path]) -> dict[Path, str]:
     """Name by path: the stem, and of equal stems as many folders as tell them apart."""
+    if not paths:
+        raise InputError("no images were given: name at least one file")
     if len(set(paths)) < len(paths):
         twice = next(path for number, path in enumerate(paths) if path in paths[:number])
         raise InputError(f"{twice}: given twice: name every image once")

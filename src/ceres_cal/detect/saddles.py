@@ -30,9 +30,9 @@ from numpy.typing import NDArray
 
 from ceres_cal.transforms import Array
 
-_SMOOTHING_PX = 1.0
+_SMOOTHING_PX = 0.7
 _REACH = 0.6  # radius of the disc, as a part of the distance to the next edges
-_RADIUS_PX = (3.0, 15.0)
+_RADIUS_PX = (3.0, 20.0)
 _LOST = 0.5  # a corner that moved further, as a part of that distance, followed something else
 _SHARPNESS = (0.05, 3.0)  # 1 / px; beyond, s says nothing any more
 _STEPS = 20
@@ -99,7 +99,7 @@ def _fit_grid(smooth: NDArray[Any], start: Array, seen: Array, reach: float, cur
 
 
 def _line_geometry(grid: Array, axis: int) -> tuple[Array, Array, Array]:
-    """Unit tangent (.., 2), curvature (1 / px) and distance to the next corner (px) of the grid's lines along `axis`."""
+    """Unit tangent (.., 2), curvature (1 / px) and distance to the next corner (px) of the lines along `axis`."""
     line = np.moveaxis(grid, axis, 0)
     gap = np.full((1, *line.shape[1:]), np.nan)
     ahead = np.concatenate([np.diff(line, axis=0), gap])
@@ -140,8 +140,8 @@ class _Patches:
         x, y = middle[:, :1] + dx, middle[:, 1:] + dy
         inside = (x >= 0) & (y >= 0) & (x < width) & (y < height)
         near = (x - corners[:, :1]) ** 2 + (y - corners[:, 1:]) ** 2 <= radius[:, None] ** 2
-        values = image[np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)]
-        return cls(*(a.astype(float) for a in (x, y, values, inside & near)), bends=bends)
+        values = image[np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)].astype(float)
+        return cls(x.astype(float), y.astype(float), values, (inside & near).astype(float), bends)
 
 
 def _first_guess(patches: _Patches, corners: Array, along_row: Array, along_column: Array) -> Array:

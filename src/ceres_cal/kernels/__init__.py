@@ -1,6 +1,7 @@
 """The inner loops, compiled by numba: the only place that imports it. They release the GIL."""
 
-from ceres_cal.kernels.block import evaluate_block
+from ceres_cal.kernels.block import cholesky, evaluate_block
+from ceres_cal.kernels.elimination import eliminate_placements
 from ceres_cal.kernels.lenses import INTRINSICS, LENS_CODES
 from ceres_cal.kernels.sight import LOSS_CODES, curve_residuals, normal_equations, point_residuals
 
@@ -8,7 +9,9 @@ __all__ = [
     "INTRINSICS",
     "LENS_CODES",
     "LOSS_CODES",
+    "cholesky",
     "curve_residuals",
+    "eliminate_placements",
     "evaluate_block",
     "normal_equations",
     "point_residuals",

@@ -15,7 +15,7 @@ from ceres_cal.kernels.sight import normal_equations
 
 
 @jit
-def _cholesky(normal: Any, upper: Any) -> None:
+def cholesky(normal: Any, upper: Any) -> None:
     """U with U^T U = A from A's lower triangle; where A is singular the row of U is zero."""
     size = len(normal)
     upper[:] = 0.0
@@ -35,7 +35,7 @@ def _cholesky(normal: Any, upper: Any) -> None:
 
 
 @jit
-def _rotation(w: Any, out: Any) -> None:
+def rotation(w: Any, out: Any) -> None:
     """Rodrigues' formula, into the left (3, 3) of `out`."""
     angle2 = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
     angle = np.sqrt(angle2)
@@ -86,8 +86,8 @@ def _chain(station: Any, placement: Any, pose: Any, to_station: Any, to_placemen
     """
     first, second = np.empty((3, 3)), np.empty((3, 3))
     left = np.empty((3, 3))
-    _rotation(station, first)
-    _rotation(placement, second)
+    rotation(station, first)
+    rotation(placement, second)
     for j in range(3):
         for k in range(3):
             pose[j, k] = first[j, 0] * second[0, k] + first[j, 1] * second[1, k] + first[j, 2] * second[2, k]
@@ -158,7 +158,7 @@ def evaluate_block(
         residuals[0] = np.sqrt(cost)
         return True
     upper = np.empty((count + 7, count + 7))
-    _cholesky(normal, upper)
+    cholesky(normal, upper)
     last = count + 6
     missing = cost
     for row in range(last):

@@ -262,35 +262,38 @@ def normal_equations(
 
 @jit
 def point_residuals(
-    lens: int, intrinsics: Any, powers: Any, unit: float, pose: Any, points: Any, pixels: Any, residuals: Any
-) -> None:
-    """project(X) - p in px, (N, 2); NaN where a point cannot be projected."""
+    lens: int, intrinsics: Any, powers: Any, unit: float, poses: Any, bounds: Any, points: Any, pixels: Any,
+    residuals: Any,
+) -> None:  # fmt: skip
+    """project(X) - p in px, (N, 2), of the sights at poses (S, 3, 4); NaN where a point cannot be projected."""
     scratch = np.empty((21, 1))
     dense = one_dimensional(lens, intrinsics, powers)
     limit = answer_limit(lens, dense)
-    for k in range(len(points)):
-        for j in range(3):
-            scratch[j, 0] = points[k, j]
-        _to_camera(1, pose, scratch[:3], scratch[3:6], scratch[6:9])
-        good = distort(lens, 1, intrinsics, dense, unit, limit, scratch[6:9], scratch[9:16], scratch[16:])
-        residuals[k, 0] = intrinsics[2] + scratch[9, 0] - pixels[k, 0] if good else np.nan
-        residuals[k, 1] = intrinsics[3] + intrinsics[1] * scratch[10, 0] - pixels[k, 1] if good else np.nan
+    for v in range(len(poses)):
+        for k in range(bounds[v], bounds[v + 1]):
+            for j in range(3):
+                scratch[j, 0] = points[k, j]
+            _to_camera(1, poses[v], scratch[:3], scratch[3:6], scratch[6:9])
+            good = distort(lens, 1, intrinsics, dense, unit, limit, scratch[6:9], scratch[9:16], scratch[16:])
+            residuals[k, 0] = intrinsics[2] + scratch[9, 0] - pixels[k, 0] if good else np.nan
+            residuals[k, 1] = intrinsics[3] + intrinsics[1] * scratch[10, 0] - pixels[k, 1] if good else np.nan
 
 
 @jit
 def curve_residuals(
-    lens: int, intrinsics: Any, powers: Any, unit: float, pose: Any, tracks: Any, is_arc: Any, track: Any, pixels: Any,
-    s: Any, residuals: Any,
+    lens: int, intrinsics: Any, powers: Any, unit: float, poses: Any, bounds: Any, tracks: Any, is_arc: Any,
+    track: Any, pixels: Any, s: Any, residuals: Any,
 ) -> None:  # fmt: skip
     """Signed distance from each pixel to its curve in px, (M,), and s moved to the foot; NaN where there is none."""
     scratch = np.empty((32, 1))
     dense = one_dimensional(lens, intrinsics, powers)
     limit = answer_limit(lens, dense)
     foot = scratch[21:]
-    for k in range(len(pixels)):
-        good = _feet(
-            lens, 1, k, intrinsics, dense, unit, limit, pose, tracks, is_arc, track, pixels, s,
-            scratch[:3], scratch[3:6], scratch[6:9], scratch[9:16], scratch[16:21], foot,
-        )  # fmt: skip
-        distance = (foot[0, 0] * foot[3, 0] - foot[1, 0] * foot[2, 0]) / np.sqrt(foot[7, 0])
-        residuals[k] = distance if good else np.nan
+    for v in range(len(poses)):
+        for k in range(bounds[v], bounds[v + 1]):
+            good = _feet(
+                lens, 1, k, intrinsics, dense, unit, limit, poses[v], tracks, is_arc, track, pixels, s,
+                scratch[:3], scratch[3:6], scratch[6:9], scratch[9:16], scratch[16:21], foot,
+            )  # fmt: skip
+            distance = (foot[0, 0] * foot[3, 0] - foot[1, 0] * foot[2, 0]) / np.sqrt(foot[7, 0])
+            residuals[k] = distance if good else np.nan

@@ -1,0 +1,100 @@
+"""The commands: `ceres-cal COMMAND ...` (design, section 11).
+
+Only argparse is imported here and at the top of the commands' modules, so that help and wrong usage answer at once.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Sequence
+
+from ceres_cal.cli import calibrate
+from ceres_cal.cli.command import Command, print_answer
+from ceres_cal.errors import CalibrationError, InputError
+
+_GROUPS = (calibrate,)
+COMMANDS: dict[str, Command] = {command.name: command for group in _GROUPS for command in group.COMMANDS}
+_INTERRUPTED, _PIPE_CLOSED = 130, 141  # what a shell reports of a program that SIGINT or SIGPIPE ended
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command and return its exit code.
+
+    Args:
+        arguments: those of the command line by default.
+
+    Returns:
+        0 success, 1 the answer is no, 2 bad usage or input, 3 no usable solution, 130 interrupted. Every failure is one
+        line on standard error; with CERES_CAL_DEBUG set an unexpected one is raised instead.
+    """
+    try:
+        return _run(sys.argv[1:] if arguments is None else list(arguments))
+    except CalibrationError as error:
+        return _fail(str(error), error.exit_code)
+    except SystemExit as done:  # argparse has printed its help
+        return int(done.code or 0)
+    except KeyboardInterrupt:
+        return _fail("interrupted: nothing was written", _INTERRUPTED)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or Python complains when it closes the stream
+        return _PIPE_CLOSED
+    except MemoryError:
+        return _fail("out of memory: give fewer observations or images at a time", InputError.exit_code)
+    except OSError as error:
+        return _fail(": ".join(str(part) for part in (error.filename, error.strerror or error) if part), 2)
+    except Exception as error:
+        if os.environ.get("CERES_CAL_DEBUG"):
+            raise
+        return _fail(f"unexpected {type(error).__name__}: {error}: please report it (CERES_CAL_DEBUG=1 tells more)", 3)
+
+
+def _fail(message: str, exit_code: int) -> int:
+    print(f"ceres-cal: {' '.join(message.splitlines())}", file=sys.stderr)
+    return exit_code
+
+
+def _run(arguments: list[str]) -> int:
+    if arguments[:1] in (["-h"], ["--help"]):
+        print(_overview())
+        return 0
+    if arguments[:1] == ["--version"]:
+        from importlib.metadata import version
+
+        print(f"ceres-cal {version('ceres-cal')}")
+        return 0
+    command, rest = _choose(arguments)
+    options = command.parse(rest)
+    answer = command.run(options)
+    print_answer(answer, as_json=options.json)
+    return answer.exit_code
+
+
+def _choose(arguments: list[str]) -> tuple[Command, list[str]]:
+    """The command that the first one or two arguments name, and the arguments after it."""
+    for words in (1, 2):
+        command = COMMANDS.get(" ".join(arguments[:words]))
+        if command is not None:
+            return command, arguments[words:]
+    if not arguments:
+        raise InputError("which command? See `ceres-cal --help`")
+    longer = [name for name in COMMANDS if name.startswith(f"{arguments[0]} ")]
+    if longer:
+        raise InputError(f"{arguments[0]} what? See {' or '.join(f'`ceres-cal {name} --help`' for name in longer)}")
+    raise InputError(f"there is no command {arguments[0]!r}: see `ceres-cal --help`")
+
+
+def _overview() -> str:
+    width = max(map(len, COMMANDS))
+    return "\n".join(
+        [
+            "usage: ceres-cal COMMAND ... [--json]",
+            "",
+            "Calibrate an overhead camera from corners, lines and arcs of a flat field.",
+            "",
+            *(f"  {name:{width}}  {command.summary}" for name, command in COMMANDS.items()),
+            "",
+            "`ceres-cal COMMAND --help` tells how. Every command prints one JSON object with --json.",
+            "Exit codes: 0 success, 1 the answer is no, 2 bad usage or bad input, 3 no usable solution.",
+        ]
+    )

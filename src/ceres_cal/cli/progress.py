@@ -1,0 +1,67 @@
+"""Progress on standard error: a bar on a terminal, now and then a line elsewhere, nothing where it is not wanted."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sys
+import time
+from collections.abc import Callable
+from types import TracebackType
+from typing import TextIO
+
+_REDRAW_S = 0.1
+_FIRST_LINE_S = 3.0  # where there is no terminal; each further line waits twice as long
+_BAR_COLUMNS = 24
+_CLEAR = "\r\x1b[K"
+
+
+class ProgressBar:
+    """How far some long work is. A context: the bar is gone when it ends, however it ends.
+
+    Args:
+        silent: show nothing.
+        stream: where; standard error by default.
+        clock: seconds.
+    """
+
+    def __init__(
+        self, *, silent: bool, stream: TextIO | None = None, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._stream = sys.stderr if stream is None else stream
+        self._silent, self._clock = silent, clock
+        self._terminal = self._stream.isatty() and os.environ.get("TERM") != "dumb"
+        self._wait = _REDRAW_S if self._terminal else _FIRST_LINE_S
+        self._due = clock() + (0.0 if self._terminal else self._wait)
+
+    def __enter__(self) -> ProgressBar:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._terminal and not self._silent:
+            self._write(_CLEAR)
+
+    def say(self, text: str) -> None:
+        """A line that stays."""
+        if not self._silent:
+            self._write(f"{_CLEAR if self._terminal else ''}{text}\n")
+
+    def update(self, done: int, total: int, note: str) -> None:
+        """Show that `done` steps of at most `total` are done; `note` says what is going on."""
+        now = self._clock()
+        if self._silent or now < self._due:
+            return
+        if self._terminal:
+            full = _BAR_COLUMNS * done // max(total, 1)
+            bar = f"[{'#' * full}{'.' * (_BAR_COLUMNS - full)}] {note}"
+            self._write(_CLEAR + bar[: shutil.get_terminal_size().columns - 1])
+        else:
+            self._write(f"{note} ({done} of {total})\n")
+            self._wait *= 2.0
+        self._due = now + self._wait
+
+    def _write(self, text: str) -> None:
+        self._stream.write(text)
+        self._stream.flush()

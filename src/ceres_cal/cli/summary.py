@@ -1,0 +1,177 @@
+"""What `ceres-cal calibrate` says of its result, to people and to scripts."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ceres_cal.calibration import Calibration, calibration_to_json
+from ceres_cal.camera import Camera
+from ceres_cal.observations import Observations
+from ceres_cal.parameters import Options, anchored_stations
+from ceres_cal.transforms import Pose, euler_from_rotation
+
+_MOST_FEATURES = 6
+_PHI_FROM = {"fixed": "held", "views": "started from the views", "prior": "started from its prior", "guess": "started from a guess"}
+
+
+def tilt_deg(cam_from_world: Pose) -> float:
+    """Angle between the camera's axis and straight down."""
+    x, y, z = cam_from_world.rotation[2]
+    return float(np.degrees(np.arctan2(np.hypot(x, y), -z)))
+
+
+def calibration_data(
+    calibration: Calibration, observations: Observations, inputs: Sequence[str], output: Path | None
+) -> dict[str, Any]:
+    """Everything, for --json."""
+    return {
+        "calibration": calibration_to_json(calibration),
+        "inputs": list(inputs),
+        "output": None if output is None else str(output),
+        "counts": _counts(observations),
+        "rms_px": calibration.rms_px,
+        "tilt_deg": {name: tilt_deg(camera.cam_from_world) for name, camera in calibration.stations.items()},
+        "outliers": dict(_outliers(calibration).most_common()),
+        "warnings": list(_warnings(calibration, observations)),
+    }
+
+
+def calibration_text(
+    calibration: Calibration, observations: Observations, inputs: Sequence[str], output: Path | None
+) -> str:
+    """A short table for people."""
+    anchored = anchored_stations(observations)
+    sections = [
+        _section("read", [", ".join(map(str, inputs)), *_counted(observations)]),
+        _section("fit", _fit(calibration)),
+    ]
+    for name, camera in calibration.cameras.items():
+        lines = _intrinsics(camera, calibration.options, calibration.phi_from.get(name, ""))
+        sections.append(_section("camera", [f"{name}, {camera.image_size[0]} x {camera.image_size[1]} px", *lines]))
+    for name, camera in calibration.stations.items():
+        sections.append(_section("station", [f"{name}{_of_camera(calibration, name)}", *_pose(camera, name in anchored)]))
+    sections.append(_section("outliers", _outlier_lines(calibration)))
+    sections.append(_section("stopped", [_stop(calibration)]))
+    sections.extend(_section("warning", [text]) for text in _warnings(calibration, observations))
+    if output is not None:
+        sections.append(_section("written", [str(output)]))
+    return "\n".join(sections)
+
+
+def _section(title: str, lines: Iterable[str]) -> str:
+    """A title beside its lines."""
+    return "\n".join(f"{'' if number else title:10}{line}" for number, line in enumerate(lines))
+
+
+def _plural(count: int, word: str) -> str:
+    return f"{count} {word}{'' if count == 1 else 's'}"
+
+
+def _counts(observations: Observations) -> dict[str, int]:
+    return {
+        "views": len(observations.views),
+        "cameras": len(observations.cameras),
+        "stations": len(observations.stations),
+        "placements": len(observations.placements),
+        "points": len(observations.points),
+        "curves": len(observations.curves),
+    }
+
+
+def _counted(observations: Observations) -> list[str]:
+    count = _counts(observations)
+    owners = [_plural(count[f"{word}s"], word) for word in ("view", "camera", "station", "placement")]
+    return [
+        ", ".join(owners),
+        f"{_plural(count['points'], 'point observation')}, {_plural(count['curves'], 'curve observation')}",
+    ]
+
+
+def _fit(calibration: Calibration) -> list[str]:
+    fit, lines = calibration.fit, []
+    for kind, used, rms, scale in (
+        ("points", fit.points, fit.points_rms_px, fit.point_scale),
+        ("curves", fit.curves, fit.curves_rms_px, fit.curve_scale),
+    ):
+        if used:
+            noise = f"noise {scale:.3f} times the stated sigmas"
+            lines.append(f"{kind}  rms {rms:.4f} px over {used}, {noise}")
+    return lines
+
+
+def _intrinsics(camera: Camera, options: Options, phi_from: str) -> list[str]:
+    def held(*names: str) -> str:
+        return " (held)" if all(name in options.fixed for name in names) else ""
+
+    cx, cy = camera.principal_point
+    centre = held("cx", "cy") if options.free_principal_point else " (held)"
+    rows = [("phi", f"{camera.phi:.4f} px ({_PHI_FROM.get(phi_from, phi_from)})")]
+    if options.free_aspect or camera.aspect != 1.0:
+        rows.append(("aspect", f"{camera.aspect:.7f}{held('aspect')}"))
+    rows.append(("principal point", f"{cx:.4f}, {cy:.4f} px{centre}"))
+    rows += [(name, f"{value!r}{held(name)}") for name, value in camera.lens.coefficients.items()]
+    lines = [f"{name:16}{value}" for name, value in rows]
+    if camera.lens.kind == "radial" and camera.lens.radius_powers == (2, 3):
+        lines.append("the paper's a1, a2, a3: 1 and these two; for another a1 multiply all three, and phi, by it")
+    return lines
+
+
+def _of_camera(calibration: Calibration, station: str) -> str:
+    camera = calibration.estimate.stations[station].camera
+    return "" if camera == station else f", camera {camera}"
+
+
+def _pose(camera: Camera, anchored: bool) -> list[str]:
+    if anchored:
+        return ["held as the world: boards alone do not tell where it stands"]
+    x, y, z = camera.position
+    alpha, beta, gamma = np.degrees(euler_from_rotation(camera.cam_from_world.rotation))
+    return [
+        f"{'position':16}x {x:.3f} m, y {y:.3f} m, height {z:.3f} m",
+        f"{'angles':16}alpha {alpha:.4f}, beta {beta:.4f}, gamma {gamma:.4f} deg (the paper's)",
+        f"{'tilt':16}{tilt_deg(camera.cam_from_world):.3f} deg from straight down",
+    ]
+
+
+def _outliers(calibration: Calibration) -> Counter[str]:
+    return Counter(f"{entry.kind} {entry.feature}" for entry in calibration.rejected)
+
+
+def _outlier_lines(calibration: Calibration) -> list[str]:
+    fit, total, features = calibration.fit, len(calibration.rejected), _outliers(calibration)
+    everything = fit.points + fit.curves + total
+    if not total:
+        return [f"none of {everything}"]
+    lines = [f"{total} of {everything} taken out ({calibration.options.reject_sigma:g} sigma and more)"]
+    lines += [f"{count:5}  {name}" for name, count in features.most_common(_MOST_FEATURES)]
+    rest = len(features) - _MOST_FEATURES
+    if rest > 0:
+        others = total - sum(count for _, count in features.most_common(_MOST_FEATURES))
+        lines.append(f"{others:5}  of {_plural(rest, 'other feature')}")
+    return lines
+
+
+def _stop(calibration: Calibration) -> str:
+    iterations = max(len(calibration.history) - 1, 0)
+    how = "converged" if calibration.converged else "did not converge"
+    reason = calibration.termination.rstrip(". ")
+    return f"{how} after {calibration.rounds} solves, the last of {_plural(iterations, 'iteration')}: {reason}"
+
+
+def _warnings(calibration: Calibration, observations: Observations) -> Iterator[str]:
+    if not calibration.converged:
+        yield "the solve did not come to rest: raise --max-iterations, and trust no digit before it does"
+    for name, origin in calibration.phi_from.items():
+        if origin == "guess":
+            yield (
+                f"the views of camera {name} can hardly tell phi and height apart (phi was started from a guess): "
+                "give a height prior (--prior height_m=4.02:0.01) or add tilted boards"
+            )
+    taken_out = len(calibration.rejected)
+    if taken_out > 0.3 * (len(observations.points) + len(observations.curves)):
+        yield "more than three in ten observations were taken out: check labels and target dimensions"

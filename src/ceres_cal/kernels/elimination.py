@@ -1,0 +1,139 @@
+"""Many placements that only one station sees each: their poses are eliminated from the problem (variable projection).
+
+For given intrinsics each pose is brought to its own best value, and what is left of the normal equations, the Schur
+complement A_cc - A_cp A_pp^-1 A_pc, speaks of the intrinsics alone. Near the best pose one evaluation per sight is
+enough: the complement takes the rest of the step, and its cost, along to second order.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ceres_cal.kernels.block import rotation
+from ceres_cal.kernels.jit import jit
+from ceres_cal.kernels.sight import normal_equations
+
+_MOST_STEPS = 50
+_NOTHING_LEFT = 1e-14  # squared standard deviations
+
+
+@jit
+def _move(pose: Any, step: Any, turned: Any, moved: Any) -> None:
+    """moved = the pose after a left perturbation: R <- exp(dw) R, t <- t + dt."""
+    rotation(step, turned)
+    for j in range(3):
+        for k in range(3):
+            moved[j, k] = turned[j, 0] * pose[0, k] + turned[j, 1] * pose[1, k] + turned[j, 2] * pose[2, k]
+        moved[j, 3] = pose[j, 3] + step[3 + j]
+
+
+@jit
+def _solve_pose(normal: Any, count: int, damping: float, lower: Any, gain: Any) -> None:
+    """gain (6, count + 1) = A_pp^-1 [A_pc A_pe] by Cholesky; a direction that nothing fixes is left where it is.
+
+    `normal` has its lower triangle filled, in the order [count intrinsics | 6 pose | residual].
+    """
+    for k in range(6):
+        for i in range(k, 6):
+            total = normal[count + i, count + k] * (1.0 + damping if i == k else 1.0)
+            for j in range(k):
+                total -= lower[i, j] * lower[k, j]
+            if i == k:
+                held = not total > 1e-13 * normal[count + k, count + k]
+                lower[k, k] = np.inf if held else np.sqrt(total)
+            else:
+                lower[i, k] = total / lower[k, k]
+    for column in range(count + 1):
+        for k in range(6):
+            total = normal[count + k, column] if column < count else normal[count + 6, count + k]
+            for j in range(k):
+                total -= lower[k, j] * gain[j, column]
+            gain[k, column] = total / lower[k, k]
+        for k in range(5, -1, -1):
+            total = gain[k, column]
+            for j in range(k + 1, 6):
+                total -= lower[j, k] * gain[j, column]
+            gain[k, column] = total / lower[k, k]
+
+
+@jit
+def eliminate_placements(
+    first: int, last: int, lens: int, intrinsics: Any, free: Any, powers: Any, unit: float,
+    bounds: Any, points: Any, pixels: Any, weights: Any,
+    tracks: Any, is_arc: Any, curve_bounds: Any, track: Any, curve_pixels: Any, curve_weights: Any, s: Any,
+    loss: int, scale: float, tolerance: float, change: Any, poses: Any, gains: Any, reduced: Any,
+) -> float:  # fmt: skip
+    """Sum of rho over the sights first to last at their best poses, and what they say of the free intrinsics.
+
+    Args:
+        intrinsics, free, powers, unit, loss, scale and the observations: see `normal_equations`; bounds, curve_bounds
+            (S + 1,) say where each sight's rows begin.
+        tolerance: how much of a sight's cost a step of its pose may still promise when it is left to the complement.
+        change: (free,) by how much the free intrinsics have moved since `poses` and `gains` were made.
+        poses: (S, 3, 4) [R t] of cam_from_target, moved. gains: (S, 6, free), d pose / d intrinsics, renewed.
+        reduced: (free + 1, free + 1), lower triangle: the complement with the residual's row last, added up.
+
+    Returns:
+        NaN where an observation cannot be projected.
+    """
+    count = len(free)
+    rows = np.empty(count + 7, np.int64)
+    rows[:count] = free
+    rows[count:] = np.arange(len(intrinsics), len(intrinsics) + 7)
+    normal, trial = np.empty((count + 7, count + 7)), np.empty((count + 7, count + 7))
+    lower, gain = np.empty((6, 6)), np.empty((6, count + 1))
+    turned, step, pose, moved = np.empty((3, 3)), np.empty(6), np.empty((3, 4)), np.empty((3, 4))
+    total = 0.0
+    for v in range(first, last):
+        p, c = slice(bounds[v], bounds[v + 1]), slice(curve_bounds[v], curve_bounds[v + 1])
+        for k in range(6):
+            step[k] = 0.0
+            for j in range(count):
+                step[k] -= gains[v, k, j] * change[j]
+        _move(poses[v], step, turned, pose)
+        cost = normal_equations(
+            lens, intrinsics, powers, unit, pose, points[p], pixels[p], weights[p], tracks, is_arc, track[c],
+            curve_pixels[c], curve_weights[c], s[c], loss, scale, rows, True, normal,
+        )  # fmt: skip
+        damping = 0.0
+        for _ in range(_MOST_STEPS):
+            if not np.isfinite(cost):
+                return np.nan
+            _solve_pose(normal, count, damping, lower, gain)
+            promise = 0.0
+            for k in range(6):
+                step[k] = -gain[k, count]
+                promise -= step[k] * normal[count + 6, count + k]
+            if promise <= max(tolerance * cost, _NOTHING_LEFT):
+                break
+            _move(pose, step, turned, moved)
+            moved_cost = normal_equations(
+                lens, intrinsics, powers, unit, moved, points[p], pixels[p], weights[p], tracks, is_arc, track[c],
+                curve_pixels[c], curve_weights[c], s[c], loss, scale, rows, True, trial,
+            )  # fmt: skip
+            if moved_cost <= cost:
+                pose, moved, normal, trial, cost, damping = moved, pose, trial, normal, moved_cost, 0.1 * damping
+            elif promise <= 1e-12 * cost:
+                break  # rounding
+            else:
+                damping = max(1e-3, 10.0 * damping)
+        if damping > 0.0:
+            _solve_pose(normal, count, 0.0, lower, gain)
+            promise = 0.0
+            for k in range(6):
+                promise += gain[k, count] * normal[count + 6, count + k]
+            for k in range(6):
+                step[k] = -gain[k, count] if promise <= 1e-2 * cost else 0.0
+        _move(pose, step, turned, poses[v])
+        gains[v] = gain[:, :count]
+        for i in range(count + 1):
+            at = count + 6 if i == count else i
+            for j in range(i + 1):
+                value = normal[at, count + 6 if j == count else j]
+                for k in range(6):
+                    value -= gain[k, i] * (normal[count + 6, count + k] if j == count else normal[count + k, j])
+                reduced[i, j] += value
+        total += cost - max(promise, 0.0)
+    return total

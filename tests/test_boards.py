@@ -1,0 +1,404 @@
+"""Boards in images: how many, how well, under which names, and what is said where there are none."""
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from ceres_cal.camera import Camera
+from ceres_cal.detect.boards import BoardDetections, CharucoSpec, detect_boards, read_grey
+from ceres_cal.detect.saddles import measure_saddles
+from ceres_cal.errors import InputError
+from ceres_cal.lens import Radial
+from ceres_cal.observations import Observations
+from ceres_cal.targets import Target, checkerboard, rings
+from ceres_cal.transforms import Array, Pose
+
+BOARD = checkerboard(7, 6, 0.03)
+CAMERA = Camera((480, 360), 450.0, (243.3, 177.8), Radial((1e-4, 7e-7)))
+POSE = Pose.exp((0.35, -0.45, 0.1, -0.07, -0.08, 0.33))  # tilted by half a radian; the board fills half the image
+
+Image = NDArray[np.uint8]
+Paint = Callable[[Array], Array]
+"""Places on the board (N, 2) in squares -> brightness 0 to 1."""
+
+
+# ---- pictures with known corners ------------------------------------------------------------------------------------
+
+
+def squares(columns: int, rows: int) -> Paint:
+    """A board with one more square than corners each way, the one between "0,0" and "1,1" dark, and a white margin."""
+
+    def paint(places: Array) -> Array:
+        x, y = places.T
+        inside = (x > -1.0) & (y > -1.0) & (x < columns) & (y < rows)
+        paper = (x > -1.5) & (y > -1.5) & (x < columns + 0.5) & (y < rows + 0.5)
+        dark = inside & ((np.floor(x) + np.floor(y)) % 2 == 0)
+        return np.where(dark, 0.0, np.where(paper, 1.0, 0.4))
+
+    return paint
+
+
+def ideal_picture(camera: Camera, square_m: float, paint: Paint) -> Array:
+    """What each pixel sees: the mean over its area, at 64 places of a lattice wherever an edge runs through it."""
+    width, height = camera.image_size
+    middle = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).reshape(-1, 2).astype(float)
+    number = np.arange(64)
+    lattice = (np.stack([number, number * 19 % 64], axis=1) + 0.5) / 64.0 - 0.5
+
+    def seen(pixels: Array) -> Array:
+        return paint(camera.locate(pixels) / square_m)
+
+    spread = np.stack(
+        [seen(middle + corner) for corner in np.array([[0, 0], [-1, -1], [1, -1], [-1, 1], [1, 1]]) * 0.55]
+    )
+    picture = spread[0]
+    mixed = np.ptp(spread, axis=0) > 0.0
+    picture[mixed] = seen((middle[mixed, None] + lattice).reshape(-1, 2)).reshape(-1, 64).mean(axis=1)
+    return picture.reshape(height, width)
+
+
+def photograph(picture: Array, blur_px: float = 0.7, noise: float = 2.0, seed: int = 1) -> Image:
+    """Grey levels 40 to 200 of a picture, blurred, with noise (grey levels)."""
+    levels = cv2.GaussianBlur(40.0 + 160.0 * picture, (0, 0), blur_px)
+    levels += noise * np.random.default_rng(seed).standard_normal(levels.shape)
+    return np.clip(np.rint(levels), 0, 255).astype(np.uint8)
+
+
+def error_px(grid: Array, truth: Array) -> Array:
+    """Measured minus true, (N, 2), of the corners that were measured."""
+    return (grid - truth).reshape(-1, 2)[~np.isnan(grid[..., 0]).ravel()]
+
+
+def rms(error: Array) -> float:
+    """Per coordinate."""
+    return float(np.sqrt(np.mean(error**2)))
+
+
+@pytest.fixture(scope="module")
+def picture() -> Array:
+    return ideal_picture(CAMERA.at(POSE), 0.03, squares(7, 6))
+
+
+@pytest.fixture(scope="module")
+def truth() -> Array:
+    return CAMERA.at(POSE).project(BOARD.point_array)
+
+
+def write(path: Path, image: NDArray[Any]) -> Path:
+    path.parent.mkdir(exist_ok=True)
+    assert cv2.imwrite(str(path), image)
+    return path
+
+
+# ---- how well -------------------------------------------------------------------------------------------------------
+
+
+def test_corners_are_good_to_a_hundredth_of_a_pixel(tmp_path: Path, picture: Array, truth: Array) -> None:
+    path = write(tmp_path / "a.png", photograph(picture))
+    points = detect_boards([path], BOARD).observations.points
+    assert np.array_equal(points.feature, np.arange(42))
+    error = points.pixels - truth
+    assert np.all(np.abs(error.mean(axis=0)) < 0.004)  # (0.0003, 0.0012)
+    assert np.all(error.std(axis=0) < 0.010)  # (0.0056, 0.0061)
+    start = truth.astype(np.float32).reshape(-1, 1, 2)  # at the truth: cornerSubPix has no way to go wrong but its own
+    peer = cv2.cornerSubPix(read_grey(path), start, (7, 7), (-1, -1), (3, 100, 1e-4)).reshape(-1, 2)
+    assert rms(error) < 0.5 * rms(peer - truth)  # 0.0059 against 0.0172
+
+
+@pytest.mark.parametrize(
+    "change, limit",
+    [
+        ("blur", 0.03),
+        ("noise", 0.04),
+        ("sharpened", 0.02),
+        ("uneven light", 0.02),
+        ("gamma", 0.02),
+    ],
+)
+def test_corners_stay_good_whatever_the_camera_does(change: str, limit: float, picture: Array, truth: Array) -> None:
+    image = photograph(picture)
+    if change == "blur":
+        image = photograph(picture, blur_px=2.0)
+    elif change == "noise":
+        image = photograph(picture, noise=8.0)
+    elif change == "sharpened":  # along the rows only, as video cameras do
+        level = image.astype(float)
+        sharp = level + 0.8 * (level - cv2.GaussianBlur(level, (9, 1), 1.2))
+        image = np.clip(np.rint(sharp), 0, 255).astype(np.uint8)
+    elif change == "uneven light":  # from 0.6 to 1.4 across the image
+        image = np.rint(np.minimum(image * np.linspace(0.6, 1.4, 480), 255)).astype(np.uint8)
+    else:
+        image = np.rint(255.0 * (image / 255.0) ** 0.45).astype(np.uint8)
+    start = truth.reshape(6, 7, 2) + np.random.default_rng(2).uniform(-0.7, 0.7, (6, 7, 2))
+    error = error_px(measure_saddles(image, start).grid, truth.reshape(6, 7, 2))
+    assert len(error) == 42
+    assert rms(error) < limit
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    turn=st.floats(-np.pi, np.pi),
+    shift=st.tuples(st.floats(-0.5, 0.5), st.floats(-0.5, 0.5)),
+    tilt=st.tuples(st.floats(-0.7, 0.7), st.floats(-0.7, 0.7)),
+)
+def test_any_turn_and_place(turn: float, shift: tuple[float, float], tilt: tuple[float, float]) -> None:
+    facing = Pose.exp((*tilt, 0.0, 0.0, 0.0, 4.6)) @ Pose.exp((0.0, 0.0, turn, 0.0, 0.0, 0.0))
+    pose = facing @ Pose.exp((0.0, 0.0, 0.0, -1.0, -1.0, 0.0))  # the middle of 3 x 3 corners before the camera
+    camera = Camera((80, 80), 70.0, (39.5 + shift[0], 39.5 + shift[1]), Radial((0.0,), (3,)), cam_from_world=pose)
+    truth = camera.project(checkerboard(3, 3, 1.0).point_array).reshape(3, 3, 2)
+    image = photograph(ideal_picture(camera, 1.0, squares(3, 3)), noise=0.0)
+    saddles = measure_saddles(image, truth + 0.6)
+    error = error_px(saddles.grid, truth)
+    assert len(error) == 9
+    assert np.max(np.abs(error)) < 0.06
+    assert np.all(saddles.contrast[::2, ::2] > 0.0) and np.all(saddles.contrast[1, ::2] < 0.0)
+
+
+def test_what_is_no_corner_is_left_out(picture: Array, truth: Array) -> None:
+    image = photograph(picture)
+    start = truth.reshape(6, 7, 2).copy()
+    column, row = np.rint(start[2, 3]).astype(int)
+    image[row - 12 : row + 13, column - 12 : column + 13] = 120  # a sticker on "3,2"
+    start[0, :] = np.nan
+    start[5, 1:] = np.nan
+    start[5, 0] += (14.0, 2.0)  # not a corner at all: half a square off
+    grid = measure_saddles(image, start).grid
+    lost = {(int(c), int(r)) for r, c in np.argwhere(np.isnan(grid[..., 0])) if r not in (0, 5)}
+    assert lost <= {(3, 2)}
+    assert np.all(np.isnan(grid[0])) and np.all(np.isnan(grid[5]))
+    kept = np.delete(grid[1:5].reshape(-1, 2) - truth.reshape(6, 7, 2)[1:5].reshape(-1, 2), 1 * 7 + 3, axis=0)
+    assert rms(kept) < 0.02
+
+
+# ---- real photographs -----------------------------------------------------------------------------------------------
+
+
+def calibrated(detections: BoardDetections, flags: int) -> tuple[float, Array, Array]:
+    """OpenCV's 2D rms (px), camera matrix and standard deviations of fx, fy, cx, cy from the detected corners."""
+    observations = detections.observations
+    points, (board,) = observations.points, observations.targets.values()
+    rows = [points.view == number for number in range(len(observations.views))]
+    objects = [board.point_array[points.feature[row]].astype(np.float32) for row in rows]
+    pixels = [points.pixels[row].astype(np.float32) for row in rows]
+    (size,) = observations.cameras.values()
+    answer = cv2.calibrateCameraExtended(objects, pixels, size, None, None, flags=flags)  # type: ignore[call-overload]
+    return float(answer[0]), np.asarray(answer[1]), np.ravel(answer[5])[:4]
+
+
+def test_sony_photographs(real_data: Path) -> None:
+    images = sorted((real_data / "boofcv_sony_chess").glob("*.jpg"))
+    detections = detect_boards(images, checkerboard(4, 6, 0.03))
+    assert len(detections.found) == 13 and not detections.missed
+    assert len(detections.observations.points) == 13 * 24
+    rms_px, matrix, sigma = calibrated(detections, cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K3)
+    assert rms_px < 0.145  # 0.1379; cornerSubPix (5 x 5) 0.1624, findChessboardCornersSB 0.1535
+    # 702.6 with a standard deviation of 1.2. BoofCV's own 701.0 and cornerSubPix' 700.9 agree within it; cornerSubPix
+    # is 0.5 to 1.0 px short in renderings of these very views.
+    assert abs(matrix[0, 0] - 701.0) < 2.0 * sigma[0]
+    assert abs(matrix[1, 1] - 698.65) < 2.0 * sigma[1]
+    assert sigma[0] < 1.4
+
+
+def test_gopro_photographs(real_data: Path) -> None:
+    images = sorted((real_data / "udacity_gopro_wide").glob("GOPR*.jpg"))
+    seen: list[tuple[int, int, str]] = []
+    detections = detect_boards(images, checkerboard(8, 6, 1.0), progress=lambda *done: seen.append(done))
+    assert len(images) == 36 and len(detections.found) == 35
+    assert [Path(path).name for path, _ in detections.missed] == ["GOPR0055.jpg"]  # shows a part of the board only
+    assert seen == [(i, 36, path.name) for i, path in enumerate(images, start=1)]
+    assert len(detections.observations.points) == 35 * 48
+    rms_px, matrix, _ = calibrated(detections, cv2.CALIB_ZERO_TANGENT_DIST)
+    assert rms_px < 0.5225  # 0.5205; cornerSubPix 0.5235
+    assert abs(matrix[0, 0] - 560.07) < 0.5  # 560.11; 560.07 with cornerSubPix
+
+
+# ---- names ----------------------------------------------------------------------------------------------------------
+
+
+def corner_names(observations: Observations) -> list[str]:
+    return [observations.feature_name("point", row) for row in range(len(observations.points))]
+
+
+@pytest.mark.parametrize("quarter_turns", range(4))
+def test_labelling_is_never_mirrored_and_stays_on_the_board(
+    quarter_turns: int, tmp_path: Path, picture: Array, truth: Array
+) -> None:
+    image = np.rot90(photograph(picture), quarter_turns)
+    points = detect_boards([write(tmp_path / "a.png", image)], BOARD).observations.points
+    grid = points.pixels[np.argsort(points.feature)].reshape(6, 7, 2)
+    along_row, along_column = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
+    assert along_row[0] * along_column[1] - along_row[1] * along_column[0] > 0.0
+    # 7 + 6 is odd: the picture itself tells which end is "0,0".
+    width, height = CAMERA.image_size
+    origin = truth[0]
+    for _ in range(quarter_turns):
+        origin, width, height = np.array([origin[1], width - 1 - origin[0]]), height, width
+    assert np.linalg.norm(grid[0, 0] - origin) < 0.1  # 0.01; the other end is 190 px away
+
+
+def test_board_seen_through_a_mirror_is_named_right_handed(tmp_path: Path, picture: Array) -> None:
+    path = write(tmp_path / "a.png", photograph(picture)[:, ::-1])
+    observations = detect_boards([path], BOARD).observations
+    where = dict(zip(corner_names(observations), observations.points.pixels, strict=True))
+    along_row, along_column = where["6,0"] - where["0,0"], where["0,5"] - where["0,0"]
+    assert along_row[0] * along_column[1] - along_row[1] * along_column[0] > 0.0
+
+
+def test_views_stations_and_placements(tmp_path: Path, picture: Array) -> None:
+    image = photograph(picture)
+    files = ["one/a.png", "one/b.png", "two/a.png", "two/a.bmp"]
+    images = [write(tmp_path / name, image) for name in files]
+    blank = write(tmp_path / "blank.png", np.full_like(image, 90))
+    detections = detect_boards([*images, blank], BOARD, camera="left")
+    assert detections.found == tuple(map(str, images))
+    assert detections.missed == ((str(blank), "no chessboard of 7 x 6 inner corners found"),)
+    views = detections.observations.views
+    assert [view.frame for view in views] == ["a", "b", "a", "a"]
+    assert views[1].placement == "b" and views[0].placement == "one/a"
+    assert len({view.placement for view in views}) == 4
+    assert {(view.camera, view.station, view.target) for view in views} == {("left", "left", "board")}
+    moved = detect_boards(images[:1], BOARD, camera="left", station="left-2").observations
+    assert moved.views[0].station == "left-2"
+    assert moved.cameras == {"left": (480, 360)} and moved.targets == {"board": BOARD}
+    moved.save(tmp_path / "obs.json")
+    assert np.array_equal(Observations.load(tmp_path / "obs.json").points.pixels, moved.points.pixels)
+
+
+# ---- kinds of files -------------------------------------------------------------------------------------------------
+
+
+def test_depth_and_colour_change_nothing(tmp_path: Path, picture: Array) -> None:
+    grey = photograph(picture)
+    images = {
+        "grey": grey,
+        "colour": cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR),
+        "alpha": cv2.cvtColor(grey, cv2.COLOR_GRAY2BGRA),
+        "deep": grey.astype(np.uint16) * 20 + 700,  # 12 bit in a 16-bit file, far from filling it
+    }
+    paths = [write(tmp_path / f"{name}.png", image) for name, image in images.items()]
+    assert read_grey(paths[3]).dtype == np.uint16
+    pixels = detect_boards(paths, BOARD).observations.points.pixels.reshape(4, 42, 2)
+    assert np.max(np.abs(pixels - pixels[0])) < 0.001  # 0.0001
+
+
+def test_a_noted_rotation_is_ignored(tmp_path: Path, picture: Array) -> None:
+    path = write(tmp_path / "a.jpg", photograph(picture))
+    plain = read_grey(path)
+    content = path.read_bytes()
+    entry = b"\x01\x12\x00\x03\x00\x00\x00\x01\x00\x06\x00\x00"  # Orientation = 6: turn by a quarter to look at it
+    exif = b"Exif\x00\x00MM\x00\x2a\x00\x00\x00\x08\x00\x01" + entry + b"\x00\x00\x00\x00"
+    path.write_bytes(content[:2] + b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif + content[2:])
+    assert cv2.imread(str(path)).shape[:2] == (480, 360)  # what a viewer shows
+    assert np.array_equal(read_grey(path), plain)
+
+
+# ---- ChArUco --------------------------------------------------------------------------------------------------------
+
+CHARUCO_BOARD = checkerboard(7, 5, 0.04)
+CHARUCO = CharucoSpec("DICT_4X4_50", 0.03)
+
+
+@pytest.fixture(scope="module")
+def charuco() -> tuple[Image, Array]:
+    """OpenCV's own drawing of the board, in perspective, and its corners (35, 2)."""
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+    drawing = cv2.aruco.CharucoBoard((8, 6), 0.04, 0.03, dictionary).generateImage(
+        (8 * 200 + 100, 6 * 200 + 100), None, 50
+    )
+    corners = 50 + 200 * (np.stack(np.meshgrid(np.arange(7), np.arange(5)), axis=-1).reshape(-1, 2) + 1) - 0.5
+    from_drawing = cv2.getPerspectiveTransform(
+        np.array([[0, 0], [1700, 0], [1700, 1300], [0, 1300]], np.float32),
+        np.array([[70, 60], [585, 95], [548, 436], [102, 391]], np.float32),
+    )
+    finer = np.array([[8.0, 0.0, 3.5], [0.0, 8.0, 3.5], [0.0, 0.0, 1.0]])  # 8 x 8 places in each pixel
+    fine = cv2.warpPerspective(drawing, finer @ from_drawing, (8 * 640, 8 * 480), borderValue=255)
+    image = photograph(cv2.resize(fine, (640, 480), interpolation=cv2.INTER_AREA) / 255.0)
+    return image, cv2.perspectiveTransform(corners[None], from_drawing)[0]
+
+
+def test_charuco_corners(tmp_path: Path, charuco: tuple[Image, Array]) -> None:
+    image, truth = charuco
+    points = detect_boards([write(tmp_path / "a.png", image)], CHARUCO_BOARD, charuco=CHARUCO).observations.points
+    assert np.array_equal(points.feature, np.arange(35))
+    assert rms(points.pixels - truth) < 0.025  # 0.011; OpenCV's own corners 0.05
+
+
+def test_charuco_may_be_partly_seen(tmp_path: Path, charuco: tuple[Image, Array]) -> None:
+    image, truth = charuco
+    image = image.copy()
+    image[:, 330:] = 128
+    observations = detect_boards([write(tmp_path / "a.png", image)], CHARUCO_BOARD, charuco=CHARUCO).observations
+    points = observations.points
+    assert 10 <= len(points) < 25  # 15
+    assert {"0,0", "0,4"} <= set(corner_names(observations)) and "6,0" not in corner_names(observations)
+    assert rms(points.pixels - truth[points.feature]) < 0.025
+
+
+@pytest.mark.parametrize(
+    "right, reason", [(190, "lie on one line|only \\d corners, 6 are needed"), (0, "no ChArUco corners found")]
+)
+def test_charuco_too_little_seen(right: int, reason: str, tmp_path: Path, charuco: tuple[Image, Array]) -> None:
+    whole = write(tmp_path / "a.png", charuco[0])
+    part = charuco[0].copy()
+    part[:, right:] = 128
+    detections = detect_boards([write(tmp_path / "b.png", part), whole], CHARUCO_BOARD, charuco=CHARUCO)
+    assert detections.found == (str(whole),)
+    ((path, why),) = detections.missed
+    assert path.endswith("b.png")
+    assert re.search(reason, why)
+
+
+# ---- what is said ---------------------------------------------------------------------------------------------------
+
+
+def test_unreadable_images_are_named(tmp_path: Path, picture: Array) -> None:
+    good = write(tmp_path / "good.png", photograph(picture))
+    text, empty = tmp_path / "text.png", tmp_path / "empty.png"
+    text.write_text("no image")
+    empty.touch()
+    for bad in (text, empty):
+        with pytest.raises(InputError, match=f"{bad.name}: not an image"):
+            detect_boards([good, bad], BOARD)
+    with pytest.raises(InputError, match=r"gone\.png: no such file"):
+        detect_boards([good, tmp_path / "gone.png"], BOARD)
+
+
+def test_another_size_is_another_camera(tmp_path: Path, picture: Array) -> None:
+    image = photograph(picture)
+    images = [write(tmp_path / "a.png", image), write(tmp_path / "b.png", image[:, 8:])]
+    with pytest.raises(InputError, match=r"b\.png: 472 x 360 px, but .*a\.png has 480 x 360"):
+        detect_boards(images, BOARD)
+
+
+def test_no_board_at_all(tmp_path: Path, picture: Array) -> None:
+    path = write(tmp_path / "a.png", photograph(picture))
+    with pytest.raises(InputError, match=r"no board of 9 x 6 inner corners in any of 1 images .*a\.png: no chessboard"):
+        detect_boards([path], checkerboard(9, 6, 0.03))
+    with pytest.raises(InputError, match="no images were given"):
+        detect_boards([], BOARD)
+    with pytest.raises(InputError, match=r"a\.png: given twice"):
+        detect_boards([path, path], BOARD)
+
+
+@pytest.mark.parametrize(
+    "board, charuco_spec, message",
+    [
+        (rings([0.1, 0.2]), None, "kind 'rings'"),
+        (checkerboard(2, 5, 0.03), None, "3 inner corners a side or more, not 2 x 5"),
+        (CHARUCO_BOARD, CharucoSpec("DICT_9X9", 0.03), "unknown marker dictionary 'DICT_9X9'"),
+        (CHARUCO_BOARD, CharucoSpec("Dictionary", 0.03), "unknown marker dictionary 'Dictionary'"),
+        (CHARUCO_BOARD, CharucoSpec("DICT_4X4_50", 0.04), r"marker_m must be between 0 and the square's 0\.04 m"),
+        (checkerboard(11, 9, 0.04), CHARUCO, "has 50 markers, but a board of 12 x 10 squares needs 60"),
+    ],
+)
+def test_wrong_targets(board: Target, charuco_spec: CharucoSpec | None, message: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=message):
+        detect_boards([write(tmp_path / "a.png", np.zeros((50, 50), np.uint8))], board, charuco=charuco_spec)

@@ -1,0 +1,546 @@
+"""The compiled kernels against the readable lens models, brute force, differences and the uncompressed problem."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pyceres
+import pytest
+import scenes
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
+
+from ceres_cal import kernels
+from ceres_cal.camera import Camera
+from ceres_cal.lens import Brown, KannalaBrandt, Radial
+from ceres_cal.parameters import intrinsics_vector, unit_px, with_intrinsics
+from ceres_cal.simulate import overhead_pose
+from ceres_cal.targets import Arc, Segment, along_track, custom
+from ceres_cal.transforms import Array, Pose, rotation_exp
+
+LOSSES = {
+    "trivial": pyceres.TrivialLoss,
+    "huber": pyceres.HuberLoss,
+    "soft_l1": pyceres.SoftLOneLoss,
+    "cauchy": pyceres.CauchyLoss,
+    "tukey": None,  # pyceres has none
+}
+
+each_lens = pytest.mark.parametrize("lens", scenes.LENSES)
+each_loss = pytest.mark.parametrize("loss", LOSSES)
+
+TARGET = custom(
+    {"a": (-3.1, -1.9, 0.0), "b": (2.9, -2.1, 0.4), "c": (3.2, 1.7, 0.0), "d": (-2.8, 2.0, 1.1), "e": (0.1, 0.2, 0.0)},
+    {
+        "along": Segment((-3.5, -2.2, 0.0), (3.5, -2.0, 0.0), 0.08),
+        "rising": Segment((-3.0, 2.1, 0.0), (2.5, 1.6, 0.7), 0.05),
+        "circle": Arc((0.4, 0.1, 0.0), 0.6, width_m=0.06),
+        "bow": Arc((1.8, 0.3, 0.2), 1.1, -0.9, 1.4, 0.04),
+    },
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """What one camera sees of one frame, as the kernels take it; `start`: where the search for the feet begins."""
+
+    points: Array
+    pixels: Array
+    sigma_px: Array
+    track: NDArray[np.int32]
+    curve_pixels: Array
+    curve_sigma_px: Array
+    start: Array
+
+    @property
+    def tracks(self) -> Array:
+        return TARGET.tracks.reshape(-1, 3, 3)
+
+    @property
+    def is_arc(self) -> NDArray[np.bool_]:
+        return np.tile(TARGET.is_arc, 3)
+
+    def take(self, points: Any = slice(0, 0), curves: Any = slice(0, 0)) -> Seen:
+        """Some of the points and some of the curve observations."""
+        columns = {name: getattr(self, name)[points] for name in ("points", "pixels", "sigma_px")}
+        names = ("track", "curve_pixels", "curve_sigma_px", "start")
+        return Seen(**columns, **{name: getattr(self, name)[curves] for name in names})
+
+    @property
+    def singles(self) -> list[Seen]:
+        """Each observation alone."""
+        points = [self.take(points=slice(k, k + 1)) for k in range(len(self.points))]
+        return points + [self.take(curves=slice(k, k + 1)) for k in range(len(self.curve_pixels))]
+
+
+@cache
+def looked_at(lens: str) -> tuple[Camera, Seen]:
+    """A leaning camera with pixels that are not square, and what it sees: points, lines and arcs, every side, 2 px off.
+
+    About a hundred curve observations: more than one chunk, and not a whole number of them.
+    """
+    rng = np.random.default_rng(4)
+    height = 3.2 if lens == "kannala-brandt" else 5.2
+    pose = overhead_pose(-0.5, -1.0, height, tilt_x_deg=-12.0, tilt_y_deg=-9.0, yaw_deg=25.0)
+    camera = replace(scenes.camera(lens), aspect=1.03).at(pose)
+    curves = list(TARGET.curves.values())
+    number = np.repeat(np.arange(3 * len(curves)), 9)  # three sides of every curve
+    places = np.concatenate([np.linspace(*curves[k % len(curves)].parameter_range, 11)[1:-1] for k in number[::9]])
+    there = along_track(TARGET.tracks.reshape(-1, 3, 3)[number], np.tile(TARGET.is_arc, 3)[number], places)
+    points, pixels = TARGET.point_array.copy(), camera.project(TARGET.point_array)
+    curve_pixels = camera.project(there)
+    return camera, Seen(
+        points,
+        pixels + rng.normal(0.0, 2.0, pixels.shape),
+        rng.uniform(0.7, 1.6, len(pixels)),
+        number.astype(np.int32),
+        curve_pixels + rng.normal(0.0, 2.0, curve_pixels.shape),
+        rng.uniform(0.7, 1.6, len(places)),
+        places + rng.normal(0.0, 0.01, len(places)),
+    )
+
+
+def optics(camera: Camera) -> tuple[int, Array, Array, float]:
+    powers = np.asarray(camera.lens.radius_powers, dtype=np.int64)
+    return kernels.LENS_CODES[camera.lens.kind], intrinsics_vector(camera), powers, unit_px(camera)
+
+
+def matrix(pose: Pose) -> Array:
+    return np.column_stack([pose.rotation, pose.translation])
+
+
+def normal_equations(
+    camera: Camera, seen: Seen, loss: str = "trivial", scale: float = 1.0, *, wants_normal: bool = True
+) -> tuple[float, Array]:
+    """Sum of rho, and A over [intrinsics | 6 pose | residual], whole."""
+    size = len(intrinsics_vector(camera)) + 7
+    normal = np.zeros((size, size))
+    cost = kernels.normal_equations(
+        *optics(camera), matrix(camera.cam_from_world),
+        seen.points, seen.pixels, 1.0 / seen.sigma_px,
+        seen.tracks, seen.is_arc, seen.track, seen.curve_pixels, 1.0 / seen.curve_sigma_px, seen.start.copy(),
+        kernels.LOSS_CODES[loss], scale, np.arange(size), wants_normal, normal,
+    )  # fmt: skip
+    lower = np.tril(normal)
+    return float(cost), lower + np.tril(lower, -1).T
+
+
+def point_residuals(camera: Camera, seen: Seen) -> Array:
+    found = np.empty((len(seen.points), 2))
+    kernels.point_residuals(*optics(camera), matrix(camera.cam_from_world), seen.points, seen.pixels, found)
+    return found
+
+
+def curve_residuals(camera: Camera, seen: Seen) -> tuple[Array, Array]:
+    """Distances px, and the feet they were measured at."""
+    found, places = np.empty(len(seen.curve_pixels)), seen.start.copy()
+    kernels.curve_residuals(
+        *optics(camera), matrix(camera.cam_from_world),
+        seen.tracks, seen.is_arc, seen.track, seen.curve_pixels, places, found,
+    )  # fmt: skip
+    return found, places
+
+
+def residual_vector(camera: Camera, seen: Seen) -> Array:
+    """Every residual in its sigmas: x and y of the points, then the curves' distances."""
+    points = point_residuals(camera, seen) / seen.sigma_px[:, None]
+    return np.concatenate([points.ravel(), curve_residuals(camera, seen)[0] / seen.curve_sigma_px])
+
+
+def moved(camera: Camera, change: Array) -> Camera:
+    """The camera with a small change of [intrinsics | left perturbation of its pose]."""
+    count = len(change) - 6
+    pose = camera.cam_from_world
+    turned = Pose(rotation_exp(change[count : count + 3]) @ pose.rotation, pose.translation + change[count + 3 :])
+    return with_intrinsics(camera, intrinsics_vector(camera) + change[:count]).at(turned)
+
+
+def derivative(function: Callable[[Array], Array], steps: Array) -> Array:
+    """Jacobian (residuals, numbers) at 0 by central differences of fourth order."""
+    columns = []
+    for k, step in enumerate(steps):
+        along = np.zeros(len(steps))
+        along[k] = step
+        once, twice = function(along) - function(-along), function(2.0 * along) - function(-2.0 * along)
+        columns.append((8.0 * once - twice) / (12.0 * step))
+    return np.column_stack(columns)
+
+
+POSE_STEPS = np.repeat([1e-3, 3e-3], 3)
+
+
+def intrinsics_steps(camera: Camera) -> Array:
+    """A step for each number that moves pixels by about one."""
+    return np.array([1.0, 1e-3, 1.0, 1.0, *[2e-3] * len(camera.lens.values)])
+
+
+# ---- residuals ------------------------------------------------------------------------------------------------------
+
+
+@each_lens
+def test_point_residuals_are_those_of_the_readable_lens(lens: str) -> None:
+    camera, seen = looked_at(lens)
+    found = point_residuals(camera, seen)
+    assert np.max(np.abs(found - (camera.project(seen.points) - seen.pixels))) < 1e-10  # 5e-13 px measured
+
+
+def foot_by_search(camera: Camera, seen: Seen, row: int) -> tuple[float, float]:
+    """Signed distance from a pixel to its curve and the foot, by minimising over the projected curve alone."""
+    track, is_arc, start = seen.tracks[seen.track[row]], bool(seen.is_arc[seen.track[row]]), seen.start[row]
+
+    def away(s: float) -> Array:
+        return np.asarray((camera.project(along_track(track, is_arc, [s])) - seen.curve_pixels[row])[0])
+
+    reach = 0.3 if is_arc else 0.1
+    bounds = (start - reach, start + reach)
+    found = minimize_scalar(lambda s: np.sum(away(s) ** 2), bounds=bounds, method="bounded", options={"xatol": 1e-10})
+    tangent = away(found.x + 1e-4) - away(found.x - 1e-4)
+    normal = np.array([-tangent[1], tangent[0]]) / np.linalg.norm(tangent)
+    return float(normal @ away(found.x)), float(found.x)
+
+
+@each_lens
+def test_curve_residuals_are_true_distances(lens: str) -> None:
+    camera, seen = looked_at(lens)
+    distances, places = curve_residuals(camera, seen)
+    assert np.std(distances) > 1.0  # 2 px of noise: the feet are not where the pixels are
+    brute = np.array([foot_by_search(camera, seen, row) for row in range(len(distances))])
+    assert np.max(np.abs(distances - brute[:, 0])) < 1e-8  # 3e-10 px measured
+    assert np.max(np.abs(places - brute[:, 1])) < 1e-6  # 3e-8 measured: the search knows its foot no better
+
+
+def test_far_pixels_have_the_nearest_foot_too() -> None:
+    """Gross errors: pixels tens of px off the centre circle, some of them on the far side of a sharp bend."""
+    camera, seen = looked_at("radial-2-3")
+    rows = np.flatnonzero(seen.is_arc[seen.track])
+    seen = seen.take(curves=rows)
+    far = seen.curve_pixels + np.random.default_rng(0).normal(0.0, 25.0, (len(rows), 2))
+    distances, _ = curve_residuals(camera, replace(seen, curve_pixels=far))
+    for row in range(len(rows)):
+        around = along_track(seen.tracks[seen.track[row]], True, np.linspace(0.0, 2.0 * np.pi, 7200))
+        nearest = np.min(np.linalg.norm(camera.project(around) - far[row], axis=1))
+        assert abs(distances[row]) == pytest.approx(nearest, abs=0.01)  # the steps round the arc are 0.15 px long
+
+
+# ---- derivatives ----------------------------------------------------------------------------------------------------
+
+
+def jacobian_by_gradients(camera: Camera, seen: Seen) -> Array:
+    """Jacobian (residuals, numbers) read off single observations: the last row of A is e J, whatever e is.
+
+    A point's pixel is moved so that its residual is (1, 0), then (0, 1).
+    """
+    rows = []
+    for k in range(len(seen.points)):
+        for unit in np.eye(2):
+            one = seen.take(points=slice(k, k + 1))
+            one = replace(one, pixels=camera.project(one.points) - unit, sigma_px=np.ones(1))
+            rows.append(normal_equations(camera, one)[1][-1, :-1] / seen.sigma_px[k])
+    for k in range(len(seen.curve_pixels)):
+        one = seen.take(curves=slice(k, k + 1))
+        rows.append(normal_equations(camera, one)[1][-1, :-1] / residual_vector(camera, one)[0])
+    return np.array(rows)
+
+
+@each_lens
+def test_every_residual_knows_its_derivatives(lens: str) -> None:
+    """Points against the readable lens model, curves against their own distance with the foot searched anew."""
+    camera, seen = looked_at(lens)
+    found = jacobian_by_gradients(camera, seen)
+
+    def project(change: Array) -> Array:
+        return np.asarray((moved(camera, change).project(seen.points) / seen.sigma_px[:, None]).ravel())
+
+    def distance(change: Array) -> Array:
+        return residual_vector(moved(camera, change), seen.take(curves=slice(None)))
+
+    steps = np.concatenate([intrinsics_steps(camera), POSE_STEPS])
+    error = np.abs(found - np.vstack([derivative(project, steps), derivative(distance, steps)]))
+    error /= np.max(np.abs(found), axis=0)
+    points = 2 * len(seen.points)
+    assert np.max(error[:points]) < 1e-8  # 6e-10 measured
+    assert np.max(error[points:]) < 1e-7  # 4e-9 measured
+
+
+@each_lens
+@each_loss
+def test_normal_equations_sum_up_single_observations(lens: str, loss: str) -> None:
+    """The cost is sum rho and A is sum w [J e]^T [J e], over chunks whole and broken."""
+    camera, seen = looked_at(lens)
+    cost, normal = normal_equations(camera, seen, loss, 1.5)
+    parts = [normal_equations(camera, one, loss, 1.5) for one in seen.singles]
+    assert cost == pytest.approx(sum(part[0] for part in parts), rel=1e-12)  # 6e-15 measured
+    total = np.sum([part[1] for part in parts], axis=0)
+    size = np.sqrt(np.outer(np.diag(total), np.diag(total)))
+    # A foot that is 1e-9 px off is good enough for both, but not the same one.
+    assert np.max(np.abs(normal - total) / size) < 1e-8  # 4e-10 measured
+
+
+@pytest.mark.parametrize("count", [0, 1, 63, 64, 65, 128, 130])
+def test_chunks_of_any_length_count_every_row_once(count: int) -> None:
+    camera, seen = looked_at("brown")
+    points, curves = (np.resize(np.arange(len(rows)), count) for rows in (seen.pixels, seen.curve_pixels))
+    for many in (seen.take(points, curves), seen.take(points), seen.take(curves=curves)):
+        expected = float(np.sum(residual_vector(camera, many) ** 2))
+        assert normal_equations(camera, many)[0] == pytest.approx(expected, rel=1e-12)  # 2e-15 measured
+
+
+# ---- losses ---------------------------------------------------------------------------------------------------------
+
+
+def loss_of(loss: str, scale: float, length: float) -> tuple[float, float]:
+    """rho and rho' at the square of `length`, from one point whose residual has that length."""
+    camera, seen = looked_at("brown")
+    one = replace(seen.take(points=slice(0, 1)), sigma_px=np.ones(1))
+    one = replace(one, pixels=camera.project(one.points) + length * np.array([[0.6, -0.8]]))
+    cost, normal = normal_equations(camera, one, loss, scale)
+    return cost, normal[-1, -1] / float(np.sum(point_residuals(camera, one) ** 2))
+
+
+lengths, scales = st.floats(1e-3, 1e3), st.floats(0.1, 20.0)
+
+
+@each_loss
+@given(length=lengths, scale=scales)
+def test_losses_are_those_of_ceres(loss: str, length: float, scale: float) -> None:
+    rho, slope = loss_of(loss, scale, length)
+    s, b = length**2, scale**2
+    if loss == "tukey":  # Ceres: a^2 / 3 (1 - (1 - s / a^2)^3), constant from a on
+        rest = max(0.0, 1.0 - s / b)
+        expected = b / 3.0 * (1.0 - rest**3), rest**2
+    else:
+        expected = (LOSSES[loss]() if loss == "trivial" else LOSSES[loss](scale)).evaluate(s)[:2]
+    # The residual is the difference of pixels of about 1000: known to 1e-13 px, of 1e-3.
+    assert rho == pytest.approx(expected[0], rel=1e-8)  # 4e-10 measured
+    assert slope == pytest.approx(expected[1], rel=1e-8, abs=1e-12)
+
+
+@each_loss
+@given(length=lengths, scale=scales)
+def test_losses_are_concave_enough_for_the_extra_row(loss: str, length: float, scale: float) -> None:
+    """rho >= rho' s: without it the block's last row would be the root of a negative number (design, section 6)."""
+    rho, slope = loss_of(loss, scale, length)
+    assert rho >= slope * length**2 * (1.0 - 1e-9)
+    assert 0.0 <= slope <= 1.0
+
+
+# ---- the compressed block -------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Block:
+    """What Ceres gets: the Jacobian's columns in the order camera, station, placement."""
+
+    residuals: Array
+    jacobian: Array
+
+
+def evaluate_block(
+    camera: Camera, poses: tuple[Array, Array], seen: Seen, loss: str = "trivial", scale: float = 1.0, *,
+    free: NDArray[np.int64] | None = None, held: tuple[str, ...] = (), wants_jacobian: bool = True,
+) -> Block | None:  # fmt: skip
+    """The block of a camera at station @ placement; None where the kernel says that there is no answer."""
+    code, vector, powers, unit = optics(camera)
+    free = np.arange(len(vector)) if free is None else free
+    rows = len(free) + 7
+    sizes = {"camera": len(free), "station": 6, "placement": 6}
+    outputs = {name: np.full(0 if name in held else rows * size, 7.0) for name, size in sizes.items()}
+    residuals = np.full(rows, 7.0)
+    good = kernels.evaluate_block(
+        code, vector, free, powers, unit, seen.points, seen.pixels, 1.0 / seen.sigma_px,
+        seen.tracks, seen.is_arc, seen.track, seen.curve_pixels, 1.0 / seen.curve_sigma_px, seen.start.copy(),
+        kernels.LOSS_CODES[loss], scale,
+        vector[free], *poses, wants_jacobian, residuals, *outputs.values(),
+    )  # fmt: skip
+    shown = [outputs[name].reshape(rows, size) for name, size in sizes.items() if name not in held and size]
+    return Block(residuals, np.hstack([np.empty((rows, 0)), *shown])) if good else None
+
+
+def uncompressed(
+    camera: Camera, poses: tuple[Array, Array], seen: Seen, loss: str, scale: float
+) -> tuple[float, Array, Array]:
+    """Sum of rho, J^T W J and J^T W e of the problem with one row per residual, its Jacobian by differences."""
+    count = len(intrinsics_vector(camera))
+
+    def residuals(change: Array) -> Array:
+        station, placement = poses[0] + change[count : count + 6], poses[1] + change[count + 6 :]
+        changed = with_intrinsics(camera, intrinsics_vector(camera) + change[:count])
+        return residual_vector(changed.at(Pose.exp(station) @ Pose.exp(placement)), seen)
+
+    jacobian = derivative(residuals, np.concatenate([intrinsics_steps(camera), POSE_STEPS, POSE_STEPS]))
+    e = residuals(np.zeros(count + 12))
+    lengths = np.concatenate([np.linalg.norm(e[: 2 * len(seen.points)].reshape(-1, 2), axis=1), np.abs(e[2 * len(seen.points) :])])
+    rho, slope = np.array([loss_of(loss, scale, length) for length in lengths]).T
+    weights = np.concatenate([np.repeat(slope[: len(seen.points)], 2), slope[len(seen.points) :]])
+    return float(rho.sum()), jacobian.T @ (weights[:, None] * jacobian), jacobian.T @ (weights * e)
+
+
+def split(camera: Camera, rotation: Array, *, turned: str) -> tuple[Array, Array]:
+    """The camera's pose as station @ placement where one of them has this rotation vector."""
+    given = Pose.exp([*rotation, 0.3, -0.2, 0.5])
+    if turned == "station":
+        return np.array([*rotation, 0.3, -0.2, 0.5]), (given.inverse @ camera.cam_from_world).log()
+    return (camera.cam_from_world @ given.inverse).log(), np.array([*rotation, 0.3, -0.2, 0.5])
+
+
+AXIS = np.array([2.0, -1.0, 2.0]) / 3.0
+ANGLES = [0.0, 1e-9, 0.99e-4, 1.01e-4, 0.7, 2.5, np.pi - 1e-6, np.pi, 4.0]
+"""Around the switch to the series at 1e-4, around pi where the logarithm turns over, and past it, as steps may go."""
+
+
+def assert_same_problem(block: Block, problem: tuple[float, Array, Array], tolerance: float) -> None:
+    """Cost, gradient, J^T J and the damped Gauss-Newton step of a block are those of the uncompressed problem."""
+    cost, normal, gradient = problem
+    assert block.residuals @ block.residuals == pytest.approx(cost, rel=1e-9)  # 1e-10 measured
+    size = np.sqrt(np.diag(normal))
+    found = block.jacobian.T @ block.jacobian
+    assert np.max(np.abs(found - normal) / np.outer(size, size)) < tolerance
+    found_gradient = block.jacobian.T @ block.residuals
+    assert np.max(np.abs(found_gradient - gradient) / size) < tolerance * np.sqrt(cost)
+    damping = np.diag(1e-3 * size**2)
+    step = np.linalg.solve(normal + damping, gradient)
+    found_step = np.linalg.solve(found + damping, found_gradient)
+    # Damped by 1e-3, the equations are conditioned no worse than 1e4, so the step is known that much less well.
+    assert np.max(np.abs(found_step - step) * size) < 1e4 * tolerance * np.max(np.abs(step) * size)
+
+
+@each_lens
+@each_loss
+def test_block_is_the_uncompressed_problem(lens: str, loss: str) -> None:
+    camera, seen = looked_at(lens)
+    poses = split(camera, 0.7 * AXIS, turned="placement")
+    block = evaluate_block(camera, poses, seen, loss, 1.5)
+    assert block is not None
+    assert_same_problem(block, uncompressed(camera, poses, seen, loss, 1.5), 1e-8)  # 4e-10 measured
+
+
+@pytest.mark.parametrize("turned", ["station", "placement"])
+@pytest.mark.parametrize("angle", ANGLES)
+def test_chain_rule_to_both_pose_vectors(angle: float, turned: str) -> None:
+    camera, seen = looked_at("brown")
+    poses = split(camera, angle * AXIS, turned=turned)
+    block = evaluate_block(camera, poses, seen, "huber", 1.5)
+    assert block is not None
+    assert_same_problem(block, uncompressed(camera, poses, seen, "huber", 1.5), 1e-8)  # 4e-10 measured
+
+
+@each_loss
+def test_cost_alone_is_the_same_cost(loss: str) -> None:
+    camera, seen = looked_at("radial-2-3")
+    poses = split(camera, 0.7 * AXIS, turned="placement")
+    whole, alone = (evaluate_block(camera, poses, seen, loss, 1.5, wants_jacobian=wants) for wants in (True, False))
+    assert whole is not None and alone is not None
+    assert np.all(alone.residuals[1:] == 0.0)
+    assert alone.residuals[0] ** 2 == pytest.approx(whole.residuals @ whole.residuals, rel=1e-12)  # 1e-15 measured
+    assert np.all(alone.jacobian == 7.0)  # it was told not to touch it
+
+
+@pytest.mark.parametrize("held", [("camera",), ("station",), ("placement",), ("camera", "placement"), ("station", "placement")])
+def test_held_blocks_change_nothing_for_the_others(held: tuple[str, ...]) -> None:
+    camera, seen = looked_at("kannala-brandt")
+    poses = split(camera, 0.7 * AXIS, turned="placement")
+    whole, part = evaluate_block(camera, poses, seen), evaluate_block(camera, poses, seen, held=held)
+    assert whole is not None and part is not None
+    count = len(intrinsics_vector(camera))
+    columns = np.repeat(["camera", "station", "placement"], [count, 6, 6])
+    assert np.array_equal(part.jacobian, whole.jacobian[:, ~np.isin(columns, held)])
+    assert np.array_equal(part.residuals, whole.residuals)
+
+
+@pytest.mark.parametrize("free", [[], [0], [0, 4, 5], [1, 2, 3, 8]])
+def test_fixed_intrinsics_have_no_column(free: list[int]) -> None:
+    camera, seen = looked_at("brown")
+    poses = split(camera, 0.7 * AXIS, turned="placement")
+    chosen = np.array(free, dtype=np.int64)
+    block, whole = evaluate_block(camera, poses, seen, free=chosen), evaluate_block(camera, poses, seen)
+    assert block is not None and whole is not None
+    kept = np.concatenate([chosen, np.arange(9, 21)])
+    normal, everything = block.jacobian.T @ block.jacobian, whole.jacobian.T @ whole.jacobian
+    size = np.sqrt(np.diag(normal))
+    assert np.max(np.abs(normal - everything[np.ix_(kept, kept)]) / np.outer(size, size)) < 1e-12  # 2e-15 measured
+    assert block.residuals @ block.residuals == pytest.approx(whole.residuals @ whole.residuals, rel=1e-12)
+
+
+@each_lens
+@pytest.mark.parametrize("what", ["one point", "one place on a line", "a point on the axis", "nothing wrong at all"])
+def test_blocks_of_less_than_full_rank(lens: str, what: str) -> None:
+    """Zero pivots: fewer residuals than numbers, columns that are zero, and a residual that is zero."""
+    camera, seen = looked_at(lens)
+    if what == "one place on a line":
+        seen = seen.take(curves=slice(4, 5))
+    elif what == "nothing wrong at all":
+        seen = replace(seen.take(points=slice(None)), pixels=camera.project(seen.points))
+    else:
+        seen = seen.take(points=slice(0, 1))
+    if what == "a point on the axis":
+        seen = replace(seen, points=camera.cam_from_world.inverse.transform([[0.0, 0.0, 2.0]]))
+    poses = split(camera, 0.7 * AXIS, turned="placement")
+    block = evaluate_block(camera, poses, seen)
+    assert block is not None
+    assert np.all(np.isfinite(block.jacobian))
+    cost, normal, gradient = uncompressed(camera, poses, seen, "trivial", 1.0)
+    size = np.maximum(np.sqrt(np.diag(normal)), 1e-3)
+    assert block.residuals @ block.residuals == pytest.approx(cost, rel=1e-9, abs=1e-18)
+    assert np.max(np.abs(block.jacobian.T @ block.jacobian - normal) / np.outer(size, size)) < 1e-7  # 7e-9 measured
+    found = block.jacobian.T @ block.residuals
+    assert np.max(np.abs(found - gradient) / size) < 1e-7 * np.sqrt(cost) + 1e-10  # 7e-9 measured
+
+
+# ---- where there is no answer ---------------------------------------------------------------------------------------
+
+FOLDING = {
+    "radial": Radial((0.0, -6e-7), (2, 3)),  # r' = r - 6e-7 r^3 turns at r = 745 px, r' = 497 px
+    "brown": Brown((-0.3, 0.0, 0.0, 0.0, 0.0)),  # at an ideal radius of 1.054
+    "kannala-brandt": KannalaBrandt((-0.2, 0.0, 0.0, 0.0)),  # at 1.29 rad
+}
+
+
+def before(lens: str) -> Camera:
+    return Camera((1280, 960), 500.0, (640.0, 480.0), FOLDING[lens])
+
+
+def rays(*angles_rad: float) -> Array:
+    return np.array([[2.0 * np.sin(a), 0.0, 2.0 * np.cos(a)] for a in angles_rad])
+
+
+@pytest.mark.parametrize("lens", FOLDING)
+@pytest.mark.parametrize("hidden", ["behind", "beyond"])
+def test_what_cannot_be_projected_has_no_residual(lens: str, hidden: str) -> None:
+    limit = {"radial": np.arctan(497.0 / 500.0), "brown": np.arctan(1.054), "kannala-brandt": 1.2910}[lens]
+    bad = np.pi - 0.3 if hidden == "behind" else limit + 0.02
+    camera, (_, whole) = before(lens), looked_at("brown")
+    points = rays(0.1, limit - 0.02, bad, 0.3)
+    seen = replace(whole.take(points=slice(0, 4)), points=points, pixels=np.zeros((4, 2)), sigma_px=np.ones(4))
+    found = point_residuals(camera, seen)
+    assert np.all(np.isnan(found[2]))
+    assert np.all(np.isfinite(found[[0, 1, 3]]))  # each on its own
+    assert np.array_equal(np.isnan(camera.project(points)[:, 0]), np.isnan(found[:, 0]))
+    assert np.isnan(normal_equations(camera, seen)[0])
+    poses = np.zeros(6), np.zeros(6)
+    for wants in (True, False):
+        assert evaluate_block(camera, poses, seen, wants_jacobian=wants) is None
+        assert evaluate_block(camera, poses, seen.take(points=[0, 1, 3]), wants_jacobian=wants) is not None
+
+
+@pytest.mark.parametrize("lens", FOLDING)
+def test_a_curve_that_cannot_be_projected_has_no_residual(lens: str) -> None:
+    """A line that is wholly behind the camera or, for a fisheye, past its limit."""
+    camera, (_, whole) = before(lens), looked_at("brown")
+    away = camera.at(Pose.exp([0.0, np.pi, 0.0, 0.0, 0.0, -2.0]))  # looks away from the target
+    seen = whole.take(curves=slice(0, 3))
+    assert np.all(np.isnan(curve_residuals(away, seen)[0]))
+    assert np.isnan(normal_equations(away, seen)[0])
+
+
+def test_a_fisheye_sees_behind_itself() -> None:
+    """130 degrees from the axis, as far as its polynomial grows."""
+    camera = Camera((1280, 960), 200.0, (640.0, 480.0), KannalaBrandt((0.01, 0.0, 0.0, 0.0)))
+    points = rays(np.deg2rad(130.0), -np.deg2rad(100.0))
+    seen = replace(looked_at("brown")[1].take(points=slice(0, 2)), points=points, pixels=np.zeros((2, 2)))
+    assert np.max(np.abs(point_residuals(camera, seen) - camera.project(points))) < 1e-10
