@@ -1,6 +1,5 @@
 """Boards in images: how many, how well, under which names, and what is said where there are none."""
 
-import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from ceres_cal.camera import Camera
-from ceres_cal.detect.boards import BoardDetections, CharucoSpec, detect_boards, read_grey
+from ceres_cal.detect.boards import BoardDetections, CharucoSpec, detect_boards, read_grey, right_handed
 from ceres_cal.detect.saddles import measure_saddles
 from ceres_cal.errors import InputError
 from ceres_cal.lens import Radial
@@ -62,13 +61,13 @@ def ideal_picture(camera: Camera, square_m: float, paint: Paint) -> Array:
     picture = spread[0]
     mixed = np.ptp(spread, axis=0) > 0.0
     picture[mixed] = seen((middle[mixed, None] + lattice).reshape(-1, 2)).reshape(-1, 64).mean(axis=1)
-    return picture.reshape(height, width)
+    return np.asarray(picture.reshape(height, width))
 
 
 def photograph(picture: Array, blur_px: float = 0.7, noise: float = 2.0, seed: int = 1) -> Image:
     """Grey levels 40 to 200 of a picture, blurred, with noise (grey levels)."""
-    levels = cv2.GaussianBlur(40.0 + 160.0 * picture, (0, 0), blur_px)
-    levels += noise * np.random.default_rng(seed).standard_normal(levels.shape)
+    blurred = cv2.GaussianBlur(40.0 + 160.0 * picture, (0, 0), blur_px)
+    levels = blurred + noise * np.random.default_rng(seed).standard_normal(picture.shape)
     return np.clip(np.rint(levels), 0, 255).astype(np.uint8)
 
 
@@ -106,21 +105,21 @@ def test_corners_are_good_to_a_hundredth_of_a_pixel(tmp_path: Path, picture: Arr
     points = detect_boards([path], BOARD).observations.points
     assert np.array_equal(points.feature, np.arange(42))
     error = points.pixels - truth
-    assert np.all(np.abs(error.mean(axis=0)) < 0.004)  # (0.0003, 0.0012)
-    assert np.all(error.std(axis=0) < 0.010)  # (0.0056, 0.0061)
+    assert np.all(np.abs(error.mean(axis=0)) < 0.003)  # (0.0000, 0.0007)
+    assert np.all(error.std(axis=0) < 0.008)  # (0.0054, 0.0043)
     start = truth.astype(np.float32).reshape(-1, 1, 2)  # at the truth: cornerSubPix has no way to go wrong but its own
     peer = cv2.cornerSubPix(read_grey(path), start, (7, 7), (-1, -1), (3, 100, 1e-4)).reshape(-1, 2)
-    assert rms(error) < 0.5 * rms(peer - truth)  # 0.0059 against 0.0172
+    assert rms(error) < 0.5 * rms(peer - truth)  # 0.0049 against 0.0265
 
 
 @pytest.mark.parametrize(
     "change, limit",
     [
-        ("blur", 0.03),
-        ("noise", 0.04),
-        ("sharpened", 0.02),
-        ("uneven light", 0.02),
-        ("gamma", 0.02),
+        ("blur", 0.015),  # 0.009
+        ("noise", 0.03),  # 0.017
+        ("sharpened", 0.01),  # 0.0045
+        ("uneven light", 0.01),  # 0.005
+        ("gamma", 0.012),  # 0.007
     ],
 )
 def test_corners_stay_good_whatever_the_camera_does(change: str, limit: float, picture: Array, truth: Array) -> None:
@@ -152,13 +151,13 @@ def test_corners_stay_good_whatever_the_camera_does(change: str, limit: float, p
 def test_any_turn_and_place(turn: float, shift: tuple[float, float], tilt: tuple[float, float]) -> None:
     facing = Pose.exp((*tilt, 0.0, 0.0, 0.0, 4.6)) @ Pose.exp((0.0, 0.0, turn, 0.0, 0.0, 0.0))
     pose = facing @ Pose.exp((0.0, 0.0, 0.0, -1.0, -1.0, 0.0))  # the middle of 3 x 3 corners before the camera
-    camera = Camera((80, 80), 70.0, (39.5 + shift[0], 39.5 + shift[1]), Radial((0.0,), (3,)), cam_from_world=pose)
+    camera = Camera((120, 120), 105.0, (59.5 + shift[0], 59.5 + shift[1]), Radial((0.0,), (3,)), cam_from_world=pose)
     truth = camera.project(checkerboard(3, 3, 1.0).point_array).reshape(3, 3, 2)
     image = photograph(ideal_picture(camera, 1.0, squares(3, 3)), noise=0.0)
     saddles = measure_saddles(image, truth + 0.6)
     error = error_px(saddles.grid, truth)
     assert len(error) == 9
-    assert np.max(np.abs(error)) < 0.06
+    assert np.max(np.abs(error)) < 0.08  # 0.045 at worst in 600 examples
     assert np.all(saddles.contrast[::2, ::2] > 0.0) and np.all(saddles.contrast[1, ::2] < 0.0)
 
 
@@ -166,16 +165,24 @@ def test_what_is_no_corner_is_left_out(picture: Array, truth: Array) -> None:
     image = photograph(picture)
     start = truth.reshape(6, 7, 2).copy()
     column, row = np.rint(start[2, 3]).astype(int)
-    image[row - 12 : row + 13, column - 12 : column + 13] = 120  # a sticker on "3,2"
+    image[row - 14 : row + 15, column - 14 : column + 15] = 120  # a sticker on "3,2"
     start[0, :] = np.nan
     start[5, 1:] = np.nan
     start[5, 0] += (14.0, 2.0)  # not a corner at all: half a square off
     grid = measure_saddles(image, start).grid
     lost = {(int(c), int(r)) for r, c in np.argwhere(np.isnan(grid[..., 0])) if r not in (0, 5)}
-    assert lost <= {(3, 2)}
+    assert lost == {(3, 2)}
     assert np.all(np.isnan(grid[0])) and np.all(np.isnan(grid[5]))
     kept = np.delete(grid[1:5].reshape(-1, 2) - truth.reshape(6, 7, 2)[1:5].reshape(-1, 2), 1 * 7 + 3, axis=0)
-    assert rms(kept) < 0.02
+    assert rms(kept) < 0.02  # 0.010: the sticker reaches into the discs of its neighbours
+
+
+def test_nothing_is_measured_where_nothing_is_seen(truth: Array) -> None:
+    grid = truth.reshape(6, 7, 2)
+    blank = np.full((360, 480), 90, np.uint8)
+    assert np.all(np.isnan(measure_saddles(blank, grid).contrast))
+    assert np.all(np.isnan(measure_saddles(blank, np.full((6, 7, 2), np.nan)).grid))
+    assert np.all(np.isnan(measure_saddles(blank, grid + 500.0).grid))  # outside the image
 
 
 # ---- real photographs -----------------------------------------------------------------------------------------------
@@ -199,9 +206,9 @@ def test_sony_photographs(real_data: Path) -> None:
     assert len(detections.found) == 13 and not detections.missed
     assert len(detections.observations.points) == 13 * 24
     rms_px, matrix, sigma = calibrated(detections, cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K3)
-    assert rms_px < 0.145  # 0.1379; cornerSubPix (5 x 5) 0.1624, findChessboardCornersSB 0.1535
+    assert rms_px < 0.145  # 0.1383; cornerSubPix (5 x 5) 0.1624, findChessboardCornersSB 0.1535
     # 702.6 with a standard deviation of 1.2. BoofCV's own 701.0 and cornerSubPix' 700.9 agree within it; cornerSubPix
-    # is 0.5 to 1.0 px short in renderings of these very views.
+    # is 0.4 to 1.0 px short in renderings of these very views, this detector 0.04 px.
     assert abs(matrix[0, 0] - 701.0) < 2.0 * sigma[0]
     assert abs(matrix[1, 1] - 698.65) < 2.0 * sigma[1]
     assert sigma[0] < 1.4
@@ -216,8 +223,8 @@ def test_gopro_photographs(real_data: Path) -> None:
     assert seen == [(i, 36, path.name) for i, path in enumerate(images, start=1)]
     assert len(detections.observations.points) == 35 * 48
     rms_px, matrix, _ = calibrated(detections, cv2.CALIB_ZERO_TANGENT_DIST)
-    assert rms_px < 0.5225  # 0.5205; cornerSubPix 0.5235
-    assert abs(matrix[0, 0] - 560.07) < 0.5  # 560.11; 560.07 with cornerSubPix
+    assert rms_px < 0.5225  # 0.5208; cornerSubPix 0.5235
+    assert abs(matrix[0, 0] - 560.07) < 0.5  # 560.09; 560.07 with cornerSubPix
 
 
 # ---- names ----------------------------------------------------------------------------------------------------------
@@ -241,15 +248,16 @@ def test_labelling_is_never_mirrored_and_stays_on_the_board(
     origin = truth[0]
     for _ in range(quarter_turns):
         origin, width, height = np.array([origin[1], width - 1 - origin[0]]), height, width
-    assert np.linalg.norm(grid[0, 0] - origin) < 0.1  # 0.01; the other end is 190 px away
+    assert np.linalg.norm(grid[0, 0] - origin) < 0.1  # 0.003; the other end is 230 px away
 
 
-def test_board_seen_through_a_mirror_is_named_right_handed(tmp_path: Path, picture: Array) -> None:
-    path = write(tmp_path / "a.png", photograph(picture)[:, ::-1])
-    observations = detect_boards([path], BOARD).observations
-    where = dict(zip(corner_names(observations), observations.points.pixels, strict=True))
-    along_row, along_column = where["6,0"] - where["0,0"], where["0,5"] - where["0,0"]
-    assert along_row[0] * along_column[1] - along_row[1] * along_column[0] > 0.0
+def test_a_mirrored_grid_is_turned_over(truth: Array) -> None:
+    grid = truth.reshape(6, 7, 2)
+    assert np.array_equal(right_handed(grid), grid)
+    assert np.array_equal(right_handed(grid[::-1, ::-1]), grid[::-1, ::-1])  # turned is not mirrored
+    assert np.array_equal(right_handed(grid[:, ::-1]), grid)
+    assert np.array_equal(right_handed(grid[::-1]), grid[::-1, ::-1])
+    assert np.array_equal(right_handed(grid.transpose(1, 0, 2)), grid.transpose(1, 0, 2)[:, ::-1])
 
 
 def test_views_stations_and_placements(tmp_path: Path, picture: Array) -> None:
@@ -286,7 +294,7 @@ def test_depth_and_colour_change_nothing(tmp_path: Path, picture: Array) -> None
     paths = [write(tmp_path / f"{name}.png", image) for name, image in images.items()]
     assert read_grey(paths[3]).dtype == np.uint16
     pixels = detect_boards(paths, BOARD).observations.points.pixels.reshape(4, 42, 2)
-    assert np.max(np.abs(pixels - pixels[0])) < 0.001  # 0.0001
+    assert np.max(np.abs(pixels - pixels[0])) < 0.001  # 0.00005
 
 
 def test_a_noted_rotation_is_ignored(tmp_path: Path, picture: Array) -> None:
@@ -296,8 +304,26 @@ def test_a_noted_rotation_is_ignored(tmp_path: Path, picture: Array) -> None:
     entry = b"\x01\x12\x00\x03\x00\x00\x00\x01\x00\x06\x00\x00"  # Orientation = 6: turn by a quarter to look at it
     exif = b"Exif\x00\x00MM\x00\x2a\x00\x00\x00\x08\x00\x01" + entry + b"\x00\x00\x00\x00"
     path.write_bytes(content[:2] + b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif + content[2:])
-    assert cv2.imread(str(path)).shape[:2] == (480, 360)  # what a viewer shows
+    viewed = cv2.imread(str(path))
+    assert viewed is not None and viewed.shape[:2] == (480, 360)  # what a viewer shows
     assert np.array_equal(read_grey(path), plain)
+
+
+@pytest.mark.parametrize(
+    "width, limit",
+    [(2400, 0.4), (72, 0.2)],  # 0.27 and 0.14 px at worst; the small one is found at twice its size only
+)
+def test_any_size_of_image(width: int, limit: float, picture: Array, truth: Array, tmp_path: Path) -> None:
+    how = cv2.INTER_AREA if width < 480 else cv2.INTER_CUBIC
+    path = write(tmp_path / "a.png", cv2.resize(photograph(picture), (width, width * 3 // 4), interpolation=how))
+    points = detect_boards([path], BOARD).observations.points
+    assert np.max(np.abs(points.pixels - ((truth + 0.5) * width / 480 - 0.5))) < limit
+
+
+def test_dark_images(tmp_path: Path, picture: Array, truth: Array) -> None:
+    """Eleven grey levels in all: OpenCV's newer detector is blind there, the older one is not."""
+    path = write(tmp_path / "a.png", photograph(picture) // 16)
+    assert rms(detect_boards([path], BOARD).observations.points.pixels - truth) < 0.05  # 0.015
 
 
 # ---- ChArUco --------------------------------------------------------------------------------------------------------
@@ -320,7 +346,7 @@ def charuco() -> tuple[Image, Array]:
     )
     finer = np.array([[8.0, 0.0, 3.5], [0.0, 8.0, 3.5], [0.0, 0.0, 1.0]])  # 8 x 8 places in each pixel
     fine = cv2.warpPerspective(drawing, finer @ from_drawing, (8 * 640, 8 * 480), borderValue=255)
-    image = photograph(cv2.resize(fine, (640, 480), interpolation=cv2.INTER_AREA) / 255.0)
+    image = photograph(np.asarray(cv2.resize(fine, (640, 480), interpolation=cv2.INTER_AREA), float) / 255.0)
     return image, cv2.perspectiveTransform(corners[None], from_drawing)[0]
 
 
@@ -328,7 +354,7 @@ def test_charuco_corners(tmp_path: Path, charuco: tuple[Image, Array]) -> None:
     image, truth = charuco
     points = detect_boards([write(tmp_path / "a.png", image)], CHARUCO_BOARD, charuco=CHARUCO).observations.points
     assert np.array_equal(points.feature, np.arange(35))
-    assert rms(points.pixels - truth) < 0.025  # 0.011; OpenCV's own corners 0.05
+    assert rms(points.pixels - truth) < 0.02  # 0.009; OpenCV's own corners 0.05
 
 
 def test_charuco_may_be_partly_seen(tmp_path: Path, charuco: tuple[Image, Array]) -> None:
@@ -339,21 +365,26 @@ def test_charuco_may_be_partly_seen(tmp_path: Path, charuco: tuple[Image, Array]
     points = observations.points
     assert 10 <= len(points) < 25  # 15
     assert {"0,0", "0,4"} <= set(corner_names(observations)) and "6,0" not in corner_names(observations)
-    assert rms(points.pixels - truth[points.feature]) < 0.025
+    assert rms(points.pixels - truth[points.feature]) < 0.02  # 0.011
 
 
 @pytest.mark.parametrize(
-    "right, reason", [(190, "lie on one line|only \\d corners, 6 are needed"), (0, "no ChArUco corners found")]
+    "right, below, reason",
+    [
+        (230, 480, "only 5 corners, 6 are needed"),  # one column
+        (640, 220, "its 7 corners lie in one row or column (but for one at most)"),
+        (0, 480, "no ChArUco corners found"),
+    ],
 )
-def test_charuco_too_little_seen(right: int, reason: str, tmp_path: Path, charuco: tuple[Image, Array]) -> None:
+def test_charuco_too_little_seen(
+    right: int, below: int, reason: str, tmp_path: Path, charuco: tuple[Image, Array]
+) -> None:
     whole = write(tmp_path / "a.png", charuco[0])
-    part = charuco[0].copy()
-    part[:, right:] = 128
+    part = np.full_like(charuco[0], 128)
+    part[:below, :right] = charuco[0][:below, :right]
     detections = detect_boards([write(tmp_path / "b.png", part), whole], CHARUCO_BOARD, charuco=CHARUCO)
     assert detections.found == (str(whole),)
-    ((path, why),) = detections.missed
-    assert path.endswith("b.png")
-    assert re.search(reason, why)
+    assert detections.missed == ((str(tmp_path / "b.png"), reason),)
 
 
 # ---- what is said ---------------------------------------------------------------------------------------------------

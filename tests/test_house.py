@@ -17,7 +17,6 @@ MAX_LINES = 450
 FLOORS = {
     "errors": 0,
     "files": 0,
-    "closed_forms": 0,
     "transforms": 0,
     "lens": 0,
     "targets": 0,
@@ -25,6 +24,7 @@ FLOORS = {
     "observations": 1,
     "sights": 1,
     "kernels": 1,
+    "closed_forms": 2,
     "planes": 2,
     "initialise": 2,
     "parameters": 2,

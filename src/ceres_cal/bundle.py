@@ -40,12 +40,19 @@ _DENSE_LIMIT = 600  # numbers that stay after the Schur complement; above it a s
 
 @dataclass(frozen=True)
 class Weighting:
-    """How residuals become costs: the noise scale of points and of curves (times the stated sigmas), and the loss."""
+    """How residuals become costs, and how far down the cost is followed.
+
+    Attributes:
+        point_scale, curve_scale: noise scales, factors on the stated sigmas.
+        loss, loss_scale: robust loss of each observation, its scale in standard deviations.
+        precision: relative change of the cost at which the solve ends.
+    """
 
     point_scale: float = 1.0
     curve_scale: float = 1.0
     loss: str = "huber"
     loss_scale: float = 3.0
+    precision: float = 1e-12
 
 
 @dataclass(frozen=True)
@@ -115,7 +122,6 @@ class _Run:
 
 
 _NOTHING = np.empty(0)
-_ELIMINATION_TOLERANCE = 1e-4
 _ROWS_WORTH_A_THREAD = 20_000
 
 
@@ -208,6 +214,7 @@ class _EliminatedCost(pyceres.CostFunction):
             np.concatenate([_NOTHING, *places]),
         )
         self._loss = (kernels.LOSS_CODES[weighting.loss], weighting.loss_scale)
+        self._precision = weighting.precision
         self._poses = estimate.pose_stack(sights.keys)
         self._gains = np.zeros((len(sights), 6, len(self._free)))
         self._at = self._optics[1][self._free]
@@ -222,7 +229,7 @@ class _EliminatedCost(pyceres.CostFunction):
         try:
             # Ceres asks for the cost of a step first, then for the Jacobian in the same place: once is enough.
             if self._known is None or not np.array_equal(self._known[0], parameters[0]):
-                self._known = self._evaluated(parameters[0].copy(), _ELIMINATION_TOLERANCE)
+                self._known = self._evaluated(parameters[0].copy(), max(1e-4, 10.0 * self._precision))
         except BaseException as error:  # an exception must not travel through C++: the solve ends, then it is raised
             self._run.failure = self._run.failure or error
             return False
@@ -270,7 +277,7 @@ class _EliminatedCost(pyceres.CostFunction):
 
     def settled(self, at: Array) -> tuple[tuple[SightKey, ...], Array]:
         """The sights' keys and their cam_from_target, (S, 3, 4), at their best for these intrinsics."""
-        self._evaluated(at.copy(), 0.0)
+        self._evaluated(at.copy(), self._precision)
         return self._sights.keys, self._poses
 
 
@@ -369,7 +376,7 @@ def solve(
     for prior_cost, array in prior_costs:
         problem.add_residual_block(prior_cost, None, [array])
     summary = pyceres.SolverSummary()
-    pyceres.solve(_solver_options(layout, blocks, options, _Watcher(run, progress)), problem, summary)
+    pyceres.solve(_solver_options(layout, blocks, options, weighting, _Watcher(run, progress)), problem, summary)
     if run.failure is not None:
         raise run.failure
     solved = blocks.unpack(estimate, layout)
@@ -411,14 +418,14 @@ def _require_enough(sights: Sights, layout: Layout) -> None:
         )
 
 
-def _solver_options(layout: Layout, blocks: _Blocks, options: Options, watcher: _Watcher) -> Any:
+def _solver_options(layout: Layout, blocks: _Blocks, options: Options, weighting: Weighting, watcher: _Watcher) -> Any:
     solver = pyceres.SolverOptions()
     kept = sum(len(free) for free in layout.free.values())
     kept += 6 * len(layout.stations) if blocks.placements else 0
     few = kept < _DENSE_LIMIT
     solver.linear_solver_type = pyceres.LinearSolverType.DENSE_SCHUR if few else pyceres.LinearSolverType.SPARSE_SCHUR
     solver.max_num_iterations = options.max_iterations
-    solver.function_tolerance = 1e-12
+    solver.function_tolerance = weighting.precision
     solver.parameter_tolerance = 1e-12
     solver.gradient_tolerance = 1e-14
     solver.num_threads = 1  # the kernels are shorter than the wait for Python's lock

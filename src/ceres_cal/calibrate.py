@@ -83,14 +83,15 @@ def _settle(
             observations, found, layout.size, options.reject_sigma, estimate_noise=options.noise_scale == "estimate"
         )
 
-    def solved(at: Estimate, by: Inliers, loss: str, loss_scale: float) -> Solution:
-        weighting = Weighting(by.point_scale, by.curve_scale, loss, loss_scale)
+    def solved(at: Estimate, by: Inliers, loss: str, loss_scale: float, precision: float) -> Solution:
+        weighting = Weighting(by.point_scale, by.curve_scale, loss, loss_scale, precision)
         return solve(sights.used(by.points, by.curves), at, layout, weighting, options, progress)
 
-    solution = solved(estimate, start_weights(observations, residuals(observations, sights, estimate)), "cauchy", 1.0)
+    everything = start_weights(observations, residuals(observations, sights, estimate))
+    solution = solved(estimate, everything, "cauchy", 1.0, 1e-3)
     found, inliers = judged(solution.estimate)
     for rounds in range(2, _MOST_ROUNDS + 1):
-        solution = solved(solution.estimate, inliers, options.loss, options.loss_scale)
+        solution = solved(solution.estimate, inliers, options.loss, options.loss_scale, 1e-12)
         before = inliers
         found, inliers = judged(solution.estimate)
         if inliers.same_as(before):

@@ -105,7 +105,8 @@ class Camera:
 
         A pixel may lie outside the image: nothing is cut off.
         """
-        rays = self.cam_from_world.transform(_rows(points_world, 3, "points_world"))
+        with np.errstate(invalid="ignore"):  # infinite points
+            rays = self.cam_from_world.transform(_rows(points_world, 3, "points_world"))
         return np.asarray(self.lens.distort(rays, self.phi) * (1.0, self.aspect) + self.principal_point)
 
     def rays(self, pixels: ArrayLike) -> Array:

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ceres_cal.errors import DegenerateError
+from ceres_cal.kernels import grouped_products
 from ceres_cal.transforms import Array, Pose, nearest_rotation
 
 Ints = NDArray[np.int64]
@@ -109,15 +110,28 @@ def max_norm_pose(homography: Array) -> Pose:
     return Pose(nearest_rotation(rotation), h3 / scale)
 
 
-def polar_pose(homography: Array) -> Pose:
-    """The pose that minimises the paper's E = |h1 / lambda - r1|^2 + |h2 / lambda - r2|^2 (section 3.6).
+def polar_poses(homographies: Array) -> Array:
+    """[R t] (S, 3, 4) minimising the paper's E = |h1 / lambda - r1|^2 + |h2 / lambda - r2|^2 (section 3.6) for each H.
 
-    With [h1 h2] = U S V^T: [r1 r2] = U V^T and 1 / lambda = tr(S) / tr(S^2).
+    With [h1 h2] = U S V^T: [r1 r2] = U V^T and 1 / lambda = tr(S) / tr(S^2). U V^T is B (B^T B)^-1/2, and the root of a
+    2 x 2 matrix M is (M + d) / (tr M + 2 d)^1/2 with d = (det M)^1/2.
     """
-    u, s, vt = np.linalg.svd(homography[:, :2], full_matrices=False)
-    r = u @ vt
-    rotation = np.column_stack([r, np.cross(r[:, 0], r[:, 1])])
-    return Pose(rotation, homography[:, 2] * s.sum() / np.sum(s * s))
+    b = homographies[:, :, :2]
+    m = np.swapaxes(b, 1, 2) @ b
+    trace = m[:, 0, 0] + m[:, 1, 1]
+    d = np.sqrt(np.maximum(m[:, 0, 0] * m[:, 1, 1] - m[:, 0, 1] ** 2, 0.0))
+    sum_s = np.sqrt(trace + 2.0 * d)
+    root = (m + d[:, None, None] * np.eye(2)) / sum_s[:, None, None]
+    r = b @ np.linalg.inv(root)
+    third = np.cross(r[:, :, 0], r[:, :, 1])
+    translation = homographies[:, :, 2] * (sum_s / trace)[:, None]
+    return np.concatenate([r, third[:, :, None], translation[:, :, None]], axis=2)
+
+
+def polar_pose(homography: Array) -> Pose:
+    """The pose of one homography in normalised coordinates: see `polar_poses`."""
+    (matrix,) = polar_poses(homography[None])
+    return Pose(matrix[:, :3], matrix[:, 3])
 
 
 def fit_rings(measured_radius: ArrayLike, ring_radius: ArrayLike, powers: Sequence[int] = (1, 2, 3)) -> Array:
@@ -144,89 +158,111 @@ def ring_profile(measured_radius: Array, ring_radius: Array, unit_px: float) -> 
 
 @dataclass(frozen=True, eq=False)
 class PlaneData:
-    """Flat observations of several sights of one camera, sorted by sight: pairs of a plane point and an offset.
+    """Points of several sights of one camera, one sight after the other.
 
     Attributes:
-        sight: (N,) number of the sight, not decreasing. plane: (N, 2) m. offsets: (N, 2) px.
+        bounds: (S + 1,) where each sight begins. plane: (N, 2) m. offsets: (N, 2) px.
     """
 
-    sight: Ints
+    bounds: Ints
     plane: Array
     offsets: Array
 
+    @property
+    def sight(self) -> Ints:
+        """(N,) number of each point's sight."""
+        return np.repeat(np.arange(len(self.bounds) - 1), np.diff(self.bounds))
 
-def radial_alignment(data: PlaneData, count: int, unit_px: float, terms: int, rounds: int = 8) -> tuple[Profile, Array]:
-    """Profile and homographies (count, 3, 3) of sights of points, whatever the radial distortion (design, section 7).
+
+@dataclass(frozen=True, eq=False)
+class RadialAlignment:
+    """What `radial_alignment` found: the profile, H (S, 3, 3) of every sight, and each point's error.
+
+    Attributes:
+        error_px: (N,). relative_error: (N,) the same in units of what is usual at that distance from the centre.
+    """
+
+    profile: Profile
+    homographies: Array
+    error_px: Array
+    relative_error: Array
+
+
+def radial_alignment(data: PlaneData, unit_px: float, terms: int, rounds: int) -> RadialAlignment:
+    """Profile and homographies of sights of points, whatever the radial distortion (design, section 7).
 
     p_x (h2 . X) - p_y (h1 . X) = 0 holds for any radial lens: it gives h1 and h2 of each sight. Along p, then,
     r (h3 . X) - q sum c_k r^2k = q with q = (h1 . X, h2 . X) . p / r is linear in h3 of each sight and in the shared c.
-    Iterated reweighting keeps wrong labels from deciding. Fewer than six points in a sight leave its answer to chance.
+    Rounds of reweighting keep wrong labels from deciding. Fewer than six points in a sight leave its answer to chance.
     """
-    starts = np.searchsorted(data.sight, np.arange(count)).astype(np.int64)
-    x, restore = _normalised_by_sight(data, starts, count)
+    sight = data.sight
+    x, restore = _normalised_by_sight(data, sight)
     p = data.offsets / unit_px
     radius = np.linalg.norm(p, axis=1)
     weights = np.ones(len(p))
     for _ in range(rounds):
-        h12 = _alignment(x, p, weights, starts)[data.sight]
-        sent = np.einsum("nij,nj->ni", h12, x)
+        h12 = _alignment(x, p, weights, data.bounds)
+        sent = np.matmul(h12[sight], x[:, :, None])[:, :, 0]
         across = p[:, 0] * sent[:, 1] - p[:, 1] * sent[:, 0]
         q = np.sum(sent * p, axis=1) / np.maximum(radius, 1e-9)
-        c, h3 = _depth_and_profile(x, radius, q, weights, starts, data.sight, terms)
-        depth = np.sum(h3[data.sight] * x, axis=1)
+        c, h3 = _depth_and_profile(x, radius, q, weights, data.bounds, terms)
+        depth = np.sum(h3[sight] * x, axis=1)
         w = 1.0 + (radius[:, None] ** (2 * np.arange(1, terms + 1))) @ c
         along = radius - q * w / np.where(np.abs(depth) > 1e-9, depth, 1e-9)
         error = np.hypot(across / np.maximum(np.linalg.norm(sent, axis=1), 1e-9) * radius, along)
-        scale = max(1.5 * float(np.median(error)), 1e-12)
-        weights = 1.0 / (1.0 + (error / scale) ** 2)
-    h12_all = _alignment(x, p, weights, starts)
-    homographies = np.concatenate([h12_all * unit_px, h3[:, None, :]], axis=1) @ restore
-    return Profile(tuple(c), unit_px), homographies
+        usual = usual_by_radius(error, radius)
+        weights = 1.0 / (1.0 + (error / (1.5 * usual)) ** 2)
+    homographies = np.concatenate([h12 * unit_px, h3[:, None, :]], axis=1) @ restore
+    return RadialAlignment(Profile(tuple(float(v) for v in c), unit_px), homographies, error * unit_px, error / usual)
 
 
-def _normalised_by_sight(data: PlaneData, starts: Ints, count: int) -> tuple[Array, Array]:
-    """Homogeneous plane points with each sight's centroid at 0 and unit spread, and the (count, 3, 3) that did it."""
-    number = np.diff([*starts, len(data.sight)])[:, None]
+def usual_by_radius(error: Array, radius: Array, rings: int = 16) -> Array:
+    """(N,) the median error at each point's distance from the centre: a profile fits worse where the lens bends most."""
+    ring = np.minimum((radius * (rings / (np.max(radius) + 1e-300))).astype(int), rings - 1)
+    medians = np.full(rings, 1e-12)
+    for number in range(rings):
+        inside = error[ring == number]
+        if len(inside):
+            medians[number] = max(float(np.median(inside)), 1e-12)
+    return medians[ring]
+
+
+def _normalised_by_sight(data: PlaneData, sight: Ints) -> tuple[Array, Array]:
+    """Homogeneous plane points with each sight's centroid at 0 and unit spread, and the (S, 3, 3) that did it."""
+    starts, number = data.bounds[:-1], np.diff(data.bounds)[:, None]
     centre = np.add.reduceat(data.plane, starts) / number
-    away = data.plane - centre[data.sight]
+    away = data.plane - centre[sight]
     spread = np.sqrt(np.add.reduceat(np.sum(away**2, axis=1), starts) / number[:, 0]) + 1e-12
-    x = np.column_stack([away / spread[data.sight][:, None], np.ones(len(away))])
-    restore = np.zeros((count, 3, 3))
+    x = np.column_stack([away / spread[sight][:, None], np.ones(len(away))])
+    restore = np.zeros((len(starts), 3, 3))
     restore[:, 0, 0] = restore[:, 1, 1] = 1.0 / spread
     restore[:, :2, 2] = -centre / spread[:, None]
     restore[:, 2, 2] = 1.0
     return x, restore
 
 
-def _alignment(x: Array, p: Array, weights: Array, starts: Ints) -> Array:
-    """(count, 2, 3): h1 and h2 of each sight, scaled so that |(h1 . X, h2 . X)| is |p| on average."""
-    rows = np.hstack([-p[:, 1:] * x, p[:, :1] * x]) * np.sqrt(weights)[:, None]
-    moments = np.add.reduceat(rows[:, :, None] * rows[:, None, :], starts)
-    h = np.linalg.eigh(moments)[1][:, :, 0].reshape(-1, 2, 3)
-    number = np.diff([*starts, len(x)])
-    sent = np.einsum("nij,nj->ni", np.repeat(h, number, axis=0), x)
-    agree = np.add.reduceat(weights * np.sum(sent * p, axis=1), starts)
-    size = np.add.reduceat(weights * np.sum(p * p, axis=1), starts)
+def _alignment(x: Array, p: Array, weights: Array, bounds: Ints) -> Array:
+    """(S, 2, 3): h1 and h2 of each sight, scaled so that |(h1 . X, h2 . X)| is |p| on average."""
+    rows = np.hstack([-p[:, 1:] * x, p[:, :1] * x])
+    h = np.linalg.eigh(grouped_products(rows, weights, bounds))[1][:, :, 0].reshape(-1, 2, 3)
+    sent = np.matmul(np.repeat(h, np.diff(bounds), axis=0), x[:, :, None])[:, :, 0]
+    agree = np.add.reduceat(weights * np.sum(sent * p, axis=1), bounds[:-1])
+    size = np.add.reduceat(weights * np.sum(p * p, axis=1), bounds[:-1])
     return np.asarray(h * (size / np.where(np.abs(agree) > 1e-12, agree, 1e-12))[:, None, None])
 
 
 def _depth_and_profile(
-    x: Array, radius: Array, q: Array, weights: Array, starts: Ints, sight: Ints, terms: int
+    x: Array, radius: Array, q: Array, weights: Array, bounds: Ints, terms: int
 ) -> tuple[Array, Array]:
-    """c (terms,) and h3 (count, 3) of r (h3 . X) - q sum c_k r^2k = q, by elimination of each sight's h3."""
-    root = np.sqrt(weights)[:, None]
-    own = radius[:, None] * x * root
-    shared = -q[:, None] * radius[:, None] ** (2 * np.arange(1, terms + 1)) * root
-    right = q[:, None] * root
-    both = np.hstack([shared, right])
-    own_own = np.add.reduceat(own[:, :, None] * own[:, None, :], starts)
-    own_own += 1e-12 * np.trace(own_own, axis1=1, axis2=2)[:, None, None] * np.eye(3)
-    own_both = np.add.reduceat(own[:, :, None] * both[:, None, :], starts)
-    eliminated = np.linalg.solve(own_own, own_both)
-    reduced = both.T @ both - np.einsum("sij,sik->jk", own_both, eliminated)
+    """c (terms,) and h3 (S, 3) of r (h3 . X) - q sum c_k r^2k = q, by elimination of each sight's h3."""
+    shared = -q[:, None] * radius[:, None] ** (2 * np.arange(1, terms + 1))
+    rows = np.hstack([radius[:, None] * x, shared, q[:, None]])
+    products = grouped_products(rows, weights, bounds)
+    own = products[:, :3, :3] + 1e-12 * np.trace(products[:, :3, :3], axis1=1, axis2=2)[:, None, None] * np.eye(3)
+    eliminated = np.linalg.solve(own, products[:, :3, 3:])
+    reduced = products[:, 3:, 3:].sum(axis=0) - np.einsum("sij,sik->jk", products[:, :3, 3:], eliminated)
     c = np.linalg.lstsq(reduced[:terms, :terms], reduced[:terms, terms], rcond=1e-10)[0]
-    h3 = eliminated[:, :, terms] - eliminated[:, :, :terms] @ c
-    return c, h3
+    return c, eliminated[:, :, terms] - eliminated[:, :, :terms] @ c
 
 
 def line_moments(lines: Array, offsets: Array, weights: Array, unit_px: float, terms: int) -> Array:

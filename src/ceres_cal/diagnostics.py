@@ -39,12 +39,12 @@ class Inliers:
     curve_sigmas: Array
 
     def same_as(self, other: Inliers) -> bool:
-        """Whether nothing worth another solve changed: the same rows, scales within a thousandth."""
+        """Whether nothing worth another solve changed: the same rows, scales within a hundredth."""
         return (
             np.array_equal(self.points, other.points)
             and np.array_equal(self.curves, other.curves)
-            and abs(self.point_scale - other.point_scale) <= 1e-3 * other.point_scale
-            and abs(self.curve_scale - other.curve_scale) <= 1e-3 * other.curve_scale
+            and abs(self.point_scale - other.point_scale) <= 1e-2 * other.point_scale
+            and abs(self.curve_scale - other.curve_scale) <= 1e-2 * other.curve_scale
         )
 
 

@@ -12,12 +12,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ceres_cal.camera import Camera
-from ceres_cal.closed_forms import Profile, orthogonality_error, polar_pose
+from ceres_cal.closed_forms import Profile, orthogonality_error, polar_poses
 from ceres_cal.errors import DegenerateError
 from ceres_cal.lens import Brown, KannalaBrandt, Lens, Radial
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.parameters import Estimate, Options, Station, anchored_stations
-from ceres_cal.planes import PlaneSight, on_plane, profile_and_homographies
+from ceres_cal.planes import Homographies, profile_and_homographies
 from ceres_cal.sights import Sights
 from ceres_cal.transforms import Array, Pose
 
@@ -67,19 +67,28 @@ def _start_camera(
 ) -> _CameraStart:
     blank = _blank_camera(name, image_size, options, priors)
     unit = 0.5 * float(np.hypot(*image_size))
-    planes = [on_plane(sight, blank) for sight in sights]
-    profile, homographies = profile_and_homographies(planes, sights, blank, unit)
-    own_priors = [p for p in priors if p.name == (name if p.owner == "camera" else sights.keys[0].station)]
-    phi, phi_from = _choose_phi(planes, homographies, unit, options, own_priors)
+    profile, homographies = profile_and_homographies(sights, blank, unit)
+    phi, phi_from = _choose_phi(sights, homographies, unit, options, [p for p in priors if _concerns(p, name, sights)])
     reach = float(np.max(np.linalg.norm(_all_offsets(sights, blank), axis=1)))
     camera = replace(blank, phi=phi, lens=_fit_lens(blank.lens, profile, phi, reach, options.fixed))
-    flat = np.diag([1.0 / phi, 1.0 / phi, 1.0])
-    poses = {}
-    for i, homography in homographies.items():
-        pose = polar_pose(flat @ homography)
-        shift = planes[i].height_m * pose.rotation[:, 2]
-        poses[i] = Pose(pose.rotation, pose.translation - shift)
+    poses = {
+        int(number): Pose(matrix[:, :3], matrix[:, 3])
+        for number, matrix in zip(homographies.sights, _poses_at(homographies, phi), strict=True)
+    }
     return _CameraStart(camera, phi_from, poses)
+
+
+def _concerns(prior: Prior, camera: str, sights: Sights) -> bool:
+    if prior.owner == "camera":
+        return prior.name == camera
+    return any(key.station == prior.name for key in sights.keys)
+
+
+def _poses_at(homographies: Homographies, phi: float) -> Array:
+    """cam_from_frame (K, 3, 4) of the homographies for one phi."""
+    matrices = polar_poses(homographies.matrices * np.array([[1.0 / phi], [1.0 / phi], [1.0]]))
+    matrices[:, :, 3] -= homographies.heights_m[:, None] * matrices[:, :, 2]
+    return matrices
 
 
 def _blank_camera(name: str, image_size: tuple[int, int], options: Options, priors: Sequence[Prior]) -> Camera:
@@ -106,8 +115,8 @@ def _all_offsets(sights: Sights, camera: Camera) -> Array:
 
 
 def _choose_phi(
-    planes: Sequence[PlaneSight],
-    homographies: Mapping[int, Array],
+    sights: Sights,
+    homographies: Homographies,
     unit: float,
     options: Options,
     priors: Sequence[Prior],
@@ -119,14 +128,12 @@ def _choose_phi(
     """
     if "phi" in options.fixed:
         return options.fixed["phi"], "fixed"
-    sizes = np.array([planes[i].size_px for i in homographies])
-    stack = np.array(list(homographies.values())).reshape(-1, 3, 3)
     known = [p for p in priors if p.quantity in ("phi", "height_m", "position_m")]
 
     def cost(phi: Array) -> Array:
-        error = orthogonality_error(stack, phi) * sizes
+        error = orthogonality_error(homographies.matrices, phi) * homographies.sizes_px
         total = np.sum(np.log1p((error / 0.5) ** 2), axis=1)
-        return np.asarray(total + sum(_prior_cost(prior, phi, planes, homographies) for prior in known))
+        return np.asarray(total + sum(_prior_cost(prior, phi, sights, homographies) for prior in known))
 
     grid = unit * _PHI_RANGE
     values = cost(grid)
@@ -142,18 +149,19 @@ def _choose_phi(
     return float(middle), source
 
 
-def _prior_cost(prior: Prior, phi: Array, planes: Sequence[PlaneSight], homographies: Mapping[int, Array]) -> Array:
+def _prior_cost(prior: Prior, phi: Array, sights: Sights, homographies: Homographies) -> Array:
     if prior.quantity == "phi":
         return np.asarray(((phi - prior.value[0]) / prior.sigma[0]) ** 2)
-    heights = [
-        [polar_pose(np.diag([1.0 / f, 1.0 / f, 1.0]) @ h).position[2] + planes[i].height_m for f in phi]
-        for i, h in homographies.items()
-        if planes[i].sight.key.placement is None and planes[i].sight.key.station == prior.name
-    ]
-    if not heights:
+    keys = [sights.keys[i] for i in homographies.sights]
+    own = np.array([key.placement is None and key.station == prior.name for key in keys])
+    if not own.any():
         return np.zeros(len(phi))
+    heights = []
+    for value in phi:
+        poses = _poses_at(homographies, value)[own]
+        heights.append(float(np.mean(-np.sum(poses[:, :, 2] * poses[:, :, 3], axis=1))))
     spread = max(prior.sigma[-1], 0.01 * abs(prior.value[-1]))  # a start's height is no better than that
-    return np.asarray(((np.mean(heights, axis=0) - prior.value[-1]) / spread) ** 2)
+    return np.asarray(((np.array(heights) - prior.value[-1]) / spread) ** 2)
 
 
 def _fit_lens(blank: Lens, profile: Profile, phi: float, reach_px: float, fixed: Mapping[str, float]) -> Lens:

@@ -15,20 +15,23 @@ from ceres_cal.camera import Camera
 from ceres_cal.closed_forms import (
     PlaneData,
     Profile,
+    RadialAlignment,
     facing,
     homography_from_points,
     inverse_homography_from_moments,
     line_moments,
     profile_from_moments,
     radial_alignment,
-    require_spread,
     ring_profile,
 )
 from ceres_cal.errors import DegenerateError
-from ceres_cal.sights import Sights
+from ceres_cal.sights import Mask, Rows, Sights
 from ceres_cal.transforms import Array
 
 _MOST = 1500  # observations of one kind in a sight beyond which a start learns nothing more
+_ENOUGH_POINTS = 40.0  # of a board
+_GOLDEN = 0.6180339887498949
+_SUSPICIOUS = 8.0  # medians: no clean residual is that long
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +58,7 @@ class PlaneSight:
         return float(np.sqrt(np.mean(np.sum((every - every.mean(axis=0)) ** 2, axis=1))))
 
 
-def on_plane(sight: Sights, camera: Camera) -> PlaneSight:
+def _on_plane(sight: Sights, camera: Camera) -> PlaneSight:
     """The observations on the plane that holds most of them, thinned where there are very many."""
     segments = ~sight.is_arc[sight.track]
     tracks = sight.tracks[sight.track]
@@ -78,48 +81,94 @@ def on_plane(sight: Sights, camera: Camera) -> PlaneSight:
     )
 
 
-def profile_and_homographies(
-    planes: Sequence[PlaneSight], sights: Sights, camera: Camera, unit: float
-) -> tuple[Profile, dict[int, Array]]:
-    """The camera's radial profile and the homography of each sight that can tell one."""
-    pure = [i for i, plane in enumerate(planes) if len(plane.points) >= 6 and not len(plane.lines)]
-    pure = [i for i in pure if _is_spread(planes[i].points)]
-    mixed = [i for i, plane in enumerate(planes) if i not in pure and plane.equations >= 8]
-    ringed = [
-        i for i in range(len(planes)) if i not in pure and i not in mixed and sights[i].is_arc[sights[i].track].any()
-    ]
-    homographies: dict[int, Array] = {}
+@dataclass(frozen=True, eq=False)
+class Homographies:
+    """The homographies that a camera's sights could tell.
+
+    Attributes:
+        sights: (K,) numbers of the sights. matrices: (K, 3, 3), plane (x, y, 1) m to (p px, w), see `closed_forms`.
+        heights_m: (K,) z of each plane. sizes_px: (K,) spread of its observations over the image.
+    """
+
+    sights: Rows
+    matrices: Array
+    heights_m: Array
+    sizes_px: Array
+
+
+def profile_and_homographies(sights: Sights, camera: Camera, unit: float) -> tuple[Profile, Homographies]:
+    """The camera's radial profile and the homography of each of its sights that can tell one."""
+    pure = _flat_sights_of_points(sights)
+    rest = np.setdiff1d(np.arange(len(sights)), pure)
+    planes = {int(i): _on_plane(sights[int(i)], camera) for i in rest}
+    found: dict[int, Array] = {}
     profile: Profile | None = None
-    if sum(len(planes[i].points) - 3 for i in pure) >= 10:
-        profile, found = radial_alignment(_flatten([planes[i] for i in pure]), len(pure), unit, terms=2)
-        homographies |= dict(zip(pure, found, strict=True))
-    for i in ringed:
-        ring, homography = _from_rings(sights[i], camera, unit)
-        profile = profile or ring
-        homographies[i] = homography
+    board = sights.take(pure)
+    if len(pure):
+        alignment = _align(board, camera, unit)
+        profile = alignment.profile
+    for i, plane in planes.items():
+        if plane.equations < 8 and sights[i].is_arc[sights[i].track].any():
+            ring, found[i] = _from_rings(sights[i], camera, unit)
+            profile = profile or ring
+    mixed = [i for i, plane in planes.items() if plane.equations >= 8]
     if profile is None:
         profile = _profile_from_lines([planes[i] for i in mixed], unit)
-    for i in [*mixed, *(i for i in pure if i not in homographies)]:
-        homographies[i] = _homography_of(planes[i], profile)
-    for i in pure:
-        homographies[i] = _without_wrong_labels(planes[i], profile, homographies[i])
-    return profile, homographies
+    found |= {i: _homography_of(planes[i], profile) for i in mixed}
+    parts = [Homographies(np.array([i]), h[None], *_extent(planes[i])) for i, h in found.items()]
+    if len(pure):
+        sizes = _spreads(camera.offsets(board.pixels), board.point_bounds)
+        heights = board.points[board.point_bounds[:-1], 2]
+        parts.append(Homographies(pure, _without_wrong_labels(board, camera, alignment), heights, sizes))
+    names = ("sights", "matrices", "heights_m", "sizes_px")
+    if not parts:
+        return profile, Homographies(np.empty(0, np.int64), np.empty((0, 3, 3)), np.empty(0), np.empty(0))
+    return profile, Homographies(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
 
-def _is_spread(points: Array) -> bool:
-    try:
-        require_spread(points)
-    except DegenerateError:
-        return False
-    return True
+def _extent(plane: PlaneSight) -> tuple[Array, Array]:
+    return np.array([plane.height_m]), np.array([plane.size_px])
 
 
-def _flatten(planes: Sequence[PlaneSight]) -> PlaneData:
-    return PlaneData(
-        np.repeat(np.arange(len(planes)), [len(plane.points) for plane in planes]),
-        np.vstack([plane.points for plane in planes]),
-        np.vstack([plane.offsets for plane in planes]),
-    )
+def _spreads(values: Array, bounds: Rows) -> Array:
+    """Root mean square distance from the centroid, group by group."""
+    sizes = np.diff(bounds)[:, None]
+    centre = np.add.reduceat(values, bounds[:-1]) / sizes
+    away = values - np.repeat(centre, sizes[:, 0], axis=0)
+    return np.asarray(np.sqrt(np.add.reduceat(np.sum(away**2, axis=1), bounds[:-1]) / sizes[:, 0]))
+
+
+def _flat_sights_of_points(sights: Sights) -> Rows:
+    """Numbers of the sights that show at least six points of one plane, not on one line, and no curve."""
+    few = (np.diff(sights.point_bounds) >= 6) & (np.diff(sights.curve_bounds) == 0)
+    candidates = np.flatnonzero(few)
+    if not len(candidates):
+        return candidates
+    board = sights.take(candidates)
+    starts, sizes = board.point_bounds[:-1], np.diff(board.point_bounds)
+    z = board.points[:, 2]
+    flat = np.maximum.reduceat(z, starts) - np.minimum.reduceat(z, starts) < 1e-9
+    away = board.points[:, :2] - np.repeat(np.add.reduceat(board.points[:, :2], starts) / sizes[:, None], sizes, axis=0)
+    xx, yy = np.add.reduceat(away[:, 0] ** 2, starts), np.add.reduceat(away[:, 1] ** 2, starts)
+    xy = np.add.reduceat(away[:, 0] * away[:, 1], starts)
+    return candidates[flat & (xx * yy - xy**2 > 1e-12 * (xx + yy) ** 2)]
+
+
+def _align(board: Sights, camera: Camera, unit: float) -> RadialAlignment:
+    """Radial alignment on a part of the points; with all of them, and more patience, where some do not fit."""
+    everything = PlaneData(board.point_bounds, board.points[:, :2], camera.offsets(board.pixels))
+    terms = int(np.clip((len(board.points) - 3 * len(board)) // 8, 1, 3))
+    sizes = np.diff(board.point_bounds)
+    place = np.arange(len(board.points)) - np.repeat(board.point_bounds[:-1], sizes)
+    # Steps of the golden ratio spread the chosen points evenly and never along one row of a board.
+    some = (place * _GOLDEN) % 1.0 < np.repeat(_ENOUGH_POINTS / sizes, sizes)
+    chosen = np.flatnonzero(some)
+    bounds = np.searchsorted(chosen, board.point_bounds)
+    few = PlaneData(bounds, everything.plane[chosen], everything.offsets[chosen])
+    first = radial_alignment(few, unit, terms, rounds=2)
+    if np.mean(_is_suspicious(first)) < 0.02:
+        return first
+    return radial_alignment(everything, unit, terms, rounds=8)
 
 
 def _as_lines(plane: PlaneSight, scale: float) -> tuple[Array, Array]:
@@ -217,23 +266,38 @@ def _from_rings(sight: Sights, camera: Camera, unit: float) -> tuple[Profile, Ar
     return profile, np.array([[kappa, 0.0, centre[0]], [0.0, kappa, centre[1]], [0.0, 0.0, 1.0]])
 
 
-def _without_wrong_labels(plane: PlaneSight, profile: Profile, homography: Array) -> Array:
-    """The homography again by LO-RANSAC (pycolmap) where single points lie far off while most fit."""
-    lifted = profile.lift(plane.offsets)
-    sent = np.column_stack([plane.points, np.ones(len(plane.points))]) @ homography.T
-    image, ideal = lifted[:, :2] / lifted[:, 2:], sent[:, :2] / sent[:, 2:]
-    error = np.linalg.norm(image - ideal, axis=1)
-    if len(error) < 8 or np.max(error) < max(10.0 * float(np.median(error)), 4.0):
-        return homography
+def _is_suspicious(alignment: RadialAlignment) -> Mask:
+    return np.asarray((alignment.relative_error > _SUSPICIOUS) & (alignment.error_px > 1.0))
+
+
+def _without_wrong_labels(board: Sights, camera: Camera, alignment: RadialAlignment) -> Array:
+    """The homographies, by LO-RANSAC (pycolmap) where some points of a sight lie far off while most fit."""
+    homographies = alignment.homographies.copy()
+    if len(alignment.error_px) < len(board.points):  # aligned on a part of the points because all of them fit
+        return homographies
+    limit = max(_SUSPICIOUS * float(np.median(alignment.error_px)), 2.0)
+    far = np.add.reduceat(_is_suspicious(alignment), board.point_bounds[:-1], dtype=np.int64)
+    sizes = np.diff(board.point_bounds)
+    for number in np.flatnonzero((far > 0.1 * sizes) & (sizes >= 8)):
+        sight = board[int(number)]
+        lifted = alignment.profile.lift(camera.offsets(sight.pixels))
+        found = _consensus(sight.points[:, :2], lifted, limit)
+        if found is not None:
+            homographies[number] = found
+    return homographies
+
+
+def _consensus(plane: Array, lifted: Array, limit_px: float) -> Array | None:
     import pycolmap
 
     options = pycolmap.RANSACOptions()
-    options.max_error = max(4.0 * float(np.median(error)), 2.0)
+    options.max_error = limit_px
     options.random_seed = 0
-    found = pycolmap.estimate_homography_matrix(plane.points, image, options)
+    found = pycolmap.estimate_homography_matrix(plane, lifted[:, :2] / lifted[:, 2:], options)
     if found is None:
-        return homography
+        return None
     inliers = np.asarray(found["inlier_mask"], dtype=bool)
-    if inliers.sum() < 6 or not _is_spread(plane.points[inliers]):
-        return homography
-    return homography_from_points(plane.points[inliers], lifted[inliers])
+    try:
+        return homography_from_points(plane[inliers], lifted[inliers])
+    except DegenerateError:
+        return None

@@ -9,12 +9,16 @@ import os
 import sys
 from collections.abc import Sequence
 
-from ceres_cal.cli import calibrate
+from ceres_cal.cli.calibrate import COMMANDS as CALIBRATE
 from ceres_cal.cli.command import Command, print_answer
+from ceres_cal.cli.detect import COMMANDS as DETECT
+from ceres_cal.cli.locate import COMMANDS as LOCATE
+from ceres_cal.cli.simulate import COMMANDS as SIMULATE
+from ceres_cal.cli.targets import COMMANDS as TARGETS
 from ceres_cal.errors import CalibrationError, InputError
 
-_GROUPS = (calibrate,)
-COMMANDS: dict[str, Command] = {command.name: command for group in _GROUPS for command in group.COMMANDS}
+COMMANDS = {command.name: command for command in (*DETECT, *CALIBRATE, *LOCATE, *SIMULATE, *TARGETS)}
+_BEGINNINGS = {"", *(name.partition(" ")[0] for name in COMMANDS if " " in name)}
 _INTERRUPTED, _PIPE_CLOSED = 130, 141  # what a shell reports of a program that SIGINT or SIGPIPE ended
 
 
@@ -55,8 +59,8 @@ def _fail(message: str, exit_code: int) -> int:
 
 
 def _run(arguments: list[str]) -> int:
-    if arguments[:1] in (["-h"], ["--help"]):
-        print(_overview())
+    if arguments[-1:] in (["-h"], ["--help"]) and " ".join(arguments[:-1]) in _BEGINNINGS:
+        print(_overview(" ".join(arguments[:-1])))
         return 0
     if arguments[:1] == ["--version"]:
         from importlib.metadata import version
@@ -78,21 +82,22 @@ def _choose(arguments: list[str]) -> tuple[Command, list[str]]:
             return command, arguments[words:]
     if not arguments:
         raise InputError("which command? See `ceres-cal --help`")
-    longer = [name for name in COMMANDS if name.startswith(f"{arguments[0]} ")]
-    if longer:
-        raise InputError(f"{arguments[0]} what? See {' or '.join(f'`ceres-cal {name} --help`' for name in longer)}")
+    if arguments[0] in _BEGINNINGS:
+        raise InputError(f"{arguments[0]} what? See `ceres-cal {arguments[0]} --help`")
     raise InputError(f"there is no command {arguments[0]!r}: see `ceres-cal --help`")
 
 
-def _overview() -> str:
-    width = max(map(len, COMMANDS))
+def _overview(beginning: str) -> str:
+    """Help on all commands that begin so."""
+    shown = {name: command.summary for name, command in COMMANDS.items() if name.startswith(beginning)}
+    width = max(map(len, shown))
     return "\n".join(
         [
             "usage: ceres-cal COMMAND ... [--json]",
             "",
             "Calibrate an overhead camera from corners, lines and arcs of a flat field.",
             "",
-            *(f"  {name:{width}}  {command.summary}" for name, command in COMMANDS.items()),
+            *(f"  {name:{width}}  {summary}" for name, summary in shown.items()),
             "",
             "`ceres-cal COMMAND --help` tells how. Every command prints one JSON object with --json.",
             "Exit codes: 0 success, 1 the answer is no, 2 bad usage or bad input, 3 no usable solution.",

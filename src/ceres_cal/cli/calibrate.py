@@ -78,6 +78,7 @@ def _add_arguments(parser: ArgumentParser) -> None:
 
 def _run(args: Namespace) -> Answer:
     require_output(args.output, args.observations)
+    _require_different(args.observations)
     fixed, powers = _fixed(args.fix), _powers(args)
     from ceres_cal.cli.summary import calibration_data, calibration_text
     from ceres_cal.observations import Observations, combine
@@ -101,9 +102,15 @@ def _run(args: Namespace) -> Answer:
     )
 
 
-COMMANDS = (
-    Command("calibrate", "calibrate cameras from observations of fields and boards", _add_arguments, _run),
-)
+COMMANDS = (Command("calibrate", "calibrate cameras from observations of fields and boards", _add_arguments, _run),)
+
+
+def _require_different(files: list[str]) -> None:
+    """A file that counts twice would make its observations look better than they are."""
+    places = [Path(file).resolve() for file in files]
+    for file, place in zip(files, places, strict=True):
+        if places.count(place) > 1:
+            raise InputError(f"{file}: given twice: name every file once")
 
 
 def _shown_on(bar: ProgressBar, most: int) -> Callable[[Progress], None]:

@@ -107,6 +107,11 @@ def finishing() -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
 
 
+def plural(count: int, word: str) -> str:
+    """A count with its word: 1 view, 2 views."""
+    return f"{count} {word}{'' if count == 1 else 's'}"
+
+
 def parse_number(text: str, where: str) -> float:
     """A finite number; InputError naming `where`."""
     try:

@@ -5,18 +5,26 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
+from textwrap import wrap
 from typing import Any
 
 import numpy as np
 
 from ceres_cal.calibration import Calibration, calibration_to_json
 from ceres_cal.camera import Camera
+from ceres_cal.cli.command import plural
 from ceres_cal.observations import Observations
 from ceres_cal.parameters import Options, anchored_stations
 from ceres_cal.transforms import Pose, euler_from_rotation
 
 _MOST_FEATURES = 6
-_PHI_FROM = {"fixed": "held", "views": "started from the views", "prior": "started from its prior", "guess": "started from a guess"}
+_MANY_OUTLIERS, _LARGE_SCALE = 0.3, 4.0  # from where on a warning is due
+_PHI_FROM = {
+    "fixed": "held",
+    "views": "started from the views",
+    "prior": "started from its prior",
+    "guess": "started from a guess",
+}
 
 
 def tilt_deg(cam_from_world: Pose) -> float:
@@ -54,10 +62,12 @@ def calibration_text(
         lines = _intrinsics(camera, calibration.options, calibration.phi_from.get(name, ""))
         sections.append(_section("camera", [f"{name}, {camera.image_size[0]} x {camera.image_size[1]} px", *lines]))
     for name, camera in calibration.stations.items():
-        sections.append(_section("station", [f"{name}{_of_camera(calibration, name)}", *_pose(camera, name in anchored)]))
+        sections.append(
+            _section("station", [f"{name}{_of_camera(calibration, name)}", *_pose(camera, name in anchored)])
+        )
     sections.append(_section("outliers", _outlier_lines(calibration)))
-    sections.append(_section("stopped", [_stop(calibration)]))
-    sections.extend(_section("warning", [text]) for text in _warnings(calibration, observations))
+    sections.append(_section("stopped", _stop(calibration)))
+    sections.extend(_section("warning", wrap(text, 100)) for text in _warnings(calibration, observations))
     if output is not None:
         sections.append(_section("written", [str(output)]))
     return "\n".join(sections)
@@ -66,10 +76,6 @@ def calibration_text(
 def _section(title: str, lines: Iterable[str]) -> str:
     """A title beside its lines."""
     return "\n".join(f"{'' if number else title:10}{line}" for number, line in enumerate(lines))
-
-
-def _plural(count: int, word: str) -> str:
-    return f"{count} {word}{'' if count == 1 else 's'}"
 
 
 def _counts(observations: Observations) -> dict[str, int]:
@@ -85,10 +91,10 @@ def _counts(observations: Observations) -> dict[str, int]:
 
 def _counted(observations: Observations) -> list[str]:
     count = _counts(observations)
-    owners = [_plural(count[f"{word}s"], word) for word in ("view", "camera", "station", "placement")]
+    owners = [plural(count[f"{word}s"], word) for word in ("view", "camera", "station", "placement")]
     return [
         ", ".join(owners),
-        f"{_plural(count['points'], 'point observation')}, {_plural(count['curves'], 'curve observation')}",
+        f"{plural(count['points'], 'point observation')}, {plural(count['curves'], 'curve observation')}",
     ]
 
 
@@ -117,7 +123,7 @@ def _intrinsics(camera: Camera, options: Options, phi_from: str) -> list[str]:
     rows += [(name, f"{value!r}{held(name)}") for name, value in camera.lens.coefficients.items()]
     lines = [f"{name:16}{value}" for name, value in rows]
     if camera.lens.kind == "radial" and camera.lens.radius_powers == (2, 3):
-        lines.append("the paper's a1, a2, a3: 1 and these two; for another a1 multiply all three, and phi, by it")
+        lines.append("these are the paper's, with its a1 = 1: another a1 goes with a1 a2, a1 a3 and a1 phi")
     return lines
 
 
@@ -152,26 +158,42 @@ def _outlier_lines(calibration: Calibration) -> list[str]:
     rest = len(features) - _MOST_FEATURES
     if rest > 0:
         others = total - sum(count for _, count in features.most_common(_MOST_FEATURES))
-        lines.append(f"{others:5}  of {_plural(rest, 'other feature')}")
+        lines.append(f"{others:5}  on {plural(rest, 'other feature')}")
     return lines
 
 
-def _stop(calibration: Calibration) -> str:
+def _stop(calibration: Calibration) -> list[str]:
     iterations = max(len(calibration.history) - 1, 0)
     how = "converged" if calibration.converged else "did not converge"
-    reason = calibration.termination.rstrip(". ")
-    return f"{how} after {calibration.rounds} solves, the last of {_plural(iterations, 'iteration')}: {reason}"
+    return [
+        f"{how} after {calibration.rounds} solves, the last of {plural(iterations, 'iteration')}",
+        calibration.termination,
+    ]
 
 
 def _warnings(calibration: Calibration, observations: Observations) -> Iterator[str]:
     if not calibration.converged:
-        yield "the solve did not come to rest: raise --max-iterations, and trust no digit before it does"
+        yield "the solve did not come to rest: raise --max-iterations"
     for name, origin in calibration.phi_from.items():
         if origin == "guess":
             yield (
-                f"the views of camera {name} can hardly tell phi and height apart (phi was started from a guess): "
-                "give a height prior (--prior height_m=4.02:0.01) or add tilted boards"
+                f"the views of camera {name} hardly tell phi and height apart (phi was started from a guess): "
+                f"add tilted boards, or {_useful_prior(observations, name)}"
             )
-    taken_out = len(calibration.rejected)
-    if taken_out > 0.3 * (len(observations.points) + len(observations.curves)):
-        yield "more than three in ten observations were taken out: check labels and target dimensions"
+    if len(calibration.rejected) > _MANY_OUTLIERS * (len(observations.points) + len(observations.curves)):
+        yield "so many observations were taken out: check labels, target dimensions and the choice of lens"
+    scale = max(calibration.fit.point_scale, calibration.fit.curve_scale)
+    if scale > _LARGE_SCALE:
+        yield (
+            f"the residuals are {scale:.0f} times the stated sigmas: the lens may not suit the camera, or labels and "
+            "target dimensions may be wrong"
+        )
+
+
+def _useful_prior(observations: Observations, camera: str) -> str:
+    """What would help: the height of a station, but phi where no station of the camera is tied to the world."""
+    tied = set(observations.stations) - anchored_stations(observations)
+    for name, owner in observations.stations.items():
+        if owner == camera and name in tied:
+            return f"the camera's height by a tape measure: --prior {name}.height_m=METRES:0.01"
+    return f"phi from another calibration: --prior {camera}.phi=PIXELS:5"

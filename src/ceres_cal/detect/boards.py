@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ceres_cal.detect.saddles import measure_saddles
+from ceres_cal.detect.saddles import REACH, measure_saddles
 from ceres_cal.errors import InputError
 from ceres_cal.files import read_bytes
 from ceres_cal.observations import Curves, Observations, Points, View
@@ -36,7 +36,7 @@ class CharucoSpec:
 
     Attributes:
         dictionary: OpenCV's name of the marker dictionary, such as "DICT_4X4_50".
-        marker_m: side of a marker, less than that of a square.
+        marker_m: side of a marker. Best at most 0.8 of a square: a corner needs some white towards the markers.
         legacy_pattern: made with OpenCV before 4.6, which began boards of an even number of rows otherwise.
     """
 
@@ -73,11 +73,11 @@ def detect_boards(
     Each image is one view; its frame is the file's stem, its placement too (with as much of the folders as tells
     equal stems apart). Corners are named so that the labelling is never mirrored: the board's x along columns, y along
     rows and z away from the camera. Which end of a plain chessboard is "0,0" is settled where its picture says so, by
-    columns + rows being odd: then the square between "0,0" and "1,1" is dark; otherwise two turns are possible, and
-    either is a placement.
+    columns + rows being odd: then the square between "0,0" and "1,1" is dark; otherwise the board may be named as if
+    turned, which the placement takes up.
 
     `sigma_px` is left at 1: the fit of a corner is good to about 0.01 px, but what an unflat board and an unmodelled
-    lens add is several times that in real sets, and only the solve can tell.
+    lens add is ten times that in real sets, and only the solve can tell.
 
     Args:
         images: files of any kind OpenCV reads, colour or grey, 8 or 16 bit, all of one size. A rotation noted in the
@@ -169,11 +169,7 @@ def _measured_chessboard(image: Image, columns: int, rows: int) -> Array | str:
     seen = _find_chessboard(_as_8_bit(image), columns, rows)
     if seen is None:
         return f"no chessboard of {columns} x {rows} inner corners found"
-    along_row, along_column = np.diff(seen, axis=1)[:-1], np.diff(seen, axis=0)[:, :-1]
-    turn = along_row[..., 0] * along_column[..., 1] - along_row[..., 1] * along_column[..., 0]
-    if np.sum(turn) < 0.0:
-        seen = seen[:, ::-1]
-    saddles = measure_saddles(image, seen)
+    saddles = measure_saddles(image, right_handed(seen))
     grid = saddles.grid
     if (columns + rows) % 2 == 1:
         parity = np.where(np.indices((rows, columns)).sum(axis=0) % 2 == 0, 1.0, -1.0)
@@ -182,13 +178,20 @@ def _measured_chessboard(image: Image, columns: int, rows: int) -> Array | str:
     return _enough(grid)
 
 
+def right_handed(grid: Array) -> Array:
+    """A whole grid (rows, columns, 2) px, its columns in reverse where rows x columns made a mirrored board of it."""
+    along_row, along_column = np.diff(grid, axis=1)[:-1], np.diff(grid, axis=0)[:, :-1]
+    turn = along_row[..., 0] * along_column[..., 1] - along_row[..., 1] * along_column[..., 0]
+    return grid[:, ::-1] if np.sum(turn) < 0.0 else grid
+
+
 def _find_chessboard(image: NDArray[np.uint8], columns: int, rows: int) -> Array | None:
     """Roughly where the corners are, (rows, columns, 2) px, by OpenCV's two detectors at several scales."""
     legacy = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
     for scale in _scales(image.size):
         how = cv2.INTER_AREA if scale < 1.0 else cv2.INTER_CUBIC
         scaled = image if scale == 1.0 else cv2.resize(image, None, fx=scale, fy=scale, interpolation=how)
-        # The newer detector is the better one; where it misses a board the older one may still see it.
+        # The newer detector is the better one, but blind where it is dark.
         found, corners = cv2.findChessboardCornersSB(scaled, (columns, rows))
         if not found:
             found, corners = cv2.findChessboardCorners(scaled, (columns, rows), flags=legacy)
@@ -230,29 +233,33 @@ def _measured_charuco(
     corners, ids, _, _ = detector.detectBoard(_as_8_bit(image))
     if ids is None or len(ids) == 0:
         return "no ChArUco corners found"
-    seen = np.full((rows * columns, 2), np.nan)
-    seen[ids.ravel()] = corners.reshape(-1, 2)
+    grid = np.full((rows * columns, 2), np.nan)
+    grid[ids.ravel()] = corners.reshape(-1, 2)
+    seen = _enough(grid.reshape(rows, columns, 2))
+    if isinstance(seen, str):
+        return seen
     # The disc around a corner must end before the markers on both sides of it begin.
-    reach = min(0.6, float(np.sqrt(2.0)) * margin)
-    return _enough(measure_saddles(image, seen.reshape(rows, columns, 2), reach).grid)
+    reach = min(REACH, float(np.sqrt(2.0)) * margin)
+    return _enough(measure_saddles(image, seen, reach).grid)
 
 
 def _enough(grid: Array) -> Array | str:
-    """The grid, or why its corners cannot place a board: too few, or (but for one) all on one line."""
+    """The grid, or why its corners cannot place a board: too few, or all but one in one row or column."""
     row, column = np.nonzero(~np.isnan(grid[..., 0]))
     if len(row) < MIN_CORNERS:
         return f"only {len(row)} corners, {MIN_CORNERS} are needed"
     if max(np.bincount(row).max(), np.bincount(column).max()) >= len(row) - 1:
-        return f"its {len(row)} corners lie on one line"
+        return f"its {len(row)} corners lie in one row or column (but for one at most)"
     return grid
 
 
 def _as_8_bit(image: Image) -> NDArray[np.uint8]:
     """What OpenCV's detectors take; deeper images are stretched, but for half a percent at either end."""
     if image.dtype == np.uint8:
-        return np.asarray(image, np.uint8)
+        return image.astype(np.uint8, copy=False)
     low, high = np.percentile(image, [0.5, 99.5])
-    return np.clip((image - low) * (255.0 / max(high - low, 1e-12)), 0.0, 255.0).astype(np.uint8)
+    stretched: Array = (image - low) * (255.0 / max(float(high - low), 1e-12))
+    return np.clip(stretched, 0.0, 255.0).astype(np.uint8)
 
 
 # ---- observations ---------------------------------------------------------------------------------------------------

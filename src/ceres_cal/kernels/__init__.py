@@ -2,6 +2,7 @@
 
 from ceres_cal.kernels.block import cholesky, evaluate_block
 from ceres_cal.kernels.elimination import eliminate_placements
+from ceres_cal.kernels.groups import grouped_products
 from ceres_cal.kernels.lenses import INTRINSICS, LENS_CODES
 from ceres_cal.kernels.sight import LOSS_CODES, curve_residuals, normal_equations, point_residuals
 
@@ -13,6 +14,7 @@ __all__ = [
     "curve_residuals",
     "eliminate_placements",
     "evaluate_block",
+    "grouped_products",
     "normal_equations",
     "point_residuals",
 ]

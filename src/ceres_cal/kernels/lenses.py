@@ -23,7 +23,7 @@ INTRINSICS = 4
 _RADIAL, _BROWN = 0, 1
 _FAR = 6.0  # half image diagonals (radial), or ideal radii (brown): nothing is observed farther out
 _FAR_STEPS = 96
-_TINY = 1e-300
+_TINY = 1e-150  # its square is still a number
 
 
 @jit

@@ -266,17 +266,39 @@ def point_residuals(
     residuals: Any,
 ) -> None:  # fmt: skip
     """project(X) - p in px, (N, 2), of the sights at poses (S, 3, 4); NaN where a point cannot be projected."""
-    scratch = np.empty((21, 1))
+    scratch = np.empty((21, _CHUNK))
     dense = one_dimensional(lens, intrinsics, powers)
     limit = answer_limit(lens, dense)
     for v in range(len(poses)):
-        for k in range(bounds[v], bounds[v + 1]):
-            for j in range(3):
-                scratch[j, 0] = points[k, j]
-            _to_camera(1, poses[v], scratch[:3], scratch[3:6], scratch[6:9])
-            good = distort(lens, 1, intrinsics, dense, unit, limit, scratch[6:9], scratch[9:16], scratch[16:])
-            residuals[k, 0] = intrinsics[2] + scratch[9, 0] - pixels[k, 0] if good else np.nan
-            residuals[k, 1] = intrinsics[3] + intrinsics[1] * scratch[10, 0] - pixels[k, 1] if good else np.nan
+        for start in range(bounds[v], bounds[v + 1], _CHUNK):
+            stop = min(start + _CHUNK, bounds[v + 1])
+            if not _chunk_residuals(
+                start, stop, lens, intrinsics, dense, unit, limit, poses[v], points, pixels, scratch, residuals
+            ):
+                for k in range(start, stop):
+                    if not _chunk_residuals(
+                        k, k + 1, lens, intrinsics, dense, unit, limit, poses[v], points, pixels, scratch, residuals
+                    ):
+                        residuals[k] = np.nan
+
+
+@jit
+def _chunk_residuals(
+    start: int, stop: int, lens: int, intrinsics: Any, dense: Any, unit: float, limit: float, pose: Any, points: Any,
+    pixels: Any, scratch: Any, residuals: Any,
+) -> bool:  # fmt: skip
+    """The same for some points of one sight; False where any of them cannot be projected."""
+    n, image = stop - start, scratch[9:16]
+    for i in range(n):
+        for j in range(3):
+            scratch[j, i] = points[start + i, j]
+    _to_camera(n, pose, scratch[:3], scratch[3:6], scratch[6:9])
+    if not distort(lens, n, intrinsics, dense, unit, limit, scratch[6:9], image, scratch[16:]):
+        return False
+    for i in range(n):
+        residuals[start + i, 0] = intrinsics[2] + image[0, i] - pixels[start + i, 0]
+        residuals[start + i, 1] = intrinsics[3] + intrinsics[1] * image[1, i] - pixels[start + i, 1]
+    return True
 
 
 @jit

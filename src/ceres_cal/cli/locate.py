@@ -1,0 +1,159 @@
+"""`ceres-cal locate` and `ceres-cal project`: use a calibration, from pixels to metres and back."""
+
+from __future__ import annotations
+
+import sys
+from argparse import ArgumentParser, Namespace
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ceres_cal.cli.command import Answer, Command, parse_number
+from ceres_cal.errors import InputError
+
+if TYPE_CHECKING:
+    from ceres_cal.camera import Camera
+    from ceres_cal.transforms import Array
+
+
+def _add_common(parser: ArgumentParser, rows: str, example: str) -> None:
+    parser.add_argument("calibration", metavar="CALIBRATION", type=Path, help="file that `ceres-cal calibrate` wrote")
+    parser.add_argument(
+        "rows", nargs="*", metavar=rows, help=f"such as {example}; - reads lines of these from standard input"
+    )
+    parser.add_argument("--file", metavar="CSV", help="read lines of these from a file instead")
+    parser.add_argument("--station", help="which station; may be left out where there is only one")
+
+
+def _add_locate(parser: ArgumentParser) -> None:
+    _add_common(parser, "X,Y", "640.5,480.2 (px)")
+    height = parser.add_mutually_exclusive_group()
+    height.add_argument("--height-mm", type=float, metavar="MM", help="height of what is seen above the field")
+    height.add_argument("--height-m", type=float, metavar="M", help="the same in metres; default: 0, the floor")
+
+
+def _add_project(parser: ArgumentParser) -> None:
+    _add_common(parser, "X,Y[,Z]", "-2.5,1.0 or -2.5,1.0,0.15 (m)")
+
+
+def _locate(args: Namespace) -> Answer:
+    pixels = _read_rows(args, (2,))
+    height_m = _height_m(args)
+    name, camera = _station(args)
+    points = camera.locate(pixels, height_m)
+    lost = {row: _why_not_located(camera, pixels[row], height_m) for row in _rows_without_answer(points)}
+    data = {"station": name, "height_m": height_m, "pixels": pixels.tolist()}
+    return _answer({**data, "points_m": _or_null(points)}, points, lost)
+
+
+def _project(args: Namespace) -> Answer:
+    points = _read_rows(args, (2, 3))
+    name, camera = _station(args)
+    pixels = camera.project(points)
+    lost = {row: _why_not_projected(camera, points[row]) for row in _rows_without_answer(pixels)}
+    data = {"station": name, "points_m": points.tolist()}
+    return _answer({**data, "pixels": _or_null(pixels)}, pixels, lost)
+
+
+COMMANDS = (
+    Command("locate", "where on the field, or at a height above it, pixels lie (m)", _add_locate, _locate),
+    Command("project", "where points of the world appear in the image (px)", _add_project, _project),
+)
+
+
+def _height_m(args: Namespace) -> float:
+    if args.height_mm is not None:
+        return parse_number(str(args.height_mm), "--height-mm") / 1000.0
+    return parse_number(str(args.height_m or 0.0), "--height-m")
+
+
+def _station(args: Namespace) -> tuple[str, Camera]:
+    from ceres_cal.calibration import Calibration
+
+    calibration = Calibration.load(args.calibration)
+    if args.station is None and len(calibration.stations) > 1:
+        raise InputError(
+            f"{args.calibration} has several stations, name one: --station {' or '.join(calibration.stations)}"
+        )
+    camera = calibration.station(args.station)
+    return args.station or next(iter(calibration.stations)), camera
+
+
+# ---- reading --------------------------------------------------------------------------------------------------------
+
+
+def _read_rows(args: Namespace, sizes: tuple[int, ...]) -> Array:
+    """(N, largest size) numbers from the arguments, a file or standard input; a number left out is 0."""
+    import numpy as np
+
+    rows = [_numbers(text, sizes, where) for where, text in _texts(args)]
+    if not rows:
+        raise InputError("nothing was given: name at least one place, or --file")
+    return np.array([row + [0.0] * (max(sizes) - len(row)) for row in rows])
+
+
+def _texts(args: Namespace) -> Iterator[tuple[str, str]]:
+    """What to read numbers from, each with how messages name it."""
+    if args.file is not None and args.rows:
+        raise InputError("give places as arguments or by --file, not both")
+    if args.file == "-" or args.rows == ["-"]:
+        yield from _lines(sys.stdin, "standard input")
+    elif args.file is not None:
+        from ceres_cal.files import read_bytes
+
+        yield from _lines(read_bytes(args.file).decode(errors="replace").splitlines(), args.file)
+    else:
+        yield from ((f"argument {text!r}", text) for text in args.rows)
+
+
+def _lines(lines: Iterable[str], where: str) -> Iterator[tuple[str, str]]:
+    """The lines that hold numbers: not the empty ones, not comments (#), and not a header of names."""
+    for number, line in enumerate(lines, start=1):
+        text = line.partition("#")[0].strip()
+        is_header = number == 1 and all(part.strip().isidentifier() for part in text.split(","))
+        if text and not is_header:
+            yield f"{where}, line {number}", text
+
+
+def _numbers(text: str, sizes: tuple[int, ...], where: str) -> list[float]:
+    row = [parse_number(part, where) for part in (text.split(",") if "," in text else text.split())]
+    if len(row) not in sizes:
+        raise InputError(f"{where}: give {' or '.join(map(str, sizes))} numbers with commas between, not {len(row)}")
+    return row
+
+
+# ---- answering ------------------------------------------------------------------------------------------------------
+
+
+def _rows_without_answer(values: Array) -> list[int]:
+    import numpy as np
+
+    return [int(row) for row in np.flatnonzero(np.isnan(values[:, 0]))]
+
+
+def _or_null(values: Array) -> list[list[float] | None]:
+    return [None if row[0] != row[0] else row for row in values.tolist()]
+
+
+def _why_not_located(camera: Camera, pixel: Array, height_m: float) -> str:
+    radius = camera.lens.monotone_radius(camera.phi)
+    if camera.rays(pixel[None])[0, 0] != camera.rays(pixel[None])[0, 0]:
+        return f"it lies past the {radius:.0f} px from the principal point where the lens has one answer"
+    return f"its ray does not meet the plane z = {height_m:g} m in front of the camera"
+
+
+def _why_not_projected(camera: Camera, point: Array) -> str:
+    if camera.cam_from_world.transform(point)[2] <= 0.0:
+        return "it lies behind the camera"
+    return "it lies outside of what the lens can show"
+
+
+def _answer(data: dict[str, Any], values: Array, lost: dict[int, str]) -> Answer:
+    def text() -> str:
+        lines = [f"{x:.4f} {y:.4f}" for x, y in values.tolist()]
+        for row, reason in lost.items():
+            lines[row] = f"no answer: {reason}"
+        return "\n".join(lines)
+
+    data["no_answer"] = [{"row": row, "reason": reason} for row, reason in lost.items()]
+    return Answer(data, text, 1 if lost else 0)
