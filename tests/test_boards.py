@@ -102,7 +102,7 @@ def write(path: Path, image: NDArray[Any]) -> Path:
 
 def test_corners_are_good_to_a_hundredth_of_a_pixel(tmp_path: Path, picture: Array, truth: Array) -> None:
     path = write(tmp_path / "a.png", photograph(picture))
-    points = detect_boards([path], BOARD).observations.points
+    points = detect_boards([path], BOARD, corner_fit="saddle").observations.points
     assert np.array_equal(points.feature, np.arange(42))
     error = points.pixels - truth
     assert np.all(np.abs(error.mean(axis=0)) < 0.003)  # (0.0000, 0.0007)
@@ -200,18 +200,25 @@ def calibrated(detections: BoardDetections, flags: int) -> tuple[float, Array, A
     return float(answer[0]), np.asarray(answer[1]), np.ravel(answer[5])[:4]
 
 
-def test_sony_photographs(real_data: Path) -> None:
+@pytest.mark.parametrize(
+    "corner_fit, most_px, phi",
+    [
+        ("opencv", 0.163, 700.9),  # 0.1624 and 700.93, OpenCV's own figures
+        ("saddle", 0.145, 702.6),  # 0.1383 and 702.59
+    ],
+)
+def test_sony_photographs(real_data: Path, corner_fit: str, most_px: float, phi: float) -> None:
     images = sorted((real_data / "boofcv_sony_chess").glob("*.jpg"))
-    detections = detect_boards(images, checkerboard(4, 6, 0.03))
+    detections = detect_boards(images, checkerboard(4, 6, 0.03), corner_fit=corner_fit)
     assert len(detections.found) == 13 and not detections.missed
     assert len(detections.observations.points) == 13 * 24
     rms_px, matrix, sigma = calibrated(detections, cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K3)
-    assert rms_px < 0.145  # 0.1383; cornerSubPix (5 x 5) 0.1624, findChessboardCornersSB 0.1535
-    # 702.6 with a standard deviation of 1.2. BoofCV's own 701.0 and cornerSubPix' 700.9 agree within it; cornerSubPix
-    # is 0.4 to 1.0 px short in renderings of these very views, this detector 0.04 px.
+    assert rms_px < most_px
+    assert abs(matrix[0, 0] - phi) < 0.1
+    # phi has a standard deviation of 1.2 px here: both agree with BoofCV's published 701.0. cornerSubPix is 0.4 to
+    # 1.0 px short in renderings of these very views, saddles 0.04 px.
     assert abs(matrix[0, 0] - 701.0) < 2.0 * sigma[0]
     assert abs(matrix[1, 1] - 698.65) < 2.0 * sigma[1]
-    assert sigma[0] < 1.4
 
 
 def test_gopro_photographs(real_data: Path) -> None:
@@ -223,8 +230,8 @@ def test_gopro_photographs(real_data: Path) -> None:
     assert seen == [(i, 36, path.name) for i, path in enumerate(images, start=1)]
     assert len(detections.observations.points) == 35 * 48
     rms_px, matrix, _ = calibrated(detections, cv2.CALIB_ZERO_TANGENT_DIST)
-    assert rms_px < 0.5225  # 0.5208; cornerSubPix 0.5235
-    assert abs(matrix[0, 0] - 560.07) < 0.5  # 560.09; 560.07 with cornerSubPix
+    assert rms_px < 0.53  # 0.5236; 0.5208 with saddles
+    assert abs(matrix[0, 0] - 560.07) < 0.5  # 560.07
 
 
 # ---- names ----------------------------------------------------------------------------------------------------------
@@ -293,7 +300,7 @@ def test_depth_and_colour_change_nothing(tmp_path: Path, picture: Array) -> None
     }
     paths = [write(tmp_path / f"{name}.png", image) for name, image in images.items()]
     assert read_grey(paths[3]).dtype == np.uint16
-    pixels = detect_boards(paths, BOARD).observations.points.pixels.reshape(4, 42, 2)
+    pixels = detect_boards(paths, BOARD, corner_fit="saddle").observations.points.pixels.reshape(4, 42, 2)
     assert np.max(np.abs(pixels - pixels[0])) < 0.001  # 0.00005
 
 
@@ -316,14 +323,15 @@ def test_a_noted_rotation_is_ignored(tmp_path: Path, picture: Array) -> None:
 def test_any_size_of_image(width: int, limit: float, picture: Array, truth: Array, tmp_path: Path) -> None:
     how = cv2.INTER_AREA if width < 480 else cv2.INTER_CUBIC
     path = write(tmp_path / "a.png", cv2.resize(photograph(picture), (width, width * 3 // 4), interpolation=how))
-    points = detect_boards([path], BOARD).observations.points
+    points = detect_boards([path], BOARD, corner_fit="saddle").observations.points
     assert np.max(np.abs(points.pixels - ((truth + 0.5) * width / 480 - 0.5))) < limit
 
 
 def test_dark_images(tmp_path: Path, picture: Array, truth: Array) -> None:
     """Eleven grey levels in all: OpenCV's newer detector is blind there, the older one is not."""
     path = write(tmp_path / "a.png", photograph(picture) // 16)
-    assert rms(detect_boards([path], BOARD).observations.points.pixels - truth) < 0.05  # 0.015
+    points = detect_boards([path], BOARD, corner_fit="saddle").observations.points
+    assert rms(points.pixels - truth) < 0.03  # 0.009
 
 
 # ---- ChArUco --------------------------------------------------------------------------------------------------------

@@ -27,6 +27,7 @@ FLOORS = {
     "closed_forms": 2,
     "planes": 2,
     "initialise": 2,
+    "baseline": 2,
     "parameters": 2,
     "residuals": 2,
     "simulate": 2,

@@ -7,8 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ceres_cal.baseline import four_point_baseline
 from ceres_cal.bundle import Progress, Solution, Weighting, solve
 from ceres_cal.calibration import Calibration, Fit, Rejected
+from ceres_cal.camera import Camera
 from ceres_cal.diagnostics import Inliers, judge, start_weights
 from ceres_cal.errors import SolutionError
 from ceres_cal.initialise import initialise
@@ -18,6 +20,10 @@ from ceres_cal.residuals import Residuals, residuals
 from ceres_cal.sights import Sights, gather_sights
 
 _MOST_ROUNDS = 15
+_GUESSED = (
+    "camera {!r}: the views are too frontal to tell phi and height apart, so the start for phi was a guess; "
+    "measure the height (a prior on height_m) or add tilted boards before using it above the floor"
+)
 
 
 def calibrate(
@@ -39,8 +45,11 @@ def calibrate(
     sights = gather_sights(observations)
     layout = make_layout(observations, options)
     start = initialise(observations, sights, options)
-    settled = _settle(observations, sights, start.estimate, layout, options, progress)
-    _require_usable(settled.solution)
+    if options.closed_form_only:
+        settled = _unsolved(observations, sights, four_point_baseline(sights, start.estimate))
+    else:
+        settled = _settle(observations, sights, start.estimate, layout, options, progress)
+    warnings = _require_usable(settled, sights)
     return Calibration(
         settled.solution.estimate,
         _fit(settled, layout),
@@ -50,6 +59,7 @@ def calibrate(
         settled.rounds,
         settled.solution.history,
         start.phi_from,
+        (*warnings, *(_GUESSED.format(name) for name, source in start.phi_from.items() if source == "guess")),
         options,
         observations.digest,
     )
@@ -61,6 +71,12 @@ class _Settled:
     inliers: Inliers
     residuals: Residuals
     rounds: int
+
+
+def _unsolved(observations: Observations, sights: Sights, estimate: Estimate) -> _Settled:
+    found = residuals(observations, sights, estimate)
+    solution = Solution(estimate, np.nan, False, "the paper's closed form, nothing was minimised", ())
+    return _Settled(solution, start_weights(observations, found), found, 0)
 
 
 def _settle(
@@ -90,7 +106,9 @@ def _settle(
     everything = start_weights(observations, residuals(observations, sights, estimate))
     solution = solved(estimate, everything, "cauchy", 1.0, 1e-3)
     found, inliers = judged(solution.estimate)
-    for rounds in range(2, _MOST_ROUNDS + 1):
+    rounds = 1
+    while rounds < _MOST_ROUNDS:
+        rounds += 1
         solution = solved(solution.estimate, inliers, options.loss, options.loss_scale, 1e-12)
         before = inliers
         found, inliers = judged(solution.estimate)
@@ -99,16 +117,35 @@ def _settle(
     return _Settled(solution, inliers, found, rounds)
 
 
-def _require_usable(solution: Solution) -> None:
-    for name, camera in solution.estimate.cameras.items():
-        if camera.folds:
+def _require_usable(settled: _Settled, sights: Sights) -> tuple[str, ...]:
+    """Warnings about the solution; SolutionError where it must not be used."""
+    if settled.solution.failed:
+        raise SolutionError(f"the solve failed ({settled.solution.termination}): check labels and target dimensions")
+    warnings = []
+    for name, camera in settled.solution.estimate.cameras.items():
+        if not camera.folds:
+            continue
+        fold, corner = camera.lens.monotone_radius(camera.phi), camera.corner_radius
+        where = f"camera {name!r}: the solved {camera.lens.kind} lens folds {fold:.0f} px from the principal point"
+        seen = _reach_px(name, camera, sights.used(settled.inliers.points, settled.inliers.curves))
+        # The paper's polynomial can be had without a fold; the others' published models fold in corners nobody saw.
+        if camera.lens.kind == "radial" or fold <= seen:
             raise SolutionError(
-                f"camera {name!r}: the solved {camera.lens.kind} lens folds over at "
-                f"{camera.lens.monotone_radius(camera.phi):.0f} px from the principal point, inside the image (corner "
-                f"at {camera.corner_radius:.0f} px): choose fewer or other coefficients, or observe nearer to the corners"
+                f"{where}, inside the image (corner at {corner:.0f} px): "
+                "choose fewer or other coefficients, or observe nearer to the corners"
             )
-    if not solution.converged and not np.isfinite(solution.cost):
-        raise SolutionError(f"the solve failed ({solution.termination}): check labels and target dimensions")
+        warnings.append(
+            f"{where}: from there to the corner ({corner:.0f} px) pixels have no answer; "
+            f"observations reach {seen:.0f} px"
+        )
+    return tuple(warnings)
+
+
+def _reach_px(name: str, camera: Camera, sights: Sights) -> float:
+    """Distance from the principal point to the farthest observation of this camera."""
+    own = sights.take(np.array([i for i, key in enumerate(sights.keys) if key.camera == name], dtype=np.int64))
+    offsets = camera.offsets(np.vstack([own.pixels, own.curve_pixels]))
+    return float(np.max(np.linalg.norm(offsets, axis=1), initial=0.0))
 
 
 def _fit(settled: _Settled, layout: Layout) -> Fit:

@@ -71,6 +71,7 @@ class Calibration:
         termination: why the last solve stopped. converged: whether it had come to rest.
         rounds: solves it took. history: cost at each iteration of the last one.
         phi_from: camera -> "fixed", "views", "prior" or "guess": what the start for phi rested on.
+        warnings: what to know before using it, each one line.
         options: how it was solved. digest: SHA-256 of the observations. versions: of the packages that solved it.
     """
 
@@ -82,6 +83,7 @@ class Calibration:
     rounds: int
     history: tuple[float, ...]
     phi_from: Mapping[str, str]
+    warnings: tuple[str, ...]
     options: Options
     digest: str
     versions: Mapping[str, str] = field(default_factory=lambda: package_versions())
@@ -127,7 +129,7 @@ class Calibration:
         """Read a calibration.
 
         Raises:
-            InputError: one line that names the file and the place; also for a lens that folds over inside the image.
+            InputError: one line that names the file and the place; also for a radial lens that folds inside the image.
         """
         data = convert(read_json(path, FORMAT, VERSION), _CalibrationFile, str(path))
         try:
@@ -192,6 +194,7 @@ class _CalibrationFile(msgspec.Struct, forbid_unknown_fields=True):
     rounds: int
     history: tuple[float, ...]
     phi_from: dict[str, str]
+    warnings: tuple[str, ...]
     options: dict[str, Any]
     digest: str
     versions: dict[str, str]
@@ -238,6 +241,7 @@ def calibration_to_json(calibration: Calibration) -> dict[str, Any]:
         "rounds": calibration.rounds,
         "history": list(calibration.history),
         "phi_from": dict(calibration.phi_from),
+        "warnings": list(calibration.warnings),
         "options": options,
         "digest": calibration.digest,
         "versions": dict(calibration.versions),
@@ -253,7 +257,8 @@ def _from_file(data: _CalibrationFile) -> Calibration:
     for name, entry in data.cameras.items():
         lens = make_lens(entry.lens.kind, entry.lens.powers or (2, 3), entry.lens.coefficients)
         cameras[name] = Camera(entry.image_size, entry.phi, entry.principal_point, lens, entry.aspect)
-        cameras[name].require_monotone(name)
+        if lens.kind == "radial":  # the others may fold in corners that nobody saw: `locate` gives NaN there
+            cameras[name].require_monotone(name)
     stations = {}
     for name, station in data.stations.items():
         if station.camera not in cameras:
@@ -271,6 +276,7 @@ def _from_file(data: _CalibrationFile) -> Calibration:
         data.rounds,
         data.history,
         data.phi_from,
+        data.warnings,
         convert(options, Options, "options"),
         data.digest,
         data.versions,

@@ -59,7 +59,7 @@ def homography_from_points(plane_points: ArrayLike, image_points: ArrayLike) -> 
         image_points: (N, 2), or (N, 3) homogeneous.
 
     Raises:
-        DegenerateError: fewer than four points, or all on one line.
+        DegenerateError: fewer than four points, or no four of which no three lie on one line.
     """
     plane = np.asarray(plane_points, dtype=float)
     image = np.asarray(image_points, dtype=float)
@@ -77,8 +77,10 @@ def homography_from_points(plane_points: ArrayLike, image_points: ArrayLike) -> 
             np.hstack([zero, u[:, 2:] * x, -u[:, 1:2] * x]),
         ]
     )
-    h = np.linalg.svd(rows)[2][-1].reshape(3, 3)
-    h = np.linalg.inv(scale) @ h @ t
+    _, s, vt = np.linalg.svd(rows)
+    if s[7] <= 1e-9 * s[0]:
+        raise DegenerateError(f"of any four of the {len(plane)} points three lie on one line: add points beside it")
+    h = np.linalg.inv(scale) @ vt[-1].reshape(3, 3) @ t
     return facing(h, plane, image)
 
 
@@ -217,14 +219,14 @@ def radial_alignment(data: PlaneData, unit_px: float, terms: int, rounds: int) -
 
 
 def usual_by_radius(error: Array, radius: Array, rings: int = 16) -> Array:
-    """(N,) the median error at each point's distance from the centre: a profile fits worse where the lens bends most."""
+    """(N,) the median error at each point's distance from the centre: profiles fit worst where lenses bend most."""
     ring = np.minimum((radius * (rings / (np.max(radius) + 1e-300))).astype(int), rings - 1)
     medians = np.full(rings, 1e-12)
     for number in range(rings):
         inside = error[ring == number]
         if len(inside):
             medians[number] = max(float(np.median(inside)), 1e-12)
-    return medians[ring]
+    return np.asarray(medians[ring])
 
 
 def _normalised_by_sight(data: PlaneData, sight: Ints) -> tuple[Array, Array]:

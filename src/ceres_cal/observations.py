@@ -232,7 +232,7 @@ class Observations:
         for what, bad in (
             ("its pixel is not finite", ~np.all(np.isfinite(column.pixels), axis=1)),
             ("its sigma_px must be positive and finite", ~(np.isfinite(column.sigma_px) & (column.sigma_px > 0.0))),
-            ("its side must be 0, 1 or -1", np.abs(side) > 1),
+            ("its side must be 0, 1 or -1", (side < -1) | (side > 1)),
         ):
             if np.any(bad):
                 row = int(np.argmax(bad))

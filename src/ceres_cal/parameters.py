@@ -37,6 +37,8 @@ class Options:
             deviations.
         reject_sigma: observations farther off than this many standard deviations are taken out and listed.
         noise_scale: "estimate" the factor on the stated sigmas of points and curves from the residuals, or "stated".
+        closed_form_only: stop at the paper's own method (radial fit, four points, max-norm lambda): a baseline to
+            compare with, not a calibration.
         max_iterations: of each solve. threads: of the solver; 0 chooses.
     """
 
@@ -50,6 +52,7 @@ class Options:
     loss_scale: float = 3.0
     reject_sigma: float = 5.0
     noise_scale: str = "estimate"
+    closed_form_only: bool = False
     max_iterations: int = 100
     threads: int = 0
 
@@ -132,7 +135,7 @@ class Estimate:
     def pose_stack(self, keys: Sequence[SightKey]) -> Array:
         """cam_from_frame of each sight as [R t], (S, 3, 4)."""
         stations = {name: station.cam_from_world for name, station in self.stations.items()}
-        frames = {**self.placements, None: Pose.identity()}
+        frames: dict[str | None, Pose] = {None: Pose.identity(), **{name: p for name, p in self.placements.items()}}
         first = np.array([stations[key.station].rotation for key in keys])
         offset = np.array([stations[key.station].translation for key in keys])
         second = np.array([frames[key.placement].rotation for key in keys])

@@ -151,7 +151,7 @@ def _flat_sights_of_points(sights: Sights) -> Rows:
     away = board.points[:, :2] - np.repeat(np.add.reduceat(board.points[:, :2], starts) / sizes[:, None], sizes, axis=0)
     xx, yy = np.add.reduceat(away[:, 0] ** 2, starts), np.add.reduceat(away[:, 1] ** 2, starts)
     xy = np.add.reduceat(away[:, 0] * away[:, 1], starts)
-    return candidates[flat & (xx * yy - xy**2 > 1e-12 * (xx + yy) ** 2)]
+    return np.asarray(candidates[flat & (xx * yy - xy**2 > 1e-12 * (xx + yy) ** 2)])
 
 
 def _align(board: Sights, camera: Camera, unit: float) -> RadialAlignment:
@@ -248,22 +248,41 @@ def _profile_from_lines(planes: Sequence[PlaneSight], unit: float) -> Profile:
 _RADII = np.linspace(0.0, 1.0, 21)
 
 
-def _from_rings(sight: Sights, camera: Camera, unit: float) -> tuple[Profile, Array]:
-    """Profile and homography of concentric rings seen about frontally (paper, section 2)."""
-    offsets = camera.offsets(sight.curve_pixels)
-    radii = np.linalg.norm(sight.tracks[sight.track, 1], axis=1)
+@dataclass(frozen=True, eq=False)
+class RingRadii:
+    """Rings seen about frontally: their centre (2,) px, and for each observation (M,) its distance from there (px) and
+    the radius of its ring (m).
+    """
+
+    centre: Array
+    measured_px: Array
+    ring_m: Array
+
+
+def ring_radii(sight: Sights, camera: Camera) -> RingRadii:
+    """Radii of the observed rings around their own centre, which need not be the principal point (paper, section 2)."""
+    on_ring = sight.is_arc[sight.track]
+    offsets = camera.offsets(sight.curve_pixels)[on_ring]
+    radii = np.linalg.norm(sight.tracks[sight.track[on_ring], 1], axis=1)
+    rings, ring = np.unique(radii, return_inverse=True)
     centre = offsets.mean(axis=0)
     for _ in range(10):  # each ring's own mean radius, so that stretches that are not seen do not pull the centre
         away = offsets - centre
         radius = np.linalg.norm(away, axis=1)
-        rings, ring = np.unique(radii, return_inverse=True)
         mean = np.bincount(ring, radius) / np.bincount(ring)
         direction = away / np.maximum(radius, 1e-9)[:, None]
         centre = centre + np.linalg.lstsq(direction, radius - mean[ring], rcond=None)[0]
-    profile, kappa = ring_profile(np.linalg.norm(offsets - centre, axis=1), radii, unit)
-    if len(rings) < 3:
+    return RingRadii(centre, np.linalg.norm(offsets - centre, axis=1), radii)
+
+
+def _from_rings(sight: Sights, camera: Camera, unit: float) -> tuple[Profile, Array]:
+    """Profile and homography of concentric rings seen about frontally."""
+    radii = ring_radii(sight, camera)
+    profile, kappa = ring_profile(radii.measured_px, radii.ring_m, unit)
+    if len(np.unique(radii.ring_m)) < 3:
         profile = Profile((0.0, 0.0), unit)
-    return profile, np.array([[kappa, 0.0, centre[0]], [0.0, kappa, centre[1]], [0.0, 0.0, 1.0]])
+    cx, cy = radii.centre
+    return profile, np.array([[kappa, 0.0, cx], [0.0, kappa, cy], [0.0, 0.0, 1.0]])
 
 
 def _is_suspicious(alignment: RadialAlignment) -> Mask:

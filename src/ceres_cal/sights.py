@@ -63,7 +63,7 @@ class Sights(Sequence["Sights"]):
     def __len__(self) -> int:
         return len(self.keys)
 
-    def __getitem__(self, number: int | slice) -> Sights:  # type: ignore[override]
+    def __getitem__(self, number: int | slice) -> Sights:
         if isinstance(number, slice):
             return self.take(np.arange(len(self))[number])
         if not -len(self) <= number < len(self):

@@ -6,8 +6,9 @@ above (from +z) when sides are named.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from functools import cached_property
 from typing import Any
 
@@ -52,13 +53,13 @@ class Segment:
 
     @property
     def length_m(self) -> float:
-        return float(np.linalg.norm(np.subtract(self.end, self.start)))
+        return math.dist(self.start, self.end)
 
     def track(self, side: int = 0) -> Array:
         """(3, 3) rows c, a, b of C(s) = c + s a, s from 0 to 1; b is 0 for a segment."""
         start, along = np.asarray(self.start, dtype=float), np.subtract(self.end, self.start)
         left = np.array([-along[1], along[0], 0.0])
-        norm = np.linalg.norm(left)
+        norm = math.hypot(along[0], along[1])
         offset = side * 0.5 * self.width_m * left / norm if norm > 0.0 else np.zeros(3)
         return np.array([start + offset, along, np.zeros(3)])
 
@@ -351,7 +352,7 @@ def custom(
         if not np.all(np.isfinite(place)):
             raise InputError(f"custom target: point {name!r} must have three finite numbers, not {place}")
     for name, curve in curves.items():
-        if not (np.all(np.isfinite(curve.track(1))) and 0.0 < curve.length_m < np.inf and curve.width_m >= 0.0):
+        if not np.all(np.isfinite(np.hstack(astuple(curve)))) or curve.length_m <= 0.0 or curve.width_m < 0.0:
             raise InputError(f"custom target: curve {name!r} needs finite numbers, a length and a width_m from 0 on")
         if isinstance(curve, Arc) and not curve.radius_m > 0.5 * curve.width_m:
             raise InputError(f"custom target: arc {name!r} must have a radius of more than half its width")

@@ -63,9 +63,9 @@ def _run(arguments: list[str]) -> int:
         print(_overview(" ".join(arguments[:-1])))
         return 0
     if arguments[:1] == ["--version"]:
-        from importlib.metadata import version
+        from ceres_cal.calibration import package_versions
 
-        print(f"ceres-cal {version('ceres-cal')}")
+        print(", ".join(f"{name} {version}" for name, version in package_versions().items()))
         return 0
     command, rest = _choose(arguments)
     options = command.parse(rest)

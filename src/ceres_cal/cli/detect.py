@@ -27,6 +27,12 @@ def _add_board(parser: ArgumentParser) -> None:
     add("--square", type=float, required=True, metavar="M", help="side of a square in metres")
     add("--charuco", metavar="DICT", help="the board has markers of this OpenCV dictionary, such as DICT_4X4_50")
     add("--marker", type=float, metavar="M", help="side of a marker in metres, with --charuco")
+    add(
+        "--corner-fit",
+        choices=("opencv", "saddle"),
+        default="opencv",
+        help="measure corners as OpenCV does (default), or by the saddle around each: finer where squares are large",
+    )
     add("--camera", default="camera", metavar="NAME", help="name of the camera; default: camera")
     add("--station", metavar="NAME", help="name of the station; default: that of the camera")
     add_output(parser, "the observations (.json or .npz)", required=True)
@@ -47,7 +53,15 @@ def _run_board(args: Namespace) -> Answer:
     board = checkerboard(args.columns, args.rows, args.square)
     charuco = None if args.charuco is None else CharucoSpec(args.charuco, args.marker)
     with ProgressBar(silent=args.quiet or args.json) as bar:
-        found = detect_boards(images, board, args.camera, args.station, charuco, bar.update)
+        found = detect_boards(
+            images,
+            board,
+            camera=args.camera,
+            station=args.station,
+            charuco=charuco,
+            corner_fit=args.corner_fit,
+            progress=bar.update,
+        )
     with finishing():
         found.observations.save(args.output)
     return Answer(_data(found, args.output), lambda: _text(found, args.output))

@@ -101,7 +101,7 @@ def _texts(args: Namespace) -> Iterator[tuple[str, str]]:
     elif args.file is not None:
         from ceres_cal.files import read_bytes
 
-        yield from _lines(read_bytes(args.file).decode(errors="replace").splitlines(), args.file)
+        yield from _lines(read_bytes(args.file).decode("utf-8-sig", errors="replace").splitlines(), args.file)
     else:
         yield from ((f"argument {text!r}", text) for text in args.rows)
 

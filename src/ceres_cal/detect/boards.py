@@ -1,6 +1,6 @@
 """Chessboard and ChArUco corners from image files, as observations.
 
-OpenCV finds the board; `saddles` then measures every corner.
+OpenCV finds the board; its sub-pixel search or `saddles` then measures every corner.
 """
 
 from __future__ import annotations
@@ -24,9 +24,11 @@ from ceres_cal.transforms import Array
 Image = NDArray[Any]
 Progress = Callable[[int, int, str], None]
 
+CORNER_FITS = ("opencv", "saddle")
 MIN_CORNERS = 6
 TARGET_NAME = "board"
 _LARGE_PX = 2e6  # larger images are searched at this size first: faster, and with less of noise and blur
+_SUBPIX_HALF_WINDOW_PX = 5  # at most; a third of the spacing keeps the neighbouring corners out of it
 _SMALL_PX = 2e6  # smaller ones also at twice their size, where the squares are few pixels wide
 
 
@@ -66,6 +68,7 @@ def detect_boards(
     camera: str = "camera",
     station: str | None = None,
     charuco: CharucoSpec | None = None,
+    corner_fit: str = "opencv",
     progress: Progress | None = None,
 ) -> BoardDetections:
     """Chessboard or ChArUco corners of one camera's images.
@@ -86,6 +89,9 @@ def detect_boards(
         camera: name of the camera.
         station: name of the station, that of the camera by default.
         charuco: the markers, when the board has any. Boards may then be partly seen.
+        corner_fit: "opencv" measures with cornerSubPix, as the peers do, so that results compare; "saddle" fits a
+            blurred saddle to each corner: about four times more precise on rendered boards (0.005 px against 0.02),
+            and without cornerSubPix's pull towards the middle of its window. ChArUco corners are always saddles.
         progress: called after each image with (images done, images in all, file name).
 
     Raises:
@@ -94,7 +100,7 @@ def detect_boards(
     """
     paths = [Path(path) for path in images]
     placements = _placement_names(paths)
-    size, found, missed = _find_all(paths, _finder(board, charuco), progress)
+    size, found, missed = _find_all(paths, _finder(board, charuco, corner_fit), progress)
     if not found:
         raise InputError(
             f"no board of {board.spec['columns']} x {board.spec['rows']} inner corners in any of {len(paths)} images "
@@ -152,30 +158,44 @@ def _find_all(
     return size, found, missed
 
 
-def _finder(board: Target, charuco: CharucoSpec | None) -> Finder:
+def _finder(board: Target, charuco: CharucoSpec | None, corner_fit: str) -> Finder:
+    if corner_fit not in CORNER_FITS:
+        raise InputError(f"unknown corner fit {corner_fit!r}: choose one of {', '.join(CORNER_FITS)}")
     if board.kind != "checkerboard":
         raise InputError(f"target of kind {board.kind!r}: boards are detected with a target of kind 'checkerboard'")
     columns, rows = int(board.spec["columns"]), int(board.spec["rows"])
     if min(columns, rows) < 3:
         raise InputError(f"a board to be found in images needs 3 inner corners a side or more, not {columns} x {rows}")
     if charuco is None:
-        return lambda image: _measured_chessboard(image, columns, rows)
+        return lambda image: _measured_chessboard(image, columns, rows, corner_fit)
     detector = _charuco_detector(charuco, columns, rows, float(board.spec["square_m"]))
     margin = 0.5 * (1.0 - charuco.marker_m / float(board.spec["square_m"]))  # white around a marker, in squares
     return lambda image: _measured_charuco(image, detector, columns, rows, margin)
 
 
-def _measured_chessboard(image: Image, columns: int, rows: int) -> Array | str:
+def _measured_chessboard(image: Image, columns: int, rows: int, corner_fit: str) -> Array | str:
     seen = _find_chessboard(_as_8_bit(image), columns, rows)
     if seen is None:
         return f"no chessboard of {columns} x {rows} inner corners found"
-    saddles = measure_saddles(image, right_handed(seen))
-    grid = saddles.grid
+    seen = right_handed(seen)
+    saddles = measure_saddles(image, seen)
+    grid = saddles.grid if corner_fit == "saddle" else _subpixel(_as_8_bit(image), seen)
     if (columns + rows) % 2 == 1:
         parity = np.where(np.indices((rows, columns)).sum(axis=0) % 2 == 0, 1.0, -1.0)
         if np.nansum(parity * saddles.contrast) < 0.0:
             grid = grid[::-1, ::-1]
     return _enough(grid)
+
+
+def _subpixel(image: NDArray[np.uint8], grid: Array) -> Array:
+    """OpenCV's sub-pixel corners, in a window that holds no other corner."""
+    steps = np.concatenate([np.diff(grid, axis=axis).reshape(-1, 2) for axis in (0, 1)])
+    half = int(np.clip(np.min(np.linalg.norm(steps, axis=1)) / 3.0, 2, _SUBPIX_HALF_WINDOW_PX))
+    criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-4)
+    corners = grid.reshape(-1, 1, 2).astype(np.float32)
+    return np.asarray(cv2.cornerSubPix(image, corners, (half, half), (-1, -1), criteria), dtype=float).reshape(
+        grid.shape
+    )
 
 
 def right_handed(grid: Array) -> Array:

@@ -1,7 +1,7 @@
 """How the kernels are compiled and where the machine code is kept.
 
-numba's cache looks at the file of the compiled function alone, not at the files it calls into. So the kernels are kept in
-a folder named after all their sources: change one line of one of them and all are compiled anew.
+numba's cache looks at the file of the compiled function alone, not at the files it calls into. So the kernels are kept
+in a folder named after all their sources: change one line of one of them and all are compiled anew.
 """
 
 from __future__ import annotations

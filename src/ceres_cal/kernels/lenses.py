@@ -86,7 +86,7 @@ def _measured_radius(n: int, dense: Any, limit: float, ideal: Any, s: Any, value
 
 @jit
 def _radial(n: int, intrinsics: Any, dense: Any, unit: float, limit: float, rays: Any, image: Any, work: Any) -> bool:
-    """The paper's lens: solve s (1 + c_2 s + ...) = phi |u| / unit for the measured radius s, in half image diagonals."""
+    """The paper's lens: s (1 + c_2 s + ...) = phi |u| / unit solved for the radius s, in half image diagonals."""
     phi = intrinsics[0]
     ideal, value, slope = image[0], image[1], image[2]
     for i in range(n):
@@ -183,7 +183,7 @@ def distort(
 def intrinsics_rows(
     lens: int, n: int, intrinsics: Any, powers: Any, unit: float, image: Any, work: Any, jacobian: Any
 ) -> None:
-    """Derivatives of the pixel with respect to phi, aspect, principal point and coefficients, for the distorted chunk."""
+    """Derivatives of the distorted chunk's pixels with respect to phi, aspect, principal point and coefficients."""
     phi, aspect = intrinsics[0], intrinsics[1]
     for i in range(n):
         jacobian[0, 0, i], jacobian[0, 1, i] = image[0, i] / phi, aspect * image[1, i] / phi

@@ -1,4 +1,4 @@
-"""All observations of one sight: residuals in measured pixels, robust weights and the normal equations (design, 5 and 6).
+"""All observations of one sight: residuals in measured pixels, robust weights, normal equations (design, 5 and 6).
 
 The observations are walked in chunks laid out number by number, so that the compiler can use SIMD registers. The pose
 columns are left perturbations in the camera frame, (dw x R X) + dt. `lenses` names the working arrays.
@@ -32,7 +32,7 @@ def _to_camera(n: int, pose: Any, points: Any, rotated: Any, rays: Any) -> None:
 
 @jit
 def _pose_rows(n: int, first: int, aspect: float, rotated: Any, image: Any, jacobian: Any) -> None:
-    """Derivatives of the pixel with respect to a left perturbation of the pose: three of rotation, three of translation."""
+    """Derivatives of the pixel with respect to a left perturbation of the pose: rotation, then translation."""
     for c in range(2):
         scale = 1.0 if c == 0 else aspect
         for i in range(n):
@@ -136,12 +136,12 @@ def _loss(code: int, scale: float, squared: float) -> tuple[float, float]:
 def _add_products(n: int, components: int, rows: Any, jacobian: Any, normal: Any) -> None:
     """normal += J J^T over the chosen rows, lower triangle."""
     for k in range(len(rows)):
-        for l in range(k + 1):
+        for j in range(k + 1):
             total = 0.0
             for c in range(components):
                 for i in range(n):
-                    total += jacobian[rows[k], c, i] * jacobian[rows[l], c, i]
-            normal[k, l] += total
+                    total += jacobian[rows[k], c, i] * jacobian[rows[j], c, i]
+            normal[k, j] += total
 
 
 @jit
@@ -183,8 +183,8 @@ def _add_points(
 
 @jit
 def _add_curves(
-    lens: int, intrinsics: Any, powers: Any, dense: Any, unit: float, limit: float, pose: Any, tracks: Any, is_arc: Any, track: Any,
-    pixels: Any, weights: Any, s: Any, loss: int, scale: float, rows: Any, wants_normal: bool, normal: Any,
+    lens: int, intrinsics: Any, powers: Any, dense: Any, unit: float, limit: float, pose: Any, tracks: Any,
+    is_arc: Any, track: Any, pixels: Any, weights: Any, s: Any, loss: int, scale: float, rows: Any, wants_normal: bool, normal: Any,
     jacobian: Any, scratch: Any,
 ) -> float:  # fmt: skip
     """The same for the curve observations: one residual each, the distance along the image normal at the foot.

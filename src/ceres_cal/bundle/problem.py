@@ -1,0 +1,238 @@
+"""The one nonlinear least-squares problem: its blocks, the solve and what comes out."""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pyceres
+from numpy.typing import NDArray
+
+from ceres_cal.bundle.costs import EliminatedCost, LinearPriorCost, PositionPriorCost, Run, SightCost, Weighting
+from ceres_cal.errors import DegenerateError
+from ceres_cal.observations import Prior
+from ceres_cal.parameters import (
+    Estimate,
+    Layout,
+    Options,
+    Station,
+    intrinsic_names,
+    intrinsics_scales,
+    intrinsics_vector,
+    with_intrinsics,
+)
+from ceres_cal.sights import SightKey, Sights
+from ceres_cal.transforms import Array, Pose
+
+_DENSE_LIMIT = 600  # numbers that stay after the Schur complement; above it a sparse factorisation is faster
+
+
+@dataclass(frozen=True)
+class Progress:
+    """One iteration of a solve, as the progress callback gets it."""
+
+    iteration: int
+    cost: float
+    step_norm: float
+
+
+@dataclass(frozen=True)
+class Solution:
+    """The end of one solve.
+
+    Attributes:
+        cost: half the sum of all rho, at the end. history: the same at every iteration.
+        converged: False when the iterations ran out or the solver failed; termination: Ceres' own words why it stopped.
+        failed: the estimate must not be used.
+    """
+
+    estimate: Estimate
+    cost: float
+    converged: bool
+    termination: str
+    history: tuple[float, ...]
+    failed: bool = False
+
+
+@dataclass(eq=False)
+class _Blocks:
+    """The arrays that Ceres moves, by name; the caller's estimate is never touched."""
+
+    cameras: dict[str, Array]
+    stations: dict[str, Array]
+    placements: dict[str, Array]
+
+    @classmethod
+    def pack(cls, estimate: Estimate, layout: Layout, eliminated: Container[str | None]) -> _Blocks:
+        return cls(
+            {name: intrinsics_vector(camera)[layout.free[name]] for name, camera in estimate.cameras.items()},
+            {name: station.cam_from_world.log() for name, station in estimate.stations.items()},
+            {name: pose.log() for name, pose in estimate.placements.items() if name not in eliminated},
+        )
+
+    def of(self, key: SightKey, slots: Iterable[int]) -> list[Array]:
+        """The arrays of a sight's camera (slot 0), station (1) and placement (2), as far as they are free."""
+        names = ((self.cameras, key.camera), (self.stations, key.station), (self.placements, str(key.placement)))
+        return [names[slot][0][names[slot][1]] for slot in slots]
+
+    def unpack(self, estimate: Estimate, layout: Layout) -> Estimate:
+        cameras = {}
+        for name, camera in estimate.cameras.items():
+            vector = intrinsics_vector(camera)
+            vector[layout.free[name]] = self.cameras[name]
+            cameras[name] = with_intrinsics(camera, vector) if len(layout.free[name]) else camera
+        stations = {
+            name: Station(old.camera, Pose.exp(self.stations[name])) if name in layout.stations else old
+            for name, old in estimate.stations.items()
+        }
+        placements = {
+            name: Pose.exp(self.placements[name]) if name in layout.placements and name in self.placements else old
+            for name, old in estimate.placements.items()
+        }
+        return Estimate(cameras, stations, placements)
+
+
+class _Watcher(pyceres.IterationCallback):
+    """Passes progress on, and ends the solve when a callback has failed or Ctrl-C was pressed."""
+
+    def __init__(self, run: Run, progress: Callable[[Progress], None] | None) -> None:
+        super().__init__()
+        self._run, self._progress = run, progress
+
+    def __call__(self, summary: Any) -> Any:
+        try:
+            self._run.history.append(float(summary.cost))
+            if self._progress is not None:
+                self._progress(Progress(int(summary.iteration), float(summary.cost), float(summary.step_norm)))
+        except BaseException as error:
+            self._run.failure = self._run.failure or error
+        stop = self._run.failure is not None
+        return pyceres.CallbackReturnType.SOLVER_ABORT if stop else pyceres.CallbackReturnType.SOLVER_CONTINUE
+
+
+def solve(
+    sights: Sights,
+    estimate: Estimate,
+    layout: Layout,
+    weighting: Weighting,
+    options: Options,
+    progress: Callable[[Progress], None] | None = None,
+) -> Solution:
+    """Minimise the robust cost over everything free, from `estimate`.
+
+    Raises:
+        DegenerateError: fewer observations than free numbers.
+    """
+    _require_enough(sights, layout)
+    run = Run()
+    threads = options.threads or min(os.cpu_count() or 1, 8)
+    private = _private_placements(sights, layout)
+    blocks = _Blocks.pack(estimate, layout, private)
+    problem = pyceres.Problem()
+    eliminated: list[EliminatedCost] = []
+    others: list[SightCost] = []
+    for camera in estimate.cameras:
+        own = np.array([i for i, key in enumerate(sights.keys) if key.camera == camera and key.placement in private])
+        if len(own):
+            eliminated.append(EliminatedCost(run, sights.take(own), estimate, layout, weighting, threads))
+            if len(blocks.cameras[camera]):
+                problem.add_residual_block(eliminated[-1], None, [blocks.cameras[camera]])
+    for number, key in enumerate(sights.keys):
+        if key.placement not in private:
+            others.append(SightCost(run, sights[number], estimate, layout, weighting))
+            if arrays := blocks.of(key, others[-1].slots):
+                problem.add_residual_block(others[-1], None, arrays)
+    prior_costs = list(_prior_blocks(layout, estimate, blocks))
+    for prior_cost, array in prior_costs:
+        problem.add_residual_block(prior_cost, None, [array])
+    summary = pyceres.SolverSummary()
+    pyceres.solve(_solver_options(layout, blocks, options, weighting, _Watcher(run, progress)), problem, summary)
+    if run.failure is not None:
+        raise run.failure
+    solved = blocks.unpack(estimate, layout)
+    placements = dict(solved.placements)
+    for cost in eliminated:
+        placements |= _placed(solved, *cost.settled(blocks.cameras[cost.camera]))
+    return Solution(
+        Estimate(solved.cameras, solved.stations, placements),
+        float(summary.final_cost),
+        summary.termination_type == pyceres.TerminationType.CONVERGENCE,
+        str(summary.message),
+        tuple(run.history),
+        not summary.IsSolutionUsable(),
+    )
+
+
+def _private_placements(sights: Sights, layout: Layout) -> frozenset[str | None]:
+    """Free placements that a single sight shows."""
+    seen = Counter(key.placement for key in sights.keys)
+    return frozenset(name for name, times in seen.items() if times == 1 and name in layout.placements)
+
+
+def _placed(estimate: Estimate, keys: Sequence[SightKey], cam_from_target: Array) -> dict[str, Pose]:
+    """world_from_target of each key's placement."""
+    stations = {name: station.cam_from_world.inverse for name, station in estimate.stations.items()}
+    first = np.array([stations[key.station].rotation for key in keys])
+    offset = np.array([stations[key.station].translation for key in keys])
+    rotations = first @ cam_from_target[:, :, :3]
+    translations = np.einsum("sij,sj->si", first, cam_from_target[:, :, 3]) + offset
+    return {str(key.placement): Pose(r, t) for key, r, t in zip(keys, rotations, translations, strict=True)}
+
+
+def _require_enough(sights: Sights, layout: Layout) -> None:
+    equations = 2 * len(sights.point_rows) + len(sights.curve_rows)
+    equations += sum(len(prior.value) for prior in layout.priors)
+    if equations < layout.size:
+        raise DegenerateError(
+            f"{equations} measured numbers (two a point, one a curve observation or prior) cannot determine "
+            f"{layout.size} unknowns: add observations, or fix some of the unknowns"
+        )
+
+
+def _solver_options(layout: Layout, blocks: _Blocks, options: Options, weighting: Weighting, watcher: _Watcher) -> Any:
+    solver = pyceres.SolverOptions()
+    kept = sum(len(free) for free in layout.free.values())
+    kept += 6 * len(layout.stations) if blocks.placements else 0
+    few = kept < _DENSE_LIMIT
+    solver.linear_solver_type = pyceres.LinearSolverType.DENSE_SCHUR if few else pyceres.LinearSolverType.SPARSE_SCHUR
+    solver.max_num_iterations = options.max_iterations
+    solver.function_tolerance = weighting.precision
+    solver.parameter_tolerance = 1e-12
+    solver.gradient_tolerance = 1e-14
+    solver.num_threads = 1  # the kernels are shorter than the wait for Python's lock
+    solver.logging_type = pyceres.LoggingType.SILENT
+    solver.callbacks = [watcher]
+    return solver
+
+
+def _prior_blocks(layout: Layout, estimate: Estimate, blocks: _Blocks) -> Iterable[tuple[Any, Array]]:
+    """The cost and the array of each prior on something free."""
+    for prior in layout.priors:
+        if prior.owner == "station":
+            if prior.name in layout.stations:
+                axes = np.array([2] if prior.quantity == "height_m" else [0, 1, 2])
+                cost = PositionPriorCost(axes, np.asarray(prior.value), np.asarray(prior.sigma))
+                yield cost, blocks.stations[prior.name]
+            continue
+        places, mean, sigma = _prior_on_intrinsics(prior, estimate, layout.free)
+        if len(places):
+            array = blocks.cameras[prior.name]
+            yield LinearPriorCost(places, mean, sigma, len(array)), array
+
+
+def _prior_on_intrinsics(
+    prior: Prior, estimate: Estimate, free: Mapping[str, NDArray[np.int64]]
+) -> tuple[NDArray[np.int64], Array, Array]:
+    """Places in the camera's block, mean and sigma in the solver's units; a number that is held needs no prior."""
+    camera = estimate.cameras[prior.name]
+    names = intrinsic_names(camera.lens)
+    quantities = ("cx", "cy") if prior.quantity == "principal_point" else (prior.quantity,)
+    wanted = np.array([names.index(quantity) for quantity in quantities])
+    scales = intrinsics_scales(camera)[wanted]
+    held = np.isin(wanted, free[prior.name])
+    places = np.searchsorted(free[prior.name], wanted[held])
+    return places, (np.asarray(prior.value) * scales)[held], (np.asarray(prior.sigma) * scales)[held]

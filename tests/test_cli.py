@@ -1,0 +1,743 @@
+"""The commands as someone types them: answers, wrong usage, bad input, Ctrl-C, progress."""
+
+import importlib.util
+import io
+import json
+import os
+import pty
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+import pytest
+
+import ceres_cal.calibrate
+from ceres_cal.calibration import Calibration
+from ceres_cal.cli import COMMANDS, main
+from ceres_cal.cli.progress import ProgressBar
+from ceres_cal.cli.targets import KINDS
+from ceres_cal.detect.boards import CORNER_FITS
+from ceres_cal.lens import LENS_KINDS
+from ceres_cal.observations import Observations
+from ceres_cal.parameters import LOSSES, Options
+from ceres_cal.simulate import scene_names
+from ceres_cal.targets import TARGET_KINDS, ssl_field
+
+ROOT = Path(__file__).resolve().parents[1]
+SAMPLE = ROOT / "data" / "ssl_field" / "observations.json"
+
+
+class Said(NamedTuple):
+    code: int
+    out: str
+    err: str
+
+
+Say = Callable[..., Said]
+
+
+@pytest.fixture
+def say(capsys: pytest.CaptureFixture[str]) -> Say:
+    """Runs a command in this process."""
+
+    def run(*arguments: object) -> Said:
+        code = main([str(argument) for argument in arguments])
+        return Said(code, *capsys.readouterr())
+
+    return run
+
+
+def refused(said: Said, code: int = 2) -> str:
+    """The one line of an error, with nothing else said."""
+    assert said.code == code, said
+    assert said.out == ""
+    assert said.err.startswith("ceres-cal: ") and said.err.endswith("\n") and said.err.count("\n") == 1, said.err
+    return said.err
+
+
+@pytest.fixture(scope="module")
+def calibrated(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The calibration of the sample."""
+    path = tmp_path_factory.mktemp("calibrated") / "calibration.json"
+    assert main(["calibrate", str(SAMPLE), "-o", str(path), "--quiet"]) == 0
+    return path
+
+
+def in_a_shell(command: str, **settings: Any) -> subprocess.CompletedProcess[str]:
+    """Runs a shell command in which $CC is ceres-cal."""
+    program = "import sys; from ceres_cal.cli import main; sys.exit(main())"
+    environment = {**os.environ, "PYTHONPATH": str(ROOT / "src"), "CC_PROGRAM": program, "CC_PYTHON": sys.executable}
+    script = f'cc() {{ "$CC_PYTHON" -c "$CC_PROGRAM" "$@"; }}; {command}'
+    return subprocess.run(["bash", "-c", script], env=environment, text=True, check=False, **settings)
+
+
+# ---- help and usage -------------------------------------------------------------------------------------------------
+
+
+def test_help_lists_every_command(say: Say) -> None:
+    said = say("--help")
+    assert said.code == 0 and said.err == ""
+    assert all(f"  {name}  " in said.out for name in ("detect board", "calibrate    ", "locate       "))
+    assert set(COMMANDS) == {"detect board", "calibrate", "locate", "project", "simulate", "targets"}
+    assert say("detect", "-h").out.count("board") > 0
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_help_of_a_command(say: Say, name: str) -> None:
+    said = say(*name.split(), "--help")
+    assert said.code == 0 and said.err == ""
+    assert said.out.startswith(f"usage: ceres-cal {name} ") and "--json" in said.out
+
+
+def test_version(say: Say) -> None:
+    said = say("--version")
+    assert said.code == 0 and said.out.startswith("ceres-cal ") and "pyceres" in said.out
+
+
+def test_help_and_wrong_usage_bring_in_nothing_heavy() -> None:
+    code = (
+        "import sys; from ceres_cal.cli import main\n"
+        "for arguments in (['--help'], ['calibrate', '--help'], ['calibrate'], ['detect'], ['locate', '--frob']):\n"
+        "    main(arguments)\n"
+        "print(*sorted({'numpy', 'msgspec', 'numba', 'pyceres', 'cv2', 'pycolmap'} & sys.modules.keys()), file=sys.stderr)"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert run.stderr.splitlines()[-1] == ""
+
+
+@pytest.mark.parametrize(
+    "arguments, words",
+    [
+        ((), "which command?"),
+        (("frobnicate",), "no command 'frobnicate'"),
+        (("--json",), "no command '--json'"),
+        (("detect",), "detect what?"),
+        (("detect", "shoes"), "detect what?"),
+        (("calibrate",), "required: OBS: see `ceres-cal calibrate --help`"),
+        (("calibrate", "x", "--frobnicate"), "unrecognized arguments: --frobnicate"),
+        (("calibrate", "x", "--lens", "zoom"), "invalid choice: 'zoom'"),
+        (("calibrate", "x", "--powers", "2,x"), "--powers '2,x': give whole numbers"),
+        (("calibrate", "x", "--powers", "3", "--lens", "brown"), "--powers is for the radial lens"),
+        (("calibrate", "x", "--fix", "k3"), "--fix 'k3': write NAME=VALUE"),
+        (("calibrate", "x", "--fix", "k3=0", "--fix", "k3=1"), "k3 is fixed twice"),
+        (("calibrate", "x", "--fix", "k3=nan"), "'nan' is not a finite number"),
+        (("calibrate", "x", "x"), "x: given twice"),
+        (("calibrate", "nowhere.json"), "nowhere.json: no such file"),
+        (("calibrate", "x", "-o", "no/where.json"), "there is no folder 'no': make it first"),
+        (("calibrate", "x", "-o", ROOT), "it is a folder"),
+        (("calibrate", SAMPLE, "-o", SAMPLE), "the output would replace it"),
+        (("calibrate", SAMPLE, "--powers", "1,2"), "powers of the radial lens"),
+        (("calibrate", SAMPLE, "--fix", "k3=0"), "cannot fix 'k3'"),
+        (("calibrate", SAMPLE, "--loss-scale", "0"), "loss_scale must be above 0"),
+        (("calibrate", SAMPLE, "--max-iterations", "0"), "max_iterations must be above 0"),
+        (("locate", "nowhere.json", "1,2"), "nowhere.json: no such file"),
+        (("locate", SAMPLE, "1,2"), '"format" must be "ceres-cal/calibration"'),
+        (("simulate",), "name a scene and a folder"),
+        (("simulate", "ssl-field"), "name a scene and a folder"),
+        (("simulate", "atlantis", "-o", "x"), "there is no scene 'atlantis'"),
+        (("simulate", "atlantis.json", "-o", "x"), "atlantis.json: no such file"),
+        (("simulate", "boards", "-o", "x", "--seed", "-1"), "--seed must be"),
+        (("simulate", "boards", "-o", SAMPLE), "is a file: name a folder"),
+        (("targets", "pitch"), "there is no target 'pitch'"),
+        (("targets", "nowhere.json"), "nowhere.json: no such file"),
+        (("detect", "board", "x.png"), "required: --columns, --rows, --square, -o/--output"),
+    ],
+)
+def test_wrong_usage_is_one_line(say: Say, arguments: Sequence[object], words: str, tmp_path: Path) -> None:
+    os.chdir(tmp_path)
+    assert words in refused(say(*arguments))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_choices_are_those_of_the_package() -> None:
+    calibrate, detect = COMMANDS["calibrate"], COMMANDS["detect board"]
+    assert [calibrate.parse(["x", "--lens", lens]).lens for lens in LENS_KINDS] == list(LENS_KINDS)
+    assert [calibrate.parse(["x", "--loss", loss]).loss for loss in LOSSES] == list(LOSSES)
+    board = ["x.png", "--columns", "4", "--rows", "3", "--square", "1", "-o", "y.json"]
+    assert [detect.parse([*board, "--corner-fit", fit]).corner_fit for fit in CORNER_FITS] == list(CORNER_FITS)
+    assert set(KINDS) == set(TARGET_KINDS)
+
+
+# ---- calibrate ------------------------------------------------------------------------------------------------------
+
+
+def test_calibrate_tells_what_came_out(say: Say, tmp_path: Path) -> None:
+    out = tmp_path / "calibration.json"
+    said = say("calibrate", SAMPLE, "-o", out)
+    assert said.code == 0 and said.err == ""
+    camera = Calibration.load(out).station("overhead")
+    for words in (
+        "20 views, 1 camera, 1 station, 12 placements",
+        "680 point observations, 1591 curve observations",
+        f"phi             {camera.phi:.4f} px (started from the views)",
+        f"a2              {camera.lens.values[0]!r}",
+        f"height {camera.position[2]:.3f} m",
+        "deg from straight down",
+        "of 2271 taken out",
+        "converged after",
+        f"written   {out}",
+    ):
+        assert words in said.out
+    assert "warning" not in said.out
+
+
+def test_calibrate_as_json_is_the_file_and_more(say: Say, tmp_path: Path) -> None:
+    out = tmp_path / "calibration.json"
+    said = say("calibrate", SAMPLE, "-o", out, "--json")
+    assert said.code == 0 and said.err == ""
+    data = json.loads(said.out)
+    assert data["calibration"] == json.loads(out.read_text())
+    assert data["counts"]["views"] == 20 and data["output"] == str(out) and data["warnings"] == []
+    assert sum(data["outliers"].values()) == len(data["calibration"]["rejected"])
+    # Nothing given on the command line is what nothing given in Python is.
+    assert data["calibration"]["options"] == json.loads(json.dumps(asdict(Options())))
+
+
+def test_options_arrive(say: Say) -> None:
+    said = say(
+        *("calibrate", SAMPLE, "--json", "--lens", "brown", "--fix", "k3=0", "--fix", "p1=1e-4", "--free-aspect"),
+        *("--hold-principal-point", "--loss", "cauchy", "--loss-scale", "2", "--reject-sigma", "6", "--threads", "1"),
+        *("--noise-scale", "stated", "--max-iterations", "50", "--prior", "height_m=4.02:0.01"),
+        *("--prior", "overhead.position_m=-2.27,-0.12,4.02:0.01,0.02,0.03", "--prior", "k1=-0.2:1"),
+    )
+    calibration = json.loads(said.out)["calibration"]
+    assert calibration["options"] == {
+        "lens": "brown",
+        "powers": [2, 3],
+        "free_principal_point": False,
+        "free_aspect": True,
+        "fixed": {"k3": 0.0, "p1": 1e-4},
+        "priors": [
+            {"station": "overhead", "height_m": 4.02, "sigma_m": 0.01},
+            {"station": "overhead", "position_m": [-2.27, -0.12, 4.02], "sigma_m": [0.01, 0.02, 0.03]},
+            {"camera": "overhead", "k1": -0.2, "sigma": 1.0},
+        ],
+        "loss": "cauchy",
+        "loss_scale": 2.0,
+        "reject_sigma": 6.0,
+        "noise_scale": "stated",
+        "max_iterations": 50,
+        "threads": 1,
+    }
+    assert calibration["cameras"]["overhead"]["lens"]["coefficients"]["p1"] == 1e-4
+
+
+@pytest.mark.parametrize(
+    "prior, words",
+    [
+        ("height_m", "write OWNER.NAME=VALUE:SIGMA"),
+        ("height_m=4", "write OWNER.NAME=VALUE:SIGMA"),
+        ("height_m=4:0", "sigma must be above 0"),
+        ("height_m=4:-1", "sigma must be above 0"),
+        ("height_m=inf:1", "'inf' is not a finite number"),
+        ("height_m=tall:1", "'tall' is not a number"),
+        ("heigth_m=4:1", "'heigth_m' is unknown: a station has height_m, position_m, a camera phi"),
+        ("k1=4:1", "'k1' is unknown"),
+        ("tower.height_m=4:1", "name one station before the dot: overhead"),
+        ("position_m=4:1", "3 numbers are needed, not 1"),
+        ("principal_point=640,480:1,2,3", "2 numbers are needed, not 3"),
+    ],
+)
+def test_wrong_priors(say: Say, prior: str, words: str) -> None:
+    line = refused(say("calibrate", SAMPLE, "--prior", prior))
+    assert f"--prior {prior!r}" in line and words in line
+
+
+def test_a_prior_names_its_owner_where_there_are_several(say: Say, tmp_path: Path) -> None:
+    say("simulate", "two-cameras", "-o", tmp_path)
+    observations = tmp_path / "observations.json"
+    assert "name one station before the dot: left, right" in refused(
+        say("calibrate", observations, "--prior", "height_m=4.4:0.01")
+    )
+    said = say("calibrate", observations, "--prior", "right.height_m=4.5:0.0001", "--json")
+    height_m = json.loads(said.out)["calibration"]["stations"]["right"]["position_m"][2]
+    assert height_m == pytest.approx(4.5, abs=3e-4)  # without the prior it was off by 7e-3
+
+
+def test_files_are_taken_together(say: Say, tmp_path: Path) -> None:
+    whole = Observations.load(SAMPLE)
+    data = json.loads(SAMPLE.read_text())
+    for number in (0, 1):
+        part = {**data, "views": data["views"][number::2]}
+        (tmp_path / f"{number}.json").write_text(json.dumps(part))
+    Observations.load(tmp_path / "1.json").save(tmp_path / "1.npz")
+    said = say("calibrate", tmp_path / "0.json", tmp_path / "1.npz", "--json")
+    counts = json.loads(said.out)["counts"]
+    assert (counts["views"], counts["points"]) == (len(whole.views), len(whole.points))
+
+
+def test_warns_where_phi_and_height_trade(say: Say, tmp_path: Path) -> None:
+    say("simulate", "field-2004", "-o", tmp_path)
+    said = say("calibrate", tmp_path / "observations.json")
+    assert said.code == 0 and "(started from a guess)" in said.out
+    words = " ".join(said.out.split())
+    assert "hardly tell phi and height apart" in words and "--prior overhead.height_m=METRES:0.01" in words
+
+
+def test_warns_of_a_lens_that_does_not_suit(say: Say, tmp_path: Path) -> None:
+    say("simulate", "fisheye", "-o", tmp_path)
+    said = say("calibrate", tmp_path / "observations.json", "--json")
+    assert any("times the stated sigmas" in warning for warning in json.loads(said.out)["warnings"])
+
+
+def test_says_what_boards_alone_cannot_tell(say: Say, tmp_path: Path) -> None:
+    say("simulate", "boards", "-o", tmp_path)
+    said = say("calibrate", tmp_path / "observations.json", "--fix", "a3=6.1e-7", "--free-aspect")
+    assert "held as the world" in said.out and "height" not in said.out
+    assert "a3              6.1e-07 (held)" in said.out and "aspect          1.000" in said.out
+
+
+# ---- bad input: one line, exit code 2, nothing written --------------------------------------------------------------
+
+Sample = dict[str, Any]
+
+
+def _feature(data: Sample) -> None:
+    data["views"][0]["points"]["features"][0] = "CornerOfTheRoom"
+
+
+def _curve(data: Sample) -> None:
+    data["views"][0]["curves"]["features"][0] = "Horizon"
+
+
+def _target(data: Sample) -> None:
+    data["views"][0]["target"] = "pitch"
+
+
+def _kind(data: Sample) -> None:
+    data["targets"]["field"]["kind"] = "tennis"
+
+
+def _version(data: Sample) -> None:
+    data["version"] = 99
+
+
+def _nan(data: Sample) -> None:
+    data["views"][0]["points"]["pixels"][1][0] = float("nan")
+
+
+def _infinite(data: Sample) -> None:
+    data["views"][0]["curves"]["pixels"][1][0] = float("inf")
+
+
+def _too_few(data: Sample) -> None:
+    view = data["views"][0]
+    del view["curves"]
+    view["points"]["features"] = view["points"]["features"][:4]
+    view["points"]["pixels"] = view["points"]["pixels"][:4]
+    data["views"] = [view]
+
+
+def _collinear(data: Sample) -> None:
+    field = ssl_field("B")
+    names = [name for name in field.point_names if field.points[name][1] == 0.0]
+    pixels = [[640.0 + 50.0 * field.points[name][0], 480.0 + 10.0 * field.points[name][0]] for name in names]
+    view = data["views"][0]
+    del view["curves"]
+    view["points"] = {"features": names, "pixels": pixels}
+    data["views"] = [view]
+
+
+def _idle_camera(data: Sample) -> None:
+    data["cameras"]["spare"] = {"image_size": [640, 480]}
+
+
+def _no_camera(data: Sample) -> None:
+    data["views"][0]["camera"] = "underwater"
+
+
+@pytest.mark.parametrize(
+    "spoil, words",
+    [
+        (_feature, ("view 0 (frame ", "point feature 'CornerOfTheRoom' is unknown", "`ceres-cal targets`")),
+        (_curve, ("view 0 (frame ", "curve feature 'Horizon' is unknown")),
+        (_target, ("view 0 (frame ", "target 'pitch', which is not there")),
+        (_kind, ("target 'field'", "unknown kind 'tennis'")),
+        (_version, ("version 99 is not known",)),
+        (_nan, ("view 0 (frame ", "pixel is not finite")),
+        (_infinite, ("view 0 (frame ", "pixel is not finite")),
+        (_too_few, ("cannot",)),
+        (_collinear, ("overhead",)),
+        (_idle_camera, ("camera 'spare' has no observation",)),
+        (_no_camera, ("view 0 (frame ", "camera 'underwater', which is not there")),
+    ],
+)
+def test_bad_observations(say: Say, tmp_path: Path, spoil: Callable[[Sample], None], words: Sequence[str]) -> None:
+    data = json.loads(SAMPLE.read_text())
+    spoil(data)
+    (tmp_path / "bad.json").write_text(json.dumps(data))
+    line = refused(say("calibrate", tmp_path / "bad.json", "-o", tmp_path / "calibration.json"))
+    assert all(word in line for word in words), line
+    assert [path.name for path in tmp_path.iterdir()] == ["bad.json"]
+
+
+def _pickled() -> bytes:
+    stream = io.BytesIO()
+    np.savez(stream, header=np.array([{"format": "ceres-cal/observations"}], dtype=object))
+    return stream.getvalue()
+
+
+@pytest.mark.parametrize(
+    "name, content, words",
+    [
+        ("bad.json", SAMPLE.read_bytes()[:5000], "not valid JSON (cut short?)"),
+        ("bad.json", b"x,y\n1,2\n", "not valid JSON"),
+        ("bad.json", b"", "not valid JSON"),
+        ("bad.json", b"[1, 2]", '"format" must be'),
+        ("bad.npz", _pickled(), "pickled"),
+        ("bad.npz", SAMPLE.read_bytes(), "no NPZ file"),
+    ],
+)
+def test_bad_files(say: Say, tmp_path: Path, name: str, content: bytes, words: str) -> None:
+    (tmp_path / name).write_bytes(content)
+    line = refused(say("calibrate", tmp_path / name, "-o", tmp_path / "calibration.json", "--json"))
+    assert str(tmp_path / name) in line and words in line
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
+def test_a_lens_that_folds_over_inside_the_image(say: Say, tmp_path: Path, calibrated: Path) -> None:
+    refused(say("calibrate", SAMPLE, "--fix", "a2=-0.01", "--fix", "a3=0", "-o", tmp_path / "calibration.json"))
+    assert list(tmp_path.iterdir()) == []
+    data = json.loads(calibrated.read_text())
+    data["cameras"]["overhead"]["lens"]["coefficients"] = {"a2": -0.01, "a3": 0.0}
+    (tmp_path / "folded.json").write_text(json.dumps(data))
+    assert "folds over at 50.0 px" in refused(say("locate", tmp_path / "folded.json", "640,480"))
+
+
+# ---- what else can happen -------------------------------------------------------------------------------------------
+
+
+def test_ctrl_c_leaves_nothing(say: Say, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(ProgressBar, "update", interrupt)
+    line = refused(say("calibrate", SAMPLE, "-o", tmp_path / "calibration.json"), code=130)
+    assert line == "ceres-cal: interrupted: nothing was written\n"
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "failure, code, line",
+    [
+        (MemoryError(), 2, "out of memory: give fewer observations or images at a time"),
+        (OSError(28, "No space left on device", "/there"), 2, "/there: No space left on device"),
+        (OSError("odd"), 2, "odd"),
+        (
+            KeyError("two\nlines"),
+            3,
+            "unexpected KeyError: 'two\\nlines': please report it (CERES_CAL_DEBUG=1 tells more)",
+        ),
+    ],
+)
+def test_no_failure_is_a_traceback(
+    say: Say, monkeypatch: pytest.MonkeyPatch, failure: Exception, code: int, line: str
+) -> None:
+    def fail(*_: object) -> None:
+        raise failure
+
+    monkeypatch.setattr(ceres_cal.calibrate, "calibrate", fail)
+    assert refused(say("calibrate", SAMPLE), code) == f"ceres-cal: {line}\n"
+    if code == 3:
+        monkeypatch.setenv("CERES_CAL_DEBUG", "1")
+        with pytest.raises(type(failure)):
+            say("calibrate", SAMPLE)
+
+
+def test_no_usable_solution_is_3(say: Say, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> None:
+        raise ceres_cal.SolutionError("no camera\ncame out")
+
+    monkeypatch.setattr(ceres_cal.calibrate, "calibrate", fail)
+    said = say("calibrate", SAMPLE, "-o", tmp_path / "calibration.json")
+    assert refused(said, 3) == "ceres-cal: no camera came out\n"
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_nobody_reads_on() -> None:
+    """`| head -1` ends the command quietly."""
+    run = in_a_shell("set -o pipefail; for i in 1 2 3 4; do cc targets ssl-a --json; done | true", capture_output=True)
+    assert (run.returncode, run.stdout, run.stderr) == (141, "", "")
+
+
+# ---- locate and project ---------------------------------------------------------------------------------------------
+
+
+def test_locate_and_project_are_inverse(say: Say, calibrated: Path) -> None:
+    located = json.loads(say("locate", calibrated, "300.5,200", "900,700.25", "--height-mm", "150", "--json").out)
+    assert located["height_m"] == 0.15 and located["no_answer"] == []
+    camera = Calibration.load(calibrated).station()
+    assert located["points_m"] == camera.locate(np.array(located["pixels"]), 0.15).tolist()  # every digit
+    places = [f"{x!r},{y!r},0.15" for x, y in located["points_m"]]
+    projected = json.loads(say("project", calibrated, *places, "--json").out)
+    assert np.allclose(projected["pixels"], located["pixels"], rtol=0.0, atol=1e-8)  # 2e-12
+
+
+def test_locate_in_text(say: Say, calibrated: Path) -> None:
+    x, y = Calibration.load(calibrated).station().locate(np.array([[640.0, 480.0]]))[0]
+    assert say("locate", calibrated, "640,480") == Said(0, f"{x:.4f} {y:.4f}\n", "")
+    assert say("locate", "640,480", "--height-m", "0", calibrated).code == 2  # the calibration comes first
+
+
+def test_negative_numbers_and_options_in_any_order(say: Say, calibrated: Path) -> None:
+    straight = say("project", calibrated, "-2.5,-1", "-.5,1,0.15", "--station", "overhead")
+    assert straight.code == 0 and straight.out.count("\n") == 2
+    assert say("project", "--station", "overhead", calibrated, "-2.5,-1", "-.5,1,0.15") == straight
+    assert say("project", calibrated, "--station", "overhead", "-2.5,-1", "-.5,1,0.15") == straight
+
+
+def test_no_answer_is_said_and_is_1(say: Say, calibrated: Path) -> None:
+    said = say("locate", calibrated, "640,480", "--height-m", "9")
+    assert (said.code, said.err) == (1, "")
+    assert said.out == "no answer: its ray does not meet the plane z = 9 m in front of the camera\n"
+    data = json.loads(say("project", calibrated, "0,0,9", "0,0", "--json").out)
+    assert data["pixels"][0] is None and data["pixels"][1] is not None
+    assert data["no_answer"] == [{"row": 0, "reason": "it lies behind the camera"}]
+
+
+def test_beyond_the_lens(say: Say, calibrated: Path, tmp_path: Path) -> None:
+    data = json.loads(calibrated.read_text())
+    data["cameras"]["overhead"]["lens"]["coefficients"] = {"a2": -5e-4, "a3": 0.0}  # folds over at 1000 px
+    (tmp_path / "weak.json").write_text(json.dumps(data))
+    said = say("locate", tmp_path / "weak.json", "2000,480")
+    assert said.code == 1 and "past the 1000 px from the principal point" in said.out
+    said = say("project", tmp_path / "weak.json", "-30,0")
+    assert said.code == 1 and "outside of what the lens can show" in said.out
+
+
+def test_rows_from_a_file(say: Say, calibrated: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    straight = say("locate", calibrated, "640,480", "-1.5,2")
+    table = "\ufeffx,y\n640,480\n\n# a comment\n-1.5 2  # another\r\n"
+    (tmp_path / "rows.csv").write_text(table, encoding="utf-8")
+    assert say("locate", calibrated, "--file", tmp_path / "rows.csv") == straight
+    for arguments in (("-",), ("--file", "-")):
+        monkeypatch.setattr(sys, "stdin", io.StringIO(table.removeprefix("\ufeff")))
+        assert say("locate", calibrated, *arguments) == straight
+
+
+@pytest.mark.parametrize(
+    "arguments, words",
+    [
+        ((), "nothing was given"),
+        (("640",), "argument '640': give 2 numbers"),
+        (("1,2,3",), "give 2 numbers with commas between, not 3"),
+        (("1;2",), "'1;2' is not a number"),
+        (("1,nan",), "'nan' is not a finite number"),
+        (("1,2", "--file", "rows.csv"), "not both"),
+        (("--file", "rows.csv"), "rows.csv, line 2: 'two' is not a number"),
+        (("1,2", "--station", "attic"), "station 'attic' is not there: there are 'overhead'"),
+        (("1,2", "--height-m", "1", "--height-mm", "1"), "not allowed with"),
+        (("1,2", "--height-m", "nan"), "'nan' is not a finite number"),
+    ],
+)
+def test_wrong_rows(
+    say: Say, calibrated: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: Sequence[str], words: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("rows.csv").write_text("1,2\n1,two\n")
+    assert words in refused(say("locate", calibrated, *arguments))
+
+
+# ---- simulate, and the way through ----------------------------------------------------------------------------------
+
+
+def _compare_with_truth() -> Callable[[Sequence[str]], int]:
+    spec = importlib.util.spec_from_file_location("compare_with_truth", ROOT / "scripts" / "compare_with_truth.py")
+    assert spec is not None and spec.loader is not None
+    script = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(script)
+    run: Callable[[Sequence[str]], int] = script.main
+    return run
+
+
+compare_with_truth = _compare_with_truth()
+
+
+@pytest.mark.parametrize("scene", scene_names())
+def test_simulate_calibrate_compare(say: Say, capsys: pytest.CaptureFixture[str], tmp_path: Path, scene: str) -> None:
+    said = say("simulate", scene, "-o", tmp_path / "new" / "folder", "--seed", 5, "--json")
+    assert said.code == 0
+    files = json.loads(said.out)
+    out = tmp_path / "calibration.json"
+    lens = "kannala-brandt" if scene == "fisheye" else "radial"
+    said = say("calibrate", files["observations"], "--lens", lens, "-o", out)
+    assert said.code == 0, said
+    assert compare_with_truth([str(out), files["truth"]]) == 0
+    table = capsys.readouterr().out
+    assert "phi px" in table
+    tied = scene not in ("boards", "rings-2004")
+    assert ("map at z = 0.15 m: off by " in table) == tied and ("alpha deg" in table) == tied
+
+
+def test_compare_says_no(calibrated: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    data = json.loads(calibrated.read_text())
+    data["stations"]["overhead"]["translation_m"][0] += 0.02
+    (tmp_path / "moved.json").write_text(json.dumps(data))
+    assert compare_with_truth([str(tmp_path / "moved.json"), str(SAMPLE.with_name("truth.json"))]) == 1
+    assert compare_with_truth([str(calibrated), str(SAMPLE)]) == 2
+    assert compare_with_truth([str(calibrated)]) == 2
+    assert "truth" in capsys.readouterr().err
+
+
+def test_the_seed_tells_simulations_apart(say: Say, tmp_path: Path) -> None:
+    for name, seed in (("a", 1), ("b", 1), ("c", 2)):
+        said = say("simulate", "boards", "-o", tmp_path / name, "--seed", seed)
+        assert said.code == 0 and f"{tmp_path / name}/truth.json" in said.out
+    a, b, c = ((tmp_path / name / "observations.json").read_bytes() for name in "abc")
+    assert a == b != c
+
+
+def test_simulate_lists_its_scenes(say: Say) -> None:
+    assert all(name in say("simulate", "--list").out for name in scene_names())
+    assert json.loads(say("simulate", "--list", "--json").out)["scenes"] == scene_names()
+
+
+# ---- targets --------------------------------------------------------------------------------------------------------
+
+
+def test_targets_of_every_kind(say: Say) -> None:
+    said = say("targets")
+    assert said.code == 0 and all(f"{kind}: " in said.out for kind in TARGET_KINDS)
+    kinds = json.loads(say("targets", "--json").out)["kinds"]
+    assert kinds["ssl-field"]["examples"]["ssl-b"] == {"kind": "ssl-field", "division": "B"}
+    for kind in TARGET_KINDS:
+        assert json.loads(say("targets", kind, "--json").out)["targets"]
+
+
+def test_targets_lists_features_with_their_places(say: Say) -> None:
+    field = ssl_field("A")
+    said = say("targets", "ssl-a")
+    assert all(f"  {name} " in said.out for name in (*field.point_names, *field.curve_names))
+    data = json.loads(say("targets", "ssl-a", "--json").out)["targets"]["ssl-a"]
+    assert {name: tuple(place) for name, place in data["points"].items()} == field.points
+    assert data["arcs"]["CenterCircle"]["radius_m"] == 0.5
+    assert data["segments"]["TopTouchLine"]["from"] == [-6.0, 4.5, 0.0]
+
+
+def test_targets_of_a_file(say: Say, tmp_path: Path) -> None:
+    Observations.load(SAMPLE).save(tmp_path / "sample.npz")
+    data = json.loads(SAMPLE.read_text())
+    _feature(data)  # whoever looks for the right name has a file with a wrong one
+    (tmp_path / "wrong.json").write_text(json.dumps(data))
+    for path in (SAMPLE, tmp_path / "sample.npz", tmp_path / "wrong.json"):
+        assert set(json.loads(say("targets", path, "--json").out)["targets"]) == {"field", "board"}
+    del data["targets"]
+    (tmp_path / "wrong.json").write_text(json.dumps(data))
+    assert "holds no targets" in refused(say("targets", tmp_path / "wrong.json"))
+
+
+# ---- detect board ---------------------------------------------------------------------------------------------------
+
+BOARD = ("--columns", 5, "--rows", 4, "--square", 0.03)
+
+
+@pytest.fixture
+def photos(tmp_path: Path) -> Path:
+    """A folder with a board, nothing, the board elsewhere, and a file that is no image."""
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    squares = np.indices((5, 6)).sum(axis=0) % 2
+    board = np.kron(np.where(squares, 230, 30), np.ones((40, 40))).astype(np.uint8)
+    for name, left in (("b.png", 60), ("a.PNG", 100), ("none.png", None)):
+        image = np.full((320, 400), 230, np.uint8)
+        if left is not None:
+            image[50:250, left : left + 240] = board
+        cv2.imwrite(str(folder / name), cv2.GaussianBlur(image, (0, 0), 0.8))
+    (folder / "notes.txt").write_text("no image")
+    return folder
+
+
+def test_detect_board(say: Say, photos: Path, tmp_path: Path) -> None:
+    out = tmp_path / "observations.json"
+    said = say("detect", "board", photos, *BOARD, "--camera", "sony", "--station", "table", "-o", out)
+    assert said.code == 0 and said.err == ""
+    assert said.out.splitlines()[0] == "2 of 3 images show the board, 40 corners in all"
+    assert f"{photos / 'none.png'}: " in said.out and "notes.txt" not in said.out
+    observations = Observations.load(out)
+    assert [(view.frame, view.camera, view.station) for view in observations.views] == [
+        ("a", "sony", "table"),
+        ("b", "sony", "table"),
+    ]
+    assert observations.targets["board"].spec["square_m"] == 0.03
+
+
+def test_detect_board_as_json_from_a_pattern(say: Say, photos: Path, tmp_path: Path) -> None:
+    said = say(
+        "detect", "board", photos / "*.png", *BOARD, "-o", tmp_path / "o.npz", "--corner-fit", "saddle", "--json"
+    )
+    data = json.loads(said.out)
+    assert said.err == "" and data["corners"] == len(Observations.load(tmp_path / "o.npz").points) == 20
+    assert data["found"] == [str(photos / "b.png")]
+    assert [entry["image"] for entry in data["missed"]] == [str(photos / "none.png")]
+
+
+def test_detect_board_without_one(say: Say, photos: Path, tmp_path: Path) -> None:
+    out = tmp_path / "o.json"
+    assert "no board of 5 x 4" in refused(say("detect", "board", photos / "none.png", *BOARD, "-o", out))
+    assert "no such file" in refused(say("detect", "board", photos / "c*.png", *BOARD, "-o", out))
+    assert "not an image" in refused(say("detect", "board", photos / "notes.txt", *BOARD, "-o", out))
+    assert "no images in this folder" in refused(say("detect", "board", ROOT / "data", *BOARD, "-o", out))
+    assert ".json or .npz" in refused(say("detect", "board", photos, *BOARD, "-o", tmp_path / "o.csv"))
+    assert "go together" in refused(say("detect", "board", photos, *BOARD, "-o", out, "--charuco", "DICT_4X4_50"))
+    assert not out.exists()
+
+
+# ---- progress -------------------------------------------------------------------------------------------------------
+
+
+class _Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def test_bar_on_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TERM", "xterm")
+    stream, now = _Terminal(), 0.0
+    with pytest.raises(KeyboardInterrupt), ProgressBar(silent=False, stream=stream, clock=lambda: now) as bar:
+        bar.say("a line that stays")
+        for done in range(101):
+            bar.update(done, 100, "x" * 500)
+            now += 0.03
+        raise KeyboardInterrupt
+    lines = stream.getvalue().split("\r\x1b[K")
+    assert lines[:2] == ["", "a line that stays\n"]
+    assert lines[2].startswith("[........................] xxx") and "[############............]" in stream.getvalue()
+    assert max(map(len, lines)) < 80 and 20 < len(lines) < 40  # a hundred updates in 3 seconds
+    assert lines[-1] == ""  # the bar is gone
+
+
+def test_few_lines_elsewhere() -> None:
+    stream, now = io.StringIO(), 0.0
+    with ProgressBar(silent=False, stream=stream, clock=lambda: now) as bar:
+        for done in range(1000):
+            bar.update(done, 1000, "working")
+            now += 0.1
+    assert stream.getvalue().splitlines() == [f"working ({done} of 1000)" for done in (30, 90, 210, 450, 930)]
+
+
+def test_no_progress_where_it_is_not_wanted() -> None:
+    stream = _Terminal()
+    with ProgressBar(silent=True, stream=stream) as bar:
+        bar.say("anything")
+        bar.update(1, 2, "anything")
+    assert stream.getvalue() == ""
+
+
+@pytest.mark.parametrize("quiet", ["", "--quiet"])
+def test_calibrate_on_a_terminal(quiet: str) -> None:
+    ours, its = pty.openpty()
+    run = in_a_shell(f"TERM=xterm cc calibrate {SAMPLE} {quiet}", stdout=subprocess.PIPE, stderr=its)
+    os.close(its)
+    with os.fdopen(ours, "rb", buffering=0) as terminal:
+        try:
+            seen = terminal.read(10000)
+        except OSError:  # the end of a terminal on which nothing was written
+            seen = b""
+    assert run.returncode == 0 and run.stdout.startswith("read ")
+    assert (b"solve 1, iteration 0, cost" in seen) == (not quiet)
+    assert not seen or seen.endswith(b"\r\x1b[K")
