@@ -5,6 +5,9 @@ from pathlib import Path
 
 import pytest
 
+from ceres_cal.detect.boards import BoardDetections, detect_boards
+from ceres_cal.targets import checkerboard
+
 
 @pytest.fixture(scope="session")
 def real_data() -> Path:
@@ -13,3 +16,15 @@ def real_data() -> Path:
     if not folder.is_dir():
         pytest.skip(f"no real data: {folder} is not there (set CERES_CAL_REAL to its place)")
     return folder
+
+
+@pytest.fixture(scope="session")
+def sony_boards(real_data: Path) -> BoardDetections:
+    """What is detected in BoofCV's 13 photographs."""
+    return detect_boards(sorted((real_data / "boofcv_sony_chess").glob("*.jpg")), checkerboard(4, 6, 0.03))
+
+
+@pytest.fixture(scope="session")
+def gopro_boards(real_data: Path) -> BoardDetections:
+    """What is detected in the 36 wide-angle photographs; the size of a square is not known."""
+    return detect_boards(sorted((real_data / "udacity_gopro_wide").glob("GOPR*.jpg")), checkerboard(8, 6, 1.0))

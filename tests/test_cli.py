@@ -60,9 +60,9 @@ def refused(said: Said, code: int = 2) -> str:
     return said.err
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="module", autouse=True)
 def calibrated(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The calibration of the sample."""
+    """The calibration of the sample. It comes first: in a fresh clone it compiles the kernels, which would be said."""
     path = tmp_path_factory.mktemp("calibrated") / "calibration.json"
     assert main(["calibrate", str(SAMPLE), "-o", str(path), "--quiet"]) == 0
     return path
@@ -82,7 +82,7 @@ def in_a_shell(command: str, **settings: Any) -> subprocess.CompletedProcess[str
 def test_help_lists_every_command(say: Say) -> None:
     said = say("--help")
     assert said.code == 0 and said.err == ""
-    assert all(f"  {name}  " in said.out for name in ("detect board", "calibrate    ", "locate       "))
+    assert all(f"  {name:12}  {command.summary}\n" in said.out for name, command in COMMANDS.items())
     assert set(COMMANDS) == {"detect board", "calibrate", "locate", "project", "simulate", "targets"}
     assert say("detect", "-h").out.count("board") > 0
 
@@ -104,7 +104,8 @@ def test_help_and_wrong_usage_bring_in_nothing_heavy() -> None:
         "import sys; from ceres_cal.cli import main\n"
         "for arguments in (['--help'], ['calibrate', '--help'], ['calibrate'], ['detect'], ['locate', '--frob']):\n"
         "    main(arguments)\n"
-        "print(*sorted({'numpy', 'msgspec', 'numba', 'pyceres', 'cv2', 'pycolmap'} & sys.modules.keys()), file=sys.stderr)"
+        "heavy = {'numpy', 'msgspec', 'numba', 'pyceres', 'cv2', 'pycolmap'} & sys.modules.keys()\n"
+        "print(*sorted(heavy), file=sys.stderr)"
     )
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert run.stderr.splitlines()[-1] == ""
@@ -166,6 +167,12 @@ def test_choices_are_those_of_the_package() -> None:
 # ---- calibrate ------------------------------------------------------------------------------------------------------
 
 
+def _plain(options: Options) -> dict[str, Any]:
+    """As JSON has them."""
+    plain: dict[str, Any] = json.loads(json.dumps(asdict(options)))
+    return plain
+
+
 def test_calibrate_tells_what_came_out(say: Say, tmp_path: Path) -> None:
     out = tmp_path / "calibration.json"
     said = say("calibrate", SAMPLE, "-o", out)
@@ -195,7 +202,7 @@ def test_calibrate_as_json_is_the_file_and_more(say: Say, tmp_path: Path) -> Non
     assert data["counts"]["views"] == 20 and data["output"] == str(out) and data["warnings"] == []
     assert sum(data["outliers"].values()) == len(data["calibration"]["rejected"])
     # Nothing given on the command line is what nothing given in Python is.
-    assert data["calibration"]["options"] == json.loads(json.dumps(asdict(Options())))
+    assert data["calibration"]["options"] == _plain(Options())
 
 
 def test_options_arrive(say: Say) -> None:
@@ -206,24 +213,24 @@ def test_options_arrive(say: Say) -> None:
         *("--prior", "overhead.position_m=-2.27,-0.12,4.02:0.01,0.02,0.03", "--prior", "k1=-0.2:1"),
     )
     calibration = json.loads(said.out)["calibration"]
-    assert calibration["options"] == {
-        "lens": "brown",
-        "powers": [2, 3],
-        "free_principal_point": False,
-        "free_aspect": True,
-        "fixed": {"k3": 0.0, "p1": 1e-4},
-        "priors": [
-            {"station": "overhead", "height_m": 4.02, "sigma_m": 0.01},
-            {"station": "overhead", "position_m": [-2.27, -0.12, 4.02], "sigma_m": [0.01, 0.02, 0.03]},
-            {"camera": "overhead", "k1": -0.2, "sigma": 1.0},
-        ],
-        "loss": "cauchy",
-        "loss_scale": 2.0,
-        "reject_sigma": 6.0,
-        "noise_scale": "stated",
-        "max_iterations": 50,
-        "threads": 1,
-    }
+    assert calibration["options"].pop("priors") == [
+        {"station": "overhead", "height_m": 4.02, "sigma_m": 0.01},
+        {"station": "overhead", "position_m": [-2.27, -0.12, 4.02], "sigma_m": [0.01, 0.02, 0.03]},
+        {"camera": "overhead", "k1": -0.2, "sigma": 1.0},
+    ]
+    options = Options(
+        lens="brown",
+        free_principal_point=False,
+        free_aspect=True,
+        fixed={"k3": 0.0, "p1": 1e-4},
+        loss="cauchy",
+        loss_scale=2.0,
+        reject_sigma=6.0,
+        noise_scale="stated",
+        max_iterations=50,
+        threads=1,
+    )
+    assert calibration["options"] == {name: value for name, value in _plain(options).items() if name != "priors"}
     assert calibration["cameras"]["overhead"]["lens"]["coefficients"]["p1"] == 1e-4
 
 
@@ -275,8 +282,7 @@ def test_warns_where_phi_and_height_trade(say: Say, tmp_path: Path) -> None:
     say("simulate", "field-2004", "-o", tmp_path)
     said = say("calibrate", tmp_path / "observations.json")
     assert said.code == 0 and "(started from a guess)" in said.out
-    words = " ".join(said.out.split())
-    assert "hardly tell phi and height apart" in words and "--prior overhead.height_m=METRES:0.01" in words
+    assert "warning   " in said.out and "tell phi and height apart" in " ".join(said.out.split())
 
 
 def test_warns_of_a_lens_that_does_not_suit(say: Say, tmp_path: Path) -> None:
@@ -558,14 +564,17 @@ def _compare_with_truth() -> Callable[[Sequence[str]], int]:
 compare_with_truth = _compare_with_truth()
 
 
+# A single view from almost straight above leaves phi / height open: 213 mm too low and 7 mm off at robot height.
+MORE_TO_SAY = {"fisheye": ("--lens", "kannala-brandt"), "field-2004": ("--prior", "height_m=2.5:0.01")}
+
+
 @pytest.mark.parametrize("scene", scene_names())
 def test_simulate_calibrate_compare(say: Say, capsys: pytest.CaptureFixture[str], tmp_path: Path, scene: str) -> None:
     said = say("simulate", scene, "-o", tmp_path / "new" / "folder", "--seed", 5, "--json")
     assert said.code == 0
     files = json.loads(said.out)
     out = tmp_path / "calibration.json"
-    lens = "kannala-brandt" if scene == "fisheye" else "radial"
-    said = say("calibrate", files["observations"], "--lens", lens, "-o", out)
+    said = say("calibrate", files["observations"], "-o", out, *MORE_TO_SAY.get(scene, ()))
     assert said.code == 0, said
     assert compare_with_truth([str(out), files["truth"]]) == 0
     table = capsys.readouterr().out
@@ -698,12 +707,11 @@ class _Terminal(io.StringIO):
 def test_bar_on_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TERM", "xterm")
     stream, now = _Terminal(), 0.0
-    with pytest.raises(KeyboardInterrupt), ProgressBar(silent=False, stream=stream, clock=lambda: now) as bar:
+    with ProgressBar(silent=False, stream=stream, clock=lambda: now) as bar:
         bar.say("a line that stays")
         for done in range(101):
             bar.update(done, 100, "x" * 500)
             now += 0.03
-        raise KeyboardInterrupt
     lines = stream.getvalue().split("\r\x1b[K")
     assert lines[:2] == ["", "a line that stays\n"]
     assert lines[2].startswith("[........................] xxx") and "[############............]" in stream.getvalue()
@@ -716,8 +724,8 @@ def test_few_lines_elsewhere() -> None:
     with ProgressBar(silent=False, stream=stream, clock=lambda: now) as bar:
         for done in range(1000):
             bar.update(done, 1000, "working")
-            now += 0.1
-    assert stream.getvalue().splitlines() == [f"working ({done} of 1000)" for done in (30, 90, 210, 450, 930)]
+            now += 0.125
+    assert stream.getvalue().splitlines() == [f"working ({done} of 1000)" for done in (24, 72, 168, 360, 744)]
 
 
 def test_no_progress_where_it_is_not_wanted() -> None:

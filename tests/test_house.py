@@ -24,6 +24,7 @@ FLOORS = {
     "observations": 1,
     "sights": 1,
     "kernels": 1,
+    "structure": 2,
     "closed_forms": 2,
     "planes": 2,
     "initialise": 2,

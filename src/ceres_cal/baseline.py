@@ -40,7 +40,7 @@ def four_point_baseline(sights: Sights, start: Estimate) -> Estimate:
         if key.placement is not None:  # stays where its station saw it
             seen = start.stations[key.station].cam_from_world @ start.placements[key.placement]
             placements[key.placement] = stations[key.station].cam_from_world.inverse @ seen
-    return Estimate(cameras, stations, placements)
+    return Estimate(cameras, stations, placements, start.structure)
 
 
 def _with_rings(camera: Camera, name: str, sights: Sights) -> Camera:

@@ -52,6 +52,7 @@ def calibrate(
     warnings = _require_usable(settled, sights)
     return Calibration(
         settled.solution.estimate,
+        observations.targets,
         _fit(settled, layout),
         _rejected(observations, settled.inliers),
         settled.solution.termination,
@@ -104,12 +105,14 @@ def _settle(
         return solve(sights.used(by.points, by.curves), at, layout, weighting, options, progress)
 
     everything = start_weights(observations, residuals(observations, sights, estimate))
-    solution = solved(estimate, everything, "cauchy", 1.0, 1e-3)
+    # A line painted aside is an outlier to a redescending loss, but not to its tolerance.
+    rough_loss = "huber" if len(estimate.structure.values) else "cauchy"
+    solution = solved(estimate, everything, rough_loss, 1.0, 1e-3)
     found, inliers = judged(solution.estimate)
     rounds = 1
     while rounds < _MOST_ROUNDS:
         rounds += 1
-        solution = solved(solution.estimate, inliers, options.loss, options.loss_scale, 1e-12)
+        solution = solved(solution.estimate, inliers, options.loss, options.loss_scale, 1e-14)
         before = inliers
         found, inliers = judged(solution.estimate)
         if inliers.same_as(before):

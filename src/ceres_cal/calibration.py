@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
 
 from ceres_cal.camera import Camera
 from ceres_cal.errors import InputError
@@ -17,6 +18,8 @@ from ceres_cal.files import convert, read_json, write_json
 from ceres_cal.lens import make_lens
 from ceres_cal.observations import prior_from_json, prior_to_json
 from ceres_cal.parameters import Estimate, Options, Station
+from ceres_cal.structure import make_structure
+from ceres_cal.targets import Target, target_from_spec
 from ceres_cal.transforms import Pose, euler_from_rotation
 
 FORMAT, VERSION = "ceres-cal/calibration", 1
@@ -66,7 +69,7 @@ class Calibration:
     """Calibrated cameras and where they stood.
 
     Attributes:
-        estimate: cameras, stations, placements.
+        estimate: cameras, stations, placements, and the targets as built. targets: as drawn, by name.
         fit: residuals and noise. rejected: every observation that was taken out.
         termination: why the last solve stopped. converged: whether it had come to rest.
         rounds: solves it took. history: cost at each iteration of the last one.
@@ -76,6 +79,7 @@ class Calibration:
     """
 
     estimate: Estimate
+    targets: Mapping[str, Target]
     fit: Fit
     rejected: tuple[Rejected, ...]
     termination: str
@@ -187,6 +191,8 @@ class _CalibrationFile(msgspec.Struct, forbid_unknown_fields=True):
     cameras: dict[str, _CameraFile]
     stations: dict[str, _StationFile]
     placements: dict[str, _PlacementFile]
+    targets: dict[str, Any]
+    structure_m: dict[str, float]
     fit: Fit
     rejected: list[Rejected]
     termination: str
@@ -234,6 +240,8 @@ def calibration_to_json(calibration: Calibration) -> dict[str, Any]:
             for name, station in estimate.stations.items()
         },
         "placements": {name: _pose_to_json(pose) for name, pose in estimate.placements.items()},
+        "targets": {name: target.spec for name, target in calibration.targets.items()},
+        "structure_m": dict(zip(estimate.structure.names, estimate.structure.values.tolist(), strict=True)),
         "fit": asdict(calibration.fit),
         "rejected": [asdict(entry) for entry in calibration.rejected],
         "termination": calibration.termination,
@@ -265,10 +273,16 @@ def _from_file(data: _CalibrationFile) -> Calibration:
             raise InputError(f"station {name!r} names camera {station.camera!r}, which is not there")
         stations[name] = Station(station.camera, Pose(station.rotation, station.translation_m))  # type: ignore[arg-type]
     placements = {name: Pose(p.rotation, p.translation_m) for name, p in data.placements.items()}  # type: ignore[arg-type]
-    options = dict(data.options)
-    options["priors"] = tuple(prior_from_json(entry, "options.priors") for entry in options.get("priors", []))
+    settings = dict(data.options)
+    settings["priors"] = tuple(prior_from_json(entry, "options.priors") for entry in settings.get("priors", []))
+    options = convert(settings, Options, "options")
+    targets = {name: target_from_spec(spec, f"target {name!r}") for name, spec in data.targets.items()}
+    structure = make_structure(targets, options.tolerances)
+    if structure.names != tuple(data.structure_m):
+        raise InputError("structure_m does not fit the targets and the tolerances: calibrate again")
     return Calibration(
-        Estimate(cameras, stations, placements),
+        Estimate(cameras, stations, placements, structure.with_values(np.array(list(data.structure_m.values())))),
+        targets,
         data.fit,
         tuple(data.rejected),
         data.termination,
@@ -277,7 +291,7 @@ def _from_file(data: _CalibrationFile) -> Calibration:
         data.history,
         data.phi_from,
         data.warnings,
-        convert(options, Options, "options"),
+        options,
         data.digest,
         data.versions,
     )

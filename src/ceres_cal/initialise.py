@@ -19,6 +19,7 @@ from ceres_cal.observations import Observations, Prior
 from ceres_cal.parameters import Estimate, Options, Station, anchored_stations
 from ceres_cal.planes import Homographies, profile_and_homographies
 from ceres_cal.sights import Sights
+from ceres_cal.structure import make_structure
 from ceres_cal.transforms import Array, Pose
 
 _PHI_RANGE = np.geomspace(0.15, 15.0, 120)  # in half image diagonals
@@ -49,7 +50,8 @@ def initialise(observations: Observations, sights: Sights, options: Options) -> 
         cameras[name], phi_from[name] = start.camera, start.phi_from
         poses |= {int(own[i]): pose for i, pose in start.poses.items()}
     stations, placements = _chain_poses(observations, sights, poses)
-    return Start(Estimate(cameras, stations, placements), phi_from)
+    structure = make_structure(observations.targets, options.tolerances)
+    return Start(Estimate(cameras, stations, placements, structure), phi_from)
 
 
 # ---- one camera -----------------------------------------------------------------------------------------------------

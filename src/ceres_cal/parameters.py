@@ -17,6 +17,7 @@ from ceres_cal.errors import InputError
 from ceres_cal.lens import LENS_KINDS, Lens, make_lens
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.sights import SightKey
+from ceres_cal.structure import Structure, Tolerance
 from ceres_cal.transforms import Array, Pose
 
 LOSSES = ("trivial", "huber", "soft_l1", "cauchy", "tukey")
@@ -33,6 +34,7 @@ class Options:
         fixed: numbers held, by name: phi, aspect, cx, cy (px) and the lens's coefficients in the units of the files.
             They hold for every camera.
         priors: what is known beforehand, besides the observations' own.
+        tolerances: target -> how far it may have been built from its drawing; none of it where a target is not named.
         loss: robust loss of each observation: one of LOSSES. loss_scale: where it starts to bend, in standard
             deviations.
         reject_sigma: observations farther off than this many standard deviations are taken out and listed.
@@ -48,6 +50,7 @@ class Options:
     free_aspect: bool = False
     fixed: Mapping[str, float] = field(default_factory=dict)
     priors: tuple[Prior, ...] = ()
+    tolerances: Mapping[str, Tolerance] = field(default_factory=dict)
     loss: str = "huber"
     loss_scale: float = 3.0
     reject_sigma: float = 5.0
@@ -124,6 +127,8 @@ class Estimate:
     stations: Mapping[str, Station]
     placements: Mapping[str, Pose]
     """world_from_target of each placement."""
+    structure: Structure
+    """The targets as built."""
 
     def camera_at(self, station: str, placement: str | None = None) -> Camera:
         """The station's camera in the world, or in the frame of a placement (its cam_from_world is cam_from_target)."""
@@ -135,7 +140,8 @@ class Estimate:
     def pose_stack(self, keys: Sequence[SightKey]) -> Array:
         """cam_from_frame of each sight as [R t], (S, 3, 4)."""
         stations = {name: station.cam_from_world for name, station in self.stations.items()}
-        frames: dict[str | None, Pose] = {None: Pose.identity(), **{name: p for name, p in self.placements.items()}}
+        frames: dict[str | None, Pose] = {None: Pose.identity()}
+        frames.update(self.placements)
         first = np.array([stations[key.station].rotation for key in keys])
         offset = np.array([stations[key.station].translation for key in keys])
         second = np.array([frames[key.placement].rotation for key in keys])

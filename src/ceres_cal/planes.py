@@ -264,7 +264,7 @@ def ring_radii(sight: Sights, camera: Camera) -> RingRadii:
     on_ring = sight.is_arc[sight.track]
     offsets = camera.offsets(sight.curve_pixels)[on_ring]
     radii = np.linalg.norm(sight.tracks[sight.track[on_ring], 1], axis=1)
-    rings, ring = np.unique(radii, return_inverse=True)
+    _, ring = np.unique(radii, return_inverse=True)
     centre = offsets.mean(axis=0)
     for _ in range(10):  # each ring's own mean radius, so that stretches that are not seen do not pull the centre
         away = offsets - centre

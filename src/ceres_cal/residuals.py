@@ -47,14 +47,16 @@ def residuals(observations: Observations, sights: Sights, estimate: Estimate) ->
         own = sights if len(numbers) == len(sights) else sights.take(numbers)
         optics = lens_arguments(estimate.cameras[name])
         offsets = np.empty((len(own.point_rows), 2))
-        kernels.point_residuals(*optics, poses[numbers], own.point_bounds, own.points, own.pixels, offsets)
+        kernels.point_residuals(
+            *optics, poses[numbers], own.point_bounds, estimate.structure.points(own), own.pixels, offsets
+        )
         points[own.point_rows] = offsets
         if len(own.curve_rows):
             distances = np.empty(len(own.curve_rows))
             places = [nearest_places(s, estimate.camera_at(s.key.station, s.key.placement)) for s in own]
             kernels.curve_residuals(
-                *optics, poses[numbers], own.curve_bounds, own.tracks, own.is_arc, own.track, own.curve_pixels,
-                np.concatenate(places), distances,
+                *optics, poses[numbers], own.curve_bounds, estimate.structure.tracks(own), own.is_arc, own.track,
+                own.curve_pixels, np.concatenate(places), distances,
             )  # fmt: skip
             curves[own.curve_rows] = distances
     return Residuals(points, curves)

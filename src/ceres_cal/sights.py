@@ -1,7 +1,7 @@
 """Sights: what one camera at one station sees of one rigid frame, gathered over all its views.
 
-The frame is the world or a placement. A static camera's many frames of a field are one sight; each board frame is one of
-its own. Rows are kept so that residuals find their way back to the observations' permanent ids.
+The frame is the world or a placement. A static camera's many frames of a field are one sight; each board frame is one
+of its own. Rows are kept so that residuals find their way back to the observations' permanent ids.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class Sights(Sequence["Sights"]):
     Attributes:
         keys: of each of the S sights. views: numbers of the views that each sight gathers.
         point_bounds: (S + 1,) where each sight's points begin. point_rows: (N,) rows of the observations' columns.
-        points: (N, 3) m in the sight's frame. pixels: (N, 2). sigma_px: (N,).
+        feature: (N,) number of each point among the points of all targets. points: (N, 3) m in the sight's frame. pixels: (N, 2). sigma_px: (N,).
         curve_bounds, curve_rows, curve_pixels, curve_sigma_px: the same of the M curve observations.
         track: (M,) index into tracks (T, 3, 3) and is_arc (T,): every curve and side of every target (see
             `targets.along_track`).
@@ -49,6 +49,7 @@ class Sights(Sequence["Sights"]):
     views: tuple[tuple[int, ...], ...]
     point_bounds: Rows
     point_rows: Rows
+    feature: Rows
     points: Array
     pixels: Array
     sigma_px: Array
@@ -76,6 +77,7 @@ class Sights(Sequence["Sights"]):
             (self.views[number],),
             np.array([0, p.stop - p.start]),
             self.point_rows[p],
+            self.feature[p],
             self.points[p],
             self.pixels[p],
             self.sigma_px[p],
@@ -115,6 +117,7 @@ class Sights(Sequence["Sights"]):
             tuple(self.views[i] for i in numbers),
             np.concatenate([[0], np.cumsum(point_sizes)]),
             self.point_rows[p],
+            self.feature[p],
             self.points[p],
             self.pixels[p],
             self.sigma_px[p],
@@ -156,6 +159,7 @@ def gather_sights(observations: Observations) -> Sights:
     curve_rows, curve_bounds = _grouped(curves, sight_of_view, len(order))
     of_point = target_of_view[points.view[point_rows]]
     of_curve = target_of_view[curves.view[curve_rows]]
+    feature = (first_point[of_point] + points.feature[point_rows]).astype(np.int64)
     side = curves.side[curve_rows] % 3  # -1 is the last of a target's three sets of tracks
     track = first_track[of_curve] + side * curve_count[of_curve] + curves.feature[curve_rows]
     every = Sights(
@@ -163,7 +167,8 @@ def gather_sights(observations: Observations) -> Sights:
         tuple(tuple(views) for views in views_of),
         point_bounds,
         point_rows,
-        np.concatenate([t.point_array for t in targets])[first_point[of_point] + points.feature[point_rows]],
+        feature,
+        np.concatenate([t.point_array for t in targets])[feature],
         points.pixels[point_rows],
         points.sigma_px[point_rows],
         curve_bounds,

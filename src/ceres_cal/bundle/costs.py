@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import pyceres
@@ -14,6 +15,7 @@ from ceres_cal import kernels
 from ceres_cal.parameters import Estimate, Layout
 from ceres_cal.residuals import lens_arguments
 from ceres_cal.sights import SightKey, Sights, nearest_places
+from ceres_cal.structure import Structure
 from ceres_cal.transforms import Array, left_jacobian, rotation_exp, skew
 
 _ROWS_WORTH_A_THREAD = 20_000
@@ -46,127 +48,141 @@ class Run:
 
 
 class SightCost(pyceres.CostFunction):
-    """The compressed block of one sight (design, section 6)."""
+    """The compressed block of one sight (design, section 6).
+
+    Attributes:
+        slots: which of its camera (0), station (1), placement (2) and structure (3) the solver hands over; the others
+            are held.
+    """
 
     def __init__(self, run: Run, sight: Sights, estimate: Estimate, layout: Layout, weighting: Weighting) -> None:
         super().__init__()
-        self._run = run
+        self._run, self._sight, self._structure = run, sight, estimate.structure
         key = sight.key
-        camera = estimate.cameras[key.camera]
-        code, vector, powers, unit = lens_arguments(camera)
+        code, vector, powers, unit = lens_arguments(estimate.cameras[key.camera])
         free = layout.free[key.camera]
+        places = nearest_places(sight, estimate.camera_at(key.station, key.placement))
         self._static = (
-            code,
-            vector,
-            free,
-            powers,
-            unit,
-            sight.points,
-            sight.pixels,
-            1.0 / (weighting.point_scale * sight.sigma_px),
-            sight.tracks,
-            sight.is_arc,
-            sight.track,
-            sight.curve_pixels,
-            1.0 / (weighting.curve_scale * sight.curve_sigma_px),
-            nearest_places(sight, estimate.camera_at(key.station, key.placement)),
-            kernels.LOSS_CODES[weighting.loss],
-            weighting.loss_scale,
-        )
+            code, vector, free, powers, unit, *_columns(sight, estimate.structure, weighting), places,
+            *_track_slots(estimate.structure), kernels.LOSS_CODES[weighting.loss], weighting.loss_scale,
+        )  # fmt: skip
         self._poses = [estimate.stations[key.station].cam_from_world.log(), np.zeros(6)]
         if key.placement is not None:
             self._poses[1] = estimate.placements[key.placement].log()
-        # Which of the three arguments the solver hands over; the others are held.
-        self.slots = [
-            slot
-            for slot, is_free in enumerate(
-                (len(free) > 0, key.station in layout.stations, key.placement in layout.placements)
-            )
-            if is_free
-        ]
-        self.set_num_residuals(len(free) + 7)
-        self.set_parameter_block_sizes([(len(free), 6, 6)[slot] for slot in self.slots])
+        count = len(estimate.structure.values)
+        sizes = (len(free), 6, 6, count)
+        is_free = (len(free) > 0, key.station in layout.stations, key.placement in layout.placements, count > 0)
+        self.slots = [slot for slot in range(4) if is_free[slot]]
+        self.set_num_residuals(len(free) + count + 7)
+        self.set_parameter_block_sizes([sizes[slot] for slot in self.slots])
 
     def Evaluate(self, parameters: Sequence[Array], residuals: Array, jacobians: Sequence[Array] | None) -> bool:
-        arguments = [_NOTHING, self._poses[0], self._poses[1]]
-        outputs = [_NOTHING, _NOTHING, _NOTHING]
+        arguments = [_NOTHING, *self._poses, _NOTHING]
+        outputs = [_NOTHING, _NOTHING, _NOTHING, _NOTHING]
         for place, slot in enumerate(self.slots):
             arguments[slot] = parameters[place]
             if jacobians is not None:
                 outputs[slot] = jacobians[place]
         try:
-            return bool(kernels.evaluate_block(*self._static, *arguments, jacobians is not None, residuals, *outputs))
+            built = self._structure.with_values(arguments[3])
+            answered = kernels.evaluate_block(
+                *self._static, built.points(self._sight), built.tracks(self._sight), len(built.values),
+                *arguments[:3], jacobians is not None, residuals, *outputs,
+            )  # fmt: skip
+            return bool(answered)
         except BaseException as error:  # an exception must not travel through C++: the solve ends, then it is raised
             self._run.failure = self._run.failure or error
             return False
 
 
+def _columns(sights: Sights, structure: Structure, weighting: Weighting) -> tuple[NDArray[Any], ...]:
+    """The observations as the kernels take them, but for points and tracks, which the structure moves."""
+    moves = len(structure.values) > 0
+    feature = sights.feature if moves else sights.feature[:0]
+    return (
+        sights.pixels,
+        1.0 / (weighting.point_scale * sights.sigma_px),
+        structure.point_slots[feature],
+        structure.bends[feature],
+        sights.is_arc,
+        sights.track,
+        sights.curve_pixels,
+        1.0 / (weighting.curve_scale * sights.curve_sigma_px),
+    )
+
+
+def _track_slots(structure: Structure) -> tuple[NDArray[np.int32]]:
+    return (structure.track_slots if len(structure.values) else structure.track_slots[:0],)
+
+
 class EliminatedCost(pyceres.CostFunction):
-    """All sights of one camera whose placements no other station sees, over the camera's free intrinsics alone."""
+    """All sights of one camera whose placements no other station sees, over its free intrinsics and the structure."""
 
     def __init__(
         self, run: Run, sights: Sights, estimate: Estimate, layout: Layout, weighting: Weighting, threads: int
     ) -> None:
         super().__init__()
-        self._run = run
         self.camera = sights.keys[0].camera
+        self._run, self._sights, self._structure = run, sights, estimate.structure
         self._optics = lens_arguments(estimate.cameras[self.camera])
         self._free = layout.free[self.camera]
-        self._sights = sights
         places = [nearest_places(s, estimate.camera_at(s.key.station, s.key.placement)) for s in _with_curves(sights)]
-        self._observations = (
-            sights.point_bounds,
-            sights.points,
-            sights.pixels,
-            1.0 / (weighting.point_scale * sights.sigma_px),
-            sights.tracks,
-            sights.is_arc,
-            sights.curve_bounds,
-            sights.track,
-            sights.curve_pixels,
-            1.0 / (weighting.curve_scale * sights.curve_sigma_px),
-            np.concatenate([_NOTHING, *places]),
+        pixels, weights, slots, bends, is_arc, track, curve_pixels, curve_weights = _columns(
+            sights, estimate.structure, weighting
         )
+        self._observations = (
+            sights.point_bounds, pixels, weights, slots, bends, is_arc, sights.curve_bounds, track, curve_pixels,
+            curve_weights, np.concatenate([_NOTHING, *places]), *_track_slots(estimate.structure),
+        )  # fmt: skip
         self._loss = (kernels.LOSS_CODES[weighting.loss], weighting.loss_scale)
         self._precision = weighting.precision
         self._poses = estimate.pose_stack(sights.keys)
-        self._gains = np.zeros((len(sights), 6, len(self._free)))
-        self._at = self._optics[1][self._free]
+        sizes = (len(self._free), len(estimate.structure.values))
+        self._size = sum(sizes)
+        self._gains = np.zeros((len(sights), 6, self._size))
+        self._at = np.concatenate([self._optics[1][self._free], estimate.structure.values])
         self._known: tuple[Array, Array, Array] | None = None
         work = len(sights.points) + len(sights.curve_pixels)
         parts = max(1, min(threads, work // _ROWS_WORTH_A_THREAD))
         self._parts = np.linspace(0, len(sights), parts + 1).astype(int).tolist()
-        self.set_num_residuals(len(self._free) + 1)
-        self.set_parameter_block_sizes([len(self._free)])
+        self.slots = [slot for slot, size in zip((0, 3), sizes, strict=True) if size]
+        self.set_num_residuals(self._size + 1)
+        self.set_parameter_block_sizes([size for size in sizes if size])
 
     def Evaluate(self, parameters: Sequence[Array], residuals: Array, jacobians: Sequence[Array] | None) -> bool:
         try:
+            at = np.concatenate(parameters)
             # Ceres asks for the cost of a step first, then for the Jacobian in the same place: once is enough.
-            if self._known is None or not np.array_equal(self._known[0], parameters[0]):
-                self._known = self._evaluated(parameters[0].copy(), max(1e-4, 10.0 * self._precision))
+            if self._known is None or not np.array_equal(self._known[0], at):
+                self._known = self._evaluated(at, max(1e-4, 10.0 * self._precision))
         except BaseException as error:  # an exception must not travel through C++: the solve ends, then it is raised
             self._run.failure = self._run.failure or error
             return False
         if self._known is None:
             return False
         residuals[:] = self._known[1]
-        if jacobians is not None:
-            jacobians[0][:] = self._known[2]
+        first = 0
+        for jacobian in jacobians or ():
+            size = len(jacobian) // (self._size + 1)
+            jacobian[:] = self._known[2][:, first : first + size].reshape(-1)
+            first += size
         return True
 
     def _evaluated(self, at: Array, tolerance: float) -> tuple[Array, Array, Array] | None:
-        """(place, residuals, flat Jacobian), or None where an observation cannot be projected from there."""
+        """(place, residuals, Jacobian), or None where an observation cannot be projected from there."""
         count = len(self._free)
         before = self._poses.copy()
         code, intrinsics, powers, unit = self._optics
         intrinsics = intrinsics.copy()
-        intrinsics[self._free] = at
+        intrinsics[self._free] = at[:count]
+        built = self._structure.with_values(at[count:])
+        points, tracks = built.points(self._sights), built.tracks(self._sights)
 
         def part(first: int, last: int) -> tuple[float, Array]:
-            reduced = np.zeros((count + 1, count + 1))
+            reduced = np.zeros((self._size + 1, self._size + 1))
             cost = kernels.eliminate_placements(
-                first, last, code, intrinsics, self._free, powers, unit, *self._observations, *self._loss, tolerance,
-                at - self._at, self._poses, self._gains, reduced,
+                first, last, code, intrinsics, self._free, powers, unit, *self._observations, *self._loss, points,
+                tracks, self._size - count, tolerance, at - self._at, self._poses, self._gains, reduced,
             )  # fmt: skip
             return cost, reduced
 
@@ -182,16 +198,16 @@ class EliminatedCost(pyceres.CostFunction):
             self._at = at
             return None
         self._at = at
-        upper = np.empty((count + 1, count + 1))
+        upper = np.empty((self._size + 1, self._size + 1))
         kernels.cholesky(sum(result[1] for result in results), upper)
-        residuals = upper[:, count].copy()
-        residuals[count] = np.sqrt(max(cost - float(residuals[:count] @ residuals[:count]), 0.0))
-        upper[count] = 0.0
-        return at, residuals, upper[:, :count].reshape(-1)
+        residuals = upper[:, -1].copy()
+        residuals[-1] = np.sqrt(max(cost - float(residuals[:-1] @ residuals[:-1]), 0.0))
+        upper[-1] = 0.0
+        return at, residuals, upper[:, :-1]
 
-    def settled(self, at: Array) -> tuple[tuple[SightKey, ...], Array]:
-        """The sights' keys and their cam_from_target, (S, 3, 4), at their best for these intrinsics."""
-        self._evaluated(at.copy(), self._precision)
+    def settled(self, parameters: Sequence[Array]) -> tuple[tuple[SightKey, ...], Array]:
+        """The sights' keys and their cam_from_target, (S, 3, 4), at their best for these numbers."""
+        self._evaluated(np.concatenate([_NOTHING, *parameters]), self._precision)
         return self._sights.keys, self._poses
 
 

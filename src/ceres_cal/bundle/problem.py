@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections import Counter
 from collections.abc import Callable, Container, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -65,6 +65,7 @@ class _Blocks:
     cameras: dict[str, Array]
     stations: dict[str, Array]
     placements: dict[str, Array]
+    structure: Array
 
     @classmethod
     def pack(cls, estimate: Estimate, layout: Layout, eliminated: Container[str | None]) -> _Blocks:
@@ -72,12 +73,18 @@ class _Blocks:
             {name: intrinsics_vector(camera)[layout.free[name]] for name, camera in estimate.cameras.items()},
             {name: station.cam_from_world.log() for name, station in estimate.stations.items()},
             {name: pose.log() for name, pose in estimate.placements.items() if name not in eliminated},
+            estimate.structure.values.copy(),
         )
 
     def of(self, key: SightKey, slots: Iterable[int]) -> list[Array]:
-        """The arrays of a sight's camera (slot 0), station (1) and placement (2), as far as they are free."""
-        names = ((self.cameras, key.camera), (self.stations, key.station), (self.placements, str(key.placement)))
-        return [names[slot][0][names[slot][1]] for slot in slots]
+        """The arrays of a sight's camera (slot 0), station (1), placement (2) and structure (3)."""
+        every = (
+            lambda: self.cameras[key.camera],
+            lambda: self.stations[key.station],
+            lambda: self.placements[str(key.placement)],
+            lambda: self.structure,
+        )
+        return [every[slot]() for slot in slots]
 
     def unpack(self, estimate: Estimate, layout: Layout) -> Estimate:
         cameras = {}
@@ -93,7 +100,36 @@ class _Blocks:
             name: Pose.exp(self.placements[name]) if name in layout.placements and name in self.placements else old
             for name, old in estimate.placements.items()
         }
-        return Estimate(cameras, stations, placements)
+        return Estimate(cameras, stations, placements, estimate.structure.with_values(self.structure))
+
+
+@dataclass(eq=False)
+class _Assembly:
+    """Every cost of a problem with the arrays it depends on; costs that depend on nothing free have no array."""
+
+    blocks: _Blocks
+    costs: list[tuple[Any, list[Array]]]
+    eliminated: list[tuple[EliminatedCost, list[Array]]]
+
+
+def _assemble(
+    run: Run, sights: Sights, estimate: Estimate, layout: Layout, weighting: Weighting, threads: int
+) -> _Assembly:
+    private = _private_placements(sights, layout)
+    blocks = _Blocks.pack(estimate, layout, private)
+    assembly = _Assembly(blocks, [], [])
+    for camera in estimate.cameras:
+        own = np.array([i for i, key in enumerate(sights.keys) if key.camera == camera and key.placement in private])
+        if len(own):
+            cost = EliminatedCost(run, sights.take(own), estimate, layout, weighting, threads)
+            assembly.eliminated.append((cost, blocks.of(sights.keys[own[0]], cost.slots)))
+    assembly.costs += assembly.eliminated
+    for number, key in enumerate(sights.keys):
+        if key.placement not in private:
+            sight_cost = SightCost(run, sights[number], estimate, layout, weighting)
+            assembly.costs.append((sight_cost, blocks.of(key, sight_cost.slots)))
+    assembly.costs += [(cost, [array]) for cost, array in _prior_blocks(layout, estimate, blocks)]
+    return assembly
 
 
 class _Watcher(pyceres.IterationCallback):
@@ -129,36 +165,23 @@ def solve(
     """
     _require_enough(sights, layout)
     run = Run()
-    threads = options.threads or min(os.cpu_count() or 1, 8)
-    private = _private_placements(sights, layout)
-    blocks = _Blocks.pack(estimate, layout, private)
+    assembly = _assemble(run, sights, estimate, layout, weighting, options.threads or min(os.cpu_count() or 1, 8))
     problem = pyceres.Problem()
-    eliminated: list[EliminatedCost] = []
-    others: list[SightCost] = []
-    for camera in estimate.cameras:
-        own = np.array([i for i, key in enumerate(sights.keys) if key.camera == camera and key.placement in private])
-        if len(own):
-            eliminated.append(EliminatedCost(run, sights.take(own), estimate, layout, weighting, threads))
-            if len(blocks.cameras[camera]):
-                problem.add_residual_block(eliminated[-1], None, [blocks.cameras[camera]])
-    for number, key in enumerate(sights.keys):
-        if key.placement not in private:
-            others.append(SightCost(run, sights[number], estimate, layout, weighting))
-            if arrays := blocks.of(key, others[-1].slots):
-                problem.add_residual_block(others[-1], None, arrays)
-    prior_costs = list(_prior_blocks(layout, estimate, blocks))
-    for prior_cost, array in prior_costs:
-        problem.add_residual_block(prior_cost, None, [array])
+    for cost, arrays in assembly.costs:
+        if arrays:
+            problem.add_residual_block(cost, None, arrays)
     summary = pyceres.SolverSummary()
-    pyceres.solve(_solver_options(layout, blocks, options, weighting, _Watcher(run, progress)), problem, summary)
+    pyceres.solve(
+        _solver_options(layout, assembly.blocks, options, weighting, _Watcher(run, progress)), problem, summary
+    )
     if run.failure is not None:
         raise run.failure
-    solved = blocks.unpack(estimate, layout)
+    solved = assembly.blocks.unpack(estimate, layout)
     placements = dict(solved.placements)
-    for cost in eliminated:
-        placements |= _placed(solved, *cost.settled(blocks.cameras[cost.camera]))
+    for eliminated, arrays in assembly.eliminated:
+        placements |= _placed(solved, *eliminated.settled(arrays))
     return Solution(
-        Estimate(solved.cameras, solved.stations, placements),
+        replace(solved, placements=placements),
         float(summary.final_cost),
         summary.termination_type == pyceres.TerminationType.CONVERGENCE,
         str(summary.message),
@@ -185,7 +208,7 @@ def _placed(estimate: Estimate, keys: Sequence[SightKey], cam_from_target: Array
 
 def _require_enough(sights: Sights, layout: Layout) -> None:
     equations = 2 * len(sights.point_rows) + len(sights.curve_rows)
-    equations += sum(len(prior.value) for prior in layout.priors)
+    equations += sum(len(prior.value) for prior in layout.priors)  # each structure number has a prior of its own
     if equations < layout.size:
         raise DegenerateError(
             f"{equations} measured numbers (two a point, one a curve observation or prior) cannot determine "
@@ -222,6 +245,10 @@ def _prior_blocks(layout: Layout, estimate: Estimate, blocks: _Blocks) -> Iterab
         if len(places):
             array = blocks.cameras[prior.name]
             yield LinearPriorCost(places, mean, sigma, len(array)), array
+    sigma_m = estimate.structure.sigma_m
+    if len(sigma_m):
+        every = np.arange(len(sigma_m))
+        yield LinearPriorCost(every, np.zeros(len(sigma_m)), sigma_m, len(sigma_m)), blocks.structure
 
 
 def _prior_on_intrinsics(

@@ -15,10 +15,11 @@ from ceres_cal.cli.detect import COMMANDS as DETECT
 from ceres_cal.cli.locate import COMMANDS as LOCATE
 from ceres_cal.cli.simulate import COMMANDS as SIMULATE
 from ceres_cal.cli.targets import COMMANDS as TARGETS
-from ceres_cal.errors import CalibrationError, InputError
+from ceres_cal.errors import CalibrationError, InputError, SolutionError
 
 COMMANDS = {command.name: command for command in (*DETECT, *CALIBRATE, *LOCATE, *SIMULATE, *TARGETS)}
 _BEGINNINGS = {"", *(name.partition(" ")[0] for name in COMMANDS if " " in name)}
+_MOST_LETTERS = 200  # of an error that nobody wrote for people
 _INTERRUPTED, _PIPE_CLOSED = 130, 141  # what a shell reports of a program that SIGINT or SIGPIPE ended
 
 
@@ -46,11 +47,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except MemoryError:
         return _fail("out of memory: give fewer observations or images at a time", InputError.exit_code)
     except OSError as error:
-        return _fail(": ".join(str(part) for part in (error.filename, error.strerror or error) if part), 2)
+        return _fail(
+            ": ".join(str(part) for part in (error.filename, error.strerror or error) if part), InputError.exit_code
+        )
     except Exception as error:
         if os.environ.get("CERES_CAL_DEBUG"):
             raise
-        return _fail(f"unexpected {type(error).__name__}: {error}: please report it (CERES_CAL_DEBUG=1 tells more)", 3)
+        what = f"{type(error).__name__}: {error}"[:_MOST_LETTERS]
+        return _fail(f"unexpected {what}: please report it (CERES_CAL_DEBUG=1 tells more)", SolutionError.exit_code)
 
 
 def _fail(message: str, exit_code: int) -> int:

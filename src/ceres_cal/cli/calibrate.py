@@ -72,6 +72,11 @@ def _add_arguments(parser: ArgumentParser) -> None:
         default="estimate",
         help="estimate the noise of points and of curves from their residuals (default), or keep the stated sigmas",
     )
+    add(
+        "--closed-form-only",
+        action="store_true",
+        help="stop at the paper's own method: a baseline to compare with, not a calibration",
+    )
     add("--max-iterations", type=int, default=100, metavar="N", help="of each solve; default: 100")
     add("--threads", type=int, default=0, metavar="N", help="default: the solver chooses")
     parser.add_argument("--quiet", action="store_true", help="no progress")
@@ -172,6 +177,7 @@ def _options(
         loss_scale=args.loss_scale,
         reject_sigma=args.reject_sigma,
         noise_scale=args.noise_scale,
+        closed_form_only=args.closed_form_only,
         max_iterations=args.max_iterations,
         threads=args.threads,
     )

@@ -79,7 +79,7 @@ def print_answer(answer: Answer, *, as_json: bool) -> None:
 
 def add_output(parser: argparse.ArgumentParser, what: str, *, required: bool) -> None:
     """The option -o FILE."""
-    parser.add_argument("-o", "--output", metavar="FILE", type=Path, required=required, help=f"where {what} is written")
+    parser.add_argument("-o", "--output", metavar="FILE", type=Path, required=required, help=f"file for {what}")
 
 
 def require_output(path: Path | None, inputs: Iterable[str | Path]) -> None:

@@ -163,23 +163,22 @@ def _outlier_lines(calibration: Calibration) -> list[str]:
 
 
 def _stop(calibration: Calibration) -> list[str]:
+    if not calibration.rounds:
+        return [calibration.termination]
     iterations = max(len(calibration.history) - 1, 0)
     how = "converged" if calibration.converged else "did not converge"
     return [
-        f"{how} after {calibration.rounds} solves, the last of {plural(iterations, 'iteration')}",
+        f"{how} after {plural(calibration.rounds, 'solve')}, the last of {plural(iterations, 'iteration')}",
         calibration.termination,
     ]
 
 
 def _warnings(calibration: Calibration, observations: Observations) -> Iterator[str]:
+    yield from calibration.warnings
+    if not calibration.rounds:  # nothing was solved
+        return
     if not calibration.converged:
         yield "the solve did not come to rest: raise --max-iterations"
-    for name, origin in calibration.phi_from.items():
-        if origin == "guess":
-            yield (
-                f"the views of camera {name} hardly tell phi and height apart (phi was started from a guess): "
-                f"add tilted boards, or {_useful_prior(observations, name)}"
-            )
     if len(calibration.rejected) > _MANY_OUTLIERS * (len(observations.points) + len(observations.curves)):
         yield "so many observations were taken out: check labels, target dimensions and the choice of lens"
     scale = max(calibration.fit.point_scale, calibration.fit.curve_scale)
@@ -188,12 +187,3 @@ def _warnings(calibration: Calibration, observations: Observations) -> Iterator[
             f"the residuals are {scale:.0f} times the stated sigmas: the lens may not suit the camera, or labels and "
             "target dimensions may be wrong"
         )
-
-
-def _useful_prior(observations: Observations, camera: str) -> str:
-    """What would help: the height of a station, but phi where no station of the camera is tied to the world."""
-    tied = set(observations.stations) - anchored_stations(observations)
-    for name, owner in observations.stations.items():
-        if owner == camera and name in tied:
-            return f"the camera's height by a tape measure: --prior {name}.height_m=METRES:0.01"
-    return f"phi from another calibration: --prior {camera}.phi=PIXELS:5"

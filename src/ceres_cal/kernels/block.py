@@ -1,7 +1,7 @@
 """The compressed block of one sight, as Ceres asks for it (design, section 6).
 
-A = sum w [J e]^T [J e] over [free intrinsics | 6 pose | e] is factored as A = U^T U; the rows of U are the Jacobian
-that Ceres sees, their last column its residual. Station and placement follow by the chain rule on U.
+A = sum w [J e]^T [J e] over [free intrinsics | structure | 6 pose | e] is factored as A = U^T U; the rows of U are the
+Jacobian that Ceres sees, their last column its residual. Station and placement follow by the chain rule on U.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ceres_cal.kernels.jit import jit
-from ceres_cal.kernels.sight import normal_equations
+from ceres_cal.kernels.sight import layout_of_rows, normal_equations
 
 
 @jit
@@ -111,45 +111,58 @@ def _chain(station: Any, placement: Any, pose: Any, to_station: Any, to_placemen
 
 
 @jit
-def _copy_columns(upper: Any, free: int, chain: Any, jacobian: Any) -> None:
-    """Rows of U's pose columns times the chain rule, as the row-major Jacobian of one 6-vector block."""
+def _copy_plain(upper: Any, first: int, count: int, jacobian: Any) -> None:
+    """Columns of U as the row-major Jacobian of one block; nothing where the block is held."""
+    if len(jacobian) == 0:
+        return
+    jacobian[:] = 0.0
+    for row in range(len(upper) - 1):
+        for k in range(count):
+            jacobian[count * row + k] = upper[row, first + k]
+
+
+@jit
+def _copy_chained(upper: Any, first: int, chain: Any, jacobian: Any) -> None:
+    """U's pose columns times the chain rule, as the row-major Jacobian of one 6-vector block."""
+    if len(jacobian) == 0:
+        return
+    jacobian[:] = 0.0
     for row in range(len(upper) - 1):
         for k in range(6):
-            total = 0.0
             for j in range(6):
-                total += upper[row, free + j] * chain[j, k]
-            jacobian[6 * row + k] = total
+                jacobian[6 * row + k] += upper[row, first + j] * chain[j, k]
 
 
 @jit
 def evaluate_block(
-    lens: int, fixed_intrinsics: Any, free: Any, powers: Any, unit: float, points: Any, pixels: Any, weights: Any,
-    tracks: Any, is_arc: Any, track: Any, curve_pixels: Any, curve_weights: Any, s: Any, loss: int, scale: float,
+    lens: int, fixed_intrinsics: Any, free: Any, powers: Any, unit: float, pixels: Any, weights: Any,
+    slots: Any, bends: Any, is_arc: Any, track: Any, curve_pixels: Any, curve_weights: Any, s: Any, track_slots: Any,
+    loss: int, scale: float, points: Any, tracks: Any, structure: int,
     camera: Any, station: Any, placement: Any, wants_jacobian: bool, residuals: Any,
-    camera_jacobian: Any, station_jacobian: Any, placement_jacobian: Any,
+    camera_jacobian: Any, station_jacobian: Any, placement_jacobian: Any, structure_jacobian: Any,
 ) -> bool:  # fmt: skip
     """What Ceres asks of the block of one sight (design, section 6); False where an observation cannot be projected.
 
     Args:
         fixed_intrinsics: the whole intrinsics vector; `camera` replaces its entries `free`.
+        points, tracks: as built, with the `structure` numbers of the moment put in.
         station, placement: 6-vectors of cam_from_world and world_from_target.
-        residuals: (free + 7,): the rows of U, then what is missing from the robust cost; with the cost alone wanted,
-            all of it in the first entry.
-        *_jacobian: row-major, (free + 7) x the block's size; empty where that block is held.
+        residuals: (free + structure + 7,): the rows of U, then what is missing from the robust cost; with the cost
+            alone wanted, all of it in the first entry.
+        *_jacobian: row-major, as many rows x the block's size; empty where that block is held.
     """
     count = len(free)
+    shared = count + structure
     intrinsics = fixed_intrinsics.copy()
     for k in range(count):
         intrinsics[free[k]] = camera[k]
     pose, to_station, to_placement = np.empty((3, 4)), np.empty((6, 6)), np.empty((6, 6))
     _chain(station, placement, pose, to_station, to_placement)
-    rows = np.empty(count + 7, np.int64)
-    rows[:count] = free
-    rows[count:] = np.arange(len(intrinsics), len(intrinsics) + 7)
-    normal = np.empty((count + 7, count + 7))
+    rows, places = layout_of_rows(free, len(intrinsics), structure)
+    normal = np.empty((shared + 7, shared + 7))
     cost = normal_equations(
-        lens, intrinsics, powers, unit, pose, points, pixels, weights, tracks, is_arc, track, curve_pixels,
-        curve_weights, s, loss, scale, rows, wants_jacobian, normal,
+        lens, intrinsics, powers, unit, pose, points, pixels, weights, slots, bends, tracks, is_arc, track,
+        curve_pixels, curve_weights, s, track_slots, loss, scale, rows, places, wants_jacobian, normal,
     )  # fmt: skip
     if not np.isfinite(cost):
         return False
@@ -157,23 +170,16 @@ def evaluate_block(
     if not wants_jacobian:
         residuals[0] = np.sqrt(cost)
         return True
-    upper = np.empty((count + 7, count + 7))
+    upper = np.empty((shared + 7, shared + 7))
     cholesky(normal, upper)
-    last = count + 6
+    last = shared + 6
     missing = cost
     for row in range(last):
         residuals[row] = upper[row, last]
         missing -= upper[row, last] * upper[row, last]
     residuals[last] = np.sqrt(max(missing, 0.0))
-    if len(camera_jacobian) > 0:
-        camera_jacobian[:] = 0.0
-        for row in range(last):
-            for k in range(count):
-                camera_jacobian[count * row + k] = upper[row, k]
-    if len(station_jacobian) > 0:
-        station_jacobian[:] = 0.0
-        _copy_columns(upper, count, to_station, station_jacobian)
-    if len(placement_jacobian) > 0:
-        placement_jacobian[:] = 0.0
-        _copy_columns(upper, count, to_placement, placement_jacobian)
+    _copy_plain(upper, 0, count, camera_jacobian)
+    _copy_plain(upper, count, structure, structure_jacobian)
+    _copy_chained(upper, shared, to_station, station_jacobian)
+    _copy_chained(upper, shared, to_placement, placement_jacobian)
     return True

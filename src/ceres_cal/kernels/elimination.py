@@ -1,8 +1,8 @@
 """Many placements that only one station sees each: their poses are eliminated from the problem (variable projection).
 
 For given intrinsics each pose is brought to its own best value, and what is left of the normal equations, the Schur
-complement A_cc - A_cp A_pp^-1 A_pc, speaks of the intrinsics alone. Near the best pose one evaluation per sight is
-enough: the complement takes the rest of the step, and its cost, along to second order.
+complement A_cc - A_cp A_pp^-1 A_pc, speaks of what all sights share: the free intrinsics and the structure. Near the
+best pose one evaluation per sight is enough: the complement takes the rest of the step, and its cost, along.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 
 from ceres_cal.kernels.block import rotation
 from ceres_cal.kernels.jit import jit
-from ceres_cal.kernels.sight import normal_equations
+from ceres_cal.kernels.sight import layout_of_rows, normal_equations
 
 _MOST_STEPS = 50
 _NOTHING_LEFT = 1e-14  # squared standard deviations
@@ -61,9 +61,10 @@ def _solve_pose(normal: Any, count: int, damping: float, lower: Any, gain: Any) 
 @jit
 def eliminate_placements(
     first: int, last: int, lens: int, intrinsics: Any, free: Any, powers: Any, unit: float,
-    bounds: Any, points: Any, pixels: Any, weights: Any,
-    tracks: Any, is_arc: Any, curve_bounds: Any, track: Any, curve_pixels: Any, curve_weights: Any, s: Any,
-    loss: int, scale: float, tolerance: float, change: Any, poses: Any, gains: Any, reduced: Any,
+    bounds: Any, pixels: Any, weights: Any, slots: Any, bends: Any,
+    is_arc: Any, curve_bounds: Any, track: Any, curve_pixels: Any, curve_weights: Any, s: Any, track_slots: Any,
+    loss: int, scale: float, points: Any, tracks: Any, structure: int, tolerance: float, change: Any, poses: Any,
+    gains: Any, reduced: Any,
 ) -> float:  # fmt: skip
     """Sum of rho over the sights first to last at their best poses, and what they say of the free intrinsics.
 
@@ -71,31 +72,32 @@ def eliminate_placements(
         intrinsics, free, powers, unit, loss, scale and the observations: see `normal_equations`; bounds, curve_bounds
             (S + 1,) say where each sight's rows begin.
         tolerance: how much of a sight's cost a step of its pose may still promise when it is left to the complement.
-        change: (free,) by how much the free intrinsics have moved since `poses` and `gains` were made.
-        poses: (S, 3, 4) [R t] of cam_from_target, moved. gains: (S, 6, free), d pose / d intrinsics, renewed.
-        reduced: (free + 1, free + 1), lower triangle: the complement with the residual's row last, added up.
+        points, tracks: as built, with the `structure` numbers of the moment put in.
+        change: (free + structure,) by how much these have moved since `poses` and `gains` were made.
+        poses: (S, 3, 4) [R t] of cam_from_target, moved. gains: (S, 6, free + structure), their effect, renewed.
+        reduced: (free + structure + 1,) squared, lower triangle: the complement with the residual's row last, added up.
 
     Returns:
         NaN where an observation cannot be projected.
     """
-    count = len(free)
-    rows = np.empty(count + 7, np.int64)
-    rows[:count] = free
-    rows[count:] = np.arange(len(intrinsics), len(intrinsics) + 7)
+    count = len(free) + structure
+    rows, places = layout_of_rows(free, len(intrinsics), structure)
     normal, trial = np.empty((count + 7, count + 7)), np.empty((count + 7, count + 7))
     lower, gain = np.empty((6, 6)), np.empty((6, count + 1))
     turned, step, pose, moved = np.empty((3, 3)), np.empty(6), np.empty((3, 4)), np.empty((3, 4))
     total = 0.0
     for v in range(first, last):
         p, c = slice(bounds[v], bounds[v + 1]), slice(curve_bounds[v], curve_bounds[v + 1])
+        moving = p if len(slots) > 0 else slice(0, 0)
         for k in range(6):
             step[k] = 0.0
             for j in range(count):
                 step[k] -= gains[v, k, j] * change[j]
         _move(poses[v], step, turned, pose)
         cost = normal_equations(
-            lens, intrinsics, powers, unit, pose, points[p], pixels[p], weights[p], tracks, is_arc, track[c],
-            curve_pixels[c], curve_weights[c], s[c], loss, scale, rows, True, normal,
+            lens, intrinsics, powers, unit, pose, points[p], pixels[p], weights[p], slots[moving], bends[moving],
+            tracks, is_arc, track[c], curve_pixels[c], curve_weights[c], s[c], track_slots, loss, scale,
+            rows, places, True, normal,
         )  # fmt: skip
         damping = 0.0
         for _ in range(_MOST_STEPS):
@@ -110,8 +112,9 @@ def eliminate_placements(
                 break
             _move(pose, step, turned, moved)
             moved_cost = normal_equations(
-                lens, intrinsics, powers, unit, moved, points[p], pixels[p], weights[p], tracks, is_arc, track[c],
-                curve_pixels[c], curve_weights[c], s[c], loss, scale, rows, True, trial,
+                lens, intrinsics, powers, unit, moved, points[p], pixels[p], weights[p], slots[moving], bends[moving],
+                tracks, is_arc, track[c], curve_pixels[c], curve_weights[c], s[c], track_slots, loss, scale,
+                rows, places, True, trial,
             )  # fmt: skip
             if moved_cost <= cost:
                 pose, moved, normal, trial, cost, damping = moved, pose, trial, normal, moved_cost, 0.1 * damping

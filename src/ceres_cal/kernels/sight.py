@@ -133,21 +133,58 @@ def _loss(code: int, scale: float, squared: float) -> tuple[float, float]:
 
 
 @jit
-def _add_products(n: int, components: int, rows: Any, jacobian: Any, normal: Any) -> None:
-    """normal += J J^T over the chosen rows, lower triangle."""
+def _add_products(n: int, components: int, rows: Any, places: Any, jacobian: Any, normal: Any) -> None:
+    """normal += J J^T over the chosen rows, at their places, lower triangle."""
     for k in range(len(rows)):
         for j in range(k + 1):
             total = 0.0
             for c in range(components):
                 for i in range(n):
                     total += jacobian[rows[k], c, i] * jacobian[rows[j], c, i]
-            normal[k, j] += total
+            normal[places[k], places[j]] += total
+
+
+@jit
+def _add_structure(
+    i: int, components: int, slots: Any, directions: Any, pose: Any, rows: Any, places: Any, jacobian: Any,
+    columns: Any, normal: Any,
+) -> None:  # fmt: skip
+    """The share of the chunk's observation i in the rows of the structure numbers `slots` (-1: none) that move it.
+
+    Moving the target along a direction moves the point by R times it in the camera frame: the pose's translation rows
+    of the Jacobian say what that does. Structure numbers stand between the free intrinsics and the pose.
+    """
+    base = len(rows) - 7
+    translation = jacobian.shape[0] - 4
+    for a in range(len(slots)):
+        if slots[a] < 0:
+            continue
+        for c in range(components):
+            columns[a, c] = 0.0
+            for j in range(3):
+                turned = 0.0
+                for k in range(3):
+                    turned += pose[j, k] * directions[a, k]
+                columns[a, c] += jacobian[translation + j, c, i] * turned
+        for k in range(len(rows)):
+            value = 0.0
+            for c in range(components):
+                value += columns[a, c] * jacobian[rows[k], c, i]
+            row, column = max(base + slots[a], places[k]), min(base + slots[a], places[k])
+            normal[row, column] += value
+        for b in range(a + 1):
+            if slots[b] >= 0:
+                value = 0.0
+                for c in range(components):
+                    value += columns[a, c] * columns[b, c]
+                normal[base + max(slots[a], slots[b]), base + min(slots[a], slots[b])] += value
 
 
 @jit
 def _add_points(
     lens: int, intrinsics: Any, powers: Any, dense: Any, unit: float, limit: float, pose: Any, points: Any, pixels: Any,
-    weights: Any, loss: int, scale: float, rows: Any, wants_normal: bool, normal: Any, jacobian: Any, scratch: Any,
+    weights: Any, slots: Any, bends: Any, loss: int, scale: float, rows: Any, places: Any, wants_normal: bool,
+    normal: Any, jacobian: Any, scratch: Any,
 ) -> float:  # fmt: skip
     """Sum of rho over the point observations, NaN where one cannot be projected; their share of `normal`."""
     residual_row = jacobian.shape[0] - 1
@@ -177,15 +214,34 @@ def _add_points(
                 for i in range(n):
                     jacobian[k, 0, i] *= local[0, i]
                     jacobian[k, 1, i] *= local[0, i]
-            _add_products(n, 2, rows, jacobian, normal)
+            _add_products(n, 2, rows, places, jacobian, normal)
+            if len(slots) > 0:
+                directions, columns = np.eye(4, 3), np.empty((4, 2))
+                for i in range(n):
+                    directions[2, 2], directions[3, 2] = bends[start + i, 0], bends[start + i, 1]
+                    _add_structure(i, 2, slots[start + i], directions, pose, rows, places, jacobian, columns, normal)
     return cost
+
+
+@jit
+def _curve_directions(i: int, k: int, tracks: Any, is_arc: Any, foot: Any, directions: Any) -> None:
+    """Where the foot on track k goes: to the left of a segment; with the centre and outwards on an arc."""
+    if is_arc[k]:
+        directions[0, 0], directions[0, 1] = 1.0, 0.0
+        # The tangent's right side is outside; turned by a quarter it is the radius' own direction.
+        length = np.sqrt(foot[8, i] * foot[8, i] + foot[9, i] * foot[9, i])
+        directions[2, 0], directions[2, 1], directions[2, 2] = foot[9, i] / length, -foot[8, i] / length, 0.0
+    else:
+        x, y = tracks[k, 1, 0], tracks[k, 1, 1]
+        length = np.sqrt(x * x + y * y) + 1e-300
+        directions[0, 0], directions[0, 1] = -y / length, x / length
 
 
 @jit
 def _add_curves(
     lens: int, intrinsics: Any, powers: Any, dense: Any, unit: float, limit: float, pose: Any, tracks: Any,
-    is_arc: Any, track: Any, pixels: Any, weights: Any, s: Any, loss: int, scale: float, rows: Any, wants_normal: bool, normal: Any,
-    jacobian: Any, scratch: Any,
+    is_arc: Any, track: Any, pixels: Any, weights: Any, s: Any, track_slots: Any, loss: int, scale: float, rows: Any,
+    places: Any, wants_normal: bool, normal: Any, jacobian: Any, scratch: Any,
 ) -> float:  # fmt: skip
     """The same for the curve observations: one residual each, the distance along the image normal at the foot.
 
@@ -218,15 +274,34 @@ def _add_curves(
             for k in rows[:-1]:
                 for i in range(n):
                     jacobian[k, 0, i] = local[0, i] * jacobian[k, 0, i] + local[1, i] * jacobian[k, 1, i]
-            _add_products(n, 1, rows, jacobian, normal)
+            _add_products(n, 1, rows, places, jacobian, normal)
+            if len(track_slots) > 0:
+                directions, columns = np.eye(3, 3), np.empty((3, 2))
+                for i in range(n):
+                    _curve_directions(i, track[start + i], tracks, is_arc, foot, directions)
+                    _add_structure(
+                        i, 1, track_slots[track[start + i]], directions, pose, rows, places, jacobian, columns, normal
+                    )
     return cost
+
+
+@jit
+def layout_of_rows(free: Any, intrinsics: int, structure: int) -> tuple[Any, Any]:
+    """(rows, places) as `normal_equations` takes them: A is [free intrinsics | structure | 6 pose | residual]."""
+    count = len(free)
+    rows, places = np.empty(count + 7, np.int64), np.empty(count + 7, np.int64)
+    rows[:count] = free
+    rows[count:] = np.arange(intrinsics, intrinsics + 7)
+    places[:count] = np.arange(count)
+    places[count:] = np.arange(count + structure, count + structure + 7)
+    return rows, places
 
 
 @jit
 def normal_equations(
     lens: int, intrinsics: Any, powers: Any, unit: float, pose: Any, points: Any, pixels: Any, weights: Any,
-    tracks: Any, is_arc: Any, track: Any, curve_pixels: Any, curve_weights: Any, s: Any,
-    loss: int, scale: float, rows: Any, wants_normal: bool, normal: Any,
+    slots: Any, bends: Any, tracks: Any, is_arc: Any, track: Any, curve_pixels: Any, curve_weights: Any, s: Any,
+    track_slots: Any, loss: int, scale: float, rows: Any, places: Any, wants_normal: bool, normal: Any,
 ) -> float:  # fmt: skip
     """Sum of rho over one sight, NaN where an observation cannot be projected; A added up in `normal`'s lower triangle.
 
@@ -236,8 +311,11 @@ def normal_equations(
         points (N, 3) m, pixels (N, 2), weights (N,) = 1 / (noise scale * sigma).
         tracks (T, 3, 3), is_arc (T,), track (M,) index into tracks, curve_pixels (M, 2), curve_weights (M,),
             s (M,): place on the track, read as a start and left at the foot.
+        slots (N, 4) with bends (N, 2), and track_slots (T, 3): the structure numbers that move each point and track,
+            -1 for none; empty without structure (see `structure.Structure`).
         loss, scale: a LOSS_CODES value and its scale in standard deviations.
         rows: which numbers take part: indices into [intrinsics | 6 pose | residual], the last one the residual's.
+        places: their rows in A; structure numbers come after the intrinsics, before the pose.
         wants_normal: whether A is wanted or only the cost.
     """
     jacobian = np.empty((len(intrinsics) + 7, 2, _CHUNK))
@@ -249,13 +327,13 @@ def normal_equations(
     cost = 0.0
     if len(points) > 0:
         cost += _add_points(
-            lens, intrinsics, powers, dense, unit, limit, pose, points, pixels, weights, loss, scale, rows,
-            wants_normal, normal, jacobian, scratch,
+            lens, intrinsics, powers, dense, unit, limit, pose, points, pixels, weights, slots, bends, loss, scale,
+            rows, places, wants_normal, normal, jacobian, scratch,
         )  # fmt: skip
     if len(curve_pixels) > 0:
         cost += _add_curves(
             lens, intrinsics, powers, dense, unit, limit, pose, tracks, is_arc, track, curve_pixels, curve_weights, s,
-            loss, scale, rows, wants_normal, normal, jacobian, scratch,
+            track_slots, loss, scale, rows, places, wants_normal, normal, jacobian, scratch,
         )  # fmt: skip
     return cost
 

@@ -1,0 +1,241 @@
+"""The same optimum as independent solvers on the same corners: OpenCV, and pycolmap's own C++ cost functions.
+
+The corners are noisy, so the optimum is not the truth and residuals do not vanish: agreement means the same model, the
+same cost and a solver that has come to rest. pyceres and pycolmap are pinned as a pair; this is the test of that pair.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import Any
+
+import cv2
+import numpy as np
+import pyceres
+import pycolmap
+import pycolmap.cost_functions
+import pytest
+
+from ceres_cal.calibrate import calibrate
+from ceres_cal.calibration import Calibration
+from ceres_cal.camera import Camera
+from ceres_cal.detect.boards import BoardDetections
+from ceres_cal.lens import Brown, KannalaBrandt, Lens
+from ceres_cal.observations import Observations
+from ceres_cal.parameters import Options
+from ceres_cal.simulate import Disturbance, Station, board_scene, simulate
+from ceres_cal.targets import checkerboard
+from ceres_cal.transforms import Array, Pose, rotation_exp, rotation_log
+
+BOARD = checkerboard(9, 6, 0.125)  # its corners are the same numbers in single precision, which OpenCV asks for
+SIZE = (1280, 960)
+LENSES: dict[str, tuple[float, Lens]] = {
+    "brown": (825.0, Brown((-0.24, 0.082, 4e-4, -3e-4, -0.011))),
+    "kannala-brandt": (480.0, KannalaBrandt((-0.05, 0.012, -0.008, 0.0015))),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """What a solver found: phi, aspect, cx, cy and coefficients; cam_from_board of every view; 2D rms."""
+
+    intrinsics: Array
+    poses: Sequence[Pose]
+    rms_px: float
+
+
+@cache
+def corners(lens: str) -> Observations:
+    """15 views of a board, 0.3 px of noise, pixels rounded to single precision."""
+    phi, model = LENSES[lens]
+    camera = Camera(SIZE, phi, (651.3, 468.9), model, 1.004)
+    scene = board_scene(
+        BOARD, {"camera": camera}, {"camera": Station("camera", Pose.identity())}, 15, seed=1, distance_m=(0.8, 2.0)
+    )
+    found = simulate(scene, Disturbance(points_sigma_px=0.3), seed=1).observations
+    return replace(found, points=replace(found.points, pixels=found.points.pixels.astype(np.float32)))
+
+
+def per_view(observations: Observations, precision: Any) -> tuple[list[Any], list[Any]]:
+    """Board points and pixels of each view, as OpenCV takes them."""
+    rows = [np.flatnonzero(observations.points.view == number) for number in range(len(observations.views))]
+    (board,) = observations.targets.values()
+    places = [board.point_array[observations.points.feature[row]].astype(precision) for row in rows]
+    return places, [observations.points.pixels[row].astype(precision) for row in rows]
+
+
+@cache
+def ours(lens: str, free_aspect: bool = True, fixed: tuple[str, ...] = ()) -> tuple[Calibration, Answer]:
+    """Plain least squares: no robust loss, no rejection, the stated sigmas."""
+    options = Options(
+        lens=lens, free_aspect=free_aspect, fixed=dict.fromkeys(fixed, 0.0), loss="trivial", noise_scale="stated",
+        reject_sigma=1e9,
+    )  # fmt: skip
+    calibration = calibrate(corners(lens), options)
+    camera = calibration.cameras["camera"]
+    station = calibration.station().cam_from_world
+    poses = [station @ calibration.placements[str(view.placement)] for view in corners(lens).views]
+    intrinsics = np.array([camera.phi, camera.aspect, *camera.principal_point, *camera.lens.values])
+    return calibration, Answer(intrinsics, poses, calibration.fit.points_rms_px)
+
+
+def assert_same(found: Answer, peer: Answer, fixed: int = 0) -> None:
+    """Every parameter equal to 1e-6, relative; the principal point relative to phi, rotations in rad."""
+    free = len(found.intrinsics) - fixed
+    size = np.abs(peer.intrinsics[:free])
+    size[2:4] = peer.intrinsics[0]
+    assert np.max(np.abs(found.intrinsics - peer.intrinsics)[:free] / size) < 1e-6
+    for mine, theirs in zip(found.poses, peer.poses, strict=True):
+        assert np.linalg.norm(rotation_log(mine.rotation @ theirs.rotation.T)) < 1e-6
+        away = np.linalg.norm(mine.translation - theirs.translation)
+        assert away < 1e-6 * np.linalg.norm(theirs.translation)
+    assert found.rms_px == pytest.approx(peer.rms_px, rel=1e-9)
+    assert peer.rms_px == pytest.approx(0.3 * np.sqrt(2.0), rel=0.1)  # noise, and nothing else
+
+
+# ---- OpenCV ---------------------------------------------------------------------------------------------------------
+
+PATIENCE = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 2000, 1e-15)
+
+
+def from_opencv(rms: float, matrix: Any, distortion: Any, rotations: Any, translations: Any) -> Answer:
+    poses = [Pose.exp(np.concatenate([r.ravel(), t.ravel()])) for r, t in zip(rotations, translations, strict=True)]
+    fx, fy, cx, cy = matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]
+    return Answer(np.array([fx, fy / fx, cx, cy, *distortion.ravel()]), poses, rms)
+
+
+@pytest.mark.parametrize("free_aspect", [True, False])
+def test_opencv_brown(free_aspect: bool) -> None:
+    flags = 0 if free_aspect else cv2.CALIB_FIX_ASPECT_RATIO
+    places, pixels = per_view(corners("brown"), np.float32)
+    peer = from_opencv(
+        *cv2.calibrateCamera(places, pixels, SIZE, np.eye(3), np.zeros(5), flags=flags, criteria=PATIENCE)
+    )
+    assert_same(ours("brown", free_aspect)[1], peer)  # 6e-7 (of k3) measured, 2e-9 of all but the coefficients
+
+
+def test_opencv_fisheye() -> None:
+    """Started 1 % from our answer: from nothing it ends at an rms of 377 px."""
+    _, found = ours("kannala-brandt")
+    phi, aspect, cx, cy, *coefficients = found.intrinsics * 1.01
+    start = np.array([[phi, 0.0, cx], [0.0, phi * aspect, cy], [0.0, 0.0, 1.0]])
+    places, pixels = ([each[None] for each in column] for column in per_view(corners("kannala-brandt"), np.float64))
+    flags = cv2.CALIB_FIX_SKEW + cv2.CALIB_RECOMPUTE_EXTRINSIC + cv2.CALIB_USE_INTRINSIC_GUESS
+    peer = cv2.fisheye.calibrate(places, pixels, SIZE, start, np.array(coefficients), flags=flags, criteria=PATIENCE)
+    assert_same(found, from_opencv(*peer))  # 4e-9 measured
+
+
+# ---- pycolmap's cost functions in a pyceres problem -----------------------------------------------------------------
+
+HALF = 0.5  # COLMAP's pixels count from the corner of the top-left one
+
+
+def solve_with_colmap(
+    model: pycolmap.CameraModelId, observations: Observations, start: Array, poses: Sequence[Pose], held: list[int]
+) -> tuple[Array, list[Pose], float]:
+    """Least squares over COLMAP's parameters and one pose per view.
+
+    A pose is a quaternion and a translation in one block, for which pyceres has no manifold. So each round turns the
+    board's points by the rotation found so far and solves for a small one (x, y, z, 1), w held: where x, y, z end at 0
+    that is a stationary point over the rotations.
+    """
+    parameters, poses = start.copy(), list(poses)
+    options, summary = pyceres.SolverOptions(), pyceres.SolverSummary()
+    options.function_tolerance, options.gradient_tolerance, options.parameter_tolerance = 1e-18, 1e-20, 1e-14
+    options.linear_solver_type = pyceres.LinearSolverType.DENSE_SCHUR
+    options.logging_type = pyceres.LoggingType.SILENT
+    turn = np.ones(1)
+    for _ in range(6):
+        problem = pyceres.Problem()
+        blocks = [np.array([0.0, 0.0, 0.0, 1.0, *pose.translation]) for pose in poses]
+        for block, pose, places, pixels in zip(blocks, poses, *per_view(observations, np.float64), strict=True):
+            for place, pixel in zip(places @ pose.rotation.T, pixels + HALF, strict=True):
+                cost = pycolmap.cost_functions.ReprojErrorCost(model, pixel, place)
+                problem.add_residual_block(cost, None, [block, parameters])
+            problem.set_manifold(block, pyceres.SubsetManifold(7, [3]))
+        if held:
+            problem.set_manifold(parameters, pyceres.SubsetManifold(len(parameters), held))
+        pyceres.solve(options, problem, summary)
+        turn = np.array([np.linalg.norm(block[:3]) for block in blocks])
+        poses = [
+            Pose(rotation_exp(2.0 * np.arctan(size) * block[:3] / max(size, 1e-300)) @ pose.rotation, block[4:])
+            for block, pose, size in zip(blocks, poses, turn, strict=True)
+        ]
+        if np.max(turn) < 1e-9:
+            break
+    assert np.max(turn) < 1e-9
+    return parameters, poses, float(np.sqrt(2.0 * summary.final_cost / len(observations.points)))
+
+
+MODELS = {
+    "OPENCV": ("brown", ("k3",), 1, 0),  # fx fy cx cy k1 k2 p1 p2
+    "FULL_OPENCV": ("brown", (), 0, 3),  # ... k3 k4 k5 k6, of which the last three stay 0
+    "OPENCV_FISHEYE": ("kannala-brandt", (), 0, 0),
+}
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_pycolmap_cost_functions(name: str) -> None:
+    lens, fixed, without, more = MODELS[name]
+    _, found = ours(lens, True, fixed)
+    phi, aspect, cx, cy, *coefficients = found.intrinsics
+    coefficients = [*coefficients[: len(coefficients) - without], *[0.0] * more]
+    start = np.array([phi, phi * aspect, cx + HALF, cy + HALF, *coefficients])
+    held = list(range(len(start) - more, len(start)))
+    rng = np.random.default_rng(0)
+    start *= 1.0 + 1e-3 * rng.standard_normal(len(start))
+    starts = [Pose.exp(rng.normal(0.0, 1e-3, 6)) @ pose for pose in found.poses]
+    model = getattr(pycolmap.CameraModelId, name)
+    parameters, poses, rms_px = solve_with_colmap(model, corners(lens), start, starts, held)
+    fx, fy, cx, cy, *coefficients = parameters
+    peer = np.array([fx, fy / fx, cx - HALF, cy - HALF, *coefficients[: len(coefficients) - more], *[0.0] * without])
+    assert_same(found, Answer(peer, poses, rms_px), fixed=without)  # 6e-7 (of k3), 2e-9 measured
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_pycolmap_projects_as_we_do(name: str) -> None:
+    """One of its cost functions evaluated by hand."""
+    lens, _, without, more = MODELS[name]
+    camera = Camera(SIZE, LENSES[lens][0], (651.3, 468.9), LENSES[lens][1], 1.004)
+    values = list(camera.lens.values)
+    if without:
+        values[-1] = 0.0
+        camera = replace(camera, lens=camera.lens.with_values(values))
+    parameters = [camera.phi, camera.phi * 1.004, 651.3 + HALF, 468.9 + HALF]
+    parameters += [*values[: len(values) - without], *[0.0] * more]
+    point = np.array([0.7, -0.4, 1.5])
+    cost = pycolmap.cost_functions.ReprojErrorCost(
+        getattr(pycolmap.CameraModelId, name), np.array([200.5, 300.5]), point
+    )
+    residual, _ = cost.evaluate(np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]), np.array(parameters))
+    assert np.max(np.abs(residual.ravel() - (camera.project(point[None])[0] - (200.0, 300.0)))) < 1e-10
+
+
+# ---- real boards ----------------------------------------------------------------------------------------------------
+
+
+def test_sony_boards(sony_boards: BoardDetections) -> None:
+    """OpenCV on its own corners, k1 and k2 only: 0.162 px and 700.93; BoofCV published 701.0."""
+    assert len(sony_boards.observations.views) == 13
+    options = Options(lens="brown", free_aspect=True, fixed={"p1": 0.0, "p2": 0.0, "k3": 0.0})
+    calibration = calibrate(sony_boards.observations, options)
+    assert calibration.fit.points_rms_px <= 0.163  # 0.1625 measured
+    assert calibration.fit.points == 13 * 24
+    assert abs(calibration.station().phi - 700.9) <= 0.5  # 700.77 measured
+
+
+def test_gopro_boards(gopro_boards: BoardDetections) -> None:
+    """OpenCV with three radial coefficients: 0.5235 px and 560.07; some corners are 2 px and more off."""
+    observations = gopro_boards.observations
+    assert len(observations.views) >= 35
+    options = Options(lens="brown", free_aspect=True, fixed={"p1": 0.0, "p2": 0.0})
+    calibration = calibrate(observations, options)
+    assert calibration.fit.points_rms_px <= 0.53  # 0.445 measured, without 6 corners
+    assert len(calibration.rejected) < 0.01 * len(observations.points)
+    everything = replace(options, loss="trivial", noise_scale="stated", reject_sigma=1e9)
+    plain = calibrate(observations, everything)
+    assert plain.fit.points == len(observations.points)
+    assert plain.fit.points_rms_px == pytest.approx(0.5235, abs=1e-3)  # 0.52356 measured
+    assert plain.station().phi == pytest.approx(560.07, abs=0.02)  # 560.0699 measured
