@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -141,7 +141,17 @@ def _require_usable(settled: _Settled, sights: Sights) -> tuple[str, ...]:
             f"{where}: from there to the corner ({corner:.0f} px) pixels have no answer; "
             f"observations reach {seen:.0f} px"
         )
-    return tuple(warnings)
+    return (*warnings, *_lost(settled.inliers, sights))
+
+
+def _lost(inliers: Inliers, sights: Sights) -> Iterator[str]:
+    """Sights most of whose observations were taken out: they were not understood, whatever the rest says."""
+    for number, key in enumerate(sights.keys):
+        sight = sights[number]
+        used = np.count_nonzero(inliers.points[sight.point_rows]) + np.count_nonzero(inliers.curves[sight.curve_rows])
+        total = len(sight.point_rows) + len(sight.curve_rows)
+        if 2 * used < total:
+            yield f"{key}: {total - used} of its {total} observations were taken out: check its labels, do not use its pose"
 
 
 def _reach_px(name: str, camera: Camera, sights: Sights) -> float:

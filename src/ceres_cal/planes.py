@@ -47,7 +47,8 @@ class PlaneSight:
 
     @property
     def equations(self) -> int:
-        return 2 * len(self.points) + len(self.lines)
+        """What the sight can say of a homography's eight numbers: two for each point, two for each line."""
+        return 2 * len(np.unique(self.points, axis=0)) + 2 * len(np.unique(self.lines, axis=0))
 
     @property
     def size_px(self) -> float:

@@ -39,7 +39,8 @@ class Sights(Sequence["Sights"]):
     Attributes:
         keys: of each of the S sights. views: numbers of the views that each sight gathers.
         point_bounds: (S + 1,) where each sight's points begin. point_rows: (N,) rows of the observations' columns.
-        feature: (N,) number of each point among the points of all targets. points: (N, 3) m in the sight's frame. pixels: (N, 2). sigma_px: (N,).
+        feature: (N,) number of each point among those of all targets. points: (N, 3) m in the sight's frame.
+        pixels: (N, 2). sigma_px: (N,).
         curve_bounds, curve_rows, curve_pixels, curve_sigma_px: the same of the M curve observations.
         track: (M,) index into tracks (T, 3, 3) and is_arc (T,): every curve and side of every target (see
             `targets.along_track`).
