@@ -151,7 +151,7 @@ def _lost(inliers: Inliers, sights: Sights) -> Iterator[str]:
         used = np.count_nonzero(inliers.points[sight.point_rows]) + np.count_nonzero(inliers.curves[sight.curve_rows])
         total = len(sight.point_rows) + len(sight.curve_rows)
         if 2 * used < total:
-            yield f"{key}: {total - used} of its {total} observations were taken out: check its labels, do not use its pose"
+            yield f"{key}: {total - used} of its {total} observations were taken out: check labels, do not use its pose"
 
 
 def _reach_px(name: str, camera: Camera, sights: Sights) -> float:

@@ -109,7 +109,7 @@ def profile_and_homographies(sights: Sights, camera: Camera, unit: float) -> tup
         alignment = _align(board, camera, unit)
         profile = alignment.profile
     for i, plane in planes.items():
-        if plane.equations < 8 and sights[i].is_arc[sights[i].track].any():
+        if plane.equations == 0 and len(sights[i].track) and sights[i].is_arc[sights[i].track].all():
             ring, found[i] = _from_rings(sights[i], camera, unit)
             profile = profile or ring
     mixed = [i for i, plane in planes.items() if plane.equations >= 8]

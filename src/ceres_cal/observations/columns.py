@@ -1,0 +1,101 @@
+"""What observations are made of: views, priors, and columns of points and curves."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ceres_cal.transforms import Array
+
+Ints = NDArray[np.int32]
+
+
+@dataclass(frozen=True)
+class View:
+    """What one frame shows of one target. `placement` None: the target lies in the world, as a field does."""
+
+    frame: str
+    camera: str
+    station: str
+    target: str
+    placement: str | None = None
+
+
+@dataclass(frozen=True)
+class Prior:
+    """What is known beforehand: `quantity` of a camera or station is `value` with standard deviation `sigma`.
+
+    Quantities of a station: height_m, position_m (m). Of a camera: phi, principal_point (px), aspect, and the lens's
+    coefficients by name in the units of the files.
+    """
+
+    owner: str
+    """"camera" or "station"."""
+    name: str
+    quantity: str
+    value: tuple[float, ...]
+    sigma: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "value", tuple(float(v) for v in self.value))
+        object.__setattr__(self, "sigma", tuple(float(s) for s in self.sigma))
+
+
+TYPES = {"view": np.int32, "feature": np.int32, "pixels": np.float64, "sigma_px": np.float64, "side": np.int8}
+
+
+def _freeze(columns: Columns) -> None:
+    """Own, read-only columns of the types that the files have."""
+    for name, values in vars(columns).items():
+        column = np.array(values, dtype=TYPES[name])
+        column.setflags(write=False)
+        object.__setattr__(columns, name, column)
+
+
+@dataclass(frozen=True, eq=False)
+class Points:
+    """Columns of the point observations: index of the view, index into the target's point names, pixel, its sigma."""
+
+    view: Ints
+    feature: Ints
+    pixels: Array
+    sigma_px: Array
+
+    def __post_init__(self) -> None:
+        _freeze(self)
+
+    def __len__(self) -> int:
+        return len(self.view)
+
+
+@dataclass(frozen=True, eq=False)
+class Curves:
+    """Columns of the curve observations; `side` is 0 for the centre of the paint, +1 for left, -1 for right."""
+
+    view: Ints
+    feature: Ints
+    pixels: Array
+    sigma_px: Array
+    side: NDArray[np.int8]
+
+    def __post_init__(self) -> None:
+        _freeze(self)
+
+    def __len__(self) -> int:
+        return len(self.view)
+
+
+Columns = Points | Curves
+
+
+def place_of(number: int, views: Sequence[View]) -> str:
+    """How messages name a view."""
+    return f"view {number} (frame {views[number].frame!r})"
+
+
+def listed(names: Iterable[str]) -> str:
+    """How messages say what there is."""
+    return "there are " + (", ".join(map(repr, names)) or "none")

@@ -1,0 +1,319 @@
+"""Observations in JSON and NPZ files (design, section 9): every number comes back exactly."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from ceres_cal.errors import InputError
+from ceres_cal.files import check_header, convert, parse_json, read_bytes, write_bytes
+from ceres_cal.observations.columns import TYPES, Curves, Points, Prior, View, listed, place_of
+from ceres_cal.targets import SIDES, Target, target_from_spec
+
+FORMAT, VERSION = "ceres-cal/observations", 1
+_SIDE_NAMES = {value: name for name, value in SIDES.items()}
+
+
+class Content(NamedTuple):
+    """What a file holds: the fields of `Observations`."""
+
+    targets: Mapping[str, Target]
+    cameras: Mapping[str, tuple[int, int]]
+    views: tuple[View, ...]
+    points: Points
+    curves: Curves
+    priors: tuple[Prior, ...]
+
+
+class _PointsFile(msgspec.Struct, forbid_unknown_fields=True):
+    features: list[str]
+    pixels: list[tuple[float, float]]
+    sigma_px: float | list[float] = 1.0
+
+
+class _CurvesFile(msgspec.Struct, forbid_unknown_fields=True):
+    features: list[str]
+    pixels: list[tuple[float, float]]
+    sigma_px: float | list[float] = 1.0
+    side: str | list[str] = "centre"
+
+
+class _ViewFile(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True):
+    frame: str
+    camera: str
+    target: str
+    station: str | None = None
+    placement: str | None = None
+    points: _PointsFile | None = None
+    curves: _CurvesFile | None = None
+
+
+class _CameraFile(msgspec.Struct, forbid_unknown_fields=True):
+    image_size: tuple[int, int]
+
+
+class _ObservationsFile(msgspec.Struct, forbid_unknown_fields=True):
+    format: str
+    version: int
+    targets: dict[str, Any]
+    cameras: dict[str, _CameraFile]
+    views: list[_ViewFile]
+    priors: list[dict[str, Any]] = []
+    units: str = "metres, radians, pixels"
+    pixel_origin: str = "centre of the top-left pixel"
+
+
+def read_content(path: Path) -> Content:
+    """See `Observations.load`."""
+    content = read_bytes(path)
+    return _from_npz(content, str(path)) if path.suffix == ".npz" else _from_json(content, str(path))
+
+
+def write_content(content: Content, path: Path) -> None:
+    """See `Observations.save`."""
+    if path.suffix == ".npz":
+        write_bytes(path, _to_npz(content))
+    elif path.suffix == ".json":
+        write_bytes(path, _to_json(content))
+    else:
+        raise InputError(f"{path}: observations are written as .json or .npz: give one of these endings")
+
+
+def header_of(content: Content) -> dict[str, Any]:
+    """Everything but the columns, as a file has it."""
+    return {
+        "format": FORMAT,
+        "version": VERSION,
+        "units": "metres, radians, pixels",
+        "pixel_origin": "centre of the top-left pixel",
+        "targets": {name: target.spec for name, target in content.targets.items()},
+        "cameras": {name: {"image_size": list(size)} for name, size in content.cameras.items()},
+        "views": [
+            {
+                "frame": view.frame,
+                "camera": view.camera,
+                "station": view.station,
+                "target": view.target,
+                **({"placement": view.placement} if view.placement is not None else {}),
+            }
+            for view in content.views
+        ],
+        "priors": [prior_to_json(prior) for prior in content.priors],
+    }
+
+
+def prior_to_json(prior: Prior) -> dict[str, Any]:
+    """A prior as the files have it: `{"station": "a", "height_m": 4.02, "sigma_m": 0.01}`."""
+    value, sigma = (v[0] if len(v) == 1 else list(v) for v in (prior.value, prior.sigma))
+    return {prior.owner: prior.name, prior.quantity: value, "sigma_m" if prior.owner == "station" else "sigma": sigma}
+
+
+def prior_from_json(entry: Mapping[str, Any], where: str) -> Prior:
+    """The prior that a file describes.
+
+    Raises:
+        InputError: naming `where`, when the entry does not name one owner, one quantity and one sigma.
+    """
+    rest = dict(entry)
+    owners = [key for key in ("camera", "station") if key in rest]
+    if len(owners) != 1:
+        raise InputError(f'{where}: a prior names one "camera" or one "station"')
+    name = rest.pop(owners[0])
+    sigma_key = "sigma_m" if owners[0] == "station" else "sigma"
+    sigma = rest.pop(sigma_key, None)
+    if sigma is None or len(rest) != 1:
+        raise InputError(f'{where}: a prior of a {owners[0]} has one quantity and "{sigma_key}", not {sorted(entry)}')
+    ((quantity, value),) = rest.items()
+    size = {"position_m": 3, "principal_point": 2}.get(quantity, 1)
+    if owners[0] == "station" and quantity not in ("height_m", "position_m"):
+        raise InputError(f"{where}: a station's prior is on height_m or position_m, not {quantity!r}")
+    values = _numbers(value, size, f"{where}: {quantity}")
+    return Prior(owners[0], str(name), quantity, values, _numbers(sigma, size, f"{where}: {sigma_key}", spread=True))
+
+
+def _numbers(value: Any, size: int, where: str, *, spread: bool = False) -> tuple[float, ...]:
+    if isinstance(value, (int, float)) and (size == 1 or spread):
+        return (float(value),) * size
+    numbers = convert(value, list[float], where)
+    if len(numbers) != size:
+        raise InputError(f"{where}: {size} numbers are needed, not {len(numbers)}")
+    return tuple(numbers)
+
+
+def _read_header(data: dict[str, Any]) -> tuple[dict[str, Target], dict[str, tuple[int, int]], tuple[Prior, ...]]:
+    targets = {name: target_from_spec(spec, f"target {name!r}") for name, spec in data["targets"].items()}
+    cameras = {name: tuple(entry["image_size"]) for name, entry in data["cameras"].items()}
+    priors = tuple(prior_from_json(entry, f"prior {i}") for i, entry in enumerate(data.get("priors", [])))
+    return targets, cameras, priors
+
+
+def _view(entry: _ViewFile) -> View:
+    station = entry.camera if entry.station is None else entry.station
+    return View(entry.frame, entry.camera, station, entry.target, entry.placement)
+
+
+def _from_json(content: bytes, where: str) -> Content:
+    try:
+        data = msgspec.json.decode(content, type=_ObservationsFile)  # several times faster than by way of plain data
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+        plain = check_header(parse_json(content, where), where, FORMAT, VERSION)
+        data = convert(plain, _ObservationsFile, where)
+    check_header({"format": data.format, "version": data.version}, where, FORMAT, VERSION)
+    cameras = {name: {"image_size": entry.image_size} for name, entry in data.cameras.items()}
+    targets, sizes, priors = _read_header({"targets": data.targets, "cameras": cameras, "priors": data.priors})
+    views = tuple(_view(entry) for entry in data.views)
+    for number, view in enumerate(views):
+        if view.target not in targets:
+            raise InputError(
+                f"{place_of(number, views)} names target {view.target!r}, which is not there: {listed(targets)}"
+            )
+    points = [(i, entry.points) for i, entry in enumerate(data.views) if entry.points is not None]
+    curves = [(i, entry.curves) for i, entry in enumerate(data.views) if entry.curves is not None]
+    point_index = {name: {f: i for i, f in enumerate(target.point_names)} for name, target in targets.items()}
+    curve_index = {name: {f: i for i, f in enumerate(target.curve_names)} for name, target in targets.items()}
+    sides = [_sides(entry, place_of(i, views)) for i, entry in curves]
+    return Content(
+        targets,
+        sizes,
+        views,
+        Points(**_columns(points, views, point_index, "point")),
+        Curves(**_columns(curves, views, curve_index, "curve"), side=_concatenate(sides, np.int8)),
+        priors,
+    )
+
+
+def _concatenate(parts: Sequence[Any], dtype: Any) -> NDArray[Any]:
+    return np.concatenate([np.empty(0, dtype), *parts]).astype(dtype)
+
+
+def _columns(
+    entries: Sequence[tuple[int, _PointsFile | _CurvesFile]],
+    views: Sequence[View],
+    index: Mapping[str, Mapping[str, int]],
+    kind: str,
+) -> dict[str, Any]:
+    """The columns of all views' features; InputError naming the view and the feature."""
+    view, feature, sigma = [], [], []
+    pixels: list[tuple[float, float]] = []
+    for number, entry in entries:
+        here, count = place_of(number, views), len(entry.features)
+        if len(entry.pixels) != count:
+            raise InputError(f"{here}: {count} {kind} features but {len(entry.pixels)} pixels")
+        names = index[views[number].target]
+        try:
+            feature.append([names[name] for name in entry.features])
+        except KeyError as error:
+            raise InputError(
+                f"{here}: {kind} feature {error.args[0]!r} is unknown in target {views[number].target!r}: "
+                "`ceres-cal targets` lists the names"
+            ) from None
+        if isinstance(entry.sigma_px, list) and len(entry.sigma_px) != count:
+            raise InputError(f"{here}: {count} {kind} features but {len(entry.sigma_px)} numbers in sigma_px")
+        view.append(np.full(count, number, np.int32))
+        sigma.append(np.broadcast_to(np.asarray(entry.sigma_px, dtype=float), count))
+        pixels.extend(entry.pixels)
+    return {
+        "view": _concatenate(view, np.int32),
+        "feature": _concatenate(feature, np.int32),
+        "pixels": np.array(pixels, dtype=float).reshape(-1, 2),
+        "sigma_px": _concatenate(sigma, np.float64),
+    }
+
+
+def _sides(entry: _CurvesFile, here: str) -> list[int]:
+    names = entry.side if isinstance(entry.side, list) else [entry.side] * len(entry.features)
+    if len(names) != len(entry.features):
+        raise InputError(f"{here}: {len(entry.features)} curve features but {len(names)} sides")
+    for name in names:
+        if name not in SIDES:
+            raise InputError(f"{here}: side {name!r} is unknown: {', '.join(SIDES)}")
+    return [SIDES[name] for name in names]
+
+
+def _same_or_list(values: NDArray[Any]) -> Any:
+    return values[0].item() if len(values) and np.all(values == values[0]) else values.tolist()
+
+
+def _to_json(content: Content) -> bytes:
+    data = header_of(content)
+    for kind, column in (("points", content.points), ("curves", content.curves)):
+        order = np.argsort(column.view, kind="stable")
+        bounds = np.searchsorted(column.view[order], np.arange(len(content.views) + 1))
+        for number, entry in enumerate(data["views"]):
+            rows = order[bounds[number] : bounds[number + 1]]
+            if not len(rows):
+                continue
+            target = content.targets[entry["target"]]
+            names = target.point_names if kind == "points" else target.curve_names
+            entry[kind] = {
+                "features": [names[i] for i in column.feature[rows]],
+                "pixels": column.pixels[rows].tolist(),
+                "sigma_px": _same_or_list(column.sigma_px[rows]),
+            }
+            if isinstance(column, Curves) and np.any(column.side[rows]):
+                side = _same_or_list(column.side[rows])
+                entry[kind]["side"] = [_SIDE_NAMES[s] for s in side] if isinstance(side, list) else _SIDE_NAMES[side]
+    views = data.pop("views")
+    head = msgspec.json.format(msgspec.json.encode(data), indent=1).rstrip(b"}\n")
+    lines = b",\n  ".join(msgspec.json.encode(entry) for entry in views)
+    return head + b',\n "views": [\n  ' + lines + b"\n ]\n}\n"
+
+
+def _to_npz(content: Content) -> bytes:
+    arrays: dict[str, Any] = {"header": np.frombuffer(msgspec.json.encode(header_of(content)), np.uint8)}
+    for kind, column in (("points", content.points), ("curves", content.curves)):
+        arrays |= {f"{kind}_{name}": array for name, array in vars(column).items()}
+    stream = io.BytesIO()
+    np.savez(stream, **arrays)
+    return stream.getvalue()
+
+
+def _arrays(content: bytes, where: str) -> dict[str, NDArray[Any]]:
+    """What an NPZ file holds, by name."""
+    reason = "it is cut short or no NPZ file"
+    try:
+        if zipfile.is_zipfile(io.BytesIO(content)):
+            with np.load(io.BytesIO(content), allow_pickle=False) as archive:
+                return {name: archive[name] for name in archive.files}
+    except Exception as error:  # zipfile, zlib and NumPy raise a dozen kinds for a broken archive
+        if "allow_pickle" in str(error):
+            reason = "it holds pickled objects"
+    raise InputError(f"{where}: cannot be read, {reason}: write it again with Observations.save")
+
+
+def _taken(arrays: dict[str, NDArray[Any]], kind: str, names: Sequence[str], where: str) -> dict[str, Any]:
+    """The columns of one kind, taken out of the arrays."""
+    found = {}
+    for name in names:
+        array, dtype, ndim = arrays.pop(f"{kind}_{name}", None), np.dtype(TYPES[name]), 2 if name == "pixels" else 1
+        if array is None:
+            raise InputError(f"{where}: column {kind}_{name} is missing")
+        if array.dtype != dtype or array.ndim != ndim:
+            raise InputError(
+                f"{where}: column {kind}_{name} must be {dtype} in {ndim} dimensions, not {array.dtype} in {array.ndim}"
+            )
+        found[name] = array
+    return found
+
+
+def _from_npz(content: bytes, where: str) -> Content:
+    arrays = _arrays(content, where)
+    header = arrays.pop("header", None)
+    if header is None or header.dtype != np.uint8:
+        raise InputError(f"{where}: no header: this is not a file of observations")
+    plain = check_header(parse_json(header.tobytes(), where), where, FORMAT, VERSION)
+    typed = convert(plain, _ObservationsFile, where)
+    targets, cameras, priors = _read_header(plain)
+    names = ("view", "feature", "pixels", "sigma_px")
+    points = Points(**_taken(arrays, "points", names, where))
+    curves = Curves(**_taken(arrays, "curves", (*names, "side"), where))
+    if arrays:
+        raise InputError(f"{where}: unknown column {min(arrays)!r}")
+    return Content(targets, cameras, tuple(_view(entry) for entry in typed.views), points, curves, priors)

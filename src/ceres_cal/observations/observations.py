@@ -1,0 +1,208 @@
+"""Observations: what the frames show, as columns, with their targets, cameras, views and priors.
+
+The row of an observation in `points` or `curves` is its permanent id: nothing here reorders or drops rows.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from ceres_cal.errors import InputError
+from ceres_cal.observations.columns import Columns, Curves, Points, Prior, View, listed, place_of
+from ceres_cal.observations.files import Content, header_of, read_content, write_content
+from ceres_cal.targets import Target
+
+
+@dataclass(frozen=True, eq=False)
+class Observations:
+    """Everything that was observed.
+
+    Attributes:
+        targets: by name.
+        cameras: name -> (width, height) px.
+        views: what frame shows which target.
+        points: point observations, in the order of their views and in pixels with (0, 0) at the centre of the top-left
+            pixel. `sigma_px` is the standard deviation of each coordinate, 1 where nobody stated one (only ratios
+            matter then: the solve estimates the scale).
+        curves: curve observations, in the order of their views; `sigma_px` is that of the distance to the curve.
+        priors: what is known beforehand.
+
+    Raises:
+        InputError: on construction, naming the view and the feature: a name that is not there, a number that is not
+            finite, a camera without any observation.
+    """
+
+    targets: Mapping[str, Target]
+    cameras: Mapping[str, tuple[int, int]]
+    views: tuple[View, ...]
+    points: Points
+    curves: Curves
+    priors: tuple[Prior, ...] = ()
+
+    def __post_init__(self) -> None:
+        self._check_names()
+        self._check_columns("point", self.points)
+        self._check_columns("curve", self.curves)
+        seen = {self.views[i].camera for column in (self.points, self.curves) for i in np.unique(column.view)}
+        for name in self.cameras:
+            if name not in seen:
+                raise InputError(f"camera {name!r} has no observation: add views of it or remove the camera")
+        self._check_priors()
+
+    # ---- files --------------------------------------------------------------------------------------------------
+
+    @classmethod
+    def load(cls, path: str | Path) -> Observations:
+        """Read `.json` or `.npz` (design, section 9).
+
+        Raises:
+            InputError: one line that names the file, the view and the feature.
+        """
+        path = Path(path)
+        try:
+            return cls(*read_content(path))
+        except InputError as error:
+            text = str(error)
+            raise InputError(text if text.startswith(f"{path}: ") else f"{path}: {text}") from None
+
+    def save(self, path: str | Path) -> None:
+        """Write `.json` or, for large sets, `.npz`; every number comes back exactly."""
+        write_content(self._content, Path(path))
+
+    @cached_property
+    def digest(self) -> str:
+        """SHA-256 of the content, the same for the JSON and the NPZ file: where a calibration came from."""
+        content = hashlib.sha256(msgspec.json.encode(header_of(self._content)))
+        for column in (self.points, self.curves):
+            for array in vars(column).values():
+                content.update(array.tobytes())
+        return content.hexdigest()
+
+    @property
+    def _content(self) -> Content:
+        return Content(self.targets, self.cameras, self.views, self.points, self.curves, self.priors)
+
+    # ---- reading ------------------------------------------------------------------------------------------------
+
+    @property
+    def stations(self) -> dict[str, str]:
+        """Name of the camera of each station, in order of appearance."""
+        return {view.station: view.camera for view in self.views}
+
+    @property
+    def placements(self) -> tuple[str, ...]:
+        """Names of the placements, in order of appearance."""
+        return tuple(dict.fromkeys(view.placement for view in self.views if view.placement is not None))
+
+    def feature_name(self, kind: str, row: int) -> str:
+        """Name of the feature that observation `row` of the points (kind "point") or curves ("curve") shows."""
+        column: Columns = self.points if kind == "point" else self.curves
+        target = self.targets[self.views[int(column.view[row])].target]
+        names = target.point_names if kind == "point" else target.curve_names
+        return names[int(column.feature[row])]
+
+    # ---- checks -------------------------------------------------------------------------------------------------
+
+    def _check_names(self) -> None:
+        for name, size in self.cameras.items():
+            if len(size) != 2 or min(size) < 1:
+                raise InputError(f"camera {name!r}: image_size must be two positive whole numbers, not {size}")
+        owner: dict[str, str] = {}
+        placed: dict[str, str] = {}
+        for number, view in enumerate(self.views):
+            here = place_of(number, self.views)
+            if view.camera not in self.cameras:
+                raise InputError(f"{here} names camera {view.camera!r}, which is not there: {listed(self.cameras)}")
+            if view.target not in self.targets:
+                raise InputError(f"{here} names target {view.target!r}, which is not there: {listed(self.targets)}")
+            if owner.setdefault(view.station, view.camera) != view.camera:
+                raise InputError(f"{here}: station {view.station!r} belongs to camera {owner[view.station]!r} already")
+            if view.placement is not None and placed.setdefault(view.placement, view.target) != view.target:
+                raise InputError(
+                    f"{here}: placement {view.placement!r} holds target {placed[view.placement]!r} already; "
+                    "give each rigid thing a placement of its own"
+                )
+
+    def _check_columns(self, kind: str, column: Columns) -> None:
+        count = len(column.view)
+        if column.pixels.shape != (count, 2) or any(len(array) != count for array in vars(column).values()):
+            raise InputError(f"the columns of the {kind} observations differ in length: write them again")
+        if count == 0:
+            return
+        if np.any(wrong := (column.view < 0) | (column.view >= len(self.views))):
+            raise InputError(
+                f"a {kind} observation names view {column.view[np.argmax(wrong)]}, but there are {len(self.views)}"
+            )
+        if np.any(np.diff(column.view) < 0):
+            raise InputError(f"the {kind} observations are not in the order of their views: sort the columns by view")
+        targets = [self.targets[view.target] for view in self.views]
+        known = np.array([len(target.points if kind == "point" else target.curves) for target in targets])
+        if np.any(wrong := (column.feature < 0) | (column.feature >= known[column.view])):
+            row = int(np.argmax(wrong))
+            here, target = place_of(column.view[row], self.views), self.views[column.view[row]].target
+            raise InputError(
+                f"{here}: {kind} feature number {column.feature[row]} is unknown in target {target!r}, "
+                f"which has {known[column.view[row]]}"
+            )
+        self._check_numbers(kind, column)
+
+    def _check_numbers(self, kind: str, column: Columns) -> None:
+        side = column.side if isinstance(column, Curves) else np.zeros(1, np.int8)
+        for what, bad in (
+            ("its pixel is not finite", ~np.all(np.isfinite(column.pixels), axis=1)),
+            ("its sigma_px must be positive and finite", ~(np.isfinite(column.sigma_px) & (column.sigma_px > 0.0))),
+            ("its side must be 0, 1 or -1", (side < -1) | (side > 1)),
+        ):
+            if np.any(bad):
+                row = int(np.argmax(bad))
+                here = place_of(column.view[row], self.views)
+                raise InputError(f"{here}, {kind} {self.feature_name(kind, row)!r}: {what}: correct or remove it")
+
+    def _check_priors(self) -> None:
+        for prior in self.priors:
+            names: Iterable[str] = self.cameras if prior.owner == "camera" else self.stations
+            if prior.name not in names:
+                raise InputError(f"a prior names {prior.owner} {prior.name!r}, which is not there: {listed(names)}")
+            if not np.all(np.isfinite(prior.value)) or not np.all(np.isfinite(prior.sigma)) or min(prior.sigma) <= 0.0:
+                raise InputError(f"prior on {prior.quantity!r} of {prior.name!r}: finite numbers and a sigma above 0")
+
+
+def combine(parts: Sequence[Observations]) -> Observations:
+    """Several sets as one: views one after the other, targets, cameras and priors together.
+
+    Raises:
+        InputError: a target or camera means different things in two sets.
+    """
+    if len(parts) == 1:
+        return parts[0]
+    targets: dict[str, Target] = {}
+    cameras: dict[str, tuple[int, int]] = {}
+    for part in parts:
+        for name, target in part.targets.items():
+            if targets.setdefault(name, target) != target:
+                raise InputError(f"target {name!r} is described in two ways: give one of them another name")
+        for name, size in part.cameras.items():
+            if cameras.setdefault(name, size) != size:
+                raise InputError(f"camera {name!r} has image sizes {cameras[name]} and {size}: these are two cameras")
+    starts = np.cumsum([0, *(len(part.views) for part in parts)])
+
+    def joined(columns: Sequence[Any]) -> dict[str, Any]:
+        moved = [replace(c, view=(c.view + start).astype(np.int32)) for c, start in zip(columns, starts, strict=False)]
+        return {name: np.concatenate([getattr(c, name) for c in moved]) for name in vars(columns[0])}
+
+    return Observations(
+        targets,
+        cameras,
+        tuple(view for part in parts for view in part.views),
+        Points(**joined([part.points for part in parts])),
+        Curves(**joined([part.curves for part in parts])),
+        tuple(dict.fromkeys(prior for part in parts for prior in part.priors)),
+    )
