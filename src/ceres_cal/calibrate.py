@@ -14,6 +14,7 @@ from ceres_cal.camera import Camera
 from ceres_cal.diagnostics import Inliers, judge, start_weights
 from ceres_cal.errors import SolutionError
 from ceres_cal.initialise import initialise
+from ceres_cal.mirrored import without_mirrored_poses
 from ceres_cal.observations import Observations
 from ceres_cal.parameters import Estimate, Layout, Options, make_layout
 from ceres_cal.residuals import Residuals, residuals
@@ -100,23 +101,28 @@ def _settle(
             observations, found, layout.size, options.reject_sigma, estimate_noise=options.noise_scale == "estimate"
         )
 
-    def solved(at: Estimate, by: Inliers, loss: str, loss_scale: float, precision: float) -> Solution:
-        weighting = Weighting(by.point_scale, by.curve_scale, loss, loss_scale, precision)
-        return solve(sights.used(by.points, by.curves), at, layout, weighting, options, progress)
-
     everything = start_weights(observations, residuals(observations, sights, estimate))
     # A line painted aside is an outlier to a redescending loss, but not to its tolerance.
-    rough_loss = "huber" if len(estimate.structure.values) else "cauchy"
-    solution = solved(estimate, everything, rough_loss, 1.0, 1e-3)
-    found, inliers = judged(solution.estimate)
+    rough = Weighting(
+        everything.point_scale,
+        everything.curve_scale,
+        "huber" if len(estimate.structure.values) else "cauchy",
+        loss_scale=1.0,
+        precision=1e-3,
+    )
+    used = sights.used(everything.points, everything.curves)
+    solution = solve(used, estimate, layout, rough, options, progress)
+    before, (found, inliers) = everything, judged(solution.estimate)
     rounds = 1
     while rounds < _MOST_ROUNDS:
-        rounds += 1
-        solution = solved(solution.estimate, inliers, options.loss, options.loss_scale, 1e-14)
-        before = inliers
-        found, inliers = judged(solution.estimate)
-        if inliers.same_as(before):
+        weighting = Weighting(inliers.point_scale, inliers.curve_scale, options.loss, options.loss_scale)
+        used = sights.used(inliers.points, inliers.curves)
+        estimate, mended = without_mirrored_poses(used, solution.estimate, layout, weighting)
+        if rounds > 1 and not mended and inliers.same_as(before):
             break
+        solution = solve(used, estimate, layout, weighting, options, progress)
+        before, (found, inliers) = inliers, judged(solution.estimate)
+        rounds += 1
     return _Settled(solution, inliers, found, rounds)
 
 

@@ -31,6 +31,7 @@ from ceres_cal.transforms import Array
 _MOST = 1500  # observations of one kind in a sight beyond which a start learns nothing more
 _ENOUGH_POINTS = 40.0  # of a board
 _GOLDEN = 0.6180339887498949
+_ROUGH_PX = 5.0  # a median beyond it is no fit at all, however even
 _SUSPICIOUS = 8.0  # medians: no clean residual is that long
 
 
@@ -167,7 +168,7 @@ def _align(board: Sights, camera: Camera, unit: float) -> RadialAlignment:
     bounds = np.searchsorted(chosen, board.point_bounds)
     few = PlaneData(bounds, everything.plane[chosen], everything.offsets[chosen])
     first = radial_alignment(few, unit, terms, rounds=2)
-    if np.mean(_is_suspicious(first)) < 0.02:
+    if np.mean(_is_suspicious(first)) < 0.02 and np.median(first.error_px) < _ROUGH_PX:
         return first
     return radial_alignment(everything, unit, terms, rounds=8)
 

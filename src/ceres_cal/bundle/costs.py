@@ -140,6 +140,7 @@ class EliminatedCost(pyceres.CostFunction):
         sizes = (len(self._free), len(estimate.structure.values))
         self._size = sum(sizes)
         self._gains = np.zeros((len(sights), 6, self._size))
+        self._costs = np.zeros(len(sights))
         self._at = np.concatenate([self._optics[1][self._free], estimate.structure.values])
         self._known: tuple[Array, Array, Array] | None = None
         work = len(sights.points) + len(sights.curve_pixels)
@@ -182,7 +183,7 @@ class EliminatedCost(pyceres.CostFunction):
             reduced = np.zeros((self._size + 1, self._size + 1))
             cost = kernels.eliminate_placements(
                 first, last, code, intrinsics, self._free, powers, unit, *self._observations, *self._loss, points,
-                tracks, self._size - count, tolerance, at - self._at, self._poses, self._gains, reduced,
+                tracks, self._size - count, tolerance, at - self._at, self._poses, self._gains, self._costs, reduced,
             )  # fmt: skip
             return cost, reduced
 
@@ -204,6 +205,15 @@ class EliminatedCost(pyceres.CostFunction):
         residuals[-1] = np.sqrt(max(cost - float(residuals[:-1] @ residuals[:-1]), 0.0))
         upper[-1] = 0.0
         return at, residuals, upper[:, :-1]
+
+    def from_poses(self, poses: Array) -> tuple[Array, Array]:
+        """Costs (S,) and poses (S, 3, 4) that the search for each placement ends with when it starts from `poses`,
+        everything else held; infinite costs where a start cannot be seen.
+        """
+        self._poses[:] = poses
+        self._gains[:] = 0.0
+        answered = self._evaluated(self._at.copy(), 1e-6) is not None
+        return (self._costs if answered else np.full(len(poses), np.inf)), self._poses
 
     def settled(self, parameters: Sequence[Array]) -> tuple[tuple[SightKey, ...], Array]:
         """The sights' keys and their cam_from_target, (S, 3, 4), at their best for these numbers."""

@@ -115,7 +115,7 @@ class _Assembly:
 def _assemble(
     run: Run, sights: Sights, estimate: Estimate, layout: Layout, weighting: Weighting, threads: int
 ) -> _Assembly:
-    private = _private_placements(sights, layout)
+    private = private_placements(sights, layout)
     blocks = _Blocks.pack(estimate, layout, private)
     assembly = _Assembly(blocks, [], [])
     for camera in estimate.cameras:
@@ -179,7 +179,7 @@ def solve(
     solved = assembly.blocks.unpack(estimate, layout)
     placements = dict(solved.placements)
     for eliminated, arrays in assembly.eliminated:
-        placements |= _placed(solved, *eliminated.settled(arrays))
+        placements |= placed(solved, *eliminated.settled(arrays))
     return Solution(
         replace(solved, placements=placements),
         float(summary.final_cost),
@@ -190,13 +190,24 @@ def solve(
     )
 
 
-def _private_placements(sights: Sights, layout: Layout) -> frozenset[str | None]:
+def placement_costs(
+    sights: Sights, estimate: Estimate, layout: Layout, weighting: Weighting, poses: Array
+) -> tuple[Array, Array]:
+    """Costs (S,) and cam_from_target (S, 3, 4) of one camera's sights after each placement alone was solved for.
+
+    Args:
+        poses: (S, 3, 4) where the search for each cam_from_target starts.
+    """
+    return EliminatedCost(Run(), sights, estimate, layout, weighting, threads=1).from_poses(poses)
+
+
+def private_placements(sights: Sights, layout: Layout) -> frozenset[str | None]:
     """Free placements that a single sight shows."""
     seen = Counter(key.placement for key in sights.keys)
     return frozenset(name for name, times in seen.items() if times == 1 and name in layout.placements)
 
 
-def _placed(estimate: Estimate, keys: Sequence[SightKey], cam_from_target: Array) -> dict[str, Pose]:
+def placed(estimate: Estimate, keys: Sequence[SightKey], cam_from_target: Array) -> dict[str, Pose]:
     """world_from_target of each key's placement."""
     stations = {name: station.cam_from_world.inverse for name, station in estimate.stations.items()}
     first = np.array([stations[key.station].rotation for key in keys])

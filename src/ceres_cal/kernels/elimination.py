@@ -64,7 +64,7 @@ def eliminate_placements(
     bounds: Any, pixels: Any, weights: Any, slots: Any, bends: Any,
     is_arc: Any, curve_bounds: Any, track: Any, curve_pixels: Any, curve_weights: Any, s: Any, track_slots: Any,
     loss: int, scale: float, points: Any, tracks: Any, structure: int, tolerance: float, change: Any, poses: Any,
-    gains: Any, reduced: Any,
+    gains: Any, costs: Any, reduced: Any,
 ) -> float:  # fmt: skip
     """Sum of rho over the sights first to last at their best poses, and what they say of the free intrinsics.
 
@@ -75,6 +75,7 @@ def eliminate_placements(
         points, tracks: as built, with the `structure` numbers of the moment put in.
         change: (free + structure,) by how much these have moved since `poses` and `gains` were made.
         poses: (S, 3, 4) [R t] of cam_from_target, moved. gains: (S, 6, free + structure), their effect, renewed.
+        costs: (S,) sum of rho of each sight.
         reduced: (free + structure + 1,) squared, lower triangle: the complement with the residual's row last, added up.
 
     Returns:
@@ -138,5 +139,6 @@ def eliminate_placements(
                 for k in range(6):
                     value -= gain[k, i] * (normal[count + 6, count + k] if j == count else normal[count + k, j])
                 reduced[i, j] += value
-        total += cost - max(promise, 0.0)
+        costs[v] = cost - max(promise, 0.0)
+        total += costs[v]
     return total

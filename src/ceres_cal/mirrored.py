@@ -1,0 +1,90 @@
+"""The two mirrored poses of a plane: a small or distant board looks almost the same tilted either way.
+
+Each has its own minimum of the cost. Which is the lower one can only be told by trying both; they are tried where they
+compete, that is, where perspective is too weak to have decided at the start.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from ceres_cal.bundle import Weighting, placed, placement_costs, private_placements
+from ceres_cal.parameters import Estimate, Layout
+from ceres_cal.sights import Rows, Sights
+from ceres_cal.transforms import Array, Pose
+
+_DECIDED_SIGMA = 100.0  # perspective that bends a view by so many standard deviations leaves no doubt
+
+
+def without_mirrored_poses(
+    sights: Sights, estimate: Estimate, layout: Layout, weighting: Weighting
+) -> tuple[Estimate, int]:
+    """The estimate with every private placement in the better one of its two poses, and how many were changed."""
+    private = private_placements(sights, layout)
+    placements, changed = dict(estimate.placements), 0
+    for camera in estimate.cameras:
+        own = np.array(
+            [i for i, key in enumerate(sights.keys) if key.camera == camera and key.placement in private],
+            dtype=np.int64,
+        )
+        if len(own):
+            found, count = _better_poses(sights.take(own), estimate, layout, weighting)
+            placements |= found
+            changed += count
+    return replace(estimate, placements=placements), changed
+
+
+def _better_poses(
+    sights: Sights, estimate: Estimate, layout: Layout, weighting: Weighting
+) -> tuple[dict[str, Pose], int]:
+    poses = estimate.pose_stack(sights.keys)
+    doubtful = _doubtful(sights, poses, estimate, weighting)
+    if not len(doubtful):
+        return {}, 0
+    few = sights.take(doubtful)
+    as_is, _ = placement_costs(few, estimate, layout, weighting, poses[doubtful])
+    costs, found = placement_costs(few, estimate, layout, weighting, mirrored(few, poses[doubtful]))
+    better = np.flatnonzero(costs < as_is * (1.0 - 1e-6))
+    return placed(estimate, [few.keys[i] for i in better], found[better]) if len(better) else {}, len(better)
+
+
+def _centres(sights: Sights) -> Array:
+    sizes = np.diff(sights.point_bounds)[:, None]
+    return np.asarray(np.add.reduceat(sights.points, sights.point_bounds[:-1]) / np.maximum(sizes, 1))
+
+
+def _doubtful(sights: Sights, poses: Array, estimate: Estimate, weighting: Weighting) -> Rows:
+    """Sights of points whose two poses differ by little: the bend that perspective adds, phi (size / depth)^2 sin(tilt)
+    cos(tilt), against the noise.
+    """
+    seen = np.flatnonzero(np.diff(sights.point_bounds) >= 4)
+    if len(seen) < len(sights):
+        inner = _doubtful(sights.take(seen), poses[seen], estimate, weighting) if len(seen) else seen
+        return seen[inner]
+    centres = _centres(sights)
+    bounds = sights.point_bounds
+    away = sights.points - np.repeat(centres, np.diff(bounds), axis=0)
+    reach = np.sqrt(np.maximum.reduceat(np.sum(away**2, axis=1), bounds[:-1]))
+    middle = np.einsum("sij,sj->si", poses[:, :, :3], centres) + poses[:, :, 3]
+    distance = np.linalg.norm(middle, axis=1)
+    cosine = np.abs(np.sum(poses[:, :, 2] * middle, axis=1)) / distance
+    sine = np.sqrt(np.maximum(1.0 - cosine**2, 0.0))
+    phi = estimate.cameras[sights.keys[0].camera].phi
+    bend_px = phi * (reach / distance) ** 2 * sine * cosine
+    sigma_px = weighting.point_scale * np.minimum.reduceat(sights.sigma_px, bounds[:-1])
+    return np.flatnonzero(bend_px < _DECIDED_SIGMA * sigma_px)
+
+
+def mirrored(sights: Sights, poses: Array) -> Array:
+    """cam_from_target (S, 3, 4) with the depth of each target's points reversed about its middle, along the line of
+    sight: R' = (1 - 2 d d^T) R diag(1, 1, -1), a rotation again.
+    """
+    centres = _centres(sights)
+    middle = np.einsum("sij,sj->si", poses[:, :, :3], centres) + poses[:, :, 3]
+    d = middle / np.linalg.norm(middle, axis=1, keepdims=True)
+    reflect = np.eye(3) - 2.0 * d[:, :, None] * d[:, None, :]
+    rotations = reflect @ poses[:, :, :3] @ np.diag([1.0, 1.0, -1.0])
+    translations = middle - np.einsum("sij,sj->si", rotations, centres)
+    return np.concatenate([rotations, translations[:, :, None]], axis=2)
