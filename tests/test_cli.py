@@ -282,7 +282,7 @@ def test_warns_where_phi_and_height_trade(say: Say, tmp_path: Path) -> None:
     say("simulate", "field-2004", "-o", tmp_path)
     said = say("calibrate", tmp_path / "observations.json")
     assert said.code == 0 and "(started from a guess)" in said.out
-    assert "warning   " in said.out and "tell phi and height apart" in " ".join(said.out.split())
+    assert "warning   " in said.out and "tell phi and distance apart" in " ".join(said.out.split())
 
 
 def test_warns_of_a_lens_that_does_not_suit(say: Say, tmp_path: Path) -> None:

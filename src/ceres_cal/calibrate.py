@@ -22,8 +22,8 @@ from ceres_cal.sights import Sights, gather_sights
 
 _MOST_ROUNDS = 15
 _GUESSED = (
-    "camera {!r}: the views are too frontal to tell phi and height apart, so the start for phi was a guess; "
-    "measure the height (a prior on height_m) or add tilted boards before using it above the floor"
+    "camera {!r}: the views are too frontal to tell phi and distance apart, so phi started from a guess and may be "
+    "unknown still: add boards tilted by 20 degrees, or a prior on height_m where the camera sees the field"
 )
 
 

@@ -68,6 +68,8 @@ def _start_camera(
     name: str, image_size: tuple[int, int], sights: Sights, options: Options, priors: Sequence[Prior]
 ) -> _CameraStart:
     blank = _blank_camera(name, image_size, options, priors)
+    if set(blank.lens.names) <= set(options.fixed) and blank.lens.kind == "radial":
+        blank.require_monotone(name)
     unit = 0.5 * float(np.hypot(*image_size))
     profile, homographies = profile_and_homographies(sights, blank, unit)
     phi, phi_from = _choose_phi(sights, homographies, unit, options, [p for p in priors if _concerns(p, name, sights)])

@@ -75,6 +75,8 @@ class Options:
         for name in ("loss_scale", "reject_sigma", "max_iterations"):
             if not getattr(self, name) > 0:
                 raise InputError(f"{name} must be above 0, not {getattr(self, name)}")
+        if self.threads < 0:
+            raise InputError(f"threads must be 0 (to choose) or above, not {self.threads}")
 
     @property
     def blank_lens(self) -> Lens:
@@ -175,7 +177,7 @@ def make_layout(observations: Observations, options: Options) -> Layout:
     """The layout of a calibration: everything free but what the options fix and what nothing can tell.
 
     Raises:
-        InputError: a prior names a quantity that the camera does not have.
+        InputError: a prior names a camera, a station or a quantity that is not there.
     """
     names = intrinsic_names(options.blank_lens)
     held = set(options.fixed)
@@ -186,6 +188,7 @@ def make_layout(observations: Observations, options: Options) -> Layout:
     free = np.array([i for i, name in enumerate(names) if name not in held], dtype=np.int64)
     priors = (*observations.priors, *options.priors)
     for prior in priors:
+        observations.require_owner(prior)
         if prior.owner == "camera" and prior.quantity not in (*names, "principal_point"):
             raise InputError(f"prior on camera {prior.name!r}: it has no {prior.quantity!r}, only {', '.join(names)}")
     return Layout(

@@ -6,6 +6,25 @@ and its placement; each prior is one small block. What Ceres minimises is the sa
 """
 
 from ceres_cal.bundle.costs import Weighting
-from ceres_cal.bundle.problem import Progress, Solution, placed, placement_costs, private_placements, solve
+from ceres_cal.bundle.problem import (
+    Information,
+    Progress,
+    Solution,
+    information,
+    placed,
+    placement_costs,
+    private_placements,
+    solve,
+)
 
-__all__ = ["Progress", "Solution", "Weighting", "placed", "placement_costs", "private_placements", "solve"]
+__all__ = [
+    "Information",
+    "Progress",
+    "Solution",
+    "Weighting",
+    "information",
+    "placed",
+    "placement_costs",
+    "private_placements",
+    "solve",
+]

@@ -36,7 +36,7 @@ class Weighting:
     curve_scale: float = 1.0
     loss: str = "huber"
     loss_scale: float = 3.0
-    precision: float = 1e-12
+    precision: float = 1e-14
 
 
 @dataclass(eq=False)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ceres_cal.errors import InputError
 from ceres_cal.transforms import Array
 
 Ints = NDArray[np.int32]
@@ -30,6 +31,9 @@ class Prior:
 
     Quantities of a station: height_m, position_m (m). Of a camera: phi, principal_point (px), aspect, and the lens's
     coefficients by name in the units of the files.
+
+    Raises:
+        InputError: on construction: an unknown owner, numbers that are not finite, a sigma that is not above 0.
     """
 
     owner: str
@@ -42,6 +46,14 @@ class Prior:
     def __post_init__(self) -> None:
         object.__setattr__(self, "value", tuple(float(v) for v in self.value))
         object.__setattr__(self, "sigma", tuple(float(s) for s in self.sigma))
+        here = f"prior on {self.quantity!r} of {self.name!r}"
+        if self.owner not in ("camera", "station"):
+            raise InputError(f"{here}: its owner must be 'camera' or 'station', not {self.owner!r}")
+        size = {"position_m": 3, "principal_point": 2}.get(self.quantity, 1)
+        if len(self.value) != size or len(self.sigma) != size:
+            raise InputError(f"{here}: give {size} numbers and {size} sigmas")
+        if not np.all(np.isfinite((*self.value, *self.sigma))) or min(self.sigma) <= 0.0:
+            raise InputError(f"{here}: finite numbers and a sigma above 0")
 
 
 TYPES = {"view": np.int32, "feature": np.int32, "pixels": np.float64, "sigma_px": np.float64, "side": np.int8}

@@ -55,7 +55,8 @@ class Observations:
         for name in self.cameras:
             if name not in seen:
                 raise InputError(f"camera {name!r} has no observation: add views of it or remove the camera")
-        self._check_priors()
+        for prior in self.priors:
+            self.require_owner(prior)
 
     # ---- files --------------------------------------------------------------------------------------------------
 
@@ -166,13 +167,11 @@ class Observations:
                 here = place_of(column.view[row], self.views)
                 raise InputError(f"{here}, {kind} {self.feature_name(kind, row)!r}: {what}: correct or remove it")
 
-    def _check_priors(self) -> None:
-        for prior in self.priors:
-            names: Iterable[str] = self.cameras if prior.owner == "camera" else self.stations
-            if prior.name not in names:
-                raise InputError(f"a prior names {prior.owner} {prior.name!r}, which is not there: {listed(names)}")
-            if not np.all(np.isfinite(prior.value)) or not np.all(np.isfinite(prior.sigma)) or min(prior.sigma) <= 0.0:
-                raise InputError(f"prior on {prior.quantity!r} of {prior.name!r}: finite numbers and a sigma above 0")
+    def require_owner(self, prior: Prior) -> None:
+        """Raise InputError where a prior names a camera or station that is not there."""
+        names: Iterable[str] = self.cameras if prior.owner == "camera" else self.stations
+        if prior.name not in names:
+            raise InputError(f"a prior names {prior.owner} {prior.name!r}, which is not there: {listed(names)}")
 
 
 def combine(parts: Sequence[Observations]) -> Observations:
