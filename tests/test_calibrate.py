@@ -92,3 +92,47 @@ def test_noise_free_scenes_return_the_truth(name: str) -> None:
     assert calibration.rejected == ()
     assert calibration.rms_px < 1e-6  # 4e-10 measured
     assert calibration.warnings == ()
+
+
+# ---- robustness -----------------------------------------------------------------------------------------------------
+
+
+def camera_before(simulation: Simulation, view: View) -> Camera:
+    """The true camera of a view, in the frame of its target."""
+    scene = simulation.scene
+    pose = scene.stations[view.station].cam_from_world
+    return scene.cameras[view.camera].at(pose if view.placement is None else pose @ scene.placements[view.placement])
+
+
+def deviations_px(simulation: Simulation) -> tuple[Array, Array]:
+    """How far each point and curve observation lies from what it is named, as the true camera sees it.
+
+    Curves by a dense walk along the projected line or circle: good to 0.1 px.
+    """
+    observations = simulation.observations
+    points, curves = np.empty(len(observations.points)), np.empty(len(observations.curves))
+    for number, view in enumerate(observations.views):
+        camera, target = camera_before(simulation, view), observations.targets[view.target]
+        rows = np.flatnonzero(observations.points.view == number)
+        seen = camera.project(target.point_array[observations.points.feature[rows]])
+        points[rows] = np.nan_to_num(np.linalg.norm(seen - observations.points.pixels[rows], axis=1), nan=np.inf)
+        for row in np.flatnonzero(observations.curves.view == number):
+            feature, side = observations.curves.feature[row], observations.curves.side[row]
+            seen = _walk(camera, target, int(feature), int(side))
+            curves[row] = np.min(np.linalg.norm(seen - observations.curves.pixels[row], axis=1))
+    return points, curves
+
+
+_WALKS: dict[Any, Array] = {}
+
+
+def _walk(camera: Camera, target: Target, feature: int, side: int) -> Array:
+    key = (id(camera.cam_from_world), id(target), feature, side)
+    if key not in _WALKS:
+        is_arc = bool(target.is_arc[feature])
+        low, high = list(target.curves.values())[feature].parameter_range
+        beyond = 0.0 if is_arc else 0.3 * (high - low)
+        s = np.linspace(low - beyond, high + beyond, 3000)
+        seen = camera.project(along_track(target.tracks[side, feature], is_arc, s))
+        _WALKS[key] = seen[np.isfinite(seen[:, 0])]
+    return _WALKS[key]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Any
 
@@ -57,10 +57,7 @@ class Seen:
     curve_pixels: Array
     curve_sigma_px: Array
     start: Array
-
-    @property
-    def tracks(self) -> Array:
-        return TARGET.tracks.reshape(-1, 3, 3)
+    tracks: Array = field(default_factory=lambda: TARGET.tracks.reshape(-1, 3, 3))
 
     @property
     def is_arc(self) -> NDArray[np.bool_]:
@@ -70,7 +67,7 @@ class Seen:
         """Some of the points and some of the curve observations."""
         columns = {name: getattr(self, name)[points] for name in ("points", "pixels", "sigma_px")}
         names = ("track", "curve_pixels", "curve_sigma_px", "start")
-        return Seen(**columns, **{name: getattr(self, name)[curves] for name in names})
+        return Seen(**columns, **{name: getattr(self, name)[curves] for name in names}, tracks=self.tracks)
 
     @property
     def singles(self) -> list[Seen]:
@@ -116,17 +113,33 @@ def matrix(pose: Pose) -> Array:
     return np.column_stack([pose.rotation, pose.translation])
 
 
+@dataclass(frozen=True, eq=False)
+class Moves:
+    """Which structure numbers move what, as the kernels take it; nothing by default."""
+
+    count: int = 0
+    slots: NDArray[np.int32] = field(default_factory=lambda: np.empty((0, 4), np.int32))
+    bends: Array = field(default_factory=lambda: np.empty((0, 2)))
+    track_slots: NDArray[np.int32] = field(default_factory=lambda: np.empty((0, 3), np.int32))
+
+
+NOTHING_MOVES = Moves()
+
+
 def normal_equations(
-    camera: Camera, seen: Seen, loss: str = "trivial", scale: float = 1.0, *, wants_normal: bool = True
-) -> tuple[float, Array]:
-    """Sum of rho, and A over [intrinsics | 6 pose | residual], whole."""
-    size = len(intrinsics_vector(camera)) + 7
+    camera: Camera, seen: Seen, loss: str = "trivial", scale: float = 1.0, *,
+    moves: Moves = NOTHING_MOVES, wants_normal: bool = True,
+) -> tuple[float, Array]:  # fmt: skip
+    """Sum of rho, and A over [intrinsics | structure | 6 pose | residual], whole."""
+    count = len(intrinsics_vector(camera))
+    size = count + moves.count + 7
     normal = np.zeros((size, size))
+    places = np.concatenate([np.arange(count), np.arange(count + moves.count, size)])
     cost = kernels.normal_equations(
         *optics(camera), matrix(camera.cam_from_world),
-        seen.points, seen.pixels, 1.0 / seen.sigma_px,
+        seen.points, seen.pixels, 1.0 / seen.sigma_px, moves.slots, moves.bends,
         seen.tracks, seen.is_arc, seen.track, seen.curve_pixels, 1.0 / seen.curve_sigma_px, seen.start.copy(),
-        kernels.LOSS_CODES[loss], scale, np.arange(size), wants_normal, normal,
+        moves.track_slots, kernels.LOSS_CODES[loss], scale, np.arange(count + 7), places, wants_normal, normal,
     )  # fmt: skip
     lower = np.tril(normal)
     return float(cost), lower + np.tril(lower, -1).T
@@ -336,7 +349,7 @@ def test_losses_are_concave_enough_for_the_extra_row(loss: str, length: float, s
 
 @dataclass(frozen=True)
 class Block:
-    """What Ceres gets: the Jacobian's columns in the order camera, station, placement."""
+    """What Ceres gets: the Jacobian's columns in the order camera, station, placement, structure."""
 
     residuals: Array
     jacobian: Array
@@ -344,19 +357,20 @@ class Block:
 
 def evaluate_block(
     camera: Camera, poses: tuple[Array, Array], seen: Seen, loss: str = "trivial", scale: float = 1.0, *,
-    free: NDArray[np.int64] | None = None, held: tuple[str, ...] = (), wants_jacobian: bool = True,
+    free: NDArray[np.int64] | None = None, held: tuple[str, ...] = (), moves: Moves = NOTHING_MOVES,
+    wants_jacobian: bool = True,
 ) -> Block | None:  # fmt: skip
     """The block of a camera at station @ placement; None where the kernel says that there is no answer."""
     code, vector, powers, unit = optics(camera)
     free = np.arange(len(vector)) if free is None else free
-    rows = len(free) + 7
-    sizes = {"camera": len(free), "station": 6, "placement": 6}
+    rows = len(free) + moves.count + 7
+    sizes = {"camera": len(free), "station": 6, "placement": 6, "structure": moves.count}
     outputs = {name: np.full(0 if name in held else rows * size, 7.0) for name, size in sizes.items()}
     residuals = np.full(rows, 7.0)
     good = kernels.evaluate_block(
-        code, vector, free, powers, unit, seen.points, seen.pixels, 1.0 / seen.sigma_px,
-        seen.tracks, seen.is_arc, seen.track, seen.curve_pixels, 1.0 / seen.curve_sigma_px, seen.start.copy(),
-        kernels.LOSS_CODES[loss], scale,
+        code, vector, free, powers, unit, seen.pixels, 1.0 / seen.sigma_px, moves.slots, moves.bends,
+        seen.is_arc, seen.track, seen.curve_pixels, 1.0 / seen.curve_sigma_px, seen.start.copy(), moves.track_slots,
+        kernels.LOSS_CODES[loss], scale, seen.points, seen.tracks, moves.count,
         vector[free], *poses, wants_jacobian, residuals, *outputs.values(),
     )  # fmt: skip
     shown = [outputs[name].reshape(rows, size) for name, size in sizes.items() if name not in held and size]
@@ -510,6 +524,68 @@ def test_a_point_on_the_axis_moves_as_through_a_pinhole(lens: str) -> None:
     assert np.max(np.abs(found - expected)) < 1e-12 * np.max(expected)  # 2e-16 measured
 
 
+# ---- structure ------------------------------------------------------------------------------------------------------
+
+
+def everything_moves() -> Moves:
+    """A number for x and y of each point, two bows that all share, the offset of each segment, x, y, radius of arcs."""
+    points = len(TARGET.points)
+    slots = np.column_stack([np.arange(2 * points).reshape(-1, 2), np.tile([2 * points, 2 * points + 1], (points, 1))])
+    first = 2 * points + 2
+    tracks = np.array([[0, -1, -1], [1, -1, -1], [2, 3, 4], [5, 6, 7]])
+    tracks = np.where(tracks < 0, -1, tracks + first)
+    bends = np.random.default_rng(2).uniform(-1.0, 1.0, (points, 2))
+    return Moves(first + 8, slots.astype(np.int32), bends, np.tile(tracks, (3, 1)).astype(np.int32))
+
+
+def as_built(seen: Seen, moves: Moves, values: Array) -> Seen:
+    """The target with the structure numbers put in: points along x and y, their bows along z, segments to the left."""
+    shift = np.column_stack([values[moves.slots[:, :2]], np.sum(moves.bends * values[moves.slots[:, 2:]], axis=1)])
+    tracks = seen.tracks.copy()
+    for k, (first, second, third) in enumerate(moves.track_slots):
+        if seen.is_arc[k]:
+            tracks[k, 0, :2] += values[[first, second]]
+            tracks[k, 1, 0] += values[third]
+            tracks[k, 2, 1] += values[third]
+        else:
+            along = tracks[k, 1, :2] / np.linalg.norm(tracks[k, 1, :2])
+            tracks[k, 0, :2] += values[first] * np.array([-along[1], along[0]])
+    return replace(seen, points=seen.points + shift, tracks=tracks)
+
+
+@each_lens
+def test_structure_knows_its_derivatives(lens: str) -> None:
+    """J^T J and J^T e with the structure's numbers, against differences of every residual."""
+    camera, seen = looked_at(lens)
+    moves = everything_moves()
+    count, total = len(intrinsics_vector(camera)), len(intrinsics_vector(camera)) + moves.count
+
+    def residuals(change: Array) -> Array:
+        built = as_built(seen, moves, change[count:total])
+        return residual_vector(moved(camera, np.concatenate([change[:count], change[total:]])), built)
+
+    steps = np.concatenate([intrinsics_steps(camera), np.full(moves.count, 3e-3), POSE_STEPS])
+    jacobian, e = derivative(residuals, steps), residuals(np.zeros(total + 6))
+    both = np.column_stack([jacobian, e])
+    expected = both.T @ both
+    found = normal_equations(camera, seen, moves=moves)[1]
+    size = np.sqrt(np.diag(expected))
+    assert np.max(np.abs(found - expected) / np.outer(size, size)) < 5e-8  # 6e-9 measured
+    poses = split(camera, 0.7 * AXIS, turned="placement")
+    block = evaluate_block(camera, poses, seen, moves=moves)
+    assert block is not None
+    columns = [*range(count), *range(count + 12, count + 12 + moves.count)]
+    normal = block.jacobian.T @ block.jacobian
+    inside = range(total)
+    assert (
+        np.max(
+            np.abs(normal[np.ix_(columns, columns)] - found[np.ix_(inside, inside)])
+            / np.outer(size, size)[:total, :total]
+        )
+        < 1e-12
+    )
+
+
 # ---- placements eliminated ------------------------------------------------------------------------------------------
 
 
@@ -519,18 +595,22 @@ def eliminate(
     """Sum of rho at the best poses, the complement over [intrinsics | residual], whole, and those poses."""
     code, vector, powers, unit = optics(camera)
     free, count = np.arange(len(vector)), len(vector)
-    stack = np.stack([matrix(pose) for pose in poses])
-    columns = {name: np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])}
+    stack, costs = np.stack([matrix(pose) for pose in poses]), np.empty(len(parts))
+    names = ("pixels", "points", "sigma_px", "track", "curve_pixels", "curve_sigma_px", "start")
+    columns = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
     bounds, curve_bounds = (
         np.cumsum([0, *(len(getattr(part, name)) for part in parts)]) for name in ("pixels", "curve_pixels")
     )
     reduced = np.zeros((count + 1, count + 1))
     cost = kernels.eliminate_placements(
         0, len(parts), code, vector, free, powers, unit,
-        bounds, columns["points"], columns["pixels"], 1.0 / columns["sigma_px"], parts[0].tracks, parts[0].is_arc,
-        curve_bounds, columns["track"], columns["curve_pixels"], 1.0 / columns["curve_sigma_px"], columns["start"],
-        kernels.LOSS_CODES[loss], 1.5, tolerance, np.zeros(count), stack, np.zeros((len(parts), 6, count)), reduced,
+        bounds, columns["pixels"], 1.0 / columns["sigma_px"], NOTHING_MOVES.slots, NOTHING_MOVES.bends,
+        parts[0].is_arc, curve_bounds, columns["track"], columns["curve_pixels"], 1.0 / columns["curve_sigma_px"],
+        columns["start"], NOTHING_MOVES.track_slots, kernels.LOSS_CODES[loss], 1.5,
+        columns["points"], parts[0].tracks, 0, tolerance, np.zeros(count), stack,
+        np.zeros((len(parts), 6, count)), costs, reduced,
     )  # fmt: skip
+    assert np.isnan(cost) or cost == pytest.approx(costs.sum(), rel=1e-14)
     lower = np.tril(reduced)
     return float(cost), lower + np.tril(lower, -1).T, [Pose(pose[:, :3], pose[:, 3]) for pose in stack]
 

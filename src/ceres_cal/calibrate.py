@@ -19,6 +19,7 @@ from ceres_cal.observations import Observations
 from ceres_cal.parameters import Estimate, Layout, Options, make_layout
 from ceres_cal.residuals import Residuals, residuals
 from ceres_cal.sights import Sights, gather_sights
+from ceres_cal.transforms import Array
 
 _MOST_ROUNDS = 15
 _GUESSED = (
@@ -95,13 +96,14 @@ def _settle(
     loss at the residuals' median keeps gross errors from deciding.
     """
 
-    def judged(at: Estimate) -> tuple[Residuals, Inliers]:
-        found = residuals(observations, sights, at)
+    def judged(at: Estimate, places: Array) -> tuple[Residuals, Inliers]:
+        found = residuals(observations, sights, at, places)
         return found, judge(
             observations, found, layout.size, options.reject_sigma, estimate_noise=options.noise_scale == "estimate"
         )
 
-    everything = start_weights(observations, residuals(observations, sights, estimate))
+    found = residuals(observations, sights, estimate)
+    everything = start_weights(observations, found)
     # A line painted aside is an outlier to a redescending loss, but not to its tolerance.
     rough = Weighting(
         everything.point_scale,
@@ -111,8 +113,8 @@ def _settle(
         precision=1e-3,
     )
     used = sights.used(everything.points, everything.curves)
-    solution = solve(used, estimate, layout, rough, options, progress)
-    before, (found, inliers) = everything, judged(solution.estimate)
+    solution = solve(used, estimate, layout, rough, options, progress, found.places)
+    before, (found, inliers) = everything, judged(solution.estimate, found.places)
     rounds = 1
     while rounds < _MOST_ROUNDS:
         weighting = Weighting(inliers.point_scale, inliers.curve_scale, options.loss, options.loss_scale)
@@ -120,8 +122,8 @@ def _settle(
         estimate, mended = without_mirrored_poses(used, solution.estimate, layout, weighting)
         if rounds > 1 and not mended and inliers.same_as(before):
             break
-        solution = solve(used, estimate, layout, weighting, options, progress)
-        before, (found, inliers) = inliers, judged(solution.estimate)
+        solution = solve(used, estimate, layout, weighting, options, progress, found.places)
+        before, (found, inliers) = inliers, judged(solution.estimate, found.places)
         rounds += 1
     return _Settled(solution, inliers, found, rounds)
 

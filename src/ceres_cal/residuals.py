@@ -20,10 +20,12 @@ class Residuals:
 
     Attributes:
         points: (N, 2), projected minus observed. curves: (M,), signed distance from the observed pixel to the curve.
+        places: (M,) the foot of that distance, as the parameter of the curve's track.
     """
 
     points: Array
     curves: Array
+    places: Array
 
 
 def lens_arguments(camera: Camera) -> tuple[int, Array, Array, float]:
@@ -36,10 +38,15 @@ def lens_arguments(camera: Camera) -> tuple[int, Array, Array, float]:
     )
 
 
-def residuals(observations: Observations, sights: Sights, estimate: Estimate) -> Residuals:
-    """Residuals of every observation in the sights; NaN for rows in none of them."""
+def residuals(observations: Observations, sights: Sights, estimate: Estimate, places: Array | None = None) -> Residuals:
+    """Residuals of every observation in the sights; NaN for rows in none of them.
+
+    Args:
+        places: (M,) where on its track the search for each curve observation's foot starts, such as those of earlier
+            residuals; without them it starts where the ray passes nearest.
+    """
     points = np.full((len(observations.points), 2), np.nan)
-    curves = np.full(len(observations.curves), np.nan)
+    curves, feet = np.full(len(observations.curves), np.nan), np.full(len(observations.curves), np.nan)
     poses = estimate.pose_stack(sights.keys)
     owners = np.array([key.camera for key in sights.keys])
     for name in np.unique(owners):
@@ -53,10 +60,21 @@ def residuals(observations: Observations, sights: Sights, estimate: Estimate) ->
         points[own.point_rows] = offsets
         if len(own.curve_rows):
             distances = np.empty(len(own.curve_rows))
-            places = [nearest_places(s, estimate.camera_at(s.key.station, s.key.placement)) for s in own]
+            starts = starting_places(own, estimate, places)
             kernels.curve_residuals(
                 *optics, poses[numbers], own.curve_bounds, estimate.structure.tracks(own), own.is_arc, own.track,
-                own.curve_pixels, np.concatenate(places), distances,
+                own.curve_pixels, starts, distances,
             )  # fmt: skip
-            curves[own.curve_rows] = distances
-    return Residuals(points, curves)
+            curves[own.curve_rows], feet[own.curve_rows] = distances, starts
+    return Residuals(points, curves, feet)
+
+
+def starting_places(sights: Sights, estimate: Estimate, places: Array | None) -> Array:
+    """(M of the sights,) a copy of the places of their rows, or where the rays pass nearest."""
+    if places is not None:
+        known = places[sights.curve_rows]
+        if np.all(np.isfinite(known)):
+            return known
+    seen = [sights[int(number)] for number in np.flatnonzero(np.diff(sights.curve_bounds))]
+    nearest = [nearest_places(s, estimate.camera_at(s.key.station, s.key.placement)) for s in seen]
+    return np.concatenate([np.empty(0), *nearest])

@@ -102,6 +102,15 @@ class Sights(Sequence["Sights"]):
         p, c = _ranges(self.point_bounds, numbers), _ranges(self.curve_bounds, numbers)
         return self._rows(numbers, p, c, np.diff(self.point_bounds)[numbers], np.diff(self.curve_bounds)[numbers])
 
+    def part(self, number: int, count: int) -> Sights:
+        """The number-th of `count` about equal parts of the observations of a single sight."""
+        first, last = (int(self.point_bounds[-1]) * n // count for n in (number, number + 1))
+        start, stop = (int(self.curve_bounds[-1]) * n // count for n in (number, number + 1))
+        here = np.zeros(1, dtype=np.int64)
+        return self._rows(
+            here, np.arange(first, last), np.arange(start, stop), np.array([last - first]), np.array([stop - start])
+        )
+
     def used(self, points: Mask, curves: Mask) -> Sights:
         """What is left of every sight when only these rows of the observations count; empty sights are left out."""
         if points.all() and curves.all():

@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 
 from ceres_cal import kernels
 from ceres_cal.parameters import Estimate, Layout
-from ceres_cal.residuals import lens_arguments
-from ceres_cal.sights import SightKey, Sights, nearest_places
+from ceres_cal.residuals import lens_arguments, starting_places
+from ceres_cal.sights import SightKey, Sights
 from ceres_cal.structure import Structure
 from ceres_cal.transforms import Array, left_jacobian, rotation_exp, skew
 
-_ROWS_WORTH_A_THREAD = 20_000
+ROWS_WORTH_A_THREAD = 20_000
 _NOTHING = np.empty(0)
 
 
@@ -55,15 +55,17 @@ class SightCost(pyceres.CostFunction):
             are held.
     """
 
-    def __init__(self, run: Run, sight: Sights, estimate: Estimate, layout: Layout, weighting: Weighting) -> None:
+    def __init__(
+        self, run: Run, sight: Sights, estimate: Estimate, layout: Layout, weighting: Weighting, places: Array | None
+    ) -> None:
         super().__init__()
         self._run, self._sight, self._structure = run, sight, estimate.structure
         key = sight.key
         code, vector, powers, unit = lens_arguments(estimate.cameras[key.camera])
         free = layout.free[key.camera]
-        places = nearest_places(sight, estimate.camera_at(key.station, key.placement))
         self._static = (
-            code, vector, free, powers, unit, *_columns(sight, estimate.structure, weighting), places,
+            code, vector, free, powers, unit, *_columns(sight, estimate.structure, weighting),
+            starting_places(sight, estimate, places),
             *_track_slots(estimate.structure), kernels.LOSS_CODES[weighting.loss], weighting.loss_scale,
         )  # fmt: skip
         self._poses = [estimate.stations[key.station].cam_from_world.log(), np.zeros(6)]
@@ -73,26 +75,39 @@ class SightCost(pyceres.CostFunction):
         sizes = (len(free), 6, 6, count)
         is_free = (len(free) > 0, key.station in layout.stations, key.placement in layout.placements, count > 0)
         self.slots = [slot for slot in range(4) if is_free[slot]]
+        self._known: tuple[Array, Array, list[Array]] | None = None
         self.set_num_residuals(len(free) + count + 7)
         self.set_parameter_block_sizes([sizes[slot] for slot in self.slots])
 
     def Evaluate(self, parameters: Sequence[Array], residuals: Array, jacobians: Sequence[Array] | None) -> bool:
-        arguments = [_NOTHING, *self._poses, _NOTHING]
-        outputs = [_NOTHING, _NOTHING, _NOTHING, _NOTHING]
-        for place, slot in enumerate(self.slots):
-            arguments[slot] = parameters[place]
-            if jacobians is not None:
-                outputs[slot] = jacobians[place]
         try:
-            built = self._structure.with_values(arguments[3])
-            answered = kernels.evaluate_block(
-                *self._static, built.points(self._sight), built.tracks(self._sight), len(built.values),
-                *arguments[:3], jacobians is not None, residuals, *outputs,
-            )  # fmt: skip
-            return bool(answered)
+            at = np.concatenate(parameters)
+            # Ceres asks for the cost of a step first, then for the Jacobian in the same place: once is enough.
+            if self._known is None or not np.array_equal(self._known[0], at):
+                self._known = self._evaluated(at, parameters)
         except BaseException as error:  # an exception must not travel through C++: the solve ends, then it is raised
             self._run.failure = self._run.failure or error
             return False
+        if self._known is None:
+            return False
+        residuals[:] = self._known[1]
+        for jacobian, known in zip(jacobians or (), self._known[2], strict=False):
+            jacobian[:] = known
+        return True
+
+    def _evaluated(self, at: Array, parameters: Sequence[Array]) -> tuple[Array, Array, list[Array]] | None:
+        """(place, residuals, flat Jacobians), or None where an observation cannot be projected from there."""
+        arguments, outputs = [_NOTHING, *self._poses, _NOTHING], [_NOTHING] * 4
+        rows = self.num_residuals()
+        for place, slot in enumerate(self.slots):
+            arguments[slot], outputs[slot] = parameters[place], np.empty(rows * len(parameters[place]))
+        residuals = np.empty(rows)
+        built = self._structure.with_values(arguments[3])
+        answered = kernels.evaluate_block(
+            *self._static, built.points(self._sight), built.tracks(self._sight), len(built.values), *arguments[:3],
+            True, residuals, *outputs,
+        )  # fmt: skip
+        return (at, residuals, [outputs[slot] for slot in self.slots]) if answered else None
 
 
 def _columns(sights: Sights, structure: Structure, weighting: Weighting) -> tuple[NDArray[Any], ...]:
@@ -119,20 +134,26 @@ class EliminatedCost(pyceres.CostFunction):
     """All sights of one camera whose placements no other station sees, over its free intrinsics and the structure."""
 
     def __init__(
-        self, run: Run, sights: Sights, estimate: Estimate, layout: Layout, weighting: Weighting, threads: int
+        self,
+        run: Run,
+        sights: Sights,
+        estimate: Estimate,
+        layout: Layout,
+        weighting: Weighting,
+        threads: int,
+        places: Array | None = None,
     ) -> None:
         super().__init__()
         self.camera = sights.keys[0].camera
         self._run, self._sights, self._structure = run, sights, estimate.structure
         self._optics = lens_arguments(estimate.cameras[self.camera])
         self._free = layout.free[self.camera]
-        places = [nearest_places(s, estimate.camera_at(s.key.station, s.key.placement)) for s in _with_curves(sights)]
         pixels, weights, slots, bends, is_arc, track, curve_pixels, curve_weights = _columns(
             sights, estimate.structure, weighting
         )
         self._observations = (
             sights.point_bounds, pixels, weights, slots, bends, is_arc, sights.curve_bounds, track, curve_pixels,
-            curve_weights, np.concatenate([_NOTHING, *places]), *_track_slots(estimate.structure),
+            curve_weights, starting_places(sights, estimate, places), *_track_slots(estimate.structure),
         )  # fmt: skip
         self._loss = (kernels.LOSS_CODES[weighting.loss], weighting.loss_scale)
         self._precision = weighting.precision
@@ -144,7 +165,7 @@ class EliminatedCost(pyceres.CostFunction):
         self._at = np.concatenate([self._optics[1][self._free], estimate.structure.values])
         self._known: tuple[Array, Array, Array] | None = None
         work = len(sights.points) + len(sights.curve_pixels)
-        parts = max(1, min(threads, work // _ROWS_WORTH_A_THREAD))
+        parts = max(1, min(threads, work // ROWS_WORTH_A_THREAD))
         self._parts = np.linspace(0, len(sights), parts + 1).astype(int).tolist()
         self.slots = [slot for slot, size in zip((0, 3), sizes, strict=True) if size]
         self.set_num_residuals(self._size + 1)
@@ -219,10 +240,6 @@ class EliminatedCost(pyceres.CostFunction):
         """The sights' keys and their cam_from_target, (S, 3, 4), at their best for these numbers."""
         self._evaluated(np.concatenate([_NOTHING, *parameters]), self._precision)
         return self._sights.keys, self._poses
-
-
-def _with_curves(sights: Sights) -> list[Sights]:
-    return [sights[int(number)] for number in np.flatnonzero(np.diff(sights.curve_bounds))]
 
 
 class LinearPriorCost(pyceres.CostFunction):

@@ -12,7 +12,15 @@ import numpy as np
 import pyceres
 from numpy.typing import NDArray
 
-from ceres_cal.bundle.costs import EliminatedCost, LinearPriorCost, PositionPriorCost, Run, SightCost, Weighting
+from ceres_cal.bundle.costs import (
+    ROWS_WORTH_A_THREAD,
+    EliminatedCost,
+    LinearPriorCost,
+    PositionPriorCost,
+    Run,
+    SightCost,
+    Weighting,
+)
 from ceres_cal.errors import DegenerateError, SolutionError
 from ceres_cal.observations import Prior
 from ceres_cal.parameters import (
@@ -110,10 +118,18 @@ class _Assembly:
     blocks: _Blocks
     costs: list[tuple[Any, list[Array]]]
     eliminated: list[tuple[EliminatedCost, list[Array]]]
+    threads: int = 1
+    """Blocks that are worth a thread each."""
 
 
 def _assemble(
-    run: Run, sights: Sights, estimate: Estimate, layout: Layout, weighting: Weighting, threads: int
+    run: Run,
+    sights: Sights,
+    estimate: Estimate,
+    layout: Layout,
+    weighting: Weighting,
+    threads: int,
+    places: Array | None = None,
 ) -> _Assembly:
     private = private_placements(sights, layout)
     blocks = _Blocks.pack(estimate, layout, private)
@@ -121,13 +137,16 @@ def _assemble(
     for camera in estimate.cameras:
         own = np.array([i for i, key in enumerate(sights.keys) if key.camera == camera and key.placement in private])
         if len(own):
-            cost = EliminatedCost(run, sights.take(own), estimate, layout, weighting, threads)
+            cost = EliminatedCost(run, sights.take(own), estimate, layout, weighting, threads, places)
             assembly.eliminated.append((cost, blocks.of(sights.keys[own[0]], cost.slots)))
     assembly.costs += assembly.eliminated
     for number, key in enumerate(sights.keys):
         if key.placement not in private:
-            sight_cost = SightCost(run, sights[number], estimate, layout, weighting)
-            assembly.costs.append((sight_cost, blocks.of(key, sight_cost.slots)))
+            parts = list(_parts(sights[number], threads))
+            assembly.threads = max(assembly.threads, len(parts))
+            for part in parts:
+                sight_cost = SightCost(run, part, estimate, layout, weighting, places)
+                assembly.costs.append((sight_cost, blocks.of(key, sight_cost.slots)))
     assembly.costs += [(cost, [array]) for cost, array in _prior_blocks(layout, estimate, blocks)]
     return assembly
 
@@ -150,6 +169,12 @@ class _Watcher(pyceres.IterationCallback):
         return pyceres.CallbackReturnType.SOLVER_ABORT if stop else pyceres.CallbackReturnType.SOLVER_CONTINUE
 
 
+def _parts(sight: Sights, threads: int) -> list[Sights]:
+    """A sight of very many observations as one for each thread."""
+    count = max(1, min(threads, (len(sight.points) + len(sight.curve_pixels)) // ROWS_WORTH_A_THREAD))
+    return [sight.part(number, count) for number in range(count)] if count > 1 else [sight]
+
+
 def solve(
     sights: Sights,
     estimate: Estimate,
@@ -157,22 +182,29 @@ def solve(
     weighting: Weighting,
     options: Options,
     progress: Callable[[Progress], None] | None = None,
+    places: Array | None = None,
 ) -> Solution:
     """Minimise the robust cost over everything free, from `estimate`.
+
+    Args:
+        progress: called at every iteration. places: feet of the curve observations, see `residuals`.
 
     Raises:
         DegenerateError: fewer observations than free numbers.
     """
     _require_enough(sights, layout)
     run = Run()
-    assembly = _assemble(run, sights, estimate, layout, weighting, options.threads or min(os.cpu_count() or 1, 8))
+    threads = options.threads or min(os.cpu_count() or 1, 8)
+    assembly = _assemble(run, sights, estimate, layout, weighting, threads, places)
     problem = pyceres.Problem()
     for cost, arrays in assembly.costs:
         if arrays:
             problem.add_residual_block(cost, None, arrays)
     summary = pyceres.SolverSummary()
     pyceres.solve(
-        _solver_options(layout, assembly.blocks, options, weighting, _Watcher(run, progress)), problem, summary
+        _solver_options(layout, assembly.blocks, options, weighting, assembly.threads, _Watcher(run, progress)),
+        problem,
+        summary,
     )
     if run.failure is not None:
         raise run.failure
@@ -281,7 +313,9 @@ def _require_enough(sights: Sights, layout: Layout) -> None:
         )
 
 
-def _solver_options(layout: Layout, blocks: _Blocks, options: Options, weighting: Weighting, watcher: _Watcher) -> Any:
+def _solver_options(
+    layout: Layout, blocks: _Blocks, options: Options, weighting: Weighting, threads: int, watcher: _Watcher
+) -> Any:
     solver = pyceres.SolverOptions()
     kept = sum(len(free) for free in layout.free.values())
     kept += 6 * len(layout.stations) if blocks.placements else 0
@@ -291,7 +325,8 @@ def _solver_options(layout: Layout, blocks: _Blocks, options: Options, weighting
     solver.function_tolerance = weighting.precision
     solver.parameter_tolerance = 1e-12
     solver.gradient_tolerance = 1e-14
-    solver.num_threads = 1  # the kernels are shorter than the wait for Python's lock
+    # Short kernels are over before Python's lock is had; only parts of very large sights are worth a thread each.
+    solver.num_threads = threads
     solver.logging_type = pyceres.LoggingType.SILENT
     solver.callbacks = [watcher]
     return solver

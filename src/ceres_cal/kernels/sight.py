@@ -385,15 +385,37 @@ def curve_residuals(
     track: Any, pixels: Any, s: Any, residuals: Any,
 ) -> None:  # fmt: skip
     """Signed distance from each pixel to its curve in px, (M,), and s moved to the foot; NaN where there is none."""
-    scratch = np.empty((32, 1))
+    scratch = np.empty((32, _CHUNK))
     dense = one_dimensional(lens, intrinsics, powers)
     limit = answer_limit(lens, dense)
-    foot = scratch[21:]
     for v in range(len(poses)):
-        for k in range(bounds[v], bounds[v + 1]):
-            good = _feet(
-                lens, 1, k, intrinsics, dense, unit, limit, poses[v], tracks, is_arc, track, pixels, s,
-                scratch[:3], scratch[3:6], scratch[6:9], scratch[9:16], scratch[16:21], foot,
-            )  # fmt: skip
-            distance = (foot[0, 0] * foot[3, 0] - foot[1, 0] * foot[2, 0]) / np.sqrt(foot[7, 0])
-            residuals[k] = distance if good else np.nan
+        for start in range(bounds[v], bounds[v + 1], _CHUNK):
+            stop = min(start + _CHUNK, bounds[v + 1])
+            if not _chunk_distances(
+                start, stop, lens, intrinsics, dense, unit, limit, poses[v], tracks, is_arc, track, pixels, s, scratch,
+                residuals,
+            ):  # fmt: skip
+                for k in range(start, stop):
+                    if not _chunk_distances(
+                        k, k + 1, lens, intrinsics, dense, unit, limit, poses[v], tracks, is_arc, track, pixels, s,
+                        scratch, residuals,
+                    ):  # fmt: skip
+                        residuals[k] = np.nan
+
+
+@jit
+def _chunk_distances(
+    start: int, stop: int, lens: int, intrinsics: Any, dense: Any, unit: float, limit: float, pose: Any, tracks: Any,
+    is_arc: Any, track: Any, pixels: Any, s: Any, scratch: Any, residuals: Any,
+) -> bool:  # fmt: skip
+    """The same for some curve observations of one sight; False where any of them has no foot."""
+    foot = scratch[21:]
+    if not _feet(
+        lens, stop - start, start, intrinsics, dense, unit, limit, pose, tracks, is_arc, track, pixels, s,
+        scratch[:3], scratch[3:6], scratch[6:9], scratch[9:16], scratch[16:21], foot,
+    ):  # fmt: skip
+        return False
+    for i in range(stop - start):
+        distance = foot[0, i] * foot[3, i] - foot[1, i] * foot[2, i]
+        residuals[start + i] = distance / np.sqrt(foot[7, i])
+    return True
