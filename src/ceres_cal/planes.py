@@ -62,16 +62,18 @@ class PlaneSight:
 
 def _on_plane(sight: Sights, camera: Camera) -> PlaneSight:
     """The observations on the plane that holds most of them, thinned where there are very many."""
-    segments = ~sight.is_arc[sight.track]
-    tracks = sight.tracks[sight.track]
-    level = np.abs(tracks[:, 1, 2]) < 1e-12
-    heights, votes = np.unique(np.concatenate([sight.points[:, 2], tracks[level, 0, 2]]).round(9), return_counts=True)
+    starts, along = sight.tracks[:, 0], sight.tracks[:, 1]
+    level = np.abs(along[:, 2]) < 1e-12
+    on_level = np.flatnonzero(level[sight.track])
+    z = np.concatenate([sight.points[:, 2], starts[sight.track[on_level[:: max(1, len(on_level) // _MOST)]], 2]])
+    heights, votes = np.unique(z.round(9), return_counts=True)
     height = float(heights[np.argmax(votes)]) if len(heights) else 0.0
     on = np.flatnonzero(np.abs(sight.points[:, 2] - height) < 1e-9)
     on = on[:: max(1, len(on) // _MOST)]
-    straight = np.flatnonzero(segments & level & (np.abs(tracks[:, 0, 2] - height) < 1e-9))
+    usable = level & ~sight.is_arc & (np.abs(starts[:, 2] - height) < 1e-9)
+    straight = np.flatnonzero(usable[sight.track])
     straight = straight[:: max(1, len(straight) // _MOST)]
-    c, a = tracks[straight, 0, :2], tracks[straight, 1, :2]
+    c, a = starts[sight.track[straight], :2], along[sight.track[straight], :2]
     normal = np.column_stack([-a[:, 1], a[:, 0]]) / np.linalg.norm(a, axis=1, keepdims=True)
     return PlaneSight(
         sight,

@@ -19,6 +19,7 @@ from ceres_cal.transforms import Array
 
 Rows = NDArray[np.int64]
 Mask = NDArray[np.bool_]
+_BLOCK = 1 << 16  # rows worked on at once: memory stays small beside the observations
 
 
 class SightKey(NamedTuple):
@@ -108,7 +109,7 @@ class Sights(Sequence["Sights"]):
         start, stop = (int(self.curve_bounds[-1]) * n // count for n in (number, number + 1))
         here = np.zeros(1, dtype=np.int64)
         return self._rows(
-            here, np.arange(first, last), np.arange(start, stop), np.array([last - first]), np.array([stop - start])
+            here, slice(first, last), slice(start, stop), np.array([last - first]), np.array([stop - start])
         )
 
     def used(self, points: Mask, curves: Mask) -> Sights:
@@ -121,7 +122,7 @@ class Sights(Sequence["Sights"]):
         numbers = np.flatnonzero(point_sizes + curve_sizes)
         return self._rows(numbers, p, c, point_sizes[numbers], curve_sizes[numbers])
 
-    def _rows(self, numbers: Rows, p: Rows, c: Rows, point_sizes: Rows, curve_sizes: Rows) -> Sights:
+    def _rows(self, numbers: Rows, p: Rows | slice, c: Rows | slice, point_sizes: Rows, curve_sizes: Rows) -> Sights:
         return Sights(
             tuple(self.keys[i] for i in numbers),
             tuple(self.views[i] for i in numbers),
@@ -206,10 +207,14 @@ def nearest_places(sight: Sights, camera: Camera) -> Array:
     `camera` stands in the frame of the single sight (cam_from_frame). Where the lens has no ray the track's origin is
     taken.
     """
-    if not len(sight.curve_pixels):
-        return np.empty(0)
-    rays = np.nan_to_num(camera.rays(sight.curve_pixels) @ camera.cam_from_world.rotation)
-    tracks, is_arc = sight.tracks[sight.track], sight.is_arc[sight.track]
+    blocks = range(0, len(sight.curve_pixels), _BLOCK)
+    return np.concatenate([np.empty(0), *(_nearest(sight, camera, slice(at, at + _BLOCK)) for at in blocks)])
+
+
+def _nearest(sight: Sights, camera: Camera, rows: slice) -> Array:
+    rays = np.nan_to_num(camera.rays(sight.curve_pixels[rows]) @ camera.cam_from_world.rotation)
+    track = sight.track[rows]
+    tracks, is_arc = sight.tracks[track], sight.is_arc[track]
     c, a = tracks[:, 0], tracks[:, 1]
     away = camera.position - c
     # Arc: where the ray meets the arc's plane. Segment: the common perpendicular of ray and line.
