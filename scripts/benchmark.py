@@ -1,9 +1,9 @@
 """How fast we are, beside the others and by ourselves: python scripts/benchmark.py [--help]
 
-First a wide lens (f 600 px, k1 -0.28, k2 0.07, 1280 x 960) from the corners of a checkerboard with 0.3 px of noise, solved
-from a cold start by us, OpenCV, pycolmap and mrcal in turn; then, for us alone, growth with the frames, and with the line
-points that a static camera sees of a field. Ours is everything from Observations to Calibration; theirs is the solver
-alone, though OpenCV's seeds itself.
+First a wide lens (f 600 px, k1 -0.28, k2 0.07, 1280 x 960) from the corners of a checkerboard with 0.3 px of noise,
+solved from a cold start by us, OpenCV, pycolmap and mrcal in turn; then, for us alone, growth with the frames, and with
+the line points that a static camera sees of a field. Ours is everything from Observations to Calibration; of the others
+only the solver counts, though OpenCV's call seeds itself.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
@@ -77,12 +77,19 @@ def solve_apart(name: str, corners: Corners) -> tuple[Answer, float]:
 
 
 def run(name: str, *arguments: str) -> str:
-    """What the Python of a solver prints; the system's must not find this one's packages."""
-    if name != "mrcal":
-        command, environment = sys.executable, dict(os.environ)
-    else:
-        command, environment = MRCAL_PYTHON, {k: v for k, v in os.environ.items() if not k.startswith("PYTHON")}
-    return subprocess.run([command, *arguments], env=environment, capture_output=True, text=True, check=True).stdout
+    """What the Python of a solver prints; another than this must not find this one's packages."""
+    strange = python_of(name) != sys.executable
+    variables = {k: v for k, v in os.environ.items() if not (strange and k.startswith("PYTHON"))}
+    command = [python_of(name), *arguments]
+    try:
+        return subprocess.run(command, env=variables, capture_output=True, text=True, check=True).stdout
+    except subprocess.CalledProcessError as error:
+        error.add_note(error.stderr)
+        raise
+
+
+def python_of(name: str) -> str:
+    return MRCAL_PYTHON if name == "mrcal" else sys.executable
 
 
 def import_seconds(name: str, repeat: int) -> float | None:
@@ -97,7 +104,7 @@ def import_seconds(name: str, repeat: int) -> float | None:
 # ---- beside the others ----------------------------------------------------------------------------------------------
 
 
-def judge(problem: Problem, answer: Answer) -> dict[str, float]:
+def judge(problem: Problem, answer: Answer) -> dict[str, Any]:
     """The same for all: rms over every corner, error of the focal length, number of mirrored frames."""
     import cv2
 
@@ -120,14 +127,16 @@ def compare(frames: int, solvers: Mapping[str, Solver], repeat: int) -> dict[str
     for solve in solvers.values():
         solve(problem.corners.first(WARM_UP_FRAMES))
     turns = [{name: solve(problem.corners) for name, solve in solvers.items()} for _ in range(repeat)]
-    rows: dict[str, dict[str, float]] = {}
+    rows: dict[str, dict[str, Any]] = {}
     for name, answer in turns[-1].items():
         rows[name] = {
-            "seconds": median(turn[name].seconds for turn in turns),
+            "solver": name,
+            "solve_seconds": median(turn[name].seconds - turn[name].initialise_seconds for turn in turns),
             "times_ours": median(turn[name].seconds / turn[OURS].seconds for turn in turns),
             **judge(problem, answer),
         }
-    rows[OURS]["initialise_seconds"] = median(turn[OURS].initialise_seconds or 0.0 for turn in turns)
+    rows[OURS]["initialise_seconds"] = median(turn[OURS].initialise_seconds for turn in turns)
+    rows[OURS]["total_seconds"] = median(turn[OURS].seconds for turn in turns)
     peers = [name for name in solvers if name != OURS]
     ratios = [min(turn[name].seconds for name in peers) / turn[OURS].seconds for turn in turns if peers]
     return {
@@ -167,7 +176,7 @@ def corners_memory(frames: int, repeat: int) -> float:
     return peak_mib()
 
 
-def field_growth(line_points: int, repeat: int) -> dict[str, float]:
+def field_growth(line_points: int, repeat: int) -> dict[str, Any]:
     """Seconds of calibrate (median) and the memory that the process holds at most meanwhile, observations included."""
     from ceres_cal.calibrate import calibrate
 
@@ -207,12 +216,13 @@ TASKS: dict[str, Callable[[int, int], Any]] = {
 # ---- growth ---------------------------------------------------------------------------------------------------------
 
 
-def frames_growth(frames: int, repeat: int) -> dict[str, float]:
+def frames_growth(frames: int, repeat: int) -> dict[str, Any]:
     """Our seconds on the wide lens."""
     problem = wide_lens(frames)
     solve_ours(problem.corners.first(WARM_UP_FRAMES))
     answers = [solve_ours(problem.corners) for _ in range(repeat)]
-    return {"size": frames, "seconds": median(a.seconds for a in answers), **judge(problem, answers[-1])}
+    seconds = median(answer.seconds for answer in answers)
+    return {"size": frames, "frames": frames, "seconds": seconds, **judge(problem, answers[-1])}
 
 
 def exponent(rows: Sequence[Mapping[str, float]]) -> float | None:
@@ -225,60 +235,52 @@ def exponent(rows: Sequence[Mapping[str, float]]) -> float | None:
 # ---- tables ---------------------------------------------------------------------------------------------------------
 
 
-def table(title: str, head: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """Print a table, its first column to the left."""
-    widths = [max(len(row[i]) for row in (head, *rows)) for i in range(len(head))]
+COMPARISON = {
+    "solver": ("", "s"),
+    "import_seconds": ("import s", ".2f"),
+    "initialise_seconds": ("initialise s", ".4f"),
+    "solve_seconds": ("solve s", ".4f"),
+    "total_seconds": ("total s", ".4f"),
+    "times_ours": ("times ours", ".2f"),
+    "rms_px": ("rms px", ".4f"),
+    "focal_error_px": ("focal error px", "+.3f"),
+    "mirrored": ("mirrored", "d"),
+    "peak_mib": ("peak MiB", ".0f"),
+}
+GROWTH = {
+    "size": ("number", "d"),
+    "frames": ("frames", "d"),
+    "seconds": ("seconds", ".4f"),
+    "rms_px": ("rms px", ".4f"),
+    "focal_error_px": ("focal error px", "+.3f"),
+    "peak_mib": ("peak MiB", ".0f"),
+}
+
+
+def print_table(title: str, columns: Mapping[str, tuple[str, str]], rows: Iterable[Mapping[str, Any]]) -> None:
+    """Rows by key; columns: key -> head and format. What a row does not have is a dash."""
+    lines = [[head for head, _ in columns.values()]]
+    for row in rows:
+        values = [(row.get(key), form) for key, (_, form) in columns.items()]
+        lines.append(["-" if value is None else format(value, form) for value, form in values])
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     print(f"\n{title}")
-    for row in (head, *rows):
-        first, *others = (cell.ljust(w) if i == 0 else cell.rjust(w) for i, (cell, w) in enumerate(zip(row, widths, strict=True)))
-        print("  ".join(["", first, *others]), flush=True)
+    for first, *others in lines:
+        cells = [cell.rjust(width) for cell, width in zip(others, widths[1:], strict=True)]
+        print("  ".join(["", first.ljust(widths[0]), *cells]), flush=True)
 
 
-def number(value: float | None, form: str) -> str:
-    return "-" if value is None else format(value, form)
+def print_comparison(found: Mapping[str, Any], repeat: int) -> None:
+    title = f"{found['frames']} frames, {found['corners']} corners, median of {repeat} turns"
+    print_table(title, COMPARISON, found["solvers"].values())
+    if (ratio := found["fastest_peer_times_ours"]) is not None:
+        print(f"  the fastest of the others takes {ratio:.2f} times as long as we do (median over the turns)")
 
 
-def print_comparison(found: Mapping[str, Any], imports: Mapping[str, float | None], repeat: int) -> None:
-    head = ("", "import s", "initialise s", "solve s", "total s", "times ours", "rms px", "focal error px", "mirrored", "peak MiB")
-    rows = []
-    for name, row in found["solvers"].items():
-        start = row.get("initialise_seconds")
-        rows.append(
-            (
-                name,
-                number(imports[name], ".2f"),
-                number(start, ".4f"),
-                number(row["seconds"] - (start or 0.0), ".4f"),
-                number(row["seconds"] if name == OURS else None, ".4f"),
-                number(row["times_ours"], ".2f"),
-                number(row["rms_px"], ".4f"),
-                number(row["focal_error_px"], "+.3f"),
-                str(row["mirrored"]),
-                number(row.get("peak_mib"), ".0f"),
-            )
-        )
-    table(f"{found['frames']} frames, {found['corners']} corners, median of {repeat} turns", head, rows)
-    if found["fastest_peer_times_ours"] is not None:
-        print(f"  turn by turn, the fastest peer takes {found['fastest_peer_times_ours']:.2f} times as long as we do")
-
-
-def print_growth(title: str, rows: Sequence[Mapping[str, float]]) -> None:
-    head = ("", "frames", "seconds", "us each", "rms px", "focal error px", "peak MiB")
-    cells = [
-        (
-            f"{row['size']:.0f}",
-            number(row.get("frames", row["size"]), ".0f"),
-            number(row["seconds"], ".4f"),
-            number(1e6 * row["seconds"] / row["size"], ".2f"),
-            number(row["rms_px"], ".4f"),
-            number(row["focal_error_px"], "+.3f"),
-            number(row.get("peak_mib"), ".0f"),
-        )
-        for row in rows
-    ]
-    table(title, head, cells)
+def print_growth(title: str, rows: Sequence[Mapping[str, Any]]) -> None:
+    print_table(title, GROWTH, rows)
     if (slope := exponent(rows)) is not None:
-        print(f"  seconds grow as the power {slope:.3f} of the number, over the last {LAST_DECADES:.0f} decades")
+        print(f"  seconds grow as the number to the power {slope:.3f} (last {LAST_DECADES:.0f} decades)")
 
 
 # ---- the whole ------------------------------------------------------------------------------------------------------
@@ -290,44 +292,53 @@ def environment() -> dict[str, Any]:
         "cores": os.cpu_count(),
         "machine": platform.machine(),
         "python": platform.python_version(),
-        "versions": {name: version(name) for name in names},
-        "load_before": os.getloadavg(),
+        **{name: version(name) for name in names},
+        "load before": round(os.getloadavg()[0], 2),
     }
 
 
-def measure(sizes: argparse.Namespace) -> dict[str, Any]:
+def measure(chosen: argparse.Namespace) -> dict[str, Any]:
     """Everything asked for, printed as it comes."""
     report: dict[str, Any] = {"environment": environment()}
-    print(f"{report['environment']}\nthreads: each solver as many as it takes by itself; pycolmap num_threads -1")
-    imports = {name: import_seconds(name, sizes.repeat) for name in (OURS, *sizes.peers)}
-    for name in (name for name, seconds in imports.items() if seconds is None):
-        print(f"{name} is skipped: {MRCAL_PYTHON if name == 'mrcal' else sys.executable} cannot import {MODULES[name]}")
-    report["import_seconds"] = imports
+    print(", ".join(f"{name} {value}" for name, value in report["environment"].items()))
+    print("each solver takes as many threads as it does by itself; pycolmap's num_threads is -1: all")
+    report["import_seconds"] = {name: import_seconds(name, chosen.repeat) for name in (OURS, *chosen.peers)}
+    for name, seconds in report["import_seconds"].items():
+        if seconds is None:
+            print(f"{name} is skipped: {python_of(name)} cannot import {MODULES[name]}")
     report["first_call_seconds"] = [alone("first", WARM_UP_FRAMES) for _ in range(2)][-1]  # the first may compile
     print(f"a process' first calibration takes {report['first_call_seconds']:.2f} s more: compiled kernels are loaded")
-    solvers: dict[str, Solver] = {OURS: solve_ours, **{name: PEERS[name] for name in sizes.peers if imports[name]}}
-    if "mrcal" in solvers:
-        solvers["mrcal"] = lambda corners: solve_apart("mrcal", corners)[0]
-    report["comparison"] = []
-    for frames in sizes.frames:
-        found = compare(frames, solvers, sizes.repeat)
-        if sizes.memory and frames == max(sizes.frames):
-            add_memory(found)
-        report["comparison"].append(found)
-        print_comparison(found, imports, sizes.repeat)
-    if sizes.growth:
-        report["frames"] = [frames_growth(frames, sizes.repeat) for frames in sizes.growth]
+    report["comparison"] = compare_all(chosen, report["import_seconds"])
+    if chosen.growth:
+        report["frames"] = [frames_growth(frames, chosen.repeat) for frames in chosen.growth]
         print_growth("growth with the frames, ours", report["frames"])
-    if sizes.points:
-        report["field"] = [alone("field", count, sizes.repeat) for count in sizes.points]
+    if chosen.points:
+        report["field"] = [alone("field", count, chosen.repeat) for count in chosen.points]
         print_growth("growth with the line points of a static camera over a field, ours", report["field"])
-    report["environment"]["load_after"] = os.getloadavg()
-    print(f"\nload {report['environment']['load_before'][0]:.2f} before, {os.getloadavg()[0]:.2f} after")
+    report["environment"]["load after"] = round(os.getloadavg()[0], 2)
+    print(f"\nload after {report['environment']['load after']}")
     return report
 
 
+def compare_all(chosen: argparse.Namespace, imports: Mapping[str, float | None]) -> list[dict[str, Any]]:
+    """Every size of the comparison, by the solvers that are there."""
+    solvers: dict[str, Solver] = {OURS: solve_ours}
+    for name in (name for name in chosen.peers if imports[name] is not None):
+        solvers[name] = PEERS[name] if name != "mrcal" else lambda corners: solve_apart("mrcal", corners)[0]
+    comparison = []
+    for frames in chosen.frames:
+        found = compare(frames, solvers, chosen.repeat)
+        if chosen.memory and frames == max(chosen.frames):
+            add_memory(found)
+        for name, row in found["solvers"].items():
+            row["import_seconds"] = imports[name]
+        print_comparison(found, chosen.repeat)
+        comparison.append(found)
+    return comparison
+
+
 def numbers(text: str) -> list[int]:
-    """ "20,1e3" -> [20, 1000]"""
+    """Of a list with commas: 20,1e3 is [20, 1000]."""
     return sorted(int(float(part)) for part in text.split(",") if part)
 
 

@@ -1,7 +1,7 @@
 """The other solvers of the benchmark, each on the same corners: OpenCV, pycolmap and mrcal.
 
-Needs NumPy and the library of the peer that is asked for, nothing of this package, so that mrcal runs under the system's
-Python and each peer in a process of its own: python scripts/benchmark_peers.py NAME CORNERS.npz prints its answer as JSON.
+Needs NumPy and the library of the peer that is asked for, nothing of this package: so mrcal runs under the system's
+Python, and each peer in a process of its own. python scripts/benchmark_peers.py NAME CORNERS.npz prints its answer.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ class Corners:
     """Corners of a checkerboard, seen in many frames by one camera, in the order of the frames.
 
     Attributes:
-        image_size: (2,) width, height. grid: (2,) columns, rows of corners; number r * columns + c lies at (c, r) squares.
-        square_m: (). view, feature: (N,) number of the frame and of the corner. pixels: (N, 2).
+        image_size: (2,) width, height. grid: (2,) columns, rows of corners, a distance of square_m () apart.
+        view, feature: (N,) number of the frame, and r * columns + c of the corner. pixels: (N, 2).
     """
 
     image_size: NDArray[np.int64]
@@ -73,14 +73,14 @@ class Answer:
     """What a solver found.
 
     Attributes:
-        seconds: of the solve. initialise_seconds: of the start, where it is part of `seconds` and can be told.
+        seconds: of the solve. initialise_seconds: of the start, where that is known to be a part of them.
         intrinsics: (9,) fx, fy, cx, cy, k1, k2, p1, p2, k3 in OpenCV's terms. cam_from_board: (F, 3, 4) as [R t].
     """
 
     seconds: float
     intrinsics: Array
     cam_from_board: Array
-    initialise_seconds: float | None = None
+    initialise_seconds: float = 0.0
 
 
 def peak_mib() -> float:
@@ -106,7 +106,7 @@ def _seed(corners: Corners) -> tuple[Array, Array]:
     for on_board, pixels in zip(objects, images, strict=True):
         _, turn, shift = cv2.solvePnP(on_board, pixels, matrix, None)
         poses.append(np.column_stack([cv2.Rodrigues(turn)[0], shift]))
-    return matrix, np.array(poses)
+    return np.asarray(matrix, dtype=float), np.array(poses)
 
 
 def solve_opencv(corners: Corners) -> Answer:
@@ -116,7 +116,7 @@ def solve_opencv(corners: Corners) -> Answer:
     objects, images = ([part.astype(np.float32) for part in parts] for parts in corners.by_frame())
     size = tuple(corners.image_size.tolist())
     start = time.perf_counter()
-    _, matrix, lens, turns, shifts = cv2.calibrateCamera(objects, images, size, None, None)  # type: ignore[call-overload]
+    _, matrix, lens, turns, shifts = cv2.calibrateCamera(objects, images, size, None, None)
     seconds = time.perf_counter() - start
     poses = [np.column_stack([cv2.Rodrigues(turn)[0], shift]) for turn, shift in zip(turns, shifts, strict=True)]
     intrinsics = [matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], *lens.ravel()[:5]]
@@ -148,7 +148,7 @@ def _reconstruction(corners: Corners) -> Any:
 
 
 def solve_pycolmap(corners: Corners) -> Answer:
-    """Bundle adjustment with the board's corners held, model OPENCV (no k3, which is 0 in truth); only `solve` counts."""
+    """Bundle adjustment, the board held, model OPENCV (no k3, which is 0 in truth); only its `solve` counts."""
     import pycolmap
 
     scene = _reconstruction(corners)

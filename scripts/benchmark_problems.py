@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from benchmark_peers import Corners
 
 from ceres_cal.camera import Camera
 from ceres_cal.lens import Brown, Radial
-from ceres_cal.observations import Curves, Observations, Points, Prior, View
+from ceres_cal.observations import Columns, Curves, Observations, Points, Prior, View
 from ceres_cal.simulate import Scene, Station, field_scene, overhead_pose, simulate
 from ceres_cal.targets import checkerboard, ssl_field
 from ceres_cal.transforms import Array, rotation_exp
@@ -38,7 +39,8 @@ def wide_lens(frames: int, seed: int = 0) -> Problem:
     rng = np.random.default_rng(seed)
     number = np.arange(COLUMNS * ROWS)
     board = np.column_stack([number % COLUMNS - 4.5, number // COLUMNS - 4.5, 0.0 * number]) * SQUARE_M
-    rotations, seen, pixels = [], [], []
+    rotations: list[Array] = []
+    seen, pixels = [], []
     while len(rotations) < frames:
         rotation = rotation_exp(rng.normal(size=3) * (0.4, 0.4, 0.5))
         shift = (rng.uniform(-0.4, 0.4), rng.uniform(-0.3, 0.3), rng.uniform(0.7, 1.5))
@@ -61,13 +63,12 @@ def wide_lens(frames: int, seed: int = 0) -> Problem:
 
 def corner_observations(corners: Corners) -> Observations:
     """The corners as our observations."""
-    none = np.empty(0)
     return Observations(
         {"board": checkerboard(COLUMNS, ROWS, SQUARE_M)},
         {"camera": WIDE.image_size},
         tuple(View(str(frame), "camera", "camera", "board", str(frame)) for frame in range(corners.frames)),
         Points(corners.view, corners.feature, corners.pixels, np.ones(len(corners.view))),
-        Curves(none, none, none.reshape(0, 2), none, none),
+        Curves(*(np.empty(0, np.int32),) * 2, np.empty((0, 2)), np.empty(0), np.empty(0, np.int8)),
     )
 
 
@@ -80,17 +81,17 @@ def field_observations(line_points: int, seed: int = 0) -> Observations:
     frames = -(-line_points // len(clean.curves))
     rng = np.random.default_rng(seed)
 
-    def repeated(columns: Points | Curves, count: int, sigma_px: float) -> tuple[Array, ...]:
+    def repeated(columns: Columns, count: int, sigma_px: float) -> dict[str, Any]:
         view, place = np.divmod(np.arange(count, dtype=np.int32), np.int32(len(columns)))
         pixels = columns.pixels[place]
         pixels += sigma_px * rng.standard_normal(pixels.shape)
-        return view, columns.feature[place], pixels, np.full(count, sigma_px)
+        return {"view": view, "feature": columns.feature[place], "pixels": pixels, "sigma_px": np.full(count, sigma_px)}
 
     return replace(
         clean,
         views=tuple(View(str(frame), "overhead", "overhead", "field") for frame in range(frames)),
-        points=Points(*repeated(clean.points, frames * len(clean.points), _CROSSINGS_PX)),
-        curves=Curves(*repeated(clean.curves, line_points, _LINES_PX), np.zeros(line_points)),
+        points=Points(**repeated(clean.points, frames * len(clean.points), _CROSSINGS_PX)),
+        curves=Curves(**repeated(clean.curves, line_points, _LINES_PX), side=np.zeros(line_points, np.int8)),
         priors=(Prior("station", "overhead", "height_m", (HEIGHT_M,), (HEIGHT_SIGMA_M,)),),
     )
 

@@ -1,0 +1,31 @@
+"""The benchmark runs, and what it compares are answers of one quality. Nothing here is about time."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+SCRIPT = Path(__file__).parents[1] / "scripts" / "benchmark.py"
+
+
+def test_quick_run(tmp_path: Path) -> None:
+    path = tmp_path / "report.json"
+    command = [sys.executable, str(SCRIPT), "--quick", "--json", str(path)]
+    printed = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    report = json.loads(path.read_text(encoding="utf-8"))
+    (found,) = report["comparison"]
+    ours = found["solvers"]["ceres-cal"]
+    # sqrt(2) times 0.3 px, less what 129 unknowns take of 3998 numbers, is 0.417 px; this seed gives 0.4163 px
+    assert ours["rms_px"] == pytest.approx(0.417, abs=0.003)
+    assert ours["mirrored"] == 0
+    (row,) = (line.split() for line in printed.splitlines() if line.split()[:1] == ["ceres-cal"])
+    assert f"{ours['rms_px']:.4f}" in row
+    for name in ("opencv", "pycolmap"):
+        # They stop where they like: 0.4163 and 0.4167 px.
+        assert found["solvers"][name]["rms_px"] == pytest.approx(ours["rms_px"], abs=0.001), name
+    if report["import_seconds"]["mrcal"] is None:
+        assert "mrcal is skipped" in printed
+    (field,) = report["field"]
+    assert field["rms_px"] == pytest.approx(0.3, abs=0.03)  # 0.293 of 1000 line points
