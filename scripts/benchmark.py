@@ -131,12 +131,14 @@ def compare(frames: int, solvers: Mapping[str, Solver], repeat: int) -> dict[str
     for name, answer in turns[-1].items():
         rows[name] = {
             "solver": name,
-            "solve_seconds": median(turn[name].seconds - turn[name].initialise_seconds for turn in turns),
+            "solve_seconds": median(turn[name].seconds for turn in turns),
             "times_ours": median(turn[name].seconds / turn[OURS].seconds for turn in turns),
             **judge(problem, answer),
         }
-    rows[OURS]["initialise_seconds"] = median(turn[OURS].initialise_seconds for turn in turns)
-    rows[OURS]["total_seconds"] = median(turn[OURS].seconds for turn in turns)
+    ours = rows[OURS]
+    ours["total_seconds"] = ours["solve_seconds"]
+    ours["initialise_seconds"] = median(turn[OURS].initialise_seconds for turn in turns)
+    ours["solve_seconds"] -= ours["initialise_seconds"]
     peers = [name for name in solvers if name != OURS]
     ratios = [min(turn[name].seconds for name in peers) / turn[OURS].seconds for turn in turns if peers]
     return {

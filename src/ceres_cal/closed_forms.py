@@ -218,8 +218,9 @@ def radial_alignment(data: PlaneData, unit_px: float, terms: int, rounds: int) -
     return RadialAlignment(Profile(tuple(float(v) for v in c), unit_px), homographies, error * unit_px, error / usual)
 
 
-def usual_by_radius(error: Array, radius: Array, rings: int = 16) -> Array:
+def usual_by_radius(error: Array, radius: Array) -> Array:
     """(N,) the median error at each point's distance from the centre: profiles fit worst where lenses bend most."""
+    rings = int(np.clip(len(error) // 200, 1, 16))  # few points in a ring, and its outliers would be the usual there
     ring = np.minimum((radius * (rings / (np.max(radius) + 1e-300))).astype(int), rings - 1)
     medians = np.full(rings, 1e-12)
     for number in range(rings):

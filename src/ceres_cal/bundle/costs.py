@@ -19,6 +19,7 @@ from ceres_cal.structure import Structure
 from ceres_cal.transforms import Array, left_jacobian, rotation_exp, skew
 
 ROWS_WORTH_A_THREAD = 20_000
+_ROUGH = 1e-6
 _NOTHING = np.empty(0)
 
 
@@ -238,7 +239,9 @@ class EliminatedCost(pyceres.CostFunction):
 
     def settled(self, parameters: Sequence[Array]) -> tuple[tuple[SightKey, ...], Array]:
         """The sights' keys and their cam_from_target, (S, 3, 4), at their best for these numbers."""
-        self._evaluated(np.concatenate([_NOTHING, *parameters]), self._precision)
+        at = np.concatenate([_NOTHING, *parameters])
+        if self._precision < _ROUGH or not np.array_equal(self._at, at):  # after a rough solve they are good enough
+            self._evaluated(at, self._precision)
         return self._sights.keys, self._poses
 
 

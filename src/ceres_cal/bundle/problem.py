@@ -21,7 +21,7 @@ from ceres_cal.bundle.costs import (
     SightCost,
     Weighting,
 )
-from ceres_cal.errors import DegenerateError, SolutionError
+from ceres_cal.errors import DegenerateError, InputError, SolutionError
 from ceres_cal.observations import Prior
 from ceres_cal.parameters import (
     Estimate,
@@ -191,6 +191,7 @@ def solve(
 
     Raises:
         DegenerateError: fewer observations than free numbers.
+        SolutionError: the least cost lies where phi or the aspect is negative.
     """
     _require_enough(sights, layout)
     run = Run()
@@ -208,7 +209,10 @@ def solve(
     )
     if run.failure is not None:
         raise run.failure
-    solved = assembly.blocks.unpack(estimate, layout)
+    try:
+        solved = assembly.blocks.unpack(estimate, layout)
+    except InputError as error:  # phi or aspect below 0
+        raise SolutionError(f"the solve ended at no camera ({error}): check labels and target dimensions") from None
     placements = dict(solved.placements)
     for eliminated, arrays in assembly.eliminated:
         placements |= placed(solved, *eliminated.settled(arrays))
