@@ -50,12 +50,12 @@ def solve_ours(corners: Corners) -> Answer:
     options = Options(lens="brown", free_aspect=True)
     observations = corner_observations(corners)  # new ones each time: they remember what was derived from them
     start = time.perf_counter()
-    initialise(observations, gather_sights(observations), options)
-    initialise_seconds = time.perf_counter() - start
-    observations = corner_observations(corners)
-    start = time.perf_counter()
     calibration = calibrate(observations, options)
     seconds = time.perf_counter() - start
+    observations = corner_observations(corners)
+    start = time.perf_counter()
+    initialise(observations, gather_sights(observations), options)
+    initialise_seconds = time.perf_counter() - start
     camera, station = calibration.cameras["camera"], calibration.station("camera").cam_from_world
     poses = [station @ calibration.placements[str(view.placement)] for view in observations.views]
     return Answer(
@@ -255,6 +255,7 @@ GROWTH = {
     "seconds": ("seconds", ".4f"),
     "rms_px": ("rms px", ".4f"),
     "focal_error_px": ("focal error px", "+.3f"),
+    "mirrored": ("mirrored", "d"),
     "peak_mib": ("peak MiB", ".0f"),
 }
 

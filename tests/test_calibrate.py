@@ -17,9 +17,8 @@ from scipy.optimize import least_squares
 
 from ceres_cal.bundle import Progress
 from ceres_cal.calibrate import calibrate
-from ceres_cal.calibration import Calibration
 from ceres_cal.camera import Camera
-from ceres_cal.errors import CalibrationError, DegenerateError, InputError, SolutionError
+from ceres_cal.errors import DegenerateError, InputError, SolutionError
 from ceres_cal.lens import Radial
 from ceres_cal.observations import Curves, Observations, Points, Prior, View, combine
 from ceres_cal.parameters import Options, intrinsic_names, intrinsics_scales, intrinsics_vector, with_intrinsics
@@ -135,26 +134,26 @@ def walk_along(camera: Camera, target: Target, feature: int, side: int) -> Array
     return seen[np.isfinite(seen[:, 0])]
 
 
-@pytest.mark.parametrize(
-    "name, phi",  # phi: relative error allowed, four standard deviations as found from 20 seeds
-    [
-        ("radial-2-3/lines-arcs", 1.0),
-        ("radial-2-3/field-boards", 1.0),
-        ("radial-3/two-cameras", 1.0),
-        ("brown/two-cameras", 1.0),
-        ("brown/boards", 1.0),
-        ("brown/rings-field", 1.0),
-        ("kannala-brandt/lines", 1.0),
-        ("kannala-brandt/several-stations", 1.0),
-    ],
-)
+PHI_SPREAD = {  # standard deviation of the relative error of phi, measured over 20 seeds
+    "radial-2-3/lines-arcs": 2.2e-3,
+    "radial-2-3/field-boards": 1.0e-3,
+    "radial-3/two-cameras": 0.9e-3,
+    "brown/two-cameras": 1.6e-3,
+    "brown/boards": 1.9e-3,
+    "brown/rings-field": 3.6e-3,
+    "kannala-brandt/lines": 5.2e-3,
+    "kannala-brandt/several-stations": 1.6e-3,
+}
+
+
+@pytest.mark.parametrize("name", PHI_SPREAD)
 @pytest.mark.parametrize("seed", [0, 1])
-def test_gross_errors_are_listed_and_do_not_decide(name: str, phi: float, seed: int) -> None:
+def test_gross_errors_are_listed_and_do_not_decide(name: str, seed: int) -> None:
     """0.3 px of noise, 5 % outliers, 3 % wrong labels."""
     simulation = observed(name, WORKDAY, seed)
     calibration = calibrate(simulation.observations, options_for(simulation.scene))
     for camera, truth in simulation.scene.cameras.items():
-        assert calibration.cameras[camera].phi == pytest.approx(truth.phi, rel=phi)
+        assert calibration.cameras[camera].phi == pytest.approx(truth.phi, rel=4.0 * PHI_SPREAD[name])
     points = len(simulation.observations.points)
     listed = np.zeros(points + len(simulation.observations.curves), dtype=bool)
     listed[[entry.row + (points if entry.kind == "curve" else 0) for entry in calibration.rejected]] = True
@@ -165,9 +164,30 @@ def test_gross_errors_are_listed_and_do_not_decide(name: str, phi: float, seed: 
     assert not np.any(listed[sigmas < 4.0])
     assert np.all(wrong[listed])  # precision 1: 5 sigma take out no clean observation of these
     assert np.count_nonzero(listed) > 0.5 * np.count_nonzero(wrong)  # many an outlier lies along its line
-    for scale, kind in ((calibration.fit.point_scale, simulation.points), (calibration.fit.curve_scale, simulation.curves)):
-        if len(kind.flag) > 50:
-            assert scale == pytest.approx(1.0, abs=0.15)  # of the stated 0.3 px
+    if points > 50:
+        assert calibration.fit.point_scale == pytest.approx(1.0, abs=0.1)  # of the stated 0.3 px; 0.06 measured
+    if len(simulation.curves.flag) > 50:
+        assert calibration.fit.curve_scale == pytest.approx(1.0, abs=0.2)  # 0.13 measured
+
+
+LOST = pytest.mark.xfail(reason="radial alignment begins with the outliers in: no consensus is asked for before it")
+
+
+@pytest.mark.parametrize(
+    "name, seed",
+    [
+        ("radial-3/two-cameras", 1),
+        ("brown/two-cameras", 17),
+        pytest.param("brown/two-cameras", 9, marks=LOST),
+        pytest.param("brown/two-cameras", 18, marks=LOST),
+    ],
+)
+def test_hard_starts(name: str, seed: int) -> None:
+    """Four boards a camera, 60 px wide, one corner in ten far off: the radial alignment alone loses its way."""
+    simulation = observed(name, WORKDAY, seed)
+    calibration = calibrate(simulation.observations, options_for(simulation.scene))
+    for camera, truth in simulation.scene.cameras.items():
+        assert calibration.cameras[camera].phi == pytest.approx(truth.phi, rel=4.0 * PHI_SPREAD[name])
 
 
 def test_what_is_listed_can_be_found_again() -> None:
@@ -181,9 +201,9 @@ def test_what_is_listed_can_be_found_again() -> None:
         assert entry.feature == observations.feature_name(entry.kind, entry.row)
         number, *words = entry.reason.split(" ", 1)
         assert words == ["sigma off"] and float(number) >= 5.0
-    assert calibration.fit.points + calibration.fit.curves + len(calibration.rejected) == len(observations.points) + len(
-        observations.curves
-    )
+    assert calibration.fit.points + calibration.fit.curves + len(calibration.rejected) == len(
+        observations.points
+    ) + len(observations.curves)
 
 
 # ---- what must not matter -------------------------------------------------------------------------------------------
@@ -191,7 +211,9 @@ def test_what_is_listed_can_be_found_again() -> None:
 Rearrange = Callable[[Observations], Observations]
 
 
-def with_rows(observations: Observations, views: tuple[View, ...], order: Callable[[Any], tuple[Any, Any]]) -> Observations:
+def with_rows(
+    observations: Observations, views: tuple[View, ...], order: Callable[[Any], tuple[Any, Any]]
+) -> Observations:
     """Other views and rows: `order` gives the new view of each row and the rows in their new order."""
 
     def moved(column: Any) -> dict[str, Any]:
@@ -252,18 +274,19 @@ def split(observations: Observations) -> Observations:
 )
 @pytest.mark.parametrize("rearranged", [permuted, renamed, split])
 def test_order_names_and_frames_do_not_matter(name: str, rearranged: Rearrange) -> None:
-    """At the stated noise, for an estimated one is settled to 1 % only: 6e-7 of phi were measured then."""
+    """At the stated noise to the end of the solve; an estimated noise is settled to 1 %, which shows in phi."""
     simulation = observed(name)
     options = options_for(simulation.scene, noise_scale="stated")
     base = calibrate(simulation.observations, options)
     other = calibrate(rearranged(simulation.observations), options)
     for truth, found in zip(base.cameras.values(), other.cameras.values(), strict=True):
-        assert found.phi == pytest.approx(truth.phi, rel=1e-8)  # FILL 6e-10 measured
+        assert found.phi == pytest.approx(truth.phi, rel=1e-8)  # 8e-10 measured
         assert found.principal_point == pytest.approx(truth.principal_point, abs=1e-8 * truth.phi)
     assert sorted(e.row for e in other.rejected) == sorted(e.row for e in base.rejected) == []
-    estimated = [calibrate(o, options_for(simulation.scene)) for o in (simulation.observations, rearranged(simulation.observations))]
-    for truth, found in zip(*(calibration.cameras.values() for calibration in estimated), strict=True):
-        assert found.phi == pytest.approx(truth.phi, rel=5e-6)  # FILL measured
+    base = calibrate(simulation.observations, options_for(simulation.scene))
+    other = calibrate(rearranged(simulation.observations), options_for(simulation.scene))
+    for truth, found in zip(base.cameras.values(), other.cameras.values(), strict=True):
+        assert found.phi == pytest.approx(truth.phi, rel=5e-6)  # 6e-7 measured
 
 
 def transformed(target: Target, pose: Pose, unit: float) -> Target:
@@ -304,18 +327,19 @@ def test_frame_and_unit_of_the_world_do_not_matter(
     new_from_old = Pose(rotation_exp((0.0, 0.0, turn)), np.array(shift))
     targets = {key: transformed(target, new_from_old, unit) for key, target in simulation.observations.targets.items()}
     found = calibrate(replace(simulation.observations, targets=targets), options).station()
-    assert found.phi == pytest.approx(base.phi, rel=3e-8)  # 5e-9 measured
+    assert found.phi == pytest.approx(base.phi, rel=3e-8)  # 2e-9 measured
     assert found.principal_point == pytest.approx(base.principal_point, abs=3e-8 * base.phi)
     in_metres = Pose(found.cam_from_world.rotation, found.cam_from_world.translation / unit) @ new_from_old
-    assert error_of_pose(in_metres, base.cam_from_world) < 3e-8  # 3e-9 measured
+    assert error_of_pose(in_metres, base.cam_from_world) < 3e-8  # 7e-10 measured
 
 
 # ---- priors ---------------------------------------------------------------------------------------------------------
 
 
 class DensePoints:
-    """The problem of one station that sees points of the world, plain: residuals from `Camera.project`, derivatives by
-    differences, minimised by scipy. Unknowns: the free intrinsics, and a left perturbation of the pose.
+    """One station that sees points of the world, plainly: residuals by `Camera.project`, minimised by scipy.
+
+    Unknowns: the free intrinsics, and a left perturbation of the pose.
     """
 
     def __init__(self, simulation: Simulation, free: NDArray[np.int64], priors: tuple[Prior, ...] = ()) -> None:
@@ -337,7 +361,7 @@ class DensePoints:
         return np.concatenate(found)
 
     def solve(self) -> tuple[Camera, Array]:
-        """The camera, and the covariance of value_of any prior's quantity by way of its Jacobian: see `spread`."""
+        """The camera at the minimum, and the covariance of the unknowns there."""
         tight = {"xtol": 1e-15, "ftol": 1e-15, "gtol": 1e-15}
         count = len(self.free) + 6
         found = least_squares(self.residuals, np.zeros(count), "3-point", method="lm", x_scale="jac", **tight)
@@ -372,8 +396,8 @@ def test_the_optimum_is_that_of_a_dense_solver() -> None:
     simulation = observed(POINTS_SCENE)
     found = calibrate(simulation.observations, options_for(simulation.scene, **PLAIN)).station()
     expected, _ = without_prior()
-    assert error_of(found, expected) < 1e-6  # FILL measured
-    assert error_of_pose(found.cam_from_world, expected.cam_from_world) < 1e-7  # FILL measured
+    assert error_of(found, expected) < 1e-6  # 6e-8 measured, with or without a prior
+    assert error_of_pose(found.cam_from_world, expected.cam_from_world) < 1e-7  # 2e-9 measured
 
 
 @pytest.mark.parametrize(
@@ -388,7 +412,7 @@ def test_the_optimum_is_that_of_a_dense_solver() -> None:
     ],
 )  # fmt: skip
 def test_priors_pull_as_gauss_says(owner: str, quantity: str) -> None:
-    """A prior as sure as the data, two of their standard deviations away, is met half-way; and in full: as scipy has it."""
+    """A prior as sure as the data, two of their standard deviations away, is met half-way; every number as by scipy."""
     simulation = observed(POINTS_SCENE)
     unpulled, covariance = without_prior()
     size = {"position_m": 3, "principal_point": 2}.get(quantity, 1)
@@ -401,11 +425,11 @@ def test_priors_pull_as_gauss_says(owner: str, quantity: str) -> None:
     prior = replace(blank, value=tuple(mean), sigma=(spread,) * size)
     expected, _ = DensePoints(simulation, FREE, (prior,)).solve()
     found = calibrate(simulation.observations, options_for(simulation.scene, priors=(prior,), **PLAIN)).station()
-    assert error_of(found, expected) < 1e-6  # FILL measured
-    assert error_of_pose(found.cam_from_world, expected.cam_from_world) < 1e-7  # FILL measured
+    assert error_of(found, expected) < 1e-6  # 6e-8 measured, with or without a prior
+    assert error_of_pose(found.cam_from_world, expected.cam_from_world) < 1e-7  # 2e-9 measured
     if size == 1:
         pulled = (value_of(blank, found)[0] - before[0]) / spread
-        assert pulled == pytest.approx(1.0, abs=0.05)  # FILL measured: the rest is not linear
+        assert pulled == pytest.approx(1.0, abs=0.05)  # 0.005 measured: what is not linear
 
 
 def test_a_prior_may_come_with_the_observations() -> None:
@@ -431,7 +455,7 @@ def test_a_height_prior_cures_the_view_from_straight_above() -> None:
     assert held.phi_from == {"camera": "prior"}
     assert held.warnings == ()
     assert held.station().position[2] == pytest.approx(5.0, abs=0.015)
-    assert held.station().phi == pytest.approx(868.0, rel=0.004)  # FILL measured
+    assert held.station().phi == pytest.approx(868.0, rel=0.004)  # 0.0006 measured, 0.0014 at most in 8 seeds
 
 
 def test_priors_and_fixed_numbers_that_do_not_fit_are_refused() -> None:
@@ -462,7 +486,9 @@ def test_priors_and_fixed_numbers_that_do_not_fit_are_refused() -> None:
 def test_what_is_fixed_stays_exactly(more: dict[str, Any], held: Mapping[str, float]) -> None:
     simulation = observed("radial-2-3/field-boards")
     camera = calibrate(simulation.observations, options_for(simulation.scene, **more)).cameras["overhead"]
-    numbers = dict(zip(intrinsic_names(camera.lens), intrinsics_vector(camera) / intrinsics_scales(camera), strict=True))
+    numbers = dict(
+        zip(intrinsic_names(camera.lens), intrinsics_vector(camera) / intrinsics_scales(camera), strict=True)
+    )
     cx, cy = camera.principal_point
     numbers |= {"phi": camera.phi, "aspect": camera.aspect, "cx": cx, "cy": cy} | camera.lens.coefficients
     for name, value in numbers.items():
@@ -475,13 +501,20 @@ def test_what_is_fixed_stays_exactly(more: dict[str, Any], held: Mapping[str, fl
 def test_everything_may_be_fixed_but_the_poses() -> None:
     scene = SCENES["brown/two-cameras"]()
     truth = scene.cameras["west"]
-    numbers = {"phi": truth.phi, "cx": truth.principal_point[0], "cy": truth.principal_point[1], **truth.lens.coefficients}
+    numbers = {
+        "phi": truth.phi,
+        "cx": truth.principal_point[0],
+        "cy": truth.principal_point[1],
+        **truth.lens.coefficients,
+    }
     observations = observed("brown/two-cameras", Disturbance()).observations
     alone = replace(scene, cameras=dict.fromkeys(scene.cameras, truth))
     calibration = calibrate(simulate(alone).observations, Options(lens="brown", fixed=numbers))
     assert calibration.fit.unknowns == 6 * (2 + 4)
     for station, place in scene.stations.items():
-        assert error_of_pose(calibration.stations[station].cam_from_world, place.cam_from_world) < 1e-9  # FILL measured
+        assert (
+            error_of_pose(calibration.stations[station].cam_from_world, place.cam_from_world) < 1e-9
+        )  # 2e-15 measured
     assert len(observations.cameras) == 2
 
 
@@ -528,7 +561,10 @@ def fourth_board_with(*rows: int) -> Observations:
         (lambda: corners_at(lambda p: np.arange(len(p)) < 5), "10 measured numbers.*cannot determine 11 unknowns: add"),
         (lambda: corners_at(lambda p: p[:, 1] == 0.0), "station 'overhead'.*8 points.*one line.*add points or lines"),
         (lambda: lines_named("HalfwayLine"), "station 'overhead'.*29 curve observations.*cannot fix its pose"),
-        (lambda: lines_named("TopTouchLine", "CenterLine", "BottomTouchLine"), "station 'overhead'.*cannot fix its pose"),
+        (
+            lambda: lines_named("TopTouchLine", "CenterLine", "BottomTouchLine"),
+            "station 'overhead'.*cannot fix its pose",
+        ),
         (
             lambda: lines_named("HalfwayLine", "TopTouchLine", "CenterLine", "BottomTouchLine"),
             "station 'overhead'.*4 lines cannot fix the plane's pose",
@@ -565,7 +601,9 @@ def test_a_lens_that_folds_inside_the_image_is_no_solution() -> None:
     camera = Camera((1280, 960), 900.0, (640.0, 480.0), Radial((0.0, -6.5e-7)))
     stations = {"camera": Station("camera", Pose.identity())}
     scene = board_scene(checkerboard(9, 6, 0.05), {"camera": camera}, stations, 8, seed=3, distance_m=(0.8, 1.2))
-    with pytest.raises(SolutionError, match=r"camera 'camera'.*radial lens folds 7\d\d px.*corner at 801 px.*fewer") as caught:
+    with pytest.raises(
+        SolutionError, match=r"camera 'camera'.*radial lens folds 7\d\d px.*corner at 801 px.*fewer"
+    ) as caught:
         calibrate(simulate(scene, NOISE).observations)
     assert caught.value.exit_code == 3
 
@@ -606,7 +644,12 @@ def raising(error: BaseException) -> Callable[[], None]:
 
 @pytest.mark.parametrize("at", [0, 1, 4])
 @pytest.mark.parametrize(
-    "stop, kind", [(interrupted, KeyboardInterrupt), (raising(ValueError("enough")), ValueError), (raising(SystemExit(5)), SystemExit)]
+    "stop, kind",
+    [
+        (interrupted, KeyboardInterrupt),
+        (raising(ValueError("enough")), ValueError),
+        (raising(SystemExit(5)), SystemExit),
+    ],
 )
 def test_an_exception_in_progress_ends_the_solve(stop: Callable[[], None], kind: type[BaseException], at: int) -> None:
     """It comes out as it went in, nothing crashes, and the next calibration is not touched by it."""
@@ -631,6 +674,13 @@ def test_an_exception_in_progress_ends_the_solve(stop: Callable[[], None], kind:
 # ---- the sample data ------------------------------------------------------------------------------------------------
 
 
+def floor_error_m(camera: Camera, truth: Camera, height_m: float) -> float:
+    """How far apart the two put a pixel of the image onto the plane of that height, at the worst pixel."""
+    width, height = truth.image_size
+    pixels = np.stack(np.meshgrid(np.linspace(0, width - 1, 15), np.linspace(0, height - 1, 12)), -1).reshape(-1, 2)
+    return float(np.max(np.linalg.norm(camera.locate(pixels, height_m) - truth.locate(pixels, height_m), axis=1)))
+
+
 def test_the_papers_camera_comes_back_from_rings_and_field() -> None:
     """data/field_2004 in the paper's own scaling; the standard deviations are those of 30 seeds of the same scenes."""
     parts = [Observations.load(ROOT / f"data/field_2004/{name}.json") for name in ("rings", "field")]
@@ -643,8 +693,11 @@ def test_the_papers_camera_comes_back_from_rings_and_field() -> None:
     assert a3 == pytest.approx(0.00000401304361, abs=3 * 3.0e-9)  # 0.7
     assert a1 * lens.ideal_radius(450.0) == pytest.approx(655.7, abs=3 * 0.2)  # 655.38 px measured
     truth = scene.camera_at("overhead")
-    assert camera.phi == pytest.approx(truth.phi, rel=1.0)  # FILL measured
-    assert np.linalg.norm(camera.position - truth.position) < 1.0  # FILL m measured
+    # Tilted by 4 degrees, phi and height are known together only (4 % and 10 cm measured); the floor is known.
+    assert "frontal" in calibration.warnings[0]
+    ratio = camera.phi / camera.position[2] / (truth.phi / truth.position[2])
+    assert ratio == pytest.approx(1.0, abs=0.004)  # 0.0008 measured, 0.0013 at most in 8 seeds
+    assert floor_error_m(camera, truth, 0.0) < 0.004  # 0.8 mm measured, 1.7 mm at most in 8 seeds
 
 
 def test_the_sample_field_comes_back() -> None:
@@ -652,9 +705,7 @@ def test_the_sample_field_comes_back() -> None:
     scene, _ = built_in_scene("ssl-field")
     calibration = calibrate(Observations.load(ROOT / "data/ssl_field/observations.json"))
     camera, truth = calibration.station(), scene.camera_at("overhead")
-    assert camera.phi == pytest.approx(truth.phi, rel=1.0)  # FILL measured
-    assert np.linalg.norm(camera.position - truth.position) < 1.0  # FILL m measured
-    pixels = np.stack(np.meshgrid(np.linspace(0, 1279, 15), np.linspace(0, 959, 12)), -1).reshape(-1, 2)
+    assert camera.phi == pytest.approx(truth.phi, rel=0.005)  # 0.0011 measured
+    assert np.linalg.norm(camera.position - truth.position) < 0.01  # 2.5 mm measured
     for height_m in (0.0, 0.15):
-        off = np.linalg.norm(camera.locate(pixels, height_m) - truth.locate(pixels, height_m), axis=1)
-        assert np.max(off) < 1.0  # FILL m measured
+        assert floor_error_m(camera, truth, height_m) < 0.003  # 0.9 and 0.8 mm measured

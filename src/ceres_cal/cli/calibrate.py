@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from ceres_cal.bundle import Progress
     from ceres_cal.observations import Observations, Prior
     from ceres_cal.parameters import Options
+    from ceres_cal.structure import Tolerance
 
 _STATION_QUANTITIES = ("height_m", "position_m")
 _PRIOR_EXAMPLE = "overhead.height_m=4.02:0.01"
@@ -46,6 +47,14 @@ def _add_arguments(parser: ArgumentParser) -> None:
     )
     add("--free-aspect", action="store_true", help="let fy / fx differ from 1")
     add("--hold-principal-point", action="store_true", help="hold it at the image's centre")
+    add(
+        "--tolerance",
+        metavar="SPEC",
+        action="append",
+        default=[],
+        help="solve for a target as built: field.lines_m=0.01, field.points_m=0.005 or board.warp_m=0.002 "
+        "(a sigma in metres; repeatable)",
+    )
     add(
         "--prior",
         action="append",
@@ -173,6 +182,7 @@ def _options(
         free_aspect=args.free_aspect,
         fixed=fixed,
         priors=tuple(_prior(spec, observations, quantities) for spec in args.prior),
+        tolerances=_tolerances(args.tolerance),
         loss=args.loss,
         loss_scale=args.loss_scale,
         reject_sigma=args.reject_sigma,
@@ -181,6 +191,21 @@ def _options(
         max_iterations=args.max_iterations,
         threads=args.threads,
     )
+
+
+def _tolerances(specs: list[str]) -> dict[str, Tolerance]:
+    """The tolerances of `--tolerance` arguments: TARGET.lines_m|points_m|warp_m=SIGMA."""
+    from ceres_cal.structure import Tolerance
+
+    given: dict[str, dict[str, float]] = {}
+    for spec in specs:
+        left, equals, value = spec.rpartition("=")
+        target, dot, what = left.strip().rpartition(".")
+        names = tuple(Tolerance.__dataclass_fields__)
+        if not (equals and dot) or what not in names:
+            raise InputError(f"--tolerance {spec!r}: write TARGET.{'|'.join(names)}=SIGMA, such as field.lines_m=0.01")
+        given.setdefault(target, {})[what] = parse_number(value, f"--tolerance {spec!r}")
+    return {target: Tolerance(**sigmas) for target, sigmas in given.items()}
 
 
 def _prior(spec: str, observations: Observations, camera_quantities: tuple[str, ...]) -> Prior:

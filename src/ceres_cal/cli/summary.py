@@ -65,6 +65,8 @@ def calibration_text(
         sections.append(
             _section("station", [f"{name}{_of_camera(calibration, name)}", *_pose(camera, name in anchored)])
         )
+    if len(calibration.estimate.structure.names):
+        sections.append(_section("as built", _structure(calibration)))
     sections.append(_section("outliers", _outlier_lines(calibration)))
     sections.append(_section("stopped", _stop(calibration)))
     sections.extend(_section("warning", wrap(text, 100)) for text in _warnings(calibration, observations))
@@ -108,6 +110,14 @@ def _fit(calibration: Calibration) -> list[str]:
             noise = f"noise {scale:.3f} times the stated sigmas"
             lines.append(f"{kind}  rms {rms:.4f} px over {used}, {noise}")
     return lines
+
+
+def _structure(calibration: Calibration) -> list[str]:
+    structure = calibration.estimate.structure
+    order = np.argsort(-np.abs(structure.values))[:_MOST_FEATURES]
+    lines = [f"{1e3 * structure.values[i]:8.2f} mm  {structure.names[i]}" for i in order]
+    rest = len(structure.names) - len(lines)
+    return [*lines, f"and {plural(rest, 'smaller correction')}"] if rest else lines
 
 
 def _intrinsics(camera: Camera, options: Options, phi_from: str) -> list[str]:

@@ -1,0 +1,307 @@
+"""The solve alone: its optimum, what it leaves alone, how it is stopped, and that it knows when it is there."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scenes import SCENES
+from scipy.optimize import least_squares
+
+from ceres_cal.bundle import Progress, Weighting, solve
+from ceres_cal.errors import DegenerateError
+from ceres_cal.initialise import initialise
+from ceres_cal.observations import Observations, Prior
+from ceres_cal.parameters import (
+    Estimate,
+    Layout,
+    Options,
+    Station,
+    intrinsics_vector,
+    make_layout,
+    with_intrinsics,
+)
+from ceres_cal.residuals import residuals
+from ceres_cal.sights import gather_sights
+from ceres_cal.simulate import Disturbance, simulate
+from ceres_cal.transforms import Array, Pose, rotation_exp, rotation_log
+
+NOISE = Disturbance(points_sigma_px=0.3, curves_sigma_px=0.3, outliers=0.03, outlier_spread_px=5.0)
+LOSSES = ["trivial", "huber", "soft_l1", "cauchy", "tukey"]
+
+
+@cache
+def case(name: str) -> tuple[Observations, Options]:
+    """Noisy observations, some of them 5 px off, and the options that fit the scene's lens."""
+    scene = SCENES[name]()
+    lens = next(iter(scene.cameras.values())).lens
+    return simulate(scene, NOISE, 3).observations, Options(lens=lens.kind, powers=getattr(lens, "powers", (2, 3)))
+
+
+def start_of(name: str) -> Estimate:
+    """The true estimate with phi 0.1 % off, moved by 0.2 mm and 0.2 mrad: even a redescending loss finds the end."""
+    scene = SCENES[name]()
+    observations, options = case(name)
+    start = initialise(observations, gather_sights(observations), options).estimate
+    moved = Pose.exp([2e-4, -1e-4, 2e-4, 2e-4, 1e-4, -2e-4])
+    cameras = {key: replace(camera, phi=1.001 * camera.phi) for key, camera in scene.cameras.items()}
+    stations = {key: Station(place.camera, moved @ place.cam_from_world) for key, place in scene.stations.items()}
+    placements = {key: pose @ moved for key, pose in scene.placements.items()}
+    return replace(start, cameras=cameras, stations=stations, placements=placements)
+
+
+def solved(name: str, weighting: Weighting, start: Estimate | None = None, **more: Any) -> Any:
+    observations, options = case(name)
+    layout = make_layout(observations, replace(options, **more))
+    return solve(gather_sights(observations), start or start_of(name), layout, weighting, replace(options, **more))
+
+
+def distance(a: Estimate, b: Estimate) -> float:
+    """Largest difference: intrinsics in the solver's units, relative to phi; rotations in rad, translations in m."""
+    found = [0.0]
+    for name, camera in a.cameras.items():
+        difference = np.abs(intrinsics_vector(camera) - intrinsics_vector(b.cameras[name]))
+        difference[[0, 2, 3]] /= camera.phi
+        found.append(float(np.max(difference)))
+    pairs = [(a.stations[name].cam_from_world, b.stations[name].cam_from_world) for name in a.stations]
+    pairs += [(a.placements[name], b.placements[name]) for name in a.placements]
+    for one, other in pairs:
+        found.append(float(np.linalg.norm(rotation_log(one.rotation @ other.rotation.T))))
+        found.append(float(np.linalg.norm(one.translation - other.translation)))
+    return max(found)
+
+
+# ---- the optimum ----------------------------------------------------------------------------------------------------
+
+
+class Dense:
+    """The same robust problem for scipy: one row for each component, derivatives by differences, no elimination.
+
+    An observation of length s counts rho(s^2): its components are multiplied with the root of rho(s^2) / s^2.
+    """
+
+    def __init__(self, name: str, weighting: Weighting) -> None:
+        self.observations, self.options = case(name)
+        self.sights, self.start, self.weighting = gather_sights(self.observations), start_of(name), weighting
+        self.layout = make_layout(self.observations, self.options)
+        self.poses = [("stations", n) for n in self.start.stations if n in self.layout.stations]
+        self.poses += [("placements", n) for n in self.start.placements]
+
+    def estimate(self, unknowns: Array) -> Estimate:
+        """Unknowns: the free intrinsics of each camera, then a left perturbation of each free pose."""
+        cameras, at = {}, 0
+        for name, camera in self.start.cameras.items():
+            free, vector = self.layout.free[name], intrinsics_vector(camera)
+            vector[free] += unknowns[at : at + len(free)]
+            cameras[name], at = with_intrinsics(camera, vector), at + len(free)
+        stations, placements = dict(self.start.stations), dict(self.start.placements)
+        for number, (kind, name) in enumerate(self.poses):
+            change = unknowns[at + 6 * number : at + 6 * number + 6]
+            change_of_frame = Pose(rotation_exp(change[:3]), change[3:])
+            if kind == "stations":
+                stations[name] = replace(stations[name], cam_from_world=change_of_frame @ stations[name].cam_from_world)
+            else:
+                placements[name] = change_of_frame @ placements[name]
+        return replace(self.start, cameras=cameras, stations=stations, placements=placements)
+
+    def rows(self, unknowns: Array) -> Array:
+        found = residuals(self.observations, self.sights, self.estimate(unknowns))
+        points = found.points / (self.weighting.point_scale * self.observations.points.sigma_px[:, None])
+        curves = found.curves / (self.weighting.curve_scale * self.observations.curves.sigma_px)
+        points *= self._bend(np.sum(points**2, axis=1))[:, None]
+        return np.concatenate([points.ravel(), curves * self._bend(curves**2)])
+
+    def _bend(self, s: Array) -> Array:
+        b, s = self.weighting.loss_scale**2, np.maximum(s, 1e-12)
+        rho = {
+            "trivial": s,
+            "huber": np.where(s <= b, s, 2.0 * np.sqrt(b * s) - b),
+            "soft_l1": 2.0 * b * (np.sqrt(1.0 + s / b) - 1.0),
+            "cauchy": b * np.log1p(s / b),
+            "tukey": b / 3.0 * (1.0 - np.maximum(1.0 - s / b, 0.0) ** 3),
+        }[self.weighting.loss]
+        return np.sqrt(rho / s)
+
+    def solve(self) -> tuple[Estimate, float]:
+        count = sum(len(free) for free in self.layout.free.values()) + 6 * len(self.poses)
+        tight = {"xtol": 1e-15, "ftol": 1e-15, "gtol": 1e-15}
+        found = least_squares(self.rows, np.zeros(count), "3-point", method="trf", x_scale="jac", **tight)
+        return self.estimate(found.x), float(found.cost)
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+@pytest.mark.parametrize("name", ["radial-2-3/lines-arcs", "radial-3/corners"])
+def test_robust_optimum_is_scipys(name: str, loss: str) -> None:
+    weighting = Weighting(1.1, 0.9, loss, 2.5)
+    found = solved(name, weighting)
+    expected, cost = Dense(name, weighting).solve()
+    assert found.converged and not found.failed
+    # With a loss it is scipy that stops short, 1e-8 of the cost above ours at most.
+    assert found.cost < cost * (1.0 + 1e-12)
+    assert found.cost == pytest.approx(cost, rel=1e-7)  # 4e-15 (trivial), 1e-8 (tukey) measured
+    assert distance(found.estimate, expected) < (1e-7 if loss == "trivial" else 1e-4)  # 8e-9, 2e-5 measured
+
+
+@pytest.mark.parametrize("loss", ["trivial", "huber"])
+@pytest.mark.parametrize("name", ["brown/two-cameras", "kannala-brandt/rings-field"])
+def test_no_step_leads_further_down(name: str, loss: str) -> None:
+    """Placements seen twice, eliminated ones and rings: the gradient by differences of the plain problem vanishes."""
+    weighting = Weighting(1.1, 0.9, loss, 2.5)
+    dense = Dense(name, weighting)
+    dense.start = solved(name, weighting).estimate
+    count = sum(len(free) for free in dense.layout.free.values()) + 6 * len(dense.poses)
+    rows, jacobian = dense.rows(np.zeros(count)), np.empty((len(dense.rows(np.zeros(count))), count))
+    for k in range(count):
+        step = np.zeros(count)
+        step[k] = 1e-3 if k < count - 6 * len(dense.poses) and dense_is_px(dense, k) else 1e-6
+        jacobian[:, k] = (dense.rows(step) - dense.rows(-step)) / (2.0 * step[k])
+    size = np.linalg.norm(jacobian, axis=0) * np.linalg.norm(rows)
+    told = size > 1e-6 * np.max(size)  # the roll of the rings moves nothing
+    assert np.max(np.abs(jacobian.T @ rows)[told] / size[told]) < 1e-6  # 4e-8 measured
+
+
+def dense_is_px(dense: Dense, k: int) -> bool:
+    """Whether unknown k is phi or a principal point, in px."""
+    numbers = np.concatenate([dense.layout.free[name] for name in dense.start.cameras])
+    return int(numbers[k]) in (0, 2, 3)
+
+
+@pytest.mark.parametrize(
+    "name", ["brown/two-cameras", "radial-2-3/field-boards", "kannala-brandt/lines", "brown/boards"]
+)
+def test_its_own_answer_is_where_it_stays(name: str) -> None:
+    weighting = Weighting(loss="huber")
+    first = solved(name, weighting)
+    again = solved(name, weighting, first.estimate)
+    assert again.cost == pytest.approx(first.cost, rel=1e-12)
+    assert distance(again.estimate, first.estimate) < 1e-9  # 1e-11 measured
+
+
+def test_threads_do_not_change_the_answer() -> None:
+    one, two = (solved("brown/boards", Weighting(), threads=threads) for threads in (1, 2))
+    assert distance(one.estimate, two.estimate) == 0.0
+
+
+def test_history_falls_to_the_cost() -> None:
+    found = solved("radial-2-3/field-boards", Weighting(loss="trivial"))
+    assert found.history[0] > 1.05 * found.history[-1]
+    assert min(found.history) == pytest.approx(found.cost, rel=1e-12)
+
+
+def test_noise_scales_weigh_points_against_curves() -> None:
+    """Twice as sure of the curves: as if their sigmas were halved."""
+    observations, options = case("radial-2-3/field-boards")
+    sure = replace(observations, curves=replace(observations.curves, sigma_px=0.5 * observations.curves.sigma_px))
+    start, layout = start_of("radial-2-3/field-boards"), make_layout(observations, options)
+    by_scale = solve(gather_sights(observations), start, layout, Weighting(1.0, 0.5), options)
+    by_sigma = solve(gather_sights(sure), start, layout, Weighting(), options)
+    assert distance(by_scale.estimate, by_sigma.estimate) < 1e-12
+    assert distance(by_scale.estimate, solved("radial-2-3/field-boards", Weighting()).estimate) > 1e-5
+
+
+# ---- what it leaves alone -------------------------------------------------------------------------------------------
+
+
+def test_the_start_is_not_touched() -> None:
+    start, same = start_of("brown/two-cameras"), start_of("brown/two-cameras")
+    solved("brown/two-cameras", Weighting(), start)
+    assert distance(start, same) == 0.0
+
+
+@pytest.mark.parametrize("held", ["cameras", "stations", "placements", "one placement", "all"])
+def test_what_is_held_comes_back_as_it_was(held: str) -> None:
+    name = "brown/two-cameras"
+    observations, options = case(name)
+    whole, start = make_layout(observations, options), start_of(name)
+    none: NDArray[np.int64] = np.empty(0, dtype=np.int64)
+    layout = Layout(
+        dict.fromkeys(whole.free, none) if held in ("cameras", "all") else whole.free,
+        frozenset() if held in ("stations", "all") else whole.stations,
+        {"placements": frozenset(), "all": frozenset(), "one placement": whole.placements - {"board_02"}}.get(
+            held, whole.placements
+        ),
+    )
+    found = solve(gather_sights(observations), start, layout, Weighting(), options).estimate
+    for camera in start.cameras:
+        assert (found.cameras[camera] == start.cameras[camera]) == (held in ("cameras", "all"))
+    for station in start.stations:
+        assert (found.stations[station] == start.stations[station]) == (held in ("stations", "all"))
+    for placement, pose in start.placements.items():
+        stays = held in ("placements", "all") or (held == "one placement" and placement == "board_02")
+        assert (found.placements[placement] == pose) == stays
+
+
+def test_priors_on_what_is_held_are_no_contradiction() -> None:
+    """A fixed number under a prior: nothing to pull; the other half of a prior on the principal point still does."""
+    name = "radial-2-3/corners"
+    observations, options = case(name)
+    options = replace(options, fixed={"cx": 651.3})
+    prior = Prior("camera", "overhead", "principal_point", (600.0, 470.0), (0.1, 0.001))
+    layout = make_layout(observations, replace(options, priors=(prior,)))
+    start = start_of(name)
+    camera = solve(gather_sights(observations), start, layout, Weighting(), options).estimate.cameras["overhead"]
+    assert camera.principal_point[0] == 651.3
+    assert camera.principal_point[1] == pytest.approx(470.0, abs=0.001)
+
+
+def test_fewer_numbers_than_unknowns() -> None:
+    observations, options = case("radial-2-3/corners")
+    sights = gather_sights(replace(observations, points=replace_rows(observations, 5)))
+    with pytest.raises(DegenerateError, match=r"10 measured numbers .* cannot determine 11 unknowns: add observations"):
+        solve(sights, start_of("radial-2-3/corners"), make_layout(observations, options), Weighting(), options)
+
+
+def replace_rows(observations: Observations, count: int) -> Any:
+    points = observations.points
+    return type(points)(**{name: column[:count] for name, column in vars(points).items()})
+
+
+# ---- how it ends ----------------------------------------------------------------------------------------------------
+
+
+def test_iterations_may_run_out() -> None:
+    found = solved("radial-2-3/field-boards", Weighting(), max_iterations=1)
+    assert not found.converged and not found.failed
+    assert len(found.history) == 2
+    assert "iterations" in found.termination
+
+
+class EnoughError(Exception):
+    pass
+
+
+@pytest.mark.parametrize("name", ["brown/boards", "brown/two-cameras", "radial-2-3/lines"])
+def test_a_failure_in_progress_comes_out_and_nothing_is_left_behind(name: str) -> None:
+    observations, options = case(name)
+    start, before = start_of(name), start_of(name)
+    sights, layout = gather_sights(observations), make_layout(observations, options)
+    calls: list[Progress] = []
+
+    def progress(now: Progress) -> None:
+        calls.append(now)
+        if now.iteration == 1:
+            raise EnoughError
+
+    for _ in range(20):  # a crash of the process would need more than one try to be seen
+        calls.clear()
+        with pytest.raises(EnoughError):
+            solve(sights, start, layout, Weighting(), options, progress)
+        assert [now.iteration for now in calls] == [0, 1]
+    assert distance(start, before) == 0.0
+    assert solve(sights, start, layout, Weighting(), options).converged
+
+
+def test_a_start_that_shows_nothing_fails_without_a_crash() -> None:
+    """The camera looks the other way: no residual can be evaluated."""
+    name = "radial-2-3/corners"
+    observations, options = case(name)
+    start = start_of(name)
+    away = Pose.exp([0.0, np.pi, 0.0, 0.0, 0.0, 0.0])
+    stations = {key: Station(place.camera, away @ place.cam_from_world) for key, place in start.stations.items()}
+    lost = replace(start, stations=stations)
+    found = solve(gather_sights(observations), lost, make_layout(observations, options), Weighting(), options)
+    assert found.failed and not found.converged
