@@ -34,6 +34,7 @@ FLOORS = {
     "simulate": 2,
     "detect": 2,
     "bundle": 3,
+    "lost": 4,
     "mirrored": 4,
     "uncertainty": 4,
     "diagnostics": 4,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from ceres_cal.camera import Camera
 from ceres_cal.diagnostics import Inliers, judge, start_weights
 from ceres_cal.errors import SolutionError
 from ceres_cal.initialise import initialise
+from ceres_cal.lost import with_lost_boards_found
 from ceres_cal.mirrored import without_mirrored_poses
 from ceres_cal.observations import Observations
 from ceres_cal.parameters import Estimate, Layout, Options, make_layout
@@ -22,6 +23,7 @@ from ceres_cal.sights import Sights, gather_sights
 from ceres_cal.transforms import Array
 
 _MOST_ROUNDS = 15
+_NO_FIT = 0.015  # of the image diagonal: a median residual beyond it is no calibration
 _GUESSED = (
     "camera {!r}: the views are too frontal to tell phi and distance apart, so phi started from a guess and may be "
     "unknown still: add boards tilted by 20 degrees, or a prior on height_m where the camera sees the field"
@@ -47,11 +49,12 @@ def calibrate(
     sights = gather_sights(observations)
     layout = make_layout(observations, options)
     start = initialise(observations, sights, options)
+    warnings: tuple[str, ...] = ()
     if options.closed_form_only:
         settled = _unsolved(observations, sights, four_point_baseline(sights, start.estimate))
     else:
         settled = _settle(observations, sights, start.estimate, layout, options, progress)
-    warnings = _require_usable(settled, sights)
+        warnings = _require_usable(settled, sights)
     return Calibration(
         settled.solution.estimate,
         observations.targets,
@@ -118,14 +121,26 @@ def _settle(
     rounds = 1
     while rounds < _MOST_ROUNDS:
         weighting = Weighting(inliers.point_scale, inliers.curve_scale, options.loss, options.loss_scale)
-        used = sights.used(inliers.points, inliers.curves)
-        estimate, mended = without_mirrored_poses(used, solution.estimate, layout, weighting)
-        if rounds > 1 and not mended and inliers.same_as(before):
+        estimate, changed = _mended(sights, inliers, solution.estimate, layout, weighting)
+        if changed:
+            found, inliers = judged(estimate, found.places)
+        elif rounds > 1 and inliers.same_as(before):
             break
+        used = sights.used(inliers.points, inliers.curves)
         solution = solve(used, estimate, layout, weighting, options, progress, found.places)
         before, (found, inliers) = inliers, judged(solution.estimate, found.places)
         rounds += 1
     return _Settled(solution, inliers, found, rounds)
+
+
+def _mended(
+    sights: Sights, inliers: Inliers, estimate: Estimate, layout: Layout, weighting: Weighting
+) -> tuple[Estimate, int]:
+    """The estimate with lost boards posed again and mirrored poses turned over, and how many there were of both."""
+    estimate, lost = with_lost_boards_found(sights, inliers, estimate, layout, replace(weighting, loss="cauchy"))
+    used = sights.used(inliers.points, inliers.curves)
+    estimate, turned = without_mirrored_poses(used, estimate, layout, weighting)
+    return estimate, lost + turned
 
 
 def _require_usable(settled: _Settled, sights: Sights) -> tuple[str, ...]:
@@ -134,6 +149,7 @@ def _require_usable(settled: _Settled, sights: Sights) -> tuple[str, ...]:
         raise SolutionError(f"the solve failed ({settled.solution.termination}): check labels and target dimensions")
     warnings = []
     for name, camera in settled.solution.estimate.cameras.items():
+        _require_fit(name, camera, settled, sights)
         if not camera.folds:
             continue
         fold, corner = camera.lens.monotone_radius(camera.phi), camera.corner_radius
@@ -152,14 +168,25 @@ def _require_usable(settled: _Settled, sights: Sights) -> tuple[str, ...]:
     return (*warnings, *_lost(settled.inliers, sights))
 
 
+def _require_fit(name: str, camera: Camera, settled: _Settled, sights: Sights) -> None:
+    """Raise SolutionError where half of a camera's observations are missed by more than any lens could explain."""
+    own = sights.take(np.array([i for i, key in enumerate(sights.keys) if key.camera == name], dtype=np.int64))
+    points = np.linalg.norm(settled.residuals.points[own.point_rows], axis=1)
+    missed = np.nan_to_num(np.concatenate([points, np.abs(settled.residuals.curves[own.curve_rows])]), nan=np.inf)
+    limit_px = _NO_FIT * float(np.hypot(*camera.image_size))
+    if np.median(missed) > limit_px:
+        raise SolutionError(
+            f"camera {name!r}: the best solution misses half of its observations by more than {limit_px:.0f} px: "
+            "check labels, target dimensions and which lens it is"
+        )
+
+
 def _lost(inliers: Inliers, sights: Sights) -> Iterator[str]:
     """Sights most of whose observations were taken out: they were not understood, whatever the rest says."""
-    for number, key in enumerate(sights.keys):
-        sight = sights[number]
-        used = np.count_nonzero(inliers.points[sight.point_rows]) + np.count_nonzero(inliers.curves[sight.curve_rows])
-        total = len(sight.point_rows) + len(sight.curve_rows)
-        if 2 * used < total:
-            yield f"{key}: {total - used} of its {total} observations were taken out: check labels, do not use its pose"
+    shares = sights.used_share(inliers.points, inliers.curves)
+    for number in np.flatnonzero(shares < 0.5):
+        out = f"{100.0 * (1.0 - shares[number]):.0f} % of its observations were taken out"
+        yield f"{sights.keys[number]}: {out}: check its labels, do not use its pose"
 
 
 def _reach_px(name: str, camera: Camera, sights: Sights) -> float:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
-from functools import cached_property
+from functools import cache, cached_property
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -64,6 +64,18 @@ class Fit:
         return float((total / max(self.points + self.curves, 1)) ** 0.5)
 
 
+@cache
+def package_versions() -> dict[str, str]:
+    """Versions of what the numbers depend on."""
+    found = {}
+    for name in ("ceres-cal", "pyceres", "numpy", "numba"):
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "not installed"
+    return found
+
+
 @dataclass(frozen=True, eq=False)
 class Calibration:
     """Calibrated cameras and where they stood.
@@ -90,7 +102,7 @@ class Calibration:
     warnings: tuple[str, ...]
     options: Options
     digest: str
-    versions: Mapping[str, str] = field(default_factory=lambda: package_versions())
+    versions: Mapping[str, str] = field(default_factory=package_versions)
 
     @property
     def cameras(self) -> Mapping[str, Camera]:
@@ -140,17 +152,6 @@ class Calibration:
             return _from_file(data)
         except InputError as error:
             raise InputError(f"{path}: {error}") from None
-
-
-def package_versions() -> dict[str, str]:
-    """Versions of what the numbers depend on."""
-    found = {}
-    for name in ("ceres-cal", "pyceres", "numpy", "numba"):
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            found[name] = "not installed"
-    return found
 
 
 class _LensFile(msgspec.Struct, forbid_unknown_fields=True):

@@ -50,9 +50,11 @@ def _better_poses(
     return placed(estimate, [few.keys[i] for i in better], found[better]) if len(better) else {}, len(better)
 
 
-def _centres(sights: Sights) -> Array:
-    sizes = np.diff(sights.point_bounds)[:, None]
-    return np.asarray(np.add.reduceat(sights.points, sights.point_bounds[:-1]) / np.maximum(sizes, 1))
+def _boxes(sights: Sights) -> tuple[Array, Array]:
+    """Middle (S, 3) and half diagonal (S,) of the box around each sight's points; every sight has some."""
+    starts = sights.point_bounds[:-1]
+    low, high = np.minimum.reduceat(sights.points, starts), np.maximum.reduceat(sights.points, starts)
+    return 0.5 * (low + high), 0.5 * np.linalg.norm(high - low, axis=1)
 
 
 def _doubtful(sights: Sights, poses: Array, estimate: Estimate, weighting: Weighting) -> Rows:
@@ -60,28 +62,25 @@ def _doubtful(sights: Sights, poses: Array, estimate: Estimate, weighting: Weigh
     cos(tilt), against the noise.
     """
     seen = np.flatnonzero(np.diff(sights.point_bounds) >= 4)
-    if len(seen) < len(sights):
-        inner = _doubtful(sights.take(seen), poses[seen], estimate, weighting) if len(seen) else seen
-        return seen[inner]
-    centres = _centres(sights)
-    bounds = sights.point_bounds
-    away = sights.points - np.repeat(centres, np.diff(bounds), axis=0)
-    reach = np.sqrt(np.maximum.reduceat(np.sum(away**2, axis=1), bounds[:-1]))
-    middle = np.einsum("sij,sj->si", poses[:, :, :3], centres) + poses[:, :, 3]
+    if not len(seen):
+        return seen
+    few, pose = sights.take(seen), poses[seen]
+    centres, reach = _boxes(few)
+    middle = np.einsum("sij,sj->si", pose[:, :, :3], centres) + pose[:, :, 3]
     distance = np.linalg.norm(middle, axis=1)
-    cosine = np.abs(np.sum(poses[:, :, 2] * middle, axis=1)) / distance
+    cosine = np.abs(np.sum(pose[:, :, 2] * middle, axis=1)) / distance
     sine = np.sqrt(np.maximum(1.0 - cosine**2, 0.0))
     phi = estimate.cameras[sights.keys[0].camera].phi
     bend_px = phi * (reach / distance) ** 2 * sine * cosine
-    sigma_px = weighting.point_scale * np.minimum.reduceat(sights.sigma_px, bounds[:-1])
-    return np.flatnonzero(bend_px < _DECIDED_SIGMA * sigma_px)
+    sigma_px = weighting.point_scale * np.minimum.reduceat(few.sigma_px, few.point_bounds[:-1])
+    return np.asarray(seen[bend_px < _DECIDED_SIGMA * sigma_px])
 
 
 def mirrored(sights: Sights, poses: Array) -> Array:
     """cam_from_target (S, 3, 4) with the depth of each target's points reversed about its middle, along the line of
     sight: R' = (1 - 2 d d^T) R diag(1, 1, -1), a rotation again.
     """
-    centres = _centres(sights)
+    centres, _ = _boxes(sights)
     middle = np.einsum("sij,sj->si", poses[:, :, :3], centres) + poses[:, :, 3]
     d = middle / np.linalg.norm(middle, axis=1, keepdims=True)
     reflect = np.eye(3) - 2.0 * d[:, :, None] * d[:, None, :]

@@ -33,6 +33,7 @@ _ENOUGH_POINTS = 40.0  # of a board
 _GOLDEN = 0.6180339887498949
 _ROUGH_PX = 1.0  # a median beyond it may be no fit at all, however even
 _SUSPICIOUS = 8.0  # medians: no clean residual is that long
+_NO_FIT = 0.01  # typical distance in a plane scaled to unit size; the fits are 20 times better
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +117,8 @@ def profile_and_homographies(sights: Sights, camera: Camera, unit: float) -> tup
             ring, found[i] = _from_rings(sights[i], camera, unit)
             profile = profile or ring
     mixed = [i for i, plane in planes.items() if plane.equations >= 8]
-    if profile is None:
+    # Boards in a corner of the image may say nothing of the rest of it.
+    if profile is None or any(_solve_plane(planes[i], profile, rounds=2)[1] > _NO_FIT for i in mixed):
         profile = _profile_from_lines([planes[i] for i in mixed], unit)
     found |= {i: _homography_of(planes[i], profile) for i in mixed}
     parts = [Homographies(np.array([i]), h[None], *_extent(planes[i])) for i, h in found.items()]
@@ -304,13 +306,18 @@ def _without_wrong_labels(board: Sights, camera: Camera, alignment: RadialAlignm
     for number in np.flatnonzero((far > 0.1 * sizes) & (sizes >= 8)):
         sight = board[int(number)]
         lifted = alignment.profile.lift(camera.offsets(sight.pixels))
-        found = _consensus(sight.points[:, :2], lifted, limit)
+        found = consensus_homography(sight.points[:, :2], lifted, limit)
         if found is not None:
             homographies[number] = found
     return homographies
 
 
-def _consensus(plane: Array, lifted: Array, limit_px: float) -> Array | None:
+def consensus_homography(plane: Array, lifted: Array, limit_px: float) -> Array | None:
+    """The homography that most points agree on within `limit_px`, by LO-RANSAC (pycolmap), or None.
+
+    Args:
+        plane: (N, 2) m. lifted: (N, 3) homogeneous undistorted offsets, px.
+    """
     import pycolmap
 
     options = pycolmap.RANSACOptions()

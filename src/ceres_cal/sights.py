@@ -100,8 +100,16 @@ class Sights(Sequence["Sights"]):
 
     def take(self, numbers: Rows) -> Sights:
         """The sights with these numbers, in this order."""
+        if len(numbers) == len(self) and np.array_equal(numbers, np.arange(len(self))):
+            return self
         p, c = _ranges(self.point_bounds, numbers), _ranges(self.curve_bounds, numbers)
         return self._rows(numbers, p, c, np.diff(self.point_bounds)[numbers], np.diff(self.curve_bounds)[numbers])
+
+    def used_share(self, points: Mask, curves: Mask) -> Array:
+        """(S,) the share of each sight's observations that is used."""
+        p = np.concatenate([[0], np.cumsum(points[self.point_rows])])[self.point_bounds]
+        c = np.concatenate([[0], np.cumsum(curves[self.curve_rows])])[self.curve_bounds]
+        return np.asarray((np.diff(p) + np.diff(c)) / (np.diff(self.point_bounds) + np.diff(self.curve_bounds)))
 
     def part(self, number: int, count: int) -> Sights:
         """The number-th of `count` about equal parts of the observations of a single sight."""

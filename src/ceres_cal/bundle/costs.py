@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,8 @@ from ceres_cal.structure import Structure
 from ceres_cal.transforms import Array, left_jacobian, rotation_exp, skew
 
 ROWS_WORTH_A_THREAD = 20_000
-_ROUGH = 1e-6
+ROUGH = 1e-6
+"""A solve of less precision only prepares another one."""
 _NOTHING = np.empty(0)
 
 
@@ -131,6 +132,22 @@ def _track_slots(structure: Structure) -> tuple[NDArray[np.int32]]:
     return (structure.track_slots if len(structure.values) else structure.track_slots[:0],)
 
 
+@dataclass(frozen=True, eq=False)
+class _Evaluation:
+    """An EliminatedCost in one place: its numbers `at`, what Ceres is told, and the placements there.
+
+    Attributes:
+        poses: (S, 3, 4) cam_from_target at their best. gains: (S, 6, len(at)) how they follow. costs: (S,).
+    """
+
+    at: Array
+    residuals: Array
+    jacobian: Array
+    poses: Array
+    gains: Array
+    costs: Array
+
+
 class EliminatedCost(pyceres.CostFunction):
     """All sights of one camera whose placements no other station sees, over its free intrinsics and the structure."""
 
@@ -158,16 +175,17 @@ class EliminatedCost(pyceres.CostFunction):
         )  # fmt: skip
         self._loss = (kernels.LOSS_CODES[weighting.loss], weighting.loss_scale)
         self._precision = weighting.precision
-        self._poses = estimate.pose_stack(sights.keys)
         sizes = (len(self._free), len(estimate.structure.values))
         self._size = sum(sizes)
-        self._gains = np.zeros((len(sights), 6, self._size))
-        self._costs = np.zeros(len(sights))
-        self._at = np.concatenate([self._optics[1][self._free], estimate.structure.values])
-        self._known: tuple[Array, Array, Array] | None = None
+        start = np.concatenate([self._optics[1][self._free], estimate.structure.values])
+        poses, gains = estimate.pose_stack(sights.keys), np.zeros((len(sights), 6, self._size))
+        # Every step starts from the poses of the last accepted one: a rejected step may have led them astray.
+        self._accepted = _Evaluation(start, _NOTHING, _NOTHING, poses, gains, np.zeros(len(sights)))
+        self._known: _Evaluation | None = None
         work = len(sights.points) + len(sights.curve_pixels)
         parts = max(1, min(threads, work // ROWS_WORTH_A_THREAD))
         self._parts = np.linspace(0, len(sights), parts + 1).astype(int).tolist()
+        self._pool = ThreadPoolExecutor(max(1, parts - 1))
         self.slots = [slot for slot, size in zip((0, 3), sizes, strict=True) if size]
         self.set_num_residuals(self._size + 1)
         self.set_parameter_block_sizes([size for size in sizes if size])
@@ -176,73 +194,67 @@ class EliminatedCost(pyceres.CostFunction):
         try:
             at = np.concatenate(parameters)
             # Ceres asks for the cost of a step first, then for the Jacobian in the same place: once is enough.
-            if self._known is None or not np.array_equal(self._known[0], at):
+            if self._known is None or not np.array_equal(self._known.at, at):
                 self._known = self._evaluated(at, max(1e-4, 10.0 * self._precision))
         except BaseException as error:  # an exception must not travel through C++: the solve ends, then it is raised
             self._run.failure = self._run.failure or error
             return False
         if self._known is None:
             return False
-        residuals[:] = self._known[1]
+        residuals[:] = self._known.residuals
         first = 0
         for jacobian in jacobians or ():
             size = len(jacobian) // (self._size + 1)
-            jacobian[:] = self._known[2][:, first : first + size].reshape(-1)
+            jacobian[:] = self._known.jacobian[:, first : first + size].reshape(-1)
             first += size
+        if jacobians is not None:  # asked for where a step was accepted, and nowhere else
+            self._accepted = self._known
         return True
 
-    def _evaluated(self, at: Array, tolerance: float) -> tuple[Array, Array, Array] | None:
-        """(place, residuals, Jacobian), or None where an observation cannot be projected from there."""
+    def _evaluated(self, at: Array, tolerance: float) -> _Evaluation | None:
+        """The cost in a place, or None where an observation cannot be projected from there."""
         count = len(self._free)
-        before = self._poses.copy()
         code, intrinsics, powers, unit = self._optics
         intrinsics = intrinsics.copy()
         intrinsics[self._free] = at[:count]
         built = self._structure.with_values(at[count:])
         points, tracks = built.points(self._sights), built.tracks(self._sights)
+        poses, gains, costs = self._accepted.poses.copy(), self._accepted.gains.copy(), np.empty(len(self._sights))
 
         def part(first: int, last: int) -> tuple[float, Array]:
             reduced = np.zeros((self._size + 1, self._size + 1))
             cost = kernels.eliminate_placements(
                 first, last, code, intrinsics, self._free, powers, unit, *self._observations, *self._loss, points,
-                tracks, self._size - count, tolerance, at - self._at, self._poses, self._gains, self._costs, reduced,
+                tracks, self._size - count, tolerance, at - self._accepted.at, poses, gains, costs, reduced,
             )  # fmt: skip
             return cost, reduced
 
-        if len(self._parts) == 2:
-            results = [part(*self._parts)]
-        else:
-            with ThreadPoolExecutor(len(self._parts) - 1) as pool:
-                results = list(pool.map(part, self._parts[:-1], self._parts[1:]))
+        others = [self._pool.submit(part, *self._parts[i : i + 2]) for i in range(1, len(self._parts) - 1)]
+        results = [part(*self._parts[:2]), *(other.result() for other in others)]
         cost = sum(result[0] for result in results)
         if not np.isfinite(cost):
-            self._poses[:] = before
-            self._gains[:] = 0.0
-            self._at = at
             return None
-        self._at = at
         upper = np.empty((self._size + 1, self._size + 1))
         kernels.cholesky(sum(result[1] for result in results), upper)
         residuals = upper[:, -1].copy()
         residuals[-1] = np.sqrt(max(cost - float(residuals[:-1] @ residuals[:-1]), 0.0))
         upper[-1] = 0.0
-        return at, residuals, upper[:, :-1]
+        return _Evaluation(at, residuals, upper[:, :-1], poses, gains, costs)
 
     def from_poses(self, poses: Array) -> tuple[Array, Array]:
         """Costs (S,) and poses (S, 3, 4) that the search for each placement ends with when it starts from `poses`,
         everything else held; infinite costs where a start cannot be seen.
         """
-        self._poses[:] = poses
-        self._gains[:] = 0.0
-        answered = self._evaluated(self._at.copy(), 1e-6) is not None
-        return (self._costs if answered else np.full(len(poses), np.inf)), self._poses
+        self._accepted = replace(self._accepted, poses=poses, gains=np.zeros_like(self._accepted.gains))
+        found = self._evaluated(self._accepted.at, 1e-6)
+        return (np.full(len(poses), np.inf), poses) if found is None else (found.costs, found.poses)
 
     def settled(self, parameters: Sequence[Array]) -> tuple[tuple[SightKey, ...], Array]:
         """The sights' keys and their cam_from_target, (S, 3, 4), at their best for these numbers."""
         at = np.concatenate([_NOTHING, *parameters])
-        if self._precision < _ROUGH or not np.array_equal(self._at, at):  # after a rough solve they are good enough
-            self._evaluated(at, self._precision)
-        return self._sights.keys, self._poses
+        if self._precision < ROUGH or not np.array_equal(self._accepted.at, at):  # else they are good enough
+            self._accepted = self._evaluated(at, self._precision) or self._accepted
+        return self._sights.keys, self._accepted.poses
 
 
 class LinearPriorCost(pyceres.CostFunction):

@@ -13,6 +13,7 @@ import pyceres
 from numpy.typing import NDArray
 
 from ceres_cal.bundle.costs import (
+    ROUGH,
     ROWS_WORTH_A_THREAD,
     EliminatedCost,
     LinearPriorCost,
@@ -327,6 +328,9 @@ def _solver_options(
     solver.linear_solver_type = pyceres.LinearSolverType.DENSE_SCHUR if few else pyceres.LinearSolverType.SPARSE_SCHUR
     solver.max_num_iterations = options.max_iterations
     solver.function_tolerance = weighting.precision
+    # Near the end of a convex problem plain Gauss-Newton is right, and phi against height creeps without it.
+    if weighting.precision < ROUGH and weighting.loss in ("trivial", "huber", "soft_l1"):
+        solver.initial_trust_region_radius = 1e8
     solver.parameter_tolerance = 1e-12
     solver.gradient_tolerance = 1e-14
     # Short kernels are over before Python's lock is had; only parts of very large sights are worth a thread each.

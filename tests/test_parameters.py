@@ -1,0 +1,218 @@
+"""Options, and the layout of the solver's numbers: what is free, shared, held or anchored."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import scenes
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ceres_cal.camera import Camera
+from ceres_cal.errors import InputError
+from ceres_cal.lens import Brown, KannalaBrandt, Radial, make_lens
+from ceres_cal.observations import Curves, Observations, Points, Prior, View
+from ceres_cal.parameters import (
+    LOSSES,
+    Estimate,
+    Layout,
+    Options,
+    Station,
+    anchored_stations,
+    intrinsic_names,
+    intrinsics_scales,
+    intrinsics_vector,
+    make_layout,
+    unit_px,
+    with_intrinsics,
+)
+from ceres_cal.sights import SightKey
+from ceres_cal.structure import make_structure
+from ceres_cal.targets import checkerboard
+from ceres_cal.transforms import Pose
+
+BOARD = checkerboard(3, 2, 0.1)
+
+each_lens = pytest.mark.parametrize("lens", scenes.LENSES)
+
+
+def watched(*views: tuple[str, str | None], cameras: dict[str, str] | None = None) -> Observations:
+    """One point in each view of (station, placement); every station has a camera of its own name unless told."""
+    owner = cameras or {}
+    entries = tuple(
+        View(str(number), owner.get(station, station), station, "board", placement)
+        for number, (station, placement) in enumerate(views)
+    )
+    count = len(entries)
+    return Observations(
+        {"board": BOARD},
+        {entry.camera: (640, 480) for entry in entries},
+        entries,
+        Points(np.arange(count, dtype=np.int32), np.zeros(count, np.int32), np.full((count, 2), 100.0), np.ones(count)),
+        Curves(np.empty(0), np.empty(0), np.empty((0, 2)), np.empty(0), np.empty(0)),  # type: ignore[arg-type]
+    )
+
+
+# ---- options --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "given, message",
+    [
+        ({"lens": "fisheye"}, "unknown lens 'fisheye': choose one of radial, brown, kannala-brandt"),
+        ({"loss": "l2"}, "unknown loss 'l2': choose one of trivial, huber, soft_l1, cauchy, tukey"),
+        ({"noise_scale": "guess"}, "noise_scale must be 'estimate' or 'stated', not 'guess'"),
+        ({"fixed": {"k3": 0.0}}, "cannot fix 'k3': the radial lens has phi, aspect, cx, cy, a2, a3"),
+        ({"lens": "brown", "fixed": {"a2": 0.0}}, "cannot fix 'a2': the brown lens has .*k1, k2, p1, p2, k3"),
+        ({"fixed": {"phi": np.nan}}, "cannot fix phi at nan: give a finite number"),
+        ({"fixed": {"cx": np.inf}}, "cannot fix cx at inf"),
+        ({"loss_scale": 0.0}, "loss_scale must be above 0, not 0.0"),
+        ({"loss_scale": np.nan}, "loss_scale must be above 0, not nan"),
+        ({"reject_sigma": -1.0}, "reject_sigma must be above 0"),
+        ({"max_iterations": 0}, "max_iterations must be above 0"),
+        ({"threads": -1}, "threads must be 0 .* or above, not -1"),
+        ({"powers": (1,)}, "powers of the radial lens"),
+        ({"powers": (2, 2)}, "powers of the radial lens"),
+        ({"powers": ()}, "powers of the radial lens"),
+    ],
+)
+def test_options_that_make_no_sense(given: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message) as caught:
+        Options(**given)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+def test_every_loss_is_an_option(loss: str) -> None:
+    assert Options(loss=loss).loss == loss
+
+
+def test_blank_lens_holds_the_fixed_coefficients() -> None:
+    assert Options().blank_lens == Radial((0.0, 0.0))
+    assert Options(powers=(3, 5), fixed={"a5": 1e-13, "phi": 800.0}).blank_lens == Radial((0.0, 1e-13), (3, 5))
+    assert Options(lens="brown", fixed={"k3": -0.01}).blank_lens == Brown((0.0, 0.0, 0.0, 0.0, -0.01))
+    assert Options(lens="kannala-brandt").blank_lens == KannalaBrandt((0.0,) * 4)
+
+
+# ---- the vector of a camera -----------------------------------------------------------------------------------------
+
+
+@each_lens
+def test_vector_and_camera_are_one(lens: str) -> None:
+    camera = replace(scenes.camera(lens), aspect=1.02)
+    vector = intrinsics_vector(camera)
+    assert len(vector) == len(intrinsic_names(camera.lens)) == len(intrinsics_scales(camera))
+    back = with_intrinsics(camera, vector)
+    assert intrinsics_vector(back) == pytest.approx(vector, rel=1e-15)
+    assert back.lens.values == pytest.approx(camera.lens.values, rel=1e-15)
+    assert (back.phi, back.aspect, back.principal_point) == (camera.phi, camera.aspect, camera.principal_point)
+    assert vector[4:] / intrinsics_scales(camera)[4:] == pytest.approx(camera.lens.values, rel=1e-15)
+
+
+@each_lens
+def test_scaled_coefficients_are_of_order_one(lens: str) -> None:
+    """The paper's coefficients in px are 1e-4 to 1e-13; the solver's are not."""
+    assert 1e-4 < np.max(np.abs(intrinsics_vector(scenes.camera(lens))[4:])) < 10.0
+
+
+@given(st.integers(1, 8000), st.integers(1, 8000))
+def test_unit_is_half_the_diagonal(width: int, height: int) -> None:
+    camera = Camera((width, height), 500.0, (0.0, 0.0), make_lens("radial"))
+    assert unit_px(camera) == pytest.approx(np.hypot(width, height) / 2.0)
+
+
+def test_radial_coefficients_scale_with_their_power() -> None:
+    """a_k r^k over r, at r = half the diagonal: what the lens does at the corner."""
+    camera = Camera((600, 800), 700.0, (300.0, 400.0), Radial((1e-4, 2e-7), (2, 3)))
+    assert intrinsics_vector(camera)[4:] == pytest.approx([1e-4 * 500.0, 2e-7 * 500.0**2], rel=1e-15)
+
+
+# ---- layout ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "options, free",
+    [
+        (Options(), ["phi", "cx", "cy", "a2", "a3"]),
+        (Options(free_aspect=True), ["phi", "aspect", "cx", "cy", "a2", "a3"]),
+        (Options(free_principal_point=False), ["phi", "a2", "a3"]),
+        (Options(fixed={"phi": 800.0, "cy": 200.0}), ["cx", "a2", "a3"]),
+        (Options(free_aspect=True, fixed={"aspect": 1.0}), ["phi", "cx", "cy", "a2", "a3"]),
+        (Options(lens="brown", fixed={"p1": 0.0, "p2": 0.0}), ["phi", "cx", "cy", "k1", "k2", "k3"]),
+        (Options(powers=(3,)), ["phi", "cx", "cy", "a3"]),
+    ],
+)
+def test_free_numbers(options: Options, free: list[str]) -> None:
+    layout = make_layout(watched(("a", None), ("b", None)), options)
+    names = intrinsic_names(options.blank_lens)
+    for camera in ("a", "b"):
+        assert [names[i] for i in layout.free[camera]] == free
+    assert layout.size == 2 * len(free) + 2 * 6
+
+
+def test_layout_counts_every_pose_once() -> None:
+    """A camera of two stations, a board at two placements, one of them seen twice."""
+    seen = watched(("a1", None), ("a2", None), ("a1", "p"), ("a2", "p"), ("a1", "q"), cameras={"a1": "a", "a2": "a"})
+    layout = make_layout(seen, Options())
+    assert layout == Layout(layout.free, frozenset({"a1", "a2"}), frozenset({"p", "q"}))
+    assert layout.size == 5 + 2 * 6 + 2 * 6
+
+
+def test_priors_of_file_and_options_come_together() -> None:
+    one, two = Prior("camera", "a", "phi", (800.0,), (5.0,)), Prior("station", "a", "height_m", (4.0,), (0.01,))
+    seen = replace(watched(("a", None)), priors=(one,))
+    assert make_layout(seen, Options(priors=(two,))).priors == (one, two)
+
+
+@pytest.mark.parametrize(
+    "prior, message",
+    [
+        (Prior("camera", "b", "phi", (800.0,), (5.0,)), "camera 'b'.*not there: there are 'a'"),
+        (Prior("station", "b", "height_m", (4.0,), (0.1,)), "station 'b'.*not there: there are 'a'"),
+        (Prior("camera", "a", "k1", (0.0,), (0.1,)), "camera 'a': it has no 'k1', only phi, aspect, cx, cy, a2, a3"),
+    ],
+)
+def test_priors_on_what_is_not_there(prior: Prior, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        make_layout(watched(("a", None)), Options(priors=(prior,)))
+
+
+@pytest.mark.parametrize(
+    "views, anchored",
+    [
+        ([("a", None)], set()),
+        ([("a", "p")], {"a"}),
+        ([("a", "p"), ("a", "q")], {"a"}),
+        ([("a", "p"), ("b", "p")], {"a"}),  # one freedom for the two of them
+        ([("a", "p"), ("b", "q")], {"a", "b"}),  # two worlds that nothing ties
+        ([("a", "p"), ("b", "q"), ("c", "p"), ("c", "q")], {"a"}),  # ... but for a third
+        ([("a", "p"), ("b", "p"), ("b", None)], set()),
+        ([("a", "p"), ("b", "p"), ("b", "q"), ("c", "q"), ("c", None)], set()),
+        ([("a", None), ("b", "p")], {"b"}),
+        ([("d", "s"), ("c", "r"), ("b", "r"), ("b", "s"), ("e", "t"), ("a", None)], {"d", "e"}),
+    ],
+)
+def test_one_station_of_each_group_that_nothing_ties_to_the_world(
+    views: list[tuple[str, str | None]], anchored: set[str]
+) -> None:
+    observations = watched(*views)
+    assert anchored_stations(observations) == anchored
+    assert make_layout(observations, Options()).stations == {station for station, _ in views} - anchored
+
+
+# ---- estimate -------------------------------------------------------------------------------------------------------
+
+
+def test_poses_chain_from_frame_to_camera() -> None:
+    station, placement = Pose.exp((0.3, -0.2, 0.1, 1.0, 2.0, 3.0)), Pose.exp((-0.5, 0.4, 0.9, 0.1, 0.2, -0.3))
+    camera = scenes.camera("brown")
+    structure = make_structure({"board": BOARD}, {})
+    estimate = Estimate({"lens": camera}, {"up": Station("lens", station)}, {"there": placement}, structure)
+    assert estimate.camera_at("up") == camera.at(station)
+    assert estimate.camera_at("up", "there") == camera.at(station @ placement)
+    stack = estimate.pose_stack([SightKey("lens", "up", "there"), SightKey("lens", "up", None)])
+    for matrix, pose in zip(stack, (station @ placement, station), strict=True):
+        assert np.max(np.abs(matrix - np.column_stack([pose.rotation, pose.translation]))) < 1e-15

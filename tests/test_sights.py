@@ -1,0 +1,193 @@
+"""Sights: every observation once, beside what it shows, and with its way back to its row."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scenes import SCENES
+from scipy.optimize import minimize_scalar
+
+from ceres_cal.observations import Observations
+from ceres_cal.sights import SightKey, Sights, gather_sights, nearest_places
+from ceres_cal.simulate import Disturbance, Scene, Station, ViewPlan, overhead_pose, simulate
+from ceres_cal.targets import Arc, Segment, along_track, checkerboard, custom
+from ceres_cal.transforms import Array, Pose
+
+NOISE = Disturbance(points_sigma_px=0.3, curves_sigma_px=0.5, hidden_points=0.2)
+
+
+def several() -> Scene:
+    """Two cameras, one of them at two stations; a court whose three sides are seen, and a board at two placements."""
+    court = custom(
+        {"a": (1.0, 0.5, 0.0), "b": (-1.0, 0.5, 0.3)},
+        {
+            "line": Segment((-1.5, -1.0, 0.0), (1.5, -0.9, 0.0), 0.1),
+            "circle": Arc((0.2, 0.1, 0.0), 0.5, width_m=0.06),
+            "edge": Segment((-1.5, 1.0, 0.0), (1.5, 1.0, 0.0)),
+        },
+    )
+    base = SCENES["radial-2-3/corners"]()
+    lens = base.cameras["overhead"]
+    stations = {
+        "left": Station("left", overhead_pose(-0.5, 0.0, 4.0, 4.0, 3.0)),
+        "moved": Station("left", overhead_pose(-0.3, 0.1, 4.1, -3.0, 3.0)),
+        "right": Station("right", overhead_pose(0.5, 0.0, 4.0, 2.0, -3.0)),
+    }
+    placements = {"near": Pose.exp((0.2, 0.1, 0.0, 0.1, 0.2, 1.0)), "far": Pose.exp((-0.2, 0.3, 0.0, -0.2, 0.1, 0.5))}
+    sides = ("centre", "left", "right")
+    views = [ViewPlan((side, side + "2"), "left", "court", spacing_m=0.2, side=side) for side in sides]
+    views += [ViewPlan(("7",), "right", "board", "near"), ViewPlan(("8",), "left", "board", "near")]
+    views += [ViewPlan(("9",), "moved", "court", spacing_m=0.3), ViewPlan(("10",), "right", "board", "far")]
+    cameras = {"left": lens, "right": replace(lens, phi=850.0)}
+    return Scene({"court": court, "board": checkerboard(4, 3, 0.1)}, cameras, stations, placements, tuple(views))
+
+
+def seen() -> Observations:
+    return simulate(several(), NOISE, 3).observations
+
+
+def test_sights_are_stations_and_frames() -> None:
+    """All frames of a static camera's court are one sight; each board frame is one of its own."""
+    sights = gather_sights(seen())
+    assert sights.keys == (
+        SightKey("left", "left", None),
+        SightKey("right", "right", "near"),
+        SightKey("left", "left", "near"),
+        SightKey("left", "moved", None),
+        SightKey("right", "right", "far"),
+    )
+    assert sights.views == (tuple(range(6)), (6,), (7,), (8,), (9,))
+    assert [str(key) for key in sights.keys[:2]] == ["station 'left'", "station 'right', placement 'near'"]
+
+
+def assert_true_to(observations: Observations, sights: Sights) -> None:
+    """Each row beside its own pixel, sigma and feature."""
+    for number, key in enumerate(sights.keys):
+        sight = sights[number]
+        assert sight.keys == (key,) and sight.key == key
+        for row, place, pixel, sigma in zip(sight.point_rows, sight.points, sight.pixels, sight.sigma_px, strict=True):
+            view = observations.views[observations.points.view[row]]
+            assert (view.camera, view.station, view.placement) == key
+            target = observations.targets[view.target]
+            assert np.array_equal(place, target.points[observations.feature_name("point", row)])
+            assert np.array_equal(pixel, observations.points.pixels[row])
+            assert sigma == observations.points.sigma_px[row]
+        for row, track, pixel in zip(sight.curve_rows, sight.track, sight.curve_pixels, strict=True):
+            view = observations.views[observations.curves.view[row]]
+            assert (view.camera, view.station, view.placement) == key
+            curve = observations.targets[view.target].curves[observations.feature_name("curve", row)]
+            assert np.array_equal(sight.tracks[track], curve.track(int(observations.curves.side[row])))
+            assert sight.is_arc[track] == isinstance(curve, Arc)
+            assert np.array_equal(pixel, observations.curves.pixels[row])
+
+
+def test_every_row_is_there_once_with_what_it_shows() -> None:
+    observations = seen()
+    sights = gather_sights(observations)
+    assert sorted(sights.point_rows) == list(range(len(observations.points)))
+    assert sorted(sights.curve_rows) == list(range(len(observations.curves)))
+    assert_true_to(observations, sights)
+
+
+def test_taking_some_sights() -> None:
+    observations = seen()
+    sights = gather_sights(observations)
+    some = sights.take(np.array([3, 0]))
+    assert some.keys == (sights.keys[3], sights.keys[0])
+    assert_true_to(observations, some)
+    assert sights[-1].key == sights.keys[4]
+    assert sights[1:3].keys == sights.keys[1:3]
+    with pytest.raises(IndexError):
+        sights[5]
+    assert len(list(sights)) == len(sights) == 5
+
+
+def test_only_the_rows_that_are_used() -> None:
+    observations = seen()
+    sights = gather_sights(observations)
+    rng = np.random.default_rng(0)
+    points, curves = rng.random(len(observations.points)) < 0.6, rng.random(len(observations.curves)) < 0.6
+    used = sights.used(points, curves)
+    assert sorted(used.point_rows) == np.flatnonzero(points).tolist()
+    assert sorted(used.curve_rows) == np.flatnonzero(curves).tolist()
+    assert_true_to(observations, used)
+
+
+def test_sights_of_which_nothing_is_left_are_left_out() -> None:
+    observations = seen()
+    sights = gather_sights(observations)
+    points = observations.points.view != 7
+    used = sights.used(points, np.ones(len(observations.curves), dtype=bool))
+    assert used.keys == (*sights.keys[:2], *sights.keys[3:])
+    assert sights.used(np.ones(len(points), dtype=bool), np.ones(len(observations.curves), dtype=bool)) is sights
+
+
+def test_parts_make_the_whole() -> None:
+    """A large sight in three parts, for as many threads."""
+    sight = gather_sights(seen())[0]
+    parts = [sight.part(number, 3) for number in range(3)]
+    assert all(part.keys == sight.keys for part in parts)
+    for name in ("point_rows", "points", "pixels", "curve_rows", "track", "curve_pixels", "curve_sigma_px"):
+        assert np.array_equal(np.concatenate([getattr(part, name) for part in parts]), getattr(sight, name))
+
+
+def test_a_view_without_observations_is_no_sight() -> None:
+    observations = seen()
+    empty = replace(observations.views[-1], frame="11", placement="nowhere")
+    assert (
+        gather_sights(replace(observations, views=(*observations.views, empty))).keys
+        == gather_sights(observations).keys
+    )
+
+
+# ---- where the search for a foot starts -----------------------------------------------------------------------------
+
+
+def test_nearest_places_are_where_the_ray_passes() -> None:
+    """Against a search along each line and circle for the least distance from the pixel's ray, in space."""
+    observations = seen()
+    sights, scene = gather_sights(observations), several()
+    for number in (0, 3):
+        sight = sights[number]
+        camera = scene.camera_at(sight.key.station)
+        found = nearest_places(sight, camera)
+        rays = camera.rays(sight.curve_pixels) @ camera.cam_from_world.rotation
+        for place, track, ray in zip(found, sight.track, rays, strict=True):
+            is_arc = bool(sight.is_arc[track])
+            best = nearest_to_ray(sight.tracks[track], is_arc, camera.position, ray, place)
+            # On a line they are the same; on a circle the place is where the ray meets its plane, turned to the middle.
+            assert place == pytest.approx(best, abs=0.01 if is_arc else 1e-6)  # 4e-4, 7e-9 measured
+
+
+def nearest_to_ray(track: Array, is_arc: bool, origin: Array, ray: Array, start: float) -> float:
+    """Place on a track, within 0.3 of the start, that is nearest to a line in space."""
+
+    def away(s: float) -> float:
+        there = along_track(track, is_arc, [s])[0] - origin
+        return float(np.linalg.norm(there - (there @ ray) * ray))
+
+    bounds = (start - 0.2, start + 0.3)
+    return float(minimize_scalar(away, bounds=bounds, method="bounded", options={"xatol": 1e-9}).x)
+
+
+def test_places_of_no_observation_at_all() -> None:
+    sight = gather_sights(seen())[1]
+    assert len(sight.curve_rows) == 0
+    assert nearest_places(sight, several().camera_at("right")).shape == (0,)
+
+
+def test_a_pixel_without_a_ray_has_a_place_all_the_same() -> None:
+    """Past the lens's monotone radius, or a ray along the line or the plane: a finite start, never NaN."""
+    sight = gather_sights(seen())[0]
+    camera = several().camera_at("left")
+    folding = replace(camera, lens=camera.lens.with_values((0.0, -1e-6)))
+    assert folding.folds
+    far = replace(sight, curve_pixels=sight.curve_pixels + 900.0)
+    assert np.all(np.isnan(folding.rays(far.curve_pixels)[:, 0]))
+    assert np.all(np.isfinite(nearest_places(far, folding)))
+    level = camera.at(Pose.looking((0.0, 0.0, 0.0), [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]))  # edge-on
+    assert np.all(
+        np.isfinite(nearest_places(replace(sight, curve_pixels=np.full_like(far.curve_pixels, 480.0)), level))
+    )
