@@ -617,6 +617,20 @@ def test_one_board_is_enough_for_a_pose_but_not_many() -> None:
     assert calibration.cameras["camera"].phi == pytest.approx(868.0, rel=0.01)
 
 
+def test_views_without_observations_change_nothing() -> None:
+    """Frames in which a board or the field was looked for and not found."""
+    simulation = observed("brown/boards")
+    base = calibrate(simulation.observations, options_for(simulation.scene))
+    target, station = simulation.observations.views[0].target, simulation.observations.views[0].station
+    empty = [View(str(number), "camera", station, target, f"unseen_{number}") for number in range(5)]
+    empty += [View("field", "camera", station, target), View("moved", "camera", "elsewhere", target, "unseen_0")]
+    views = (*simulation.observations.views, *empty)
+    found = calibrate(replace(simulation.observations, views=views), options_for(simulation.scene))
+    assert found.station(station) == base.station(station)
+    assert found.fit == base.fit
+    assert list(found.stations) == [station] and found.placements.keys() == base.placements.keys()
+
+
 @pytest.mark.parametrize("pixels", ["one place", "random"])
 def test_pixels_that_mean_nothing_give_no_camera(pixels: str) -> None:
     observations = observed("radial-2-3/corners").observations

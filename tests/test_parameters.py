@@ -203,6 +203,16 @@ def test_one_station_of_each_group_that_nothing_ties_to_the_world(
     assert make_layout(observations, Options()).stations == {station for station, _ in views} - anchored
 
 
+def test_views_without_observations_count_for_nothing() -> None:
+    """A field that was looked for and not found ties nothing to the world; a placement nobody saw is no unknown."""
+    seen = watched(("a", "p"))
+    empty = (View("7", "a", "a", "board"), View("8", "a", "a", "board", "q"), View("9", "a", "a2", "board", "p"))
+    layout = make_layout(replace(seen, views=(*seen.views, *empty)), Options())
+    assert anchored_stations(replace(seen, views=(*seen.views, *empty))) == {"a"}
+    assert (layout.stations, layout.placements) == (frozenset(), {"p"})
+    assert layout.size == make_layout(seen, Options()).size == 5 + 6
+
+
 # ---- estimate -------------------------------------------------------------------------------------------------------
 
 

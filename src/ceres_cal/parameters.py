@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ceres_cal.camera import Camera
 from ceres_cal.errors import InputError
 from ceres_cal.lens import LENS_KINDS, Lens, make_lens
-from ceres_cal.observations import Observations, Prior
+from ceres_cal.observations import Observations, Prior, View
 from ceres_cal.sights import SightKey
 from ceres_cal.structure import Structure, Tolerance
 from ceres_cal.transforms import Array, Pose
@@ -191,12 +191,19 @@ def make_layout(observations: Observations, options: Options) -> Layout:
         observations.require_owner(prior)
         if prior.owner == "camera" and prior.quantity not in (*names, "principal_point"):
             raise InputError(f"prior on camera {prior.name!r}: it has no {prior.quantity!r}, only {', '.join(names)}")
+    shown = _shown_views(observations)
     return Layout(
         dict.fromkeys(observations.cameras, free),
-        frozenset(observations.stations) - anchored_stations(observations),
-        frozenset(observations.placements),
+        frozenset(view.station for view in shown) - anchored_stations(observations),
+        frozenset(view.placement for view in shown if view.placement is not None),
         priors,
     )
+
+
+def _shown_views(observations: Observations) -> list[View]:
+    """The views with observations; what the others name is not there for the solve."""
+    numbers = np.union1d(observations.points.view, observations.curves.view)
+    return [observations.views[number] for number in numbers]
 
 
 def anchored_stations(observations: Observations) -> frozenset[str]:
@@ -204,7 +211,8 @@ def anchored_stations(observations: Observations) -> frozenset[str]:
 
     Boards alone tell poses among themselves only; holding one station removes that freedom.
     """
-    group = {name: name for name in observations.stations}
+    shown = _shown_views(observations)
+    group = {view.station: view.station for view in shown}
     first_seen: dict[str, str] = {}
     tied: set[str] = set()
 
@@ -213,14 +221,14 @@ def anchored_stations(observations: Observations) -> frozenset[str]:
             name = group[name]
         return name
 
-    for view in observations.views:
+    for view in shown:
         if view.placement is None:
             tied.add(view.station)
         else:
             group[root(view.station)] = root(first_seen.setdefault(view.placement, view.station))
     tied_groups = {root(name) for name in tied}
     anchors: dict[str, str] = {}
-    for name in observations.stations:
+    for name in group:
         if root(name) not in tied_groups:
             anchors.setdefault(root(name), name)
     return frozenset(anchors.values())

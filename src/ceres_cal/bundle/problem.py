@@ -37,6 +37,7 @@ from ceres_cal.parameters import (
 from ceres_cal.sights import SightKey, Sights
 from ceres_cal.transforms import Array, Pose
 
+_AT_REST = 10  # iterations
 _DENSE_LIMIT = 600  # numbers that stay after the Schur complement; above it a sparse factorisation is faster
 
 
@@ -220,7 +221,7 @@ def solve(
     return Solution(
         replace(solved, placements=placements),
         float(summary.final_cost),
-        summary.termination_type == pyceres.TerminationType.CONVERGENCE,
+        summary.termination_type == pyceres.TerminationType.CONVERGENCE or _rests(run.history),
         str(summary.message),
         tuple(run.history),
         not summary.IsSolutionUsable(),
@@ -290,6 +291,12 @@ def placement_costs(
         poses: (S, 3, 4) where the search for each cam_from_target starts.
     """
     return EliminatedCost(Run(), sights, estimate, layout, weighting, threads=1).from_poses(poses)
+
+
+def _rests(history: Sequence[float]) -> bool:
+    """Whether the last iterations changed the cost by rounding alone: a redescending loss can go on like that."""
+    last = history[-_AT_REST:]
+    return len(last) == _AT_REST and max(last) - min(last) <= 1e-11 * max(last)
 
 
 def private_placements(sights: Sights, layout: Layout) -> frozenset[str | None]:
