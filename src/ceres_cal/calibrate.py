@@ -12,7 +12,7 @@ from ceres_cal.bundle import Progress, Solution, Weighting, solve
 from ceres_cal.calibration import Calibration, Fit, Rejected
 from ceres_cal.camera import Camera
 from ceres_cal.diagnostics import Inliers, judge, start_weights
-from ceres_cal.errors import SolutionError
+from ceres_cal.errors import DegenerateError, SolutionError
 from ceres_cal.initialise import initialise
 from ceres_cal.lost import with_lost_boards_found
 from ceres_cal.mirrored import without_mirrored_poses
@@ -116,6 +116,8 @@ def _settle(
         precision=1e-3,
     )
     used = sights.used(everything.points, everything.curves)
+    if not len(used):
+        raise DegenerateError("the observations fix no pose that could show them: add points or lines of the targets")
     solution = solve(used, estimate, layout, rough, options, progress, found.places)
     before, (found, inliers) = everything, judged(solution.estimate, found.places)
     rounds = 1
