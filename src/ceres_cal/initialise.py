@@ -242,9 +242,8 @@ def _require_all(
             continue
         sight = sights[number]
         frames = ", ".join(repr(observations.views[i].frame) for i in sight.views[0][:3])
-        curves = len(np.unique(sight.track))
         raise DegenerateError(
-            f"frame {frames} ({key}): {len(sight.point_rows)} points and {len(sight.curve_rows)} observations of "
-            f"{curves} curves cannot fix its pose: give at least four points, not on one line, or straight lines in two "
-            "directions, two of each, or remove the view"
+            f"frame {frames} ({key}): {len(sight.point_rows)} points and {len(sight.curve_rows)} curve observations "
+            f"(on {len(np.unique(sight.track))} curves) cannot fix its pose: give at least four points, not on one line, "
+            "or straight lines in two directions, two of each, or remove the view"
         )
