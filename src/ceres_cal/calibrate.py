@@ -156,7 +156,7 @@ def _require_usable(settled: _Settled, sights: Sights) -> tuple[str, ...]:
             continue
         fold, corner = camera.lens.monotone_radius(camera.phi), camera.corner_radius
         where = f"camera {name!r}: the solved {camera.lens.kind} lens folds {fold:.0f} px from the principal point"
-        seen = _reach_px(name, camera, sights.used(settled.inliers.points, settled.inliers.curves))
+        seen = _of(name, sights.used(settled.inliers.points, settled.inliers.curves)).reach_px(camera)
         # The paper's polynomial can be had without a fold; the others' published models fold in corners nobody saw.
         if camera.lens.kind == "radial" or fold <= seen:
             raise SolutionError(
@@ -170,9 +170,13 @@ def _require_usable(settled: _Settled, sights: Sights) -> tuple[str, ...]:
     return (*warnings, *_lost(settled.inliers, sights))
 
 
+def _of(camera: str, sights: Sights) -> Sights:
+    return sights.take(np.array([i for i, key in enumerate(sights.keys) if key.camera == camera], dtype=np.int64))
+
+
 def _require_fit(name: str, camera: Camera, settled: _Settled, sights: Sights) -> None:
     """Raise SolutionError where half of a camera's observations are missed by more than any lens could explain."""
-    own = sights.take(np.array([i for i, key in enumerate(sights.keys) if key.camera == name], dtype=np.int64))
+    own = _of(name, sights)
     points = np.linalg.norm(settled.residuals.points[own.point_rows], axis=1)
     missed = np.nan_to_num(np.concatenate([points, np.abs(settled.residuals.curves[own.curve_rows])]), nan=np.inf)
     limit_px = _NO_FIT * float(np.hypot(*camera.image_size))
@@ -189,13 +193,6 @@ def _lost(inliers: Inliers, sights: Sights) -> Iterator[str]:
     for number in np.flatnonzero(shares < 0.5):
         out = f"{100.0 * (1.0 - shares[number]):.0f} % of its observations were taken out"
         yield f"{sights.keys[number]}: {out}: check its labels, do not use its pose"
-
-
-def _reach_px(name: str, camera: Camera, sights: Sights) -> float:
-    """Distance from the principal point to the farthest observation of this camera."""
-    own = sights.take(np.array([i for i, key in enumerate(sights.keys) if key.camera == name], dtype=np.int64))
-    offsets = camera.offsets(np.vstack([own.pixels, own.curve_pixels]))
-    return float(np.max(np.linalg.norm(offsets, axis=1), initial=0.0))
 
 
 def _fit(settled: _Settled, layout: Layout) -> Fit:

@@ -73,7 +73,7 @@ def _start_camera(
     unit = 0.5 * float(np.hypot(*image_size))
     profile, homographies = profile_and_homographies(sights, blank, unit)
     phi, phi_from = _choose_phi(sights, homographies, unit, options, [p for p in priors if _concerns(p, name, sights)])
-    reach = float(np.max(np.linalg.norm(_all_offsets(sights, blank), axis=1)))
+    reach = sights.reach_px(blank)
     camera = replace(blank, phi=phi, lens=_fit_lens(blank.lens, profile, phi, reach, options.fixed))
     poses = {
         int(number): Pose(matrix[:, :3], matrix[:, 3])
@@ -109,10 +109,6 @@ def _blank_camera(name: str, image_size: tuple[int, int], options: Options, prio
                 aspect = prior.value[0]
     cx, cy = options.fixed.get("cx", centre[0]), options.fixed.get("cy", centre[1])
     return Camera(image_size, 1.0, (cx, cy), options.blank_lens, aspect)
-
-
-def _all_offsets(sights: Sights, camera: Camera) -> Array:
-    return camera.offsets(np.vstack([sights.pixels, sights.curve_pixels]))
 
 
 # ---- phi and lens ---------------------------------------------------------------------------------------------------
@@ -244,6 +240,6 @@ def _require_all(
         frames = ", ".join(repr(observations.views[i].frame) for i in sight.views[0][:3])
         raise DegenerateError(
             f"frame {frames} ({key}): {len(sight.point_rows)} points and {len(sight.curve_rows)} curve observations "
-            f"(on {len(np.unique(sight.track))} curves) cannot fix its pose: give at least four points, not on one line, "
-            "or straight lines in two directions, two of each, or remove the view"
+            f"(on {len(np.unique(sight.track))} curves) cannot fix its pose: give at least four points, not on one "
+            "line, or straight lines in two directions, two of each, or remove the view"
         )

@@ -111,6 +111,15 @@ class Sights(Sequence["Sights"]):
         c = np.concatenate([[0], np.cumsum(curves[self.curve_rows])])[self.curve_bounds]
         return np.asarray((np.diff(p) + np.diff(c)) / (np.diff(self.point_bounds) + np.diff(self.curve_bounds)))
 
+    def reach_px(self, camera: Camera) -> float:
+        """Distance from the principal point to the farthest observation of the sights, which are the camera's."""
+        farthest = 0.0
+        for pixels in (self.pixels, self.curve_pixels):
+            for at in range(0, len(pixels), _BLOCK):
+                offsets = camera.offsets(pixels[at : at + _BLOCK])
+                farthest = max(farthest, float(np.max(np.linalg.norm(offsets, axis=1))))
+        return farthest
+
     def part(self, number: int, count: int) -> Sights:
         """The number-th of `count` about equal parts of the observations of a single sight."""
         first, last = (int(self.point_bounds[-1]) * n // count for n in (number, number + 1))
