@@ -16,6 +16,7 @@ from ceres_cal.sights import Mask
 from ceres_cal.transforms import Array
 
 _LEAST_FREEDOM = 8.0  # spare equations below which a spread says nothing
+_ENOUGH = 1_000_000
 _LEAST_SCALE_PX = 1e-4  # no image is measured better than that
 _RAYLEIGH_MEDIAN = 1.177410022515474  # of the length of a two-dimensional standard normal
 _NORMAL_MEDIAN = 0.674489750196082  # of the absolute value of a standard normal
@@ -65,7 +66,10 @@ def start_weights(observations: Observations, residuals: Residuals) -> Inliers:
 
 
 def _median_scale(lengths: Array, median_of_one: float) -> float:
-    return max(float(np.median(lengths)) / median_of_one, _LEAST_SCALE_PX) if len(lengths) else 1.0
+    if not len(lengths):
+        return 1.0
+    some = lengths[:: max(1, len(lengths) // _ENOUGH)]  # the median of a million is that of ten million
+    return max(float(np.median(some)) / median_of_one, _LEAST_SCALE_PX)
 
 
 def judge(
@@ -94,8 +98,10 @@ def judge(
 
 
 def _scale(lengths: Array, dimensions: int, median_of_one: float, spare: float, reject_sigma: float) -> float | None:
-    seen = lengths[np.isfinite(lengths)]
+    finite = np.isfinite(lengths)
+    seen = lengths if finite.all() else lengths[finite]
     if dimensions * len(seen) * spare < _LEAST_FREEDOM:
         return None
-    inside = seen[seen <= reject_sigma * _median_scale(seen, median_of_one)]
-    return max(float(np.sqrt(np.sum(inside**2) / (dimensions * len(inside) * spare))), _LEAST_SCALE_PX)
+    inside = seen <= reject_sigma * _median_scale(seen, median_of_one)
+    squares = float(np.sum(seen**2, where=inside))
+    return max(float(np.sqrt(squares / (dimensions * np.count_nonzero(inside) * spare))), _LEAST_SCALE_PX)
