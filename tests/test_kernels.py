@@ -128,7 +128,7 @@ NOTHING_MOVES = Moves()
 
 def normal_equations(
     camera: Camera, seen: Seen, loss: str = "trivial", scale: float = 1.0, *,
-    moves: Moves = NOTHING_MOVES, wants_normal: bool = True,
+    moves: Moves = NOTHING_MOVES,
 ) -> tuple[float, Array]:  # fmt: skip
     """Sum of rho, and A over [intrinsics | structure | 6 pose | residual], whole."""
     count = len(intrinsics_vector(camera))
@@ -139,7 +139,7 @@ def normal_equations(
         *optics(camera), matrix(camera.cam_from_world),
         seen.points, seen.pixels, 1.0 / seen.sigma_px, moves.slots, moves.bends,
         seen.tracks, seen.is_arc, seen.track, seen.curve_pixels, 1.0 / seen.curve_sigma_px, seen.start.copy(),
-        moves.track_slots, kernels.LOSS_CODES[loss], scale, np.arange(count + 7), places, wants_normal, normal,
+        moves.track_slots, kernels.LOSS_CODES[loss], scale, np.arange(count + 7), places, normal,
     )  # fmt: skip
     lower = np.tril(normal)
     return float(cost), lower + np.tril(lower, -1).T
@@ -358,7 +358,6 @@ class Block:
 def evaluate_block(
     camera: Camera, poses: tuple[Array, Array], seen: Seen, loss: str = "trivial", scale: float = 1.0, *,
     free: NDArray[np.int64] | None = None, held: tuple[str, ...] = (), moves: Moves = NOTHING_MOVES,
-    wants_jacobian: bool = True,
 ) -> Block | None:  # fmt: skip
     """The block of a camera at station @ placement; None where the kernel says that there is no answer."""
     code, vector, powers, unit = optics(camera)
@@ -371,7 +370,7 @@ def evaluate_block(
         code, vector, free, powers, unit, seen.pixels, 1.0 / seen.sigma_px, moves.slots, moves.bends,
         seen.is_arc, seen.track, seen.curve_pixels, 1.0 / seen.curve_sigma_px, seen.start.copy(), moves.track_slots,
         kernels.LOSS_CODES[loss], scale, seen.points, seen.tracks, moves.count,
-        vector[free], *poses, wants_jacobian, residuals, *outputs.values(),
+        vector[free], *poses, residuals, *outputs.values(),
     )  # fmt: skip
     shown = [outputs[name].reshape(rows, size) for name, size in sizes.items() if name not in held and size]
     return Block(residuals, np.hstack([np.empty((rows, 0)), *shown])) if good else None
@@ -444,17 +443,6 @@ def test_chain_rule_to_both_pose_vectors(angle: float, turned: str) -> None:
     block = evaluate_block(camera, poses, seen, "huber", 1.5)
     assert block is not None
     assert_same_problem(block, uncompressed(camera, poses, seen, "huber", 1.5))
-
-
-@each_loss
-def test_cost_alone_is_the_same_cost(loss: str) -> None:
-    camera, seen = looked_at("radial-2-3")
-    poses = split(camera, 0.7 * AXIS, turned="placement")
-    whole, alone = (evaluate_block(camera, poses, seen, loss, 1.5, wants_jacobian=wants) for wants in (True, False))
-    assert whole is not None and alone is not None
-    assert np.all(alone.residuals[1:] == 0.0)
-    assert alone.residuals[0] ** 2 == pytest.approx(whole.residuals @ whole.residuals, rel=1e-12)  # 1e-15 measured
-    assert np.all(alone.jacobian == 7.0)  # it was told not to touch it
 
 
 @pytest.mark.parametrize(
@@ -712,9 +700,8 @@ def test_what_cannot_be_projected_has_no_residual(lens: str, hidden: str) -> Non
     assert np.array_equal(np.isnan(camera.project(points)[:, 0]), np.isnan(found[:, 0]))
     assert np.isnan(normal_equations(camera, seen)[0])
     poses = np.zeros(6), np.zeros(6)
-    for wants in (True, False):
-        assert evaluate_block(camera, poses, seen, wants_jacobian=wants) is None
-        assert evaluate_block(camera, poses, seen.take(points=[0, 1, 3]), wants_jacobian=wants) is not None
+    assert evaluate_block(camera, poses, seen) is None
+    assert evaluate_block(camera, poses, seen.take(points=[0, 1, 3])) is not None
 
 
 @pytest.mark.parametrize("lens", FOLDING)

@@ -107,7 +107,7 @@ class SightCost(pyceres.CostFunction):
         built = self._structure.with_values(arguments[3])
         answered = kernels.evaluate_block(
             *self._static, built.points(self._sight), built.tracks(self._sight), len(built.values), *arguments[:3],
-            True, residuals, *outputs,
+            residuals, *outputs,
         )  # fmt: skip
         return (at, residuals, [outputs[slot] for slot in self.slots]) if answered else None
 

@@ -35,19 +35,24 @@ def cholesky(normal: Any, upper: Any) -> None:
 
 
 @jit
-def rotation(w: Any, out: Any) -> None:
-    """Rodrigues' formula, into the left (3, 3) of `out`."""
+def _sine_series(w: Any) -> tuple[float, float, float, float]:
+    """Squared angle of a rotation vector, and sin a / a, (1 - cos a) / a^2, (a - sin a) / a^3, also where a is tiny."""
     angle2 = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
     angle = np.sqrt(angle2)
-    sine, versine = 1.0 - angle2 / 6.0, 0.5 - angle2 / 24.0
-    if angle > 1e-4:
-        half = np.sin(0.5 * angle) / angle
-        sine, versine = np.sin(angle) / angle, 2.0 * half * half
+    if angle < 1e-4:
+        return angle2, 1.0 - angle2 / 6.0, 0.5 - angle2 / 24.0, 1.0 / 6.0 - angle2 / 120.0
+    half = np.sin(0.5 * angle) / angle
+    return angle2, np.sin(angle) / angle, 2.0 * half * half, (angle - np.sin(angle)) / (angle * angle2)
+
+
+@jit
+def _turn(w: Any, diagonal: float, outer: float, cross: float, out: Any) -> None:
+    """diagonal 1 + outer w w^T + cross [w]x, into the left (3, 3) of `out`."""
     for j in range(3):
         for k in range(3):
-            out[j, k] = versine * w[j] * w[k]
-        out[j, j] += 1.0 - versine * angle2
-    x, y, z = sine * w[0], sine * w[1], sine * w[2]
+            out[j, k] = outer * w[j] * w[k]
+        out[j, j] += diagonal
+    x, y, z = cross * w[0], cross * w[1], cross * w[2]
     out[0, 1] -= z
     out[1, 0] += z
     out[0, 2] += y
@@ -57,25 +62,17 @@ def rotation(w: Any, out: Any) -> None:
 
 
 @jit
+def rotation(w: Any, out: Any) -> None:
+    """Rodrigues' formula, into the left (3, 3) of `out`."""
+    angle2, sine, versine, _ = _sine_series(w)
+    _turn(w, 1.0 - versine * angle2, versine, sine, out)
+
+
+@jit
 def _left_jacobian(w: Any, out: Any) -> None:
     """J with exp(w + dw) = exp(J dw) exp(w), (3, 3)."""
-    angle2 = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
-    angle = np.sqrt(angle2)
-    versine, rest = 0.5 - angle2 / 24.0, 1.0 / 6.0 - angle2 / 120.0
-    if angle > 1e-4:
-        half = np.sin(0.5 * angle) / angle
-        versine, rest = 2.0 * half * half, (angle - np.sin(angle)) / (angle * angle2)
-    for j in range(3):
-        for k in range(3):
-            out[j, k] = rest * w[j] * w[k]
-        out[j, j] += 1.0 - rest * angle2
-    x, y, z = versine * w[0], versine * w[1], versine * w[2]
-    out[0, 1] -= z
-    out[1, 0] += z
-    out[0, 2] += y
-    out[2, 0] -= y
-    out[1, 2] -= x
-    out[2, 1] += x
+    angle2, _, versine, rest = _sine_series(w)
+    _turn(w, 1.0 - rest * angle2, rest, versine, out)
 
 
 @jit
@@ -138,7 +135,7 @@ def evaluate_block(
     lens: int, fixed_intrinsics: Any, free: Any, powers: Any, unit: float, pixels: Any, weights: Any,
     slots: Any, bends: Any, is_arc: Any, track: Any, curve_pixels: Any, curve_weights: Any, s: Any, track_slots: Any,
     loss: int, scale: float, points: Any, tracks: Any, structure: int,
-    camera: Any, station: Any, placement: Any, wants_jacobian: bool, residuals: Any,
+    camera: Any, station: Any, placement: Any, residuals: Any,
     camera_jacobian: Any, station_jacobian: Any, placement_jacobian: Any, structure_jacobian: Any,
 ) -> bool:  # fmt: skip
     """What Ceres asks of the block of one sight (design, section 6); False where an observation cannot be projected.
@@ -147,8 +144,7 @@ def evaluate_block(
         fixed_intrinsics: the whole intrinsics vector; `camera` replaces its entries `free`.
         points, tracks: as built, with the `structure` numbers of the moment put in.
         station, placement: 6-vectors of cam_from_world and world_from_target.
-        residuals: (free + structure + 7,): the rows of U, then what is missing from the robust cost; with the cost
-            alone wanted, all of it in the first entry.
+        residuals: (free + structure + 7,): the rows of U, then what is missing from the robust cost.
         *_jacobian: row-major, as many rows x the block's size; empty where that block is held.
     """
     count = len(free)
@@ -162,14 +158,10 @@ def evaluate_block(
     normal = np.empty((shared + 7, shared + 7))
     cost = normal_equations(
         lens, intrinsics, powers, unit, pose, points, pixels, weights, slots, bends, tracks, is_arc, track,
-        curve_pixels, curve_weights, s, track_slots, loss, scale, rows, places, wants_jacobian, normal,
+        curve_pixels, curve_weights, s, track_slots, loss, scale, rows, places, normal,
     )  # fmt: skip
     if not np.isfinite(cost):
         return False
-    residuals[:] = 0.0
-    if not wants_jacobian:
-        residuals[0] = np.sqrt(cost)
-        return True
     upper = np.empty((shared + 7, shared + 7))
     cholesky(normal, upper)
     last = shared + 6

@@ -98,7 +98,7 @@ def eliminate_placements(
         cost = normal_equations(
             lens, intrinsics, powers, unit, pose, points[p], pixels[p], weights[p], slots[moving], bends[moving],
             tracks, is_arc, track[c], curve_pixels[c], curve_weights[c], s[c], track_slots, loss, scale,
-            rows, places, True, normal,
+            rows, places, normal,
         )  # fmt: skip
         damping = 0.0
         for _ in range(_MOST_STEPS):
@@ -115,7 +115,7 @@ def eliminate_placements(
             moved_cost = normal_equations(
                 lens, intrinsics, powers, unit, moved, points[p], pixels[p], weights[p], slots[moving], bends[moving],
                 tracks, is_arc, track[c], curve_pixels[c], curve_weights[c], s[c], track_slots, loss, scale,
-                rows, places, True, trial,
+                rows, places, trial,
             )  # fmt: skip
             if moved_cost <= cost:
                 pose, moved, normal, trial, cost, damping = moved, pose, trial, normal, moved_cost, 0.1 * damping

@@ -196,8 +196,8 @@ def _add_structure(
 @jit
 def _add_points(
     lens: int, intrinsics: Any, powers: Any, dense: Any, unit: float, limit: float, pose: Any, points: Any, pixels: Any,
-    weights: Any, slots: Any, bends: Any, loss: int, scale: float, rows: Any, places: Any, wants_normal: bool,
-    normal: Any, jacobian: Any, scratch: Any,
+    weights: Any, slots: Any, bends: Any, loss: int, scale: float, rows: Any, places: Any, normal: Any,
+    jacobian: Any, scratch: Any,
 ) -> float:  # fmt: skip
     """Sum of rho over the point observations, NaN where one cannot be projected; their share of `normal`."""
     residual_row = jacobian.shape[0] - 1
@@ -220,19 +220,18 @@ def _add_points(
             root = np.sqrt(slope)
             jacobian[residual_row, 0, i], jacobian[residual_row, 1, i] = root * dx, root * dy
             local[0, i] = root * w
-        if wants_normal:
-            intrinsics_rows(lens, n, intrinsics, powers, unit, image, work, jacobian)
-            _pose_rows(n, residual_row - 6, intrinsics[1], rotated, image, jacobian)
-            for k in rows[:-1]:
-                for i in range(n):
-                    jacobian[k, 0, i] *= local[0, i]
-                    jacobian[k, 1, i] *= local[0, i]
-            _add_products(n, 2, rows, places, jacobian, normal)
-            if len(slots) > 0:
-                directions, columns = np.eye(4, 3), np.empty((4, 2))
-                for i in range(n):
-                    directions[2, 2], directions[3, 2] = bends[start + i, 0], bends[start + i, 1]
-                    _add_structure(i, 2, slots[start + i], directions, pose, rows, places, jacobian, columns, normal)
+        intrinsics_rows(lens, n, intrinsics, powers, unit, image, work, jacobian)
+        _pose_rows(n, residual_row - 6, intrinsics[1], rotated, image, jacobian)
+        for k in rows[:-1]:
+            for i in range(n):
+                jacobian[k, 0, i] *= local[0, i]
+                jacobian[k, 1, i] *= local[0, i]
+        _add_products(n, 2, rows, places, jacobian, normal)
+        if len(slots) > 0:
+            directions, columns = np.eye(4, 3), np.empty((4, 2))
+            for i in range(n):
+                directions[2, 2], directions[3, 2] = bends[start + i, 0], bends[start + i, 1]
+                _add_structure(i, 2, slots[start + i], directions, pose, rows, places, jacobian, columns, normal)
     return cost
 
 
@@ -254,7 +253,7 @@ def _curve_directions(i: int, k: int, tracks: Any, is_arc: Any, foot: Any, direc
 def _add_curves(
     lens: int, intrinsics: Any, powers: Any, dense: Any, unit: float, limit: float, pose: Any, tracks: Any,
     is_arc: Any, track: Any, pixels: Any, weights: Any, s: Any, track_slots: Any, loss: int, scale: float, rows: Any,
-    places: Any, wants_normal: bool, normal: Any, jacobian: Any, scratch: Any,
+    places: Any, normal: Any, jacobian: Any, scratch: Any,
 ) -> float:  # fmt: skip
     """The same for the curve observations: one residual each, the distance along the image normal at the foot.
 
@@ -281,20 +280,19 @@ def _add_curves(
             root = np.sqrt(slope)
             jacobian[residual_row, 0, i] = root * e
             local[0, i], local[1, i] = root * weights[start + i] * nx, root * weights[start + i] * ny
-        if wants_normal:
-            intrinsics_rows(lens, n, intrinsics, powers, unit, image, work, jacobian)
-            _pose_rows(n, residual_row - 6, intrinsics[1], rotated, image, jacobian)
-            for k in rows[:-1]:
-                for i in range(n):
-                    jacobian[k, 0, i] = local[0, i] * jacobian[k, 0, i] + local[1, i] * jacobian[k, 1, i]
-            _add_products(n, 1, rows, places, jacobian, normal)
-            if len(track_slots) > 0:
-                directions, columns = np.eye(3, 3), np.empty((3, 2))
-                for i in range(n):
-                    _curve_directions(i, track[start + i], tracks, is_arc, foot, directions)
-                    _add_structure(
-                        i, 1, track_slots[track[start + i]], directions, pose, rows, places, jacobian, columns, normal
-                    )
+        intrinsics_rows(lens, n, intrinsics, powers, unit, image, work, jacobian)
+        _pose_rows(n, residual_row - 6, intrinsics[1], rotated, image, jacobian)
+        for k in rows[:-1]:
+            for i in range(n):
+                jacobian[k, 0, i] = local[0, i] * jacobian[k, 0, i] + local[1, i] * jacobian[k, 1, i]
+        _add_products(n, 1, rows, places, jacobian, normal)
+        if len(track_slots) > 0:
+            directions, columns = np.eye(3, 3), np.empty((3, 2))
+            for i in range(n):
+                _curve_directions(i, track[start + i], tracks, is_arc, foot, directions)
+                _add_structure(
+                    i, 1, track_slots[track[start + i]], directions, pose, rows, places, jacobian, columns, normal
+                )
     return cost
 
 
@@ -314,7 +312,7 @@ def layout_of_rows(free: Any, intrinsics: int, structure: int) -> tuple[Any, Any
 def normal_equations(
     lens: int, intrinsics: Any, powers: Any, unit: float, pose: Any, points: Any, pixels: Any, weights: Any,
     slots: Any, bends: Any, tracks: Any, is_arc: Any, track: Any, curve_pixels: Any, curve_weights: Any, s: Any,
-    track_slots: Any, loss: int, scale: float, rows: Any, places: Any, wants_normal: bool, normal: Any,
+    track_slots: Any, loss: int, scale: float, rows: Any, places: Any, normal: Any,
 ) -> float:  # fmt: skip
     """Sum of rho over one sight, NaN where an observation cannot be projected; A added up in `normal`'s lower triangle.
 
@@ -329,24 +327,22 @@ def normal_equations(
         loss, scale: a LOSS_CODES value and its scale in standard deviations.
         rows: which numbers take part: indices into [intrinsics | 6 pose | residual], the last one the residual's.
         places: their rows in A; structure numbers come after the intrinsics, before the pose.
-        wants_normal: whether A is wanted or only the cost.
     """
     jacobian = np.empty((len(intrinsics) + 7, 2, _CHUNK))
     scratch = np.empty((32, _CHUNK))
     dense = one_dimensional(lens, intrinsics, powers)
     limit = answer_limit(lens, dense)
-    if wants_normal:
-        normal[:] = 0.0
+    normal[:] = 0.0
     cost = 0.0
     if len(points) > 0:
         cost += _add_points(
             lens, intrinsics, powers, dense, unit, limit, pose, points, pixels, weights, slots, bends, loss, scale,
-            rows, places, wants_normal, normal, jacobian, scratch,
+            rows, places, normal, jacobian, scratch,
         )  # fmt: skip
     if len(curve_pixels) > 0:
         cost += _add_curves(
             lens, intrinsics, powers, dense, unit, limit, pose, tracks, is_arc, track, curve_pixels, curve_weights, s,
-            track_slots, loss, scale, rows, places, wants_normal, normal, jacobian, scratch,
+            track_slots, loss, scale, rows, places, normal, jacobian, scratch,
         )  # fmt: skip
     return cost
 

@@ -1,9 +1,10 @@
 """Simulation of scenes as numbers: observations with noise, outliers and hidden stretches, and their truth."""
 
+from ceres_cal.parameters import Station
 from ceres_cal.simulate.built_in import built_in_scene, scene_names
 from ceres_cal.simulate.compose import board_placements, board_scene, field_scene, join, overhead_pose, rings_scene
 from ceres_cal.simulate.files import load_scene, scene_from_json, scene_to_json, truth_to_json, write_simulation
-from ceres_cal.simulate.scene import Disturbance, Scene, Station, ViewPlan
+from ceres_cal.simulate.scene import Disturbance, Scene, ViewPlan
 from ceres_cal.simulate.simulation import CLEAN, OUTLIER, WRONG_LABEL, Simulation, Truth, simulate
 
 __all__ = [

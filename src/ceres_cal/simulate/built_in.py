@@ -7,8 +7,9 @@ from collections.abc import Callable
 from ceres_cal.camera import Camera
 from ceres_cal.errors import InputError
 from ceres_cal.lens import KannalaBrandt, Radial
+from ceres_cal.parameters import Station
 from ceres_cal.simulate.compose import board_scene, field_scene, join, overhead_pose, rings_scene
-from ceres_cal.simulate.scene import Disturbance, Scene, Station
+from ceres_cal.simulate.scene import Disturbance, Scene
 from ceres_cal.targets import Arc, Curve, Segment, Target, checkerboard, custom, rings, ssl_field
 from ceres_cal.transforms import Pose
 

@@ -10,7 +10,8 @@ import numpy as np
 
 from ceres_cal.camera import Camera
 from ceres_cal.errors import InputError
-from ceres_cal.simulate.scene import Scene, Station, ViewPlan
+from ceres_cal.parameters import Station
+from ceres_cal.simulate.scene import Scene, ViewPlan
 from ceres_cal.targets import Target
 from ceres_cal.transforms import Array, Pose, rotation_exp
 

@@ -9,16 +9,9 @@ import numpy as np
 
 from ceres_cal.camera import Camera
 from ceres_cal.errors import InputError
+from ceres_cal.parameters import Station
 from ceres_cal.targets import SIDES, Target
 from ceres_cal.transforms import Pose
-
-
-@dataclass(frozen=True)
-class Station:
-    """One fixed pose of the camera named `camera` over the field."""
-
-    camera: str
-    cam_from_world: Pose
 
 
 @dataclass(frozen=True)
