@@ -1,0 +1,185 @@
+"""Calibrations beside the Cramer-Rao bound: what the noise allows, what one reaches who knows the truth, and ours."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from accuracy_scenes import Problem
+
+from ceres_cal.bundle import Weighting, information, private_placements, solve
+from ceres_cal.calibrate import calibrate
+from ceres_cal.calibration import Calibration
+from ceres_cal.errors import CalibrationError
+from ceres_cal.observations import Observations
+from ceres_cal.parameters import Estimate, Layout, Options, Station, intrinsics_vector, make_layout
+from ceres_cal.sights import Sights, gather_sights
+from ceres_cal.simulate import CLEAN, Disturbance, Simulation, simulate
+from ceres_cal.structure import make_structure
+from ceres_cal.transforms import Array, Pose
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """One simulation of a problem: what is given to the calibration, and the truth of it.
+
+    Attributes:
+        observations: with each prior drawn from its own distribution around the truth.
+        clean: without noise, priors at the truth. used: the rows of `clean` that are neither outliers nor mislabelled.
+    """
+
+    observations: Observations
+    truth: Estimate
+    layout: Layout
+    clean: Observations
+    used: Callable[[Sights], Sights]
+
+
+def make_trial(problem: Problem, disturbance: Disturbance, seed: int) -> Trial:
+    """The same problem, disturbance and seed give the same trial."""
+    simulation = simulate(problem.scene, disturbance, seed)
+    rng = np.random.default_rng([seed, len(problem.priors)])
+    drawn = tuple(
+        replace(prior, value=tuple(rng.normal(prior.value, prior.sigma).tolist())) for prior in problem.priors
+    )
+    clean = _without_noise(simulation)
+    return Trial(
+        replace(simulation.observations, priors=drawn),
+        true_estimate(simulation, problem.options),
+        make_layout(replace(clean, priors=problem.priors), problem.options),
+        clean,
+        lambda sights: sights.used(simulation.points.flag == CLEAN, simulation.curves.flag == CLEAN),
+    )
+
+
+def _without_noise(simulation: Simulation) -> Observations:
+    found = simulation.observations
+    points = replace(found.points, pixels=simulation.points.pixels)
+    return replace(found, points=points, curves=replace(found.curves, pixels=simulation.curves.pixels))
+
+
+def true_estimate(simulation: Simulation, options: Options) -> Estimate:
+    """The truth in the solver's terms."""
+    scene = simulation.scene
+    stations = {name: Station(place.camera, place.cam_from_world) for name, place in scene.stations.items()}
+    structure = make_structure(simulation.observations.targets, options.tolerances)
+    return Estimate(scene.cameras, stations, scene.placements, structure)
+
+
+def bound(trial: Trial) -> tuple[tuple[str, ...], Array]:
+    """Names and information (P, P), at the truth, of everything shared: the inverse of the Cramer-Rao bound."""
+    found = information(
+        trial.used(gather_sights(trial.clean)), trial.truth, trial.layout, Weighting(1.0, 1.0, "trivial")
+    )
+    return found.names, found.matrix
+
+
+def best(trial: Trial, options: Options) -> Estimate:
+    """What somebody reaches who knows the truth to start from, every sigma, and which observations are wrong."""
+    sights = trial.used(gather_sights(trial.observations))
+    layout = replace(trial.layout, priors=trial.observations.priors)
+    return solve(sights, trial.truth, layout, Weighting(1.0, 1.0, "trivial"), options).estimate
+
+
+def difference(trial: Trial, estimate: Estimate) -> Array:
+    """Estimate less truth (P,) in the order of `bound`'s names."""
+    truth, layout = trial.truth, trial.layout
+    alone = private_placements(gather_sights(trial.clean), layout)
+    parts = [
+        (intrinsics_vector(estimate.cameras[name]) - intrinsics_vector(camera))[layout.free[name]]
+        for name, camera in truth.cameras.items()
+    ]
+    for name, station in truth.stations.items():
+        if name in layout.stations:
+            parts.append(pose_difference(estimate.stations[name].cam_from_world, station.cam_from_world))
+    for name, pose in truth.placements.items():
+        if name in layout.placements and name not in alone:
+            parts.append(pose_difference(estimate.placements[name], pose))
+    return np.concatenate(parts)
+
+
+def pose_difference(pose: Pose, truth: Pose) -> Array:
+    """Of the 6-vectors; a rotation vector near half a turn has another that is as good: the nearer one counts."""
+    here, there = pose.log(), truth.log()
+    angle = float(np.linalg.norm(here[:3]))
+    other = here[:3] * (1.0 - 2.0 * np.pi / max(angle, 1e-12))
+    if np.linalg.norm(other - there[:3]) < np.linalg.norm(here[:3] - there[:3]):
+        here[:3] = other
+    return np.asarray(here - there)
+
+
+@dataclass(frozen=True, eq=False)
+class Efficiency:
+    """Many calibrations of one problem beside its Cramer-Rao bound.
+
+    Attributes:
+        names: (P) of the shared numbers. errors: (N, P) estimate less truth.
+        squared, best_squared: (N,) squared Mahalanobis length of the errors over P, of the calibration and of `best`:
+            1 on average where the bound is reached.
+        failed: runs that gave no calibration. rejected: observations taken out, on average.
+    """
+
+    names: tuple[str, ...]
+    errors: Array
+    squared: Array
+    best_squared: Array
+    failed: int
+    rejected: float
+
+    @property
+    def ratio(self) -> tuple[float, float]:
+        """Mean of `squared` and its standard error."""
+        return mean_and_error(self.squared)
+
+    @property
+    def excess(self) -> tuple[float, float]:
+        """How much larger it is than that of `best` on the same noise, which spares most of the chance."""
+        return mean_and_error(self.squared - self.best_squared)
+
+    @property
+    def bias(self) -> tuple[float, str]:
+        """The farthest mean error in its own standard errors, and of what."""
+        mean = np.mean(self.errors, axis=0)
+        sigmas = np.abs(mean) / (np.std(self.errors, axis=0, ddof=1) / np.sqrt(len(self.errors)))
+        return float(np.max(sigmas)), self.names[int(np.argmax(sigmas))]
+
+
+def attempts(
+    problem: Problem, disturbance: Disturbance, seeds: Sequence[int]
+) -> Iterator[tuple[Trial, Calibration | None]]:
+    """A trial for each seed and its calibration from a cold start, None where that fails."""
+    for seed in seeds:
+        trial = make_trial(problem, disturbance, seed)
+        try:
+            yield trial, calibrate(trial.observations, problem.options)
+        except CalibrationError:
+            yield trial, None
+
+
+def mean_and_error(values: Array) -> tuple[float, float]:
+    """The mean and its standard error."""
+    return float(np.mean(values)), float(np.std(values, ddof=1) / np.sqrt(len(values)))
+
+
+def efficiency(problem: Problem, disturbance: Disturbance, seeds: Sequence[int]) -> Efficiency:
+    """Calibrate the problem once per seed, from a cold start."""
+    names: tuple[str, ...] = ()
+    errors, squared, best_squared, rejected = [], [], [], []
+    for trial, calibration in attempts(problem, disturbance, seeds):
+        if calibration is None:
+            continue
+        names, matrix = bound(trial)
+        errors.append(difference(trial, calibration.estimate))
+        squared.append(errors[-1] @ matrix @ errors[-1] / len(names))
+        ideal = difference(trial, best(trial, problem.options))
+        best_squared.append(ideal @ matrix @ ideal / len(names))
+        rejected.append(len(calibration.rejected))
+    return Efficiency(
+        names,
+        np.array(errors),
+        np.array(squared),
+        np.array(best_squared),
+        len(seeds) - len(squared),
+        float(np.mean(rejected)),
+    )
