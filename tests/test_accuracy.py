@@ -1,0 +1,203 @@
+"""The statistical limit, by small samples: efficiency, bias, outliers, mirrored poses, ssl-vision's table, as built.
+
+`scripts/accuracy.py` has the full samples. Here each calibration is compared with the best one that its own noise
+allows (known truth, sigmas and outliers), so that few runs tell a few percent; the best itself keeps to the Cramer-Rao
+bound.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "scripts"))  # whose files import each other by name
+
+import accuracy
+import accuracy_bound as limit
+import accuracy_scenes as scenes
+from benchmark_problems import corner_observations, wide_lens
+
+from ceres_cal.calibrate import calibrate
+from ceres_cal.mirrored import mirrored
+from ceres_cal.parameters import Options, intrinsics_vector, with_intrinsics
+from ceres_cal.residuals import residuals
+from ceres_cal.sights import gather_sights
+from ceres_cal.simulate import simulate
+from ceres_cal.structure import Tolerance
+from ceres_cal.transforms import Array, Pose, rotation_exp
+
+RUNS = 60
+PROBLEMS = tuple(scenes.PROBLEMS)
+
+
+@cache
+def found(problem: str, outliers: float) -> limit.Efficiency:
+    return limit.efficiency(scenes.PROBLEMS[problem](), replace(scenes.CLEAN_NOISE, outliers=outliers), range(RUNS))
+
+
+# ---- against the Cramer-Rao bound -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_efficient_without_outliers(name: str) -> None:
+    efficiency = found(name, 0.0)
+    assert efficiency.failed == 0
+    excess, error = efficiency.excess
+    assert error < 0.015  # ERR measured at most, so that 5 percent are told
+    assert excess < 0.05  # EXC measured at most
+    sigmas, parameter = efficiency.bias
+    assert sigmas < 4.0, parameter  # 2.7 measured at most, of 58 numbers
+
+
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_efficient_with_a_fifth_of_outliers(name: str) -> None:
+    efficiency = found(name, 0.2)
+    assert efficiency.failed == 0
+    # 0.12 is the aim; a field's few equations let small outliers below 5 sigma cost 0.14 (0.04 and less elsewhere).
+    assert efficiency.excess[0] < (0.2 if name == "field" else 0.12)
+    sigmas, parameter = efficiency.bias
+    assert sigmas < 4.0, parameter
+
+
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_the_best_keeps_to_the_bound(name: str) -> None:
+    """So the bound is that of this problem, and the excess over the best is that over the bound."""
+    squared = np.concatenate([found(name, outliers).best_squared for outliers in (0.0, 0.2)])
+    mean, _ = limit.mean_and_error(squared)
+    expected_error = np.sqrt(2.0 / (len(found(name, 0.0).names) * len(squared)))  # of a chi-squared variable
+    assert mean == pytest.approx(1.0, abs=4.0 * expected_error)
+
+
+def test_bound_by_differences() -> None:
+    """The information of the field is that of its residuals' differences, none of the package's derivatives in it."""
+    problem = scenes.over_the_field()
+    trial = limit.make_trial(problem, scenes.CLEAN_NOISE, 0)
+    names, matrix = limit.bound(trial)
+    camera, station = trial.truth.cameras["overhead"], trial.truth.stations["overhead"]
+    free = trial.layout.free["overhead"]
+    vector = intrinsics_vector(camera)
+    start = np.concatenate([vector[free], station.cam_from_world.log()])
+    sights = gather_sights(trial.clean)
+    height = problem.priors[0].sigma[0]
+
+    def misfit(numbers: Array) -> Array:
+        vector[free] = numbers[: len(free)]
+        pose = Pose.exp(numbers[len(free) :])
+        moved = replace(
+            trial.truth,
+            cameras={"overhead": with_intrinsics(camera, vector)},
+            stations={"overhead": replace(station, cam_from_world=pose)},
+        )
+        off = residuals(trial.clean, sights, moved)
+        return np.concatenate([off.points.ravel() / 0.3, off.curves / 0.3, [pose.position[2] / height]])
+
+    steps = 1e-4 * np.diag(np.sqrt(np.diag(np.linalg.inv(matrix))))
+    jacobian = np.array([(misfit(start + s) - misfit(start - s)) / (2.0 * s.max()) for s in steps]).T
+    scale = np.sqrt(np.diag(matrix))
+    assert len(names) == len(start)
+    assert np.max(np.abs(jacobian.T @ jacobian - matrix) / np.outer(scale, scale)) < 1e-6  # 1e-8 measured
+
+
+def test_poses_near_half_a_turn_are_told_apart_the_short_way() -> None:
+    shift = np.array([0.1, 0.2, 4.0])
+    truth = Pose(rotation_exp([np.pi - 1e-3, 0.0, 0.0]), shift)
+    beyond = Pose(rotation_exp([np.pi + 1e-3, 0.0, 0.0]), shift)
+    assert limit.pose_difference(beyond, truth) == pytest.approx([2e-3, 0, 0, 0, 0, 0], abs=1e-12)
+    assert limit.pose_difference(truth, beyond) == pytest.approx([-2e-3, 0, 0, 0, 0, 0], abs=1e-12)
+
+
+# ---- mirrored poses -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_no_pose_is_mirrored_before_a_wide_lens(seed: int) -> None:
+    problem = wide_lens(200, seed)
+    observations = corner_observations(problem.corners)
+    calibration = calibrate(observations, Options(lens="brown"))
+    rotations = {str(number): rotation for number, rotation in enumerate(problem.rotations)}
+    assert accuracy.mirrored_count(calibration, observations, rotations) == 0
+    # 0.3 px sqrt(2), less what 1208 unknowns take of 40 000 numbers
+    assert calibration.rms_px == pytest.approx(0.418, abs=0.006)  # four standard errors
+
+
+def test_no_pose_of_a_small_board_is_mirrored() -> None:
+    simulation = simulate(scenes.small_boards(200, 0), scenes.CLEAN_NOISE, 0)
+    observations = simulation.observations
+    calibration = calibrate(observations, Options(lens="brown"))
+    rotations = {name: pose.rotation for name, pose in simulation.scene.placements.items()}
+    assert accuracy.mirrored_count(calibration, observations, rotations) == 0
+    # The count is no idle one: it tells poses that are mirrored on purpose.
+    sights = gather_sights(observations)
+    poses = mirrored(sights, calibration.estimate.pose_stack(sights.keys))
+    placements = {str(key.placement): Pose(p[:, :3], p[:, 3]) for key, p in zip(sights.keys, poses, strict=True)}
+    turned = replace(calibration, estimate=replace(calibration.estimate, placements=placements))
+    assert accuracy.mirrored_count(turned, observations, rotations) > 100  # 165; others are led back
+
+
+# ---- ssl-vision's table ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", scenes.SSL_PROBLEMS)
+def test_the_scenes_of_ssl_vision_are_solved_as_well_as_the_noise_allows(name: str) -> None:
+    rows = list(accuracy.ssl_vision_rows(name, scenes.SSL_PROBLEMS[name](), 20))
+    for row in rows:
+        if row.what.startswith("its excess"):
+            assert row.error < 0.03  # 0.002 measured, so that 10 percent are told
+        assert row.verdict in ("yes", "open", ""), row
+    # Medians of 20 seeds vary by 8 percent or so; the paper's lens is ssl-vision's worst case.
+    means = {row.case: row.value for row in rows if row.what.startswith("mean")}
+    if "paper" in name:
+        for height, (theirs, _) in zip(("0", "150"), scenes.SSL_VISION_MM[name], strict=True):
+            assert means[f"{name}, z = {height} mm"] < 0.5 * theirs  # 0.95 of 2.5 mm and less measured
+
+
+def test_bounds_of_the_issue() -> None:
+    """0.98 and 0.60 mm for the paper's polynomial: the mean over all draws from the covariance."""
+    for name, half, expected_mm in (("half, paper's lens", True, 0.98), ("whole, paper's lens", False, 0.60)):
+        drawn = accuracy.predicted_mm(scenes.SSL_PROBLEMS[name](), scenes.field_places(half), 0.0)
+        assert np.mean(drawn) == pytest.approx(expected_mm, abs=0.03), name  # 0.98 and 0.61 measured
+
+
+# ---- the field as built ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_lines_painted_amiss_are_found_by_six_stations(seed: int) -> None:
+    painted = scenes.painted_by_six_stations(seed)
+    calibration = calibrate(painted.observations, Options(tolerances={"field": Tolerance(lines_m=0.010)}))
+    errors = accuracy.offset_errors_mm(calibration, painted.offsets_m, scenes.FIELD)
+    assert np.max(np.abs(errors)) < 1.0  # 0.5 measured; sd 0.18
+    assert np.std(list(painted.offsets_m.values())) > 0.004  # it was painted amiss
+
+
+@pytest.mark.parametrize("heights_known", [False, True])
+def test_tolerances_do_no_harm_where_two_cameras_can_tell_little(heights_known: bool) -> None:
+    errors = np.array([accuracy.floor_errors_of_two_cameras(seed, heights_known) for seed in range(5)])
+    assert np.all(errors[:, 1] <= errors[:, 0])  # 5 against 11 mm on average
+
+
+# ---- the script -----------------------------------------------------------------------------------------------------
+
+
+def test_verdicts() -> None:
+    row = accuracy.Row("case", "what", 1.06, 0.02, 0.95, 1.05)
+    assert row.verdict == "open"
+    assert replace(row, value=1.10).verdict == "no"
+    assert replace(row, value=0.96).verdict == "yes"
+    assert replace(row, least=-np.inf, most=np.inf).verdict == ""
+
+
+def test_the_script_prints_and_writes_its_rows(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "figures.json"
+    assert accuracy.main(["--case", "as-built", "--runs", "2", "--json", str(path)]) == 0
+    rows = json.loads(path.read_text(encoding="utf-8"))
+    printed = capsys.readouterr().out
+    assert {row["verdict"] for row in rows} == {"yes", ""}
+    assert all(row["what"] in printed for row in rows)
+    assert all("least" not in row for row in rows)  # JSON knows no infinity
