@@ -49,8 +49,8 @@ def test_efficient_without_outliers(name: str) -> None:
     efficiency = found(name, 0.0)
     assert efficiency.failed == 0
     excess, error = efficiency.excess
-    assert error < 0.015  # ERR measured at most, so that 5 percent are told
-    assert excess < 0.05  # EXC measured at most
+    assert error < 0.015  # 0.007 measured at most, so that 5 percent are told
+    assert excess < 0.05  # 0.006 measured at most
     sigmas, parameter = efficiency.bias
     assert sigmas < 4.0, parameter  # 2.7 measured at most, of 58 numbers
 
@@ -172,7 +172,7 @@ def test_lines_painted_amiss_are_found_by_six_stations(seed: int) -> None:
     painted = scenes.painted_by_six_stations(seed)
     calibration = calibrate(painted.observations, Options(tolerances={"field": Tolerance(lines_m=0.010)}))
     errors = accuracy.offset_errors_mm(calibration, painted.offsets_m, scenes.FIELD)
-    assert np.max(np.abs(errors)) < 1.0  # 0.5 measured; sd 0.18
+    assert np.max(np.abs(errors)) < 1.0  # 0.45 measured; sd 0.18
     assert np.std(list(painted.offsets_m.values())) > 0.004  # it was painted amiss
 
 
