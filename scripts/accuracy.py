@@ -83,7 +83,7 @@ class Row:
         value = f"{self.value:.4g}" + (f" ± {self.error:.2g}" if self.error else "")
         both = (("from", self.least), ("to", self.most))
         limits = [f"{word} {limit:.3g}" for word, limit in both if np.isfinite(limit)]
-        return f"{self.case:33}{self.what:42}{value:>18}  {' '.join(limits):18}{self.verdict:6}{self.note}".rstrip()
+        return f"{self.case:33}{self.what:42}{value:>18}  {' '.join(limits):20}{self.verdict:6}{self.note}".rstrip()
 
 
 # ---- against the Cramer-Rao bound -----------------------------------------------------------------------------------
