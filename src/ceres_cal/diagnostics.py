@@ -86,9 +86,10 @@ def judge(
     points, curves = relative_lengths(observations, residuals)
     if not estimate_noise:
         return Inliers(points <= reject_sigma, curves <= reject_sigma, 1.0, 1.0, points, curves)
-    spare = 1.0 - unknowns / max(2.0 * len(points) + len(curves), 1.0)
-    point_scale = _scale(points, 2, _RAYLEIGH_MEDIAN, spare, reject_sigma)
-    curve_scale = _scale(curves, 1, _NORMAL_MEDIAN, spare, reject_sigma)
+    point_spread = _spread(points, _RAYLEIGH_MEDIAN, reject_sigma)
+    curve_spread = _spread(curves, _NORMAL_MEDIAN, reject_sigma)
+    spare = 1.0 - unknowns / max(2.0 * point_spread.count + curve_spread.count, 1.0)
+    point_scale, curve_scale = point_spread.scale(2.0 * spare), curve_spread.scale(spare)
     # A kind with too few spare equations borrows the other's scale; if both have, the stated sigmas are all there is.
     known = [scale for scale in (point_scale, curve_scale) if scale is not None]
     fallback = known[0] if known else 1.0
@@ -97,11 +98,22 @@ def judge(
     return Inliers(points <= reject_sigma * p, curves <= reject_sigma * c, p, c, points / p, curves / c)
 
 
-def _scale(lengths: Array, dimensions: int, median_of_one: float, spare: float, reject_sigma: float) -> float | None:
+@dataclass(frozen=True)
+class _Spread:
+    """Number and sum of squares of the lengths within the rejection bound."""
+
+    count: int
+    squares: float
+
+    def scale(self, freedom: float) -> float | None:
+        """Their scale, when each brings `freedom` spare equations; None where those are too few to tell."""
+        if self.count * freedom < _LEAST_FREEDOM:
+            return None
+        return max(float(np.sqrt(self.squares / (self.count * freedom))), _LEAST_SCALE_PX)
+
+
+def _spread(lengths: Array, median_of_one: float, reject_sigma: float) -> _Spread:
     finite = np.isfinite(lengths)
     seen = lengths if finite.all() else lengths[finite]
-    if dimensions * len(seen) * spare < _LEAST_FREEDOM:
-        return None
     inside = seen <= reject_sigma * _median_scale(seen, median_of_one)
-    squares = float(np.sum(seen**2, where=inside))
-    return max(float(np.sqrt(squares / (dimensions * np.count_nonzero(inside) * spare))), _LEAST_SCALE_PX)
+    return _Spread(int(np.count_nonzero(inside)), float(np.sum(seen**2, where=inside)))

@@ -53,7 +53,7 @@ class Options:
     tolerances: Mapping[str, Tolerance] = field(default_factory=dict)
     loss: str = "huber"
     loss_scale: float = 3.0
-    reject_sigma: float = 5.0
+    reject_sigma: float = 4.0
     noise_scale: str = "estimate"
     closed_form_only: bool = False
     max_iterations: int = 100

@@ -71,9 +71,9 @@ def _add_arguments(parser: ArgumentParser) -> None:
     add(
         "--reject-sigma",
         type=float,
-        default=5.0,
+        default=4.0,
         metavar="SIGMA",
-        help="observations farther off are taken out and listed; default: 5",
+        help="observations farther off are taken out and listed; default: 4",
     )
     add(
         "--noise-scale",
