@@ -159,10 +159,10 @@ def test_gross_errors_are_listed_and_do_not_decide(name: str, seed: int) -> None
     listed[[entry.row + (points if entry.kind == "curve" else 0) for entry in calibration.rejected]] = True
     sigmas = deviations_px(simulation) / 0.3
     wrong = np.concatenate([simulation.points.flag, simulation.curves.flag]) != CLEAN
-    # Residuals are judged from an estimate that has its own error: between 3 and 6 sigma either answer is right.
-    assert np.all(listed[sigmas > 6.0])  # recall 1: every gross error, however it came about
-    assert not np.any(listed[sigmas < 3.0])
-    assert np.count_nonzero(listed & ~wrong) <= 3  # exp(-8) = 3e-4 of clean points are 4 sigma off; 2 measured at most
+    # Residuals are judged from an estimate that has its own error: between 4 and 7 sigma either answer is right.
+    assert np.all(listed[sigmas > 7.0])  # recall 1: every gross error, however it came about
+    assert not np.any(listed[sigmas < 4.0])
+    assert np.all(wrong[listed])  # precision 1: 5 sigma take out no clean observation of these
     assert np.count_nonzero(listed) > 0.5 * np.count_nonzero(wrong)  # many an outlier lies along its line
     if points > 50:
         assert calibration.fit.point_scale == pytest.approx(1.0, abs=0.1)  # of the stated 0.3 px; 0.06 measured
@@ -201,7 +201,8 @@ def test_no_board_is_left_in_its_mirrored_pose(
     board = checkerboard(9, 6, 0.05)
     scene = board_scene(board, {"camera": camera}, stations, 60, seed=5, distance_m=(nearest_m, farthest_m))
     calibration = calibrate(simulate(scene, NOISE, seed).observations, options_for(scene))
-    assert len(calibration.rejected) < 10 and calibration.warnings == ()  # one of 3240 is 4 sigma off by chance
+    assert calibration.rejected == ()
+    assert not any("placement" in warning for warning in calibration.warnings)  # phi may well have started from a guess
     for placement, truth in scene.placements.items():
         turned = rotation_log(calibration.placements[placement].rotation @ truth.rotation.T)
         assert np.degrees(np.linalg.norm(turned)) < angle_deg
@@ -217,7 +218,7 @@ def test_what_is_listed_can_be_found_again() -> None:
         assert entry.frame == observations.views[column.view[entry.row]].frame
         assert entry.feature == observations.feature_name(entry.kind, entry.row)
         number, *words = entry.reason.split(" ", 1)
-        assert words == ["sigma off"] and float(number) >= 4.0
+        assert words == ["sigma off"] and float(number) >= 5.0
     assert calibration.fit.points + calibration.fit.curves + len(calibration.rejected) == len(
         observations.points
     ) + len(observations.curves)
@@ -312,7 +313,7 @@ def test_order_names_and_frames_do_not_matter(name: str, rearranged: Rearrange) 
     for truth, found in zip(base.cameras.values(), other.cameras.values(), strict=True):
         assert found.phi == pytest.approx(truth.phi, rel=1e-8)  # 8e-10 measured
         assert found.principal_point == pytest.approx(truth.principal_point, abs=1e-8 * truth.phi)
-    assert len(other.rejected) == len(base.rejected) < 5
+    assert sorted(e.row for e in other.rejected) == sorted(e.row for e in base.rejected) == []
     base = calibrate(simulation.observations, options_for(simulation.scene))
     other = calibrate(rearranged(simulation.observations), options_for(simulation.scene))
     for truth, found in zip(base.cameras.values(), other.cameras.values(), strict=True):

@@ -221,9 +221,9 @@ def test_sony_boards(sony_boards: BoardDetections) -> None:
     assert len(sony_boards.observations.views) == 13
     options = Options(lens="brown", free_aspect=True, fixed={"p1": 0.0, "p2": 0.0, "k3": 0.0})
     calibration = calibrate(sony_boards.observations, options)
-    assert calibration.fit.points_rms_px <= 0.163  # 0.1625 measured
+    assert calibration.fit.points_rms_px <= 0.163  # 0.1626 measured
     assert calibration.fit.points == 13 * 24
-    assert abs(calibration.station().phi - 700.9) <= 0.5  # 700.77 measured
+    assert abs(calibration.station().phi - 700.9) <= 0.5  # 700.45 measured
 
 
 def test_gopro_boards(gopro_boards: BoardDetections) -> None:
@@ -232,7 +232,7 @@ def test_gopro_boards(gopro_boards: BoardDetections) -> None:
     assert len(observations.views) >= 35
     options = Options(lens="brown", free_aspect=True, fixed={"p1": 0.0, "p2": 0.0})
     calibration = calibrate(observations, options)
-    assert calibration.fit.points_rms_px <= 0.53  # 0.445 measured, without 6 corners
+    assert calibration.fit.points_rms_px <= 0.53  # 0.444 measured, without 7 corners
     assert len(calibration.rejected) < 0.01 * len(observations.points)
     everything = replace(options, loss="trivial", noise_scale="stated", reject_sigma=1e9)
     plain = calibrate(observations, everything)

@@ -89,7 +89,7 @@ def test_painted_offsets_come_back(seed: int) -> None:
     errors = left_over({name: found[f"field/{name}"] - offset for name, offset in offsets.items()})
     assert np.max(np.abs(errors)) < 1e-3  # 0.3 to 0.6 mm; painted: up to 20 mm
     assert calibration.fit.curve_scale == pytest.approx(1.0, abs=0.06)  # 1.02; 1.6 to 2.8 with the field as drawn
-    assert len(calibration.rejected) < 0.002 * len(observations.curves)  # 4 sigma by chance; hundreds as drawn
+    assert not calibration.rejected
 
 
 def test_a_bent_board_is_straightened() -> None:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ceres_cal.baseline import four_point_baseline
-from ceres_cal.bundle import Progress, Solution, Weighting, solve
+from ceres_cal.bundle import Progress, Solution, Weighting, private_placements, settle_placements, solve
 from ceres_cal.calibration import Calibration, Fit, Rejected
 from ceres_cal.camera import Camera
 from ceres_cal.diagnostics import Inliers, judge, start_weights
@@ -19,10 +19,11 @@ from ceres_cal.mirrored import without_mirrored_poses
 from ceres_cal.observations import Observations
 from ceres_cal.parameters import Estimate, Layout, Options, make_layout
 from ceres_cal.residuals import Residuals, residuals
-from ceres_cal.sights import Sights, gather_sights
+from ceres_cal.sights import Rows, Sights, gather_sights
 from ceres_cal.transforms import Array
 
 _MOST_ROUNDS = 15
+_ENOUGH_PLACEMENTS = 48  # of a camera: with them it is known well enough to place all others
 _NO_FIT = 0.015  # of the image diagonal: a median residual beyond it is no calibration
 _GUESSED = (
     "camera {!r}: the views are too frontal to tell phi and distance apart, so phi started from a guess and may be "
@@ -118,29 +119,50 @@ def _settle(
     used = sights.used(everything.points, everything.curves)
     if not len(used):
         raise DegenerateError("the observations fix no pose that could show them: add points or lines of the targets")
-    solution = solve(used, estimate, layout, rough, options, progress, found.places)
+    few = used.take(_spread(used, layout))
+    solution = solve(few, estimate, layout.of(few.keys), rough, options, progress, found.places)
+    if len(few) < len(used):
+        solution = replace(solution, estimate=settle_placements(used, solution.estimate, layout, rough, options))
     before, (found, inliers) = everything, judged(solution.estimate, found.places)
     rounds = 1
     while rounds < _MOST_ROUNDS:
         weighting = Weighting(inliers.point_scale, inliers.curve_scale, options.loss, options.loss_scale)
-        estimate, changed = _mended(sights, inliers, solution.estimate, layout, weighting)
-        if changed:
-            found, inliers = judged(estimate, found.places)
-        elif rounds > 1 and inliers.same_as(before):
-            break
-        used = sights.used(inliers.points, inliers.curves)
+        if rounds == 1:  # to judge by, not to keep
+            weighting = replace(weighting, precision=1e-9)
+        at_rest = rounds > 2 and inliers.same_as(before)
+        estimate = solution.estimate
+        if not at_rest:
+            used = sights.used(inliers.points, inliers.curves)
+        if rounds == 1 or at_rest:
+            estimate, changed = _mended(sights, used, inliers, estimate, layout, weighting)
+            if changed:
+                found, inliers = judged(estimate, found.places)
+                used = sights.used(inliers.points, inliers.curves)
+            elif at_rest:
+                break
         solution = solve(used, estimate, layout, weighting, options, progress, found.places)
         before, (found, inliers) = inliers, judged(solution.estimate, found.places)
         rounds += 1
     return _Settled(solution, inliers, found, rounds)
 
 
+def _spread(sights: Sights, layout: Layout) -> Rows:
+    """Numbers of some sights that tell a camera well enough for a start: of private placements no more than enough."""
+    private = private_placements(sights, layout)
+    chosen: list[int] = []
+    for camera in {key.camera for key in sights.keys}:
+        own = [number for number, key in enumerate(sights.keys) if key.camera == camera]
+        boards = [number for number in own if sights.keys[number].placement in private]
+        chosen += boards[:: max(1, len(boards) // _ENOUGH_PLACEMENTS)]
+        chosen += [number for number in own if sights.keys[number].placement not in private]
+    return np.array(sorted(chosen), dtype=np.int64)
+
+
 def _mended(
-    sights: Sights, inliers: Inliers, estimate: Estimate, layout: Layout, weighting: Weighting
+    sights: Sights, used: Sights, inliers: Inliers, estimate: Estimate, layout: Layout, weighting: Weighting
 ) -> tuple[Estimate, int]:
     """The estimate with lost boards posed again and mirrored poses turned over, and how many there were of both."""
     estimate, lost = with_lost_boards_found(sights, inliers, estimate, layout, replace(weighting, loss="cauchy"))
-    used = sights.used(inliers.points, inliers.curves)
     estimate, turned = without_mirrored_poses(used, estimate, layout, weighting)
     return estimate, lost + turned
 
@@ -180,7 +202,7 @@ def _require_fit(name: str, camera: Camera, settled: _Settled, sights: Sights) -
     points = np.linalg.norm(settled.residuals.points[own.point_rows], axis=1)
     missed = np.nan_to_num(np.concatenate([points, np.abs(settled.residuals.curves[own.curve_rows])]), nan=np.inf)
     limit_px = _NO_FIT * float(np.hypot(*camera.image_size))
-    if np.median(missed) > limit_px:
+    if 2 * np.count_nonzero(missed > limit_px) > len(missed):
         raise SolutionError(
             f"camera {name!r}: the best solution misses half of its observations by more than {limit_px:.0f} px: "
             "check labels, target dimensions and which lens it is"

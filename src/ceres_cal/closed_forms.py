@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ceres_cal.errors import DegenerateError
-from ceres_cal.kernels import grouped_products
+from ceres_cal.kernels import grouped_products, plane_homographies
 from ceres_cal.transforms import Array, Pose, nearest_rotation
 
 Ints = NDArray[np.int64]
@@ -216,6 +216,18 @@ def radial_alignment(data: PlaneData, unit_px: float, terms: int, rounds: int) -
         weights = 1.0 / (1.0 + (error / (1.5 * usual)) ** 2)
     homographies = np.concatenate([h12 * unit_px, h3[:, None, :]], axis=1) @ restore
     return RadialAlignment(Profile(tuple(float(v) for v in c), unit_px), homographies, error * unit_px, error / usual)
+
+
+def homographies_of_sights(data: PlaneData, profile: Profile) -> tuple[Array, Array]:
+    """H (S, 3, 3) of every sight under a known profile, and each point's error (N,) px.
+
+    The normalised DLT, reweighted to distances in the image, and against wrong labels where some points do not fit.
+    """
+    scale = np.array([profile.unit_px, profile.unit_px, 1.0])
+    homographies, errors = np.empty((len(data.bounds) - 1, 3, 3)), np.empty(len(data.plane))
+    lifted = profile.lift(data.offsets) / scale
+    plane_homographies(data.bounds, np.ascontiguousarray(data.plane), lifted, homographies, errors)
+    return scale[:, None] * homographies, errors * profile.unit_px
 
 
 def usual_by_radius(error: Array, radius: Array) -> Array:

@@ -18,12 +18,13 @@ from ceres_cal.lens import Brown, KannalaBrandt, Lens, Radial
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.parameters import Estimate, Options, Station, anchored_stations
 from ceres_cal.planes import Homographies, profile_and_homographies
-from ceres_cal.sights import Sights
+from ceres_cal.sights import Rows, Sights
 from ceres_cal.structure import make_structure
-from ceres_cal.transforms import Array, Pose
+from ceres_cal.transforms import Array, Pose, Poses, chained, inverted
 
 _PHI_RANGE = np.geomspace(0.15, 15.0, 120)  # in half image diagonals
 _PHI_GUESS = 1.4
+_ENOUGH_VIEWS = 100  # for phi
 
 
 @dataclass(frozen=True)
@@ -42,14 +43,15 @@ def initialise(observations: Observations, sights: Sights, options: Options) -> 
     """
     cameras: dict[str, Camera] = {}
     phi_from: dict[str, str] = {}
-    poses: dict[int, Pose] = {}
+    numbers, poses = [], []
     priors = (*observations.priors, *options.priors)
     for name, image_size in observations.cameras.items():
-        own = np.array([number for number, key in enumerate(sights.keys) if key.camera == name])
+        own = np.array([number for number, key in enumerate(sights.keys) if key.camera == name], dtype=np.int64)
         start = _start_camera(name, image_size, sights.take(own), options, priors)
         cameras[name], phi_from[name] = start.camera, start.phi_from
-        poses |= {int(own[i]): pose for i, pose in start.poses.items()}
-    stations, placements = _chain_poses(observations, sights, poses)
+        numbers.append(own[start.sights])
+        poses.append(start.poses)
+    stations, placements = _chain_poses(observations, sights, np.concatenate(numbers), np.concatenate(poses))
     structure = make_structure(observations.targets, options.tolerances)
     return Start(Estimate(cameras, stations, placements, structure), phi_from)
 
@@ -61,7 +63,8 @@ def initialise(observations: Observations, sights: Sights, options: Options) -> 
 class _CameraStart:
     camera: Camera
     phi_from: str
-    poses: Mapping[int, Pose]
+    sights: Rows
+    poses: Array
 
 
 def _start_camera(
@@ -75,11 +78,7 @@ def _start_camera(
     phi, phi_from = _choose_phi(sights, homographies, unit, options, [p for p in priors if _concerns(p, name, sights)])
     reach = sights.reach_px(blank)
     camera = replace(blank, phi=phi, lens=_fit_lens(blank.lens, profile, phi, reach, options.fixed))
-    poses = {
-        int(number): Pose(matrix[:, :3], matrix[:, 3])
-        for number, matrix in zip(homographies.sights, _poses_at(homographies, phi), strict=True)
-    }
-    return _CameraStart(camera, phi_from, poses)
+    return _CameraStart(camera, phi_from, homographies.sights, _poses_at(homographies, phi))
 
 
 def _concerns(prior: Prior, camera: str, sights: Sights) -> bool:
@@ -130,8 +129,10 @@ def _choose_phi(
         return options.fixed["phi"], "fixed"
     known = [p for p in priors if p.quantity in ("phi", "height_m", "position_m")]
 
+    some = slice(None, None, max(1, len(homographies.matrices) // _ENOUGH_VIEWS))
+
     def cost(phi: Array) -> Array:
-        error = orthogonality_error(homographies.matrices, phi) * homographies.sizes_px
+        error = orthogonality_error(homographies.matrices[some], phi) * homographies.sizes_px[some]
         total = np.sum(np.log1p((error / 0.5) ** 2), axis=1)
         return np.asarray(total + sum(_prior_cost(prior, phi, sights, homographies) for prior in known))
 
@@ -202,39 +203,42 @@ def _lens_equations(lens: Lens, r: Array, w: Array, phi: float) -> tuple[dict[st
 
 
 def _chain_poses(
-    observations: Observations, sights: Sights, poses: Mapping[int, Pose]
-) -> tuple[dict[str, Station], dict[str, Pose]]:
-    """Stations and placements from the sights' poses: best-seen sights first, each one extending what is known."""
-    stations = {name: Pose.identity() for name in anchored_stations(observations)}
-    placements: dict[str, Pose] = {}
+    observations: Observations, sights: Sights, numbers: Rows, poses: Array
+) -> tuple[dict[str, Station], Poses]:
+    """Stations and placements from the poses (K, 3, 4) of sights: best-seen first, each one extending what is known."""
     sizes = np.diff(sights.point_bounds) + np.diff(sights.curve_bounds)
-    waiting = sorted(poses, key=lambda i: -sizes[i])
-    progress = True
-    while progress:
-        progress = False
-        for i in list(waiting):
-            sight, pose = sights.keys[i], poses[i]
-            station_known = sight.station in stations
-            if sight.placement is None or sight.placement in placements:
-                if not station_known:
-                    world = Pose.identity() if sight.placement is None else placements[sight.placement]
-                    stations[sight.station] = pose @ world.inverse
-            elif station_known:
-                placements[sight.placement] = stations[sight.station].inverse @ pose
-            else:
-                continue
-            waiting.remove(i)
-            progress = True
+    order = np.argsort(-sizes[numbers], kind="stable")
+    keys, seen = [sights.keys[i] for i in numbers[order]], poses[order]
+    stations = {name: np.eye(3, 4) for name in anchored_stations(observations)}
+    placements: dict[str | None, Array] = {None: np.eye(3, 4)}
+    known = -1
+    while len(stations) + len(placements) > known:
+        known = len(stations) + len(placements)
+        for key, pose in zip(keys, seen, strict=True):
+            if key.station not in stations and key.placement in placements:
+                stations[key.station] = chained(pose, inverted(placements[key.placement]))
+        fresh: dict[str | None, int] = {}
+        for place, key in enumerate(keys):
+            if key.placement not in placements and key.station in stations:
+                fresh.setdefault(key.placement, place)
+        if fresh:
+            places = list(fresh.values())
+            world_from_cam = inverted(np.array([stations[keys[place].station] for place in places]))
+            placements |= dict(zip(fresh, chained(world_from_cam, seen[places]), strict=True))
     _require_all(observations, sights, stations, placements)
     cameras = observations.stations
-    return {name: Station(cameras[name], stations[name]) for name in cameras if name in stations}, placements
+    named = [name for name in placements if name is not None]
+    return (
+        {n: Station(cameras[n], Pose(stations[n][:, :3], stations[n][:, 3])) for n in cameras if n in stations},
+        Poses.stacked(named, np.array([placements[name] for name in named]).reshape(-1, 3, 4)),
+    )
 
 
 def _require_all(
-    observations: Observations, sights: Sights, stations: Container[str], placements: Container[str]
+    observations: Observations, sights: Sights, stations: Container[str], placements: Container[str | None]
 ) -> None:
     for number, key in enumerate(sights.keys):
-        if key.station in stations and (key.placement is None or key.placement in placements):
+        if key.station in stations and key.placement in placements:
             continue
         sight = sights[number]
         frames = ", ".join(repr(observations.views[i].frame) for i in sight.views[0][:3])

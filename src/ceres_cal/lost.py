@@ -6,11 +6,9 @@ more. With the lens solved from the other boards, four good corners pose a lost 
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
-from ceres_cal.bundle import Weighting, placed, placement_costs, private_placements
+from ceres_cal.bundle import Weighting, placement_costs, private_placements
 from ceres_cal.closed_forms import polar_pose
 from ceres_cal.diagnostics import Inliers
 from ceres_cal.mirrored import mirrored
@@ -32,7 +30,7 @@ def with_lost_boards_found(
         sights: with all their observations, those rejected too. weighting: with a loss that bears outliers.
     """
     private = private_placements(sights, layout)
-    placements, count = dict(estimate.placements), 0
+    count = 0
     for number in np.flatnonzero(sights.used_share(inliers.points, inliers.curves) < _LOST):
         sight = sights[int(number)]
         pose = _by_consensus(sight, estimate, weighting) if sight.key.placement in private else None
@@ -42,9 +40,9 @@ def with_lost_boards_found(
         tried = [placement_costs(sight, estimate, layout, weighting, p) for p in (pose, mirrored(sight, pose))]
         cost, found = min(tried, key=lambda one: float(one[0][0]))
         if cost[0] < 0.99 * as_is[0]:
-            placements |= placed(estimate, sight.keys, found)
+            estimate = estimate.with_placements(sight.keys, found)
             count += 1
-    return replace(estimate, placements=placements), count
+    return estimate, count
 
 
 def _by_consensus(sight: Sights, estimate: Estimate, weighting: Weighting) -> Array | None:

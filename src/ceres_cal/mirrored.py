@@ -6,14 +6,12 @@ compete, that is, where perspective is too weak to have decided at the start.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
-from ceres_cal.bundle import Weighting, placed, placement_costs, private_placements
+from ceres_cal.bundle import Weighting, placement_costs, private_placements
 from ceres_cal.parameters import Estimate, Layout
 from ceres_cal.sights import Rows, Sights
-from ceres_cal.transforms import Array, Pose
+from ceres_cal.transforms import Array
 
 _DECIDED_SIGMA = 100.0  # perspective that bends a view by so many standard deviations leaves no doubt
 
@@ -23,31 +21,30 @@ def without_mirrored_poses(
 ) -> tuple[Estimate, int]:
     """The estimate with every private placement in the better one of its two poses, and how many were changed."""
     private = private_placements(sights, layout)
-    placements, changed = dict(estimate.placements), 0
+    changed = 0
     for camera in estimate.cameras:
         own = np.array(
             [i for i, key in enumerate(sights.keys) if key.camera == camera and key.placement in private],
             dtype=np.int64,
         )
         if len(own):
-            found, count = _better_poses(sights.take(own), estimate, layout, weighting)
-            placements |= found
+            estimate, count = _with_better_poses(sights.take(own), estimate, layout, weighting)
             changed += count
-    return replace(estimate, placements=placements), changed
+    return estimate, changed
 
 
-def _better_poses(
+def _with_better_poses(
     sights: Sights, estimate: Estimate, layout: Layout, weighting: Weighting
-) -> tuple[dict[str, Pose], int]:
+) -> tuple[Estimate, int]:
     poses = estimate.pose_stack(sights.keys)
     doubtful = _doubtful(sights, poses, estimate, weighting)
     if not len(doubtful):
-        return {}, 0
+        return estimate, 0
     few = sights.take(doubtful)
     as_is, _ = placement_costs(few, estimate, layout, weighting, poses[doubtful])
     costs, found = placement_costs(few, estimate, layout, weighting, mirrored(few, poses[doubtful]))
     better = np.flatnonzero(costs < as_is * (1.0 - 1e-6))
-    return placed(estimate, [few.keys[i] for i in better], found[better]) if len(better) else {}, len(better)
+    return estimate.with_placements([few.keys[i] for i in better], found[better]), len(better)
 
 
 def _boxes(sights: Sights) -> tuple[Array, Array]:

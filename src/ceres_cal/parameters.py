@@ -6,7 +6,7 @@ be of order one) and one 6-vector (rotation vector, translation) per free statio
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -18,7 +18,7 @@ from ceres_cal.lens import LENS_KINDS, Lens, make_lens
 from ceres_cal.observations import Observations, Prior, View
 from ceres_cal.sights import SightKey
 from ceres_cal.structure import Structure, Tolerance
-from ceres_cal.transforms import Array, Pose
+from ceres_cal.transforms import Array, Pose, Poses, chained, inverted
 
 LOSSES = ("trivial", "huber", "soft_l1", "cauchy", "tukey")
 
@@ -52,8 +52,8 @@ class Options:
     priors: tuple[Prior, ...] = ()
     tolerances: Mapping[str, Tolerance] = field(default_factory=dict)
     loss: str = "huber"
-    loss_scale: float = 3.0
-    reject_sigma: float = 4.0
+    loss_scale: float = 2.5
+    reject_sigma: float = 5.0
     noise_scale: str = "estimate"
     closed_form_only: bool = False
     max_iterations: int = 100
@@ -132,6 +132,13 @@ class Estimate:
     structure: Structure
     """The targets as built."""
 
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "placements", Poses.of(self.placements))
+
+    @property
+    def _placements(self) -> Poses:
+        return Poses.of(self.placements)
+
     def camera_at(self, station: str, placement: str | None = None) -> Camera:
         """The station's camera in the world, or in the frame of a placement (its cam_from_world is cam_from_target)."""
         pose = self.stations[station].cam_from_world
@@ -141,15 +148,17 @@ class Estimate:
 
     def pose_stack(self, keys: Sequence[SightKey]) -> Array:
         """cam_from_frame of each sight as [R t], (S, 3, 4)."""
-        stations = {name: station.cam_from_world for name, station in self.stations.items()}
-        frames: dict[str | None, Pose] = {None: Pose.identity()}
-        frames.update(self.placements)
-        first = np.array([stations[key.station].rotation for key in keys])
-        offset = np.array([stations[key.station].translation for key in keys])
-        second = np.array([frames[key.placement].rotation for key in keys])
-        moved = np.array([frames[key.placement].translation for key in keys])
-        translations = np.einsum("sij,sj->si", first, moved) + offset
-        return np.concatenate([first @ second, translations[:, :, None]], axis=2)
+        return chained(self._station_stack(keys), self._placements.of_names([key.placement for key in keys]))
+
+    def with_placements(self, keys: Sequence[SightKey], cam_from_target: Array) -> Estimate:
+        """The estimate with the placement of each key where its station sees it, cam_from_target (S, 3, 4)."""
+        names = [key.placement for key in keys if key.placement is not None]
+        moved = chained(inverted(self._station_stack(keys)), cam_from_target)
+        return replace(self, placements=self._placements.updated(names, moved))
+
+    def _station_stack(self, keys: Sequence[SightKey]) -> Array:
+        poses = Poses.of({name: station.cam_from_world for name, station in self.stations.items()})
+        return poses.of_names([key.station for key in keys])
 
 
 @dataclass(frozen=True)
@@ -171,6 +180,10 @@ class Layout:
     def size(self) -> int:
         """Number of free numbers."""
         return sum(len(f) for f in self.free.values()) + 6 * (len(self.stations) + len(self.placements))
+
+    def of(self, keys: Iterable[SightKey]) -> Layout:
+        """The layout of a problem with these sights alone: no placement that they do not show is free."""
+        return replace(self, placements=self.placements & {key.placement for key in keys})
 
 
 def make_layout(observations: Observations, options: Options) -> Layout:
@@ -202,8 +215,9 @@ def make_layout(observations: Observations, options: Options) -> Layout:
 
 def _shown_views(observations: Observations) -> list[View]:
     """The views with observations; what the others name is not there for the solve."""
-    numbers = np.union1d(observations.points.view, observations.curves.view)
-    return [observations.views[number] for number in numbers]
+    count = len(observations.views)
+    shown = sum(np.bincount(column.view, minlength=count) for column in (observations.points, observations.curves))
+    return [observations.views[number] for number in np.flatnonzero(shown)]
 
 
 def anchored_stations(observations: Observations) -> frozenset[str]:

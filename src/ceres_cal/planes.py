@@ -15,8 +15,8 @@ from ceres_cal.camera import Camera
 from ceres_cal.closed_forms import (
     PlaneData,
     Profile,
-    RadialAlignment,
     facing,
+    homographies_of_sights,
     homography_from_points,
     inverse_homography_from_moments,
     line_moments,
@@ -25,10 +25,12 @@ from ceres_cal.closed_forms import (
     ring_profile,
 )
 from ceres_cal.errors import DegenerateError
+from ceres_cal.kernels import grouped_scatter
 from ceres_cal.sights import Mask, Rows, Sights
 from ceres_cal.transforms import Array
 
 _MOST = 1500  # observations of one kind in a sight beyond which a start learns nothing more
+_ENOUGH_BOARDS = 32  # for a profile
 _ENOUGH_POINTS = 40.0  # of a board
 _GOLDEN = 0.6180339887498949
 _ROUGH_PX = 1.0  # a median beyond it may be no fit at all, however even
@@ -110,8 +112,7 @@ def profile_and_homographies(sights: Sights, camera: Camera, unit: float) -> tup
     profile: Profile | None = None
     board = sights.take(pure)
     if len(pure):
-        alignment = _align(board, camera, unit)
-        profile = alignment.profile
+        profile = _profile_of_boards(board, camera, unit)
     for i, plane in planes.items():
         if plane.equations == 0 and len(sights[i].track) and sights[i].is_arc[sights[i].track].all():
             ring, found[i] = _from_rings(sights[i], camera, unit)
@@ -123,58 +124,61 @@ def profile_and_homographies(sights: Sights, camera: Camera, unit: float) -> tup
     found |= {i: _homography_of(planes[i], profile) for i in mixed}
     parts = [Homographies(np.array([i]), h[None], *_extent(planes[i])) for i, h in found.items()]
     if len(pure):
-        sizes = _spreads(camera.offsets(board.pixels), board.point_bounds)
+        sizes = np.sqrt(np.trace(grouped_scatter(board.pixels, board.point_bounds), axis1=1, axis2=2))
         heights = board.points[board.point_bounds[:-1], 2]
-        parts.append(Homographies(pure, _without_wrong_labels(board, camera, alignment), heights, sizes))
+        matrices = _homographies_of_boards(board, camera, profile)
+        told = _spans(matrices)
+        parts.append(Homographies(pure[told], matrices[told], heights[told], sizes[told]))
     names = ("sights", "matrices", "heights_m", "sizes_px")
     if not parts:
         return profile, Homographies(np.empty(0, np.int64), np.empty((0, 3, 3)), np.empty(0), np.empty(0))
     return profile, Homographies(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
 
+def _spans(homographies: Array) -> Mask:
+    """Which homographies (K, 3, 3) send the plane to more than a point or a line."""
+    b = homographies[:, :, :2]
+    m = np.swapaxes(b, 1, 2) @ b
+    return np.asarray(np.linalg.det(m) > 1e-20 * np.trace(m, axis1=1, axis2=2) ** 2)
+
+
 def _extent(plane: PlaneSight) -> tuple[Array, Array]:
     return np.array([plane.height_m]), np.array([plane.size_px])
-
-
-def _spreads(values: Array, bounds: Rows) -> Array:
-    """Root mean square distance from the centroid, group by group."""
-    sizes = np.diff(bounds)[:, None]
-    centre = np.add.reduceat(values, bounds[:-1]) / sizes
-    away = values - np.repeat(centre, sizes[:, 0], axis=0)
-    return np.asarray(np.sqrt(np.add.reduceat(np.sum(away**2, axis=1), bounds[:-1]) / sizes[:, 0]))
 
 
 def _flat_sights_of_points(sights: Sights) -> Rows:
     """Numbers of the sights that show at least six points of one plane, not on one line, and no curve."""
     few = (np.diff(sights.point_bounds) >= 6) & (np.diff(sights.curve_bounds) == 0)
     candidates = np.flatnonzero(few)
-    if not len(candidates):
-        return candidates
     board = sights.take(candidates)
-    starts, sizes = board.point_bounds[:-1], np.diff(board.point_bounds)
-    z = board.points[:, 2]
-    flat = np.maximum.reduceat(z, starts) - np.minimum.reduceat(z, starts) < 1e-9
-    away = board.points[:, :2] - np.repeat(np.add.reduceat(board.points[:, :2], starts) / sizes[:, None], sizes, axis=0)
-    xx, yy = np.add.reduceat(away[:, 0] ** 2, starts), np.add.reduceat(away[:, 1] ** 2, starts)
-    xy = np.add.reduceat(away[:, 0] * away[:, 1], starts)
+    scatter = grouped_scatter(board.points, board.point_bounds)
+    xx, xy, yy = scatter[:, 0, 0], scatter[:, 0, 1], scatter[:, 1, 1]
+    flat = scatter[:, 2, 2] < 1e-18
     return np.asarray(candidates[flat & (xx * yy - xy**2 > 1e-12 * (xx + yy) ** 2)])
 
 
-def _align(board: Sights, camera: Camera, unit: float) -> RadialAlignment:
-    """Radial alignment on a part of the points; with all of them, and more patience, where some do not fit."""
-    everything = PlaneData(board.point_bounds, board.points[:, :2], camera.offsets(board.pixels))
-    terms = int(np.clip((len(board.points) - 3 * len(board)) // 8, 1, 3))
-    sizes = np.diff(board.point_bounds)
-    place = np.arange(len(board.points)) - np.repeat(board.point_bounds[:-1], sizes)
+def _profile_of_boards(board: Sights, camera: Camera, unit: float) -> Profile:
+    """By radial alignment on some points of some sights; on all points of these, with more patience, where not all fit.
+
+    A profile needs no more: every other homography follows from it.
+    """
+    some = board.take(np.unique(np.linspace(0, len(board) - 1, _ENOUGH_BOARDS).round().astype(np.int64)))
+    data = _plane_data(some, camera)
+    terms = int(np.clip((len(some.points) - 3 * len(some)) // 8, 1, 3))
+    sizes = np.diff(some.point_bounds)
+    place = np.arange(len(some.points)) - np.repeat(some.point_bounds[:-1], sizes)
     # Steps of the golden ratio spread the chosen points evenly and never along one row of a board.
-    some = (place * _GOLDEN) % 1.0 < np.repeat(_ENOUGH_POINTS / sizes, sizes)
-    chosen = np.flatnonzero(some)
-    bounds = np.searchsorted(chosen, board.point_bounds)
-    few = PlaneData(bounds, everything.plane[chosen], everything.offsets[chosen])
+    chosen = np.flatnonzero((place * _GOLDEN) % 1.0 < np.repeat(_ENOUGH_POINTS / sizes, sizes))
+    few = PlaneData(np.searchsorted(chosen, data.bounds), data.plane[chosen], data.offsets[chosen])
     first = radial_alignment(few, unit, terms, rounds=2)
-    if np.mean(_is_suspicious(first)) < 0.02 and np.median(first.error_px) < _ROUGH_PX:
-        return first
-    return radial_alignment(everything, unit, terms, rounds=8)
+    wrong = (first.relative_error > _SUSPICIOUS) & (first.error_px > 1.0)
+    if np.mean(wrong) < 0.02 and np.median(first.error_px) < _ROUGH_PX:
+        return first.profile
+    return radial_alignment(data, unit, terms, rounds=8).profile
+
+
+def _plane_data(board: Sights, camera: Camera) -> PlaneData:
+    return PlaneData(board.point_bounds, board.points[:, :2], camera.offsets(board.pixels))
 
 
 def _as_lines(plane: PlaneSight, scale: float) -> tuple[Array, Array]:
@@ -291,22 +295,16 @@ def _from_rings(sight: Sights, camera: Camera, unit: float) -> tuple[Profile, Ar
     return profile, np.array([[kappa, 0.0, cx], [0.0, kappa, cy], [0.0, 0.0, 1.0]])
 
 
-def _is_suspicious(alignment: RadialAlignment) -> Mask:
-    return np.asarray((alignment.relative_error > _SUSPICIOUS) & (alignment.error_px > 1.0))
-
-
-def _without_wrong_labels(board: Sights, camera: Camera, alignment: RadialAlignment) -> Array:
+def _homographies_of_boards(board: Sights, camera: Camera, profile: Profile) -> Array:
     """The homographies, by LO-RANSAC (pycolmap) where some points of a sight lie far off while most fit."""
-    homographies = alignment.homographies.copy()
-    if len(alignment.error_px) < len(board.points):  # aligned on a part of the points because all of them fit
-        return homographies
-    limit = max(_SUSPICIOUS * float(np.median(alignment.error_px)), 2.0)
-    far = np.add.reduceat(_is_suspicious(alignment), board.point_bounds[:-1], dtype=np.int64)
+    data = _plane_data(board, camera)
+    homographies, error_px = homographies_of_sights(data, profile)
+    limit = max(_SUSPICIOUS * float(np.median(error_px)), 2.0)
+    far = np.add.reduceat(error_px > limit, board.point_bounds[:-1], dtype=np.int64)
     sizes = np.diff(board.point_bounds)
     for number in np.flatnonzero((far > 0.1 * sizes) & (sizes >= 8)):
         sight = board[int(number)]
-        lifted = alignment.profile.lift(camera.offsets(sight.pixels))
-        found = consensus_homography(sight.points[:, :2], lifted, limit)
+        found = consensus_homography(sight.points[:, :2], profile.lift(camera.offsets(sight.pixels)), limit)
         if found is not None:
             homographies[number] = found
     return homographies

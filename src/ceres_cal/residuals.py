@@ -48,10 +48,9 @@ def residuals(observations: Observations, sights: Sights, estimate: Estimate, pl
     points = np.full((len(observations.points), 2), np.nan)
     curves, feet = np.full(len(observations.curves), np.nan), np.full(len(observations.curves), np.nan)
     poses = estimate.pose_stack(sights.keys)
-    owners = np.array([key.camera for key in sights.keys])
-    for name in np.unique(owners):
-        numbers = np.flatnonzero(owners == name)
-        own = sights if len(numbers) == len(sights) else sights.take(numbers)
+    for name in dict.fromkeys(key.camera for key in sights.keys):
+        numbers = np.array([number for number, key in enumerate(sights.keys) if key.camera == name], dtype=np.int64)
+        own = sights.take(numbers)
         optics = lens_arguments(estimate.cameras[name])
         offsets = np.empty((len(own.point_rows), 2))
         kernels.point_residuals(

@@ -6,6 +6,7 @@ A pose named `cam_from_world` maps world coordinates to camera coordinates, so f
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -134,6 +135,11 @@ class Pose:
         v = np.asarray(vector, dtype=float)
         return cls(rotation_exp(v[:3]), v[3:])
 
+    @property
+    def matrix(self) -> Array:
+        """(3, 4), [R t]."""
+        return np.column_stack([self.rotation, self.translation])
+
     def log(self) -> Array:
         """The 6-vector (rotation vector, translation) of this pose: the inverse of `exp`."""
         return np.concatenate([rotation_log(self.rotation), self.translation])
@@ -171,3 +177,63 @@ class Pose:
         )
 
     __hash__ = None  # type: ignore[assignment]
+
+
+# ---- very many poses ------------------------------------------------------------------------------------------------
+
+
+def chained(first: Array, second: Array) -> Array:
+    """[R t] (S, 3, 4) of c_from_b @ b_from_a, pose by pose; (3, 4) stands for the same one every time."""
+    turned = first[..., :3] @ second
+    turned[..., 3] += first[..., 3]
+    return np.asarray(turned)
+
+
+def inverted(poses: Array) -> Array:
+    """[R t] (S, 3, 4) of each pose's inverse."""
+    rotations = np.swapaxes(poses[..., :3], -1, -2)
+    return np.concatenate([rotations, -rotations @ poses[..., 3:]], axis=-1)
+
+
+@dataclass(frozen=True, eq=False)
+class Poses(Mapping[str, Pose]):
+    """Poses by name, held as one stack.
+
+    Attributes:
+        numbers: name -> place in the stack. stack: (K, 3, 4) as [R t].
+    """
+
+    numbers: Mapping[str, int]
+    stack: Array
+
+    @classmethod
+    def of(cls, poses: Mapping[str, Pose]) -> Poses:
+        if isinstance(poses, cls):
+            return poses
+        return cls.stacked(list(poses), np.array([pose.matrix for pose in poses.values()]).reshape(-1, 3, 4))
+
+    @classmethod
+    def stacked(cls, names: Sequence[str], stack: Array) -> Poses:
+        """The poses of these names, one after the other."""
+        return cls({name: number for number, name in enumerate(names)}, stack)
+
+    def __getitem__(self, name: str) -> Pose:
+        matrix = self.stack[self.numbers[name]]
+        return Pose(matrix[:, :3], matrix[:, 3])
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.numbers)
+
+    def __len__(self) -> int:
+        return len(self.numbers)
+
+    def of_names(self, names: Sequence[str | None]) -> Array:
+        """(N, 3, 4) the poses of these names, None being the identity."""
+        every = np.concatenate([self.stack, np.eye(3, 4)[None]])
+        return np.asarray(every[[len(self.stack) if name is None else self.numbers[name] for name in names]])
+
+    def updated(self, names: Sequence[str], stack: Array) -> Poses:
+        """The same poses but for those of these names."""
+        changed = self.stack.copy()
+        changed[[self.numbers[name] for name in names]] = stack
+        return Poses(self.numbers, changed)

@@ -11,9 +11,9 @@ from ceres_cal.bundle.problem import (
     Progress,
     Solution,
     information,
-    placed,
     placement_costs,
     private_placements,
+    settle_placements,
     solve,
 )
 
@@ -23,8 +23,8 @@ __all__ = [
     "Solution",
     "Weighting",
     "information",
-    "placed",
     "placement_costs",
     "private_placements",
+    "settle_placements",
     "solve",
 ]

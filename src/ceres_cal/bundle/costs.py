@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyceres
@@ -19,14 +19,12 @@ from ceres_cal.structure import Structure
 from ceres_cal.transforms import Array, left_jacobian, rotation_exp, skew
 
 ROWS_WORTH_A_THREAD = 20_000
-ROUGH = 1e-6
-"""A solve of less precision only prepares another one."""
 _NOTHING = np.empty(0)
 
 
 @dataclass(frozen=True)
 class Weighting:
-    """How residuals become costs, and how far down the cost is followed.
+    """How residuals become costs, and how far down they are followed.
 
     Attributes:
         point_scale, curve_scale: noise scales, factors on the stated sigmas.
@@ -37,8 +35,13 @@ class Weighting:
     point_scale: float = 1.0
     curve_scale: float = 1.0
     loss: str = "huber"
-    loss_scale: float = 3.0
+    loss_scale: float = 2.5
     precision: float = 1e-14
+
+    @property
+    def rough(self) -> bool:
+        """Whether the solve only prepares another one."""
+        return self.precision > 1e-6
 
 
 @dataclass(eq=False)
@@ -132,20 +135,29 @@ def _track_slots(structure: Structure) -> tuple[NDArray[np.int32]]:
     return (structure.track_slots if len(structure.values) else structure.track_slots[:0],)
 
 
-@dataclass(frozen=True, eq=False)
-class _Evaluation:
-    """An EliminatedCost in one place: its numbers `at`, what Ceres is told, and the placements there.
+class _Sweep(NamedTuple):
+    """Placements at their best for given shared numbers.
 
     Attributes:
-        poses: (S, 3, 4) cam_from_target at their best. gains: (S, 6, len(at)) how they follow. costs: (S,).
+        poses: (S, 3, 4) cam_from_target. gains: (S, 6, shared) how they follow the shared numbers. costs: (S,).
+        reduced: lower triangle of the normal equations that are left, the residual's row last.
     """
+
+    poses: Array
+    gains: Array
+    costs: Array
+    reduced: Array
+
+
+@dataclass(frozen=True, eq=False)
+class _Evaluation:
+    """An EliminatedCost in one place: its numbers `at`, what Ceres is told, poses and gains (see `_Sweep`)."""
 
     at: Array
     residuals: Array
     jacobian: Array
     poses: Array
     gains: Array
-    costs: Array
 
 
 class EliminatedCost(pyceres.CostFunction):
@@ -174,13 +186,13 @@ class EliminatedCost(pyceres.CostFunction):
             curve_weights, starting_places(sights, estimate, places), *_track_slots(estimate.structure),
         )  # fmt: skip
         self._loss = (kernels.LOSS_CODES[weighting.loss], weighting.loss_scale)
-        self._precision = weighting.precision
+        self._tolerance = 1e-2 if weighting.rough else 1e-4
         sizes = (len(self._free), len(estimate.structure.values))
         self._size = sum(sizes)
         start = np.concatenate([self._optics[1][self._free], estimate.structure.values])
         poses, gains = estimate.pose_stack(sights.keys), np.zeros((len(sights), 6, self._size))
         # Every step starts from the poses of the last accepted one: a rejected step may have led them astray.
-        self._accepted = _Evaluation(start, _NOTHING, _NOTHING, poses, gains, np.zeros(len(sights)))
+        self._accepted = _Evaluation(start, _NOTHING, _NOTHING, poses, gains)
         self._known: _Evaluation | None = None
         work = len(sights.points) + len(sights.curve_pixels)
         parts = max(1, min(threads, work // ROWS_WORTH_A_THREAD))
@@ -195,7 +207,7 @@ class EliminatedCost(pyceres.CostFunction):
             at = np.concatenate(parameters)
             # Ceres asks for the cost of a step first, then for the Jacobian in the same place: once is enough.
             if self._known is None or not np.array_equal(self._known.at, at):
-                self._known = self._evaluated(at, max(1e-4, 10.0 * self._precision))
+                self._known = self._evaluated(at, self._tolerance)
         except BaseException as error:  # an exception must not travel through C++: the solve ends, then it is raised
             self._run.failure = self._run.failure or error
             return False
@@ -213,6 +225,19 @@ class EliminatedCost(pyceres.CostFunction):
 
     def _evaluated(self, at: Array, tolerance: float) -> _Evaluation | None:
         """The cost in a place, or None where an observation cannot be projected from there."""
+        swept = self._swept(at, tolerance)
+        cost = float(np.sum(swept.costs))
+        if not np.isfinite(cost):
+            return None
+        upper = np.empty((self._size + 1, self._size + 1))
+        kernels.cholesky(swept.reduced, upper)
+        residuals = upper[:, -1].copy()
+        residuals[-1] = np.sqrt(max(cost - float(residuals[:-1] @ residuals[:-1]), 0.0))
+        upper[-1] = 0.0
+        return _Evaluation(at, residuals, upper[:, :-1], swept.poses, swept.gains)
+
+    def _swept(self, at: Array, tolerance: float) -> _Sweep:
+        """Every placement brought to its best in a place, from the last accepted one."""
         count = len(self._free)
         code, intrinsics, powers, unit = self._optics
         intrinsics = intrinsics.copy()
@@ -221,39 +246,32 @@ class EliminatedCost(pyceres.CostFunction):
         points, tracks = built.points(self._sights), built.tracks(self._sights)
         poses, gains, costs = self._accepted.poses.copy(), self._accepted.gains.copy(), np.empty(len(self._sights))
 
-        def part(first: int, last: int) -> tuple[float, Array]:
+        def part(first: int, last: int) -> Array:
             reduced = np.zeros((self._size + 1, self._size + 1))
-            cost = kernels.eliminate_placements(
+            kernels.eliminate_placements(
                 first, last, code, intrinsics, self._free, powers, unit, *self._observations, *self._loss, points,
                 tracks, self._size - count, tolerance, at - self._accepted.at, poses, gains, costs, reduced,
             )  # fmt: skip
-            return cost, reduced
+            return reduced
 
         others = [self._pool.submit(part, *self._parts[i : i + 2]) for i in range(1, len(self._parts) - 1)]
-        results = [part(*self._parts[:2]), *(other.result() for other in others)]
-        cost = sum(result[0] for result in results)
-        if not np.isfinite(cost):
-            return None
-        upper = np.empty((self._size + 1, self._size + 1))
-        kernels.cholesky(sum(result[1] for result in results), upper)
-        residuals = upper[:, -1].copy()
-        residuals[-1] = np.sqrt(max(cost - float(residuals[:-1] @ residuals[:-1]), 0.0))
-        upper[-1] = 0.0
-        return _Evaluation(at, residuals, upper[:, :-1], poses, gains, costs)
+        reduced = sum((other.result() for other in others), start=part(*self._parts[:2]))
+        return _Sweep(poses, gains, costs, reduced)
 
-    def from_poses(self, poses: Array) -> tuple[Array, Array]:
+    def from_poses(self, poses: Array, tolerance: float) -> tuple[Array, Array]:
         """Costs (S,) and poses (S, 3, 4) that the search for each placement ends with when it starts from `poses`,
-        everything else held; infinite costs where a start cannot be seen.
+        everything else held; an infinite cost where a start cannot be seen.
         """
         self._accepted = replace(self._accepted, poses=poses, gains=np.zeros_like(self._accepted.gains))
-        found = self._evaluated(self._accepted.at, 1e-6)
-        return (np.full(len(poses), np.inf), poses) if found is None else (found.costs, found.poses)
+        swept = self._swept(self._accepted.at, tolerance)
+        return swept.costs, swept.poses
 
     def settled(self, parameters: Sequence[Array]) -> tuple[tuple[SightKey, ...], Array]:
         """The sights' keys and their cam_from_target, (S, 3, 4), at their best for these numbers."""
         at = np.concatenate([_NOTHING, *parameters])
-        if self._precision < ROUGH or not np.array_equal(self._accepted.at, at):  # else they are good enough
-            self._accepted = self._evaluated(at, self._precision) or self._accepted
+        # At rest they have come to rest as well; elsewhere, or where Ceres had nothing to move, they are sought.
+        if not len(self._accepted.residuals) or not np.array_equal(self._accepted.at, at):
+            self._accepted = self._evaluated(at, 1e-14) or self._accepted
         return self._sights.keys, self._accepted.poses
 
 

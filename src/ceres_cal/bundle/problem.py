@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections import Counter
 from collections.abc import Callable, Container, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,6 @@ import pyceres
 from numpy.typing import NDArray
 
 from ceres_cal.bundle.costs import (
-    ROUGH,
     ROWS_WORTH_A_THREAD,
     EliminatedCost,
     LinearPriorCost,
@@ -35,9 +34,10 @@ from ceres_cal.parameters import (
     with_intrinsics,
 )
 from ceres_cal.sights import SightKey, Sights
-from ceres_cal.transforms import Array, Pose
+from ceres_cal.transforms import Array, Pose, Poses
 
 _AT_REST = 10  # iterations
+_POSED = 1e-3  # relative change of a placement's cost that a start may leave
 _DENSE_LIMIT = 600  # numbers that stay after the Schur complement; above it a sparse factorisation is faster
 
 
@@ -78,11 +78,12 @@ class _Blocks:
     structure: Array
 
     @classmethod
-    def pack(cls, estimate: Estimate, layout: Layout, eliminated: Container[str | None]) -> _Blocks:
+    def pack(cls, estimate: Estimate, layout: Layout, eliminated: frozenset[str | None]) -> _Blocks:
+        kept = layout.placements - eliminated
         return cls(
             {name: intrinsics_vector(camera)[layout.free[name]] for name, camera in estimate.cameras.items()},
             {name: station.cam_from_world.log() for name, station in estimate.stations.items()},
-            {name: pose.log() for name, pose in estimate.placements.items() if name not in eliminated},
+            {n: estimate.placements[n].log() for n in estimate.placements if n in kept},
             estimate.structure.values.copy(),
         )
 
@@ -106,10 +107,8 @@ class _Blocks:
             name: Station(old.camera, Pose.exp(self.stations[name])) if name in layout.stations else old
             for name, old in estimate.stations.items()
         }
-        placements = {
-            name: Pose.exp(self.placements[name]) if name in layout.placements and name in self.placements else old
-            for name, old in estimate.placements.items()
-        }
+        moved = Poses.of({name: Pose.exp(vector) for name, vector in self.placements.items()})
+        placements = Poses.of(estimate.placements).updated(list(moved), moved.stack)
         return Estimate(cameras, stations, placements, estimate.structure.with_values(self.structure))
 
 
@@ -137,7 +136,7 @@ def _assemble(
     blocks = _Blocks.pack(estimate, layout, private)
     assembly = _Assembly(blocks, [], [])
     for camera in estimate.cameras:
-        own = np.array([i for i, key in enumerate(sights.keys) if key.camera == camera and key.placement in private])
+        own = _numbers(sights, camera, private)
         if len(own):
             cost = EliminatedCost(run, sights.take(own), estimate, layout, weighting, threads, places)
             assembly.eliminated.append((cost, blocks.of(sights.keys[own[0]], cost.slots)))
@@ -197,8 +196,7 @@ def solve(
     """
     _require_enough(sights, layout)
     run = Run()
-    threads = options.threads or min(os.cpu_count() or 1, 8)
-    assembly = _assemble(run, sights, estimate, layout, weighting, threads, places)
+    assembly = _assemble(run, sights, estimate, layout, weighting, _threads(options), places)
     problem = pyceres.Problem()
     for cost, arrays in assembly.costs:
         if arrays:
@@ -215,11 +213,10 @@ def solve(
         solved = assembly.blocks.unpack(estimate, layout)
     except InputError as error:  # phi or aspect below 0
         raise SolutionError(f"the solve ended at no camera ({error}): check labels and target dimensions") from None
-    placements = dict(solved.placements)
     for eliminated, arrays in assembly.eliminated:
-        placements |= placed(solved, *eliminated.settled(arrays))
+        solved = solved.with_placements(*eliminated.settled(arrays))
     return Solution(
-        replace(solved, placements=placements),
+        solved,
         float(summary.final_cost),
         summary.termination_type == pyceres.TerminationType.CONVERGENCE or _rests(run.history),
         str(summary.message),
@@ -254,7 +251,7 @@ def information(sights: Sights, estimate: Estimate, layout: Layout, weighting: W
         labels = intrinsic_names(estimate.cameras[name].lens)
         groups.append((name, [labels[i] for i in layout.free[name]], array))
     groups += [(name, _POSE_NAMES, blocks.stations[name]) for name in estimate.stations if name in layout.stations]
-    groups += [(name, _POSE_NAMES, array) for name, array in blocks.placements.items() if name in layout.placements]
+    groups += [(name, _POSE_NAMES, array) for name, array in blocks.placements.items()]
     groups.append(("structure", estimate.structure.names, blocks.structure))
     first: dict[int, int] = {}
     names: list[str] = []
@@ -283,14 +280,45 @@ def _jacobian(cost: Any, arrays: Sequence[Array]) -> Array:
 
 
 def placement_costs(
-    sights: Sights, estimate: Estimate, layout: Layout, weighting: Weighting, poses: Array
+    sights: Sights,
+    estimate: Estimate,
+    layout: Layout,
+    weighting: Weighting,
+    poses: Array,
+    tolerance: float = 1e-6,
+    threads: int = 1,
 ) -> tuple[Array, Array]:
     """Costs (S,) and cam_from_target (S, 3, 4) of one camera's sights after each placement alone was solved for.
 
     Args:
-        poses: (S, 3, 4) where the search for each cam_from_target starts.
+        poses: (S, 3, 4) where the search for each cam_from_target starts; a start from where an observation cannot be
+            projected costs infinity. tolerance: relative, of each cost.
     """
-    return EliminatedCost(Run(), sights, estimate, layout, weighting, threads=1).from_poses(poses)
+    return EliminatedCost(Run(), sights, estimate, layout, weighting, threads).from_poses(poses, tolerance)
+
+
+def settle_placements(
+    sights: Sights, estimate: Estimate, layout: Layout, weighting: Weighting, options: Options
+) -> Estimate:
+    """The estimate with every private placement where it fits best, everything else held."""
+    private = private_placements(sights, layout)
+    for camera in estimate.cameras:
+        own = sights.take(_numbers(sights, camera, private))
+        if len(own):
+            poses = estimate.pose_stack(own.keys)
+            _, found = placement_costs(own, estimate, layout, weighting, poses, _POSED, _threads(options))
+            estimate = estimate.with_placements(own.keys, found)
+    return estimate
+
+
+def _threads(options: Options) -> int:
+    return options.threads or min(os.cpu_count() or 1, 8)
+
+
+def _numbers(sights: Sights, camera: str, placements: Container[str | None]) -> NDArray[np.int64]:
+    """Of a camera's sights of these placements."""
+    keys = enumerate(sights.keys)
+    return np.array([i for i, key in keys if key.camera == camera and key.placement in placements], dtype=np.int64)
 
 
 def _rests(history: Sequence[float]) -> bool:
@@ -305,16 +333,6 @@ def private_placements(sights: Sights, layout: Layout) -> frozenset[str | None]:
     return frozenset(name for name, times in seen.items() if times == 1 and name in layout.placements)
 
 
-def placed(estimate: Estimate, keys: Sequence[SightKey], cam_from_target: Array) -> dict[str, Pose]:
-    """world_from_target of each key's placement."""
-    stations = {name: station.cam_from_world.inverse for name, station in estimate.stations.items()}
-    first = np.array([stations[key.station].rotation for key in keys])
-    offset = np.array([stations[key.station].translation for key in keys])
-    rotations = first @ cam_from_target[:, :, :3]
-    translations = np.einsum("sij,sj->si", first, cam_from_target[:, :, 3]) + offset
-    return {str(key.placement): Pose(r, t) for key, r, t in zip(keys, rotations, translations, strict=True)}
-
-
 def _require_enough(sights: Sights, layout: Layout) -> None:
     equations = 2 * len(sights.point_rows) + len(sights.curve_rows)
     equations += sum(len(prior.value) for prior in layout.priors)  # each structure number has a prior of its own
@@ -326,7 +344,12 @@ def _require_enough(sights: Sights, layout: Layout) -> None:
 
 
 def _solver_options(
-    layout: Layout, blocks: _Blocks, options: Options, weighting: Weighting, threads: int, watcher: _Watcher
+    layout: Layout,
+    blocks: _Blocks,
+    options: Options,
+    weighting: Weighting,
+    threads: int,
+    watcher: _Watcher,
 ) -> Any:
     solver = pyceres.SolverOptions()
     kept = sum(len(free) for free in layout.free.values())
@@ -336,7 +359,7 @@ def _solver_options(
     solver.max_num_iterations = options.max_iterations
     solver.function_tolerance = weighting.precision
     # Near the end of a convex problem plain Gauss-Newton is right, and phi against height creeps without it.
-    if weighting.precision < ROUGH and weighting.loss in ("trivial", "huber", "soft_l1"):
+    if not weighting.rough and weighting.loss in ("trivial", "huber", "soft_l1"):
         solver.initial_trust_region_radius = 1e8
     solver.parameter_tolerance = 1e-12
     solver.gradient_tolerance = 1e-14

@@ -67,13 +67,13 @@ def _add_arguments(parser: ArgumentParser) -> None:
     solve = parser.add_argument_group("the solve")
     add = solve.add_argument
     add("--loss", choices=("trivial", "huber", "soft_l1", "cauchy", "tukey"), default="huber", help="default: huber")
-    add("--loss-scale", type=float, default=3.0, metavar="SIGMA", help="where the loss starts to bend; default: 3")
+    add("--loss-scale", type=float, default=2.5, metavar="SIGMA", help="where the loss starts to bend; default: 2.5")
     add(
         "--reject-sigma",
         type=float,
-        default=4.0,
+        default=5.0,
         metavar="SIGMA",
-        help="observations farther off are taken out and listed; default: 4",
+        help="observations farther off are taken out and listed; default: 5",
     )
     add(
         "--noise-scale",

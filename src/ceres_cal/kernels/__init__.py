@@ -2,9 +2,11 @@
 
 from ceres_cal.kernels.block import cholesky, evaluate_block
 from ceres_cal.kernels.elimination import eliminate_placements
-from ceres_cal.kernels.groups import grouped_products
+from ceres_cal.kernels.groups import grouped_products, grouped_scatter
 from ceres_cal.kernels.lenses import INTRINSICS, LENS_CODES
-from ceres_cal.kernels.sight import LOSS_CODES, curve_residuals, normal_equations, point_residuals
+from ceres_cal.kernels.losses import LOSS_CODES
+from ceres_cal.kernels.planes import plane_homographies
+from ceres_cal.kernels.sight import curve_residuals, normal_equations, point_residuals
 
 __all__ = [
     "INTRINSICS",
@@ -15,6 +17,8 @@ __all__ = [
     "eliminate_placements",
     "evaluate_block",
     "grouped_products",
+    "grouped_scatter",
     "normal_equations",
+    "plane_homographies",
     "point_residuals",
 ]

@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 
 from ceres_cal.kernels.jit import jit
-from ceres_cal.kernels.sight import layout_of_rows, normal_equations
+from ceres_cal.kernels.lenses import answer_limit, one_dimensional
+from ceres_cal.kernels.sight import layout_of_rows, normal_equations, working_space
 
 
 @jit
@@ -155,10 +156,13 @@ def evaluate_block(
     pose, to_station, to_placement = np.empty((3, 4)), np.empty((6, 6)), np.empty((6, 6))
     _chain(station, placement, pose, to_station, to_placement)
     rows, places = layout_of_rows(free, len(intrinsics), structure)
+    dense = one_dimensional(lens, intrinsics, powers)
+    limit = answer_limit(lens, dense)
     normal = np.empty((shared + 7, shared + 7))
     cost = normal_equations(
-        lens, intrinsics, powers, unit, pose, points, pixels, weights, slots, bends, tracks, is_arc, track,
-        curve_pixels, curve_weights, s, track_slots, loss, scale, rows, places, normal,
+        lens, intrinsics, powers, dense, limit, unit, pose, points, pixels, weights, slots, bends, tracks, is_arc,
+        track, curve_pixels, curve_weights, s, track_slots, loss, scale, rows, places, normal,
+        working_space(len(intrinsics), len(rows)),
     )  # fmt: skip
     if not np.isfinite(cost):
         return False

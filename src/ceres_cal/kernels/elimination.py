@@ -13,7 +13,8 @@ import numpy as np
 
 from ceres_cal.kernels.block import rotation
 from ceres_cal.kernels.jit import jit
-from ceres_cal.kernels.sight import layout_of_rows, normal_equations
+from ceres_cal.kernels.lenses import answer_limit, one_dimensional
+from ceres_cal.kernels.sight import layout_of_rows, normal_equations, working_space
 
 _MOST_STEPS = 50
 _NOTHING_LEFT = 1e-14  # squared standard deviations
@@ -65,8 +66,8 @@ def eliminate_placements(
     is_arc: Any, curve_bounds: Any, track: Any, curve_pixels: Any, curve_weights: Any, s: Any, track_slots: Any,
     loss: int, scale: float, points: Any, tracks: Any, structure: int, tolerance: float, change: Any, poses: Any,
     gains: Any, costs: Any, reduced: Any,
-) -> float:  # fmt: skip
-    """Sum of rho over the sights first to last at their best poses, and what they say of the free intrinsics.
+) -> None:  # fmt: skip
+    """The sights first to last at their best poses: their costs, and what they say of the free intrinsics.
 
     Args:
         intrinsics, free, powers, unit, loss, scale and the observations: see `normal_equations`; bounds, curve_bounds
@@ -75,18 +76,17 @@ def eliminate_placements(
         points, tracks: as built, with the `structure` numbers of the moment put in.
         change: (free + structure,) by how much these have moved since `poses` and `gains` were made.
         poses: (S, 3, 4) [R t] of cam_from_target, moved. gains: (S, 6, free + structure), their effect, renewed.
-        costs: (S,) sum of rho of each sight.
+        costs: (S,) sum of rho of each sight; infinite, its pose left alone, where an observation cannot be projected.
         reduced: (free + structure + 1,) squared, lower triangle: the complement with the residual's row last, added up.
-
-    Returns:
-        NaN where an observation cannot be projected.
     """
     count = len(free) + structure
     rows, places = layout_of_rows(free, len(intrinsics), structure)
+    dense = one_dimensional(lens, intrinsics, powers)
+    limit = answer_limit(lens, dense)
     normal, trial = np.empty((count + 7, count + 7)), np.empty((count + 7, count + 7))
+    space = working_space(len(intrinsics), len(rows))
     lower, gain = np.empty((6, 6)), np.empty((6, count + 1))
     turned, step, pose, moved = np.empty((3, 3)), np.empty(6), np.empty((3, 4)), np.empty((3, 4))
-    total = 0.0
     for v in range(first, last):
         p, c = slice(bounds[v], bounds[v + 1]), slice(curve_bounds[v], curve_bounds[v + 1])
         moving = p if len(slots) > 0 else slice(0, 0)
@@ -96,14 +96,14 @@ def eliminate_placements(
                 step[k] -= gains[v, k, j] * change[j]
         _move(poses[v], step, turned, pose)
         cost = normal_equations(
-            lens, intrinsics, powers, unit, pose, points[p], pixels[p], weights[p], slots[moving], bends[moving],
-            tracks, is_arc, track[c], curve_pixels[c], curve_weights[c], s[c], track_slots, loss, scale,
-            rows, places, normal,
+            lens, intrinsics, powers, dense, limit, unit, pose, points[p], pixels[p], weights[p], slots[moving],
+            bends[moving], tracks, is_arc, track[c], curve_pixels[c], curve_weights[c], s[c], track_slots, loss, scale,
+            rows, places, normal, space,
         )  # fmt: skip
         damping = 0.0
         for _ in range(_MOST_STEPS):
             if not np.isfinite(cost):
-                return np.nan
+                break
             _solve_pose(normal, count, damping, lower, gain)
             promise = 0.0
             for k in range(6):
@@ -113,9 +113,9 @@ def eliminate_placements(
                 break
             _move(pose, step, turned, moved)
             moved_cost = normal_equations(
-                lens, intrinsics, powers, unit, moved, points[p], pixels[p], weights[p], slots[moving], bends[moving],
-                tracks, is_arc, track[c], curve_pixels[c], curve_weights[c], s[c], track_slots, loss, scale,
-                rows, places, trial,
+                lens, intrinsics, powers, dense, limit, unit, moved, points[p], pixels[p], weights[p], slots[moving],
+                bends[moving], tracks, is_arc, track[c], curve_pixels[c], curve_weights[c], s[c], track_slots, loss,
+                scale, rows, places, trial, space,
             )  # fmt: skip
             if moved_cost <= cost:
                 pose, moved, normal, trial, cost, damping = moved, pose, trial, normal, moved_cost, 0.1 * damping
@@ -123,6 +123,9 @@ def eliminate_placements(
                 break  # rounding
             else:
                 damping = max(1e-3, 10.0 * damping)
+        if not np.isfinite(cost):
+            costs[v] = np.inf
+            continue
         if damping > 0.0:
             _solve_pose(normal, count, 0.0, lower, gain)
             promise = 0.0
@@ -140,5 +143,3 @@ def eliminate_placements(
                     value -= gain[k, i] * (normal[count + 6, count + k] if j == count else normal[count + k, j])
                 reduced[i, j] += value
         costs[v] = cost - max(promise, 0.0)
-        total += costs[v]
-    return total

@@ -1,4 +1,4 @@
-"""Sums of outer products by group: the normal equations of very many small linear problems at once."""
+"""Sums of outer products by group: very many small linear problems at once."""
 
 from __future__ import annotations
 
@@ -24,3 +24,21 @@ def grouped_products(rows: Any, weights: Any, bounds: Any) -> Any:
             for j in range(i):
                 products[g, j, i] = products[g, i, j]
     return products
+
+
+@jit
+def grouped_scatter(values: Any, bounds: Any) -> Any:
+    """Mean of (v - mean)(v - mean)^T over values[bounds[g]:bounds[g + 1]] for every group g: (groups, k, k)."""
+    groups, size = len(bounds) - 1, values.shape[1]
+    scatter, mean = np.zeros((groups, size, size)), np.empty(size)
+    for g in range(groups):
+        count = bounds[g + 1] - bounds[g]
+        mean[:] = 0.0
+        for n in range(bounds[g], bounds[g + 1]):
+            for i in range(size):
+                mean[i] += values[n, i] / count
+        for n in range(bounds[g], bounds[g + 1]):
+            for i in range(size):
+                for j in range(size):
+                    scatter[g, i, j] += (values[n, i] - mean[i]) * (values[n, j] - mean[j]) / count
+    return scatter

@@ -12,11 +12,9 @@ import numpy as np
 
 from ceres_cal.kernels.jit import jit
 from ceres_cal.kernels.lenses import answer_limit, distort, intrinsics_rows, one_dimensional
+from ceres_cal.kernels.losses import robust
 
-LOSS_CODES = {"trivial": 0, "huber": 1, "soft_l1": 2, "cauchy": 3, "tukey": 4}
-
-_TRIVIAL, _HUBER, _SOFT_L1, _CAUCHY = 0, 1, 2, 3
-_CHUNK = 64
+_CHUNK = 112  # a board of a hundred corners at once, and all of it in the first cache
 _FOOT_STEPS = 30
 _FOOT_TOLERANCE_PX = 1e-9
 
@@ -104,71 +102,53 @@ def _feet(
     return True
 
 
-# ---- losses ---------------------------------------------------------------------------------------------------------
-
-
-@jit
-def _loss(code: int, scale: float, squared: float) -> tuple[float, float]:
-    """rho and its derivative at the squared residual, as Ceres defines its losses."""
-    b = scale * scale
-    if code == _TRIVIAL:
-        return squared, 1.0
-    if code == _HUBER:
-        if squared <= b:
-            return squared, 1.0
-        root = np.sqrt(squared)
-        return 2.0 * scale * root - b, scale / root
-    if code == _SOFT_L1:
-        root = np.sqrt(1.0 + squared / b)
-        return 2.0 * b * (root - 1.0), 1.0 / root
-    if code == _CAUCHY:
-        return b * np.log(1.0 + squared / b), 1.0 / (1.0 + squared / b)
-    if squared >= b:
-        return b / 3.0, 0.0
-    rest = 1.0 - squared / b
-    return b / 3.0 * (1.0 - rest * rest * rest), rest * rest
-
-
 # ---- one sight ------------------------------------------------------------------------------------------------------
 
 
 @jit
-def _add_products(n: int, components: int, rows: Any, places: Any, jacobian: Any, normal: Any) -> None:
-    """normal += J J^T over the chosen rows, at their places, lower triangle; two rows by two, to read each one less."""
-    last = len(rows) - 1
-    for k in range(0, last + 1, 2):
-        k1 = min(k + 1, last)
-        for j in range(0, k + 1, 2):
-            j1 = min(j + 1, last)
-            s00, s01, s10, s11 = 0.0, 0.0, 0.0, 0.0
-            for c in range(components):
-                for i in range(n):
-                    a, b = jacobian[rows[k], c, i], jacobian[rows[k1], c, i]
-                    x, y = jacobian[rows[j], c, i], jacobian[rows[j1], c, i]
-                    s00 += a * x
-                    s01 += a * y
-                    s10 += b * x
-                    s11 += b * y
-            normal[places[k], places[j]] += s00
-            if k1 > k:
-                normal[places[k1], places[j]] += s10
-                normal[places[k1], places[j1]] += s11
-            if j < k:
-                normal[places[k], places[j1]] += s01
+def _add_products(n: int, count: int, panel: Any, products: Any) -> None:
+    """products += P P^T over the panel's first n columns, lower triangle; three rows by three, to read each one less.
+
+    Both have room for a multiple of three rows.
+    """
+    for k in range(0, count, 3):
+        a, b, c = panel[k], panel[k + 1], panel[k + 2]
+        for j in range(0, k + 1, 3):
+            x, y, z = panel[j], panel[j + 1], panel[j + 2]
+            s00, s01, s02, s10, s11, s12, s20, s21, s22 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+            for i in range(n):
+                s00 += a[i] * x[i]
+                s01 += a[i] * y[i]
+                s02 += a[i] * z[i]
+                s10 += b[i] * x[i]
+                s11 += b[i] * y[i]
+                s12 += b[i] * z[i]
+                s20 += c[i] * x[i]
+                s21 += c[i] * y[i]
+                s22 += c[i] * z[i]
+            upper, middle, lower = products[k], products[k + 1], products[k + 2]
+            upper[j] += s00
+            upper[j + 1] += s01
+            upper[j + 2] += s02
+            middle[j] += s10
+            middle[j + 1] += s11
+            middle[j + 2] += s12
+            lower[j] += s20
+            lower[j + 1] += s21
+            lower[j + 2] += s22
 
 
 @jit
 def _add_structure(
-    i: int, components: int, slots: Any, directions: Any, pose: Any, rows: Any, places: Any, jacobian: Any,
-    columns: Any, normal: Any,
+    i: int, n: int, components: int, slots: Any, directions: Any, pose: Any, places: Any, panel: Any, columns: Any,
+    normal: Any,
 ) -> None:  # fmt: skip
     """The share of the chunk's observation i in the rows of the structure numbers `slots` (-1: none) that move it.
 
     Moving the target along a direction moves the point by R times it in the camera frame: the pose's translation rows
-    of the Jacobian say what that does. Structure numbers stand between the free intrinsics and the pose.
+    of the panel say what that does. Structure numbers stand between the free intrinsics and the pose.
     """
-    base = len(rows) - 7
-    translation = jacobian.shape[0] - 4
+    base, translation = len(places) - 7, len(places) - 4
     for a in range(len(slots)):
         if slots[a] < 0:
             continue
@@ -178,11 +158,11 @@ def _add_structure(
                 turned = 0.0
                 for k in range(3):
                     turned += pose[j, k] * directions[a, k]
-                columns[a, c] += jacobian[translation + j, c, i] * turned
-        for k in range(len(rows)):
+                columns[a, c] += panel[translation + j, c * n + i] * turned
+        for k in range(len(places)):
             value = 0.0
             for c in range(components):
-                value += columns[a, c] * jacobian[rows[k], c, i]
+                value += columns[a, c] * panel[k, c * n + i]
             row, column = max(base + slots[a], places[k]), min(base + slots[a], places[k])
             normal[row, column] += value
         for b in range(a + 1):
@@ -197,10 +177,10 @@ def _add_structure(
 def _add_points(
     lens: int, intrinsics: Any, powers: Any, dense: Any, unit: float, limit: float, pose: Any, points: Any, pixels: Any,
     weights: Any, slots: Any, bends: Any, loss: int, scale: float, rows: Any, places: Any, normal: Any,
-    jacobian: Any, scratch: Any,
+    products: Any, jacobian: Any, panel: Any, scratch: Any,
 ) -> float:  # fmt: skip
     """Sum of rho over the point observations, NaN where one cannot be projected; their share of `normal`."""
-    residual_row = jacobian.shape[0] - 1
+    last = len(rows) - 1
     local, rotated, rays, image, work = scratch[:3], scratch[3:6], scratch[6:9], scratch[9:16], scratch[16:21]
     cost = 0.0
     for start in range(0, len(points), _CHUNK):
@@ -211,27 +191,28 @@ def _add_points(
         _to_camera(n, pose, local, rotated, rays)
         if not distort(lens, n, intrinsics, dense, unit, limit, rays, image, work):
             return np.nan
+        error_x, error_y = panel[last, :n], panel[last, n : 2 * n]
         for i in range(n):
             w = weights[start + i]
             dx = w * (intrinsics[2] + image[0, i] - pixels[start + i, 0])
             dy = w * (intrinsics[3] + intrinsics[1] * image[1, i] - pixels[start + i, 1])
-            rho, slope = _loss(loss, scale, dx * dx + dy * dy)
+            rho, slope = robust(loss, scale, dx * dx + dy * dy)
             cost += rho
             root = np.sqrt(slope)
-            jacobian[residual_row, 0, i], jacobian[residual_row, 1, i] = root * dx, root * dy
+            error_x[i], error_y[i] = root * dx, root * dy
             local[0, i] = root * w
         intrinsics_rows(lens, n, intrinsics, powers, unit, image, work, jacobian)
-        _pose_rows(n, residual_row - 6, intrinsics[1], rotated, image, jacobian)
-        for k in rows[:-1]:
+        _pose_rows(n, len(intrinsics), intrinsics[1], rotated, image, jacobian)
+        for k in range(last):
+            own, x, y = jacobian[rows[k]], panel[k, :n], panel[k, n : 2 * n]  # whole rows: SIMD needs plain indices
             for i in range(n):
-                jacobian[k, 0, i] *= local[0, i]
-                jacobian[k, 1, i] *= local[0, i]
-        _add_products(n, 2, rows, places, jacobian, normal)
+                x[i], y[i] = local[0, i] * own[0, i], local[0, i] * own[1, i]
+        _add_products(2 * n, len(rows), panel, products)
         if len(slots) > 0:
             directions, columns = np.eye(4, 3), np.empty((4, 2))
             for i in range(n):
                 directions[2, 2], directions[3, 2] = bends[start + i, 0], bends[start + i, 1]
-                _add_structure(i, 2, slots[start + i], directions, pose, rows, places, jacobian, columns, normal)
+                _add_structure(i, n, 2, slots[start + i], directions, pose, places, panel, columns, normal)
     return cost
 
 
@@ -253,13 +234,13 @@ def _curve_directions(i: int, k: int, tracks: Any, is_arc: Any, foot: Any, direc
 def _add_curves(
     lens: int, intrinsics: Any, powers: Any, dense: Any, unit: float, limit: float, pose: Any, tracks: Any,
     is_arc: Any, track: Any, pixels: Any, weights: Any, s: Any, track_slots: Any, loss: int, scale: float, rows: Any,
-    places: Any, normal: Any, jacobian: Any, scratch: Any,
+    places: Any, normal: Any, products: Any, jacobian: Any, panel: Any, scratch: Any,
 ) -> float:  # fmt: skip
     """The same for the curve observations: one residual each, the distance along the image normal at the foot.
 
     By the envelope theorem its derivative is that of the projected foot with s held, along the normal.
     """
-    residual_row = jacobian.shape[0] - 1
+    last = len(rows) - 1
     local, rotated, rays, image, work, foot = (
         scratch[:3], scratch[3:6], scratch[6:9], scratch[9:16], scratch[16:21], scratch[21:],
     )  # fmt: skip
@@ -275,24 +256,23 @@ def _add_curves(
             length = np.sqrt(foot[7, i])
             nx, ny = -foot[1, i] / length, foot[0, i] / length
             e = weights[start + i] * (nx * foot[2, i] + ny * foot[3, i])
-            rho, slope = _loss(loss, scale, e * e)
+            rho, slope = robust(loss, scale, e * e)
             cost += rho
             root = np.sqrt(slope)
-            jacobian[residual_row, 0, i] = root * e
+            panel[last, i] = root * e
             local[0, i], local[1, i] = root * weights[start + i] * nx, root * weights[start + i] * ny
         intrinsics_rows(lens, n, intrinsics, powers, unit, image, work, jacobian)
-        _pose_rows(n, residual_row - 6, intrinsics[1], rotated, image, jacobian)
-        for k in rows[:-1]:
+        _pose_rows(n, len(intrinsics), intrinsics[1], rotated, image, jacobian)
+        for k in range(last):
+            own, x = jacobian[rows[k]], panel[k]
             for i in range(n):
-                jacobian[k, 0, i] = local[0, i] * jacobian[k, 0, i] + local[1, i] * jacobian[k, 1, i]
-        _add_products(n, 1, rows, places, jacobian, normal)
+                x[i] = local[0, i] * own[0, i] + local[1, i] * own[1, i]
+        _add_products(n, len(rows), panel, products)
         if len(track_slots) > 0:
             directions, columns = np.eye(3, 3), np.empty((3, 2))
             for i in range(n):
                 _curve_directions(i, track[start + i], tracks, is_arc, foot, directions)
-                _add_structure(
-                    i, 1, track_slots[track[start + i]], directions, pose, rows, places, jacobian, columns, normal
-                )
+                _add_structure(i, n, 1, track_slots[track[start + i]], directions, pose, places, panel, columns, normal)
     return cost
 
 
@@ -309,16 +289,29 @@ def layout_of_rows(free: Any, intrinsics: int, structure: int) -> tuple[Any, Any
 
 
 @jit
+def working_space(intrinsics: int, rows: int) -> tuple[Any, Any, Any, Any]:
+    """Where `normal_equations` works: the chunk's Jacobian, its weighted rows, their products, and what leads there."""
+    return (
+        np.empty((intrinsics + 6, 2, _CHUNK)),
+        np.zeros((rows + 2, 2 * _CHUNK)),
+        np.empty((rows + 2, rows + 2)),
+        np.empty((32, _CHUNK)),
+    )
+
+
+@jit
 def normal_equations(
-    lens: int, intrinsics: Any, powers: Any, unit: float, pose: Any, points: Any, pixels: Any, weights: Any,
-    slots: Any, bends: Any, tracks: Any, is_arc: Any, track: Any, curve_pixels: Any, curve_weights: Any, s: Any,
-    track_slots: Any, loss: int, scale: float, rows: Any, places: Any, normal: Any,
+    lens: int, intrinsics: Any, powers: Any, dense: Any, limit: float, unit: float, pose: Any, points: Any,
+    pixels: Any, weights: Any, slots: Any, bends: Any, tracks: Any, is_arc: Any, track: Any, curve_pixels: Any,
+    curve_weights: Any, s: Any, track_slots: Any, loss: int, scale: float, rows: Any, places: Any, normal: Any,
+    space: Any,
 ) -> float:  # fmt: skip
     """Sum of rho over one sight, NaN where an observation cannot be projected; A added up in `normal`'s lower triangle.
 
     Args:
         lens: a LENS_CODES value; intrinsics: phi, aspect, cx, cy, scaled coefficients; powers: those of the
-            one-dimensional map of the lens; unit: half the image diagonal, px; pose: (3, 4) [R t] of cam_from_frame.
+            one-dimensional map of the lens, dense: that map, limit: its `answer_limit`; unit: half the image diagonal,
+            px; pose: (3, 4) [R t] of cam_from_frame.
         points (N, 3) m, pixels (N, 2), weights (N,) = 1 / (noise scale * sigma).
         tracks (T, 3, 3), is_arc (T,), track (M,) index into tracks, curve_pixels (M, 2), curve_weights (M,),
             s (M,): place on the track, read as a start and left at the foot.
@@ -327,23 +320,25 @@ def normal_equations(
         loss, scale: a LOSS_CODES value and its scale in standard deviations.
         rows: which numbers take part: indices into [intrinsics | 6 pose | residual], the last one the residual's.
         places: their rows in A; structure numbers come after the intrinsics, before the pose.
+        space: from `working_space`, used again and again.
     """
-    jacobian = np.empty((len(intrinsics) + 7, 2, _CHUNK))
-    scratch = np.empty((32, _CHUNK))
-    dense = one_dimensional(lens, intrinsics, powers)
-    limit = answer_limit(lens, dense)
+    jacobian, panel, products, scratch = space
+    products[:] = 0.0
     normal[:] = 0.0
     cost = 0.0
     if len(points) > 0:
         cost += _add_points(
             lens, intrinsics, powers, dense, unit, limit, pose, points, pixels, weights, slots, bends, loss, scale,
-            rows, places, normal, jacobian, scratch,
+            rows, places, normal, products, jacobian, panel, scratch,
         )  # fmt: skip
     if len(curve_pixels) > 0:
         cost += _add_curves(
             lens, intrinsics, powers, dense, unit, limit, pose, tracks, is_arc, track, curve_pixels, curve_weights, s,
-            track_slots, loss, scale, rows, places, normal, jacobian, scratch,
+            track_slots, loss, scale, rows, places, normal, products, jacobian, panel, scratch,
         )  # fmt: skip
+    for k in range(len(rows)):
+        for j in range(k + 1):
+            normal[places[k], places[j]] += products[k, j]
     return cost
 
 
