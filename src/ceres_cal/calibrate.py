@@ -23,7 +23,7 @@ from ceres_cal.sights import Rows, Sights, gather_sights
 from ceres_cal.transforms import Array
 
 _MOST_ROUNDS = 15
-_ENOUGH_PLACEMENTS = 48  # of a camera: with them it is known well enough to place all others
+_ENOUGH_PLACEMENTS = 32  # of a camera: with them it is known well enough to place all others
 _NO_FIT = 0.015  # of the image diagonal: a median residual beyond it is no calibration
 _GUESSED = (
     "camera {!r}: the views are too frontal to tell phi and distance apart, so phi started from a guess and may be "
@@ -127,9 +127,7 @@ def _settle(
     rounds = 1
     while rounds < _MOST_ROUNDS:
         weighting = Weighting(inliers.point_scale, inliers.curve_scale, options.loss, options.loss_scale)
-        if rounds == 1:  # to judge by, not to keep
-            weighting = replace(weighting, precision=1e-9)
-        at_rest = rounds > 2 and inliers.same_as(before)
+        at_rest = rounds > 1 and inliers.same_as(before)
         estimate = solution.estimate
         if not at_rest:
             used = sights.used(inliers.points, inliers.curves)
@@ -199,10 +197,11 @@ def _of(camera: str, sights: Sights) -> Sights:
 def _require_fit(name: str, camera: Camera, settled: _Settled, sights: Sights) -> None:
     """Raise SolutionError where half of a camera's observations are missed by more than any lens could explain."""
     own = _of(name, sights)
-    points = np.linalg.norm(settled.residuals.points[own.point_rows], axis=1)
-    missed = np.nan_to_num(np.concatenate([points, np.abs(settled.residuals.curves[own.curve_rows])]), nan=np.inf)
     limit_px = _NO_FIT * float(np.hypot(*camera.image_size))
-    if 2 * np.count_nonzero(missed > limit_px) > len(missed):
+    points, curves = settled.residuals.points[own.point_rows], settled.residuals.curves[own.curve_rows]
+    met = np.count_nonzero(np.einsum("ij,ij->i", points, points) <= limit_px**2)  # NaN is not
+    met += np.count_nonzero(np.abs(curves) <= limit_px)
+    if 2 * met < len(points) + len(curves):
         raise SolutionError(
             f"camera {name!r}: the best solution misses half of its observations by more than {limit_px:.0f} px: "
             "check labels, target dimensions and which lens it is"

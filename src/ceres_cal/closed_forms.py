@@ -223,11 +223,11 @@ def homographies_of_sights(data: PlaneData, profile: Profile) -> tuple[Array, Ar
 
     The normalised DLT, reweighted to distances in the image, and against wrong labels where some points do not fit.
     """
-    scale = np.array([profile.unit_px, profile.unit_px, 1.0])
     homographies, errors = np.empty((len(data.bounds) - 1, 3, 3)), np.empty(len(data.plane))
-    lifted = profile.lift(data.offsets) / scale
-    plane_homographies(data.bounds, np.ascontiguousarray(data.plane), lifted, homographies, errors)
-    return scale[:, None] * homographies, errors * profile.unit_px
+    plane_homographies(
+        data.bounds, data.plane, data.offsets, np.array(profile.coefficients), profile.unit_px, homographies, errors
+    )
+    return np.array([[profile.unit_px], [profile.unit_px], [1.0]]) * homographies, errors * profile.unit_px
 
 
 def usual_by_radius(error: Array, radius: Array) -> Array:

@@ -30,7 +30,7 @@ from ceres_cal.sights import Mask, Rows, Sights
 from ceres_cal.transforms import Array
 
 _MOST = 1500  # observations of one kind in a sight beyond which a start learns nothing more
-_ENOUGH_BOARDS = 32  # for a profile
+_ENOUGH_BOARDS = 24  # for a profile
 _ENOUGH_POINTS = 40.0  # of a board
 _GOLDEN = 0.6180339887498949
 _ROUGH_PX = 1.0  # a median beyond it may be no fit at all, however even

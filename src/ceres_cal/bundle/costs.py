@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,7 +20,14 @@ from ceres_cal.structure import Structure
 from ceres_cal.transforms import Array, left_jacobian, rotation_exp, skew
 
 ROWS_WORTH_A_THREAD = 20_000
+_ROWS_OF_A_PART = 3_000  # of many sights; below it a thread costs more than it brings
 _NOTHING = np.empty(0)
+
+
+@cache
+def _pool() -> ThreadPoolExecutor:
+    """For the parts of a sweep that its own thread does not take."""
+    return ThreadPoolExecutor(thread_name_prefix="ceres_cal")
 
 
 @dataclass(frozen=True)
@@ -195,9 +203,8 @@ class EliminatedCost(pyceres.CostFunction):
         self._accepted = _Evaluation(start, _NOTHING, _NOTHING, poses, gains)
         self._known: _Evaluation | None = None
         work = len(sights.points) + len(sights.curve_pixels)
-        parts = max(1, min(threads, work // ROWS_WORTH_A_THREAD))
+        parts = max(1, min(threads, work // _ROWS_OF_A_PART))
         self._parts = np.linspace(0, len(sights), parts + 1).astype(int).tolist()
-        self._pool = ThreadPoolExecutor(max(1, parts - 1))
         self.slots = [slot for slot, size in zip((0, 3), sizes, strict=True) if size]
         self.set_num_residuals(self._size + 1)
         self.set_parameter_block_sizes([size for size in sizes if size])
@@ -254,7 +261,7 @@ class EliminatedCost(pyceres.CostFunction):
             )  # fmt: skip
             return reduced
 
-        others = [self._pool.submit(part, *self._parts[i : i + 2]) for i in range(1, len(self._parts) - 1)]
+        others = [_pool().submit(part, *self._parts[i : i + 2]) for i in range(1, len(self._parts) - 1)]
         reduced = sum((other.result() for other in others), start=part(*self._parts[:2]))
         return _Sweep(poses, gains, costs, reduced)
 

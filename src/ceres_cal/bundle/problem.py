@@ -329,8 +329,9 @@ def _rests(history: Sequence[float]) -> bool:
 
 def private_placements(sights: Sights, layout: Layout) -> frozenset[str | None]:
     """Free placements that a single sight shows."""
-    seen = Counter(key.placement for key in sights.keys)
-    return frozenset(name for name, times in seen.items() if times == 1 and name in layout.placements)
+    seen = Counter([key.placement for key in sights.keys])
+    several = {name for name, times in seen.items() if times > 1}
+    return layout.placements & (seen.keys() - several)
 
 
 def _require_enough(sights: Sights, layout: Layout) -> None:
