@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ceres_cal.baseline import four_point_baseline
-from ceres_cal.bundle import Progress, Solution, Weighting, solve
+from ceres_cal.bundle import Progress, Solution, Weighting, information, solve
 from ceres_cal.calibration import Calibration, Fit, Rejected
 from ceres_cal.camera import Camera
 from ceres_cal.diagnostics import Inliers, judge, start_weights
@@ -21,6 +21,7 @@ from ceres_cal.parameters import Estimate, Layout, Options, make_layout
 from ceres_cal.residuals import Residuals, residuals
 from ceres_cal.sights import Sights, gather_sights
 from ceres_cal.transforms import Array
+from ceres_cal.uncertainty import Posterior, make_posterior
 
 _MOST_ROUNDS = 15
 _NO_FIT = 0.015  # of the image diagonal: a median residual beyond it is no calibration
@@ -50,11 +51,13 @@ def calibrate(
     layout = make_layout(observations, options)
     start = initialise(observations, sights, options)
     warnings: tuple[str, ...] = ()
+    posterior = None
     if options.closed_form_only:
         settled = _unsolved(observations, sights, four_point_baseline(sights, start.estimate))
     else:
         settled = _settle(observations, sights, start.estimate, layout, options, progress)
         warnings = _require_usable(settled, sights)
+        posterior = _assess(settled, sights, layout, options)
     return Calibration(
         settled.solution.estimate,
         observations.targets,
@@ -68,6 +71,7 @@ def calibrate(
         (*warnings, *(_GUESSED.format(name) for name, source in start.phi_from.items() if source == "guess")),
         options,
         observations.digest,
+        posterior,
     )
 
 
@@ -168,6 +172,15 @@ def _require_usable(settled: _Settled, sights: Sights) -> tuple[str, ...]:
             f"observations reach {seen:.0f} px"
         )
     return (*warnings, *_lost(settled.inliers, sights))
+
+
+def _assess(settled: _Settled, sights: Sights, layout: Layout, options: Options) -> Posterior:
+    """What is known of every number, by the observations that took part at the noise that they show."""
+    inliers = settled.inliers
+    weighting = Weighting(inliers.point_scale, inliers.curve_scale, options.loss, options.loss_scale)
+    used = sights.used(inliers.points, inliers.curves)
+    found = information(used, settled.solution.estimate, layout, weighting, settled.residuals.places)
+    return make_posterior(found, inliers.freedom)
 
 
 def _of(camera: str, sights: Sights) -> Sights:

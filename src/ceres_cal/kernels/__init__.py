@@ -3,6 +3,7 @@
 from ceres_cal.kernels.block import cholesky, evaluate_block
 from ceres_cal.kernels.elimination import eliminate_placements
 from ceres_cal.kernels.groups import grouped_products
+from ceres_cal.kernels.information import sight_normals
 from ceres_cal.kernels.lenses import INTRINSICS, LENS_CODES
 from ceres_cal.kernels.sight import LOSS_CODES, curve_residuals, normal_equations, point_residuals
 
@@ -17,4 +18,5 @@ __all__ = [
     "grouped_products",
     "normal_equations",
     "point_residuals",
+    "sight_normals",
 ]
