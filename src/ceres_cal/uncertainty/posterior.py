@@ -128,16 +128,14 @@ def _placement_information(part: Eliminated, shared: Posterior) -> Array:
     covariance own^-1 + G C G^T where both exist, else the Schur complement of the two together.
     """
     inverse = known_inverses(part.own, sigma_limits(pose_keys("placement", "")))
-    if not shared.spread.unknown.shape[1]:
-        own_covariance = shared.covariance[np.ix_(part.places, part.places)]
-        covariance = inverse + part.gains @ own_covariance @ np.swapaxes(part.gains, 1, 2)
-        found = np.linalg.inv(covariance)
-    else:
-        found = np.full_like(part.own, np.nan)
-    whole = np.einsum("sij,sji->s", part.own, inverse) > 5.5  # the rank of own
+    regular = np.einsum("sij,sji->s", part.own, inverse) > 5.5  # the rank of own
+    regular &= not shared.spread.unknown.shape[1]
+    found, gains = np.empty_like(part.own), part.gains[regular]
+    covariance = shared.spread.covariance[np.ix_(part.places, part.places)]
+    found[regular] = np.linalg.inv(inverse[regular] + gains @ covariance @ np.swapaxes(gains, 1, 2))
     marginal = shared.marginal(part.places)
     limits = sigma_limits([shared.keys[place] for place in part.places])
-    for s in np.flatnonzero(~whole | np.isnan(found[:, 0, 0])):
+    for s in np.flatnonzero(~regular):
         own, gain = part.own[s], part.gains[s]
         found[s] = without(own, gain.T @ own, marginal + gain.T @ own @ gain, limits)
     return np.asarray(0.5 * (found + np.swapaxes(found, 1, 2)))
