@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ceres_cal.baseline import four_point_baseline
-from ceres_cal.bundle import Progress, Solution, Weighting, information, solve
+from ceres_cal.bundle import Progress, Solution, Weighting, solve
 from ceres_cal.calibration import Calibration, Fit, Rejected
 from ceres_cal.camera import Camera
 from ceres_cal.diagnostics import Inliers, judge, start_weights
@@ -21,7 +21,7 @@ from ceres_cal.parameters import Estimate, Layout, Options, make_layout
 from ceres_cal.residuals import Residuals, residuals
 from ceres_cal.sights import Sights, gather_sights
 from ceres_cal.transforms import Array
-from ceres_cal.uncertainty import Posterior, make_posterior
+from ceres_cal.uncertainty import Posterior, Setting, assess
 
 _MOST_ROUNDS = 15
 _NO_FIT = 0.015  # of the image diagonal: a median residual beyond it is no calibration
@@ -56,8 +56,9 @@ def calibrate(
         settled = _unsolved(observations, sights, four_point_baseline(sights, start.estimate))
     else:
         settled = _settle(observations, sights, start.estimate, layout, options, progress)
+        _require_fits(settled, sights)
+        settled, posterior = _assess(observations, settled, sights, layout, options)
         warnings = _require_usable(settled, sights)
-        posterior = _assess(settled, sights, layout, options)
     return Calibration(
         settled.solution.estimate,
         observations.targets,
@@ -149,13 +150,18 @@ def _mended(
     return estimate, lost + turned
 
 
-def _require_usable(settled: _Settled, sights: Sights) -> tuple[str, ...]:
-    """Warnings about the solution; SolutionError where it must not be used."""
+def _require_fits(settled: _Settled, sights: Sights) -> None:
+    """Raise SolutionError where the solve failed, or its end explains too little."""
     if settled.solution.failed:
         raise SolutionError(f"the solve failed ({settled.solution.termination}): check labels and target dimensions")
-    warnings = []
     for name, camera in settled.solution.estimate.cameras.items():
         _require_fit(name, camera, settled, sights)
+
+
+def _require_usable(settled: _Settled, sights: Sights) -> tuple[str, ...]:
+    """Warnings about the solution; SolutionError where it must not be used."""
+    warnings = []
+    for name, camera in settled.solution.estimate.cameras.items():
         if not camera.folds:
             continue
         fold, corner = camera.lens.monotone_radius(camera.phi), camera.corner_radius
@@ -174,13 +180,23 @@ def _require_usable(settled: _Settled, sights: Sights) -> tuple[str, ...]:
     return (*warnings, *_lost(settled.inliers, sights))
 
 
-def _assess(settled: _Settled, sights: Sights, layout: Layout, options: Options) -> Posterior:
-    """What is known of every number, by the observations that took part at the noise that they show."""
-    inliers = settled.inliers
+def _assess(
+    observations: Observations, settled: _Settled, sights: Sights, layout: Layout, options: Options
+) -> tuple[_Settled, Posterior]:
+    """What is known of every number, by the observations that took part at the noise that they show.
+
+    Where the observations leave phi so open that their least cost lies at no lens, the estimate is another one.
+    """
+    inliers, places = settled.inliers, settled.residuals.places
     weighting = Weighting(inliers.point_scale, inliers.curve_scale, options.loss, options.loss_scale)
     used = sights.used(inliers.points, inliers.curves)
-    found = information(used, settled.solution.estimate, layout, weighting, settled.residuals.places)
-    return make_posterior(found, inliers.freedom)
+    estimate, posterior = assess(
+        Setting(used, layout, weighting, options, places), settled.solution.estimate, inliers.freedom
+    )
+    if estimate is not settled.solution.estimate:
+        found = residuals(observations, sights, estimate, places)
+        settled = replace(settled, solution=replace(settled.solution, estimate=estimate), residuals=found)
+    return settled, posterior
 
 
 def _of(camera: str, sights: Sights) -> Sights:

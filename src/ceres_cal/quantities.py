@@ -21,6 +21,7 @@ from ceres_cal.parameters import (
     intrinsic_names,
     intrinsics_scales,
     intrinsics_vector,
+    unit_px,
     with_intrinsics,
 )
 from ceres_cal.transforms import Array, Pose, rotation_exp, rotation_log, skew
@@ -50,6 +51,41 @@ _LIMITS = {"rad": 1e2, "m": 1e6, "px": 1e7}
 def sigma_limits(keys: Sequence[Key]) -> Array:
     """(P,) sigmas beyond which a number means nothing: turns of many turns, a camera in orbit."""
     return np.array([_LIMITS.get(key.unit, 1e12) for key in keys])
+
+
+def natural_sizes(estimate: Estimate, keys: Sequence[Key]) -> Array:
+    """(P,) what each number is compared with: an error of a hundredth of it moves a picture by about a hundredth.
+
+    phi and the principal point go with phi, positions with the distance to what is seen, turns with 1 rad, coefficients
+    with the one that moves a pixel half an image diagonal from the middle by as much; structure with its tolerance.
+    """
+    sizes = np.ones(len(keys))
+    for (kind, owner), places in places_of(keys).items():
+        if kind == "camera":
+            camera = estimate.cameras[owner]
+            radius = unit_px(camera) if camera.lens.kind == "radial" else unit_px(camera) / camera.phi
+            powers = {"p1": 2, "p2": 2} | dict(
+                zip([n for n in camera.lens.names if n[0] != "p"], camera.lens.radius_powers, strict=True)
+            )
+            known = {"phi": camera.phi, "cx": camera.phi, "cy": camera.phi, "aspect": 1.0}
+            known |= {name: radius ** (1 - power) for name, power in powers.items()}
+            sizes[places] = [known[keys[place].quantity] for place in places]
+        elif kind == "structure":
+            names = [f"{owner}/{keys[place].quantity}" for place in places]
+            sizes[places] = estimate.structure.sigma_m[[estimate.structure.names.index(name) for name in names]]
+        else:
+            distance = _distance_m(estimate, kind, owner)
+            sizes[places] = [distance if keys[place].unit == "m" else 1.0 for place in places]
+    return sizes
+
+
+def _distance_m(estimate: Estimate, kind: str, owner: str) -> float:
+    """From a station to the floor, or from a placement to the nearest station."""
+    if kind == "station":
+        return max(abs(float(estimate.stations[owner].cam_from_world.position[2])), 1e-3)
+    where = estimate.placements[owner].translation
+    away = [np.linalg.norm(where - station.cam_from_world.position) for station in estimate.stations.values()]
+    return max(float(min(away)), 1e-3)
 
 
 def camera_keys(name: str, camera: Camera, free: Iterable[int]) -> list[Key]:

@@ -14,6 +14,7 @@ from ceres_cal.errors import InputError
 from ceres_cal.quantities import Key, pose_keys, sigma_limits
 from ceres_cal.spread import Spread, known_inverses, without
 from ceres_cal.transforms import Array
+from ceres_cal.uncertainty.profile import Profile
 
 _NORMAL_95 = 1.959963984540054  # half width of the 95 % interval of a standard normal
 
@@ -30,12 +31,14 @@ class Posterior:
         placements: name -> (6, 6) information about each placement that one station alone sees, all else integrated
             out, in the order of `pose_keys`.
         freedom: spare equations behind the estimated noise; infinite where the sigmas were taken as stated.
+        profiles: camera -> the valley along its phi, where that is too little known for the quadratic picture.
     """
 
     keys: tuple[Key, ...]
     information: Array
     placements: Mapping[str, Array] = field(default_factory=dict)
     freedom: float = np.inf
+    profiles: Mapping[str, Profile] = field(default_factory=dict)
 
     @cached_property
     def spread(self) -> Spread:
@@ -56,6 +59,17 @@ class Posterior:
     def half_width(self) -> float:
         """Standard deviations from the middle to either end of a 95 % interval: Student's t of `freedom`."""
         return student_95(self.freedom)
+
+    @cached_property
+    def bounds(self) -> Array:
+        """(P, 2) 95 % bounds of the shared numbers, from the estimate; infinite on a side that is open."""
+        found = self.half_width * self.sd[:, None] * (-1.0, 1.0)
+        for profile in self.profiles.values():
+            across = [Spread.of(told, sigma_limits(profile.keys[1:])).sd for told in profile.information]
+            sds = np.column_stack([np.zeros(len(across)), across])
+            at = [self.keys.index(key) for key in profile.keys]
+            found[at] = np.column_stack(profile.bounds(profile.steps, sds, self.half_width))
+        return np.asarray(found)
 
     def place(self, kind: str, owner: str, quantity: str) -> int:
         """Where a number is among the keys.
