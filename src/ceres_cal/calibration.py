@@ -21,7 +21,7 @@ from ceres_cal.parameters import Estimate, Options, Station
 from ceres_cal.structure import make_structure
 from ceres_cal.targets import Target, target_from_spec
 from ceres_cal.transforms import Pose, euler_from_rotation
-from ceres_cal.uncertainty import Posterior, PosteriorFile, posterior_from_file, posterior_to_json
+from ceres_cal.uncertainty import Posterior, PosteriorFile, Uncertainty, posterior_from_file, posterior_to_json
 
 FORMAT, VERSION = "ceres-cal/calibration", 1
 
@@ -133,6 +133,17 @@ class Calibration:
         if name is None or name not in self.stations:
             raise InputError(f"station {name!r} is not there: there are {', '.join(map(repr, self.stations))}")
         return self.stations[name]
+
+    @cached_property
+    def uncertainty(self) -> Uncertainty:
+        """How well everything is known: verdicts, weak directions, maps in mm.
+
+        Raises:
+            InputError: nothing was minimised, or the file says nothing of it.
+        """
+        if self.posterior is None:
+            raise InputError("this calibration does not say how well it is known: calibrate again")
+        return Uncertainty(self.estimate, self.posterior, self.targets)
 
     @property
     def rms_px(self) -> float:

@@ -13,10 +13,14 @@ import numpy as np
 
 from ceres_cal.transforms import Array
 
-NOTHING = 1e-12
-"""Eigenvalue of an information matrix with unit diagonal below which a direction counts as unknown: rounding of sums
-over many observations reaches 1e-14, and a sigma a million times larger than the one each number would have alone is
-as good as infinite."""
+NOTHING = 2e-14
+"""Eigenvalue of an information matrix with unit diagonal below which a direction counts as unknown: rounding reaches
+1e-15 for each ten numbers, and a sigma millions of times larger than what each number would have alone is infinite."""
+_RESIDUE = 1e-11  # what a Schur complement leaves of a direction that is not told, relative to what went in
+
+
+def _nothing(count: int) -> float:
+    return NOTHING * max(1.0, count / 10.0)
 
 
 def _decomposed(information: Array, limits: Array) -> tuple[Array, Array, Array]:
@@ -37,7 +41,8 @@ def known_inverses(information: Array, limits: Array) -> Array:
         limits: (n,) see `Spread.of`.
     """
     scale, values, vectors = _decomposed(information, limits)
-    kept = np.where(values > NOTHING, 1.0 / np.where(values > NOTHING, values, 1.0), 0.0)
+    told = values > _nothing(values.shape[-1])
+    kept = np.where(told, 1.0 / np.where(told, values, 1.0), 0.0)
     half = vectors * np.sqrt(kept)[..., None, :] * scale[..., :, None]
     return np.asarray(half @ np.swapaxes(half, -1, -2))
 
@@ -52,7 +57,7 @@ def without(here: Array, coupling: Array, others: Array, limits: Array) -> Array
     diagonal = np.diagonal(here)
     scale = np.where(diagonal > 0.0, 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0)), 1.0)
     values, vectors = np.linalg.eigh(0.5 * (left + left.T) * scale[:, None] * scale)
-    root = vectors * np.sqrt(np.where(values > 10.0 * NOTHING, values, 0.0)) / scale[:, None]  # the rest is rounding
+    root = vectors * np.sqrt(np.where(values > _RESIDUE, values, 0.0)) / scale[:, None]  # the rest is rounding
     return np.asarray(root @ root.T)
 
 
@@ -78,7 +83,7 @@ class Spread:
             limits: (n,) a number whose sigma would be larger even if all others were known is not known at all.
         """
         scale, values, vectors = _decomposed(np.asarray(information, dtype=float), limits)
-        lost = values <= NOTHING
+        lost = values <= _nothing(len(values))
         half = vectors[:, ~lost] / np.sqrt(values[~lost]) * scale[:, None]
         return cls(half @ half.T, vectors[:, lost] * scale[:, None], scale)
 
@@ -88,7 +93,7 @@ class Spread:
             return np.zeros(jacobian.shape[:-1], dtype=bool)
         size = np.linalg.norm(jacobian * self.scale, axis=-1)
         # What leaks through below the root adds no more than the sigma that the function has with all else known.
-        return np.asarray(np.linalg.norm(jacobian @ self.unknown, axis=-1) > np.sqrt(NOTHING) * size)
+        return np.asarray(np.linalg.norm(jacobian @ self.unknown, axis=-1) > np.sqrt(_nothing(len(self.scale))) * size)
 
     def through(self, jacobian: Array) -> Array:
         """Covariances (..., m, m) of functions with derivatives (..., m, n); infinite variance where they depend on an

@@ -8,21 +8,21 @@ from dataclasses import replace
 import numpy as np
 
 from ceres_cal.camera import Camera
+from ceres_cal.initialise import PHI_RANGE, USUAL_PHI
 from ceres_cal.parameters import Estimate, unit_px
 from ceres_cal.uncertainty.posterior import Posterior, make_posterior, student_95
-from ceres_cal.uncertainty.profile import PHI_RANGE, Node, Setting, profile, valley
+from ceres_cal.uncertainty.profile import Node, Setting, profile, valley
 
-USUAL_PHI = 1.4
-"""In half image diagonals: 71 degrees across the diagonal, a usual lens."""
 _BENT = 0.05  # relative sigma of phi above which the quadratic picture is left
 
 
 def assess(setting: Setting, estimate: Estimate, freedom: float) -> tuple[Estimate, Posterior]:
-    """What is known at the estimate, and the estimate: another one where the least cost lies at a phi that no lens has.
+    """What is known at the estimate, and the estimate: another one where phi went astray.
 
     Nearly frontal views can be fitted a little better by a camera a hand's breadth over the floor, or in the clouds,
-    than by the true one. Where a lens is known to be none of these, the nearest to a usual lens that the observations
-    leave possible at 95 % is taken; the posterior says that phi is unknown.
+    than by the true one. Where the least cost lies at a phi that no lens has, or the observations say nothing of phi as
+    far as lenses go, the place of the valley within the 95 % bound that is nearest to a usual lens is taken; the
+    posterior says that phi is unknown.
 
     Args:
         freedom: spare equations behind the estimated noise, infinite where the sigmas were taken as stated.
@@ -30,17 +30,21 @@ def assess(setting: Setting, estimate: Estimate, freedom: float) -> tuple[Estima
     Raises:
         SolutionError: no possible lens fits.
     """
-    width = student_95(freedom)
-    free = [name for name, numbers in setting.layout.free.items() if 0 in numbers]
-    astray = [name for name in free if not _is_lens(estimate.cameras[name])]
-    for number, name in enumerate(astray):
-        estimate = _usual(name, valley(name, _holding(setting, astray[:number]), estimate), width)
-    posterior = make_posterior(setting.told(estimate), freedom)
-    profiles = {}
-    for name in free:
-        if posterior.sd_of("camera", name, "phi") > _BENT * estimate.cameras[name].phi:
-            others = _holding(setting, [other for other in astray if other != name])  # or they would go astray again
-            profiles[name] = profile(name, valley(name, others, estimate), estimate, width)
+    width, posterior = student_95(freedom), make_posterior(setting.told(estimate), freedom)
+    valleys: dict[str, tuple[Node, ...]] = {}
+    astray: list[str] = []
+    for name in [name for name, numbers in setting.layout.free.items() if 0 in numbers]:
+        camera = estimate.cameras[name]
+        if _is_lens(camera) and posterior.sd_of("camera", name, "phi") <= _BENT * camera.phi:
+            continue
+        nodes = valleys[name] = valley(name, _holding(setting, astray), estimate)
+        rise = max(nodes[0].cost, nodes[-1].cost) - min(node.cost for node in nodes)
+        if not _is_lens(camera) or rise < width**2:
+            estimate = _usual(name, nodes, width)
+            astray.append(name)  # held at it while other cameras are looked at
+    if astray:
+        posterior = make_posterior(setting.told(estimate), freedom)
+    profiles = {name: profile(name, nodes, estimate, width) for name, nodes in valleys.items()}
     return estimate, replace(posterior, profiles=profiles)
 
 

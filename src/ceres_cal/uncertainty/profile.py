@@ -16,19 +16,20 @@ import numpy as np
 
 from ceres_cal.bundle import Information, Weighting, information, solve
 from ceres_cal.errors import CalibrationError, SolutionError
+from ceres_cal.initialise import PHI_RANGE
 from ceres_cal.parameters import Estimate, Layout, Options, unit_px
 from ceres_cal.quantities import Key, difference, moved, sigma_limits
 from ceres_cal.sights import Sights
 from ceres_cal.spread import known_inverses, without
 from ceres_cal.transforms import Array
 
-PHI_RANGE = (0.15, 15.0)
-"""In half image diagonals: 163 to 8 degrees across the image's diagonal. What lies beyond is no lens over a field."""
 _FAR = 9.0  # rise of twice the cost at which the valley is followed no further: three sigma
 _STEPS = (0.02, 0.35)  # of log phi
 _MOST_NODES = 60
 _FINE = 16  # places interpolated between two
-_SETTLED = 0.5  # of a standard deviation across: what still changes by more over the last factor two does not settle
+_TWICE = (np.log(2.0), np.log(4.0))
+_SETTLED = 1.0  # standard deviation across: what changes by less over the last factor two of phi is bounded by the data
+_SHRINKING = 0.75  # ratio of two changes over a factor two each: 1/2 of what goes with phi towards 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,24 +111,31 @@ class Profile:
 
     def bounds(self, values: Array, sds: Array, half_width: float) -> tuple[Array, Array]:
         """95 % bounds (m,) below and above of numbers that are `values` (N, m) along the valley, with standard
-        deviations `sds` (N, m) across it; infinite on a side where the valley is open and they do not settle.
+        deviations `sds` (N, m) across it; infinite on a side where the valley is open and they grow on.
         """
         weights, widths = self.reaches(half_width)
         middle, spread = weights @ values, widths[:, None] * (weights @ sds)
         low, high = np.min(middle - spread, axis=0), np.max(middle + spread, axis=0)
         for is_open, end in ((self.open_below, 0), (self.open_above, -1)):
             if is_open:
-                drift = values[end] - values[self._before(end)]
-                going = np.abs(drift) > _SETTLED * sds[end]
-                low = np.where(going & (drift < 0.0), -np.inf, low)
-                high = np.where(going & (drift > 0.0), np.inf, high)
+                limit = self._limit(values, sds[end], end)
+                low = np.minimum(low, limit - widths[end] * sds[end])
+                high = np.maximum(high, limit + widths[end] * sds[end])
         return low, high
 
-    def _before(self, end: int) -> int:
-        """The place before an end of the valley from which phi changes to it by a factor of at least two."""
-        order = range(1, len(self.phi)) if end == 0 else range(len(self.phi) - 2, -1, -1)
-        far = (place for place in order if abs(np.log(self.phi[place] / self.phi[end])) >= np.log(2.0))
-        return next(far, len(self.phi) - 1 if end == 0 else 0)
+    def _limit(self, values: Array, sds: Array, end: int) -> Array:
+        """(m,) where numbers go beyond an open end: on by a geometric series, each term for another factor two of phi,
+        to infinity where the last two terms do not shrink.
+        """
+        away = np.abs(np.log(self.phi / self.phi[end]))
+        order = np.argsort(away)
+        halves = [np.array([np.interp(d, away[order], column[order]) for column in values.T]) for d in _TWICE]
+        last, before = values[end] - halves[0], halves[0] - halves[1]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ratio = np.abs(last / before)
+            limit = values[end] + last * ratio / (1.0 - ratio)
+        going = np.where(np.abs(last) > _SETTLED * sds, np.copysign(np.inf, last), values[end] + last)
+        return np.asarray(np.where(ratio < _SHRINKING, limit, going))
 
 
 def valley(camera: str, setting: Setting, estimate: Estimate) -> tuple[Node, ...]:
