@@ -39,12 +39,13 @@ from ceres_cal.calibrate import calibrate
 from ceres_cal.calibration import Calibration
 from ceres_cal.camera import Camera
 from ceres_cal.observations import Observations
-from ceres_cal.parameters import Options, intrinsics_vector, make_layout, with_intrinsics
+from ceres_cal.parameters import Options, make_layout
+from ceres_cal.quantities import moved
 from ceres_cal.sights import gather_sights
 from ceres_cal.simulate import Disturbance, simulate
 from ceres_cal.structure import Tolerance
 from ceres_cal.targets import Arc, Target
-from ceres_cal.transforms import Array, Pose
+from ceres_cal.transforms import Array
 
 MOST_SIGMA = 4.0  # a mean farther from 0 than so many of its own standard errors is a bias
 HEIGHTS_M = (0.0, 0.15)  # the floor, and the top of a robot
@@ -92,7 +93,7 @@ class Row:
 def efficiency_rows(case: str, problem: Problem, disturbance: Disturbance, most: float, runs: int) -> Iterator[Row]:
     """Squared error over the bound, the same over the best on this noise, bias and failures."""
     found = efficiency(problem, disturbance, range(runs))
-    numbers = f"{len(found.names)} numbers, {len(found.squared)} runs"
+    numbers = f"{len(found.keys)} numbers, {len(found.squared)} runs"
     yield Row(case, "squared error / Cramer-Rao bound", *found.ratio, 2.0 - most, most, numbers)
     note = f"{found.rejected:.0f} observations taken out"
     yield Row(case, "its excess over the best on this noise", *found.excess, -np.inf, most - 1.0, note)
@@ -170,21 +171,19 @@ def map_errors_mm(truth: Camera, estimate: Camera, places: Array, height_m: floa
 def predicted_mm(problem: Problem, places: Array, height_m: float) -> Array:
     """The map error (DRAWS, N) that the Cramer-Rao bound lets expect, by differences of the true camera's map."""
     trial = make_trial(problem, SSL_NOISE, 0)
-    covariance = np.linalg.inv(bound(trial)[1])
+    keys, information = bound(trial)
+    covariance = np.linalg.inv(information)
     (name,) = trial.truth.stations
     truth = trial.truth.camera_at(name)
-    free, vector = trial.layout.free[trial.truth.stations[name].camera], intrinsics_vector(truth)
-    start = np.concatenate([vector[free], truth.cam_from_world.log()])
 
-    def located(numbers: Array) -> Array:
-        vector[free] = numbers[: len(free)]
-        return with_intrinsics(truth, vector).at(Pose.exp(numbers[len(free) :])).locate(pixels, height_m)
+    def located(step: Array) -> Array:
+        return moved(trial.truth, keys, step).camera_at(name).locate(pixels, height_m)
 
     pixels = truth.project(np.column_stack([places, np.full(len(places), height_m)]))
     pixels = pixels[np.all((pixels >= -0.5) & (pixels <= np.array(truth.image_size) - 0.5), axis=1)]
     steps = 1e-3 * np.diag(np.sqrt(np.diag(covariance)))
-    slopes = np.array([(located(start + s) - located(start - s)) / (2.0 * s.max()) for s in steps])
-    draws = np.random.default_rng(0).multivariate_normal(np.zeros(len(start)), covariance, DRAWS, method="cholesky")
+    slopes = np.array([(located(s) - located(-s)) / (2.0 * s.max()) for s in steps])
+    draws = np.random.default_rng(0).multivariate_normal(np.zeros(len(keys)), covariance, DRAWS, method="cholesky")
     return np.asarray(1e3 * np.linalg.norm(np.einsum("sp,pnk->snk", draws, slopes), axis=2))
 
 

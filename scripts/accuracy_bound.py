@@ -8,16 +8,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 from accuracy_scenes import Problem
 
+from ceres_cal import quantities
 from ceres_cal.bundle import Weighting, information, private_placements, solve
 from ceres_cal.calibrate import calibrate
 from ceres_cal.calibration import Calibration
 from ceres_cal.errors import CalibrationError
 from ceres_cal.observations import Observations
-from ceres_cal.parameters import Estimate, Layout, Options, Station, intrinsics_vector, make_layout
+from ceres_cal.parameters import Estimate, Layout, Options, Station, make_layout
+from ceres_cal.quantities import Key, shared_keys
 from ceres_cal.sights import Sights, gather_sights
 from ceres_cal.simulate import CLEAN, Disturbance, Simulation, simulate
 from ceres_cal.structure import make_structure
-from ceres_cal.transforms import Array, Pose
+from ceres_cal.transforms import Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,12 +69,12 @@ def true_estimate(simulation: Simulation, options: Options) -> Estimate:
     return Estimate(scene.cameras, stations, scene.placements, structure)
 
 
-def bound(trial: Trial) -> tuple[tuple[str, ...], Array]:
-    """Names and information (P, P), at the truth, of everything shared: the inverse of the Cramer-Rao bound."""
+def bound(trial: Trial) -> tuple[tuple[Key, ...], Array]:
+    """Keys and information (P, P), at the truth, of everything shared: the inverse of the Cramer-Rao bound."""
     found = information(
         trial.used(gather_sights(trial.clean)), trial.truth, trial.layout, Weighting(1.0, 1.0, "trivial")
     )
-    return found.names, found.matrix
+    return found.keys, found.matrix
 
 
 def best(trial: Trial, options: Options) -> Estimate:
@@ -83,30 +85,9 @@ def best(trial: Trial, options: Options) -> Estimate:
 
 
 def difference(trial: Trial, estimate: Estimate) -> Array:
-    """Estimate less truth (P,) in the order of `bound`'s names."""
-    truth, layout = trial.truth, trial.layout
-    alone = private_placements(gather_sights(trial.clean), layout)
-    parts = [
-        (intrinsics_vector(estimate.cameras[name]) - intrinsics_vector(camera))[layout.free[name]]
-        for name, camera in truth.cameras.items()
-    ]
-    for name, station in truth.stations.items():
-        if name in layout.stations:
-            parts.append(pose_difference(estimate.stations[name].cam_from_world, station.cam_from_world))
-    for name, pose in truth.placements.items():
-        if name in layout.placements and name not in alone:
-            parts.append(pose_difference(estimate.placements[name], pose))
-    return np.concatenate(parts)
-
-
-def pose_difference(pose: Pose, truth: Pose) -> Array:
-    """Of the 6-vectors; a rotation vector near half a turn has another that is as good: the nearer one counts."""
-    here, there = pose.log(), truth.log()
-    angle = float(np.linalg.norm(here[:3]))
-    other = here[:3] * (1.0 - 2.0 * np.pi / max(angle, 1e-12))
-    if np.linalg.norm(other - there[:3]) < np.linalg.norm(here[:3] - there[:3]):
-        here[:3] = other
-    return np.asarray(here - there)
+    """Estimate less truth (P,) in the order of `bound`'s keys."""
+    alone = private_placements(gather_sights(trial.clean), trial.layout)
+    return quantities.difference(estimate, trial.truth, shared_keys(trial.truth, trial.layout, alone))
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,13 +95,13 @@ class Efficiency:
     """Many calibrations of one problem beside its Cramer-Rao bound.
 
     Attributes:
-        names: (P) of the shared numbers. errors: (N, P) estimate less truth.
+        keys: (P) of the shared numbers. errors: (N, P) estimate less truth.
         squared, best_squared: (N,) squared Mahalanobis length of the errors over P, of the calibration and of `best`:
             1 on average where the bound is reached.
         failed: runs that gave no calibration. rejected: observations taken out, on average.
     """
 
-    names: tuple[str, ...]
+    keys: tuple[Key, ...]
     errors: Array
     squared: Array
     best_squared: Array
@@ -142,7 +123,7 @@ class Efficiency:
         """The farthest mean error in its own standard errors, and of what."""
         mean = np.mean(self.errors, axis=0)
         sigmas = np.abs(mean) / (np.std(self.errors, axis=0, ddof=1) / np.sqrt(len(self.errors)))
-        return float(np.max(sigmas)), self.names[int(np.argmax(sigmas))]
+        return float(np.max(sigmas)), " ".join(self.keys[int(np.argmax(sigmas))][:3])
 
 
 def attempts(
@@ -164,19 +145,19 @@ def mean_and_error(values: Array) -> tuple[float, float]:
 
 def efficiency(problem: Problem, disturbance: Disturbance, seeds: Sequence[int]) -> Efficiency:
     """Calibrate the problem once per seed, from a cold start."""
-    names: tuple[str, ...] = ()
+    keys: tuple[Key, ...] = ()
     errors, squared, best_squared, rejected = [], [], [], []
     for trial, calibration in attempts(problem, disturbance, seeds):
         if calibration is None:
             continue
-        names, matrix = bound(trial)
+        keys, matrix = bound(trial)
         errors.append(difference(trial, calibration.estimate))
-        squared.append(errors[-1] @ matrix @ errors[-1] / len(names))
+        squared.append(errors[-1] @ matrix @ errors[-1] / len(keys))
         ideal = difference(trial, best(trial, problem.options))
-        best_squared.append(ideal @ matrix @ ideal / len(names))
+        best_squared.append(ideal @ matrix @ ideal / len(keys))
         rejected.append(len(calibration.rejected))
     return Efficiency(
-        names,
+        keys,
         np.array(errors),
         np.array(squared),
         np.array(best_squared),

@@ -83,6 +83,22 @@ PROBLEMS: dict[str, Callable[[], Problem]] = {
 }
 
 
+# ---- how well it is known -------------------------------------------------------------------------------------------
+
+
+def tilted(tilt_deg: float, height_sigma_m: float | None = None, boards: int = 0, spacing_m: float = 0.4) -> Problem:
+    """A few lines' worth of a whole field seen by a tilted camera, with what may be known or shown besides."""
+    cameras = {"overhead": replace(_camera(), phi=560.0)}
+    pose = overhead_pose(-0.3, 0.2, 4.0, tilt_x_deg=0.6 * tilt_deg, tilt_y_deg=-0.8 * tilt_deg, yaw_deg=1.6)
+    stations = {"overhead": Station("overhead", pose)}
+    scene = field_scene(FIELD, cameras, stations, points=(), spacing_m=spacing_m)
+    if boards:
+        shown = board_scene(checkerboard(9, 6, 0.1), cameras, stations, boards, seed=5, distance_m=(1.0, 2.0))
+        scene = join(scene, shown)
+    priors = () if height_sigma_m is None else (_height(scene, "overhead", height_sigma_m),)
+    return Problem(scene, Options(), priors)
+
+
 # ---- mirrored poses -------------------------------------------------------------------------------------------------
 
 

@@ -41,6 +41,7 @@ def calibrated(name: str, **more: Any) -> Calibration:
 def content(calibration: Calibration) -> dict[str, Any]:
     """Every field as plain, comparable data."""
     fields = {name: getattr(calibration, name) for name in calibration.__dataclass_fields__ if name != "estimate"}
+    posterior = fields.pop("posterior")
     estimate = calibration.estimate
     return fields | {
         "cameras": dict(estimate.cameras),
@@ -51,6 +52,8 @@ def content(calibration: Calibration) -> dict[str, Any]:
         "phi_from": dict(calibration.phi_from),
         "versions": dict(calibration.versions),
         "targets": dict(calibration.targets),
+        "posterior": posterior and (posterior.keys, posterior.information.tolist(), posterior.freedom),
+        "placements known": posterior and {name: m.tolist() for name, m in posterior.placements.items()},
     }
 
 
@@ -131,6 +134,8 @@ def put(*path: str, value: Any) -> Callable[[dict[str, Any]], None]:
         (put("options", "fixed", value={"k9": 1.0}), "cannot fix 'k9'"),
         (put("options", "priors", value=[{"station": "overhead"}]), "prior"),
         (lambda data: data.pop("fit"), "missing required field `fit`"),
+        (lambda data: data["posterior"]["information"].pop(), "posterior.information has .* numbers, not .*"),
+        (put("posterior", "placements", "board_01", value=[1.0]), "placements.board_01 has 1 numbers, not 21"),
     ],
 )
 def test_files_that_are_not_right(change: Callable[[dict[str, Any]], Any], message: str, tmp_path: Path) -> None:

@@ -21,6 +21,7 @@ from ceres_cal.parameters import Estimate, Layout, Options, make_layout
 from ceres_cal.residuals import Residuals, residuals
 from ceres_cal.sights import Rows, Sights, gather_sights
 from ceres_cal.transforms import Array
+from ceres_cal.uncertainty import Posterior, Setting, assess
 
 _MOST_ROUNDS = 15
 _ENOUGH_PLACEMENTS = 32  # of a camera: with them it is known well enough to place all others
@@ -51,10 +52,13 @@ def calibrate(
     layout = make_layout(observations, options)
     start = initialise(observations, sights, options)
     warnings: tuple[str, ...] = ()
+    posterior = None
     if options.closed_form_only:
         settled = _unsolved(observations, sights, four_point_baseline(sights, start.estimate))
     else:
         settled = _settle(observations, sights, start.estimate, layout, options, progress)
+        _require_fits(settled, sights)
+        settled, posterior = _assess(observations, settled, sights, layout, options)
         warnings = _require_usable(settled, sights)
     return Calibration(
         settled.solution.estimate,
@@ -69,6 +73,7 @@ def calibrate(
         (*warnings, *(_GUESSED.format(name) for name, source in start.phi_from.items() if source == "guess")),
         options,
         observations.digest,
+        posterior,
     )
 
 
@@ -165,13 +170,18 @@ def _mended(
     return estimate, lost + turned
 
 
-def _require_usable(settled: _Settled, sights: Sights) -> tuple[str, ...]:
-    """Warnings about the solution; SolutionError where it must not be used."""
+def _require_fits(settled: _Settled, sights: Sights) -> None:
+    """Raise SolutionError where the solve failed, or its end explains too little."""
     if settled.solution.failed:
         raise SolutionError(f"the solve failed ({settled.solution.termination}): check labels and target dimensions")
-    warnings = []
     for name, camera in settled.solution.estimate.cameras.items():
         _require_fit(name, camera, settled, sights)
+
+
+def _require_usable(settled: _Settled, sights: Sights) -> tuple[str, ...]:
+    """Warnings about the solution; SolutionError where it must not be used."""
+    warnings = []
+    for name, camera in settled.solution.estimate.cameras.items():
         if not camera.folds:
             continue
         fold, corner = camera.lens.monotone_radius(camera.phi), camera.corner_radius
@@ -188,6 +198,25 @@ def _require_usable(settled: _Settled, sights: Sights) -> tuple[str, ...]:
             f"observations reach {seen:.0f} px"
         )
     return (*warnings, *_lost(settled.inliers, sights))
+
+
+def _assess(
+    observations: Observations, settled: _Settled, sights: Sights, layout: Layout, options: Options
+) -> tuple[_Settled, Posterior]:
+    """What is known of every number, by the observations that took part at the noise that they show.
+
+    Where the observations leave phi so open that their least cost lies at no lens, the estimate is another one.
+    """
+    inliers, places = settled.inliers, settled.residuals.places
+    weighting = Weighting(inliers.point_scale, inliers.curve_scale, options.loss, options.loss_scale)
+    used = sights.used(inliers.points, inliers.curves)
+    estimate, posterior = assess(
+        Setting(used, layout, weighting, options, places), settled.solution.estimate, inliers.freedom
+    )
+    if estimate is not settled.solution.estimate:
+        found = residuals(observations, sights, estimate, places)
+        settled = replace(settled, solution=replace(settled.solution, estimate=estimate), residuals=found)
+    return settled, posterior
 
 
 def _of(camera: str, sights: Sights) -> Sights:

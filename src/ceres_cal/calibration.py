@@ -21,6 +21,7 @@ from ceres_cal.parameters import Estimate, Options, Station
 from ceres_cal.structure import make_structure
 from ceres_cal.targets import Target, target_from_spec
 from ceres_cal.transforms import Pose, euler_from_rotation
+from ceres_cal.uncertainty import Posterior, PosteriorFile, Uncertainty, posterior_from_file, posterior_to_json
 
 FORMAT, VERSION = "ceres-cal/calibration", 1
 
@@ -87,6 +88,7 @@ class Calibration:
         rounds: solves it took. history: cost at each iteration of the last one.
         phi_from: camera -> "fixed", "views", "prior" or "guess": what the start for phi rested on.
         warnings: what to know before using it, each one line.
+        posterior: what is known of every number; None where nothing was minimised, or a file says nothing of it.
         options: how it was solved. digest: SHA-256 of the observations. versions: of the packages that solved it.
     """
 
@@ -102,6 +104,7 @@ class Calibration:
     warnings: tuple[str, ...]
     options: Options
     digest: str
+    posterior: Posterior | None = None
     versions: Mapping[str, str] = field(default_factory=package_versions)
 
     @property
@@ -130,6 +133,17 @@ class Calibration:
         if name is None or name not in self.stations:
             raise InputError(f"station {name!r} is not there: there are {', '.join(map(repr, self.stations))}")
         return self.stations[name]
+
+    @cached_property
+    def uncertainty(self) -> Uncertainty:
+        """How well everything is known: verdicts, weak directions, maps in mm.
+
+        Raises:
+            InputError: nothing was minimised, or the file says nothing of it.
+        """
+        if self.posterior is None:
+            raise InputError("this calibration does not say how well it is known: calibrate again")
+        return Uncertainty(self.estimate, self.posterior, self.targets)
 
     @property
     def rms_px(self) -> float:
@@ -205,6 +219,7 @@ class _CalibrationFile(msgspec.Struct, forbid_unknown_fields=True):
     options: dict[str, Any]
     digest: str
     versions: dict[str, str]
+    posterior: PosteriorFile | None = None
 
 
 def camera_to_json(camera: Camera) -> dict[str, Any]:
@@ -254,6 +269,7 @@ def calibration_to_json(calibration: Calibration) -> dict[str, Any]:
         "options": options,
         "digest": calibration.digest,
         "versions": dict(calibration.versions),
+        "posterior": None if calibration.posterior is None else posterior_to_json(calibration.posterior),
     }
 
 
@@ -294,5 +310,6 @@ def _from_file(data: _CalibrationFile) -> Calibration:
         data.warnings,
         options,
         data.digest,
+        None if data.posterior is None else posterior_from_file(data.posterior),
         data.versions,
     )

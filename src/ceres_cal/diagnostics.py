@@ -30,6 +30,7 @@ class Inliers:
         points: (N,), curves: (M,) bool. point_scale, curve_scale: factors on the stated sigmas.
         point_sigmas, curve_sigmas: how many standard deviations each residual is long; infinite where the estimate
             cannot show the observation.
+        freedom: spare equations that the scales rest on; infinite where they are the stated ones.
     """
 
     points: Mask
@@ -38,6 +39,7 @@ class Inliers:
     curve_scale: float
     point_sigmas: Array
     curve_sigmas: Array
+    freedom: float = np.inf
 
     def same_as(self, other: Inliers) -> bool:
         """Whether nothing worth another solve changed: the same rows, scales within a hundredth."""
@@ -95,7 +97,8 @@ def judge(
     fallback = known[0] if known else 1.0
     p = fallback if point_scale is None else point_scale
     c = fallback if curve_scale is None else curve_scale
-    return Inliers(points <= reject_sigma * p, curves <= reject_sigma * c, p, c, points / p, curves / c)
+    freedom = spare * (2.0 * point_spread.count + curve_spread.count) if known else np.inf
+    return Inliers(points <= reject_sigma * p, curves <= reject_sigma * c, p, c, points / p, curves / c, freedom)
 
 
 @dataclass(frozen=True)

@@ -22,8 +22,10 @@ from ceres_cal.sights import Rows, Sights
 from ceres_cal.structure import make_structure
 from ceres_cal.transforms import Array, Pose, Poses, chained, inverted
 
-_PHI_RANGE = np.geomspace(0.15, 15.0, 120)  # in half image diagonals
-_PHI_GUESS = 1.4
+PHI_RANGE = (0.15, 15.0)
+"""In half image diagonals: 163 to 8 degrees across the image's diagonal. What lies beyond is no lens over a field."""
+USUAL_PHI = 1.4
+"""In half image diagonals: 71 degrees across the diagonal, a usual lens."""
 _ENOUGH_VIEWS = 100  # for phi
 
 
@@ -136,13 +138,11 @@ def _choose_phi(
         total = np.sum(np.log1p((error / 0.5) ** 2), axis=1)
         return np.asarray(total + sum(_prior_cost(prior, phi, sights, homographies) for prior in known))
 
-    grid = unit * _PHI_RANGE
+    grid = unit * np.geomspace(*PHI_RANGE, 120)
     values = cost(grid)
     acceptable = grid[values <= values.min() + 1.0]
     flat = acceptable[-1] > 1.6 * acceptable[0]
-    middle = (
-        min(acceptable, key=lambda phi: abs(np.log(phi / (_PHI_GUESS * unit)))) if flat else grid[np.argmin(values)]
-    )
+    middle = min(acceptable, key=lambda phi: abs(np.log(phi / (USUAL_PHI * unit)))) if flat else grid[np.argmin(values)]
     for _ in range(0 if flat else 6):
         near = middle * np.geomspace(1.0 / 1.04, 1.04, 13)
         middle = near[np.argmin(cost(near))]

@@ -6,11 +6,10 @@ and its placement; each prior is one small block. What Ceres minimises is the sa
 """
 
 from ceres_cal.bundle.costs import Weighting
+from ceres_cal.bundle.information import Eliminated, Information, information
 from ceres_cal.bundle.problem import (
-    Information,
     Progress,
     Solution,
-    information,
     placement_costs,
     private_placements,
     settle_placements,
@@ -18,6 +17,7 @@ from ceres_cal.bundle.problem import (
 )
 
 __all__ = [
+    "Eliminated",
     "Information",
     "Progress",
     "Solution",

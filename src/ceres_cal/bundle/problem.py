@@ -225,60 +225,6 @@ def solve(
     )
 
 
-@dataclass(frozen=True, eq=False)
-class Information:
-    """J^T J of everything shared, placements that one station sees eliminated; priors are in it.
-
-    Attributes:
-        names: (P) "camera/phi", "station/t_x", "structure/field/HalfwayLine": the numbers in the solver's units.
-        matrix: (P, P).
-    """
-
-    names: tuple[str, ...]
-    matrix: Array
-
-
-def information(sights: Sights, estimate: Estimate, layout: Layout, weighting: Weighting) -> Information:
-    """What the observations and priors say of the free intrinsics, stations, shared placements and structure.
-
-    Straight from the compressed blocks, at the estimate's own numbers: intrinsics with scaled coefficients, poses as
-    (rotation vector, translation).
-    """
-    assembly = _assemble(Run(), sights, estimate, layout, weighting, threads=1)
-    blocks = assembly.blocks
-    groups: list[tuple[str, Sequence[str], Array]] = []
-    for name, array in blocks.cameras.items():
-        labels = intrinsic_names(estimate.cameras[name].lens)
-        groups.append((name, [labels[i] for i in layout.free[name]], array))
-    groups += [(name, _POSE_NAMES, blocks.stations[name]) for name in estimate.stations if name in layout.stations]
-    groups += [(name, _POSE_NAMES, array) for name, array in blocks.placements.items()]
-    groups.append(("structure", estimate.structure.names, blocks.structure))
-    first: dict[int, int] = {}
-    names: list[str] = []
-    for owner, own_labels, array in groups:
-        first[id(array)] = len(names)
-        names += [f"{owner}/{label}" for label in own_labels]
-    matrix = np.zeros((len(names), len(names)))
-    for cost, arrays in assembly.costs:
-        if not arrays:
-            continue
-        jacobian = _jacobian(cost, arrays)
-        at = np.concatenate([np.arange(first[id(a)], first[id(a)] + len(a)) for a in arrays])
-        matrix[np.ix_(at, at)] += jacobian.T @ jacobian
-    return Information(tuple(names), matrix)
-
-
-_POSE_NAMES = ("w_x", "w_y", "w_z", "t_x", "t_y", "t_z")
-
-
-def _jacobian(cost: Any, arrays: Sequence[Array]) -> Array:
-    rows = cost.num_residuals()
-    parts = [np.zeros(rows * len(array)) for array in arrays]
-    if not cost.Evaluate(arrays, np.zeros(rows), parts):
-        raise SolutionError("an observation cannot be projected where the solve ended: no uncertainty can be given")
-    return np.hstack([part.reshape(rows, -1) for part in parts])
-
-
 def placement_costs(
     sights: Sights,
     estimate: Estimate,

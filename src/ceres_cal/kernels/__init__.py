@@ -3,6 +3,7 @@
 from ceres_cal.kernels.block import cholesky, evaluate_block
 from ceres_cal.kernels.elimination import eliminate_placements
 from ceres_cal.kernels.groups import grouped_products, grouped_scatter
+from ceres_cal.kernels.information import sight_normals
 from ceres_cal.kernels.lenses import INTRINSICS, LENS_CODES
 from ceres_cal.kernels.losses import LOSS_CODES
 from ceres_cal.kernels.planes import plane_homographies
@@ -21,4 +22,5 @@ __all__ = [
     "normal_equations",
     "plane_homographies",
     "point_residuals",
+    "sight_normals",
 ]

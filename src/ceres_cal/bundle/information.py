@@ -1,0 +1,180 @@
+"""What observations and priors say of every number, where an estimate stands: J^T W J, nothing moved (design, 6).
+
+Every sight gives its compressed normal equations once; placements that one station sees are eliminated, the rest is
+added up over what is shared, in the coordinates of `quantities`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ceres_cal import kernels
+from ceres_cal.bundle.costs import Weighting, _columns, _track_slots
+from ceres_cal.bundle.problem import private_placements
+from ceres_cal.errors import SolutionError
+from ceres_cal.parameters import Estimate, Layout, intrinsics_scales
+from ceres_cal.quantities import Key, from_placement, from_station, places_of, pose_keys, shared_keys, sigma_limits
+from ceres_cal.residuals import lens_arguments, starting_places
+from ceres_cal.sights import SightKey, Sights
+from ceres_cal.spread import known_inverses
+from ceres_cal.transforms import Array
+
+Places = NDArray[np.int64]
+_BATCH = 2_000_000  # numbers of normal equations worked on at once
+
+
+@dataclass(frozen=True, eq=False)
+class Eliminated:
+    """Private placements of one station: their own information, and how they follow the shared numbers.
+
+    Attributes:
+        names: (S). own: (S, 6, 6) information about each with everything shared held.
+        gains: (S, 6, K); a step d of the shared numbers at `places` (K,) takes each placement along by -gains d.
+    """
+
+    names: tuple[str, ...]
+    own: Array
+    gains: Array
+    places: Places
+
+
+@dataclass(frozen=True, eq=False)
+class Information:
+    """J^T W J of everything shared, private placements eliminated; priors are in it.
+
+    Attributes:
+        keys: (P) of the shared numbers. matrix: (P, P). eliminated: the private placements, by station.
+    """
+
+    keys: tuple[Key, ...]
+    matrix: Array
+    eliminated: tuple[Eliminated, ...]
+
+
+def information(
+    sights: Sights, estimate: Estimate, layout: Layout, weighting: Weighting, places: Array | None = None
+) -> Information:
+    """What the observations and priors say of the free intrinsics, stations, placements and structure.
+
+    Each observation counts with its robust weight rho'. For a placement to be eliminated rightly it must be at its
+    best, as it is after a solve.
+
+    Args:
+        places: feet of the curve observations, see `residuals`.
+
+    Raises:
+        SolutionError: an observation cannot be projected from there.
+    """
+    private = private_placements(sights, layout)
+    keys = shared_keys(estimate, layout, private)
+    matrix, owned = np.zeros((len(keys), len(keys))), _owned(keys)
+    alone = np.array([key.placement in private for key in sights.keys])
+    stations = np.array([key.station for key in sights.keys])
+    eliminated = []
+    for name in dict.fromkeys(stations[alone].tolist()):
+        own = sights.take(np.flatnonzero(alone & (stations == name)))
+        parts = list(_normals(own, estimate, layout, weighting, places))
+        eliminated.append(_eliminate(own, parts, estimate, owned, matrix))
+    for number in np.flatnonzero(~alone):
+        sight = sights[int(number)]
+        for pose, normal in _normals(sight, estimate, layout, weighting, places):
+            _add(sight.key, pose[0], normal[0], estimate, owned, matrix)
+    _add_priors(keys, estimate, layout, matrix)
+    return Information(keys, 0.5 * (matrix + matrix.T), tuple(eliminated))
+
+
+Owned = Callable[[str, str], Places]
+
+
+def _owned(keys: Sequence[Key]) -> Owned:
+    """Where the keys of an owner are, by kind and name; all structure numbers are the structure's."""
+    places = {owner: np.array(at, dtype=np.int64) for owner, at in places_of(keys).items()}
+    structure = np.array([i for i, key in enumerate(keys) if key.kind == "structure"], dtype=np.int64)
+    nothing = np.empty(0, dtype=np.int64)
+    return lambda kind, name: structure if kind == "structure" else places.get((kind, name), nothing)
+
+
+def _normals(
+    sights: Sights, estimate: Estimate, layout: Layout, weighting: Weighting, places: Array | None
+) -> Iterator[tuple[Array, Array]]:
+    """cam_from_frame (n, 3, 4) and normal equations (n, K, K) of a camera's sights, in batches; K is [free intrinsics
+    in the units of the files | structure | left perturbation of the pose: turn, shift].
+    """
+    camera = estimate.cameras[sights.keys[0].camera]
+    code, vector, powers, unit = lens_arguments(camera)
+    free, structure = layout.free[sights.keys[0].camera], estimate.structure
+    pixels, weights, slots, bends, is_arc, track, curve_pixels, curve_weights = _columns(sights, structure, weighting)
+    starts = starting_places(sights, estimate, places)
+    poses = estimate.pose_stack(sights.keys)
+    size = len(free) + len(structure.values) + 6
+    units = np.ones(size)
+    units[: len(free)] = intrinsics_scales(camera)[free]
+    batch = max(1, _BATCH // size**2)
+    for first in range(0, len(sights), batch):
+        last = min(first + batch, len(sights))
+        normals = np.empty((last - first, size, size))
+        if not kernels.sight_normals(
+            first, last, code, vector, free, powers, unit, sights.point_bounds, pixels, weights, slots, bends, is_arc,
+            sights.curve_bounds, track, curve_pixels, curve_weights, starts, *_track_slots(structure),
+            kernels.LOSS_CODES[weighting.loss], weighting.loss_scale, structure.points(sights),
+            structure.tracks(sights), len(structure.values), poses, normals,
+        ):  # fmt: skip
+            raise SolutionError("an observation cannot be projected where the solve ended: no uncertainty can be given")
+        yield poses[first:last], normals * units[:, None] * units
+
+
+def _eliminate(
+    sights: Sights, parts: Sequence[tuple[Array, Array]], estimate: Estimate, owned: Owned, matrix: Array
+) -> Eliminated:
+    """The private placements of one station; what is left of their sights is added to the matrix."""
+    key = sights.keys[0]
+    world = estimate.stations[key.station].cam_from_world
+    lead = np.concatenate([owned("camera", key.camera), owned("structure", "")])
+    station = owned("station", key.station)
+    owns, gains, limits = [], [], sigma_limits(pose_keys("placement", ""))
+    for poses, normals in parts:
+        chain = from_placement(poses, world)
+        own = np.swapaxes(chain, 1, 2) @ normals[:, -6:, -6:] @ chain
+        coupling = np.swapaxes(chain, 1, 2) @ normals[:, -6:, :-6]
+        gain = known_inverses(own, limits) @ coupling
+        matrix[np.ix_(lead, lead)] += np.sum(normals[:, :-6, :-6] - np.swapaxes(coupling, 1, 2) @ gain, axis=0)
+        if len(station):  # the placement makes up for whatever its station does: the chain is orthogonal
+            moved = np.swapaxes(chain, 1, 2) @ from_station(poses, world)
+            gain = np.concatenate([gain, moved], axis=2)
+        owns.append(own)
+        gains.append(gain)
+    names = tuple(str(key.placement) for key in sights.keys)
+    return Eliminated(names, np.concatenate(owns), np.concatenate(gains), np.concatenate([lead, station]))
+
+
+def _add(key: SightKey, pose: Array, normal: Array, estimate: Estimate, owned: Owned, matrix: Array) -> None:
+    """What a sight that nothing is eliminated from says, added to the matrix."""
+    world, lead = estimate.stations[key.station].cam_from_world, len(normal) - 6
+    at = [owned("camera", key.camera), owned("structure", "")]
+    chain = [np.eye(len(normal))[:, :lead]]
+    if len(station := owned("station", key.station)):
+        at.append(station)
+        chain.append(np.vstack([np.zeros((lead, 6)), from_station(pose[None], world)[0]]))
+    if key.placement is not None and len(placement := owned("placement", key.placement)):
+        at.append(placement)
+        chain.append(np.vstack([np.zeros((lead, 6)), from_placement(pose[None], world)[0]]))
+    steps, everywhere = np.hstack(chain), np.concatenate(at)
+    matrix[np.ix_(everywhere, everywhere)] += steps.T @ normal @ steps
+
+
+def _add_priors(keys: Sequence[Key], estimate: Estimate, layout: Layout, matrix: Array) -> None:
+    """1 / sigma^2 of every prior on a number that is free: each is on one number of the keys."""
+    places = {key[:3]: place for place, key in enumerate(keys)}
+    several = {"principal_point": ("cx", "cy"), "height_m": ("height",), "position_m": ("x", "y", "height")}
+    for prior in layout.priors:
+        quantities = several.get(prior.quantity, (prior.quantity,))
+        for quantity, sigma in zip(quantities, prior.sigma, strict=True):
+            place = places.get((prior.owner, prior.name, quantity))
+            if place is not None:  # a number that is held needs no prior
+                matrix[place, place] += sigma**-2.0
+    structure = [place for place, key in enumerate(keys) if key.kind == "structure"]
+    matrix[structure, structure] += estimate.structure.sigma_m**-2.0

@@ -1,0 +1,28 @@
+"""How well a calibration is known: covariance, weak directions, bounds beyond the quadratic picture, maps in mm."""
+
+from ceres_cal.uncertainty.assess import assess
+from ceres_cal.uncertainty.files import PosteriorFile, posterior_from_file, posterior_to_json
+from ceres_cal.uncertainty.maps import FieldMap, PointSpread
+from ceres_cal.uncertainty.posterior import Posterior, make_posterior
+from ceres_cal.uncertainty.profile import Profile, Setting
+from ceres_cal.uncertainty.seam import Disagreement, disagreement
+from ceres_cal.uncertainty.uncertainty import Uncertainty
+from ceres_cal.uncertainty.weak import Verdict, WeakDirection
+
+__all__ = [
+    "Disagreement",
+    "FieldMap",
+    "PointSpread",
+    "Posterior",
+    "PosteriorFile",
+    "Profile",
+    "Setting",
+    "Uncertainty",
+    "Verdict",
+    "WeakDirection",
+    "assess",
+    "disagreement",
+    "make_posterior",
+    "posterior_from_file",
+    "posterior_to_json",
+]

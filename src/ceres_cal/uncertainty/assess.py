@@ -1,0 +1,66 @@
+"""The last step of a calibration: what is known of its numbers, and what to do where phi ran away."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ceres_cal.camera import Camera
+from ceres_cal.initialise import PHI_RANGE, USUAL_PHI
+from ceres_cal.parameters import Estimate, unit_px
+from ceres_cal.uncertainty.posterior import Posterior, make_posterior, student_95
+from ceres_cal.uncertainty.profile import Node, Setting, profile, valley
+
+_BENT = 0.05  # relative sigma of phi above which the quadratic picture is left
+
+
+def assess(setting: Setting, estimate: Estimate, freedom: float) -> tuple[Estimate, Posterior]:
+    """What is known at the estimate, and the estimate: another one where phi went astray.
+
+    Nearly frontal views can be fitted a little better by a camera a hand's breadth over the floor, or in the clouds,
+    than by the true one. Where the least cost lies at a phi that no lens has, or the observations say nothing of phi as
+    far as lenses go, the place of the valley within the 95 % bound that is nearest to a usual lens is taken; the
+    posterior says that phi is unknown.
+
+    Args:
+        freedom: spare equations behind the estimated noise, infinite where the sigmas were taken as stated.
+
+    Raises:
+        SolutionError: no possible lens fits.
+    """
+    width, posterior = student_95(freedom), make_posterior(setting.told(estimate), freedom)
+    valleys: dict[str, tuple[Node, ...]] = {}
+    astray: list[str] = []
+    for name in [name for name, numbers in setting.layout.free.items() if 0 in numbers]:
+        camera = estimate.cameras[name]
+        if _is_lens(camera) and posterior.sd_of("camera", name, "phi") <= _BENT * camera.phi:
+            continue
+        nodes = valleys[name] = valley(name, _holding(setting, astray), estimate)
+        rise = max(nodes[0].cost, nodes[-1].cost) - min(node.cost for node in nodes)
+        if not _is_lens(camera) or rise < width**2:
+            estimate = _usual(name, nodes, width)
+            astray.append(name)  # held at it while other cameras are looked at
+    if astray:
+        posterior = make_posterior(setting.told(estimate), freedom)
+    profiles = {name: profile(name, nodes, estimate, width) for name, nodes in valleys.items()}
+    return estimate, replace(posterior, profiles=profiles)
+
+
+def _holding(setting: Setting, cameras: Sequence[str]) -> Setting:
+    for name in cameras:
+        setting = setting.holding_phi(name)
+    return setting
+
+
+def _is_lens(camera: Camera) -> bool:
+    unit = unit_px(camera)
+    return PHI_RANGE[0] * unit <= camera.phi <= PHI_RANGE[1] * unit
+
+
+def _usual(name: str, nodes: Sequence[Node], width: float) -> Estimate:
+    """Of the places within the 95 % bound the one whose phi is nearest to a usual lens'."""
+    least = min(node.cost for node in nodes)
+    possible = [node.estimate for node in nodes if node.cost - least <= width**2]
+    return min(possible, key=lambda e: abs(np.log(e.cameras[name].phi / (USUAL_PHI * unit_px(e.cameras[name])))))

@@ -1,0 +1,193 @@
+"""How well a pixel tells a place: standard deviations and 95 % bounds of located points, in metres at a height.
+
+They are the calibration's own share: the noise of the pixel that is asked about comes on top, and model error (a lens
+with too few coefficients, a field painted amiss) is not in them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ceres_cal.errors import InputError
+from ceres_cal.parameters import Estimate
+from ceres_cal.quantities import Key, moved, natural_sizes, sigma_limits
+from ceres_cal.spread import Spread
+from ceres_cal.transforms import Array
+from ceres_cal.uncertainty.posterior import Posterior
+from ceres_cal.uncertainty.profile import Profile
+
+_STEP = 1e-5  # of each number's natural size: the differences are good to 1e-9 of the slope
+_NORMAL_95 = 1.645  # one-sided
+
+
+@dataclass(frozen=True, eq=False)
+class PointSpread:
+    """What is known of N located points.
+
+    Attributes:
+        located: (N, 2) m, by the estimate.
+        low, high: (N, 2) m, 95 % bounds of x and of y, each by itself; infinite where unknown.
+        radius_95_m: (N,) 95 % of the errors are shorter. sd_m: (N,) root mean square length of the error; where phi
+            is known by its profile alone, the radius over 1.96.
+    """
+
+    located: Array
+    low: Array
+    high: Array
+    radius_95_m: Array
+    sd_m: Array
+
+
+def station_keys(estimate: Estimate, posterior: Posterior, station: str) -> tuple[Key, ...]:
+    """Keys of a station and of its camera.
+
+    Raises:
+        InputError: no such station, or one that was held, so that where it stands in the world is nobody's guess.
+    """
+    if station not in estimate.stations:
+        names = ", ".join(map(repr, estimate.stations))
+        raise InputError(f"station {station!r} is not there: there are {names}")
+    owners = {("station", station), ("camera", estimate.stations[station].camera)}
+    keys = tuple(key for key in posterior.keys if key[:2] in owners)
+    if not any(key.kind == "station" for key in keys):
+        raise InputError(f"station {station!r} was held as the world: it has no map of a field: observe one with it")
+    return keys
+
+
+def locate_slopes(estimate: Estimate, keys: Sequence[Key], station: str, pixels: Array, height_m: float) -> Array:
+    """(N, 2, K) derivatives of where pixels (N, 2) are located on the plane z = height_m, by each of the keys."""
+    slopes = np.empty((len(pixels), 2, len(keys)))
+    for k, size in enumerate(_STEP * natural_sizes(estimate, keys)):
+        step = np.zeros(len(keys))
+        step[k] = size
+        ahead, behind = (moved(estimate, keys, s).camera_at(station).locate(pixels, height_m) for s in (step, -step))
+        slopes[:, :, k] = (ahead - behind) / (2.0 * size)
+    return slopes
+
+
+def radius_95(covariance: Array) -> Array:
+    """(N,) radius of the circle that holds 95 % of errors with covariances (N, 2, 2).
+
+    The squared length is taken for a scaled chi-squared variable of the same mean and variance: within 1 %.
+    """
+    a, b, c = covariance[:, 0, 0], covariance[:, 1, 1], covariance[:, 0, 1]
+    with np.errstate(invalid="ignore"):
+        mean, variance = a + b, 2.0 * (a**2 + b**2 + 2.0 * np.nan_to_num(c) ** 2)
+        cubed = variance / (9.0 * mean**2)  # 2 / (9 degrees of freedom); Wilson and Hilferty
+        found = np.sqrt(mean * (1.0 - cubed + _NORMAL_95 * np.sqrt(cubed)) ** 3)
+    return np.where(np.isinf(mean), np.inf, np.where(mean > 0.0, found, 0.0))
+
+
+def spread_of_points(
+    estimate: Estimate, posterior: Posterior, station: str, pixels: Array, height_m: float
+) -> PointSpread:
+    """What is known of the places at a height that pixels (N, 2) show.
+
+    Raises:
+        InputError: see `station_keys`.
+    """
+    keys = station_keys(estimate, posterior, station)
+    located = estimate.camera_at(station).locate(pixels, height_m)
+    profile = posterior.profiles.get(estimate.stations[station].camera)
+    if profile is not None:
+        return _by_profile(estimate, profile, posterior.half_width, station, pixels, height_m, located)
+    slopes = np.zeros((len(pixels), 2, len(posterior.keys)))
+    slopes[:, :, [posterior.keys.index(key) for key in keys]] = locate_slopes(estimate, keys, station, pixels, height_m)
+    covariance = posterior.spread.through(slopes)
+    variance = np.diagonal(covariance, axis1=1, axis2=2)
+    reach = posterior.half_width * np.sqrt(variance)
+    radius = radius_95(covariance) * posterior.half_width / 1.96
+    return PointSpread(located, located - reach, located + reach, radius, np.sqrt(np.sum(variance, axis=1)))
+
+
+def _by_profile(
+    estimate: Estimate, profile: Profile, width: float, station: str, pixels: Array, height_m: float, located: Array
+) -> PointSpread:
+    """The same along the valley: where each of its places puts the points, and how sure it is of that."""
+    offsets, covariances = [], []
+    for step, told in zip(profile.steps, profile.information, strict=True):
+        there = moved(estimate, profile.keys, step)
+        offsets.append(there.camera_at(station).locate(pixels, height_m) - located)
+        slopes = locate_slopes(there, profile.keys[1:], station, pixels, height_m)
+        covariances.append(Spread.of(told, sigma_limits(profile.keys[1:])).through(slopes))
+    values, known = np.array(offsets), np.array(covariances)
+    nowhere = np.asarray(np.isnan(values).any(axis=(0, 2)))  # from some place of the valley nothing is seen there
+    sds = np.sqrt(np.diagonal(known, axis1=2, axis2=3))
+    shape = (len(values), -1)
+    below, above = profile.bounds(values.reshape(shape), sds.reshape(shape), width)
+    low = np.where(nowhere[:, None], -np.inf, below.reshape(-1, 2))
+    high = np.where(nowhere[:, None], np.inf, above.reshape(-1, 2))
+    circles = np.array([radius_95(part) for part in known]) / 1.96
+    weights, widths = profile.reaches(width)
+    away = np.linalg.norm(np.einsum("mn,npk->mpk", weights, values), axis=2)
+    radius = np.max(away + widths[:, None] * (weights @ circles), axis=0)
+    radius = np.where(np.isinf(low).any(axis=1) | np.isinf(high).any(axis=1), np.inf, radius)
+    return PointSpread(located, located + low, located + high, radius, radius / 1.96)
+
+
+@dataclass(frozen=True, eq=False)
+class FieldMap:
+    """How well one station locates points at one height, over a grid.
+
+    Attributes:
+        x_m: (X,), y_m: (Y,) the grid. sd_mm, radius_95_mm: (Y, X) as in `PointSpread`; NaN where the image does not
+            show the place, infinite where it is not known.
+    """
+
+    station: str
+    height_m: float
+    x_m: Array
+    y_m: Array
+    sd_mm: Array
+    radius_95_mm: Array
+
+    @property
+    def mean_mm(self) -> float:
+        """Mean standard deviation over what the image shows; NaN where it shows nothing."""
+        shown = self.sd_mm[~np.isnan(self.sd_mm)]
+        return float(np.mean(shown)) if len(shown) else np.nan
+
+    @property
+    def worst_mm(self) -> float:
+        """Largest standard deviation over what the image shows."""
+        shown = self.sd_mm[~np.isnan(self.sd_mm)]
+        return float(np.max(shown)) if len(shown) else np.nan
+
+    @property
+    def worst_place_m(self) -> tuple[float, float]:
+        """Where that is."""
+        row, column = np.unravel_index(np.argmax(np.nan_to_num(self.sd_mm, nan=-1.0, posinf=1e300)), self.sd_mm.shape)
+        return float(self.x_m[column]), float(self.y_m[row])
+
+
+def shown_pixels(estimate: Estimate, station: str, places: Array, height_m: float) -> Array:
+    """Pixels (N, 2) of places (N, 2) m at a height; NaN where the station's image does not show them."""
+    camera = estimate.camera_at(station)
+    pixels = camera.project(np.column_stack([places, np.full(len(places), height_m)]))
+    with np.errstate(invalid="ignore"):
+        inside = np.all((pixels >= -0.5) & (pixels <= np.array(camera.image_size) - 0.5), axis=1)
+    # A ray that comes from below the plane is no view of it, and past the rim of the lens there is no way back.
+    back = camera.locate(pixels, height_m)
+    with np.errstate(invalid="ignore"):
+        inside &= np.linalg.norm(back - places, axis=1) < 1e-6
+    return np.where(inside[:, None], pixels, np.nan)
+
+
+def field_map(
+    estimate: Estimate, posterior: Posterior, station: str, height_m: float, x_m: Array, y_m: Array
+) -> FieldMap:
+    """The map over a grid.
+
+    Raises:
+        InputError: see `station_keys`.
+    """
+    x, y = np.meshgrid(x_m, y_m)
+    pixels = shown_pixels(estimate, station, np.column_stack([x.ravel(), y.ravel()]), height_m)
+    shown = np.isfinite(pixels[:, 0])
+    sd, radius = np.full(len(pixels), np.nan), np.full(len(pixels), np.nan)
+    found = spread_of_points(estimate, posterior, station, pixels[shown], height_m)
+    sd[shown], radius[shown] = 1e3 * found.sd_m, 1e3 * found.radius_95_m
+    return FieldMap(station, height_m, x_m, y_m, sd.reshape(x.shape), radius.reshape(x.shape))

@@ -1,0 +1,138 @@
+"""Everything a calibration can say of its own trustworthiness, under one name: `calibration.uncertainty`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ceres_cal.errors import InputError
+from ceres_cal.parameters import Estimate
+from ceres_cal.targets import Target
+from ceres_cal.transforms import Array
+from ceres_cal.uncertainty.maps import FieldMap, PointSpread, field_map, spread_of_points
+from ceres_cal.uncertainty.posterior import Posterior
+from ceres_cal.uncertainty.seam import seam_map
+from ceres_cal.uncertainty.weak import (
+    Verdict,
+    WeakDirection,
+    ratio_sd,
+    unknown_placements,
+    verdicts,
+    weak_directions,
+)
+
+_MOVABLE = ("checkerboard", "rings")
+_GRID = 36  # steps along the longer side
+
+
+@dataclass(frozen=True, eq=False)
+class Uncertainty:
+    """How well a calibration is known. It holds as far as the model does: see `Posterior`."""
+
+    estimate: Estimate
+    posterior: Posterior
+    targets: Mapping[str, Target]
+
+    @cached_property
+    def verdicts(self) -> tuple[Verdict, ...]:
+        """Known, weak or unknown, of each shared number."""
+        return verdicts(self.estimate, self.posterior)
+
+    def verdict(self, kind: str, owner: str, quantity: str) -> Verdict:
+        """Of one number.
+
+        Raises:
+            InputError: it is not a free number.
+        """
+        return self.verdicts[self.posterior.place(kind, owner, quantity)]
+
+    @cached_property
+    def weak_directions(self) -> tuple[WeakDirection, ...]:
+        """What is hardly known, weakest first, in words."""
+        return weak_directions(self.estimate, self.posterior)
+
+    @cached_property
+    def unknown_placements(self) -> dict[str, tuple[str, ...]]:
+        """Placements of which some number is not known at all, and which."""
+        return unknown_placements(self.posterior)
+
+    def ratio_sd(self, station: str) -> float:
+        """Relative standard deviation of phi over the station's height."""
+        return ratio_sd(self.estimate, self.posterior, self.estimate.stations[station].camera, station)
+
+    def located(self, pixels: ArrayLike, height_m: float = 0.0, station: str | None = None) -> PointSpread:
+        """Pixels (N, 2) located at a height, with 95 % bounds.
+
+        Raises:
+            InputError: see `map_sd_mm`.
+        """
+        return spread_of_points(
+            self.estimate, self.posterior, self._station(station), np.asarray(pixels, dtype=float), height_m
+        )
+
+    def map_sd_mm(
+        self,
+        station: str | None = None,
+        height_m: float = 0.0,
+        x_m: ArrayLike | None = None,
+        y_m: ArrayLike | None = None,
+    ) -> FieldMap:
+        """How well a station locates points at a height, over a grid; by default one over the field.
+
+        Raises:
+            InputError: no such station, none named where there are several, or it was held as the world.
+        """
+        name = self._station(station)
+        return field_map(self.estimate, self.posterior, name, height_m, *self._grid(x_m, y_m))
+
+    def seam_sd_mm(
+        self,
+        first: str,
+        second: str,
+        height_m: float = 0.0,
+        x_m: ArrayLike | None = None,
+        y_m: ArrayLike | None = None,
+    ) -> FieldMap:
+        """By how much two stations may disagree about places that both see.
+
+        Raises:
+            InputError: see `map_sd_mm`.
+        """
+        return seam_map(self.estimate, self.posterior, first, second, height_m, *self._grid(x_m, y_m))
+
+    def _station(self, name: str | None) -> str:
+        if name is None and len(self.estimate.stations) == 1:
+            return next(iter(self.estimate.stations))
+        if name is None or name not in self.estimate.stations:
+            names = ", ".join(map(repr, self.estimate.stations))
+            raise InputError(f"station {name!r} is not there: there are {names}")
+        return name
+
+    def _grid(self, x_m: ArrayLike | None, y_m: ArrayLike | None) -> tuple[Array, Array]:
+        """A grid over the box around what does not move; without such a target over what the cameras look at."""
+        if x_m is not None and y_m is not None:
+            return np.asarray(x_m, dtype=float), np.asarray(y_m, dtype=float)
+        box = [_corners(target) for target in self.targets.values() if target.kind not in _MOVABLE]
+        if not box:
+            raise InputError("no field to draw a map of: give x_m and y_m")
+        low, high = np.min([b[0] for b in box], axis=0), np.max([b[1] for b in box], axis=0)
+        spacing = float(np.max(high - low)) / _GRID
+        counts = np.maximum(np.round((high - low) / spacing).astype(int) + 1, 2)
+        found = [np.linspace(a, b, n) for a, b, n in zip(low, high, counts, strict=True)]
+        x, y = found if x_m is None else [np.asarray(x_m, dtype=float), found[1]]
+        return x, (y if y_m is None else np.asarray(y_m, dtype=float))
+
+
+def _corners(target: Target) -> tuple[Array, Array]:
+    """(2,) lowest and highest x and y of a target's points and curves."""
+    reach = [target.point_array[:, :2]]
+    for track, is_arc in zip(target.tracks[0], target.is_arc, strict=True):
+        middle, along = track[0, :2], track[1, :2]
+        size = np.linalg.norm(along)
+        reach.append(np.array([middle - size, middle + size] if is_arc else [middle, middle + along]))
+    every = np.concatenate(reach)
+    return every.min(axis=0), every.max(axis=0)
