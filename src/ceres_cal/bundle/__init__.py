@@ -13,6 +13,7 @@ from ceres_cal.bundle.problem import (
     information,
     placed,
     placement_costs,
+    prior_on_intrinsics,
     private_placements,
     solve,
 )
@@ -25,6 +26,7 @@ __all__ = [
     "information",
     "placed",
     "placement_costs",
+    "prior_on_intrinsics",
     "private_placements",
     "solve",
 ]

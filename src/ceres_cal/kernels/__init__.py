@@ -4,6 +4,7 @@ from ceres_cal.kernels.block import cholesky, evaluate_block
 from ceres_cal.kernels.elimination import eliminate_placements
 from ceres_cal.kernels.groups import grouped_products
 from ceres_cal.kernels.lenses import INTRINSICS, LENS_CODES
+from ceres_cal.kernels.rows import curve_rows, loss_weights, point_rows
 from ceres_cal.kernels.sight import LOSS_CODES, curve_residuals, normal_equations, point_residuals
 
 __all__ = [
@@ -12,9 +13,12 @@ __all__ = [
     "LOSS_CODES",
     "cholesky",
     "curve_residuals",
+    "curve_rows",
     "eliminate_placements",
     "evaluate_block",
     "grouped_products",
+    "loss_weights",
     "normal_equations",
     "point_residuals",
+    "point_rows",
 ]
