@@ -55,27 +55,27 @@ def calibration_text(
     """A short table for people."""
     anchored = anchored_stations(observations)
     sections = [
-        _section("read", [", ".join(map(str, inputs)), *_counted(observations)]),
-        _section("fit", _fit(calibration)),
+        section("read", [", ".join(map(str, inputs)), *_counted(observations)]),
+        section("fit", _fit(calibration)),
     ]
     for name, camera in calibration.cameras.items():
         lines = _intrinsics(camera, calibration.options, calibration.phi_from.get(name, ""))
-        sections.append(_section("camera", [f"{name}, {camera.image_size[0]} x {camera.image_size[1]} px", *lines]))
+        sections.append(section("camera", [f"{name}, {camera.image_size[0]} x {camera.image_size[1]} px", *lines]))
     for name, camera in calibration.stations.items():
         sections.append(
-            _section("station", [f"{name}{_of_camera(calibration, name)}", *_pose(camera, name in anchored)])
+            section("station", [f"{name}{_of_camera(calibration, name)}", *_pose(camera, name in anchored)])
         )
     if len(calibration.estimate.structure.names):
-        sections.append(_section("as built", _structure(calibration)))
-    sections.append(_section("outliers", _outlier_lines(calibration)))
-    sections.append(_section("stopped", _stop(calibration)))
-    sections.extend(_section("warning", wrap(text, 100)) for text in _warnings(calibration, observations))
+        sections.append(section("as built", _structure(calibration)))
+    sections.append(section("outliers", _outlier_lines(calibration)))
+    sections.append(section("stopped", _stop(calibration)))
+    sections.extend(section("warning", wrap(text, 100)) for text in _warnings(calibration, observations))
     if output is not None:
-        sections.append(_section("written", [str(output)]))
+        sections.append(section("written", [str(output)]))
     return "\n".join(sections)
 
 
-def _section(title: str, lines: Iterable[str]) -> str:
+def section(title: str, lines: Iterable[str]) -> str:
     """A title beside its lines."""
     return "\n".join(f"{'' if number else title:10}{line}" for number, line in enumerate(lines))
 

@@ -92,10 +92,7 @@ def radial_column(equations: Equations, estimate: Estimate, camera: str, power: 
         return np.asarray(unit_px(one) * outward * radius**power / np.maximum(slope, 0.05))
     rays = np.nan_to_num(one.rays(equations.pixel))
     across = np.linalg.norm(rays[:, :2], axis=1)
-    if one.lens.kind == "brown":
-        own = across / np.maximum(rays[:, 2], 0.05)
-    else:
-        own = np.arctan2(across, rays[:, 2])
+    own = across / np.maximum(rays[:, 2], 0.05) if one.lens.kind == "brown" else np.arctan2(across, rays[:, 2])
     return np.asarray(one.phi * outward * own**power)
 
 
