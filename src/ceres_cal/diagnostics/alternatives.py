@@ -30,7 +30,7 @@ def all_families(
     """Every alternative worth a test, by kind."""
     return [
         *_lens_families(equations, estimate, layout),
-        *_target_families(observations, equations, estimate, used),
+        *target_families(observations, equations, estimate, used),
         *_frame_families(observations, equations, estimate, layout),
     ]
 
@@ -112,10 +112,10 @@ def _decentring_columns(equations: Equations, estimate: Estimate, camera: str) -
 # ---- the target as built --------------------------------------------------------------------------------------------
 
 
-def _target_families(
+def target_families(
     observations: Observations, equations: Equations, estimate: Estimate, used: Mask
 ) -> Iterator[Family]:
-    """Each line, arc and point aside, each board bent; not what a tolerance solves for already."""
+    """Each line, arc and point aside, each board bent, of which enough is used; not what a tolerance solves for."""
     targets = observations.targets
     structure = make_structure(targets, {name: _everything(target) for name, target in targets.items()})
     slots, values = structure_columns(equations, structure)

@@ -29,7 +29,8 @@ class Finding:
     Attributes:
         kind: "radius", "decentring", "aspect", "principal point" or "phi" (of a camera: subject), "curve aside",
             "point aside" ("target/feature") or "board bent" (target), "moved after", "moved in" (of a station: subject,
-            at a frame), "wrong label" ("target/feature" as named), "noise" or "correlated" ("points" or "curves").
+            at a frame), "wrong label" ("target/feature" as named), "does not hold"
+            (on new data: stations), "noise" or "correlated" ("points" or "curves").
         subject: what it is about. frame: at which frame, None where it is about all.
         sentence: the cause in words. advice: what to do.
         effect_px: root mean square displacement in the image of the observations that it moves (of the lens: of what
