@@ -3,7 +3,9 @@
 The names are loaded when they are first used, so that `import ceres_cal` costs nothing.
 """
 
+import sys
 from importlib import import_module
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -35,9 +37,22 @@ _HOME = {
 __all__ = list(_HOME)
 
 
+class _Package(ModuleType):
+    """Python puts a module that is imported into its package under its name: one that is called like the function in it
+    must not take the function's place.
+    """
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if not (name in _HOME and isinstance(value, ModuleType)):
+            super().__setattr__(name, value)
+
+
+sys.modules[__name__].__class__ = _Package
+
+
 def __getattr__(name: str) -> Any:
     if name not in _HOME:
         raise AttributeError(f"module 'ceres_cal' has no attribute {name!r}")
     value = getattr(import_module(f"ceres_cal.{_HOME[name]}"), name)
-    globals()[name] = value  # the module of the same name must not hide it
+    globals()[name] = value
     return value
