@@ -188,17 +188,16 @@ def is_sheet(target: Target) -> bool:
 
 
 def sheet_outline(target: Target) -> Array:
-    """(N, 3) m: the border of the paper, white beyond the last square or ring."""
+    """(N, 3) m: the border of the rectangular paper, white or dark beyond the last square or ring."""
     if target.kind == "checkerboard":
         square, columns, rows = (target.spec[name] for name in ("square_m", "columns", "rows"))
-        low, right, top = -2.0 * square, (columns + 1) * square, (rows + 1) * square
-        corners = np.array([(low, low), (right, low), (right, top), (low, top)])
-        share = np.linspace(0.0, 1.0, 50, endpoint=False)[None, :, None]
-        border = (corners[:, None] * (1.0 - share) + np.roll(corners, -1, axis=0)[:, None] * share).reshape(-1, 2)
+        low, high = np.full(2, -2.0 * square), np.array([columns + 1, rows + 1]) * square
     else:
-        radii = target.spec["radii_m"]
-        turn = np.linspace(0.0, 2.0 * np.pi, 720, endpoint=False)
-        border = (radii[-1] + 0.5 * (radii[-1] - ([0.0, *radii])[-2])) * np.column_stack([np.cos(turn), np.sin(turn)])
+        high = np.full(2, 1.05 * target.spec["radii_m"][-1])
+        low = -high
+    corners = np.array([low, (high[0], low[1]), high, (low[0], high[1])])
+    share = np.linspace(0.0, 1.0, 50, endpoint=False)[None, :, None]
+    border = (corners[:, None] * (1.0 - share) + np.roll(corners, -1, axis=0)[:, None] * share).reshape(-1, 2)
     return np.column_stack([border, np.zeros(len(border))])
 
 
