@@ -40,6 +40,7 @@ FLOORS = {
     "diagnostics": 4,
     "calibration": 5,
     "calibrate": 5,
+    "photographs": 5,
     "formats": 6,
     "report": 6,
     "cli": 6,
