@@ -40,7 +40,7 @@ def _add_board(parser: ArgumentParser) -> None:
 
 
 def _run_board(args: Namespace) -> Answer:
-    images = list(_image_files(args.images))
+    images = list(image_files(args.images))
     require_output(args.output, images)
     require_observations_file(args.output)
     if (args.charuco is None) != (args.marker is None):
@@ -75,7 +75,7 @@ def require_observations_file(path: Path) -> None:
         raise InputError(f"{path}: observations are written as .json or .npz: give one of these endings")
 
 
-def _image_files(given: Iterable[str]) -> Iterator[Path]:
+def image_files(given: Iterable[str]) -> Iterator[Path]:
     """The files named; those of folders, and of patterns that no shell expanded, in the order of their names."""
     for name in given:
         path = Path(name)

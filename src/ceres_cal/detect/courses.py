@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +26,6 @@ class Course:
         curve: (N,) index among the target's curves. s: (N,) the curves' parameter.
         pixels: (N, 2). normals: (N, 2) of length 1, towards the curve's left. curvature: (N,) 1/px, positive towards
             the normal. width_px: (N,) of the paint, along the normal.
-        clear_px: (N,) distance to the nearest other painted curve's middle, or to the curve's own end.
     """
 
     curve: Ints
@@ -35,7 +34,6 @@ class Course:
     normals: Array
     curvature: Array
     width_px: Array
-    clear_px: Array
 
     def __len__(self) -> int:
         return len(self.curve)
@@ -60,8 +58,7 @@ def predict(
     ]
     number = np.concatenate([np.empty(0, np.int32), *(np.full(len(s), i, np.int32) for i, s in parts)])
     s = np.concatenate([np.empty(0), *(s for _, s in parts)])
-    course = course_at(target, camera, number, s)
-    return replace(course, clear_px=_clear(target, camera, course, curves))
+    return course_at(target, camera, number, s)
 
 
 def _places(target: Target, camera: Camera, number: int, spacing_px: float, margin_px: float) -> tuple[int, Array]:
@@ -86,7 +83,7 @@ def _places(target: Target, camera: Camera, number: int, spacing_px: float, marg
 
 
 def course_at(target: Target, camera: Camera, number: Ints, s: Array) -> Course:
-    """The course through places that are given by curve (N,) and parameter (N,); nothing is said of others nearby."""
+    """The course through places that are given by curve (N,) and parameter (N,)."""
     is_arc = target.is_arc[number]
     span = np.array([np.diff(curve.parameter_range)[0] for curve in target.curves.values()])[number]
 
@@ -102,11 +99,11 @@ def course_at(target: Target, camera: Camera, number: Ints, s: Array) -> Course:
     normals *= np.where(np.sum((left - right) * normals, axis=1) < 0.0, -1.0, 1.0)[:, None]
     width = np.sum((left - right) * normals, axis=1)
     bend = np.sum((before - 2.0 * pixels + after) * normals, axis=1) / (0.5 * length[:, 0]) ** 2
-    return Course(number, s, pixels, normals, bend, width, np.full(len(s), np.inf))
+    return Course(number, s, pixels, normals, bend, width)
 
 
-def _clear(target: Target, camera: Camera, course: Course, curves: Collection[str]) -> Array:
-    """(N,) px to the nearest other painted curve that may be seen, or to the end of the own one."""
+def clear_px(target: Target, camera: Camera, course: Course, curves: Collection[str]) -> Array:
+    """(N,) px from each place to the middle of the nearest other curve that is painted, or to the own curve's end."""
     number, s, pixels = course.curve, course.s, course.pixels
     places = along_track(target.tracks[0][number], target.is_arc[number], s)
     clear = np.full(len(places), np.inf)

@@ -14,8 +14,8 @@ from ceres_cal.targets import Arc, Target, along_track, nearest_on_track
 from ceres_cal.transforms import Array
 
 _ON_CURVE_M = 1e-6
-_EACH_WAY, _FEWEST = 3, 3  # places of a branch, to each side of the crossing and in all
-_REACH_PX = 60.0
+_EACH_WAY, _ONE_WAY, _FEWEST = 3, 8, 3  # places of a branch that goes on, of one that ends, and at least
+_REACH_PX = 100.0
 _MOST_STRETCHED = 3.0  # of the crossing's longest standard deviation over its shortest
 
 
@@ -90,8 +90,10 @@ def _branch(target: Target, camera: Camera, lines: Lines, curve: int, point: Arr
     away = course.pixels[rows] - here.pixels[0]
     along = away @ np.array([here.normals[0, 1], -here.normals[0, 0]])
     order = np.argsort(np.abs(along))
-    chosen = [i for way in (along > 0.0, along <= 0.0) for i in order[way[order]][:_EACH_WAY]]
-    chosen = [i for i in chosen if np.linalg.norm(away[i]) < _REACH_PX]
+    order = order[np.linalg.norm(away[order], axis=1) < _REACH_PX]
+    before, after = order[along[order] <= 0.0], order[along[order] > 0.0]
+    most = _EACH_WAY if len(before) and len(after) else _ONE_WAY
+    chosen = np.concatenate([before[:most], after[:most]])
     if len(chosen) < _FEWEST:
         return None
     rows, along = rows[chosen], along[chosen]

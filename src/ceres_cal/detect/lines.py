@@ -27,6 +27,7 @@ _LEAST_CONTRAST, _LEAST_OF_NEARBY = 0.15, 0.45  # shares of the usual contrast, 
 _NOISY = 3.0  # times the usual misfit: something else is in the window
 _NEARBY = 4  # places to each side that a place is compared with
 _FAR, _FAR_PX = 5.0, 0.25  # off its neighbours: standard deviations, and at least so much
+_WANDERING = 4.0  # times the spread of its neighbours
 _FACTOR_RANGE = (0.8, 6.0)
 
 
@@ -55,6 +56,15 @@ class Lines:
     def pixels(self) -> Array:
         """(N, 2) the paint's middle, NaN where it was not found."""
         return np.asarray(self.course.pixels + self.offset_px[:, None] * self.course.normals)
+
+    def edge(self, side: int) -> Array:
+        """(N, 2) the paint's left (side 1) or right (-1) edge, NaN where it was not found.
+
+        Both come from one fit: with the width known, each is as much worse than the middle as two of them together
+        are as good, and that is how to weigh them (sigma times the square root of 2).
+        """
+        away = self.offset_px + 0.5 * side * self.stretch * self.course.width_px
+        return np.asarray(self.course.pixels + away[:, None] * self.course.normals)
 
     @property
     def share(self) -> float:
@@ -103,7 +113,7 @@ def _along_normals(grey: Grey, course: Course, steps: Array, shift_px: float) ->
 
 
 def measure(grey: Grey, course: Course, reach_px: float) -> Lines:
-    """Measure the paint at every place of a course, whose windows hold no other paint (see `Course.clear_px`).
+    """Measure the paint at every place of a course, whose windows hold no other paint (see `courses.clear_px`).
 
     Args:
         reach_px: how far the course may be off.
@@ -190,7 +200,9 @@ def _goes_on(course: Course, found: Mask, offset: Array, sigma: Array) -> Mask:
     alone = np.count_nonzero(np.isfinite(around), axis=1) < 2
     around[np.all(np.isnan(around), axis=1), 0] = 0.0
     middle = np.nanmedian(around, axis=1)
-    near = np.abs(offset - middle) < np.maximum(_FAR * sigma, _FAR_PX)
+    # Paint that wanders is still paint: what its neighbours do among themselves, it may do too.
+    wander = np.nanmedian(np.abs(around - middle[:, None]), axis=1) / 0.6745
+    near = np.abs(offset - middle) < np.maximum(np.maximum(_FAR * sigma, _FAR_PX), _WANDERING * wander)
     return np.asarray(found & near & ~alone)
 
 

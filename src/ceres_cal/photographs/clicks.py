@@ -27,6 +27,7 @@ FEWEST = 4
 _STRETCHES = (1.0, 1.06, 1.14, 1.25, 1.4)  # of the image's corner by the lens
 _PHI = np.geomspace(0.5, 3.0, 40)  # in half image diagonals
 _PHI_GUESS, _PHI_FACTOR = 1.3, 2.0
+_FREED = ("a3", "phi", "a2", "cx", "cy", "a4", "a5")
 _SQUARE = 0.02  # how square clicks are good to make the axes
 
 
@@ -98,7 +99,9 @@ def starts_from_clicks(clicks: Clicks, target: Target, image_size: tuple[int, in
         Prior("camera", CAMERA, "phi", (phi,), (0.5 * phi,)),
         Prior("camera", CAMERA, "principal_point", tuple(middle), (0.04 * image_size[0],) * 2),
     )
-    freedom = Freedom(("a3", "phi", "a2", "cx", "cy", "a4", "a5"), priors, Shown(index, pixels, np.full(len(index), SIGMA_PX)))
+    freedom = Freedom(
+        ("a3", "phi", "a2", "cx", "cy", "a4", "a5"), priors, Shown(index, pixels, np.full(len(index), SIGMA_PX))
+    )
     return cameras, freedom
 
 

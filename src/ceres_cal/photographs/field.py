@@ -7,21 +7,19 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ceres_cal.camera import Camera
 from ceres_cal.detect.boards import read_grey
 from ceres_cal.detect.crossings import Crossings, find_crossings
+from ceres_cal.detect.lines import Lines
 from ceres_cal.errors import InputError
 from ceres_cal.observations import Curves, Observations, Points, View, combine
 from ceres_cal.photographs.clicks import Clicks, starts_from_clicks
-from ceres_cal.photographs.follow import Followed, Freedom, follow
+from ceres_cal.photographs.follow import LEAST_SHARE, Followed, Freedom, follow
 from ceres_cal.targets import Target
 
 TARGET_NAME = "field"
-_NOT_FOUND = (
-    "its lines were not found: fewer than half of those in view lie where this start, moved and turned, puts them; "
-    "check the target's dimensions and which curves are painted, or start from other points"
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +45,7 @@ def detect_field(
     camera: str = "camera",
     station: str | None = None,
     with_points: bool = True,
+    edges: bool = False,
     progress: Callable[[int, int, str], None] | None = None,
 ) -> FieldDetections:
     """Painted lines, arcs, corners and crossings of a field in photographs that one camera took at one station.
@@ -59,7 +58,7 @@ def detect_field(
         images: files of any kind OpenCV reads, all of one size.
         start: the station's camera before it was moved (by up to 130 px, or 5 degrees), or points that somebody showed.
         curves: names of those that are painted; None: all of the target with a width.
-        with_points: else curve observations only.
+        with_points: else curve observations only. edges: both edges of the paint instead of its middle.
         progress: called after each image with (images done, images in all, file name).
 
     Raises:
@@ -77,8 +76,8 @@ def detect_field(
         size = (int(grey.shape[1]), int(grey.shape[0]))
         starts, freedom = _starts(start, before, target, size, path)
         followed = follow(grey, target, starts, painted, freedom)
-        if followed is None:
-            missed.append((str(path), _NOT_FOUND))
+        if not followed.holds:
+            missed.append((str(path), _why_missed(followed, target)))
         else:
             found[str(path)] = before = followed
             crossings[str(path)] = find_crossings(target, followed.camera, followed.lines) if with_points else None
@@ -87,9 +86,20 @@ def detect_field(
     if not found:
         raise InputError(f"no field in any of {len(paths)} images; {missed[0][0]}: {missed[0][1]}")
     parts = [
-        _observations(path, one, crossings[path], target, camera, station or camera) for path, one in found.items()
+        _observations(path, one, crossings[path], target, (camera, station or camera), edges)
+        for path, one in found.items()
     ]
     return FieldDetections(combine(parts), found, tuple(missed))
+
+
+def _why_missed(followed: Followed, target: Target) -> str:
+    if followed.share >= LEAST_SHARE:
+        names = ", ".join(target.curve_names[number] for number in followed.absent)
+        return f"there is no {names} where they should be: say which lines are not painted, or check the dimensions"
+    return (
+        f"its lines were not found (paint at {100.0 * followed.share:.0f} % of where this start, moved and turned, puts "
+        "them): check the target's dimensions and which lines are painted, or start from other points"
+    )
 
 
 def _painted(target: Target, curves: Collection[str] | None) -> tuple[str, ...]:
@@ -119,20 +129,32 @@ def _starts(
 
 
 def _observations(
-    path: str, followed: Followed, met: Crossings | None, target: Target, camera: str, station: str
+    path: str, followed: Followed, met: Crossings | None, target: Target, names: tuple[str, str], edges: bool
 ) -> Observations:
     """One image's view: what its lines and crossings are, each pixel counted once."""
-    lines = followed.lines
-    rows = np.flatnonzero(lines.found if met is None else lines.found & ~met.used)
+    camera, station = names
     none = np.empty(0, np.int32)
     points = Points(none, none, np.empty((0, 2)), np.empty(0))
     if met is not None:
         points = Points(np.zeros(len(met.feature), np.int32), met.feature, met.pixels, met.sigma_px)
-    first, centre = np.zeros(len(rows), np.int32), np.zeros(len(rows), np.int8)
     return Observations(
         {TARGET_NAME: target},
         {camera: followed.camera.image_size},
         (View(Path(path).stem, camera, station, TARGET_NAME),),
         points,
-        Curves(first, lines.course.curve[rows], lines.pixels[rows], lines.sigma_px[rows], centre),
+        _curves(followed.lines, np.zeros(len(followed.lines.found), dtype=bool) if met is None else met.used, edges),
+    )
+
+
+def _curves(lines: Lines, used: NDArray[np.bool_], edges: bool) -> Curves:
+    """The middles of the paint, or both its edges, where they were found and are not used elsewhere."""
+    rows = np.flatnonzero(lines.found & ~used)
+    sides = (1, -1) if edges else (0,)
+    pixels = [lines.edge(side) if edges else lines.pixels for side in sides]
+    return Curves(
+        np.zeros(len(sides) * len(rows), np.int32),
+        np.tile(lines.course.curve[rows], len(sides)),
+        np.concatenate([places[rows] for places in pixels]),
+        np.tile(np.sqrt(len(sides)) * lines.sigma_px[rows], len(sides)),
+        np.repeat(np.array(sides, np.int8), len(rows)),
     )

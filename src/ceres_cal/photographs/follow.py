@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ceres_cal.camera import Camera
-from ceres_cal.detect.courses import predict
+from ceres_cal.detect.courses import Course, clear_px, predict
 from ceres_cal.detect.lines import SPACING_PX, Lines, measure, search, window_px
 from ceres_cal.detect.profiles import Grey
 from ceres_cal.detect.registration import nearness, shifted
@@ -20,10 +20,11 @@ from ceres_cal.transforms import Array
 FAR_PX = 130.0  # how far off the start may be
 LEAST_SHARE = 0.5  # of the places in view where paint must be found
 _SURE_SHARE = 0.7
+_ABSENT, _MOST_ABSENT = 0.2, 0.12  # found of a curve, at least; places on curves without that, at most
 _ROUGH_SPACING_PX = 12.0
 _NEAR_REACHES_PX = (12.0, 6.0, 4.0)
 _FAR_REACHES_PX = (45.0, 45.0, 30.0, 30.0, 20.0, 12.0, 8.0, 5.0)
-_LAST_REACH_PX = 3.0
+_LAST_REACH_PX = 5.0
 _CANDIDATES = 5
 _FEWEST = 12
 _ROUNDS = 6
@@ -62,10 +63,24 @@ class Followed:
         """Of the places in view, the share where paint was found."""
         return self.lines.share
 
+    @property
+    def absent(self) -> tuple[int, ...]:
+        """The curves in view of which next to nothing was found."""
+        curve, found = self.lines.course.curve, self.lines.found
+        numbers, places = np.unique(curve, return_counts=True)
+        seen = np.array([np.count_nonzero(found[curve == number]) for number in numbers])
+        return tuple(int(number) for number in numbers[seen < _ABSENT * places])
+
+    @property
+    def holds(self) -> bool:
+        """Whether this is the field: paint at half of the places in view, and no line missing that weighs."""
+        missing = np.isin(self.lines.course.curve, self.absent)
+        return self.share >= LEAST_SHARE and float(np.mean(missing)) <= _MOST_ABSENT
+
 
 def follow(
     grey: Grey, target: Target, starts: Sequence[Camera], curves: Collection[str], freedom: Freedom | None = None
-) -> Followed | None:
+) -> Followed:
     """Follow a target's painted curves in a photograph, from the best of several starts.
 
     A start that is near is taken at once; else shifts, turns and scales of it are tried, by 130 px and 7.5 degrees.
@@ -74,21 +89,25 @@ def follow(
         starts: posed cameras, any of which may be right. curves: names of those that are painted.
 
     Returns:
-        None where no start leads to a camera that shows at least half of the lines in view: then the field was not
-        found, or it is not this one.
+        The best that was reached; whether it is the field, `Followed.holds` tells.
     """
     freedom = freedom or Freedom()
     tried: list[Followed] = []
     if freedom.shown is None:
         tried = [_close_in(grey, target, camera, curves, freedom, _NEAR_REACHES_PX) for camera in starts[:1]]
-        if tried[0].share >= _SURE_SHARE:
+        if tried[0].holds and tried[0].share >= _SURE_SHARE:
             return tried[0]
     for camera in _candidates(grey, target, starts, curves, freedom):
         tried.append(_close_in(grey, target, camera, curves, freedom, _FAR_REACHES_PX))
-        if tried[-1].share >= _SURE_SHARE:
+        if tried[-1].holds and tried[-1].share >= _SURE_SHARE:
             break
-    best = max(tried, key=lambda one: one.share, default=None)
-    return best if best is not None and best.share >= LEAST_SHARE else None
+    return max(tried or [_nothing(starts[0])], key=lambda one: (one.holds, one.share))
+
+
+def _nothing(camera: Camera) -> Followed:
+    none = np.empty(0)
+    course = Course(np.empty(0, np.int32), none, np.empty((0, 2)), np.empty((0, 2)), none, none)
+    return Followed(camera, Lines(course, np.empty(0, bool), none, none, none, 1.0, 1.0), np.inf)
 
 
 # ---- near enough to search ------------------------------------------------------------------------------------------
@@ -140,16 +159,14 @@ def _close_in(
         refitted = refit_camera(camera, seen, freedom.names, freedom.priors)
         if refitted is None:
             break
-        before = lines.course
-        there = predict(target, refitted, curves, SPACING_PX)
-        moved = _moved_px(target, camera, refitted, before.pixels)
+        moved = _moved_px(camera, refitted, lines.course.pixels)
         camera, lines = refitted, _measured(grey, target, refitted, curves)
-        if moved < _AT_REST_PX or not len(there):
+        if moved < _AT_REST_PX:
             break
     return Followed(camera, lines, moved)
 
 
-def _moved_px(target: Target, camera: Camera, refitted: Camera, pixels: Array) -> float:
+def _moved_px(camera: Camera, refitted: Camera, pixels: Array) -> float:
     """How far the floor that is seen at these pixels moves from one camera to the other, px at most."""
     floor = camera.locate(pixels)
     moved = refitted.project(np.column_stack([floor, np.zeros(len(floor))])) - pixels
@@ -182,4 +199,5 @@ def _searched(
 
 def _measured(grey: Grey, target: Target, camera: Camera, curves: Collection[str]) -> Lines:
     course = predict(target, camera, curves, SPACING_PX, SPACING_PX)
-    return measure(grey, course.take(course.clear_px > window_px(course)), _LAST_REACH_PX)
+    clear = clear_px(target, camera, course, curves) > window_px(course)
+    return measure(grey, course.take(clear), _LAST_REACH_PX)
