@@ -97,8 +97,8 @@ def _why_missed(followed: Followed, target: Target) -> str:
         names = ", ".join(target.curve_names[number] for number in followed.absent)
         return f"there is no {names} where they should be: say which lines are not painted, or check the dimensions"
     return (
-        f"its lines were not found (paint at {100.0 * followed.share:.0f} % of where this start, moved and turned, puts "
-        "them): check the target's dimensions and which lines are painted, or start from other points"
+        f"its lines were not found (paint at {100.0 * followed.share:.0f} % of where this start, moved, puts them): "
+        "check the target's dimensions and which lines are painted, or start from other points"
     )
 
 

@@ -7,12 +7,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ceres_cal.calibrate import calibrate
 from ceres_cal.camera import Camera
 from ceres_cal.detect.courses import Course, clear_px, predict
 from ceres_cal.detect.lines import SPACING_PX, Lines, measure, search, window_px
 from ceres_cal.detect.profiles import Grey
 from ceres_cal.detect.registration import nearness, shifted
+from ceres_cal.errors import CalibrationError
 from ceres_cal.observations import Prior
+from ceres_cal.parameters import Options
 from ceres_cal.photographs.refit import Shown, observations_of, refit_camera
 from ceres_cal.targets import Target
 from ceres_cal.transforms import Array
@@ -20,7 +23,7 @@ from ceres_cal.transforms import Array
 FAR_PX = 130.0  # how far off the start may be
 LEAST_SHARE = 0.5  # of the places in view where paint must be found
 _SURE_SHARE = 0.7
-_ABSENT, _MOST_ABSENT = 0.2, 0.12  # found of a curve, at least; places on curves without that, at most
+_ABSENT, _MOST_ABSENT = 0.2, 0.08  # found of a curve, at least; places on curves without that, at most
 _ROUGH_SPACING_PX = 12.0
 _NEAR_REACHES_PX = (12.0, 6.0, 4.0)
 _FAR_REACHES_PX = (45.0, 45.0, 30.0, 30.0, 20.0, 12.0, 8.0, 5.0)
@@ -29,6 +32,7 @@ _CANDIDATES = 5
 _FEWEST = 12
 _ROUNDS = 6
 _AT_REST_PX = 0.02
+_LENSES = (Options(powers=(2, 3, 4, 5)), Options(lens="brown"), Options(lens="kannala-brandt"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,7 +105,8 @@ def follow(
         tried.append(_close_in(grey, target, camera, curves, freedom, _FAR_REACHES_PX))
         if tried[-1].holds and tried[-1].share >= _SURE_SHARE:
             break
-    return max(tried or [_nothing(starts[0])], key=lambda one: (one.holds, one.share))
+    best = max(tried or [_nothing(starts[0])], key=lambda one: (one.holds, one.share))
+    return _with_its_lens(grey, target, best, curves) if best.holds and freedom.names else best
 
 
 def _nothing(camera: Camera) -> Followed:
@@ -164,6 +169,30 @@ def _close_in(
         if moved < _AT_REST_PX:
             break
     return Followed(camera, lines, moved)
+
+
+def _with_its_lens(grey: Grey, target: Target, followed: Followed, curves: Collection[str]) -> Followed:
+    """What is found when the lines are predicted with the kind of lens that suits them best.
+
+    A polynomial that is a pixel off bends what crossings are extrapolated along.
+    """
+    lines, fits = followed.lines, []
+    found = lines.found
+    seen = observations_of(
+        target, followed.camera.image_size, lines.course.curve[found], lines.pixels[found], lines.sigma_px[found]
+    )
+    for options in _LENSES:
+        try:
+            calibration = calibrate(seen, options)
+        except CalibrationError:
+            continue
+        fits.append((calibration.fit.curve_scale * len(lines.found) / calibration.fit.curves, calibration))
+    if not fits:
+        return followed
+    camera = min(fits, key=lambda fit: fit[0])[1].station()
+    lines = _measured(grey, target, camera, curves)
+    refined = Followed(camera, lines, _moved_px(followed.camera, camera, lines.course.pixels))
+    return refined if refined.holds and refined.share > followed.share - 0.02 else followed
 
 
 def _moved_px(camera: Camera, refitted: Camera, pixels: Array) -> float:
