@@ -134,9 +134,13 @@ def distances_px(shot: Shot, curve: NDArray[np.int32], pixels: Array) -> Array:
     first, second = np.where(is_arc, np.cos(s), s), np.where(is_arc, np.sin(s), 0.0)
     foot = tracks[:, 0] + first[:, None] * tracks[:, 1] + second[:, None] * tracks[:, 2]
     along = np.where(is_arc[:, None], -second[:, None] * tracks[:, 1] + first[:, None] * tracks[:, 2], tracks[:, 1])
-    left = np.column_stack([-along[:, 1], along[:, 0]])
-    sign = np.where(np.sum((floor - foot)[:, :2] * left, axis=1) < 0.0, -1.0, 1.0)
-    return np.asarray(sign * np.linalg.norm(pixels - camera.project(foot), axis=1))
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    left = np.column_stack([-along[:, 1], along[:, 0], np.zeros(len(along))])
+    there, step_m = camera.project(foot), 1e-3
+    tangent = camera.project(foot + step_m * along) - there
+    normal = np.column_stack([-tangent[:, 1], tangent[:, 0]]) / np.linalg.norm(tangent, axis=1, keepdims=True)
+    normal *= np.sign(np.sum(normal * (camera.project(foot + step_m * left) - there), axis=1))[:, None]
+    return np.asarray(np.sum((pixels - there) * normal, axis=1))
 
 
 def hidden_places(shot: Shot, pixels: Array) -> NDArray[np.bool_]:
@@ -148,38 +152,50 @@ def hidden_places(shot: Shot, pixels: Array) -> NDArray[np.bool_]:
 # ---- figures --------------------------------------------------------------------------------------------------------
 
 
-def line_rows(runs: int) -> Iterator[Row]:
-    """Line centres and their sigmas, from a start that is some pixels off."""
-    errors, biases = [], []
-    pulls: dict[bool, list[Array]] = {True: [], False: []}
-    hidden = missed = seen = 0
-    for seed in range(runs):
-        shot = take(seed)
-        found = follow(
-            shot.grey, shot.target, [off_by(shot.camera, NEAR_PX / shot.camera.phi, seed)], shot.target.curve_names
-        )
-        if not found.holds:
-            missed += 1
-            continue
-        lines, rows = found.lines, found.lines.found
-        error = distances_px(shot, lines.course.curve[rows], lines.pixels[rows])
-        covered = hidden_places(shot, lines.course.pixels)
-        hidden += int(np.count_nonzero(covered & rows))
-        seen += int(np.count_nonzero(covered))
-        pulls[shot.good_light].append(error / lines.sigma_px[rows])
-        biases.append(float(np.mean(error)))
-        if shot.good_light:
-            errors.append(error)
-    good = np.concatenate(errors)
-    yield Row("lines", "photographs where the field was missed", missed, most=0.0, note=f"{runs} photographs")
-    yield Row("lines", "mean error of line centres, good light, px", float(np.mean(good)), 0.0, -0.03, 0.03)
-    yield Row("lines", "largest mean error of one photograph, px", float(np.max(np.abs(biases))), most=0.03)
-    yield Row("lines", "spread of line centres, good light, px", float(np.std(good)), most=0.15)
+@dataclass(frozen=True, eq=False)
+class LineErrors:
+    """Errors (N,) px of one photograph's line centres, the same in their stated sigmas, and what is hidden there."""
+
+    good_light: bool
+    errors_px: Array
+    pulls: Array
+    hidden: int
+    hidden_found: int
+
+
+def line_errors(seed: int) -> LineErrors | None:
+    """What is measured in one photograph from a start that is some pixels off; None where the field is missed."""
+    shot = take(seed)
+    start = off_by(shot.camera, NEAR_PX / shot.camera.phi, seed)
+    found = follow(shot.grey, shot.target, [start], shot.target.curve_names)
+    if not found.holds:
+        return None
+    lines, rows = found.lines, found.lines.found
+    error = distances_px(shot, lines.course.curve[rows], lines.pixels[rows])
+    covered = hidden_places(shot, lines.course.pixels)
+    counts = int(np.count_nonzero(covered)), int(np.count_nonzero(covered & rows))
+    return LineErrors(shot.good_light, error, error / lines.sigma_px[rows], *counts)
+
+
+def line_figures(seeds: Sequence[int]) -> Iterator[Row]:
+    """Line centres and their sigmas in the photographs of these numbers."""
+    every = [line_errors(seed) for seed in seeds]
+    seen = [one for one in every if one is not None]
+    missed = len(every) - len(seen)
+    yield Row("lines", "photographs where the field was missed", missed, most=0.0, note=f"{len(every)} photographs")
+    worst = max(abs(float(np.mean(one.errors_px))) for one in seen)
+    yield Row("lines", "largest mean error of one photograph, px", worst, most=0.03)
+    if good := [one.errors_px for one in seen if one.good_light]:
+        errors = np.concatenate(good)
+        yield Row("lines", "mean error of line centres, good light, px", float(np.mean(errors)), 0.0, -0.03, 0.03)
+        yield Row("lines", "spread of line centres, good light, px", float(np.std(errors)), most=0.15)
     for light, name in ((True, "good"), (False, "bad")):
-        pull = np.concatenate(pulls[light])
-        note = f"{len(pull)} observations, largest {np.max(np.abs(pull)):.1f}"
-        yield Row("lines", f"spread over stated sigma, {name} light", float(np.std(pull)), 0.0, 0.8, 1.2, note)
-    yield Row("lines", "observations of what is hidden", hidden, most=0.0, note=f"of {seen} places behind robots")
+        if pulls := [one.pulls for one in seen if one.good_light == light]:
+            pull = np.concatenate(pulls)
+            note = f"{len(pull)} observations, largest {np.max(np.abs(pull)):.1f}"
+            yield Row("lines", f"spread over stated sigma, {name} light", float(np.std(pull)), 0.0, 0.8, 1.2, note)
+    hidden, found = sum(one.hidden for one in seen), sum(one.hidden_found for one in seen)
+    yield Row("lines", "observations of what is hidden", found, most=0.0, note=f"of {hidden} places behind robots")
 
 
 def clicks(shot: Shot, seed: int) -> Clicks:
@@ -339,7 +355,7 @@ CASES = ("lines", "floor", "starts", "speed", "rings", "real")
 
 def rows_of(case: str, runs: int, real: Path | None, picture: Path | None) -> Iterator[Row]:
     if case == "lines":
-        yield from line_rows(runs)
+        yield from line_figures(range(runs))
     elif case == "floor":
         yield from floor_rows(runs)
     elif case == "starts":
