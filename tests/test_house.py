@@ -43,6 +43,7 @@ FLOORS = {
     "calibration": 5,
     "calibrate": 5,
     "diagnostics": 5,
+    "photographs": 5,
     "formats": 6,
     "report": 6,
     "cli": 6,

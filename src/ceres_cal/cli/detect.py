@@ -40,10 +40,9 @@ def _add_board(parser: ArgumentParser) -> None:
 
 
 def _run_board(args: Namespace) -> Answer:
-    images = list(_image_files(args.images))
+    images = list(image_files(args.images))
     require_output(args.output, images)
-    if args.output.suffix not in (".json", ".npz"):
-        raise InputError(f"{args.output}: observations are written as .json or .npz: give one of these endings")
+    require_observations_file(args.output)
     if (args.charuco is None) != (args.marker is None):
         raise InputError("--charuco DICT and --marker M go together: give both or neither")
     os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")  # what it warns of in an image, we say ourselves
@@ -70,7 +69,13 @@ def _run_board(args: Namespace) -> Answer:
 COMMANDS = (Command("detect board", "corners of chessboards and ChArUco boards in images", _add_board, _run_board),)
 
 
-def _image_files(given: Iterable[str]) -> Iterator[Path]:
+def require_observations_file(path: Path) -> None:
+    """Raise InputError where a file's ending is none of those that observations are written to."""
+    if path.suffix not in (".json", ".npz"):
+        raise InputError(f"{path}: observations are written as .json or .npz: give one of these endings")
+
+
+def image_files(given: Iterable[str]) -> Iterator[Path]:
     """The files named; those of folders, and of patterns that no shell expanded, in the order of their names."""
     for name in given:
         path = Path(name)

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ceres_cal.cli.command import Answer, Command, finishing, plural
+from ceres_cal.cli.progress import ProgressBar
 from ceres_cal.errors import InputError
 
 if TYPE_CHECKING:
@@ -18,6 +19,12 @@ def _add_arguments(parser: ArgumentParser) -> None:
     add("scene", nargs="?", metavar="SCENE", help="name of a built-in scene, or a scene file (.json)")
     add("-o", "--output", metavar="DIR", type=Path, help="folder for observations.json and truth.json; made if missing")
     add("--seed", type=int, default=0, metavar="N", help="the same seed gives the same observations; default: 0")
+    add(
+        "--images",
+        choices=("png", "jpg"),
+        help="take photographs too, into photographs/ beside the observations; what robots hide there is not observed",
+    )
+    add("--quiet", action="store_true", help="no progress")
     add("--list", action="store_true", help="list the built-in scenes")
 
 
@@ -39,9 +46,19 @@ def _run(args: Namespace) -> Answer:
     is_file = args.scene not in scenes and (Path(args.scene).exists() or args.scene.endswith(".json"))
     scene, disturbance = load_scene(args.scene) if is_file else built_in_scene(args.scene)
     simulation = simulate(scene, disturbance, args.seed)
+    images: list[str] = []
+    if args.images is not None:
+        from ceres_cal.simulate.album import take_album
+
+        with ProgressBar(silent=args.quiet or args.json) as bar:
+            album = take_album(simulation, args.images, bar.update)
+        simulation, images = album.simulation, [str(args.output / name) for name in album.images]
     with finishing():
-        write_simulation(simulation, args.output)
-    data = _data(simulation, args.scene, args.output)
+        if args.images is not None:
+            album.write(args.output)
+        else:
+            write_simulation(simulation, args.output)
+    data = _data(simulation, args.scene, args.output) | {"images": images}
     return Answer(data, lambda: _text(data))
 
 
@@ -73,4 +90,5 @@ def _text(data: dict[str, Any]) -> str:
         f"{plural(data['curves'], 'curve observation')}, of them {plural(data['outliers'], 'outlier')} and "
         f"{plural(data['wrong_labels'], 'wrong label')}\n"
         f"{data['truth']}: what is true of them"
+        + (f"\n{Path(data['images'][0]).parent}: {plural(len(data['images']), 'photograph')}" if data["images"] else "")
     )

@@ -1,9 +1,13 @@
-"""Simulation of scenes as numbers: observations with noise, outliers and hidden stretches, and their truth."""
+"""Simulation of scenes: observations as numbers with noise, outliers and hidden stretches, photographs, their truth.
+
+What draws (`photograph`, `album`) needs OpenCV and is imported where it is used, by its own name.
+"""
 
 from ceres_cal.parameters import Station
 from ceres_cal.simulate.built_in import built_in_scene, scene_names
 from ceres_cal.simulate.compose import board_placements, board_scene, field_scene, join, overhead_pose, rings_scene
 from ceres_cal.simulate.files import load_scene, scene_from_json, scene_to_json, truth_to_json, write_simulation
+from ceres_cal.simulate.photography import Photography
 from ceres_cal.simulate.scene import Disturbance, Scene, ViewPlan
 from ceres_cal.simulate.simulation import CLEAN, OUTLIER, WRONG_LABEL, Simulation, Truth, simulate
 
@@ -12,6 +16,7 @@ __all__ = [
     "OUTLIER",
     "WRONG_LABEL",
     "Disturbance",
+    "Photography",
     "Scene",
     "Simulation",
     "Station",

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 from ceres_cal.camera import Camera
 from ceres_cal.errors import InputError
 from ceres_cal.lens import KannalaBrandt, Radial
 from ceres_cal.parameters import Station
 from ceres_cal.simulate.compose import board_scene, field_scene, join, overhead_pose, rings_scene
+from ceres_cal.simulate.photography import Photography
 from ceres_cal.simulate.scene import Disturbance, Scene
 from ceres_cal.targets import Arc, Curve, Segment, Target, checkerboard, custom, rings, ssl_field
 from ceres_cal.transforms import Pose
@@ -119,6 +121,14 @@ def _moved_camera() -> tuple[Scene, Disturbance]:
     return scene, _WORKDAY
 
 
+def _photographs() -> tuple[Scene, Disturbance]:
+    pose = overhead_pose(-2.27, -0.12, 4.02, tilt_x_deg=6.0, tilt_y_deg=-5.0, yaw_deg=90.6)
+    stations = {"overhead": Station("overhead", pose)}
+    scene = field_scene(ssl_field("B"), {"overhead": _overhead_camera()}, stations, frames=4)
+    how = Photography(robots=8, balls=1, shadows=1, wear=0.05, jpeg_quality=95)
+    return replace(scene, photography=how), Disturbance(points_sigma_px=0.3, curves_sigma_px=0.3)
+
+
 def _boards() -> tuple[Scene, Disturbance]:
     cameras = {"camera": _overhead_camera()}
     stations = {"camera": Station("camera", Pose.identity())}
@@ -138,6 +148,7 @@ _SCENES: dict[str, tuple[str, Callable[[], tuple[Scene, Disturbance]]]] = {
     "field-2004": ("the paper's camera over half of a field of 4.9 x 3.4 m: data/field_2004/field.json", _field_2004),
     "two-cameras": ("two overhead cameras over a division B field, and boards that both see at once", _two_cameras),
     "moved-camera": ("one camera at three stations over half of a division B field", _moved_camera),
+    "photographs": ("half of a division B field with robots, for --images: lamps, shadows, worn paint", _photographs),
     "boards": ("a checkerboard held before one camera at 20 places", _boards),
     "fisheye": ("a camera of over 120 degrees over a division B field", _fisheye),
 }

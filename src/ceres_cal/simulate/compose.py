@@ -163,7 +163,7 @@ def rings_scene(
 
 
 def join(*scenes: Scene) -> Scene:
-    """Several scenes as one: their views one after the other.
+    """Several scenes as one: their views one after the other, photographed as the first that says how.
 
     Raises:
         InputError: a name means different things in two scenes.
@@ -183,4 +183,5 @@ def join(*scenes: Scene) -> Scene:
         together("stations"),
         together("placements"),
         tuple(plan for scene in scenes for plan in scene.views),
+        next((scene.photography for scene in scenes if scene.photography is not None), None),
     )

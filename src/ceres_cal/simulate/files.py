@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 import numpy as np
@@ -17,6 +17,7 @@ from ceres_cal.errors import InputError
 from ceres_cal.files import check_header, convert, read_json, write_json
 from ceres_cal.lens import Radial, make_lens
 from ceres_cal.parameters import Station
+from ceres_cal.simulate.photography import Photography
 from ceres_cal.simulate.scene import Disturbance, Scene, ViewPlan
 from ceres_cal.simulate.simulation import OUTLIER, WRONG_LABEL, Simulation, Truth
 from ceres_cal.targets import target_from_spec
@@ -27,6 +28,7 @@ TRUTH_FORMAT, TRUTH_VERSION = "ceres-cal/truth", 1
 UNITS = "metres, radians, pixels"
 
 Vector = tuple[float, float, float]
+Settings = TypeVar("Settings", Disturbance, Photography)
 
 
 class _LensFile(msgspec.Struct, forbid_unknown_fields=True):
@@ -77,6 +79,7 @@ class _SceneFile(msgspec.Struct, forbid_unknown_fields=True):
     views: list[Any]
     placements: dict[str, Any] = {}
     disturbance: dict[str, Any] = {}
+    photography: dict[str, Any] | None = None
     units: str = UNITS
 
 
@@ -123,8 +126,9 @@ def scene_from_json(data: Mapping[str, Any], where: str) -> tuple[Scene, Disturb
             {name: _station(entry, f"station {name!r}") for name, entry in file.stations.items()},
             {name: _placement(entry, f"placement {name!r}") for name, entry in file.placements.items()},
             tuple(_plan(entry, f"view {number}") for number, entry in enumerate(file.views)),
+            None if file.photography is None else _named(Photography, file.photography, "photography"),
         )
-        return scene, _disturbance(file.disturbance)
+        return scene, _named(Disturbance, file.disturbance, "disturbance")
 
 
 def _camera(entry: Any, here: str) -> Camera:
@@ -156,12 +160,13 @@ def _plan(entry: Any, here: str) -> ViewPlan:
     return ViewPlan(**msgspec.structs.asdict(convert(entry, _ViewFile, here)))
 
 
-def _disturbance(entry: dict[str, Any]) -> Disturbance:
-    known = [field.name for field in fields(Disturbance)]
+def _named(kind: type[Settings], entry: dict[str, Any], here: str) -> Settings:
+    """The disturbance or the photography that a file describes."""
+    known = [field.name for field in fields(kind)]
     for name in entry:
         if name not in known:
-            raise InputError(f"disturbance: {name!r} is unknown: there are {', '.join(known)}")
-    return convert(entry, Disturbance, "disturbance")
+            raise InputError(f"{here}: {name!r} is unknown: there are {', '.join(known)}")
+    return convert(entry, kind, here)
 
 
 # ---- writing --------------------------------------------------------------------------------------------------------
@@ -193,6 +198,7 @@ def scene_to_json(scene: Scene, disturbance: Disturbance | None = None) -> dict[
         },
         "views": msgspec.to_builtins(views),
         "disturbance": vars(disturbance or Disturbance()).copy(),
+        **({} if scene.photography is None else {"photography": vars(scene.photography).copy()}),
     }
 
 
@@ -272,16 +278,25 @@ def _rows_truth(truth: Truth) -> dict[str, Any]:
     }
 
 
-def write_simulation(simulation: Simulation, folder: str | Path) -> None:
+def write_simulation(simulation: Simulation, folder: str | Path, more_truth: Mapping[str, Any] | None = None) -> None:
     """Write `observations.json` and `truth.json` into a folder, which is made where it is missing.
+
+    Args:
+        more_truth: what the truth says besides.
 
     Raises:
         InputError: it cannot be written.
     """
+    folder = make_folder(folder)
+    simulation.observations.save(folder / "observations.json")
+    write_json(folder / "truth.json", truth_to_json({"observations.json": simulation}) | dict(more_truth or {}))
+
+
+def make_folder(folder: str | Path) -> Path:
+    """A folder, made where it is missing; InputError where it cannot be."""
     folder = Path(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{folder}: cannot be made: {error.strerror}") from None
-    simulation.observations.save(folder / "observations.json")
-    write_json(folder / "truth.json", truth_to_json({"observations.json": simulation}))
+    return folder

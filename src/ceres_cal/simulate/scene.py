@@ -10,6 +10,7 @@ import numpy as np
 from ceres_cal.camera import Camera
 from ceres_cal.errors import InputError
 from ceres_cal.parameters import Station
+from ceres_cal.simulate.photography import Photography
 from ceres_cal.targets import SIDES, Target
 from ceres_cal.transforms import Pose
 
@@ -52,6 +53,7 @@ class Scene:
         stations: name -> camera and cam_from_world.
         placements: name -> world_from_target of a movable target.
         views: what is looked at.
+        photography: how photographs of it are taken, where it says so.
 
     Raises:
         InputError: on construction: a name that is not there, a number that cannot be; the line names the place.
@@ -62,6 +64,7 @@ class Scene:
     stations: Mapping[str, Station]
     placements: Mapping[str, Pose]
     views: tuple[ViewPlan, ...]
+    photography: Photography | None = None
 
     def __post_init__(self) -> None:
         for name, station in self.stations.items():

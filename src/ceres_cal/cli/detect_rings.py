@@ -1,0 +1,92 @@
+"""`ceres-cal detect rings`: the paper's concentric rings in a photograph, as observations and as its polynomial."""
+
+from __future__ import annotations
+
+import os
+from argparse import ArgumentParser, Namespace
+from typing import TYPE_CHECKING, Any
+
+from ceres_cal.cli.command import Answer, Command, add_output, finishing, parse_number, parse_numbers, require_output
+from ceres_cal.cli.detect import require_observations_file
+from ceres_cal.errors import InputError
+
+if TYPE_CHECKING:
+    from ceres_cal.detect.rings import RingsDetection
+
+_MOST_RINGS = 10_000
+
+
+def _add_arguments(parser: ArgumentParser) -> None:
+    add = parser.add_argument
+    add("image", metavar="IMAGE", help="photograph of the rings, taken about from the front")
+    add(
+        "--radii",
+        required=True,
+        metavar="M,M,...",
+        help="radii in metres of all edges between dark and bright, from the inside out; FROM:TO:STEP for even ones, "
+        "such as 0.01:0.36:0.01",
+    )
+    add("--camera", default="camera", metavar="NAME", help="name of the camera; default: camera")
+    add("--station", metavar="NAME", help="name of the station; default: that of the camera")
+    add_output(parser, "the observations (.json or .npz)", required=True)
+
+
+def _run(args: Namespace) -> Answer:
+    require_output(args.output, [args.image])
+    require_observations_file(args.output)
+    radii = _radii(args.radii)
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")  # what it warns of in an image, we say ourselves
+    from ceres_cal.detect.rings import detect_rings
+
+    found = detect_rings(args.image, radii, args.camera, args.station)
+    with finishing():
+        found.observations.save(args.output)
+    data = _data(found, args, len(radii))
+    return Answer(data, lambda: _text(data))
+
+
+COMMANDS = (Command("detect rings", "edges of concentric rings in a photograph", _add_arguments, _run),)
+
+
+def _radii(text: str) -> tuple[float, ...]:
+    where = f"--radii {text!r}"
+    if ":" not in text:
+        return parse_numbers(text, where)
+    parts = text.split(":")
+    if len(parts) != 3:
+        raise InputError(f"{where}: write FROM:TO:STEP, such as 0.01:0.36:0.01, or the radii between commas")
+    first, last, step = (parse_number(part, where) for part in parts)
+    if not (0.0 < first <= last and step > 0.0 and (last - first) / step < _MOST_RINGS):
+        raise InputError(f"{where}: FROM must be above 0, TO not below it, and STEP above 0")
+    return tuple(first + i * step for i in range(round((last - first) / step) + 1))
+
+
+def _data(found: RingsDetection, args: Namespace, given: int) -> dict[str, Any]:
+    a1, a2, a3 = found.polynomial.tolist()
+    return {
+        "image": args.image,
+        "output": str(args.output),
+        "rings": found.found,
+        "radii_given": given,
+        "observations": len(found.observations.curves),
+        "centre": found.centre.tolist(),
+        "polynomial": {"a1": a1, "a2": a2, "a3": a3},
+        "lens": {"a2": a2 / a1, "a3": a3 / a1},
+        "rms_px": found.rms_px,
+        "blur_px": found.blur_px,
+    }
+
+
+def _text(data: dict[str, Any]) -> str:
+    x, y = data["centre"]
+    return "\n".join(
+        [
+            f"{data['rings']} of {data['radii_given']} rings around ({x:.1f}, {y:.1f}), "
+            f"{data['observations']} edges, blurred by {data['blur_px']:.2f} px",
+            "the paper's polynomial r' = a1 r + a2 r^2 + a3 r^3, px, the first ring being as large as it is seen:",
+            *(f"    {name} {value!r}" for name, value in data["polynomial"].items()),
+            f"    with a1 = 1, as a lens has it: a2 {data['lens']['a2']!r}, a3 {data['lens']['a3']!r}; "
+            f"rms {data['rms_px']:.3f} px",
+            f"written to {data['output']}",
+        ]
+    )

@@ -1,0 +1,125 @@
+"""Where a camera should see the painted curves of a target: places along them, at even distances in the image."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ceres_cal.camera import Camera
+from ceres_cal.targets import Arc, Target, along_track, nearest_on_track
+from ceres_cal.transforms import Array
+
+Ints = NDArray[np.int32]
+Mask = NDArray[np.bool_]
+
+_PIECES = 240  # of a curve, to measure its length in the image
+
+
+@dataclass(frozen=True, eq=False)
+class Course:
+    """N places on painted curves as the camera should see them, curve after curve and in order along each.
+
+    Attributes:
+        curve: (N,) index among the target's curves. s: (N,) the curves' parameter.
+        pixels: (N, 2). normals: (N, 2) of length 1, towards the curve's left. curvature: (N,) 1/px, positive towards
+            the normal. width_px: (N,) of the paint, along the normal.
+    """
+
+    curve: Ints
+    s: Array
+    pixels: Array
+    normals: Array
+    curvature: Array
+    width_px: Array
+
+    def __len__(self) -> int:
+        return len(self.curve)
+
+    def take(self, rows: Mask | NDArray[np.intp]) -> Course:
+        """These places only."""
+        return Course(**{name: column[rows] for name, column in vars(self).items()})
+
+
+def predict(
+    target: Target, camera: Camera, curves: Collection[str], spacing_px: float, margin_px: float = 0.0
+) -> Course:
+    """Places about every `spacing_px` on the painted curves of these names that fall into the image.
+
+    Args:
+        camera: its cam_from_world is cam_from_target. margin_px: how far inside the image they must lie.
+    """
+    parts = [
+        _places(target, camera, number, spacing_px, margin_px)
+        for number, (name, curve) in enumerate(target.curves.items())
+        if name in curves and curve.width_m > 0.0
+    ]
+    number = np.concatenate([np.empty(0, np.int32), *(np.full(len(s), i, np.int32) for i, s in parts)])
+    s = np.concatenate([np.empty(0), *(s for _, s in parts)])
+    return course_at(target, camera, number, s)
+
+
+def _places(target: Target, camera: Camera, number: int, spacing_px: float, margin_px: float) -> tuple[int, Array]:
+    """The curve's number and the parameters of its places."""
+    curve = target.curves[target.curve_names[number]]
+    s = np.linspace(*curve.parameter_range, _PIECES + 1)
+    pixels = camera.project(along_track(target.tracks[0, number], isinstance(curve, Arc), s))
+    size = np.array(camera.image_size)
+    with np.errstate(invalid="ignore"):
+        near = np.all((pixels > -0.5 * size) & (pixels < 1.5 * size), axis=1)
+    step = np.where(near[1:] & near[:-1], np.linalg.norm(np.diff(pixels, axis=0), axis=1), 0.0)
+    length = np.concatenate([[0.0], np.cumsum(np.nan_to_num(step))])
+    count = int(length[-1] / spacing_px)
+    if count < 1:
+        return number, np.empty(0)
+    even = (np.arange(count) + 0.5) * (length[-1] / count)
+    chosen = np.interp(even, length, s)
+    there = camera.project(along_track(target.tracks[0, number], isinstance(curve, Arc), chosen))
+    with np.errstate(invalid="ignore"):
+        inside = np.all((there > margin_px - 0.5) & (there < size - 0.5 - margin_px), axis=1)
+    return number, chosen[inside]
+
+
+def course_at(target: Target, camera: Camera, number: Ints, s: Array) -> Course:
+    """The course through places that are given by curve (N,) and parameter (N,)."""
+    is_arc = target.is_arc[number]
+    span = np.array([np.diff(curve.parameter_range)[0] for curve in target.curves.values()])[number]
+
+    def seen(side: int, step: float) -> Array:
+        return camera.project(along_track(target.tracks[side][number], is_arc, s + step * span))
+
+    before, pixels, after = seen(0, -2e-3), seen(0, 0.0), seen(0, 2e-3)
+    tangent = after - before
+    length = np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-9)
+    tangent = tangent / length
+    left, right = seen(1, 0.0), seen(-1, 0.0)
+    normals = np.column_stack([-tangent[:, 1], tangent[:, 0]])
+    normals *= np.where(np.sum((left - right) * normals, axis=1) < 0.0, -1.0, 1.0)[:, None]
+    width = np.sum((left - right) * normals, axis=1)
+    bend = np.sum((before - 2.0 * pixels + after) * normals, axis=1) / (0.5 * length[:, 0]) ** 2
+    return Course(number, s, pixels, normals, bend, width)
+
+
+def clear_px(target: Target, camera: Camera, course: Course, curves: Collection[str]) -> Array:
+    """(N,) px from each place to the middle of the nearest other curve that is painted, or to the own curve's end."""
+    number, s, pixels = course.curve, course.s, course.pixels
+    places = along_track(target.tracks[0][number], target.is_arc[number], s)
+    clear = np.full(len(places), np.inf)
+    for other, (name, curve) in enumerate(target.curves.items()):
+        low, high = curve.parameter_range
+        own = number == other
+        if not isinstance(curve, Arc):
+            for end in (low, high):
+                end_px = camera.project(along_track(target.tracks[0, other], False, np.array([end])))
+                clear[own] = np.fmin(clear[own], np.linalg.norm(pixels[own] - end_px, axis=1))
+        if name not in curves or curve.width_m <= 0.0:
+            continue
+        rows = np.flatnonzero(~own)
+        track = np.broadcast_to(target.tracks[0, other], (len(rows), 3, 3))
+        foot = nearest_on_track(track, np.full(len(rows), isinstance(curve, Arc)), places[rows])
+        foot = low + np.mod(foot - low, 2.0 * np.pi) if isinstance(curve, Arc) else foot
+        there = camera.project(along_track(track, isinstance(curve, Arc), np.clip(foot, low, high)))
+        clear[rows] = np.fmin(clear[rows], np.linalg.norm(pixels[rows] - there, axis=1))
+    return clear

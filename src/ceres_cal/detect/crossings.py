@@ -1,0 +1,119 @@
+"""Crossings and corners: where the branches of painted curves that were measured on the way to them meet."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ceres_cal.camera import Camera
+from ceres_cal.detect.courses import Ints, Mask, course_at
+from ceres_cal.detect.lines import Lines
+from ceres_cal.targets import Arc, Target, along_track, nearest_on_track
+from ceres_cal.transforms import Array
+
+_ON_CURVE_M = 1e-6
+_EACH_WAY, _ONE_WAY, _FEWEST = 3, 8, 3  # places of a branch that goes on, of one that ends, and at least
+_REACH_PX = 100.0
+_MOST_STRETCHED = 3.0  # of the crossing's longest standard deviation over its shortest
+
+
+@dataclass(frozen=True, eq=False)
+class Crossings:
+    """Points of a target as their branches tell.
+
+    Attributes:
+        feature: (P,) index among the target's points. pixels: (P, 2). sigma_px: (P,) of each coordinate, on average.
+        used: (N,) the lines' places that went into them; who takes both must leave these out, or pixels count twice.
+    """
+
+    feature: Ints
+    pixels: Array
+    sigma_px: Array
+    used: Mask
+
+
+@dataclass(frozen=True, eq=False)
+class _Branch:
+    """A curve at a point: its normal in the image, how far along it the paint lies, its variance, its places."""
+
+    normal: Array
+    offset_px: float
+    variance: float
+    rows: NDArray[np.intp]
+
+
+def find_crossings(target: Target, camera: Camera, lines: Lines) -> Crossings:
+    """Every point of the target in which at least two measured curves meet.
+
+    Each branch is a straight line through the offsets of its nearest places from the course; the course itself bends as
+    lens and arc do.
+    """
+    used = np.zeros(len(lines.course), dtype=bool)
+    features, pixels, sigmas = [], [], []
+    seen = np.unique(lines.course.curve[lines.found])
+    for number, point in enumerate(target.point_array):
+        curves = [int(curve) for curve in seen if _passes(target, int(curve), point)]
+        branches = [b for curve in curves if (b := _branch(target, camera, lines, curve, point, used)) is not None]
+        met = _met(branches)
+        if met is None:
+            continue
+        pixel = camera.project(point[None])[0] + met[0]
+        if np.all((pixel >= -0.5) & (pixel <= np.array(camera.image_size) - 0.5)):
+            features.append(number)
+            pixels.append(pixel)
+            sigmas.append(met[1])
+            for branch in branches:
+                used[branch.rows] = True
+    return Crossings(np.array(features, np.int32), np.reshape(pixels, (-1, 2)), np.array(sigmas, float), used)
+
+
+def _foot(target: Target, curve: int, point: Array) -> float:
+    own = target.curves[target.curve_names[curve]]
+    low, high = own.parameter_range
+    foot = float(nearest_on_track(target.tracks[0, [curve]], target.is_arc[[curve]], point[None])[0])
+    if isinstance(own, Arc):
+        foot = low + float(np.mod(foot - low, 2.0 * np.pi))
+    return float(np.clip(foot, low, high))
+
+
+def _passes(target: Target, curve: int, point: Array) -> bool:
+    there = along_track(target.tracks[0, curve], bool(target.is_arc[curve]), np.array([_foot(target, curve, point)]))
+    return bool(np.linalg.norm(there[0] - point) < _ON_CURVE_M)
+
+
+def _branch(target: Target, camera: Camera, lines: Lines, curve: int, point: Array, used: Mask) -> _Branch | None:
+    course = lines.course
+    here = course_at(target, camera, np.array([curve], np.int32), np.array([_foot(target, curve, point)]))
+    rows = np.flatnonzero(lines.found & ~used & (course.curve == curve))
+    away = course.pixels[rows] - here.pixels[0]
+    along = away @ np.array([here.normals[0, 1], -here.normals[0, 0]])
+    order = np.argsort(np.abs(along))
+    order = order[np.linalg.norm(away[order], axis=1) < _REACH_PX]
+    before, after = order[along[order] <= 0.0], order[along[order] > 0.0]
+    most = _EACH_WAY if len(before) and len(after) else _ONE_WAY
+    chosen = np.concatenate([before[:most], after[:most]])
+    if len(chosen) < _FEWEST:
+        return None
+    rows, along = rows[chosen], along[chosen]
+    weight = lines.sigma_px[rows] ** -2.0
+    basis = np.column_stack([np.ones(len(rows)), along])
+    covariance = np.linalg.inv(basis.T @ (weight[:, None] * basis))
+    offset = covariance @ (basis.T @ (weight * lines.offset_px[rows]))
+    return _Branch(here.normals[0], float(offset[0]), float(covariance[0, 0]), rows)
+
+
+def _met(branches: list[_Branch]) -> tuple[Array, float] | None:
+    """Where branches meet, (2,) px from where they should, and its sigma; None where they do not tell it."""
+    if len(branches) < 2:
+        return None
+    normals = np.array([branch.normal for branch in branches])
+    weight = np.array([1.0 / branch.variance for branch in branches])
+    information = normals.T @ (weight[:, None] * normals)
+    least, most = np.linalg.eigvalsh(information)
+    if not least > most / _MOST_STRETCHED**2:
+        return None
+    covariance = np.linalg.inv(information)
+    offset = covariance @ (normals.T @ (weight * np.array([branch.offset_px for branch in branches])))
+    return offset, float(np.sqrt(0.5 * np.trace(covariance)))

@@ -1,0 +1,219 @@
+"""Painted lines and arcs in a photograph, measured where a camera says they should be.
+
+Each place of a `Course` is first looked for along its normal, then measured in the pixels themselves (`profiles`). What
+does not look like paint of that width, or does not go on as its neighbours do, gives no observation.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ceres_cal.detect.courses import Course, Mask
+from ceres_cal.detect.profiles import Grey, Profiles, Windows, cut_windows, fit_profiles, fit_shape
+from ceres_cal.transforms import Array
+
+HALF_WIDTH_PX = 3  # of a window, along the line
+SPACING_PX = 2.0 * HALF_WIDTH_PX + 2.0  # neighbouring windows share no pixels
+_BEYOND_PX = 4.5  # of a window, past the paint's border
+_SEARCH_STEP_PX = 0.5
+_BAND_PX = 3.0  # of background, to either side of the paint, in the search
+_SHAPE_WINDOWS = 150
+_LEAST_CLARITY = 4.0  # contrast over noise
+_LEAST_CONTRAST, _LEAST_OF_NEARBY = 0.15, 0.45  # shares of the usual contrast, and of that nearby
+_NOISY = 3.0  # times the usual misfit: something else is in the window
+_NEARBY = 4  # places to each side that a place is compared with
+_FAR, _FAR_PX = 5.0, 0.25  # off its neighbours: standard deviations, and at least so much
+_WANDERING = 4.0  # times the spread of its neighbours
+_FACTOR_RANGE = (0.8, 6.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Lines:
+    """What was measured of a course.
+
+    Attributes:
+        course: the places looked at.
+        found: (N,) where paint was measured.
+        offset_px: (N,) how far along the normal from the course's place the paint's middle lies; NaN where not found.
+        sigma_px: (N,) standard deviation of it. contrast: (N,) grey levels.
+        blur_px: standard deviation of the picture's blur, lens and pixel together.
+        stretch: the paint's width over what the target says, as far as the blur lets it be seen.
+    """
+
+    course: Course
+    found: Mask
+    offset_px: Array
+    sigma_px: Array
+    contrast: Array
+    blur_px: float
+    stretch: float
+
+    @property
+    def pixels(self) -> Array:
+        """(N, 2) the paint's middle, NaN where it was not found."""
+        return np.asarray(self.course.pixels + self.offset_px[:, None] * self.course.normals)
+
+    def edge(self, side: int) -> Array:
+        """(N, 2) the paint's left (side 1) or right (-1) edge, NaN where it was not found.
+
+        Both come from one fit: with the width known, each is as much worse than the middle as two of them together
+        are as good, and that is how to weigh them (sigma times the square root of 2).
+        """
+        away = self.offset_px + 0.5 * side * self.stretch * self.course.width_px
+        return np.asarray(self.course.pixels + away[:, None] * self.course.normals)
+
+    @property
+    def share(self) -> float:
+        """Of the places looked at, the share where paint was found."""
+        return float(np.mean(self.found)) if len(self.found) else 0.0
+
+
+def search(grey: Grey, course: Course, reach_px: float, spare_px: float = 0.0) -> tuple[Array, Array]:
+    """Where along the normals there is most likely paint: offsets (N,) px, and how much brighter it is, grey levels.
+
+    Args:
+        reach_px: how far to look to either side. spare_px: of two lines alike the one nearer than by this is taken.
+    """
+    if not len(course):
+        return np.empty(0), np.empty(0)
+    far = reach_px + float(np.max(course.width_px)) + _BAND_PX + 2.0
+    steps = np.arange(-np.ceil(far / _SEARCH_STEP_PX), np.ceil(far / _SEARCH_STEP_PX) + 1.0) * _SEARCH_STEP_PX
+    light = np.mean([_along_normals(grey, course, steps, shift) for shift in (-2.0, 0.0, 2.0)], axis=0)
+    total = np.cumsum(np.column_stack([np.zeros(len(light)), light]), axis=1)
+
+    def mean(low: Array, high: Array) -> Array:
+        """(N, S) mean light from `low` to `high` (N,) px beyond each step."""
+        first, last = (np.round(edge / _SEARCH_STEP_PX).astype(int) for edge in (low, high))
+        places = np.arange(len(steps))
+        a = np.clip(places + first[:, None], 0, len(steps) - 1)
+        b = np.clip(places + np.maximum(last, first + 1)[:, None], a + 1, len(steps))
+        rows = np.arange(len(light))[:, None]
+        return np.asarray((total[rows, b] - total[rows, a]) / (b - a))
+
+    half = 0.5 * np.maximum(course.width_px, 1.0)
+    left, right = mean(-half - 1.0 - _BAND_PX, -half - 1.0), mean(half + 1.0, half + 1.0 + _BAND_PX)
+    response = mean(-half, half) - np.maximum(left, right)
+    response[:, np.abs(steps) > reach_px] = -np.inf
+    preference = response * np.exp(-0.5 * (steps / spare_px) ** 2) if spare_px > 0.0 else response
+    best = np.argmax(preference, axis=1)
+    return steps[best], response[np.arange(len(best)), best]
+
+
+def _along_normals(grey: Grey, course: Course, steps: Array, shift_px: float) -> Array:
+    tangents = np.column_stack([course.normals[:, 1], -course.normals[:, 0]])
+    start = course.pixels + shift_px * tangents
+    x = start[:, 0, None] + steps * course.normals[:, 0, None]
+    y = start[:, 1, None] + steps * course.normals[:, 1, None]
+    flags, border = cv2.INTER_LINEAR, cv2.BORDER_REPLICATE
+    return np.asarray(cv2.remap(grey, x.astype(np.float32), y.astype(np.float32), flags, borderMode=border), float)
+
+
+def measure(grey: Grey, course: Course, reach_px: float) -> Lines:
+    """Measure the paint at every place of a course, whose windows hold no other paint (see `courses.clear_px`).
+
+    Args:
+        reach_px: how far the course may be off.
+    """
+    rough, bright = search(grey, course, reach_px)
+    places = course.pixels + rough[:, None] * course.normals
+    half_length = 0.5 * course.width_px + _BEYOND_PX
+    windows = cut_windows(grey, places, course.normals, course.curvature, _usual_length(half_length), HALF_WIDTH_PX)
+    edges = np.column_stack([-0.5 * course.width_px, 0.5 * course.width_px])
+    blur, stretch = _shape(windows, edges, bright)
+    fits = fit_profiles(windows, stretch * edges, blur, 1.5)
+    contrast = np.minimum(fits.heights[:, 0], -fits.heights[:, 1])
+    offset = rough + fits.offset_px
+    found = _is_paint(course, fits, contrast)
+    found = _goes_on(course, found, offset, fits.sigma_px)
+    factor = _scatter(course, found, offset, fits.sigma_px)
+    found = _goes_on(course, found, offset, factor * fits.sigma_px)
+    return Lines(
+        course,
+        found,
+        np.where(found, offset, np.nan),
+        factor * fits.sigma_px,
+        contrast,
+        blur,
+        stretch,
+    )
+
+
+def window_px(course: Course) -> Array:
+    """(N,) how far from a place its window may reach: other paint must be farther away."""
+    return np.asarray(1.2 * (course.width_px + _BEYOND_PX) + HALF_WIDTH_PX)
+
+
+def _usual_length(half_length: Array) -> float:
+    return float(np.quantile(half_length, 0.9)) if len(half_length) else _BEYOND_PX
+
+
+def _shape(windows: Windows, edges: Array, bright: Array) -> tuple[float, float]:
+    """Blur and stretch, from the clearest windows."""
+    rows = np.flatnonzero(windows.inside)
+    if not len(rows):
+        return 1.0, 1.0
+    limit = 0.5 * np.quantile(bright[rows], 0.8)
+    rows = rows[bright[rows] >= limit]
+    rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), _SHAPE_WINDOWS)).astype(int)]
+    some = Windows(windows.values[rows], windows.distance[rows], windows.inside[rows])
+    return fit_shape(some, edges[rows], 1.0)
+
+
+def _is_paint(course: Course, fits: Profiles, contrast: Array) -> Mask:
+    """Where the window shows a bright line: on both sides darker, by as much as elsewhere, and nothing else in it."""
+    fitted = np.isfinite(fits.offset_px)
+    if not np.any(fitted):
+        return fitted
+    clear = fitted & (contrast > _LEAST_CLARITY * fits.noise)
+    if not np.any(clear):
+        return clear
+    usual = float(np.median(contrast[clear]))
+    clear &= contrast > _LEAST_CONTRAST * usual
+    clear &= contrast > _LEAST_OF_NEARBY * _medians(np.where(clear, contrast, np.nan), course.curve)
+    return np.asarray(clear & (fits.noise < _NOISY * np.median(fits.noise[clear])))
+
+
+def _neighbours(values: Array, curve: NDArray[np.int32]) -> Array:
+    """(N, 2 * _NEARBY) the values of the places before and after on the same curve, NaN where there are none."""
+    count = len(values)
+    steps = np.array([step for step in range(-_NEARBY, _NEARBY + 1) if step != 0])
+    rows = np.arange(count)[:, None] + steps
+    there = np.clip(rows, 0, max(count - 1, 0))
+    same = (rows >= 0) & (rows < count) & (curve[there] == curve[:, None])
+    return np.where(same, values[there], np.nan)
+
+
+def _medians(values: Array, curve: NDArray[np.int32]) -> Array:
+    """(N,) the median of each place's neighbours, its own value where there are none."""
+    around = np.column_stack([_neighbours(values, curve), values])
+    around[np.all(np.isnan(around), axis=1), 0] = 0.0
+    return np.asarray(np.nanmedian(around, axis=1))
+
+
+def _goes_on(course: Course, found: Mask, offset: Array, sigma: Array) -> Mask:
+    """Of the places found, those that lie where their neighbours say; a place without any is not believed."""
+    around = _neighbours(np.where(found, offset, np.nan), course.curve)
+    alone = np.count_nonzero(np.isfinite(around), axis=1) < 2
+    around[np.all(np.isnan(around), axis=1), 0] = 0.0
+    middle = np.nanmedian(around, axis=1)
+    # Paint that wanders is still paint: what its neighbours do among themselves, it may do too.
+    wander = np.nanmedian(np.abs(around - middle[:, None]), axis=1) / 0.6745
+    near = np.abs(offset - middle) < np.maximum(np.maximum(_FAR * sigma, _FAR_PX), _WANDERING * wander)
+    return np.asarray(found & near & ~alone)
+
+
+def _scatter(course: Course, found: Mask, offset: Array, sigma: Array) -> float:
+    """The factor on sigma that makes it what the offsets of three places in a row tell of their scatter.
+
+    Carpet, wear and compression are not white noise, which is all that a window knows.
+    """
+    middle = np.flatnonzero(found[:-2] & found[1:-1] & found[2:] & (course.curve[:-2] == course.curve[2:])) + 1
+    if len(middle) < 20:
+        return 1.0
+    change = offset[middle - 1] - 2.0 * offset[middle] + offset[middle + 1]
+    spread = np.sqrt(sigma[middle - 1] ** 2 + 4.0 * sigma[middle] ** 2 + sigma[middle + 1] ** 2)
+    return float(np.clip(np.median(np.abs(change) / spread) / 0.6745, *_FACTOR_RANGE))

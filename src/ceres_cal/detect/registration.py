@@ -1,0 +1,88 @@
+"""From a start that is far off: which shift, turn and scale of what a camera should see lies best on the bright lines.
+
+A photograph is reduced to how near each pixel is to something thin and bright; thousands of shifts are tried on that.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import product
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ceres_cal.detect.courses import Course
+from ceres_cal.detect.profiles import Grey
+from ceres_cal.transforms import Array
+
+_REDUCED = 4
+_NEAR_PX = 8.0
+_SPECK_PX = 25  # fewer connected pixels are no line
+_TURNS_DEG = np.arange(-7.5, 7.6, 1.25)
+_SCALES = (0.92, 1.0, 1.08)
+_APART_PX = 25.0
+
+
+@dataclass(frozen=True, eq=False)
+class Nearness:
+    """(H, W) a photograph's nearness to bright lines, 1 on them and 0 far off, `reduced` times smaller."""
+
+    plane: NDArray[np.float32]
+    reduced: int = _REDUCED
+
+    def score(self, pixels: Array) -> float:
+        """Mean nearness of places (N, 2) px; those outside the image count as far off."""
+        return float(np.mean(self._at(pixels[:, 0], pixels[:, 1])))
+
+    def _at(self, x: Array, y: Array) -> Array:
+        column, row = (np.round((v + 0.5) / self.reduced - 0.5) for v in (x, y))
+        height, width = self.plane.shape
+        inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)  # False for NaN
+        places = np.where(inside, row, 0).astype(np.intp), np.where(inside, column, 0).astype(np.intp)
+        return np.where(inside, self.plane[places], 0.0)
+
+
+def nearness(grey: Grey, width_px: float) -> Nearness:
+    """How near each pixel is to something brighter than its surroundings and about `width_px` wide, or less."""
+    soft = cv2.GaussianBlur(grey, (0, 0), 0.8)
+    size = 2 * int(np.ceil(width_px) + 2) + 1
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
+    bright = cv2.morphologyEx(soft, cv2.MORPH_TOPHAT, kernel)
+    limit = max(0.3 * float(np.quantile(bright, 0.99)), 4.0 * float(np.median(bright)))
+    mask = (bright > limit).astype(np.uint8)
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
+    kept = stats[:, cv2.CC_STAT_AREA] >= _SPECK_PX
+    kept[0] = False
+    if not np.any(kept):
+        return Nearness(np.zeros((mask.shape[0] // _REDUCED, mask.shape[1] // _REDUCED), np.float32))
+    away = cv2.distanceTransform(1 - kept[labels].astype(np.uint8), cv2.DIST_L2, 3)
+    near = np.exp(-0.5 * (away / _NEAR_PX) ** 2).astype(np.float32)
+    reduced = cv2.resize(near, (mask.shape[1] // _REDUCED, mask.shape[0] // _REDUCED), interpolation=cv2.INTER_AREA)
+    return Nearness(np.asarray(reduced, dtype=np.float32))
+
+
+def shifted(course: Course, near: Nearness, image_size: tuple[int, int], reach_px: float, most: int) -> list[Array]:
+    """The best places (N, 2) px for a course that may be off by `reach_px` and some degrees: each a shift, turn and
+    scale of its pixels about the image's middle, the best first, `most` at most.
+    """
+    middle = 0.5 * np.array(image_size)
+    steps = np.arange(-reach_px, reach_px + 1.0, 2.5 * near.reduced)
+    away, found = course.pixels - middle, []
+    for turn, scale in product(np.deg2rad(_TURNS_DEG), _SCALES):
+        cosine, sine = scale * np.cos(turn), scale * np.sin(turn)
+        turned = middle + away @ np.array([[cosine, sine], [-sine, cosine]])
+        score = np.empty((len(steps), len(steps)))
+        for row, dy in enumerate(steps):
+            score[row] = near._at(turned[:, 0] + steps[:, None], turned[:, 1] + dy).mean(axis=1)
+        best = int(np.argmax(score))
+        shift = np.array([steps[best % len(steps)], steps[best // len(steps)]])
+        found.append((float(score.flat[best]), turned + shift))
+    found.sort(key=lambda one: -one[0])
+    chosen: list[Array] = []
+    for _, places in found:
+        if all(np.mean(np.linalg.norm(places - other, axis=1)) > _APART_PX for other in chosen):
+            chosen.append(places)
+        if len(chosen) == most:
+            break
+    return chosen

@@ -1,0 +1,370 @@
+"""The paper's concentric rings (section 2) from a photograph: sub-pixel edges along rays from a centre that is found.
+
+The light's gradient points to or from the centre everywhere on the rings, whatever the lens does along the radius.
+From the centre outwards each ring's edge is followed on all rays at once and smoothed, so that a ray that misses an
+edge (a shadow, a hand) does not shift the count of those beyond it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ceres_cal.detect.boards import read_grey
+from ceres_cal.detect.profiles import Grey, Windows, cut_windows, fit_profiles, fit_shape
+from ceres_cal.errors import InputError
+from ceres_cal.observations import Curves, Observations, Points, View
+from ceres_cal.targets import Target, rings
+from ceres_cal.transforms import Array
+
+TARGET_NAME = "rings"
+RAYS = 360
+_STEP_PX = 0.5
+_FEWEST_RAYS = 0.25  # share of the rays on which a ring must be seen (of those that reach it inside the image)
+_HARMONICS = 3  # of a ring's radius over its angle: what tilt and a centre beside the axis make of it
+_HALF_LENGTH_PX, _HALF_WIDTH_PX = 5.0, 2
+_LEAST_SPACING_PX = 3.0
+_LEAST_CONTRAST = 8.0  # times the noise
+_NOISY = 3.0  # times the usual misfit of a window: something else is in it
+_FAR = 5.0  # times the usual distance from the ring's smooth course
+_MOST_MISFIT = 0.004  # of the largest radius; rings counted wrongly by one make more of it
+
+
+@dataclass(frozen=True, eq=False)
+class RingsDetection:
+    """What `detect_rings` found.
+
+    Attributes:
+        observations: one view, its edges as curve observations.
+        centre: (2,) px, where the rings' common centre is seen.
+        found: number of rings, from the inside out; those beyond are outside the image.
+        polynomial: (3,) the paper's a1, a2, a3 (section 2), r' in units of the first ring's measured radius per its
+            real one: r' = a1 r + a2 r^2 + a3 r^3 px.
+        rms_px: of the rings' radii about that polynomial, in measured pixels.
+        blur_px: standard deviation of the picture's blur, lens and pixel together.
+    """
+
+    observations: Observations
+    centre: Array
+    found: int
+    polynomial: Array
+    rms_px: float
+    blur_px: float
+
+
+def detect_rings(
+    image: str | Path, radii_m: Sequence[float], camera: str = "camera", station: str | None = None
+) -> RingsDetection:
+    """Edges of concentric rings in a photograph that shows them about from the front.
+
+    `sigma_px` of each observation is that of its own fit to the pixels, times a factor that makes the scatter from
+    ring to ring's smooth course what it is.
+
+    Args:
+        image: a file of any kind OpenCV reads.
+        radii_m: of the edges between dark and bright, from the inside out; those outside the image need not be seen.
+
+    Raises:
+        InputError: not an image, no rings in it, or other rings than the radii tell; the message names the file.
+    """
+    sheet = rings(radii_m)
+    grey = read_grey(image).astype(np.float32)
+    try:
+        centre = _centre(grey)
+        tracks = _follow(grey, centre, len(radii_m))
+        edges, blur = _measured(grey, centre, tracks)
+        _require_all_seen(grey, centre, tracks, len(radii_m))
+        polynomial, rms = _polynomial(edges, centre, np.array(sheet.spec["radii_m"]))
+    except InputError as error:
+        raise InputError(f"{image}: {error}") from None
+    observations = _observations(edges, sheet, grey, Path(image).stem, camera, station or camera)
+    # The first ring's own middle: farther out, tilt makes the gradients miss the centre.
+    own = tracks[0].series[[1, 1 + _HARMONICS]]
+    return RingsDetection(observations, centre + own, len(tracks), polynomial, rms, blur)
+
+
+# ---- the centre -----------------------------------------------------------------------------------------------------
+
+
+def _centre(grey: Grey) -> Array:
+    """Where the gradients' lines meet, (2,) px: by votes on a grid, then by least squares."""
+    soft = cv2.GaussianBlur(grey, (0, 0), 1.5)
+    gradient = np.dstack([cv2.Sobel(soft, cv2.CV_32F, 1, 0), cv2.Sobel(soft, cv2.CV_32F, 0, 1)]).astype(float)
+    strength = np.hypot(gradient[..., 0], gradient[..., 1])
+    strong = np.argwhere(strength > 0.3 * np.quantile(strength, 0.99))
+    if not len(strong) or strength.max() < 1e-3:
+        raise InputError("no rings found: the picture has no edges: take it in better light")
+    chosen = strong[np.random.default_rng(0).permutation(len(strong))[:20_000]]
+    places = chosen[:, ::-1].astype(float)
+    direction = gradient[chosen[:, 0], chosen[:, 1]] / strength[chosen[:, 0], chosen[:, 1], None]
+    normal = np.column_stack([-direction[:, 1], direction[:, 0]])
+    centre = _voted(places[:2000], normal[:2000], grey.shape)
+    for scale in (20.0, 10.0, 5.0, 3.0, 3.0, 3.0, 3.0):
+        away = np.sum((places - centre) * normal, axis=1)
+        weight = 1.0 / (1.0 + (away / scale) ** 2) ** 2
+        weighted = normal * weight[:, None]
+        centre = centre + np.linalg.solve(weighted.T @ normal + 1e-9 * np.eye(2), weighted.T @ away)
+    share = float(np.mean(np.abs(np.sum((places - centre) * normal, axis=1)) < 6.0))
+    if share < 0.3:
+        raise InputError(
+            "no concentric rings found: edges point to no common centre: let the rings fill most of the picture"
+        )
+    return np.asarray(centre)
+
+
+def _voted(places: Array, normal: Array, shape: tuple[int, ...]) -> Array:
+    step = max(shape) / 60.0
+    y, x = np.mgrid[0.0 : shape[0] : step, 0.0 : shape[1] : step]
+    grid = np.column_stack([x.ravel(), y.ravel()])
+    away = np.abs(grid @ normal.T - np.sum(places * normal, axis=1))
+    return np.asarray(grid[np.argmax(np.sum(away < step, axis=1))])
+
+
+# ---- following ring after ring --------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class _Track:
+    """A ring's edge around the centre: its radius over the angle as a Fourier series, and which way it steps."""
+
+    series: Array
+    rises: bool
+
+    def radius(self, angle: Array) -> Array:
+        return np.asarray(_waves(angle) @ self.series)
+
+
+def _waves(angle: Array) -> Array:
+    """(N, 1 + 2 harmonics) 1, cos, cos 2, ..., sin, sin 2, ..."""
+    orders = np.arange(1, _HARMONICS + 1) * angle[:, None]
+    return np.column_stack(
+        [np.ones(len(angle)), *np.hsplit(np.cos(orders), _HARMONICS), *np.hsplit(np.sin(orders), _HARMONICS)]
+    )
+
+
+def _follow(grey: Grey, centre: Array, most: int) -> list[_Track]:
+    """The rings' edges from the inside out, `most` at most, as far as enough rays show them.
+
+    One more than `most` is an error.
+    """
+    angle = 2.0 * np.pi * np.arange(RAYS) / RAYS
+    slope, reach = _slopes(grey, centre, angle)
+    limit = 0.25 * float(np.quantile(np.abs(slope[np.isfinite(slope)]), 0.995))
+    tracks: list[_Track] = []
+    while True:
+        inner = tracks[-1].radius(angle) + 1.5 if tracks else np.full(RAYS, 2.0)
+        before = _next_edges(slope, inner, limit, None if not tracks else not tracks[-1].rises)
+        track = _smooth(before, angle, reach)
+        if track is None:
+            break
+        if len(tracks) == most:
+            raise InputError(f"more than {most} rings found, for {most} radii: give the radius of every edge")
+        if tracks and np.median(track.radius(angle) - tracks[-1].radius(angle)) < _LEAST_SPACING_PX:
+            break
+        tracks.append(track)
+    if len(tracks) < min(3, most):
+        raise InputError(f"only {len(tracks)} rings found around ({centre[0]:.0f}, {centre[1]:.0f}): 3 are needed")
+    return tracks
+
+
+def _slopes(grey: Grey, centre: Array, angle: Array) -> tuple[Array, Array]:
+    """(RAYS, N) change of the light along each ray, NaN outside the image, and (RAYS,) how far it stays inside, px."""
+    height, width = grey.shape
+    steps = np.arange(0.0, float(np.hypot(height, width)), _STEP_PX)
+    x = centre[0] + np.cos(angle)[:, None] * steps
+    y = centre[1] + np.sin(angle)[:, None] * steps
+    soft = cv2.GaussianBlur(grey, (0, 0), 0.8)
+    light = cv2.remap(
+        soft, x.astype(np.float32), y.astype(np.float32), cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE
+    )
+    inside = (x >= 2.0) & (x <= width - 3.0) & (y >= 2.0) & (y <= height - 3.0)
+    inside = np.logical_and.accumulate(inside, axis=1)
+    slope = np.gradient(light.astype(float), _STEP_PX, axis=1)
+    return np.where(inside, slope, np.nan), np.sum(inside, axis=1) * _STEP_PX
+
+
+def _next_edges(slope: Array, inner: Array, limit: float, rises: bool | None) -> tuple[Array, bool]:
+    """(RAYS,) radius of the first edge beyond `inner` on each ray, NaN without one, and whether edges rise.
+
+    Args:
+        rises: whether light must grow outwards there; None: as most rays have it.
+    """
+    if rises is None:
+        up, down = (_next_edges(slope, inner, limit, sign)[0] for sign in (True, False))
+        rises = bool(np.nanmedian(up) < np.nanmedian(down))
+    signed = np.nan_to_num(slope if rises else -slope)
+    peak = np.zeros(signed.shape, dtype=bool)
+    middle = signed[:, 1:-1]
+    peak[:, 1:-1] = (middle > limit) & (middle >= signed[:, :-2]) & (middle > signed[:, 2:])
+    peak &= np.arange(signed.shape[1]) * _STEP_PX > inner[:, None]
+    first = np.argmax(peak, axis=1)
+    return np.where(peak.any(axis=1), first * _STEP_PX, np.nan), rises
+
+
+def _smooth(found: tuple[Array, bool], angle: Array, reach: Array) -> _Track | None:
+    """The smooth course of most of the edges; None where too few rays have one."""
+    radius, rises = found
+    seen = np.isfinite(radius)
+    if np.count_nonzero(seen) < 8:
+        return None
+    usual = float(np.median(radius[seen]))
+    used = seen & (np.abs(radius - usual) < 0.15 * usual + 2.0)
+    waves, series = _waves(angle), np.zeros(1 + 2 * _HARMONICS)
+    pull = np.diag([0.0] + [1e-2] * (2 * _HARMONICS)) * RAYS  # stretches without an edge must not swing
+    for limit in (6.0, 3.0, 2.0, 2.0, 2.0):
+        if np.count_nonzero(used) < 8:
+            return None
+        rows = waves[used]
+        series = np.linalg.solve(rows.T @ rows + pull, rows.T @ radius[used])
+        used = seen & (np.abs(radius - waves @ series) < limit)
+    could = reach > waves @ series + 3.0
+    enough = np.count_nonzero(used & could) >= max(_FEWEST_RAYS * np.count_nonzero(could), 12)
+    return _Track(series, rises) if enough else None
+
+
+def _require_all_seen(grey: Grey, centre: Array, tracks: Sequence[_Track], expected: int) -> None:
+    """Raise InputError where a ring is missing whose place would be well inside the image."""
+    if len(tracks) == expected:
+        return
+    means = np.array([track.series[0] for track in tracks])
+    following = means[-1] + (means[-1] - means[-2])
+    angle = 2.0 * np.pi * np.arange(RAYS) / RAYS
+    place = centre + following * np.column_stack([np.cos(angle), np.sin(angle)])
+    inside = np.all((place > 5.0) & (place < np.array(grey.shape[::-1]) - 6.0), axis=1)
+    if np.mean(inside) > 0.5:
+        raise InputError(
+            f"{len(tracks)} rings found, but {expected} radii were given: give the radius of every edge in the picture"
+        )
+
+
+# ---- measuring ------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class _Edges:
+    """Measured edges: number of the ring (from 0), pixels (N, 2), sigma_px (N,), radius from the centre (N,) px."""
+
+    ring: NDArray[np.int32]
+    pixels: Array
+    sigma_px: Array
+    radius: Array
+
+
+def _measured(grey: Grey, centre: Array, tracks: Sequence[_Track]) -> tuple[_Edges, float]:
+    angle = 2.0 * np.pi * np.arange(RAYS) / RAYS
+    radii = np.array([track.radius(angle) for track in tracks])
+    # A window ends before the next edge begins, and neighbouring windows of a ring do not overlap.
+    gap = np.min(np.diff(np.vstack([np.zeros(RAYS), radii, 2.0 * radii[-1] - radii[-2]]), axis=0), axis=1)
+    parts, blurs = [], []
+    for number, (track, mean) in enumerate(zip(tracks, radii, strict=True)):
+        every = max(1, int(np.ceil((2 * _HALF_WIDTH_PX + 2) * RAYS / (2.0 * np.pi * float(mean.min())))))
+        half = min(_HALF_LENGTH_PX, 0.5 * float(min(gap[number], gap[number + 1])) - 0.5)
+        found = _measured_ring(grey, centre, track, angle[::every], max(half, 2.0))
+        blurs.append(found[2])
+        parts.append((np.full(len(angle[::every]), number, np.int32), *found[:2]))
+    ring, pixels, sigma = (np.concatenate(column) for column in zip(*parts, strict=True))
+    radius = np.linalg.norm(pixels - centre, axis=1)
+    kept = _usual(ring, radius, sigma, np.arctan2(*(pixels - centre).T[::-1]))
+    return _Edges(ring[kept[0]], pixels[kept[0]], sigma[kept[0]] * kept[1], radius[kept[0]]), float(np.median(blurs))
+
+
+def _measured_ring(
+    grey: Grey, centre: Array, track: _Track, angle: Array, half_length_px: float
+) -> tuple[Array, Array, float]:
+    """Pixels (N, 2), NaN where there is no edge, their sigmas, and the blur."""
+    radius = track.radius(angle)
+    outward = np.column_stack([np.cos(angle), np.sin(angle)])
+    places = centre + radius[:, None] * outward
+    windows = cut_windows(grey, places, outward, -1.0 / radius, half_length_px, _HALF_WIDTH_PX)
+    edge = np.zeros((len(angle), 1))
+    inside = np.flatnonzero(windows.inside)
+    some = Windows(windows.values[inside], windows.distance[inside], windows.inside[inside])
+    if not len(inside):
+        return np.full((len(angle), 2), np.nan), np.full(len(angle), np.inf), np.nan
+    blur, _ = fit_shape(some, edge[inside], 1.0)
+    fits = fit_profiles(windows, edge, blur, 0.5 * half_length_px)
+    height = fits.heights[:, 0] * (1.0 if track.rises else -1.0)
+    clear = height > np.maximum(_LEAST_CONTRAST * fits.noise, 0.3 * np.median(height[inside]))
+    clear |= height > 0.7 * np.median(height[inside])
+    clear &= fits.noise < _NOISY * np.median(fits.noise[inside])
+    offset = np.where(clear, fits.offset_px, np.nan)
+    return places + offset[:, None] * outward, fits.sigma_px, blur
+
+
+def _usual(ring: NDArray[np.int32], radius: Array, sigma: Array, angle: Array) -> tuple[NDArray[np.bool_], float]:
+    """Which edges lie on the smooth course of their ring, and the factor on sigma that their scatter tells."""
+    kept, pulls = np.isfinite(radius), [np.zeros(0)]
+    for number in range(int(ring.max()) + 1):
+        rows = np.flatnonzero(kept & (ring == number))
+        columns = 1 + 2 * min(_HARMONICS, max((len(rows) - 4) // 4, 0))
+        order = [0, *(i for k in range((columns - 1) // 2) for i in (1 + k, 1 + _HARMONICS + k))]
+        used = rows
+        for _ in range(4):
+            if len(used) <= columns:
+                break
+            waves = _waves(angle[rows])[:, order]
+            inside = np.isin(rows, used)
+            series = np.linalg.lstsq(waves[inside] / sigma[used, None], radius[used] / sigma[used], rcond=None)[0]
+            pull = (radius[rows] - waves @ series) / sigma[rows]
+            spread = max(float(np.median(np.abs(pull[inside]))) / 0.6745, 0.3)
+            used = rows[np.abs(pull) < _FAR * spread]
+        kept[rows] = np.isin(rows, used) if len(used) > columns else False
+        if len(used) > columns:
+            pulls.append(pull[np.isin(rows, used)] * np.sqrt(len(used) / (len(used) - columns)))
+    every = np.concatenate(pulls)
+    if not len(every):
+        raise InputError("no ring could be measured: the picture is too blurred or too noisy")
+    return kept, float(np.sqrt(np.mean(every**2)))
+
+
+# ---- the paper's polynomial, and observations -----------------------------------------------------------------------
+
+
+def _polynomial(edges: _Edges, centre: Array, radii_m: Array) -> tuple[Array, float]:
+    """The paper's fit (section 2) to all edges, and its rms in measured pixels.
+
+    Tilt, and a centre beside the lens's axis, add what goes round once or twice: it is fitted along with the
+    polynomial, or rings of which the image shows only a part would pull it aside.
+    """
+    inner = edges.ring == edges.ring.min()
+    unit = float(np.max(edges.radius))
+    ring = radii_m[edges.ring] * float(np.mean(edges.radius[inner])) / radii_m[edges.ring.min()]
+    angle, share = np.arctan2(*(edges.pixels - centre).T[::-1]), edges.radius / unit
+    once = np.power.outer(share, np.arange(6))
+    twice = np.power.outer(share, np.arange(1, 5))
+    turning = [
+        wave[:, None] * powers
+        for n, powers in ((1, once), (2, twice))
+        for wave in (np.cos(n * angle), np.sin(n * angle))
+    ]
+    basis = np.column_stack([np.power.outer(share, [1, 2, 3]), *turning])
+    solution = np.linalg.lstsq(basis, ring, rcond=None)[0]
+    polynomial = solution[:3] / unit ** np.array([1.0, 2.0, 3.0])
+    slope = np.power.outer(edges.radius, [0, 1, 2]) @ (polynomial * (1.0, 2.0, 3.0))
+    misfit = (basis @ solution - ring) / slope
+    worst = max(abs(float(np.median(misfit[edges.ring == number]))) for number in np.unique(edges.ring))
+    if worst > _MOST_MISFIT * unit:
+        raise InputError(
+            f"the {len(np.unique(edges.ring))} rings found do not have these radii (no smooth lens fits: one is "
+            f"{worst:.1f} px off): give the radius of every edge between dark and bright, from the inside out"
+        )
+    rms = float(np.sqrt(np.mean(misfit**2)))
+    return polynomial, rms
+
+
+def _observations(edges: _Edges, sheet: Target, grey: Grey, frame: str, camera: str, station: str) -> Observations:
+    count = len(edges.ring)
+    none = np.empty(0, dtype=np.int32)
+    size = (int(grey.shape[1]), int(grey.shape[0]))
+    return Observations(
+        {TARGET_NAME: sheet},
+        {camera: size},
+        (View(frame, camera, station, TARGET_NAME, frame),),
+        Points(none, none, np.empty((0, 2)), np.empty(0)),
+        Curves(np.zeros(count, np.int32), edges.ring, edges.pixels, edges.sigma_px, np.zeros(count, np.int8)),
+    )

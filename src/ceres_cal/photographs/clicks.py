@@ -1,0 +1,112 @@
+"""A start from points that somebody showed: their pixels, roughly, and which cameras they may belong to."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from ceres_cal.camera import Camera
+from ceres_cal.closed_forms import homography_from_points, orthogonality_error, polar_pose
+from ceres_cal.errors import DegenerateError, InputError
+from ceres_cal.files import check_header, convert, read_json
+from ceres_cal.lens import Radial
+from ceres_cal.observations import Prior
+from ceres_cal.photographs.follow import Freedom
+from ceres_cal.photographs.refit import CAMERA, Shown
+from ceres_cal.targets import Target
+from ceres_cal.transforms import Array
+
+FORMAT, VERSION = "ceres-cal/corners", 1
+SIGMA_PX = 15.0
+FEWEST = 4
+_STRETCHES = (1.0, 1.06, 1.14, 1.25, 1.4)  # of the image's corner by the lens
+_PHI = np.geomspace(0.5, 3.0, 40)  # in half image diagonals
+_PHI_GUESS, _PHI_FACTOR = 1.3, 2.0
+_FREED = ("a3", "phi", "a2", "cx", "cy", "a4", "a5")
+_SQUARE = 0.02  # how square clicks are good to make the axes
+
+
+@dataclass(frozen=True)
+class Clicks:
+    """Pixels of named points of a target, good to some 15 px; they may lie outside the image."""
+
+    points: Mapping[str, tuple[float, float]]
+
+    def __post_init__(self) -> None:
+        if len(self.points) < FEWEST:
+            raise InputError(f"{FEWEST} points are needed to start from, not {len(self.points)}: show more corners")
+        if not np.all(np.isfinite(list(self.points.values()))):
+            raise InputError("a point to start from has a number that is not finite")
+
+
+class _ClicksFile(msgspec.Struct, forbid_unknown_fields=True):
+    format: str
+    version: int
+    points: dict[str, tuple[float, float]]
+
+
+def load_clicks(path: str | Path) -> Clicks:
+    """A file `{"format": "ceres-cal/corners", "version": 1, "points": {"TopLeftCorner": [x, y], ...}}`.
+
+    Raises:
+        InputError: one line that names the file.
+    """
+    return clicks_from_json(read_json(path, FORMAT, VERSION), str(path))
+
+
+def clicks_from_json(data: Mapping[str, Any], where: str) -> Clicks:
+    """The clicks that a file describes; InputError that names `where`."""
+    file = convert(check_header(data, where, FORMAT, VERSION), _ClicksFile, where)
+    try:
+        return Clicks(file.points)
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from None
+
+
+def starts_from_clicks(clicks: Clicks, target: Target, image_size: tuple[int, int]) -> tuple[list[Camera], Freedom]:
+    """Posed cameras of several lenses that the clicks may belong to, and what is free to be told by the photograph.
+
+    Raises:
+        InputError: a point that the target does not have, or points of which three lie on a line.
+    """
+    for name in clicks.points:
+        if name not in target.points:
+            raise InputError(f"point {name!r} is not one of the target's: `ceres-cal targets` lists the names")
+    index = np.array([target.point_names.index(name) for name in clicks.points], dtype=np.int32)
+    pixels, plane = np.array(list(clicks.points.values()), dtype=float), target.point_array[index]
+    middle = 0.5 * (np.array(image_size) - 1.0)
+    half = 0.5 * float(np.hypot(*image_size))
+    cameras = []
+    for stretch in _STRETCHES:
+        lens = Radial((0.0, (stretch - 1.0) / half**2, 0.0, 0.0), (2, 3, 4, 5))
+        lifted = (pixels - middle) * (1.0 + lens.values[1] * np.sum((pixels - middle) ** 2, axis=1))[:, None]
+        try:
+            homography = homography_from_points(plane[:, :2], lifted)
+        except DegenerateError as error:
+            raise InputError(f"the points to start from tell no pose: {error}") from None
+        phi = _phi(homography, half)
+        pose = polar_pose(np.diag([1.0 / phi, 1.0 / phi, 1.0]) @ homography)
+        if pose.position[2] < 0.0:
+            raise InputError("the points to start from go round the wrong way, as if seen from below: check names")
+        cameras.append(Camera(image_size, phi, (float(middle[0]), float(middle[1])), lens, 1.0, pose))
+    phi = float(np.median([camera.phi for camera in cameras]))
+    priors = (
+        Prior("camera", CAMERA, "phi", (phi,), (0.5 * phi,)),
+        Prior("camera", CAMERA, "principal_point", tuple(middle), (0.04 * image_size[0],) * 2),
+    )
+    freedom = Freedom(
+        ("a3", "phi", "a2", "cx", "cy", "a4", "a5"), priors, Shown(index, pixels, np.full(len(index), SIGMA_PX))
+    )
+    return cameras, freedom
+
+
+def _phi(homography: Array, half_px: float) -> float:
+    """The focal length that makes the field's axes square, held near what lenses have where the view is too frontal."""
+    error = orthogonality_error(homography[None], _PHI * half_px)[:, 0]
+    cost = (error / _SQUARE) ** 2 + (np.log(_PHI / _PHI_GUESS) / np.log(_PHI_FACTOR)) ** 2
+    return float(_PHI[np.argmin(cost)] * half_px)

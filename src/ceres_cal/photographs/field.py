@@ -1,0 +1,160 @@
+"""A field's painted lines, arcs, corners and crossings from photographs of one station, as observations."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ceres_cal.camera import Camera
+from ceres_cal.detect.boards import read_grey
+from ceres_cal.detect.crossings import Crossings, find_crossings
+from ceres_cal.detect.lines import Lines
+from ceres_cal.errors import InputError
+from ceres_cal.observations import Curves, Observations, Points, View, combine
+from ceres_cal.photographs.clicks import Clicks, starts_from_clicks
+from ceres_cal.photographs.follow import LEAST_SHARE, Followed, Freedom, follow
+from ceres_cal.targets import Target
+
+TARGET_NAME = "field"
+
+
+@dataclass(frozen=True, eq=False)
+class FieldDetections:
+    """What `detect_field` found.
+
+    Attributes:
+        observations: one view per image that shows the field.
+        found: path -> the camera that predicts its lines, and what was measured.
+        missed: path and reason of every other image.
+    """
+
+    observations: Observations
+    found: dict[str, Followed]
+    missed: tuple[tuple[str, str], ...]
+
+
+def detect_field(
+    images: Sequence[Path],
+    target: Target,
+    start: Camera | Clicks,
+    curves: Collection[str] | None = None,
+    camera: str = "camera",
+    station: str | None = None,
+    with_points: bool = True,
+    edges: bool = False,
+    progress: Callable[[int, int, str], None] | None = None,
+) -> FieldDetections:
+    """Painted lines, arcs, corners and crossings of a field in photographs that one camera took at one station.
+
+    Curve observations are of the paint's middle, at places whose windows share no pixel; `sigma_px` comes from the
+    pixels of each window, times a factor that the scatter from place to place tells. A point is where measured curves
+    meet; the places that told it are no curve observations besides.
+
+    Args:
+        images: files of any kind OpenCV reads, all of one size.
+        start: the station's camera before it was moved (by up to 130 px, or 5 degrees), or points that somebody showed.
+        curves: names of those that are painted; None: all of the target with a width.
+        with_points: else curve observations only. edges: both edges of the paint instead of its middle.
+        progress: called after each image with (images done, images in all, file name).
+
+    Raises:
+        InputError: an image cannot be read or has another size than the camera, a name that the target does not have,
+            or no image shows the field.
+    """
+    painted = _painted(target, curves)
+    paths = [Path(path) for path in images]
+    found: dict[str, Followed] = {}
+    crossings: dict[str, Crossings | None] = {}
+    missed: list[tuple[str, str]] = []
+    before: Followed | None = None
+    for number, path in enumerate(paths, start=1):
+        grey = read_grey(path).astype(np.float32)
+        size = (int(grey.shape[1]), int(grey.shape[0]))
+        starts, freedom = _starts(start, before, target, size, path)
+        followed = follow(grey, target, starts, painted, freedom)
+        if not followed.holds:
+            missed.append((str(path), _why_missed(followed, target)))
+        else:
+            found[str(path)] = before = followed
+            crossings[str(path)] = find_crossings(target, followed.camera, followed.lines) if with_points else None
+        if progress is not None:
+            progress(number, len(paths), path.name)
+    if not found:
+        raise InputError(f"no field in any of {len(paths)} images; {missed[0][0]}: {missed[0][1]}")
+    parts = [
+        _observations(path, one, crossings[path], target, (camera, station or camera), edges)
+        for path, one in found.items()
+    ]
+    return FieldDetections(combine(parts), found, tuple(missed))
+
+
+def _why_missed(followed: Followed, target: Target) -> str:
+    if followed.share >= LEAST_SHARE:
+        names = ", ".join(target.curve_names[number] for number in followed.absent)
+        return f"there is no {names} where they should be: say which lines are not painted, or check the dimensions"
+    return (
+        f"its lines were not found (paint at {100.0 * followed.share:.0f} % of where this start, moved, puts them): "
+        "check the target's dimensions and which lines are painted, or start from other points"
+    )
+
+
+def _painted(target: Target, curves: Collection[str] | None) -> tuple[str, ...]:
+    for name in curves or ():
+        if name not in target.curves:
+            raise InputError(f"curve {name!r} is not one of the target's: `ceres-cal targets` lists the names")
+    painted = tuple(n for n, curve in target.curves.items() if curve.width_m > 0.0 and (curves is None or n in curves))
+    if not painted:
+        raise InputError("the target has no painted curve: a line to be found needs a width")
+    return painted
+
+
+def _starts(
+    start: Camera | Clicks, before: Followed | None, target: Target, size: tuple[int, int], path: Path
+) -> tuple[list[Camera], Freedom]:
+    """The cameras to start from: the last image's, or the one given, or those that the clicks may belong to."""
+    if isinstance(start, Camera) and start.image_size != size:
+        raise InputError(
+            f"{path}: {size[0]} x {size[1]} px, but the camera has {start.image_size[0]} x {start.image_size[1]}: "
+            "start from a calibration of this camera"
+        )
+    if before is not None:
+        if before.camera.image_size != size:
+            raise InputError(f"{path}: {size[0]} x {size[1]} px, unlike the images before: give it on its own")
+        return [before.camera], Freedom()
+    return ([start], Freedom()) if isinstance(start, Camera) else starts_from_clicks(start, target, size)
+
+
+def _observations(
+    path: str, followed: Followed, met: Crossings | None, target: Target, names: tuple[str, str], edges: bool
+) -> Observations:
+    """One image's view: what its lines and crossings are, each pixel counted once."""
+    camera, station = names
+    none = np.empty(0, np.int32)
+    points = Points(none, none, np.empty((0, 2)), np.empty(0))
+    if met is not None:
+        points = Points(np.zeros(len(met.feature), np.int32), met.feature, met.pixels, met.sigma_px)
+    return Observations(
+        {TARGET_NAME: target},
+        {camera: followed.camera.image_size},
+        (View(Path(path).stem, camera, station, TARGET_NAME),),
+        points,
+        _curves(followed.lines, np.zeros(len(followed.lines.found), dtype=bool) if met is None else met.used, edges),
+    )
+
+
+def _curves(lines: Lines, used: NDArray[np.bool_], edges: bool) -> Curves:
+    """The middles of the paint, or both its edges, where they were found and are not used elsewhere."""
+    rows = np.flatnonzero(lines.found & ~used)
+    sides = (1, -1) if edges else (0,)
+    pixels = [lines.edge(side) if edges else lines.pixels for side in sides]
+    return Curves(
+        np.zeros(len(sides) * len(rows), np.int32),
+        np.tile(lines.course.curve[rows], len(sides)),
+        np.concatenate([places[rows] for places in pixels]),
+        np.tile(np.sqrt(len(sides)) * lines.sigma_px[rows], len(sides)),
+        np.repeat(np.array(sides, np.int8), len(rows)),
+    )
