@@ -11,11 +11,11 @@ from ceres_cal.baseline import four_point_baseline
 from ceres_cal.bundle import Progress, Solution, Weighting, private_placements, settle_placements, solve
 from ceres_cal.calibration import Calibration, Fit, Rejected
 from ceres_cal.camera import Camera
-from ceres_cal.diagnostics import Inliers, judge, start_weights
 from ceres_cal.errors import DegenerateError, SolutionError
 from ceres_cal.initialise import initialise
 from ceres_cal.lost import with_lost_boards_found
 from ceres_cal.mirrored import without_mirrored_poses
+from ceres_cal.noise import Inliers, judge, start_weights
 from ceres_cal.observations import Observations
 from ceres_cal.parameters import Estimate, Layout, Options, make_layout
 from ceres_cal.residuals import Residuals, residuals

@@ -10,8 +10,8 @@ import numpy as np
 
 from ceres_cal.bundle import Weighting, placement_costs, private_placements
 from ceres_cal.closed_forms import polar_pose
-from ceres_cal.diagnostics import Inliers
 from ceres_cal.mirrored import mirrored
+from ceres_cal.noise import Inliers
 from ceres_cal.parameters import Estimate, Layout
 from ceres_cal.planes import consensus_homography
 from ceres_cal.sights import Sights

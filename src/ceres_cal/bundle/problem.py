@@ -326,7 +326,7 @@ def _prior_blocks(layout: Layout, estimate: Estimate, blocks: _Blocks) -> Iterab
                 cost = PositionPriorCost(axes, np.asarray(prior.value), np.asarray(prior.sigma))
                 yield cost, blocks.stations[prior.name]
             continue
-        places, mean, sigma = _prior_on_intrinsics(prior, estimate, layout.free)
+        places, mean, sigma = prior_on_intrinsics(prior, estimate, layout.free)
         if len(places):
             array = blocks.cameras[prior.name]
             yield LinearPriorCost(places, mean, sigma, len(array)), array
@@ -336,7 +336,7 @@ def _prior_blocks(layout: Layout, estimate: Estimate, blocks: _Blocks) -> Iterab
         yield LinearPriorCost(every, np.zeros(len(sigma_m)), sigma_m, len(sigma_m)), blocks.structure
 
 
-def _prior_on_intrinsics(
+def prior_on_intrinsics(
     prior: Prior, estimate: Estimate, free: Mapping[str, NDArray[np.int64]]
 ) -> tuple[NDArray[np.int64], Array, Array]:
     """Places in the camera's block, mean and sigma in the solver's units; a number that is held needs no prior."""

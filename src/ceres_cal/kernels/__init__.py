@@ -7,6 +7,7 @@ from ceres_cal.kernels.information import sight_normals
 from ceres_cal.kernels.lenses import INTRINSICS, LENS_CODES
 from ceres_cal.kernels.losses import LOSS_CODES
 from ceres_cal.kernels.planes import plane_homographies
+from ceres_cal.kernels.rows import curve_rows, loss_weights, point_rows
 from ceres_cal.kernels.sight import curve_residuals, normal_equations, point_residuals
 
 __all__ = [
@@ -15,12 +16,15 @@ __all__ = [
     "LOSS_CODES",
     "cholesky",
     "curve_residuals",
+    "curve_rows",
     "eliminate_placements",
     "evaluate_block",
     "grouped_products",
     "grouped_scatter",
+    "loss_weights",
     "normal_equations",
     "plane_homographies",
     "point_residuals",
+    "point_rows",
     "sight_normals",
 ]

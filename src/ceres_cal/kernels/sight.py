@@ -14,13 +14,13 @@ from ceres_cal.kernels.jit import jit
 from ceres_cal.kernels.lenses import answer_limit, distort, intrinsics_rows, one_dimensional
 from ceres_cal.kernels.losses import robust
 
-_CHUNK = 112  # a board of a hundred corners at once, and all of it in the first cache
+CHUNK = 112  # a board of a hundred corners at once, and all of it in the first cache
 _FOOT_STEPS = 30
 _FOOT_TOLERANCE_PX = 1e-9
 
 
 @jit
-def _to_camera(n: int, pose: Any, points: Any, rotated: Any, rays: Any) -> None:
+def to_camera(n: int, pose: Any, points: Any, rotated: Any, rays: Any) -> None:
     """rotated = R X and rays = R X + t of points (3, n); pose is (3, 4), [R t]."""
     for j in range(3):
         for i in range(n):
@@ -29,7 +29,7 @@ def _to_camera(n: int, pose: Any, points: Any, rotated: Any, rays: Any) -> None:
 
 
 @jit
-def _pose_rows(n: int, first: int, aspect: float, rotated: Any, image: Any, jacobian: Any) -> None:
+def pose_rows(n: int, first: int, aspect: float, rotated: Any, image: Any, jacobian: Any) -> None:
     """Derivatives of the pixel with respect to a left perturbation of the pose: rotation, then translation."""
     for c in range(2):
         scale = 1.0 if c == 0 else aspect
@@ -59,7 +59,7 @@ def _on_curves(n: int, start: int, tracks: Any, is_arc: Any, track: Any, s: Any,
 
 
 @jit
-def _feet(
+def feet(
     lens: int, n: int, start: int, intrinsics: Any, dense: Any, unit: float, limit: float, pose: Any,
     tracks: Any, is_arc: Any, track: Any, pixels: Any, s: Any,
     points: Any, rotated: Any, rays: Any, image: Any, work: Any, foot: Any,
@@ -73,7 +73,7 @@ def _feet(
     aspect, cx, cy = intrinsics[1], intrinsics[2], intrinsics[3]
     for step in range(_FOOT_STEPS):
         _on_curves(n, start, tracks, is_arc, track, s, points, foot[8:])
-        _to_camera(n, pose, points, rotated, rays)
+        to_camera(n, pose, points, rotated, rays)
         if not distort(lens, n, intrinsics, dense, unit, limit, rays, image, work):
             return False
         worst = 0.0
@@ -183,12 +183,12 @@ def _add_points(
     last = len(rows) - 1
     local, rotated, rays, image, work = scratch[:3], scratch[3:6], scratch[6:9], scratch[9:16], scratch[16:21]
     cost = 0.0
-    for start in range(0, len(points), _CHUNK):
-        n = min(_CHUNK, len(points) - start)
+    for start in range(0, len(points), CHUNK):
+        n = min(CHUNK, len(points) - start)
         for i in range(n):
             for j in range(3):
                 local[j, i] = points[start + i, j]
-        _to_camera(n, pose, local, rotated, rays)
+        to_camera(n, pose, local, rotated, rays)
         if not distort(lens, n, intrinsics, dense, unit, limit, rays, image, work):
             return np.nan
         error_x, error_y = panel[last, :n], panel[last, n : 2 * n]
@@ -202,7 +202,7 @@ def _add_points(
             error_x[i], error_y[i] = root * dx, root * dy
             local[0, i] = root * w
         intrinsics_rows(lens, n, intrinsics, powers, unit, image, work, jacobian)
-        _pose_rows(n, len(intrinsics), intrinsics[1], rotated, image, jacobian)
+        pose_rows(n, len(intrinsics), intrinsics[1], rotated, image, jacobian)
         for k in range(last):
             own, x, y = jacobian[rows[k]], panel[k, :n], panel[k, n : 2 * n]  # whole rows: SIMD needs plain indices
             for i in range(n):
@@ -245,9 +245,9 @@ def _add_curves(
         scratch[:3], scratch[3:6], scratch[6:9], scratch[9:16], scratch[16:21], scratch[21:],
     )  # fmt: skip
     cost = 0.0
-    for start in range(0, len(pixels), _CHUNK):
-        n = min(_CHUNK, len(pixels) - start)
-        if not _feet(
+    for start in range(0, len(pixels), CHUNK):
+        n = min(CHUNK, len(pixels) - start)
+        if not feet(
             lens, n, start, intrinsics, dense, unit, limit, pose, tracks, is_arc, track, pixels, s,
             local, rotated, rays, image, work, foot,
         ):  # fmt: skip
@@ -262,7 +262,7 @@ def _add_curves(
             panel[last, i] = root * e
             local[0, i], local[1, i] = root * weights[start + i] * nx, root * weights[start + i] * ny
         intrinsics_rows(lens, n, intrinsics, powers, unit, image, work, jacobian)
-        _pose_rows(n, len(intrinsics), intrinsics[1], rotated, image, jacobian)
+        pose_rows(n, len(intrinsics), intrinsics[1], rotated, image, jacobian)
         for k in range(last):
             own, x = jacobian[rows[k]], panel[k]
             for i in range(n):
@@ -292,10 +292,10 @@ def layout_of_rows(free: Any, intrinsics: int, structure: int) -> tuple[Any, Any
 def working_space(intrinsics: int, rows: int) -> tuple[Any, Any, Any, Any]:
     """Where `normal_equations` works: the chunk's Jacobian, its weighted rows, their products, and what leads there."""
     return (
-        np.empty((intrinsics + 6, 2, _CHUNK)),
-        np.zeros((rows + 2, 2 * _CHUNK)),
+        np.empty((intrinsics + 6, 2, CHUNK)),
+        np.zeros((rows + 2, 2 * CHUNK)),
         np.empty((rows + 2, rows + 2)),
-        np.empty((32, _CHUNK)),
+        np.empty((32, CHUNK)),
     )
 
 
@@ -348,12 +348,12 @@ def point_residuals(
     residuals: Any,
 ) -> None:  # fmt: skip
     """project(X) - p in px, (N, 2), of the sights at poses (S, 3, 4); NaN where a point cannot be projected."""
-    scratch = np.empty((21, _CHUNK))
+    scratch = np.empty((21, CHUNK))
     dense = one_dimensional(lens, intrinsics, powers)
     limit = answer_limit(lens, dense)
     for v in range(len(poses)):
-        for start in range(bounds[v], bounds[v + 1], _CHUNK):
-            stop = min(start + _CHUNK, bounds[v + 1])
+        for start in range(bounds[v], bounds[v + 1], CHUNK):
+            stop = min(start + CHUNK, bounds[v + 1])
             if not _chunk_residuals(
                 start, stop, lens, intrinsics, dense, unit, limit, poses[v], points, pixels, scratch, residuals
             ):
@@ -374,7 +374,7 @@ def _chunk_residuals(
     for i in range(n):
         for j in range(3):
             scratch[j, i] = points[start + i, j]
-    _to_camera(n, pose, scratch[:3], scratch[3:6], scratch[6:9])
+    to_camera(n, pose, scratch[:3], scratch[3:6], scratch[6:9])
     if not distort(lens, n, intrinsics, dense, unit, limit, scratch[6:9], image, scratch[16:]):
         return False
     for i in range(n):
@@ -389,12 +389,12 @@ def curve_residuals(
     track: Any, pixels: Any, s: Any, residuals: Any,
 ) -> None:  # fmt: skip
     """Signed distance from each pixel to its curve in px, (M,), and s moved to the foot; NaN where there is none."""
-    scratch = np.empty((32, _CHUNK))
+    scratch = np.empty((32, CHUNK))
     dense = one_dimensional(lens, intrinsics, powers)
     limit = answer_limit(lens, dense)
     for v in range(len(poses)):
-        for start in range(bounds[v], bounds[v + 1], _CHUNK):
-            stop = min(start + _CHUNK, bounds[v + 1])
+        for start in range(bounds[v], bounds[v + 1], CHUNK):
+            stop = min(start + CHUNK, bounds[v + 1])
             if not _chunk_distances(
                 start, stop, lens, intrinsics, dense, unit, limit, poses[v], tracks, is_arc, track, pixels, s, scratch,
                 residuals,
@@ -414,7 +414,7 @@ def _chunk_distances(
 ) -> bool:  # fmt: skip
     """The same for some curve observations of one sight; False where any of them has no foot."""
     foot = scratch[21:]
-    if not _feet(
+    if not feet(
         lens, stop - start, start, intrinsics, dense, unit, limit, pose, tracks, is_arc, track, pixels, s,
         scratch[:3], scratch[3:6], scratch[6:9], scratch[9:16], scratch[16:21], foot,
     ):  # fmt: skip

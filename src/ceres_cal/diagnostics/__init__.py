@@ -1,0 +1,20 @@
+"""Reading what is left over: a table, what it says of the model, the choice of lens by held-out error."""
+
+from ceres_cal.diagnostics.diagnose import FALSE_ALARM_RATE, Diagnosis, diagnose
+from ceres_cal.diagnostics.findings import Amount, Finding
+from ceres_cal.diagnostics.leftover import Noise
+from ceres_cal.diagnostics.summaries import RadiusTrend, Summaries, Summary
+from ceres_cal.diagnostics.table import ResidualTable
+
+__all__ = [
+    "FALSE_ALARM_RATE",
+    "Amount",
+    "Diagnosis",
+    "Finding",
+    "Noise",
+    "RadiusTrend",
+    "ResidualTable",
+    "Summaries",
+    "Summary",
+    "diagnose",
+]

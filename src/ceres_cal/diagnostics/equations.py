@@ -1,0 +1,154 @@
+"""Every observation that an estimate can show, as scalar equations with all their derivatives, in px.
+
+A point gives two equations, one for each image axis, a curve observation one, along the image normal at its foot. Any
+alternative to the model is a column over these equations: what it moves in the image goes in by `direction`, what it
+moves on a target by `motion`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ceres_cal import kernels
+from ceres_cal.errors import SolutionError
+from ceres_cal.observations import Observations
+from ceres_cal.parameters import Estimate
+from ceres_cal.residuals import Residuals, lens_arguments
+from ceres_cal.sights import Mask, Sights
+from ceres_cal.targets import along_track
+from ceres_cal.transforms import Array
+
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Equations:
+    """E scalar equations, sight after sight.
+
+    Attributes:
+        sights: what can be shown, S of them; none is empty. poses: (S, 3, 4) cam_from_frame. bounds: (S + 1,) where
+            each sight's equations begin. sight: (E,).
+        observation: (E,) number of the observation: points by row, then curves by row. view: (E,) of the observation.
+        is_curve: (E,). feature: (E,) number among the points, or among the curves, of all targets.
+        residual: (E,) px. direction: (E, 2) the image direction it is taken along. pixel: (E, 2) where it should lie.
+        intrinsics: (E, K) px per solver's unit of [phi, aspect, cx, cy, coefficients], 0 past a camera's own.
+        pose: (E, 6) px per left perturbation of cam_from_frame. motion: (E, 3) px per metre that the point or foot
+            moves in the camera frame. place: (E, 3) where it lies in its sight's frame, m.
+    """
+
+    sights: Sights
+    poses: Array
+    bounds: Ints
+    sight: Ints
+    observation: Ints
+    view: Ints
+    is_curve: Mask
+    feature: Ints
+    residual: Array
+    direction: Array
+    pixel: Array
+    intrinsics: Array
+    pose: Array
+    place: Array
+
+    def __len__(self) -> int:
+        return len(self.residual)
+
+    @property
+    def motion(self) -> Array:
+        return self.pose[:, 3:]
+
+    def of_sights(self, chosen: Mask) -> Mask:
+        """(E,) the equations of the chosen sights."""
+        return np.asarray(chosen[self.sight])
+
+    def moved_along(self, directions: Array) -> Array:
+        """(E,) px per metre of moving what is seen along a direction (E, 3) of its sight's frame."""
+        turned = np.einsum("eij,ej->ei", self.poses[self.sight, :, :3], directions)
+        return np.asarray(np.sum(self.motion * turned, axis=1))
+
+
+def write_equations(observations: Observations, sights: Sights, estimate: Estimate, found: Residuals) -> Equations:
+    """The equations of every observation whose residual is finite.
+
+    Raises:
+        SolutionError: there is none.
+    """
+    finite = np.all(np.isfinite(found.points), axis=1), np.isfinite(found.curves)
+    sights = sights.used(*finite)
+    if not len(sights):
+        raise SolutionError("the calibration can show none of the observations: give those it was made from")
+    poses = estimate.pose_stack(sights.keys)
+    parts = [
+        part for own in _by_camera(sights) for part in _of_camera(observations, sights, own, poses, estimate, found)
+    ]
+    size = max(part["intrinsics"].shape[1] for part in parts)
+    for part in parts:
+        missing = size - part["intrinsics"].shape[1]
+        part["intrinsics"] = np.pad(part["intrinsics"], ((0, 0), (0, missing)))
+    columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    order = np.argsort(columns["sight"], kind="stable")
+    columns = {name: column[order] for name, column in columns.items()}
+    bounds = np.searchsorted(columns["sight"], np.arange(len(sights) + 1))
+    return Equations(sights=sights, poses=poses, bounds=bounds, **columns)
+
+
+def _by_camera(sights: Sights) -> Iterator[Ints]:
+    """The numbers of each camera's sights."""
+    owners = np.array([key.camera for key in sights.keys])
+    for name in np.unique(owners):
+        yield np.flatnonzero(owners == name)
+
+
+def _of_camera(
+    observations: Observations, sights: Sights, numbers: Ints, poses: Array, estimate: Estimate, found: Residuals
+) -> Iterator[dict[str, NDArray[Any]]]:
+    """The columns of one camera's points, then of its curve observations."""
+    own = sights.take(numbers)
+    optics = lens_arguments(estimate.cameras[own.keys[0].camera])
+    size = len(optics[1])
+    rows = np.empty((len(own.point_rows), 2, size + 6))
+    places = estimate.structure.points(own)
+    kernels.point_rows(*optics, poses[numbers], own.point_bounds, places, rows)
+    yield {
+        "sight": np.repeat(numbers[_sight_of(own.point_bounds)], 2),
+        "observation": np.repeat(own.point_rows, 2),
+        "view": np.repeat(observations.points.view[own.point_rows].astype(np.int64), 2),
+        "is_curve": np.zeros(2 * len(rows), dtype=bool),
+        "feature": np.repeat(own.feature, 2),
+        "residual": found.points[own.point_rows].ravel(),
+        "direction": np.tile(np.eye(2), (len(rows), 1)),
+        "pixel": np.repeat(own.pixels + found.points[own.point_rows], 2, axis=0),
+        "intrinsics": rows[:, :, :size].reshape(-1, size),
+        "pose": rows[:, :, size:].reshape(-1, 6),
+        "place": np.repeat(places, 2, axis=0),
+    }
+    tracks, feet = estimate.structure.tracks(own), found.places[own.curve_rows]
+    rows, normals = np.empty((len(own.curve_rows), size + 6)), np.empty((len(own.curve_rows), 2))
+    kernels.curve_rows(
+        *optics, poses[numbers], own.curve_bounds, tracks, own.is_arc, own.track, own.curve_pixels, feet, rows, normals
+    )
+    distance = found.curves[own.curve_rows]
+    yield {
+        "sight": numbers[_sight_of(own.curve_bounds)],
+        "observation": len(observations.points) + own.curve_rows,
+        "view": observations.curves.view[own.curve_rows].astype(np.int64),
+        "is_curve": np.ones(len(rows), dtype=bool),
+        "feature": own.track.astype(np.int64),
+        "residual": distance,
+        "direction": normals,
+        "pixel": own.curve_pixels + distance[:, None] * normals,
+        "intrinsics": rows[:, :size],
+        "pose": rows[:, size:],
+        "place": along_track(tracks[own.track], own.is_arc[own.track], feet),
+    }
+
+
+def _sight_of(bounds: Ints) -> Ints:
+    """Which sight each row belongs to."""
+    return np.repeat(np.arange(len(bounds) - 1), np.diff(bounds))

@@ -1,0 +1,123 @@
+"""What is left once every named cause is taken off: how large the noise is, and whether neighbours agree."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ceres_cal.diagnostics.equations import Ints
+from ceres_cal.diagnostics.freedom import Freedom
+from ceres_cal.diagnostics.tails import log_chi2_tail
+from ceres_cal.observations import Observations
+from ceres_cal.sights import Mask
+from ceres_cal.transforms import Array
+
+LARGER = 1.15  # noise within so much of what was stated is as stated
+_FEWEST_PAIRS = 20
+
+
+@dataclass(frozen=True)
+class Noise:
+    """The noise of one kind, with the named causes taken off.
+
+    Attributes:
+        kind: "points" or "curves". observations: inliers. sigma_px: typical standard deviation (of each coordinate of a
+            point, of the distance to a curve). scale: factor on the stated sigmas; stated_px: their root mean square,
+            NaN where nobody stated one (all are 1).
+        log_p: natural logarithm of the probability of so much, were the noise LARGER times what was stated.
+        correlation: of neighbouring residuals (along a line, between a board's corners), NaN where there are too few.
+        correlation_log_p: of so much correlation in white noise. effective: observations that would say as much if
+            they were independent.
+    """
+
+    kind: str
+    observations: int
+    sigma_px: float
+    scale: float
+    stated_px: float
+    log_p: float
+    correlation: float
+    correlation_log_p: float
+    effective: float
+
+    @property
+    def inflation(self) -> float:
+        """How many observations weigh as much as one independent one."""
+        return self.observations / self.effective if self.observations else 1.0
+
+
+def measure_noise(observations: Observations, freedom: Freedom, scales: tuple[float, float]) -> tuple[Noise, ...]:
+    """The noise of points and of curves, where there are any. `scales`: by which the model's weights were made."""
+    answer = []
+    for is_curve, kind in ((False, "points"), (True, "curves")):
+        rows = freedom.used & (freedom.equations.is_curve == is_curve)
+        if np.any(rows):
+            answer.append(_noise_of(observations, freedom, kind, rows, scales[is_curve]))
+    return tuple(answer)
+
+
+def _noise_of(observations: Observations, freedom: Freedom, kind: str, rows: Mask, model_scale: float) -> Noise:
+    left, column = freedom.left_over(), observations.curves if kind == "curves" else observations.points
+    spare = float(np.sum(1.0 - freedom.leverage()[rows]))
+    squares = float(np.sum(left[rows] ** 2))
+    variance = squares / max(spare, 1e-9)
+    scale = model_scale * float(np.sqrt(variance))
+    count = int(np.count_nonzero(rows)) // (1 if kind == "curves" else 2)
+    stated = float("nan") if np.all(column.sigma_px == 1.0) else float(np.sqrt(np.mean(column.sigma_px**2)))
+    log_p = 0.0
+    if np.isfinite(stated) and spare >= 1.0:
+        log_p = log_chi2_tail(squares * model_scale**2 / LARGER**2, spare)
+    typical = scale * float(np.sqrt(np.mean(column.sigma_px**2)))
+    correlation, pairs_log_p = _correlation(freedom, _neighbours(observations, freedom, kind), variance)
+    agree = max(correlation, 0.0) if np.isfinite(correlation) and pairs_log_p < np.log(0.01) else 0.0
+    effective = count * (1.0 - agree) / (1.0 + agree)  # of a first-order autoregression
+    return Noise(kind, count, typical, scale, stated, log_p, correlation, pairs_log_p, effective)
+
+
+def _neighbours(observations: Observations, freedom: Freedom, kind: str) -> tuple[Ints, Ints]:
+    """Pairs of used equations: next to one another along a line of one view, or on one row of a board."""
+    equations = freedom.equations
+    if kind == "curves":
+        rows = np.flatnonzero(freedom.used & equations.is_curve)
+        along = _along(freedom, rows)
+        order = rows[np.lexsort((along, equations.feature[rows], equations.view[rows]))]
+        first, second = order[:-1], order[1:]
+        near = (equations.view[first] == equations.view[second]) & (
+            equations.feature[first] == equations.feature[second]
+        )
+        return first[near], second[near]
+    boards = np.array([observations.targets[view.target].kind == "checkerboard" for view in observations.views])
+    rows = np.flatnonzero(freedom.used & ~equations.is_curve & boards[equations.view])
+    component = (equations.direction[rows, 1] > 0.5).astype(int)
+    order = rows[np.lexsort((equations.feature[rows], component, equations.view[rows]))]
+    first, second = order[:-1], order[1:]
+    near = equations.view[first] == equations.view[second]
+    near &= equations.feature[second] - equations.feature[first] == 1
+    near &= np.all(equations.direction[first] == equations.direction[second], axis=1)
+    near &= equations.place[first, 1] == equations.place[second, 1]  # not from the end of a row to the next one
+    return first[near], second[near]
+
+
+def _along(freedom: Freedom, rows: Ints) -> Array:
+    """(N,) order of curve equations along their tracks."""
+    equations = freedom.equations
+    track = equations.feature[rows]
+    c, a, b = equations.sights.tracks[track].transpose(1, 0, 2)
+    away = equations.place[rows] - c
+    turned = np.arctan2(np.sum(away * b, axis=1), np.sum(away * a, axis=1))
+    return np.asarray(np.where(equations.sights.is_arc[track], turned, np.sum(away * a, axis=1)))
+
+
+def _correlation(freedom: Freedom, pairs: tuple[Ints, Ints], variance: float) -> tuple[float, float]:
+    """Correlation of neighbouring residuals beyond what the fit makes of white noise, and log P of so much."""
+    first, second = pairs
+    if len(first) < _FEWEST_PAIRS:
+        return float("nan"), 0.0
+    left, leverage = freedom.left_over(), np.minimum(freedom.leverage(), 1.0)
+    overlap = freedom.overlap(first, second)
+    total = float(np.sum(left[first] * left[second] + variance * overlap))
+    kept = (1.0 - leverage[first]) * (1.0 - leverage[second])
+    z = total / (variance * np.sqrt(np.sum(kept + overlap**2)))
+    log_p = log_chi2_tail(z * z, 1.0) - np.log(2.0) if z > 0.0 else 0.0
+    return float(total / (variance * max(float(np.sum(np.sqrt(kept))), 1e-9))), float(log_p)

@@ -1,0 +1,171 @@
+"""Score tests of many alternatives at once: their columns against the residuals, beyond what the free numbers take up.
+
+An alternative is a group of equations that some columns move: one line of the field, one frame, everything after a
+frame. With X its columns beyond the free numbers and r the residuals, both in standard deviations, r'X (X'X)^-1 X'r
+over the mean square of what is left is Fisher's F where the noise is normal, and -(X'X)^-1 X'r is the amount that would
+mend it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ceres_cal.diagnostics.equations import Ints
+from ceres_cal.diagnostics.freedom import Freedom, inverse_root
+from ceres_cal.diagnostics.tails import log_f_tail
+from ceres_cal.transforms import Array
+
+LEAST_LEFT = 1e-7
+"""Share of an alternative's squared length that the free numbers must leave for it to be testable."""
+
+
+@dataclass(frozen=True, eq=False)
+class Family:
+    """Alternatives of one kind.
+
+    Attributes:
+        kind: what they say, a key of `words`.
+        columns: (E, Q) px per unit of the Q amounts, for every equation.
+        group: (E,) which alternative's amounts move each equation, -1 for none.
+        names: of each alternative.
+        onwards: whether alternative g moves the groups after g instead of group g itself.
+        units: of the Q amounts, for people.
+    """
+
+    kind: str
+    columns: Array
+    group: Ints
+    names: tuple[str, ...]
+    onwards: bool = False
+    units: tuple[str, ...] = ()
+
+    def of(self, number: int) -> Array:
+        """(E, Q) columns of one alternative over all equations."""
+        moved = self.group > number if self.onwards else self.group == number
+        return np.asarray(self.columns * moved[:, None])
+
+
+@dataclass(frozen=True, eq=False)
+class Score:
+    """The test of one alternative.
+
+    Attributes:
+        family, number: which. statistic: decrease of the squared residuals, in variances. rank: numbers it can tell.
+        log_p: natural logarithm of the probability of as much in mere noise, not corrected for how many were tested.
+        amount: (Q,) what would mend it. sd: (Q,) standard deviations, infinite for a number it cannot tell at all.
+    """
+
+    family: Family
+    number: int
+    statistic: float
+    rank: int
+    log_p: float
+    amount: Array
+    sd: Array
+
+
+def score_all(freedom: Freedom, families: Sequence[Family], inflation: float = 1.0) -> list[Score]:
+    """The tests of every alternative that the free numbers leave testable.
+
+    Args:
+        inflation: how many observations weigh as much as one independent one, where neighbours agree.
+    """
+    squares = float(freedom.left_over() @ freedom.left_over())
+    slope = _robust_slope(freedom)
+    found: list[tuple[Family, int, Array, Array, Array]] = []
+    for family in families:
+        normals, scores, sizes = _sums(freedom, family)
+        for number in np.flatnonzero(sizes.max(axis=1) > 0.0):
+            root = inverse_root(normals[number], sizes[number], LEAST_LEFT)
+            if root.shape[1]:
+                found.append((family, int(number), root, root.T @ scores[number], sizes[number]))
+    if not found:
+        return []
+    ranks = np.array([root.shape[1] for _, _, root, _, _ in found])
+    statistics = np.array([float(z @ z) for _, _, _, z, _ in found])
+    spare = np.maximum(freedom.spare - ranks, 1)
+    variance = np.maximum(squares - statistics, 1e-12 * squares) / spare
+    log_p = log_f_tail(statistics / (inflation * ranks * np.maximum(variance, 1e-300)), ranks, spare)
+    return [
+        Score(
+            family, number, float(statistics[i] / variance[i]), int(ranks[i]), float(log_p[i]), -root @ z / slope,
+            _spread(root, sizes, float(np.sqrt(variance[i] * inflation)) / slope),
+        )
+        for i, (family, number, root, z, sizes) in enumerate(found)
+    ]  # fmt: skip
+
+
+def _spread(root: Array, sizes: Array, scale: float) -> Array:
+    return np.where(sizes > 0.0, scale * np.sqrt(np.sum(root**2, axis=1)), np.inf)
+
+
+def _robust_slope(freedom: Freedom) -> float:
+    """Mean derivative of a robust residual by the residual itself: 1 without a loss (Stein's lemma)."""
+    plain = freedom.weight * freedom.equations.residual * freedom.used
+    return float(plain @ freedom.score) / max(float(plain @ plain), 1e-300)
+
+
+def _sums(freedom: Freedom, family: Family) -> tuple[Array, Array, Array]:
+    """Of each alternative: X'X (G, Q, Q), X'r (G, Q), and the squared lengths (G, Q) before any projection."""
+    rows = np.flatnonzero((family.group >= 0) & freedom.used)
+    rows = rows[np.argsort(family.group[rows], kind="stable")]
+    group, count = family.group[rows], len(family.names)
+    columns = family.columns[rows] * freedom.weight[rows, None]
+    size = columns.shape[1]
+    rest = freedom.beyond_private(freedom.score[:, None])[rows, 0]
+
+    def total(values: Array) -> Array:
+        sums = _by_group(values, group, count)
+        if family.onwards:  # group g stands for all groups after it
+            sums = np.concatenate([np.cumsum(sums[::-1], axis=0)[::-1][1:], np.zeros_like(sums[:1])])
+        return sums
+
+    products = total((columns[:, :, None] * columns[:, None, :]).reshape(len(rows), size * size)).reshape(
+        -1, size, size
+    )
+    sizes = np.einsum("gqq->gq", products).copy()
+    shared = freedom.shared[rows]
+    taken = np.stack([total(columns[:, k, None] * shared) for k in range(size)], axis=1)
+    scores = total(columns * rest[:, None]) - taken @ freedom.pull
+    products -= taken @ taken.transpose(0, 2, 1)
+    for places, overlap in _private_overlaps(freedom, family, rows, columns):
+        np.subtract.at(products, places, overlap @ overlap.transpose(0, 2, 1))
+    return products, scores, sizes
+
+
+def _by_group(values: Array, group: Ints, count: int) -> Array:
+    """Sums (count, K) of rows (N, K) sorted by group."""
+    sums = np.zeros((count, values.shape[1]))
+    if len(values):
+        starts = np.flatnonzero(np.diff(group, prepend=-1))
+        sums[group[starts]] = np.add.reduceat(values, starts, axis=0)
+    return sums
+
+
+def _private_overlaps(freedom: Freedom, family: Family, rows: Ints, columns: Array) -> list[tuple[Ints, Array]]:
+    """Alternatives (N,) and what of their columns lies in the private bases of one sight or another, (N, Q, 6)."""
+    basis = freedom.private[rows]
+    held = np.flatnonzero(np.any(basis != 0.0, axis=1))
+    if not len(held):
+        return []
+    size, count = columns.shape[1], len(family.names)
+    sight, group = freedom.equations.sight[rows[held]], family.group[rows[held]]
+    order = np.lexsort((group, sight))
+    products = (columns[held, :, None] * basis[held, None, :]).reshape(len(held), -1)[order]
+    key = (sight * count + group)[order]
+    starts = np.flatnonzero(np.diff(key, prepend=-1))
+    sums = np.add.reduceat(products, starts, axis=0).reshape(-1, size, 6)
+    sights, groups = np.divmod(key[starts], count)
+    if not family.onwards:
+        return [(groups, sums)]
+    answer = []
+    for number in np.unique(sights):
+        own = sights == number
+        every = np.zeros((count, size, 6))
+        every[groups[own]] = sums[own]
+        after = np.concatenate([np.cumsum(every[::-1], axis=0)[::-1][1:], np.zeros_like(every[:1])])
+        answer.append((np.arange(count), after))
+    return answer

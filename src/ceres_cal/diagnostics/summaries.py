@@ -1,0 +1,169 @@
+"""The residual table by frame, feature, image region and radius."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from ceres_cal.camera import Camera
+from ceres_cal.diagnostics.equations import Ints
+from ceres_cal.diagnostics.freedom import Freedom
+from ceres_cal.diagnostics.table import ResidualTable
+from ceres_cal.observations import Observations
+from ceres_cal.sights import Mask
+from ceres_cal.transforms import Array
+
+REGIONS = (6, 4)
+"""Columns and rows of equal parts into which an image is divided."""
+RADIUS_BINS = 12
+"""Rings of equal width, from the principal point to the farthest corner."""
+
+
+@dataclass(frozen=True, eq=False)
+class Summary:
+    """Groups of observations, G of them.
+
+    Attributes:
+        names: of the groups. points, curves: (G,) inliers. rejected: (G,) observations that were taken out.
+        points_rms_px: (G,) of the lengths of residual vectors. curves_rms_px: (G,) of the distances. rms_mm: (G,) of
+            both on the targets' planes. rms_sigma: (G,) of both in their standard deviations, 1 where the noise is as
+            everywhere. NaN where a group has none. All of inliers.
+    """
+
+    names: tuple[str, ...]
+    points: Ints
+    curves: Ints
+    rejected: Ints
+    points_rms_px: Array
+    curves_rms_px: Array
+    rms_mm: Array
+    rms_sigma: Array
+
+
+@dataclass(frozen=True, eq=False)
+class RadiusTrend:
+    """What the residuals do along the radius, of one camera, in RADIUS_BINS rings.
+
+    Attributes:
+        radius_px: (B + 1,) edges of the rings. outward_px: (B,) the mean displacement of the model against the
+            observations away from the principal point, by least squares from points and curves; sd_px: (B,) its
+            standard deviation; NaN in a ring that nothing crosses.
+    """
+
+    camera: str
+    radius_px: Array
+    outward_px: Array
+    sd_px: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Summaries:
+    """The table by frame ("station frame" where there are several stations), feature ("target/name"), region
+    ("camera column,row" from the image's top left) and radius ("camera from-to px"), and each camera's radius trend.
+    """
+
+    frames: Summary
+    features: Summary
+    regions: Summary
+    radii: Summary
+    trends: tuple[RadiusTrend, ...]
+
+
+def summarise(
+    observations: Observations, table: ResidualTable, freedom: Freedom, cameras: Mapping[str, Camera]
+) -> Summaries:
+    """All summaries of a table."""
+    several = len(observations.stations) > 1
+    labels = [f"{view.station} {view.frame}" if several else view.frame for view in observations.views]
+    frames = list(dict.fromkeys(labels))
+    frame_of_view = _numbers(labels, frames)
+    camera_names = list(observations.cameras)
+    camera = _numbers([view.camera for view in observations.views], camera_names)[table.view]
+    region_names, region = _regions(table, camera, camera_names, cameras)
+    radius_names, ring, edges = _rings(table, camera, camera_names, cameras)
+    return Summaries(
+        _summary(table, frame_of_view[table.view], frames),
+        _summary(table, table.feature, list(table.features)),
+        _summary(table, region, region_names),
+        _summary(table, ring, radius_names),
+        tuple(_trend(freedom, cameras[name], name, camera == i, edges[i]) for i, name in enumerate(camera_names)),
+    )
+
+
+def _numbers(labels: list[str], known: list[str]) -> Ints:
+    order = {name: number for number, name in enumerate(known)}
+    return np.array([order[label] for label in labels], dtype=np.int64)
+
+
+def _summary(table: ResidualTable, group: Ints, names: list[str]) -> Summary:
+    """Groups with any observation, in the order of their names."""
+    size, inlier = len(names), table.inlier
+    points, curves = inlier & ~table.is_curve, inlier & table.is_curve
+
+    def count(rows: Mask) -> Ints:
+        return np.asarray(np.bincount(group[rows], minlength=size))
+
+    def rms(rows: Mask, values: Array) -> Array:
+        rows = rows & np.isfinite(values)
+        with np.errstate(invalid="ignore"):
+            return np.asarray(np.sqrt(np.bincount(group[rows], values[rows] ** 2, size) / count(rows)))
+
+    numbers = np.where(table.is_curve, 1.0, 2.0)
+    sigmas = table.distance_px / (table.sigma_px * table.scale * np.sqrt(numbers))
+    numbers_of = (count(points), count(curves), count(~inlier))
+    shown = np.flatnonzero(sum(numbers_of))
+    return Summary(
+        tuple(names[i] for i in shown),
+        numbers_of[0][shown],
+        numbers_of[1][shown],
+        numbers_of[2][shown],
+        rms(points, table.distance_px)[shown],
+        rms(curves, table.distance_px)[shown],
+        rms(inlier, table.error_mm)[shown],
+        rms(inlier, sigmas)[shown],
+    )
+
+
+def _regions(
+    table: ResidualTable, camera: Ints, names: list[str], cameras: Mapping[str, Camera]
+) -> tuple[list[str], Ints]:
+    columns, rows = REGIONS
+    sizes = np.array([cameras[name].image_size for name in names], dtype=float)[camera]
+    place = np.clip(((table.pixel + 0.5) / sizes * REGIONS).astype(np.int64), 0, np.array(REGIONS) - 1)
+    region = (camera * rows + place[:, 1]) * columns + place[:, 0]
+    return [f"{name} {c},{r}" for name in names for r in range(rows) for c in range(columns)], region
+
+
+def _rings(
+    table: ResidualTable, camera: Ints, names: list[str], cameras: Mapping[str, Camera]
+) -> tuple[list[str], Ints, list[Array]]:
+    edges = [np.linspace(0.0, cameras[name].corner_radius, RADIUS_BINS + 1) for name in names]
+    ring = np.zeros(len(table), dtype=np.int64)
+    labels = []
+    for number, name in enumerate(names):
+        own = camera == number
+        inner = np.searchsorted(edges[number], table.radius_px[own], side="right") - 1
+        ring[own] = number * RADIUS_BINS + np.clip(inner, 0, RADIUS_BINS - 1)
+        labels += [
+            f"{name} {low:.0f}-{high:.0f} px" for low, high in zip(edges[number], edges[number][1:], strict=False)
+        ]
+    return labels, ring, edges
+
+
+def _trend(freedom: Freedom, camera: Camera, name: str, own: Mask, edges: Array) -> RadiusTrend:
+    equations = freedom.equations
+    rows = np.flatnonzero(own[equations.observation] & freedom.used)
+    offsets = camera.offsets(equations.pixel[rows])
+    radius = np.linalg.norm(offsets, axis=1)
+    outward = np.sum(equations.direction[rows] * offsets, axis=1) / np.maximum(radius, 1e-9)
+    ring = np.clip(np.searchsorted(edges, radius, side="right") - 1, 0, RADIUS_BINS - 1)
+    weight = freedom.weight[rows] ** 2
+    total = np.bincount(ring, weight * outward**2, RADIUS_BINS)
+    moved = np.bincount(ring, weight * outward * equations.residual[rows], RADIUS_BINS)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        known = total > 0.0
+        return RadiusTrend(
+            name, edges, np.where(known, moved / total, np.nan), np.where(known, 1.0 / np.sqrt(total), np.nan)
+        )

@@ -1,0 +1,266 @@
+"""The residual table: one row per observation, in columns, under its permanent id."""
+
+from __future__ import annotations
+
+import csv
+import io
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ceres_cal.camera import Camera
+from ceres_cal.diagnostics.equations import Equations, Ints
+from ceres_cal.diagnostics.freedom import Freedom
+from ceres_cal.errors import InputError
+from ceres_cal.files import write_bytes, write_json
+from ceres_cal.noise import Inliers
+from ceres_cal.observations import Observations
+from ceres_cal.sights import Mask
+from ceres_cal.transforms import Array
+
+FORMAT, VERSION = "ceres-cal/residuals", 1
+INLIER, TOO_FAR, NOT_SEEN = 0, 1, 2
+REASONS = ("", "too far off", "cannot be seen from there")
+"""Why an observation was taken out, by its code in `ResidualTable.reason`."""
+
+
+@dataclass(frozen=True, eq=False)
+class ResidualTable:
+    """N observations: the points by row, then the curve observations by row.
+
+    Attributes:
+        is_curve, row: (N,) the permanent id: kind and row of the observations' columns.
+        view: (N,) number of its view, which tells frame, camera, station, target and placement. views: those names.
+        feature: (N,) index into `features`, "target/name".
+        pixel: (N, 2) where it was observed, px. residual_px: (N, 2) model minus observation; of a curve observation to
+            the foot of the perpendicular. distance_px: (N,) its length; of a curve observation signed, positive where
+            the curve lies to the right of the observation as someone sees it who walks along the curve in the image.
+        error_mm: (N,) the same on the target's plane, by the local derivative of the projection: how far from its
+            feature the observation places it. NaN where the plane is seen edge-on.
+        sigma_px: (N,) stated; scale: (N,) estimated factor on it. weight: (N,) of the robust loss, 0 where taken out.
+        leverage: (N,) share of the observation that the fit took up, 0 to 1 (mean of a point's two equations); of one
+            that was taken out, the fit's own variance there over the noise's.
+        standardised: (N,) residual over its own standard deviation, in which the fit's share is counted: of a point
+            the length of two such numbers, of a curve observation signed.
+        radius_px: (N,) from the principal point, square pixels. reason: (N,) code of REASONS, 0 for an inlier.
+        What is unknown, because the calibration cannot show the observation, is NaN.
+    """
+
+    is_curve: Mask
+    row: Ints
+    view: Ints
+    views: tuple[dict[str, str | None], ...]
+    feature: Ints
+    features: tuple[str, ...]
+    pixel: Array
+    residual_px: Array
+    distance_px: Array
+    error_mm: Array
+    sigma_px: Array
+    scale: Array
+    weight: Array
+    leverage: Array
+    standardised: Array
+    radius_px: Array
+    reason: NDArray[np.int8]
+
+    def __len__(self) -> int:
+        return len(self.row)
+
+    @property
+    def inlier(self) -> Mask:
+        return np.asarray(self.reason == INLIER)
+
+    def id_of(self, number: int) -> str:
+        """How messages name an observation: "point 17" or "curve 4"."""
+        return f"{'curve' if self.is_curve[number] else 'point'} {self.row[number]}"
+
+    def columns(self) -> dict[str, NDArray[Any]]:
+        """Every column as a flat array under its name in the exported files, names written out."""
+        views = {
+            name: np.array([view[name] or "" for view in self.views], dtype=np.str_)[self.view]
+            for name in ("frame", "camera", "station", "target", "placement")
+        }
+        return {
+            "kind": np.where(self.is_curve, "curve", "point"),
+            "row": self.row,
+            **views,
+            "feature": np.array([name.partition("/")[2] for name in self.features], dtype=np.str_)[self.feature],
+            "pixel_x": self.pixel[:, 0],
+            "pixel_y": self.pixel[:, 1],
+            "residual_x_px": self.residual_px[:, 0],
+            "residual_y_px": self.residual_px[:, 1],
+            "distance_px": self.distance_px,
+            "error_mm": self.error_mm,
+            "sigma_px": self.sigma_px,
+            "scale": self.scale,
+            "weight": self.weight,
+            "leverage": self.leverage,
+            "standardised": self.standardised,
+            "radius_px": self.radius_px,
+            "inlier": self.inlier,
+            "reason": np.array(REASONS, dtype=np.str_)[self.reason],
+        }
+
+    def save(self, path: Path) -> None:
+        """Write as .csv, .json or .npz (columns, all three); numbers keep every digit, NaN is empty or null in text.
+
+        Raises:
+            InputError: another ending, or the file cannot be written.
+        """
+        if path.suffix not in (".csv", ".json", ".npz"):
+            raise InputError(f"{path}: the table is written as .csv, .json or .npz: give one of these endings")
+        columns = self.columns()
+        if path.suffix == ".npz":
+            stream = io.BytesIO()
+            np.savez_compressed(stream, allow_pickle=False, **columns)
+            write_bytes(path, stream.getvalue())
+        elif path.suffix == ".json":
+            plain = {name: _plain(column) for name, column in columns.items()}
+            write_json(path, {"format": FORMAT, "version": VERSION, "columns": plain})
+        else:
+            text = io.StringIO(newline="")
+            writer = csv.writer(text, lineterminator="\n")
+            writer.writerow(columns)
+            writer.writerows(zip(*(_plain(column) for column in columns.values()), strict=True))
+            write_bytes(path, text.getvalue().encode())
+
+
+def _plain(column: NDArray[Any]) -> list[Any]:
+    values: list[Any] = column.tolist()
+    if column.dtype.kind == "f" and not np.all(np.isfinite(column)):
+        return [value if np.isfinite(value) else None for value in values]
+    return values
+
+
+def make_table(
+    observations: Observations, inliers: Inliers, freedom: Freedom, weight: Array, cameras: dict[str, Camera]
+) -> ResidualTable:
+    """The table of all observations.
+
+    Args:
+        weight: (E,) robust weight of each equation's observation.
+    """
+    equations, points, curves = freedom.equations, observations.points, observations.curves
+    count = len(points) + len(curves)
+    is_curve = np.arange(count) >= len(points)
+    features, first = _feature_names(observations)
+    view = np.concatenate([points.view, curves.view]).astype(np.int64)
+    target_of_view = _index([one.target for one in observations.views], list(observations.targets))
+    feature = np.concatenate([points.feature, curves.feature]) + first[is_curve.astype(int), target_of_view[view]]
+    pixel = np.concatenate([points.pixels, curves.pixels])
+    residual = np.full((count, 2), np.nan)
+    residual[equations.observation] = 0.0
+    np.add.at(residual, equations.observation, equations.direction * equations.residual[:, None])
+    distance = np.where(is_curve, _spread_out(equations, equations.residual, count), np.linalg.norm(residual, axis=1))
+    inlier = np.concatenate([inliers.points, inliers.curves])
+    seen = np.isfinite(residual[:, 0])
+    return ResidualTable(
+        is_curve,
+        np.concatenate([np.arange(len(points)), np.arange(len(curves))]),
+        view,
+        tuple(vars(one) for one in observations.views),
+        feature,
+        features,
+        pixel,
+        residual,
+        distance,
+        error_mm(equations, equations.residual, count),
+        np.concatenate([points.sigma_px, curves.sigma_px]),
+        np.where(is_curve, inliers.curve_scale, inliers.point_scale),
+        np.where(inlier, _spread_out(equations, weight, count), 0.0),
+        _mean_leverage(freedom, count),
+        _standardised(freedom, count),
+        _radii(observations, view, pixel, cameras),
+        np.where(inlier, INLIER, np.where(seen, TOO_FAR, NOT_SEEN)).astype(np.int8),
+    )
+
+
+def _index(names: list[str], known: list[str]) -> Ints:
+    order = {name: number for number, name in enumerate(known)}
+    return np.array([order[name] for name in names], dtype=np.int64)
+
+
+def _feature_names(observations: Observations) -> tuple[tuple[str, ...], Ints]:
+    """All features as "target/name", points of all targets first, and where each target's points and curves begin."""
+    targets = observations.targets
+    points = [f"{name}/{point}" for name, target in targets.items() for point in target.point_names]
+    curves = [f"{name}/{curve}" for name, target in targets.items() for curve in target.curve_names]
+    starts = [np.cumsum([0, *(len(t.points) for t in targets.values())])[:-1]]
+    starts.append(len(points) + np.cumsum([0, *(len(t.curves) for t in targets.values())])[:-1])
+    return (*points, *curves), np.array(starts, dtype=np.int64)
+
+
+def _spread_out(equations: Equations, values: Array, count: int) -> Array:
+    """(N,) a value of each equation at its observation, the second of a point's two; NaN where there is none."""
+    column = np.full(count, np.nan)
+    column[equations.observation] = values
+    return column
+
+
+def error_mm(equations: Equations, values: Array, count: int) -> Array:
+    """(N,) mm on the target's plane that displacements (E,) px in the image stand for; of a curve signed, else lengths.
+
+    NaN where there is no equation, or where the plane is seen edge-on.
+    """
+    answer = np.full(count, np.nan)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        x, y = plane_shift(equations, values)
+        curves = equations.is_curve
+        answer[equations.observation[curves]] = x[curves]
+        answer[equations.observation[~curves]] = np.hypot(x, y)[~curves]
+    return np.where(np.isfinite(answer), answer, np.nan)
+
+
+def plane_shift(equations: Equations, values: Array) -> tuple[Array, Array]:
+    """mm along x and y of the target, (E,) each, alike for both equations of a point; across a curve, 0 for y."""
+    count = len(equations)
+    along = [equations.moved_along(np.tile(axis, (count, 1))) for axis in np.eye(3)[:2]]
+    x, y = np.zeros(count), np.zeros(count)
+    pairs = np.flatnonzero(~equations.is_curve).reshape(-1, 2)  # a point's two equations follow one another
+    (a, c), (b, d) = along[0][pairs].T, along[1][pairs].T
+    p, q = values[pairs].T
+    determinant = a * d - b * c
+    for column in pairs.T:
+        x[column], y[column] = 1e3 * (d * p - b * q) / determinant, 1e3 * (a * q - c * p) / determinant
+    curves = np.flatnonzero(equations.is_curve)
+    steepest = np.hypot(along[0], along[1])[curves]  # the distance grows fastest across the curve
+    x[curves] = 1e3 * values[curves] / steepest
+    return x, y
+
+
+def _mean_leverage(freedom: Freedom, count: int) -> Array:
+    equations, leverage = freedom.equations, freedom.leverage()
+    sums = np.bincount(equations.observation, leverage, count)
+    numbers = np.bincount(equations.observation, minlength=count)
+    return np.where(numbers > 0, sums / np.maximum(numbers, 1), np.nan)
+
+
+def _standardised(freedom: Freedom, count: int) -> Array:
+    """e' (1 - H)^-1 e as a length; 1 + H where the observation took no part."""
+    equations = freedom.equations
+    sign = np.where(freedom.used, -1.0, 1.0)
+    residual, leverage = freedom.weight * equations.residual, freedom.leverage()
+    answer = np.full(count, np.nan)
+    variance = np.maximum(1.0 + sign * leverage, 1e-9)
+    curves = equations.is_curve
+    answer[equations.observation[curves]] = (residual / np.sqrt(variance))[curves]
+    first, second = np.flatnonzero(~curves).reshape(-1, 2).T
+    cross = sign[first] * freedom.overlap(first, second)
+    p, q = residual[first], residual[second]
+    determinant = np.maximum(variance[first] * variance[second] - cross**2, 1e-18)
+    squared = (variance[second] * p * p - 2.0 * cross * p * q + variance[first] * q * q) / determinant
+    answer[equations.observation[first]] = np.sqrt(np.maximum(squared, 0.0))
+    return answer
+
+
+def _radii(observations: Observations, view: Ints, pixel: Array, cameras: dict[str, Camera]) -> Array:
+    owner = np.array([one.camera for one in observations.views])[view]
+    radii = np.full(len(view), np.nan)
+    for name in observations.cameras:
+        own = owner == name
+        radii[own] = np.linalg.norm(cameras[name].offsets(pixel[own]), axis=1)
+    return radii
