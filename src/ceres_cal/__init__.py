@@ -3,7 +3,9 @@
 The names are loaded when they are first used, so that `import ceres_cal` costs nothing.
 """
 
+import sys
 from importlib import import_module
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -17,6 +19,7 @@ if TYPE_CHECKING:
     from ceres_cal.observations import Observations as Observations
     from ceres_cal.observations import Prior as Prior
     from ceres_cal.parameters import Options as Options
+    from ceres_cal.report import write_report as write_report
     from ceres_cal.transforms import Pose as Pose
 
 _HOME = {
@@ -31,6 +34,7 @@ _HOME = {
     "Prior": "observations",
     "Options": "parameters",
     "Pose": "transforms",
+    "write_report": "report",
 }
 __all__ = list(_HOME)
 
@@ -39,5 +43,16 @@ def __getattr__(name: str) -> Any:
     if name not in _HOME:
         raise AttributeError(f"module 'ceres_cal' has no attribute {name!r}")
     value = getattr(import_module(f"ceres_cal.{_HOME[name]}"), name)
-    globals()[name] = value  # the module of the same name must not hide it
+    globals()[name] = value
     return value
+
+
+class _Package(ModuleType):
+    """A package whose names are not hidden by its modules of the same name, whoever imports those first."""
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if not (name in _HOME and isinstance(value, ModuleType)):
+            super().__setattr__(name, value)
+
+
+sys.modules[__name__].__class__ = _Package

@@ -1,0 +1,72 @@
+"""The chapter behind the verdict: what the residuals say, cause by cause."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ceres_cal.diagnostics import Finding, Noise
+from ceres_cal.report.material import Material
+from ceres_cal.report.page import Card, Chapter, Piece, Table, Text
+from ceres_cal.report.words import count, fixed, grouped, short, signed
+
+
+def findings(material: Material) -> Chapter:
+    """Findings, the largest first, and the noise that is left."""
+    diagnosis = material.diagnosis
+    rate = f"{100.0 * diagnosis.false_alarm_rate:g} %"
+    tested = (
+        f"{count(diagnosis.tests, 'alternative')} of the model were tested; of sound data {rate} raise any finding."
+    )
+    pieces: list[Piece] = []
+    if diagnosis.new_data:
+        pieces.append(
+            Text(
+                "These are new data: residuals are those of the calibration as it stands, the findings are what would be "
+                "left if it were refitted to them."
+            )
+        )
+    if diagnosis.findings:
+        pieces.append(Text(f"The largest first. {tested}"))
+        pieces += [_card(finding) for finding in diagnosis.findings]
+    else:
+        pieces.append(Text(f"Nothing was found: what is left over looks like noise. {tested}"))
+    pieces.append(_noise(diagnosis.noise))
+    return Chapter("findings", "What the residuals say", tuple(pieces))
+
+
+def _card(finding: Finding) -> Card:
+    facts = [f"{short(finding.effect_px)} px"]
+    if np.isfinite(finding.effect_mm):
+        facts.append(f"{short(finding.effect_mm)} mm")
+    facts.append(count(finding.observations, "observation"))
+    facts.append(f"false alarm: {_chance(finding.log10_p)}")
+    facts += [f"{one.name} {one.value:+.3g} ± {short(one.sd)} {one.unit}".strip() for one in finding.amounts]
+    return Card(
+        "no" if finding.is_model_error else "care", _sentence(finding.sentence), _sentence(finding.advice), tuple(facts)
+    )
+
+
+def _sentence(text: str) -> str:
+    return f"{text[:1].upper()}{text[1:]}"
+
+
+def _chance(log10_p: float) -> str:
+    """A probability in words: "0.21 %", "1 in 10^12"."""
+    return f"{100.0 * 10.0**log10_p:.2g} %" if log10_p > -3.0 else f"1 in 10^{-log10_p:.0f}"
+
+
+def _noise(noise: tuple[Noise, ...]) -> Table:
+    return Table(
+        ("noise of", "observations", "sd, px", "of the stated", "neighbours' correlation"),
+        tuple(
+            (
+                one.kind,
+                grouped(one.observations),
+                fixed(one.sigma_px, 3),
+                f"{one.scale:.2f} times" if np.isfinite(one.stated_px) else "none stated",
+                signed(one.correlation, 2),
+            )
+            for one in noise
+        ),
+        stacked=True,
+    )
