@@ -53,6 +53,7 @@ CASES: Mapping[str, Case] = {
     "tilt 8 deg, height": Case(partial(tilted, 8.0, 0.01)),
     "tilt 3 deg, height": Case(partial(tilted, 3.0, 0.01)),
     "tilt 1 deg, height": Case(partial(tilted, 1.0, 0.01)),
+    "tilt 1 deg, height to 10 %": Case(partial(tilted, 1.0, 0.4), WEAKLY),
     "tilt 1 deg, 6 boards": Case(partial(tilted, 1.0, None, 6)),
     "tilt 8 deg, 20 % outliers": Case(partial(tilted, 8.0, 0.01, spacing_m=0.15), disturbance=GROSS_NOISE),
 }

@@ -22,7 +22,7 @@ from ceres_cal.calibrate import calibrate
 from ceres_cal.calibration import Calibration
 from ceres_cal.errors import InputError
 from ceres_cal.initialise import PHI_RANGE
-from ceres_cal.observations import Observations, combine
+from ceres_cal.observations import Observations, Prior, combine
 from ceres_cal.parameters import Estimate, Options, make_layout, unit_px
 from ceres_cal.quantities import Key, camera_keys, moved, natural_sizes, pose_keys
 from ceres_cal.sights import gather_sights
@@ -145,6 +145,15 @@ def test_bounds_are_where_the_cost_has_risen_by_four(tilt_deg: float) -> None:
     else:
         assert verdict.verdict == "unknown" and verdict.low == 0.0
         assert cost_at(calibration, observations, 125.0) - least < rise
+
+
+def test_a_prior_on_phi_is_part_of_its_profile() -> None:
+    """Too wide for the quadratic picture, and almost all that is known: the bounds are the prior's own."""
+    prior = Prior("camera", "overhead", "phi", (560.0,), (60.0,))
+    calibration = calibrate(observed(1.0), Options(priors=(prior,)))
+    verdict = phi_of(calibration)
+    assert verdict.by_profile and verdict.verdict == "weak" and calibration.warnings == ()
+    assert (verdict.low, verdict.high) == pytest.approx((560.0 - 117.6, 560.0 + 117.6), abs=12.0)  # 447, 683 measured
 
 
 @pytest.mark.parametrize("seed", range(6))

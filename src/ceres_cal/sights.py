@@ -183,27 +183,27 @@ def gather_sights(observations: Observations) -> Sights:
     curve_count = np.array([len(t.curves) for t in targets], dtype=np.int64)
 
     points, curves = observations.points, observations.curves
-    point_rows, point_bounds = _grouped(points, sight_of_view, len(order))
-    curve_rows, curve_bounds = _grouped(curves, sight_of_view, len(order))
-    of_point = target_of_view[points.view[point_rows]]
-    of_curve = target_of_view[curves.view[curve_rows]]
-    feature = (first_point[of_point] + points.feature[point_rows]).astype(np.int64)
-    side = curves.side[curve_rows] % 3  # -1 is the last of a target's three sets of tracks
-    track = first_track[of_curve] + side * curve_count[of_curve] + curves.feature[curve_rows]
+    p, point_bounds = _grouped(points, sight_of_view, len(order))
+    c, curve_bounds = _grouped(curves, sight_of_view, len(order))
+    of_point = target_of_view[points.view[p]]
+    of_curve = target_of_view[curves.view[c]]
+    feature = (first_point[of_point] + points.feature[p]).astype(np.int64)
+    side = curves.side[c] % 3  # -1 is the last of a target's three sets of tracks
+    track = first_track[of_curve] + side * curve_count[of_curve] + curves.feature[c]
     every = Sights(
         tuple(order),
         tuple(tuple(views) for views in views_of),
         point_bounds,
-        point_rows,
+        np.arange(len(points))[p],
         feature,
         np.concatenate([t.point_array for t in targets])[feature],
-        points.pixels[point_rows],
-        points.sigma_px[point_rows],
+        points.pixels[p],
+        points.sigma_px[p],
         curve_bounds,
-        curve_rows,
+        np.arange(len(curves))[c],
         track.astype(np.int32),
-        curves.pixels[curve_rows],
-        curves.sigma_px[curve_rows],
+        curves.pixels[c],
+        curves.sigma_px[c],
         np.concatenate([t.tracks.reshape(-1, 3, 3) for t in targets]),
         np.concatenate([np.tile(t.is_arc, 3) for t in targets]),
     )
@@ -211,9 +211,11 @@ def gather_sights(observations: Observations) -> Sights:
     return every if len(filled) == len(every) else every.take(filled)
 
 
-def _grouped(columns: Columns, sight_of_view: Rows, count: int) -> tuple[Rows, Rows]:
-    """Rows in the order of their sights, and where each sight begins."""
+def _grouped(columns: Columns, sight_of_view: Rows, count: int) -> tuple[Rows | slice, Rows]:
+    """Rows in the order of their sights, all of them as they are where that is their order; where each sight begins."""
     sight = sight_of_view[columns.view]
+    if np.all(sight[1:] >= sight[:-1]):
+        return slice(None), np.searchsorted(sight, np.arange(count + 1))
     order = np.argsort(sight, kind="stable")
     return order, np.searchsorted(sight[order], np.arange(count + 1))
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Callable, Container, Iterable, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -170,6 +171,17 @@ class _Watcher(pyceres.IterationCallback):
         return pyceres.CallbackReturnType.SOLVER_ABORT if stop else pyceres.CallbackReturnType.SOLVER_CONTINUE
 
 
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Ceres keeps to its summary: what it would print besides says no more."""
+    before = pyceres.logging.minloglevel
+    pyceres.logging.minloglevel = int(pyceres.logging.FATAL)
+    try:
+        yield
+    finally:
+        pyceres.logging.minloglevel = before
+
+
 def _parts(sight: Sights, threads: int) -> list[Sights]:
     """A sight of very many observations as one for each thread."""
     count = max(1, min(threads, (len(sight.points) + len(sight.curve_pixels)) // ROWS_WORTH_A_THREAD))
@@ -202,11 +214,12 @@ def solve(
         if arrays:
             problem.add_residual_block(cost, None, arrays)
     summary = pyceres.SolverSummary()
-    pyceres.solve(
-        _solver_options(layout, assembly.blocks, options, weighting, assembly.threads, _Watcher(run, progress)),
-        problem,
-        summary,
-    )
+    with _quiet():
+        pyceres.solve(
+            _solver_options(layout, assembly.blocks, options, weighting, assembly.threads, _Watcher(run, progress)),
+            problem,
+            summary,
+        )
     if run.failure is not None:
         raise run.failure
     try:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -129,10 +129,29 @@ def student_95(freedom: float) -> float:
 def make_posterior(found: Information, freedom: float) -> Posterior:
     """The posterior of what was told, placements included."""
     shared = Posterior(found.keys, found.matrix, {}, freedom)
-    placements: dict[str, Array] = {}
-    for part in found.eliminated:
-        placements |= zip(part.names, _placement_information(part, shared), strict=True)
-    return Posterior(found.keys, found.matrix, placements, freedom)
+    return Posterior(found.keys, found.matrix, _Placements(found.eliminated, shared), freedom)
+
+
+@dataclass(frozen=True, eq=False)
+class _Placements(Mapping[str, Array]):
+    """Information about each eliminated placement, worked out when the first one is asked for."""
+
+    eliminated: tuple[Eliminated, ...]
+    shared: Posterior
+
+    @cached_property
+    def _information(self) -> dict[str, Array]:
+        parts = ((part.names, _placement_information(part, self.shared)) for part in self.eliminated)
+        return {name: matrix for names, matrices in parts for name, matrix in zip(names, matrices, strict=True)}
+
+    def __getitem__(self, name: str) -> Array:
+        return self._information[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._information)
+
+    def __len__(self) -> int:
+        return len(self._information)
 
 
 def _placement_information(part: Eliminated, shared: Posterior) -> Array:

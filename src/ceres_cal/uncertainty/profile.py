@@ -147,12 +147,12 @@ def valley(camera: str, setting: Setting, estimate: Estimate) -> tuple[Node, ...
     """
     held = setting.holding_phi(camera)
     unit, phi = unit_px(estimate.cameras[camera]), estimate.cameras[camera].phi
-    first = _node(held, setting, estimate)
+    first = _node(camera, held, setting, estimate)
     within = float(np.clip(phi, unit * PHI_RANGE[0], unit * PHI_RANGE[1]))
     while first is not None and phi != within:
         factor = within / phi
         phi = within if 0.5 <= factor <= 2.0 else phi * float(np.clip(factor, 0.5, 2.0))
-        first = _node(held, setting, _ahead(camera, first, phi))
+        first = _node(camera, held, setting, _ahead(camera, first, phi))
     if first is None:
         raise SolutionError(
             f"camera {camera!r}: the least cost lies at phi {estimate.cameras[camera].phi:.1f} px, which is no lens: "
@@ -184,9 +184,18 @@ def profile(camera: str, nodes: Sequence[Node], estimate: Estimate, half_width: 
     )
 
 
-def _node(held: Setting, setting: Setting, start: Estimate) -> Node | None:
+def _node(camera: str, held: Setting, setting: Setting, start: Estimate) -> Node | None:
     found = held.solved(start)
-    return None if found is None else Node(*found, setting.told(found[0]))
+    if found is None:
+        return None
+    estimate, cost = found
+    return Node(estimate, cost + _of_prior(camera, setting, estimate), setting.told(estimate))
+
+
+def _of_prior(camera: str, setting: Setting, estimate: Estimate) -> float:
+    """What priors on phi itself add to twice the cost: a solve that holds phi leaves them out."""
+    priors = [p for p in setting.layout.priors if (p.owner, p.name, p.quantity) == ("camera", camera, "phi")]
+    return float(sum(((estimate.cameras[camera].phi - p.value[0]) / p.sigma[0]) ** 2 for p in priors))
 
 
 def _walk(camera: str, held: Setting, setting: Setting, first: Node, direction: int) -> Iterator[Node]:
@@ -200,7 +209,7 @@ def _walk(camera: str, held: Setting, setting: Setting, first: Node, direction: 
         wanted = float(np.clip(phi * np.exp(direction * step), low, high))
         if node.cost - lowest > _FAR or direction * (wanted - phi) <= 0.0:
             return
-        found = _node(held, setting, _ahead(camera, node, wanted))
+        found = _node(camera, held, setting, _ahead(camera, node, wanted))
         change = np.inf if found is None else abs(found.cost - node.cost)
         if found is None or (change > _MOST_RISE and node.cost - lowest < _FAR / 2.0 and step > _STEPS[0]):
             step *= 0.5  # too far to find, or to interpolate where the bounds will lie
