@@ -132,6 +132,12 @@ def test_importing_the_package_is_light() -> None:
     assert not heavy, f"import {PACKAGE} brings in {heavy}: import them, or the module that does, where they are used"
 
 
+def test_no_module_hides_the_function_of_its_name() -> None:
+    code = f"import {PACKAGE}.calibrate, {PACKAGE}; print(callable({PACKAGE}.calibrate))"
+    answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert answer.strip() == "True"
+
+
 @each_module
 def test_modules_stay_small(name: str) -> None:
     lines = len(MODULES[name].read_text(encoding="utf-8").splitlines())

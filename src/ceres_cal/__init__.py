@@ -39,16 +39,10 @@ _HOME = {
 __all__ = list(_HOME)
 
 
-def __getattr__(name: str) -> Any:
-    if name not in _HOME:
-        raise AttributeError(f"module 'ceres_cal' has no attribute {name!r}")
-    value = getattr(import_module(f"ceres_cal.{_HOME[name]}"), name)
-    globals()[name] = value
-    return value
-
-
 class _Package(ModuleType):
-    """A package whose names are not hidden by its modules of the same name, whoever imports those first."""
+    """Python puts a module that is imported into its package under its name: one that is called like the function in it
+    must not take the function's place.
+    """
 
     def __setattr__(self, name: str, value: Any) -> None:
         if not (name in _HOME and isinstance(value, ModuleType)):
@@ -56,3 +50,11 @@ class _Package(ModuleType):
 
 
 sys.modules[__name__].__class__ = _Package
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module 'ceres_cal' has no attribute {name!r}")
+    value = getattr(import_module(f"ceres_cal.{_HOME[name]}"), name)
+    globals()[name] = value
+    return value

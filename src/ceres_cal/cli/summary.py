@@ -57,30 +57,30 @@ def calibration_text(
     """A short table for people."""
     anchored, trust = anchored_stations(observations), Trust(calibration, observations)
     sections = [
-        _section("read", [", ".join(map(str, inputs)), *_counted(observations)]),
-        _section("fit", _fit(calibration)),
+        section("read", [", ".join(map(str, inputs)), *_counted(observations)]),
+        section("fit", _fit(calibration)),
     ]
     for name, camera in calibration.cameras.items():
         lines = _intrinsics(name, camera, calibration.options, calibration.phi_from.get(name, ""), trust)
-        sections.append(_section("camera", [f"{name}, {camera.image_size[0]} x {camera.image_size[1]} px", *lines]))
+        sections.append(section("camera", [f"{name}, {camera.image_size[0]} x {camera.image_size[1]} px", *lines]))
     for name, camera in calibration.stations.items():
         sections.append(
-            _section(
+            section(
                 "station", [f"{name}{_of_camera(calibration, name)}", *_pose(name, camera, name in anchored, trust)]
             )
         )
     if len(calibration.estimate.structure.names):
-        sections.append(_section("as built", _structure(calibration)))
-    sections += [_section(title, lines) for title, lines in trust.sections()]
-    sections.append(_section("outliers", _outlier_lines(calibration)))
-    sections.append(_section("stopped", _stop(calibration)))
-    sections.extend(_section("warning", wrap(text, 100)) for text in _warnings(calibration, observations))
+        sections.append(section("as built", _structure(calibration)))
+    sections += [section(title, lines) for title, lines in trust.sections()]
+    sections.append(section("outliers", _outlier_lines(calibration)))
+    sections.append(section("stopped", _stop(calibration)))
+    sections.extend(section("warning", wrap(text, 100)) for text in _warnings(calibration, observations))
     if output is not None:
-        sections.append(_section("written", [str(output)]))
+        sections.append(section("written", [str(output)]))
     return "\n".join(sections)
 
 
-def _section(title: str, lines: Iterable[str]) -> str:
+def section(title: str, lines: Iterable[str]) -> str:
     """A title beside its lines."""
     return "\n".join(f"{'' if number else title:10}{line}" for number, line in enumerate(lines))
 

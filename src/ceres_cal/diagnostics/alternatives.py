@@ -30,7 +30,7 @@ def all_families(
     """Every alternative worth a test, by kind."""
     return [
         *_lens_families(equations, estimate, layout),
-        *_target_families(observations, equations, estimate, used),
+        *target_families(observations, equations, estimate, used),
         *_frame_families(observations, equations, estimate, layout),
     ]
 
@@ -92,10 +92,7 @@ def radial_column(equations: Equations, estimate: Estimate, camera: str, power: 
         return np.asarray(unit_px(one) * outward * radius**power / np.maximum(slope, 0.05))
     rays = np.nan_to_num(one.rays(equations.pixel))
     across = np.linalg.norm(rays[:, :2], axis=1)
-    if one.lens.kind == "brown":
-        own = across / np.maximum(rays[:, 2], 0.05)
-    else:
-        own = np.arctan2(across, rays[:, 2])
+    own = across / np.maximum(rays[:, 2], 0.05) if one.lens.kind == "brown" else np.arctan2(across, rays[:, 2])
     return np.asarray(one.phi * outward * own**power)
 
 
@@ -115,10 +112,10 @@ def _decentring_columns(equations: Equations, estimate: Estimate, camera: str) -
 # ---- the target as built --------------------------------------------------------------------------------------------
 
 
-def _target_families(
+def target_families(
     observations: Observations, equations: Equations, estimate: Estimate, used: Mask
 ) -> Iterator[Family]:
-    """Each line, arc and point aside, each board bent; not what a tolerance solves for already."""
+    """Each line, arc and point aside, each board bent, of which enough is used; not what a tolerance solves for."""
     targets = observations.targets
     structure = make_structure(targets, {name: _everything(target) for name, target in targets.items()})
     slots, values = structure_columns(equations, structure)

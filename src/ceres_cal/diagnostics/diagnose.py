@@ -9,15 +9,14 @@ import numpy as np
 
 from ceres_cal import kernels
 from ceres_cal.calibration import Calibration
-from ceres_cal.diagnostics.alternatives import all_families
+from ceres_cal.diagnostics.alternatives import all_families, target_families
 from ceres_cal.diagnostics.equations import Equations, write_equations
 from ceres_cal.diagnostics.findings import Finding
 from ceres_cal.diagnostics.freedom import Freedom, make_freedom
 from ceres_cal.diagnostics.labels import Mislabelled, find_mislabelled
 from ceres_cal.diagnostics.leftover import Noise, measure_noise
-from ceres_cal.diagnostics.newcomers import with_newcomers_placed
+from ceres_cal.diagnostics.new_data import validity_finding, with_newcomers_placed
 from ceres_cal.diagnostics.patterns import heard_again, select
-from ceres_cal.diagnostics.scores import Family
 from ceres_cal.diagnostics.summaries import Summaries, summarise
 from ceres_cal.diagnostics.table import ResidualTable, make_table
 from ceres_cal.diagnostics.words import Context, label_findings, noise_findings, pattern_finding
@@ -31,7 +30,7 @@ from ceres_cal.transforms import Array
 
 FALSE_ALARM_RATE = 0.01
 """Probability that a calibration of sound data gets any finding at all."""
-_OTHER_TESTS = 4  # size and whiteness of the noise of points and of curves
+_OTHER_TESTS = 5  # size and whiteness of the noise of points and of curves, validity on new data
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +93,7 @@ def diagnose(
     weight, used, robust = _weights(calibration, inliers, model)
     freedom = make_freedom(equations, estimate, layout, weight, used, robust)
     table = make_table(observations, inliers, freedom, robust, dict(estimate.cameras))
-    findings, noise, tests = _judge_patterns(model, freedom, table, false_alarm_rate)
+    findings, noise, tests = _judge_patterns(model, freedom, table, false_alarm_rate, calibration if new_data else None)
     return Diagnosis(
         findings, table, summarise(observations, table, freedom, dict(estimate.cameras)), noise,
         observations.digest != calibration.digest, tests, false_alarm_rate,
@@ -163,13 +162,13 @@ def _weights(calibration: Calibration, inliers: Inliers, model: _Model) -> tuple
 
 
 def _judge_patterns(
-    model: _Model, freedom: Freedom, table: ResidualTable, rate: float
+    model: _Model, freedom: Freedom, table: ResidualTable, rate: float, calibration: Calibration | None
 ) -> tuple[tuple[Finding, ...], tuple[Noise, ...], int]:
-    """Findings, noise and how many tests there were."""
+    """Findings, noise and how many tests there were. `calibration`: that may not hold, where the data are new."""
     rejected = np.flatnonzero(~model.inliers.points), np.flatnonzero(~model.inliers.curves)
     labels, groups = find_mislabelled(model.observations, model.estimate, *rejected, model.scales, model.reject_sigma)
+    freedom = _with_the_rejected(model, freedom, labels)
     families = all_families(model.observations, model.equations, model.estimate, model.layout, freedom.used)
-    freedom = _with_the_rejected(model, freedom, families, labels)
     extra = groups + _OTHER_TESTS
     selection = select(freedom, families, rate, extra)
     noise = measure_noise(model.observations, selection.freedom, model.scales)
@@ -185,18 +184,18 @@ def _judge_patterns(
         *(pattern_finding(context, selection, number) for number in range(len(selection.chosen))),
         *label_findings(context, labels, level),
         *noise_findings(context, noise, level),
+        *([] if calibration is None else validity_finding(context, freedom, calibration, level)),
     ]
     return tuple(sorted(findings, key=lambda finding: -finding.effect_px)), noise, selection.tests
 
 
-def _with_the_rejected(
-    model: _Model, freedom: Freedom, families: Sequence[Family], labels: Sequence[Mislabelled]
-) -> Freedom:
+def _with_the_rejected(model: _Model, freedom: Freedom, labels: Sequence[Mislabelled]) -> Freedom:
     """The model in which lines and points that were taken out nearly whole take part where they agree."""
     explained = np.zeros(len(model.observations.points) + len(model.observations.curves), dtype=bool)
     for label in labels:
         explained[label.rows + (len(model.observations.points) if label.is_curve else 0)] = True
     silent = explained[model.equations.observation]
+    families = list(target_families(model.observations, model.equations, model.estimate, ~silent))
     used = heard_again(model.equations, freedom.weight, freedom.used, families, model.reject_sigma, silent)
     if np.array_equal(used, freedom.used):
         return freedom

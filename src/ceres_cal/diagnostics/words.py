@@ -10,7 +10,7 @@ import numpy as np
 
 from ceres_cal.diagnostics.alternatives import missing_powers, radial_column
 from ceres_cal.diagnostics.equations import Equations
-from ceres_cal.diagnostics.findings import Amount, Finding
+from ceres_cal.diagnostics.findings import SMALL, Amount, Finding
 from ceres_cal.diagnostics.freedom import Freedom
 from ceres_cal.diagnostics.labels import Mislabelled
 from ceres_cal.diagnostics.leftover import Noise
@@ -52,6 +52,11 @@ class Context:
         squared = np.nansum(((x**2 + y**2) / twice)[rows])
         return float(np.sqrt(np.sum(shift[rows] ** 2) / count)), float(np.sqrt(squared / count)), count
 
+    def noise_px(self, left_over: Array, rows: Mask) -> float:
+        """Root mean square over observations of what is left over, (E,) in standard deviations, px."""
+        count = len(np.unique(self.equations.observation[rows]))
+        return float(np.sqrt(np.sum((left_over / self.freedom.weight)[rows] ** 2) / count))
+
 
 @dataclass(frozen=True)
 class _Said:
@@ -73,11 +78,12 @@ def pattern_finding(context: Context, selection: Selection, number: int) -> Find
     for k, other in enumerate(selection.chosen):
         if k != number:
             others = others.with_columns(other.family.of(other.number) * others.weight[:, None])
-    size = f"{effect_px:.2f} px, {effect_mm:.1f} mm rms"
-    said = _SPEAKERS[score.family.kind](context, others, score, shift, size)
+    ratio = effect_px / context.noise_px(selection.freedom.left_over(), rows)
+    size = f"{effect_px:.2f} px, {effect_mm:.{1 if effect_mm >= 0.1 else 2}f} mm rms, {ratio:.2g} of the noise"
+    said = _SPEAKERS[score.family.kind](context, others, score, shift, size, ratio)
     name = score.family.names[score.number]
     return Finding(
-        score.family.kind, said.subject or name, said.frame, said.sentence, said.advice, effect_px, effect_mm,
+        score.family.kind, said.subject or name, said.frame, said.sentence, said.advice, effect_px, effect_mm, ratio,
         said.amounts, context.log10_p(score.log_p), count,
     )  # fmt: skip
 
@@ -87,7 +93,12 @@ def pattern_finding(context: Context, selection: Selection, number: int) -> Find
 _COEFFICIENTS = {"brown": {3: "k1", 5: "k2", 7: "k3"}, "kannala-brandt": {3: "k1", 5: "k2", 7: "k3", 9: "k4"}}
 
 
-def _radius(context: Context, others: Freedom, score: Score, shift: Array, size: str) -> _Said:
+def _most(context: Context, shift: Array) -> float:
+    """The largest displacement (px) of an observation that took part."""
+    return float(np.max(np.abs(shift[context.freedom.used])))
+
+
+def _radius(context: Context, others: Freedom, score: Score, shift: Array, size: str, ratio: float) -> _Said:
     name = score.family.names[score.number]
     lens = context.estimate.cameras[name].lens
     own = score.family.group == score.number
@@ -96,10 +107,11 @@ def _radius(context: Context, others: Freedom, score: Score, shift: Array, size:
     gains = {power: amounts_of(others, column[:, None])[2] for power, column in columns.items()}
     power = max(gains, key=lambda one: gains[one])
     whole = amounts_of(others, score.family.of(score.number))[2]
-    share = 100.0 * min(1.0, gains[power] / whole)
+    most, share = _most(context, shift * own), 100.0 * min(1.0, gains[power] / whole)
+    judged = "is too short" if ratio >= SMALL else "is long enough for one observation, not for the mean of many"
     sentence = (
-        f"camera {name!r}: residuals follow the radius, up to {np.max(np.abs(shift[own])):.2f} px ({size}): the radial "
-        f"polynomial is too short; one more power, r^{power}, explains {share:.0f} % of it"
+        f"camera {name!r}: residuals follow the radius, up to {most:.2f} px ({size}): the radial polynomial {judged}; "
+        f"one more power, r^{power}, explains {share:.0f} % of it"
     )
     coefficient = _COEFFICIENTS.get(lens.kind, {}).get(power)
     if lens.kind == "radial":
@@ -111,9 +123,9 @@ def _radius(context: Context, others: Freedom, score: Score, shift: Array, size:
     return _Said(sentence, advice, ())
 
 
-def _decentring(context: Context, others: Freedom, score: Score, shift: Array, size: str) -> _Said:
+def _decentring(context: Context, others: Freedom, score: Score, shift: Array, size: str, ratio: float) -> _Said:
     name = score.family.names[score.number]
-    most = np.max(np.abs(shift))
+    most = _most(context, shift)
     fixed = context.estimate.cameras[name].lens.kind == "brown"
     return _Said(
         f"camera {name!r}: its lens is not centred: a tangential displacement of up to {most:.2f} px ({size})",
@@ -122,7 +134,7 @@ def _decentring(context: Context, others: Freedom, score: Score, shift: Array, s
     )
 
 
-def _aspect(context: Context, others: Freedom, score: Score, shift: Array, size: str) -> _Said:
+def _aspect(context: Context, others: Freedom, score: Score, shift: Array, size: str, ratio: float) -> _Said:
     name = score.family.names[score.number]
     held = context.estimate.cameras[name].aspect
     return _Said(
@@ -133,7 +145,7 @@ def _aspect(context: Context, others: Freedom, score: Score, shift: Array, size:
     )
 
 
-def _principal_point(context: Context, others: Freedom, score: Score, shift: Array, size: str) -> _Said:
+def _principal_point(context: Context, others: Freedom, score: Score, shift: Array, size: str, ratio: float) -> _Said:
     name = score.family.names[score.number]
     x, y = score.amount
     return _Said(
@@ -144,7 +156,7 @@ def _principal_point(context: Context, others: Freedom, score: Score, shift: Arr
     )  # fmt: skip
 
 
-def _phi(context: Context, others: Freedom, score: Score, shift: Array, size: str) -> _Said:
+def _phi(context: Context, others: Freedom, score: Score, shift: Array, size: str, ratio: float) -> _Said:
     name = score.family.names[score.number]
     return _Said(
         f"camera {name!r}: phi is held, but residuals ask for {score.amount[0]:+.2f} ± {score.sd[0]:.2f} px ({size})",
@@ -156,7 +168,7 @@ def _phi(context: Context, others: Freedom, score: Score, shift: Array, size: st
 # ---- the target as built --------------------------------------------------------------------------------------------
 
 
-def _curve_aside(context: Context, others: Freedom, score: Score, shift: Array, size: str) -> _Said:
+def _curve_aside(context: Context, others: Freedom, score: Score, shift: Array, size: str, ratio: float) -> _Said:
     name = score.family.names[score.number]
     target, _, feature = name.partition("/")
     curve = context.observations.targets[target].curves[feature]
@@ -177,7 +189,7 @@ def _curve_aside(context: Context, others: Freedom, score: Score, shift: Array, 
     return _Said(sentence, advice, (Amount("left", float(mm[0]), float(sd[0]), "mm"),))
 
 
-def _point_aside(context: Context, others: Freedom, score: Score, shift: Array, size: str) -> _Said:
+def _point_aside(context: Context, others: Freedom, score: Score, shift: Array, size: str, ratio: float) -> _Said:
     name = score.family.names[score.number]
     target = name.partition("/")[0]
     mm, sd = 1e3 * score.amount, 1e3 * score.sd
@@ -188,7 +200,7 @@ def _point_aside(context: Context, others: Freedom, score: Score, shift: Array, 
     )
 
 
-def _board_bent(context: Context, others: Freedom, score: Score, shift: Array, size: str) -> _Said:
+def _board_bent(context: Context, others: Freedom, score: Score, shift: Array, size: str, ratio: float) -> _Said:
     name = score.family.names[score.number]
     mm, sd = 1e3 * score.amount, 1e3 * score.sd
     return _Said(
@@ -202,7 +214,7 @@ def _board_bent(context: Context, others: Freedom, score: Score, shift: Array, s
 # ---- a camera that moved --------------------------------------------------------------------------------------------
 
 
-def _moved(context: Context, others: Freedom, score: Score, shift: Array, size: str) -> _Said:
+def _moved(context: Context, others: Freedom, score: Score, shift: Array, size: str, ratio: float) -> _Said:
     station, _, frame = score.family.names[score.number].partition("\n")
     when = f"after frame {frame!r}" if score.family.onwards else f"in frame {frame!r} alone"
     columns = score.family.of(score.number)
@@ -236,7 +248,7 @@ def _length(vector: Array, sd: Array) -> tuple[float, float]:
     return length, float(np.linalg.norm(vector[known] * sd[known])) / max(length, 1e-300)
 
 
-_SPEAKERS: dict[str, Callable[[Context, Freedom, Score, Array, str], _Said]] = {
+_SPEAKERS: dict[str, Callable[[Context, Freedom, Score, Array, str, float], _Said]] = {
     "radius": _radius,
     "decentring": _decentring,
     "aspect": _aspect,
@@ -276,7 +288,7 @@ def label_findings(context: Context, labels: Sequence[Mislabelled], log_level: f
         )
         yield Finding(
             "wrong label", f"{target_name}/{names[feature]}", frames[0], sentence,
-            "correct the label; it was taken out and did no harm", _mean(own), _mean(mm), (),
+            "correct the label; it was taken out and did no harm", _mean(own), _mean(mm), _mean(own) / away, (),
             context.log10_p(min(member.log_p for member in members)), len(rows),
             tuple((kind, int(row)) for row in rows),
         )  # fmt: skip
@@ -301,7 +313,7 @@ def noise_findings(context: Context, noise: Sequence[Noise], log_level: float) -
             amount = Amount("scale", one.scale, one.scale / float(np.sqrt(2.0 * one.observations)), "")
             advice = "state the larger sigma where sigmas are taken as stated; the estimated scale is right already"
             yield Finding(
-                "noise", one.kind, None, sentence, advice, one.sigma_px, one.sigma_px * per_px, (amount,),
+                "noise", one.kind, None, sentence, advice, one.sigma_px, one.sigma_px * per_px, 1.0, (amount,),
                 context.log10_p(one.log_p), one.observations,
             )  # fmt: skip
         if one.correlation_log_p <= log_level:
@@ -313,6 +325,6 @@ def noise_findings(context: Context, noise: Sequence[Noise], log_level: float) -
             advice = "take every standard deviation of the calibration larger by the square root of that ratio"
             amount = Amount("correlation", one.correlation, 1.0 / float(np.sqrt(one.observations)), "")
             yield Finding(
-                "correlated", one.kind, None, sentence, advice, shared, shared * per_px, (amount,),
-                context.log10_p(one.correlation_log_p), one.observations,
+                "correlated", one.kind, None, sentence, advice, shared, shared * per_px, shared / one.sigma_px,
+                (amount,), context.log10_p(one.correlation_log_p), one.observations,
             )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Placements that new observations show and the calibration does not know: posed, everything else held."""
+"""Observations that the calibration was not made from: boards that it does not know, and whether it holds on them."""
 
 from __future__ import annotations
 
@@ -8,6 +8,10 @@ import numpy as np
 
 from ceres_cal.bundle import Weighting
 from ceres_cal.calibration import Calibration
+from ceres_cal.diagnostics.findings import Finding
+from ceres_cal.diagnostics.freedom import Freedom
+from ceres_cal.diagnostics.tails import log_f_tail
+from ceres_cal.diagnostics.words import Context
 from ceres_cal.errors import DegenerateError
 from ceres_cal.lost import with_lost_boards_found
 from ceres_cal.noise import Inliers
@@ -51,3 +55,36 @@ def with_newcomers_placed(observations: Observations, sights: Sights, calibratio
 
 def _first_station(observations: Observations, placement: str) -> str:
     return next(view.station for view in observations.views if view.placement == placement)
+
+
+def validity_finding(context: Context, freedom: Freedom, calibration: Calibration, log_level: float) -> list[Finding]:
+    """That the calibration does not hold on new observations, where a refit would fit them better than chance explains.
+
+    The gain of a refit is chi-square where the calibration is exact; its own uncertainty adds as much again for every
+    time that the new observations are as many as those it was made from. That holds where both see the same part of the
+    image: what is new at places that the calibration never saw is held against it.
+    """
+    pull, used = freedom.pull, freedom.used
+    if not len(pull):
+        return []
+    own = 2 * calibration.fit.points + calibration.fit.curves
+    inflation = 1.0 + np.count_nonzero(used) / max(own, 1)
+    left = freedom.left_over()
+    variance = float(left @ left) / max(freedom.spare, 1)
+    statistic = float(pull @ pull) / (inflation * len(pull) * variance)
+    log_p = float(log_f_tail(np.array([statistic]), np.array([len(pull)]), np.array([max(freedom.spare, 1)]))[0])
+    if log_p > log_level:
+        return []
+    shift = np.where(used, (freedom.shared @ pull) / freedom.weight, 0.0)
+    px, mm, count = context.effect(shift, used)
+    sentence = (
+        f"the calibration does not hold on these observations: a refit would move it by {px:.2f} px, {mm:.1f} mm rms"
+    )
+    ratio = px / context.noise_px(left, used)
+    return [
+        Finding(
+            "does not hold", ", ".join(context.observations.stations), None, sentence,
+            "find out with `ceres-cal check` whether the camera was moved, and refit", px, mm, ratio, (),
+            context.log10_p(log_p), count,
+        )
+    ]  # fmt: skip

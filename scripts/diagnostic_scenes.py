@@ -1,0 +1,176 @@
+"""Scenes for the diagnostics: clean ones of every kind, and the same with one fault planted."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ceres_cal.camera import Camera
+from ceres_cal.lens import Brown, KannalaBrandt, Lens, Radial
+from ceres_cal.observations import Observations, Prior
+from ceres_cal.parameters import Options
+from ceres_cal.simulate import (
+    Disturbance,
+    Scene,
+    Station,
+    board_scene,
+    built_in_scene,
+    field_scene,
+    join,
+    overhead_pose,
+    simulate,
+)
+from ceres_cal.structure import Tolerance
+from ceres_cal.targets import Segment, checkerboard, custom, ssl_field
+from ceres_cal.transforms import Pose
+
+NOISE = Disturbance(points_sigma_px=0.3, curves_sigma_px=0.3)
+OUTLIERS = replace(NOISE, outliers=0.1, hidden_stretches=4, hidden_points=0.1)
+USUAL: Lens = Radial((-5.2e-5, 6.1e-7), (2, 3))
+
+
+def overhead(
+    lens: Lens = USUAL, frames: int = 10, boards: int = 6, phi: float = 868.0, height_m: float = 4.02
+) -> Scene:
+    """One station over half of a division B field, leaning by 8 degrees, and a board at some places."""
+    cameras = {"overhead": Camera((1280, 960), 868.0, (646.5, 473.8), lens)}
+    pose = overhead_pose(-2.27, -0.12, 4.02, tilt_x_deg=6.8, tilt_y_deg=-2.4, yaw_deg=90.6)
+    stations = {"overhead": Station("overhead", pose)}
+    field = field_scene(ssl_field("B"), cameras, stations, frames=frames, spacing_m=0.2)
+    if not boards:
+        return field
+    return join(field, board_scene(checkerboard(9, 6, 0.1), cameras, stations, count=boards, seed=1))
+
+
+def held_boards(lens: Lens, phi: float = 868.0, count: int = 12) -> Scene:
+    """A board held before one camera."""
+    cameras = {"camera": Camera((1280, 960), phi, (646.5, 473.8), lens)}
+    stations = {"camera": Station("camera", Pose.identity())}
+    return board_scene(checkerboard(9, 6, 0.05), cameras, stations, count=count, seed=3, distance_m=(0.5, 1.5))
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What is calibrated: the observations of a seed, and the options."""
+
+    observe: Callable[[int], Observations]
+    options: Options
+
+
+def _plain(scene: Callable[[], Scene], disturbance: Disturbance = NOISE, **options: object) -> Problem:
+    def observe(seed: int) -> Observations:
+        return simulate(scene(), disturbance, seed).observations
+
+    return Problem(observe, Options(**options))  # type: ignore[arg-type]
+
+
+def _with_prior(seed: int) -> Observations:
+    height_m = 4.02 + 0.01 * float(np.random.default_rng(seed).standard_normal())
+    prior = Prior("station", "overhead", "height_m", (height_m,), (0.01,))
+    return replace(simulate(overhead(boards=0), NOISE, seed).observations, priors=(prior,))
+
+
+CLEAN: dict[str, Problem] = {
+    "field and boards": _plain(overhead),
+    "field and boards, 10 % outliers": _plain(overhead, OUTLIERS),
+    "field alone": _plain(lambda: overhead(boards=0)),
+    "field alone, one frame": _plain(lambda: overhead(boards=0, frames=1)),
+    "field, height measured": Problem(_with_prior, Options()),
+    "field, lines solved for": _plain(
+        lambda: overhead(boards=0, frames=4), tolerances={"field": Tolerance(lines_m=0.01)}
+    ),
+    "boards, radial lens": _plain(lambda: held_boards(USUAL)),
+    "boards, brown lens": _plain(lambda: held_boards(Brown((-0.24, 0.082, 4e-4, -3e-4, -0.011)), 825.0), lens="brown"),
+    "boards, kannala-brandt lens": _plain(
+        lambda: held_boards(KannalaBrandt((-0.012, 0.004, -0.003, 0.0006)), 548.0), lens="kannala-brandt"
+    ),
+    "two cameras, shared boards": _plain(lambda: built_in_scene("two-cameras")[0]),
+    "three stations": _plain(lambda: built_in_scene("moved-camera")[0]),
+}
+"""Data that are just what the model says."""
+
+
+# ---- faults ---------------------------------------------------------------------------------------------------------
+
+
+def short_polynomial(seed: int) -> Observations:
+    """A lens with the paper's two powers, to be calibrated with one."""
+    return simulate(overhead(), NOISE, seed).observations
+
+
+def longer_polynomial(seed: int) -> Observations:
+    """A lens with powers 2, 3 and 5, to be calibrated with 2 and 3."""
+    return simulate(overhead(Radial((-5.2e-5, 3.1e-7, 5.0e-13), (2, 3, 5))), NOISE, seed).observations
+
+
+def line_aside(seed: int, line: str = "LeftPenaltyStretch", aside_m: float = 0.012) -> Observations:
+    """One line painted to its left, everything named as it is drawn."""
+    scene, drawn = overhead(), ssl_field("B")
+    curve = drawn.curves[line]
+    assert isinstance(curve, Segment)
+    along = np.subtract(curve.end, curve.start)
+    move = aside_m * np.array([-along[1], along[0], 0.0]) / np.linalg.norm(along)
+    start, end = (tuple(float(v) for v in np.add(place, move)) for place in (curve.start, curve.end))
+    painted = custom(drawn.points, {**drawn.curves, line: Segment(start, end, curve.width_m)})  # type: ignore[arg-type]
+    seen = simulate(replace(scene, targets={**scene.targets, "field": painted}), NOISE, seed).observations
+    order = np.array([drawn.curve_names.index(name) for name in painted.curve_names])
+    curves = replace(seen.curves, feature=order[seen.curves.feature])  # boards have no curves
+    return Observations({**seen.targets, "field": drawn}, seen.cameras, seen.views, seen.points, curves)
+
+
+def wrong_label(seed: int) -> Observations:
+    """In frame 3 one corner under the name of another."""
+    seen = simulate(overhead(), NOISE, seed).observations
+    names = seen.targets["field"].point_names
+    feature = seen.points.feature.copy()
+    view = next(number for number, one in enumerate(seen.views) if one.frame == "0003")
+    corner = names.index("TopLeftCorner")
+    row = np.flatnonzero((seen.points.view == view) & (feature == corner))[0]
+    feature[row] = names.index("LeftFieldRightPenaltyCorner")
+    return replace(seen, points=replace(seen.points, feature=feature))
+
+
+def bumped(seed: int, degrees: tuple[float, float, float] = (0.05, 0.0, 0.0), frames: int = 5) -> Observations:
+    """After frame 5 the camera has turned in place about its own axes."""
+    scene = overhead()
+    station = scene.stations["overhead"]
+    turned = Pose.exp((*np.deg2rad(degrees), 0.0, 0.0, 0.0)) @ station.cam_from_world
+    field, *rest = scene.views
+    views = (
+        replace(field, frames=field.frames[:frames]),
+        replace(field, frames=field.frames[frames:], station="after"),
+    )
+    stations = {"overhead": station, "after": Station("overhead", turned)}
+    seen = simulate(replace(scene, stations=stations, views=(*views, *rest)), NOISE, seed).observations
+    return replace(seen, views=tuple(replace(view, station="overhead") for view in seen.views))
+
+
+def noisier(seed: int) -> Observations:
+    """Points with twice the noise that is stated."""
+    seen = simulate(overhead(), replace(NOISE, points_sigma_px=0.6), seed).observations
+    return replace(seen, points=replace(seen.points, sigma_px=0.5 * seen.points.sigma_px))
+
+
+def agreeing(seed: int) -> Observations:
+    """Curve observations whose neighbours share half of their variance."""
+    seen = simulate(overhead(), NOISE, seed).observations
+    rng = np.random.default_rng(seed)
+    pixels = simulate(overhead(), Disturbance(), seed).observations.curves.pixels
+    noise = rng.standard_normal((len(pixels), 2))
+    for row in range(1, len(noise)):
+        noise[row] = 0.5 * noise[row - 1] + np.sqrt(0.75) * noise[row]
+    return replace(seen, curves=replace(seen.curves, pixels=pixels + 0.3 * noise))
+
+
+FAULTS: dict[str, tuple[Problem, str, str]] = {
+    "polynomial too short (r^2)": (Problem(short_polynomial, Options(powers=(3,))), "radius", "overhead"),
+    "polynomial too short (r^5)": (Problem(longer_polynomial, Options()), "radius", "overhead"),
+    "line 12 mm aside": (Problem(line_aside, Options()), "curve aside", "field/LeftPenaltyStretch"),
+    "one mislabelled corner": (Problem(wrong_label, Options()), "wrong label", "field/LeftFieldRightPenaltyCorner"),
+    "bumped by 0.05 degrees after frame 5": (Problem(bumped, Options()), "moved after", "overhead"),
+    "noise of points twice what was stated": (Problem(noisier, Options()), "noise", "points"),
+    "neighbours along lines agree": (Problem(agreeing, Options()), "correlated", "curves"),
+}
+"""Name -> problem, and kind and subject of the one finding it must give."""

@@ -1,0 +1,109 @@
+"""What the diagnostics find where nothing is wrong, and where one thing is: python scripts/false_alarms.py [--help]
+
+Every finding on a clean scene is a false alarm; their share of the scenes must keep to the stated rate. On a scene with
+one planted fault the largest finding must name it; any other finding there is counted too. Exits with 1 when the rate
+is exceeded by more than chance allows, or a fault is not named.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections import Counter
+from dataclasses import dataclass
+
+import numpy as np
+from diagnostic_scenes import CLEAN, FAULTS, Problem
+
+from ceres_cal.calibrate import calibrate
+from ceres_cal.diagnostics import FALSE_ALARM_RATE, Diagnosis, diagnose
+from ceres_cal.diagnostics.tails import log_binomial_tail
+
+SURE = 0.001  # a count of false alarms less probable than this exceeds the rate
+
+
+@dataclass(frozen=True)
+class Row:
+    """One kind of scene: how many, in how many of them there was a (false) finding, and which."""
+
+    name: str
+    scenes: int
+    alarms: int
+    kinds: dict[str, int]
+    named: int | None = None
+
+    @property
+    def verdict(self) -> str:
+        if self.named is not None:
+            return "yes" if self.named == self.scenes else "no"
+        return "no" if self.alarms and _chance(self.alarms, self.scenes) < SURE else "yes"
+
+    def __str__(self) -> str:
+        named = "" if self.named is None else f"named in {self.named}, "
+        kinds = ", ".join(f"{kind} {count}" for kind, count in self.kinds.items())
+        count = f"{self.name:40}{self.scenes:5} scenes  {named}{self.alarms:3} false alarms"
+        return f"{count}  {self.verdict:4}{kinds}".rstrip()
+
+
+def _chance(alarms: int, scenes: int) -> float:
+    """Probability of so many false alarms at the stated rate."""
+    tail = log_binomial_tail(np.array([alarms]), np.array([scenes]), np.array([FALSE_ALARM_RATE]))
+    return float(np.exp(tail[0]))
+
+
+def diagnosed(problem: Problem, seed: int) -> Diagnosis:
+    observations = problem.observe(seed)
+    return diagnose(calibrate(observations, problem.options), observations)
+
+
+def clean_row(name: str, seeds: range) -> Row:
+    alarms, kinds = 0, Counter[str]()
+    for seed in seeds:
+        findings = diagnosed(CLEAN[name], seed).findings
+        alarms += bool(findings)
+        kinds.update(finding.kind for finding in findings)
+    return Row(name, len(seeds), alarms, dict(kinds))
+
+
+def fault_row(name: str, seeds: range) -> Row:
+    """A scene counts as named when the finding of most effect is of the planted kind and subject."""
+    problem, kind, subject = FAULTS[name]
+    named, alarms, kinds = 0, 0, Counter[str]()
+    for seed in seeds:
+        findings = diagnosed(problem, seed).findings
+        named += bool(findings) and (findings[0].kind, findings[0].subject) == (kind, subject)
+        others = [one for one in findings if (one.kind, one.subject) != (kind, subject)]
+        alarms += bool(others)
+        kinds.update(one.kind for one in others)
+    return Row(name, len(seeds), alarms, dict(kinds), named)
+
+
+def main(arguments: list[str]) -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--runs", type=int, default=50, help="clean scenes of each kind; default: 50")
+    parser.add_argument("--faults", type=int, default=10, help="scenes of each fault; default: 10")
+    parser.add_argument("--case", choices=[*CLEAN, *FAULTS], help="only this one")
+    parser.add_argument("--seed", type=int, default=0, help="of the first scene; default: 0")
+    parser.add_argument("--json", action="store_true")
+    args = parser.parse_args(arguments)
+    rows, start = [], time.perf_counter()
+    for name in [*CLEAN, *FAULTS]:
+        if args.case in (None, name):
+            make, count = (clean_row, args.runs) if name in CLEAN else (fault_row, args.faults)
+            rows.append(make(name, range(args.seed, args.seed + count)))
+            if not args.json:
+                print(rows[-1], flush=True)
+    clean = [row for row in rows if row.named is None]
+    scenes, alarms = sum(row.scenes for row in clean), sum(row.alarms for row in clean)
+    total = Row(f"all clean, at most {100 * FALSE_ALARM_RATE:g} % by design", scenes, alarms, {})
+    if args.json:
+        print(json.dumps({"rows": [vars(row) | {"verdict": row.verdict} for row in [*rows, total]]}, indent=1))
+    elif clean:
+        print(f"{total} {100.0 * alarms / scenes:.2f} %, {time.perf_counter() - start:.0f} s")
+    return int(any(row.verdict == "no" for row in [*rows, total]))
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

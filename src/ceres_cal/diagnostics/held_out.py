@@ -1,0 +1,350 @@
+"""Held-out error: calibrate on some frames, predict the others; and the choice of lens that follows from it.
+
+A frame that is held out is predicted by cameras and stations of the others. A board that only held-out frames show is
+posed from them, everything else held: its six numbers are no part of the camera. So the error of boards is a little
+below that of a field, by the same share whatever the lens.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from ceres_cal.bundle import Weighting, solve
+from ceres_cal.calibrate import calibrate
+from ceres_cal.calibration import Calibration
+from ceres_cal.diagnostics.equations import write_equations
+from ceres_cal.diagnostics.table import error_mm
+from ceres_cal.errors import CalibrationError, DegenerateError, InputError
+from ceres_cal.observations import Columns, Observations
+from ceres_cal.parameters import Estimate, Layout, Options
+from ceres_cal.residuals import residuals
+from ceres_cal.sights import Mask, Sights, gather_sights
+from ceres_cal.structure import make_structure
+from ceres_cal.transforms import Array, Pose
+
+FOLDS = 5
+MOST_OBSERVATIONS = 10_000
+_FEWEST_FRAMES = 40
+_UNSEEN_SIGMA = 10.0  # what an observation counts that the fold's camera cannot show at all
+_RADIAL = ((3,), (2, 3), (3, 5), (2, 3, 4), (2, 3, 4, 5))
+_COEFFICIENTS = {"brown": ("k1", "k2", "k3"), "kannala-brandt": ("k1", "k2", "k3", "k4")}
+_FEWEST_COEFFICIENTS = 2
+
+
+@dataclass(frozen=True, eq=False)
+class HeldOut:
+    """Errors of prediction, each observation by a calibration that did not see its frame.
+
+    Attributes:
+        label: what was calibrated. coefficients: how many the lens solves for. folds: into how many parts the frames
+            went; failed_folds: those without which nothing usable came out: their frames do not count. failed: why
+            there is no answer, "" where there is.
+        points_rms_px: of the lengths of the points' errors; curves_rms_px: of distances to curves; rms_mm: of both on
+            the targets' planes; NaN where there are none. fit_rms_px: the same of the calibration on all frames, over
+            points and curves together, on the same observations; rms_px: of the held-out errors.
+        frames: names; frame_squares: (F,) sum of squared errors in stated sigmas; frame_counts: (F,) observations.
+    """
+
+    label: str
+    coefficients: int
+    folds: int
+    failed_folds: int
+    points_rms_px: float
+    curves_rms_px: float
+    rms_px: float
+    rms_mm: float
+    fit_rms_px: float
+    frames: tuple[str, ...]
+    frame_squares: Array
+    frame_counts: Array
+    failed: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Choice:
+    """Which lens the held-out error speaks for.
+
+    Attributes:
+        candidates: each tried lens, fewest coefficients first. options: of each.
+        best: index of the least squared error in stated sigmas. chosen: the one of fewest coefficients whose error is
+            above that by no more than one standard error of their difference, frame by frame (the one-standard-error
+            rule of Breiman et al. 1984, paired). current: the one that was asked about.
+        thinned: share of the observations that took part.
+    """
+
+    candidates: tuple[HeldOut, ...]
+    options: tuple[Options, ...]
+    best: int
+    chosen: int
+    current: int
+    thinned: float
+
+
+def cross_validate(
+    observations: Observations,
+    options: Options | None = None,
+    k: int = FOLDS,
+    *,
+    calibration: Calibration | None = None,
+    counted: tuple[Mask, Mask] | None = None,
+    label: str | None = None,
+) -> HeldOut:
+    """The error with which frames are predicted by a calibration of the others, k-fold.
+
+    Args:
+        calibration: of all the observations with these options, where it is there already.
+        counted: (N,) of points and (M,) of curves, which observations count; those that the calibration of all kept.
+
+    Raises:
+        InputError: k below 2, or fewer than two frames.
+        CalibrationError: the observations cannot be calibrated, as a whole or without each of most of the folds.
+    """
+    options = options or Options()
+    whole = calibration or calibrate(observations, options)
+    kept = counted or _kept(whole, observations)
+    names, frame = _frames(observations)
+    if k < 2:
+        raise InputError(f"cross-validation needs at least 2 folds, not {k}")
+    if len(names) < 2:
+        raise InputError("cross-validation by frame needs at least two frames: a single one cannot be held out")
+    folds = min(k, len(names))
+    fold = np.random.default_rng(0).permutation(len(names)) % folds  # of each frame; the same every time
+    point_frame, curve_frame = frame[observations.points.view], frame[observations.curves.view]
+    columns = [np.full((len(column.view), 2), np.nan) for column in (observations.points, observations.curves)]
+    failures = []
+    for number in range(folds):
+        out = fold[point_frame] == number, fold[curve_frame] == number
+        held = out[0] & kept[0], out[1] & kept[1]
+        try:
+            trained = calibrate(_subset(observations, ~out[0], ~out[1]), options)
+        except CalibrationError as error:
+            failures.append(error)
+            if 2 * len(failures) > folds:
+                raise
+            continue
+        for column, found, rows in zip(columns, _predicted(observations, held, trained, whole), held, strict=True):
+            column[rows] = found[rows]
+    kept = kept[0] & np.isfinite(columns[0][:, 0]), kept[1] & np.isfinite(columns[1][:, 0])
+    fit_px = _errors(observations, kept, whole.estimate)
+    return _held_out(
+        observations, options, label or label_of(options), (folds, len(failures)), columns, fit_px, kept, names, frame
+    )
+
+
+def choose(observations: Observations, options: Options, k: int = FOLDS, *, most: int = MOST_OBSERVATIONS) -> Choice:
+    """The lens powers or coefficients that predict best, among those of the same kind of lens.
+
+    All candidates are judged on the same observations: those that the calibration with any of them keeps.
+
+    Args:
+        most: of more observations, evenly spread frames and rows take part.
+
+    Raises:
+        InputError: fewer than two frames. DegenerateError: no candidate can be calibrated.
+    """
+    few = thinned(observations, most)
+    if len(_frames(few)[0]) < 2:
+        raise InputError("cross-validation by frame needs at least two frames: a single one cannot be held out")
+    tried = candidates(options)
+    wholes: list[Calibration | str] = [_attempt(few, one) for one in tried]
+    good = [whole for whole in wholes if isinstance(whole, Calibration)]
+    if not good:
+        raise DegenerateError(f"no lens can be calibrated: {wholes[0]}")
+    masks = [_kept(whole, few) for whole in good]
+    counted = np.any([m[0] for m in masks], axis=0), np.any([m[1] for m in masks], axis=0)
+    found = []
+    for one, whole in zip(tried, wholes, strict=True):
+        if isinstance(whole, str):
+            found.append(_failure(one, whole))
+            continue
+        try:
+            found.append(cross_validate(few, one, k, calibration=whole, counted=counted))
+        except CalibrationError as error:
+            found.append(_failure(one, str(error)))
+    best, chosen = _decide(found)
+    share = (len(few.points) + len(few.curves)) / (len(observations.points) + len(observations.curves))
+    current = next(i for i, one in enumerate(tried) if label_of(one) == label_of(options))
+    return Choice(tuple(found), tuple(tried), best, chosen, current, share)
+
+
+def _attempt(observations: Observations, options: Options) -> Calibration | str:
+    try:
+        return calibrate(observations, options)
+    except CalibrationError as error:
+        return str(error)
+
+
+def _decide(found: Sequence[HeldOut]) -> tuple[int, int]:
+    """Indices of the best candidate and of the simplest that is as good within one standard error."""
+    good = [i for i, one in enumerate(found) if not one.failed]
+    if not good:
+        raise DegenerateError(f"no lens can be calibrated without one of the folds: {found[0].failed}")
+    common = np.all([found[i].frame_counts > 0 for i in good], axis=0)
+    squares = {i: found[i].frame_squares[common] for i in good}
+    best = min(good, key=lambda i: float(squares[i].sum()))
+    for i in sorted(good, key=lambda i: (found[i].coefficients, float(squares[i].sum()))):
+        more = squares[i] - squares[best]
+        error = float(np.sqrt(len(more)) * np.std(more, ddof=1))
+        if float(more.sum()) <= error:
+            return best, i
+    return best, best
+
+
+# ---- candidates -----------------------------------------------------------------------------------------------------
+
+
+def candidates(options: Options) -> list[Options]:
+    """Options with every sensible lens of the same kind, fewest coefficients first; the given one is among them."""
+    if options.lens == "radial":
+        powers = sorted({*_RADIAL, options.powers}, key=lambda p: (len(p), p))
+        own = set(options.blank_lens.names) & set(options.fixed)
+        if own:  # a held coefficient belongs to its own powers alone
+            powers = [options.powers]
+        return [replace(options, powers=one) for one in powers]
+    names = _COEFFICIENTS[options.lens]
+    held = {name: value for name, value in options.fixed.items() if name not in names}
+    found = []
+    for count in range(_FEWEST_COEFFICIENTS, len(names) + 1):
+        found.append(replace(options, fixed={**held, **dict.fromkeys(names[count:], 0.0)}))
+    if all(label_of(one) != label_of(options) for one in found):
+        found.append(options)
+    return found
+
+
+def label_of(options: Options) -> str:
+    """How a lens is called: "radial 2,3" or "brown k1 k2 p1 p2"."""
+    if options.lens == "radial":
+        return "radial " + ",".join(map(str, options.powers))
+    return " ".join([options.lens, *(name for name in options.blank_lens.names if name not in options.fixed)])
+
+
+# ---- one fold -------------------------------------------------------------------------------------------------------
+
+
+def _frames(observations: Observations) -> tuple[tuple[str, ...], Array]:
+    """Names of the frames that show anything, and the frame's number of each view (-1: shows nothing)."""
+    shown = np.union1d(observations.points.view, observations.curves.view)
+    order: dict[str, int] = {}
+    for view in shown:
+        order.setdefault(observations.views[int(view)].frame, len(order))
+    return tuple(order), np.array([order.get(view.frame, -1) for view in observations.views])
+
+
+def _subset(observations: Observations, points: Mask, curves: Mask) -> Observations:
+    """The same views with some of the observations."""
+    both = ((observations.points, points), (observations.curves, curves))
+    left: list[Any] = [replace(c, **{name: values[rows] for name, values in vars(c).items()}) for c, rows in both]
+    return replace(observations, points=left[0], curves=left[1])
+
+
+def thinned(observations: Observations, most: int) -> Observations:
+    """Evenly spread frames, and of these evenly spread observations, about `most` in all."""
+    total = len(observations.points) + len(observations.curves)
+    if total <= most:
+        return observations
+    names, frame = _frames(observations)
+    count = max(min(_FEWEST_FRAMES, len(names)), int(len(names) * most / total))
+    chosen = np.zeros(len(names) + 1, dtype=bool)
+    chosen[np.linspace(0, len(names) - 1, count).round().astype(int)] = True
+    rows = chosen[frame[observations.points.view]], chosen[frame[observations.curves.view]]
+    step = max(1, round((np.count_nonzero(rows[0]) + np.count_nonzero(rows[1])) / most))
+    for mask in rows:
+        mask[np.flatnonzero(mask)[np.arange(np.count_nonzero(mask)) % step > 0]] = False
+    return _subset(observations, *rows)
+
+
+def _kept(calibration: Calibration, observations: Observations) -> tuple[Mask, Mask]:
+    masks = np.ones(len(observations.points), bool), np.ones(len(observations.curves), bool)
+    for entry in calibration.rejected:
+        masks[entry.kind == "curve"][entry.row] = False
+    return masks
+
+
+def _predicted(
+    observations: Observations, held: tuple[Mask, Mask], trained: Calibration, whole: Calibration
+) -> tuple[Array, Array]:
+    """Errors (N, 2) and (M, 2), px and mm, of held-out observations under a calibration that did not see them."""
+    estimate = trained.estimate
+    sights = gather_sights(observations).used(*held)
+    new = {key.placement for key in sights.keys if key.placement is not None} - set(estimate.placements)
+    missing = {key.station for key in sights.keys} - set(estimate.stations)
+    if missing:
+        raise DegenerateError(f"station {min(missing)!r} stands in held-out frames only: it cannot be predicted")
+    if new:
+        placements = {**estimate.placements, **{str(name): whole.estimate.placements[str(name)] for name in new}}
+        estimate = replace(estimate, placements=placements)
+        of_new = sights.take(np.array([i for i, key in enumerate(sights.keys) if key.placement in new]))
+        estimate = replace(estimate, placements=_posed(of_new, estimate, trained, observations))
+    return _errors(observations, held, estimate)
+
+
+def _posed(sights: Sights, estimate: Estimate, trained: Calibration, observations: Observations) -> Mapping[str, Pose]:
+    """All placements, those of the sights in their best pose, everything else held; targets as the fold built them."""
+    built = replace(sights, points=estimate.structure.points(sights), tracks=estimate.structure.tracks(sights))
+    start = replace(estimate, structure=make_structure(observations.targets, {}))
+    none = {name: np.empty(0, dtype=np.int64) for name in estimate.cameras}
+    layout = Layout(none, frozenset(), frozenset(str(key.placement) for key in sights.keys))
+    fit, options = trained.fit, trained.options
+    weighting = Weighting(fit.point_scale, fit.curve_scale, options.loss, options.loss_scale)
+    return solve(built, start, layout, weighting, options).estimate.placements
+
+
+def _errors(observations: Observations, rows: tuple[Mask, Mask], estimate: Estimate) -> tuple[Array, Array]:
+    """Lengths in px and mm of the residuals, (N, 2) and (M, 2); what is not seen counts 10 sigma in px, NaN in mm."""
+    sights = gather_sights(observations).used(*rows)
+    found = residuals(observations, sights, estimate)
+    equations = write_equations(observations, sights, estimate, found)
+    count = len(observations.points)
+    mm = np.abs(error_mm(equations, equations.residual, count + len(observations.curves)))
+    px = np.linalg.norm(found.points, axis=1), np.abs(found.curves)
+    answer = []
+    both: tuple[Columns, Columns] = (observations.points, observations.curves)
+    for length, own_mm, column in zip(px, (mm[:count], mm[count:]), both, strict=True):
+        length = np.where(np.isfinite(length), length, _UNSEEN_SIGMA * column.sigma_px)
+        answer.append(np.column_stack([length, own_mm]))
+    return answer[0], answer[1]
+
+
+def _held_out(
+    observations: Observations,
+    options: Options,
+    label: str,
+    folds: tuple[int, int],
+    columns: Sequence[Array],
+    fit_columns: Sequence[Array],
+    kept: tuple[Mask, Mask],
+    names: tuple[str, ...],
+    frame: Array,
+) -> HeldOut:
+    both: tuple[Columns, Columns] = (observations.points, observations.curves)
+    squares = np.zeros(len(names))
+    counts = np.zeros(len(names))
+    for column, errors, rows in zip(both, columns, kept, strict=True):
+        own = frame[column.view[rows]]
+        squares += np.bincount(own, (errors[rows, 0] / column.sigma_px[rows]) ** 2, len(names))
+        counts += np.bincount(own, minlength=len(names))
+    points, curves = (errors[rows] for errors, rows in zip(columns, kept, strict=True))
+    together = np.concatenate([points, curves])
+    fitted = np.concatenate([errors[rows, 0] for errors, rows in zip(fit_columns, kept, strict=True)])
+    return HeldOut(
+        label, _coefficients(options), *folds, _rms(points[:, 0]), _rms(curves[:, 0]), _rms(together[:, 0]),
+        _rms(together[:, 1]), _rms(fitted), names, squares, counts,
+    )  # fmt: skip
+
+
+def _failure(options: Options, why: str) -> HeldOut:
+    nothing, nan = np.empty(0), float("nan")
+    return HeldOut(label_of(options), _coefficients(options), 0, 0, nan, nan, nan, nan, nan, (), nothing, nothing, why)
+
+
+def _coefficients(options: Options) -> int:
+    return len(set(options.blank_lens.names) - set(options.fixed))
+
+
+def _rms(values: Array) -> float:
+    known = values[np.isfinite(values)]
+    return float(np.sqrt(np.mean(known**2))) if len(known) else float("nan")

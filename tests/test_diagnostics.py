@@ -1,0 +1,431 @@
+"""Diagnostics: the table against brute force, planted faults by name, silence where nothing is wrong."""
+
+import csv
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import diagnostic_scenes as scenes
+import numpy as np
+import pytest
+import scenes as usual
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import stats
+
+from ceres_cal.calibrate import calibrate
+from ceres_cal.calibration import Calibration
+from ceres_cal.cli import main
+from ceres_cal.detect.boards import BoardDetections
+from ceres_cal.diagnostics import Diagnosis, choose, cross_validate, diagnose
+from ceres_cal.diagnostics.equations import Equations, write_equations
+from ceres_cal.diagnostics.freedom import _shared_columns, make_freedom
+from ceres_cal.diagnostics.tails import log_binomial_tail, log_chi2_tail, log_f_tail
+from ceres_cal.errors import InputError
+from ceres_cal.observations import Observations, Prior
+from ceres_cal.parameters import Options, intrinsics_vector, make_layout, with_intrinsics
+from ceres_cal.residuals import residuals
+from ceres_cal.sights import gather_sights
+from ceres_cal.simulate import Disturbance, simulate
+from ceres_cal.transforms import Array, Pose
+
+PLAIN = Options(loss="trivial")
+
+
+@pytest.fixture(scope="module")
+def observations() -> Observations:
+    return simulate(scenes.overhead(), scenes.NOISE, 7).observations
+
+
+@pytest.fixture(scope="module")
+def calibration(observations: Observations) -> Calibration:
+    return calibrate(observations)
+
+
+@pytest.fixture(scope="module")
+def diagnosis(calibration: Calibration, observations: Observations) -> Diagnosis:
+    return diagnose(calibration, observations)
+
+
+# ---- tail probabilities ---------------------------------------------------------------------------------------------
+
+
+@given(st.floats(0.01, 1e4), st.integers(1, 30), st.integers(3, 200_000))
+def test_tail_of_f(value: float, d1: int, d2: int) -> None:
+    expected = stats.f.logsf(value, d1, d2)
+    if expected > -600.0:  # scipy's own underflows
+        found = float(log_f_tail(np.array([value]), np.array([d1]), np.array([d2]))[0])
+        assert found == pytest.approx(expected, rel=2e-8, abs=2e-8)
+
+
+@given(st.integers(1, 50), st.integers(0, 100), st.floats(1e-6, 0.999))
+def test_tail_of_the_binomial(count: int, more: int, probability: float) -> None:
+    trials = count + more
+    expected = stats.binom.logsf(count - 1, trials, probability)
+    found = float(log_binomial_tail(np.array([count]), np.array([trials]), np.array([probability]))[0])
+    assert found == pytest.approx(expected, rel=1e-8, abs=1e-8)
+
+
+@given(st.floats(0.0, 2e4), st.floats(1.0, 1e4))
+def test_tail_of_chi_square(value: float, freedom: float) -> None:
+    expected = stats.chi2.logsf(value, freedom)
+    if expected > -600.0:
+        assert log_chi2_tail(value, freedom) == pytest.approx(expected, rel=1e-8, abs=1e-8)
+
+
+def test_tails_do_not_underflow() -> None:
+    assert float(log_f_tail(np.array([1e4]), np.array([3]), np.array([100_000]))[0]) == pytest.approx(
+        -13116.0, rel=1e-3
+    )
+    assert log_chi2_tail(1e5, 10.0) < -4e4
+
+
+# ---- derivatives and leverage against brute force -------------------------------------------------------------------
+
+
+def linearised(observations: Observations, calibration: Calibration) -> Equations:
+    sights = gather_sights(observations)
+    found = residuals(observations, sights, calibration.estimate)
+    return write_equations(observations, sights, calibration.estimate, found)
+
+
+@pytest.mark.parametrize("lens", usual.LENSES)
+def test_rows_are_the_derivatives_of_the_residuals(lens: str) -> None:
+    scene = usual.field_and_boards(lens)
+    seen = simulate(scene, scenes.NOISE, 1).observations
+    options = Options(lens=usual.camera(lens).lens.kind, powers=usual.camera(lens).lens.radius_powers)
+    calibration = calibrate(seen, replace(options, powers=options.powers if options.lens == "radial" else (2, 3)))
+    equations, estimate = linearised(seen, calibration), calibration.estimate
+    sights = gather_sights(seen)
+
+    def residual(change: Array) -> Array:
+        """Every equation's residual with intrinsics and station moved."""
+        (name,) = estimate.cameras
+        camera = with_intrinsics(estimate.cameras[name], intrinsics_vector(estimate.cameras[name]) + change[:-6])
+        (station,) = estimate.stations
+        old = estimate.stations[station]
+        turned = Pose.exp(np.concatenate([change[-6:-3], np.zeros(3)]))
+        pose = Pose(turned.rotation @ old.cam_from_world.rotation, old.cam_from_world.translation + change[-3:])
+        at = replace(estimate, cameras={name: camera}, stations={station: replace(old, cam_from_world=pose)})
+        found = residuals(seen, sights, at)
+        flat = np.concatenate(
+            [np.column_stack([found.points, np.full(len(found.points), np.nan)])[:, :2].ravel(), found.curves]
+        )
+        points = len(found.points)
+        second = np.r_[False, np.diff(equations.observation) == 0] & ~equations.is_curve
+        index = np.where(equations.is_curve, points + equations.observation, 2 * equations.observation + second)
+        return np.asarray(flat[index])
+
+    world = np.array([key.placement is None for key in equations.sights.keys])[equations.sight]
+    columns = np.hstack([equations.intrinsics, equations.pose])
+    size = columns.shape[1]
+    steps = np.concatenate([[1e-3, 1e-6, 1e-3, 1e-3], np.full(size - 10, 1e-6), np.full(6, 1e-6)])
+    for k in range(size):
+        move = np.zeros(size)
+        move[k] = steps[k]
+        slope = (residual(move) - residual(-move)) / (2.0 * steps[k])
+        own = world if k >= size - 6 else np.ones(len(equations), dtype=bool)
+        worst = np.max(np.abs(slope - columns[:, k])[own]) / np.max(np.abs(columns[:, k]))
+        assert worst < 2e-6  # 4e-7 at most, of the differences
+
+
+def test_leverage_is_the_diagonal_of_the_hat_matrix() -> None:
+    prior = Prior("station", "overhead", "height_m", (4.02,), (0.005,))
+    seen = replace(simulate(scenes.overhead(frames=2, boards=4), scenes.NOISE, 3).observations, priors=(prior,))
+    calibration = calibrate(seen, PLAIN)
+    layout, equations = make_layout(seen, PLAIN), linearised(seen, calibration)
+    count = len(equations)
+    freedom = make_freedom(
+        equations, calibration.estimate, layout, np.full(count, 2.0), np.ones(count, bool), np.ones(count)
+    )
+    private = [i for i, key in enumerate(equations.sights.keys) if key.placement is not None]
+    boards = np.hstack([equations.pose * (equations.sight == i)[:, None] for i in private])
+    whole = 2.0 * np.hstack([_shared_columns(equations, calibration.estimate, layout), boards])
+    pose = calibration.estimate.stations["overhead"].cam_from_world
+    of_prior = np.zeros((1, whole.shape[1]))
+    at = len(layout.free["overhead"])
+    x, y, z = pose.translation
+    of_prior[0, at : at + 6] = np.hstack(
+        [-pose.rotation.T @ [[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]], -pose.rotation.T]
+    )[2]
+    information = whole.T @ whole + of_prior.T @ of_prior / 0.005**2
+    hat = np.einsum("ei,ij,ej->e", whole, np.linalg.inv(information), whole)
+    assert freedom.leverage() == pytest.approx(hat, abs=1e-8)
+    assert freedom.unknowns == layout.size
+    # At the end of the solve nothing pulls any more.
+    assert np.max(np.abs(freedom.pull)) < 0.1
+
+
+def test_leverage_foretells_the_residual_without_the_observation() -> None:
+    seen = simulate(scenes.overhead(frames=1, boards=0), scenes.NOISE, 5).observations
+    options = Options(loss="trivial", noise_scale="stated", reject_sigma=100.0)
+    table = diagnose(calibrate(seen, options), seen).table
+    chosen = int(np.argmax(np.where(table.is_curve, table.leverage, 0.0)))
+    row = int(table.row[chosen])
+    rest = {name: np.delete(column, row, axis=0) for name, column in vars(seen.curves).items()}
+    without = calibrate(replace(seen, curves=replace(seen.curves, **rest)), options)
+    sights = gather_sights(seen)
+    left_out = residuals(seen, sights, without.estimate).curves[row]
+    foretold = table.distance_px[chosen] / (1.0 - table.leverage[chosen])
+    assert table.leverage[chosen] > 0.1  # 0.37
+    assert left_out == pytest.approx(foretold, abs=2e-3)  # 3e-4: the model is not quite linear
+
+
+# ---- the table ------------------------------------------------------------------------------------------------------
+
+
+def test_the_table_has_every_observation_under_its_id(diagnosis: Diagnosis, observations: Observations) -> None:
+    table = diagnosis.table
+    points, curves = len(observations.points), len(observations.curves)
+    assert len(table) == points + curves
+    assert np.array_equal(table.row[table.is_curve], np.arange(curves))
+    assert np.array_equal(table.pixel, np.concatenate([observations.points.pixels, observations.curves.pixels]))
+    for number in (0, points - 1, points, len(table) - 1):
+        kind = "curve" if table.is_curve[number] else "point"
+        name = observations.feature_name(kind, int(table.row[number]))
+        assert table.features[table.feature[number]].partition("/")[2] == name
+        assert table.id_of(number) == f"{kind} {table.row[number]}"
+    unknowns = 5 + 6 + 6 * len(observations.placements)
+    shares = np.where(table.is_curve, 1.0, 2.0) * table.leverage
+    assert np.sum(shares[table.inlier]) == pytest.approx(unknowns, abs=1e-6)
+    inliers = table.inlier
+    assert np.mean(table.standardised[inliers & table.is_curve] ** 2) == pytest.approx(1.0, abs=0.1)
+    assert np.mean(table.standardised[inliers & ~table.is_curve] ** 2) == pytest.approx(2.0, abs=0.3)
+
+
+def test_millimetres_are_those_on_the_field(diagnosis: Diagnosis, calibration: Calibration) -> None:
+    table = diagnosis.table
+    on_field = np.array([view["target"] == "field" for view in table.views])[table.view]
+    camera = calibration.station()
+    rows = np.flatnonzero(on_field)
+    there = camera.locate(table.pixel[rows] + table.residual_px[rows]) - camera.locate(table.pixel[rows])
+    mm = 1e3 * np.linalg.norm(there, axis=1)
+    points = ~table.is_curve[rows]
+    assert table.error_mm[rows][points] == pytest.approx(mm[points], rel=0.01)  # 0.3 %: locally linear
+    # A curve's is the distance across it: the pixel's own normal need not be the field's.
+    assert np.all(np.abs(table.error_mm[rows][~points]) < mm[~points] * 1.01)
+    assert np.median(np.abs(table.error_mm[rows][~points]) / mm[~points]) > 0.95  # 0.99
+
+
+def test_the_table_in_its_files(diagnosis: Diagnosis, tmp_path: Path) -> None:
+    table = diagnosis.table
+    for ending in (".csv", ".json", ".npz"):
+        table.save(tmp_path / f"table{ending}")
+    with (tmp_path / "table.csv").open(newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    columns = json.loads((tmp_path / "table.json").read_text())["columns"]
+    arrays = np.load(tmp_path / "table.npz")
+    assert len(rows) == len(columns["row"]) == len(arrays["row"]) == len(table)
+    assert [float(row["distance_px"]) for row in rows] == columns["distance_px"] == arrays["distance_px"].tolist()
+    assert rows[3]["feature"] == columns["feature"][3] == str(arrays["feature"][3])
+    assert list(rows[0]) == list(columns) == list(arrays)
+    with pytest.raises(InputError, match="csv"):
+        table.save(tmp_path / "table.txt")
+
+
+def test_an_observation_that_cannot_be_shown_has_no_numbers(
+    observations: Observations, calibration: Calibration
+) -> None:
+    lost = calibration.estimate
+    placement = observations.placements[0]
+    behind = Pose(lost.placements[placement].rotation, np.array([-2.27, -0.12, 9.0]))
+    moved = replace(calibration, estimate=replace(lost, placements={**lost.placements, placement: behind}))
+    table = diagnose(moved, observations).table
+    gone = np.array([view["placement"] == placement for view in table.views])[table.view]
+    assert np.all(np.isnan(table.distance_px[gone])) and not np.any(table.inlier[gone])
+    assert np.all(table.reason[gone] == 2)
+    assert np.all(np.isfinite(table.distance_px[~gone]))
+
+
+def test_summaries_count_everything_once(diagnosis: Diagnosis) -> None:
+    table, summaries = diagnosis.table, diagnosis.summaries
+    for summary in (summaries.frames, summaries.features, summaries.regions, summaries.radii):
+        assert summary.points.sum() == np.count_nonzero(table.inlier & ~table.is_curve)
+        assert summary.curves.sum() == np.count_nonzero(table.inlier & table.is_curve)
+        assert summary.rejected.sum() == np.count_nonzero(~table.inlier)
+        total = np.sqrt(np.nansum(summary.curves * summary.curves_rms_px**2) / summary.curves.sum())
+        assert total == pytest.approx(np.sqrt(np.mean(table.distance_px[table.inlier & table.is_curve] ** 2)))
+    (trend,) = summaries.trends
+    assert np.nanmax(np.abs(trend.outward_px / trend.sd_px)) < 4.0
+
+
+# ---- planted faults -------------------------------------------------------------------------------------------------
+
+
+def found(name: str, seed: int) -> Diagnosis:
+    problem = scenes.FAULTS[name][0]
+    seen = problem.observe(seed)
+    return diagnose(calibrate(seen, problem.options), seen)
+
+
+@pytest.mark.parametrize("name", scenes.FAULTS)
+def test_a_planted_fault_is_named_and_nothing_else(name: str) -> None:
+    for seed in (1, 2):
+        findings = found(name, seed).findings
+        assert [(one.kind, one.subject) for one in findings] == [scenes.FAULTS[name][1:]]
+        assert findings[0].log10_p < -2.0
+
+
+def test_how_large_they_are() -> None:
+    (short,) = found("polynomial too short (r^5)", 3).findings
+    assert "r^5 explains" in short.sentence.replace(",", "") and "--powers 2,3,5" in short.advice
+    (line,) = found("line 12 mm aside", 3).findings
+    assert line.amounts[0].value == pytest.approx(12.0, abs=4.0 * line.amounts[0].sd)  # sd 0.5
+    assert line.effect_mm == pytest.approx(12.0, abs=2.0)
+    (bump,) = found("bumped by 0.05 degrees after frame 5", 3).findings
+    assert bump.frame == "0005" and "turned by 0.05" in bump.sentence
+    assert bump.amounts[0].value == pytest.approx(0.05, abs=4.0 * bump.amounts[0].sd)  # sd 0.01: turn or shift?
+    (noise,) = found("noise of points twice what was stated", 3).findings
+    assert noise.amounts[0].value == pytest.approx(2.0, abs=0.2)
+    (label,) = found("one mislabelled corner", 3).findings
+    assert "'LeftFieldRightPenaltyCorner' observed where 'TopLeftCorner' projects" in label.sentence
+    assert label.frame == "0003" and len(label.rows) == 1
+
+
+@pytest.mark.parametrize("sigma_px", [0.05, 0.1])
+def test_a_line_that_was_taken_out_whole_speaks(sigma_px: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    quiet = Disturbance(points_sigma_px=sigma_px, curves_sigma_px=sigma_px)
+    monkeypatch.setattr(scenes, "NOISE", quiet)
+    seen = scenes.line_aside(1)
+    calibration = calibrate(seen)
+    gone = sum(entry.feature == "LeftPenaltyStretch" for entry in calibration.rejected)
+    line = seen.targets["field"].curve_names.index("LeftPenaltyStretch")
+    assert gone > 0.9 * np.count_nonzero(seen.curves.feature == line)
+    finding = diagnose(calibration, seen).findings[0]
+    assert (finding.kind, finding.subject) == ("curve aside", "field/LeftPenaltyStretch")
+    assert finding.amounts[0].value == pytest.approx(12.0, abs=0.5)  # 11.9
+
+
+def test_model_error_is_said_to_be_outside_of_the_covariance() -> None:
+    assert found("line 12 mm aside", 1).model_error
+    assert not found("noise of points twice what was stated", 1).model_error
+
+
+def test_silence_where_nothing_is_wrong() -> None:
+    alarms = []
+    for number in range(50):
+        name = list(scenes.CLEAN)[number % len(scenes.CLEAN)]
+        seen = scenes.CLEAN[name].observe(number)
+        alarms += [(name, number)] * bool(diagnose(calibrate(seen, scenes.CLEAN[name].options), seen).findings)
+    assert len(alarms) <= 3  # 1; at the stated 1 % more than 3 has a probability of 0.002
+
+
+# ---- new data -------------------------------------------------------------------------------------------------------
+
+
+def test_other_observations_are_refused_unless_they_are_called_new(
+    calibration: Calibration, observations: Observations
+) -> None:
+    other = simulate(scenes.overhead(), scenes.NOISE, 8).observations
+    with pytest.raises(InputError, match="new-data"):
+        diagnose(calibration, other)
+    answer = diagnose(calibration, other, new_data=True)
+    assert answer.new_data and not answer.findings
+
+
+def test_boards_that_the_calibration_does_not_know_are_posed(calibration: Calibration) -> None:
+    other = simulate(scenes.overhead(), scenes.NOISE, 9).observations
+    names = {name: f"new {name}" for name in other.placements}
+    views = tuple(replace(v, placement=names[v.placement] if v.placement else None) for v in other.views)
+    answer = diagnose(calibration, replace(other, views=views), new_data=True)
+    assert not answer.findings
+    assert np.count_nonzero(~answer.table.inlier) <= 2
+
+
+def test_a_calibration_that_holds_no_more(calibration: Calibration) -> None:
+    scene = scenes.overhead(boards=0)
+    station = scene.stations["overhead"]
+    turned = replace(station, cam_from_world=Pose.exp((0.001, 0.0, 0.0, 0.0, 0.0, 0.0)) @ station.cam_from_world)
+    other = simulate(replace(scene, stations={"overhead": turned}), scenes.NOISE, 9).observations
+    answer = diagnose(calibration, other, new_data=True)
+    assert [finding.kind for finding in answer.findings] == ["does not hold"]
+    assert answer.findings[0].effect_px == pytest.approx(0.7, abs=0.3)  # across lines less than 0.001 phi
+
+
+# ---- held-out error -------------------------------------------------------------------------------------------------
+
+
+def test_held_out_error_is_the_noise_and_what_the_fit_adds(
+    observations: Observations, calibration: Calibration
+) -> None:
+    answer = cross_validate(observations, calibration.options, calibration=calibration)
+    assert answer.folds == 5 and not answer.failed_folds
+    assert answer.curves_rms_px == pytest.approx(0.3, abs=0.02)  # 0.304
+    assert answer.fit_rms_px < answer.rms_px < 1.05 * answer.fit_rms_px
+    assert answer.frame_counts.sum() == len(observations.points) + len(observations.curves) - len(calibration.rejected)
+
+
+def test_the_choice_is_the_lens_that_was_simulated() -> None:
+    seen = simulate(scenes.overhead(frames=8, boards=2), scenes.NOISE, 4).observations
+    choice = choose(seen, Options(powers=(3,)))
+    assert choice.candidates[choice.chosen].label == "radial 2,3"
+    assert choice.candidates[choice.current].label == "radial 3"
+
+
+def test_a_single_frame_cannot_be_held_out() -> None:
+    seen = simulate(scenes.overhead(frames=1, boards=0), scenes.NOISE, 4).observations
+    with pytest.raises(InputError, match="two frames"):
+        cross_validate(seen)
+    with pytest.raises(InputError, match="two frames"):
+        choose(seen, Options())
+
+
+# ---- real photographs -----------------------------------------------------------------------------------------------
+
+
+def test_two_coefficients_are_too_few_for_the_wide_camera_and_three_enough(gopro_boards: BoardDetections) -> None:
+    seen = gopro_boards.observations
+    fixed = {"p1": 0.0, "p2": 0.0}
+    whole = {"loss": "trivial", "reject_sigma": 1e9}
+    two = Options(lens="brown", fixed={**fixed, "k3": 0.0}, **whole)  # type: ignore[arg-type]
+    three = Options(lens="brown", fixed=fixed, **whole)  # type: ignore[arg-type]
+    radius = {}
+    for name, options in (("two", two), ("three", three)):
+        findings = {finding.kind: finding for finding in diagnose(calibrate(seen, options), seen).findings}
+        radius[name] = findings.get("radius")
+    assert radius["two"] is not None and "too short" in radius["two"].sentence and "r^7" in radius["two"].sentence
+    assert "let k3 free" in radius["two"].advice
+    assert radius["three"] is None or radius["three"].effect_px < 0.5 * radius["two"].effect_px
+    choice = choose(seen, three)
+    short, enough = choice.candidates
+    assert choice.candidates[choice.chosen].label == "brown k1 k2 k3"
+    assert short.fit_rms_px == pytest.approx(1.36, abs=0.1) and enough.fit_rms_px == pytest.approx(0.57, abs=0.1)
+    assert enough.rms_px < 0.5 * short.rms_px
+
+
+# ---- the command ----------------------------------------------------------------------------------------------------
+
+Run = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture
+def run(capsys: pytest.CaptureFixture[str]) -> Run:
+    def call(*arguments: Any) -> tuple[int, str, str]:
+        code = main([str(argument) for argument in arguments])
+        out, err = capsys.readouterr()
+        return code, out, err
+
+    return call
+
+
+def test_the_command(run: Run, tmp_path: Path, observations: Observations, calibration: Calibration) -> None:
+    observations.save(tmp_path / "obs.json")
+    calibration.save(tmp_path / "c.json")
+    code, out, _ = run("diagnose", tmp_path / "c.json", tmp_path / "obs.json", "-o", tmp_path / "t.csv", "--held-out")
+    assert code == 0 and out.startswith("verdict   sound")
+    assert "take" in out and (tmp_path / "t.csv").exists()
+    faulty = scenes.bumped(1)
+    faulty.save(tmp_path / "bumped.json")
+    code, _, err = run("diagnose", tmp_path / "c.json", tmp_path / "bumped.json")
+    assert code == 2 and "--new-data" in err
+    calibrate(faulty).save(tmp_path / "b.json")
+    code, out, _ = run("diagnose", tmp_path / "b.json", tmp_path / "bumped.json")
+    assert code == 1 and "moved after frame '0005'" in out and "no covariance" in out
+    code, out, _ = run("diagnose", tmp_path / "b.json", tmp_path / "bumped.json", "--json")
+    data = json.loads(out)
+    assert code == 1 and data["findings"][0]["kind"] == "moved after" and data["model_error"]
+    for wrong in (["--folds", 1], ["--false-alarms", 2], ["-o", tmp_path / "t.txt"], ["--held-out", "--new-data"]):
+        code, _, err = run("diagnose", tmp_path / "b.json", tmp_path / "bumped.json", *wrong)
+        assert code == 2 and err.count("\n") == 1
