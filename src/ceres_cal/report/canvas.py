@@ -22,16 +22,15 @@ if TYPE_CHECKING:
 
 POINT, CURVE, OUTLIER = "#0072b2", "#009e73", "#d55e00"  # Okabe and Ito's, apart for colour-blind readers too
 INK, QUIET, PAINT, FAINT = "#1f2933", "#5b6770", "#b3bcc4", "#e8ecef"
-RAMP = ("#f3f7fb", "#cfe0ef", "#9cc3df", "#5f9fca", "#2c77b0", "#0b4f8a", "#08305c")
+RAMP = ("#f1f6fa", "#d5e5f1", "#b0d0e6", "#82b4d6", "#5494c0", "#2f72a4", "#185383")
 """From little to much: lightness alone tells it, in grey print too."""
 DIVERGING = ("#a84a00", "#e8a06b", "#ffffff", "#86b9da", "#004f80")
 
-NARROW_IN, WIDE_IN = 4.0, 8.0
+NARROW_IN, WIDE_IN = 3.65, 7.5
 """A picture in one column, which is what a phone shows, and one across both."""
 _POINTS_PER_INCH = 72
 _STYLE: dict[str, Any] = {
     "svg.fonttype": "none",  # letters stay letters: in the page's own face, to be searched and read aloud
-    "svg.hashsalt": "ceres-cal",
     "text.parse_math": False,  # names come from files
     "path.simplify": False,
     "font.family": "DejaVu Sans",
@@ -86,7 +85,8 @@ def to_svg(drawing: Drawing, width_in: float, name: str) -> str:
     from matplotlib.backends.backend_svg import FigureCanvasSVG
     from matplotlib.figure import Figure
 
-    with rc_context({**_STYLE, "svg.hashsalt": name}):
+    style: Any = {**_STYLE, "svg.hashsalt": name}
+    with rc_context(style):
         figure = Figure(figsize=(width_in, width_in * drawing.height), layout="constrained")
         engine = figure.get_layout_engine()
         assert engine is not None
@@ -102,8 +102,9 @@ def _as_element(figure: Figure, canvas: Any) -> str:
     text = text[text.index("<svg") :]
     text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.S)
     text = re.sub(r' (?:width|height)="[\d.]+pt"', "", text)  # as wide as its place
-    text = re.sub(r' id="(?!m|p|h)[\w.-]+"', "", text)  # only markers, clips and hatches are referred to
-    text = re.sub(r' xmlns(?::xlink)?="[^"]*"| version="1.1"', "", text)
+    named = set(re.findall(r'(?:href="|url\()#([^")]+)', text))
+    text = re.sub(r' id="([^"]+)"', lambda found: found[0] if found[1] in named else "", text)
+    text = re.sub(r' xmlns(?::xlink)?="[^"]*"| version="1.1"', "", text)  # HTML knows them
     text = text.replace("xlink:href", "href")
     return re.sub(r"\n\s*", "\n", text).strip()
 
@@ -142,6 +143,6 @@ def key(axes: Axes, columns: int = 4) -> None:
     axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=columns, borderaxespad=0.2, columnspacing=1.2)
 
 
-def plain(value: float, _: int | None = None) -> str:
+def plain(value: float, _: float) -> str:
     """A tick of a logarithmic axis: 0.01, 1, 100, 1e+07."""
     return f"{value:g}"

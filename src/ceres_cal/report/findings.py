@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from ceres_cal.diagnostics import Finding, Noise
+from ceres_cal.diagnostics import Choice, Finding, HeldOut, Noise
 from ceres_cal.report.material import Material
 from ceres_cal.report.page import Card, Chapter, Piece, Table, Text
-from ceres_cal.report.words import count, fixed, grouped, short, signed
+from ceres_cal.report.words import DASH, count, fixed, grouped, mm, short, signed
 
 
-def findings(material: Material) -> Chapter:
-    """Findings, the largest first, and the noise that is left."""
+def findings(material: Material, choice: Choice | None) -> Chapter:
+    """Findings, the largest first, the noise that is left, and the held-out errors where they were computed."""
     diagnosis = material.diagnosis
     rate = f"{100.0 * diagnosis.false_alarm_rate:g} %"
     tested = (
@@ -21,8 +21,8 @@ def findings(material: Material) -> Chapter:
     if diagnosis.new_data:
         pieces.append(
             Text(
-                "These are new data: residuals are those of the calibration as it stands, the findings are what would be "
-                "left if it were refitted to them."
+                "These are new data: residuals are those of the calibration as it stands, the findings are what would "
+                "be left if it were refitted to them."
             )
         )
     if diagnosis.findings:
@@ -31,13 +31,15 @@ def findings(material: Material) -> Chapter:
     else:
         pieces.append(Text(f"Nothing was found: what is left over looks like noise. {tested}"))
     pieces.append(_noise(diagnosis.noise))
+    if choice is not None:
+        pieces += _held_out(choice)
     return Chapter("findings", "What the residuals say", tuple(pieces))
 
 
 def _card(finding: Finding) -> Card:
     facts = [f"{short(finding.effect_px)} px"]
     if np.isfinite(finding.effect_mm):
-        facts.append(f"{short(finding.effect_mm)} mm")
+        facts.append(mm(finding.effect_mm))
     facts.append(count(finding.observations, "observation"))
     facts.append(f"false alarm: {_chance(finding.log10_p)}")
     facts += [f"{one.name} {one.value:+.3g} ± {short(one.sd)} {one.unit}".strip() for one in finding.amounts]
@@ -70,3 +72,21 @@ def _noise(noise: tuple[Noise, ...]) -> Table:
         ),
         stacked=True,
     )
+
+
+def _held_out(choice: Choice) -> tuple[Table, Text]:
+    chosen = choice.candidates[choice.chosen]
+    said = "The calibration's lens is the one to take" if choice.chosen == choice.current else f"Take {chosen.label}"
+    rule = f"{said}: the fewest coefficients within one standard error of the least error."
+    thinned = f" On {100.0 * choice.thinned:.0f} % of the observations." if choice.thinned < 1.0 else ""
+    rows = tuple(_candidate(choice, number, one) for number, one in enumerate(choice.candidates))
+    head = ("lens", "held-out px", "mm", "fit px", "")
+    return Table(head, rows, "Frames held out: how well others predict them", stacked=True), Text(rule + thinned)
+
+
+def _candidate(choice: Choice, number: int, one: HeldOut) -> tuple[str, ...]:
+    if one.failed:
+        return one.label, DASH, DASH, DASH, one.failed
+    marks = (("now", choice.current), ("least error", choice.best), ("chosen", choice.chosen))
+    said = ", ".join(word for word, index in marks if index == number)
+    return one.label, fixed(one.rms_px, 4), fixed(one.rms_mm, 3), fixed(one.fit_rms_px, 4), said

@@ -11,6 +11,7 @@ from ceres_cal.report import canvas
 from ceres_cal.report.canvas import POINT, QUIET, Drawing
 from ceres_cal.report.material import Material
 from ceres_cal.report.page import Picture, Table
+from ceres_cal.report.words import powered
 from ceres_cal.transforms import Array
 
 if TYPE_CHECKING:
@@ -38,7 +39,7 @@ def distortion(material: Material, name: str) -> Picture:
     ideal = ideal_radii(camera, radii)
     seen = table.radius_px[material.of_camera(name) & table.inlier]
     reach = float(seen.max()) if len(seen) else 0.0
-    polynomial = {"radial": "r' = r + " + " + ".join(f"a{p} r^{p}" for p in camera.lens.radius_powers)}
+    polynomial = {"radial": "r' = r + " + " + ".join(powered(f"a{p}r^{p}") for p in camera.lens.radius_powers)}
     model = polynomial.get(camera.lens.kind, f"the {camera.lens.kind} lens")
 
     def draw(axes: Axes, width_in: float) -> None:
@@ -54,10 +55,10 @@ def distortion(material: Material, name: str) -> Picture:
     table_rows = zip(steps.tolist(), ideal_radii(camera, steps).tolist(), strict=True)
     return Picture(
         f"lens-{list(material.observations.cameras).index(name)}",
-        f"The distortion curve of {name}",
-        f"The paper's figure 4: how far from the principal point a pixel is (across) and would be without distortion "
-        f"(up), {model}. Observations reach {reach:.0f} of {camera.corner_radius:.0f} px; dotted, beyond them, the curve "
-        "is a guess.",
+        "The distortion curve" + (f", {name}" if len(material.observations.cameras) > 1 else ""),
+        f"The paper's figure 4: how far from the principal point a pixel is (across) and would be without "
+        f"distortion (up), {model}. Observations reach {reach:.0f} of {camera.corner_radius:.0f} px; "
+        "dotted, beyond them, the curve is a guess.",
         Drawing(draw, 0.66),
         Table(
             ("r, px", "r', px", "r' - r, px", "r' / r"),

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import combinations
+from itertools import combinations, pairwise
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from ceres_cal.diagnostics import Diagnosis
 from ceres_cal.errors import CalibrationError
 from ceres_cal.observations import Observations
 from ceres_cal.residuals import residuals
-from ceres_cal.sights import gather_sights
+from ceres_cal.sights import Mask, gather_sights
 from ceres_cal.targets import Target, along_track
 from ceres_cal.transforms import Array
 from ceres_cal.uncertainty import Disagreement, FieldMap, Uncertainty, Verdict
@@ -23,6 +23,8 @@ from ceres_cal.uncertainty import Disagreement, FieldMap, Uncertainty, Verdict
 HEIGHTS_M = (0.0, 0.15)
 """Of the maps: the floor, and the top of a robot."""
 _CURVE_STEPS = 96
+_FINER = 2  # than the maps' own grid, where that is quick
+_BORDER_STEPS = 60
 _MOST_SEAMS = 6
 
 
@@ -85,7 +87,14 @@ class Material:
         """Of each placed station, at HEIGHTS_M."""
         if self.known is None:
             return {}
-        return {name: tuple(self.known.map_sd_mm(name, h) for h in HEIGHTS_M) for name in self.placed}
+        return {name: tuple(self._map(self.known, name, h) for h in HEIGHTS_M) for name in self.placed}
+
+    def _map(self, known: Uncertainty, station: str, height_m: float) -> FieldMap:
+        found = known.map_sd_mm(station, height_m)
+        if self.observations.stations[station] in known.posterior.profiles:  # each place takes long there
+            return found
+        x, y = (np.linspace(axis[0], axis[-1], _FINER * (len(axis) - 1) + 1) for axis in (found.x_m, found.y_m))
+        return known.map_sd_mm(station, height_m, x, y)
 
     @cached_property
     def seams(self) -> tuple[Seam, ...]:
@@ -117,7 +126,16 @@ class Material:
         left = residuals(self.observations, gather_sights(self.observations), found.estimate)
         return ClosedForm(found, np.concatenate([np.linalg.norm(left.points, axis=1), np.abs(left.curves)]))
 
-    def of_camera(self, camera: str) -> Array:
+    def border(self, station: str, height_m: float) -> Array:
+        """(B, 2) m: the border of a station's image on a plane, NaN where it does not meet that."""
+        camera = self.calibration.estimate.camera_at(station)
+        width, height = camera.image_size
+        corners = np.array([[0, 0], [width, 0], [width, height], [0, height], [0, 0]]) - 0.5
+        steps = np.linspace(0.0, 1.0, _BORDER_STEPS)[:, None]
+        sides = [a + steps * (b - a) for a, b in pairwise(corners)]
+        return camera.locate(np.concatenate(sides), height_m)
+
+    def of_camera(self, camera: str) -> Mask:
         """(N,) bool: rows of the residual table that a camera observed."""
         owners = np.array([view["camera"] == camera for view in self.diagnosis.table.views])
         return np.asarray(owners[self.diagnosis.table.view])

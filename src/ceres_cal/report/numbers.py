@@ -1,4 +1,4 @@
-"""The chapter of numbers: cameras, stations, targets as built, fit, in the paper's units, with what is known of each."""
+"""The chapter of numbers: cameras, stations, targets, fit, in the paper's units, with how well each is known."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from ceres_cal.camera import Camera
 from ceres_cal.parameters import anchored_stations
 from ceres_cal.report.material import Material, Seam
 from ceres_cal.report.page import Chapter, Piece, Points, Table, Text
-from ceres_cal.report.words import DASH, at_precision, bounds, fixed, grouped, short
+from ceres_cal.report.words import DASH, at_precision, bounds, fixed, grouped, mm, powered, short
 from ceres_cal.transforms import euler_from_rotation
 from ceres_cal.uncertainty import Verdict
 
@@ -23,8 +23,8 @@ def numbers(material: Material) -> Chapter:
     """The chapter."""
     pieces: list[Piece] = [
         Text(
-            "Lengths of the lens in pixels and coefficients as the paper has them, with its a1 = 1: another a1 goes with "
-            "a1 a2, a1 a3 and a1 phi. Known: to 1 % or better; weak: to 30 %."
+            "In the paper's units; coefficients with its a1 = 1 (another a1 goes with a1 a2, a1 a3 and a1 phi). Known "
+            "means to 1 % or better, weak to 30 %."
         )
     ]
     pieces += [_camera(material, name) for name in material.observations.cameras]
@@ -50,26 +50,24 @@ def _camera(material: Material, name: str) -> Table:
 def _named(camera: Camera, quantity: str) -> str:
     words = {"cx": "principal point x", "cy": "principal point y", "aspect": "aspect fy / fx"}
     if quantity in camera.lens.names and camera.lens.kind == "radial" and quantity != "a1":
-        power = 1 - int(quantity[1:])
-        return f"{quantity}, px^{power}"
+        return f"{quantity}, {powered(f'px^{1 - int(quantity[1:])}')}"
     return words.get(quantity, quantity)
 
 
-def _row(name: str, value: float, unit: str, found: Verdict | None, factor: float = 1.0) -> _Row:
-    """A number; without a verdict it was held, or nothing was minimised. `factor`: from the key's unit to the shown."""
+def _row(name: str, value: float, unit: str, found: Verdict | None) -> _Row:
+    """A number; without a verdict it was held, or nothing was minimised."""
     space = f" {unit}" if unit else ""
     if found is None:
-        return name, f"{value:.10g}{space}", DASH, DASH, "held"
-    sd = factor * found.sd
-    if found.key.unit.startswith("px^") or (found.key.kind == "camera" and not unit):
-        shown, width = repr(value), f"{sd:.2g}" if np.isfinite(sd) else "unknown"
+        return name, f"{value:.10g}{space}", "", "", "held"
+    if found.key.kind == "camera" and not unit:
+        shown, width = repr(value), f"{found.sd:.2g}" if np.isfinite(found.sd) else "unknown"
+    elif unit == "m":
+        shown, width = f"{at_precision(value, found.sd, unit)} m", mm(1e3 * found.sd)
     else:
-        shown, width = (
-            f"{at_precision(value, sd, found.key.unit)}{space}",
-            f"{short(sd)}{space if np.isfinite(sd) else ''}",
-        )
+        shown = f"{at_precision(value, found.sd, unit)}{space}"
+        width = f"{short(found.sd)}{space}" if np.isfinite(found.sd) else "unknown"
     by = " (by its profile)" if found.by_profile and found.verdict != "known" else ""
-    return name, shown, width, f"{bounds(found, factor)}{space}", found.verdict + by
+    return name, shown, width, f"{bounds(found)}{space}", found.verdict + by
 
 
 def _station(material: Material, name: str) -> Table:
@@ -86,17 +84,17 @@ def _station(material: Material, name: str) -> Table:
     ]  # fmt: skip
     angles = np.degrees(euler_from_rotation(camera.cam_from_world.rotation))
     for word, angle in zip(("alpha", "beta", "gamma"), angles.tolist(), strict=True):
-        rows.append((f"{word}, the paper's", f"{angle:.4f}°", DASH, DASH, ""))
+        rows.append((f"{word}, the paper's", f"{angle:.4f}°", "", "", ""))
     down = camera.cam_from_world.rotation[2]
     tilt = float(np.degrees(np.arctan2(np.hypot(down[0], down[1]), -down[2])))
-    rows.append(("tilt from straight down", f"{tilt:.3f}°", DASH, DASH, ""))
+    rows.append(("tilt from straight down", f"{tilt:.3f}°", "", "", ""))
     for axis in "xyz":
         found = material.verdicts.get(("station", name, f"turn_{axis}"))
         if found is not None:
             sd = float(np.degrees(found.sd))
             limits = f"± {short(0.5 * float(np.degrees(found.high - found.low)))}°"
             width = f"{short(sd)}°" if np.isfinite(sd) else "unknown"
-            rows.append((f"turn about the camera's {axis}", DASH, width, limits, found.verdict))
+            rows.append((f"turn about the camera's {axis}", "", width, limits, found.verdict))
     return Table(_HEAD, tuple(rows), caption, stacked=True)
 
 
@@ -136,10 +134,10 @@ def _seam_row(seam: Seam) -> tuple[str, ...]:
     found = seam.found
     over = f" rms of {len(found.what)}" if len(found.what) else ""
     return (
-        f"{seam.first} – {seam.second}",
-        *(f"± {short(one.mean_mm)} mm" for one in seam.maps),
-        f"{short(found.rms_mm)} mm{over}",
-        f"{short(found.expected_rms_mm)} mm",
+        f"{seam.first} {DASH} {seam.second}",
+        *(f"± {mm(one.mean_mm)}" for one in seam.maps),
+        f"{mm(found.rms_mm)}{over}",
+        mm(found.expected_rms_mm),
     )
 
 

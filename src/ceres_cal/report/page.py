@@ -100,19 +100,22 @@ class Picture:
             drawn = f"<div {label}>{narrow}</div>"
         return (
             f'<figure id="{escape(self.name)}"{_class("wide" if self.wide else "")}><h3>{escape(self.title)}</h3>'
-            f"{drawn}<figcaption>{escape(self.reading)}</figcaption>"
-            f"<details><summary>The numbers behind it</summary>{self.table.html()}</details></figure>"
+            f'{drawn}<div class="reading"><figcaption>{escape(self.reading)}</figcaption>'
+            f"<details><summary>The numbers behind it</summary>{self.table.html()}</details></div></figure>"
         )
 
 
 @dataclass(frozen=True)
 class Gallery:
-    """Pictures, two beside one another where there is room."""
+    """Pictures, two beside one another where there is room; one that is left over has its words beside it."""
 
     pictures: tuple[Picture, ...]
 
     def html(self) -> str:
-        return f'<div class="gallery">{"".join(picture.html() for picture in self.pictures)}</div>'
+        elements = [picture.html() for picture in self.pictures]
+        if sum(not picture.wide for picture in self.pictures) % 2 and not self.pictures[-1].wide:
+            elements[-1] = elements[-1].replace("<figure ", '<figure class="lone" ', 1)
+        return f'<div class="gallery">{"".join(elements)}</div>'
 
 
 @dataclass(frozen=True)

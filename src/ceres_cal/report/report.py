@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from ceres_cal.calibration import Calibration
-from ceres_cal.diagnostics import Diagnosis, diagnose
+from ceres_cal.diagnostics import Choice, Diagnosis, diagnose
 from ceres_cal.files import write_bytes
 from ceres_cal.observations import Observations
 from ceres_cal.report.findings import findings
@@ -14,41 +14,56 @@ from ceres_cal.report.lens_picture import distortion
 from ceres_cal.report.maps import map_picture
 from ceres_cal.report.material import ClosedForm, Material
 from ceres_cal.report.numbers import numbers
+from ceres_cal.report.outlier_picture import outliers
 from ceres_cal.report.page import Chapter, Gallery, Picture, Text, page
 from ceres_cal.report.residual_pictures import against_radius, by_frame, vectors
-from ceres_cal.report.solve_pictures import against_closed_form, convergence, correlation, outliers
+from ceres_cal.report.solve_pictures import against_closed_form, convergence, correlation
 from ceres_cal.report.verdict import verdict
 from ceres_cal.report.words import count, listed
 
 MOST_CAMERAS = 8
 """Cameras, and stations, that have pictures of their own; the others are in the tables alone."""
 
+_OF_MAPS = (
+    "Standard deviation of a point that is located, in mm, over the field as drawn: what the calibration itself is "
+    "unsure of. The noise of the pixel that is asked about comes on top; model error is not in it."
+)
 
-def make_report(calibration: Calibration, observations: Observations, diagnosis: Diagnosis | None = None) -> str:
+
+def make_report(
+    calibration: Calibration,
+    observations: Observations,
+    diagnosis: Diagnosis | None = None,
+    choice: Choice | None = None,
+) -> str:
     """One self-contained HTML page on a calibration: verdict, findings, numbers, pictures.
 
     Args:
         observations: those it was made from; or others, with a diagnosis of them (`new_data`).
-        diagnosis: of these observations; made here where there is none.
+        diagnosis: of these observations; made here where there is none. choice: of lens, by held-out error.
 
     Raises:
         InputError: the observations are not those of the calibration, and no diagnosis says so.
     """
     found = diagnose(calibration, observations) if diagnosis is None else diagnosis
     material = Material(calibration, observations, found)
-    chapters = [verdict(material), findings(material), numbers(material), *_pictures(material)]
+    chapters = [verdict(material), findings(material, choice), numbers(material), *_pictures(material)]
     return page(", ".join(list(observations.cameras)[:4]), _about(material), chapters, _foot(calibration))
 
 
 def write_report(
-    path: str | Path, calibration: Calibration, observations: Observations, diagnosis: Diagnosis | None = None
+    path: str | Path,
+    calibration: Calibration,
+    observations: Observations,
+    diagnosis: Diagnosis | None = None,
+    choice: Choice | None = None,
 ) -> None:
     """Write `make_report`'s page.
 
     Raises:
         InputError: see `make_report`; or the file cannot be written.
     """
-    write_bytes(path, make_report(calibration, observations, diagnosis).encode())
+    write_bytes(path, make_report(calibration, observations, diagnosis, choice).encode())
 
 
 def _pictures(material: Material) -> Iterator[Chapter]:
@@ -57,11 +72,12 @@ def _pictures(material: Material) -> Iterator[Chapter]:
     pictures = [vectors(material, name) for name in shown]
     for name in shown:
         pictures += [against_radius(material, name), distortion(material, name)]
+    pictures += [picture for picture in (by_frame(material), outliers(material)) if picture is not None]
     yield Chapter("residuals", "Residuals and the lens", (*_left_out(cameras), Gallery(tuple(pictures))))
     if material.maps:
         stations = list(material.maps)
         maps = [map_picture(material, name, number) for name in stations[:MOST_CAMERAS] for number in (0, 1)]
-        yield Chapter("maps", "How well places are told, in mm", (*_left_out(stations), Gallery(tuple(maps))))
+        yield Chapter("maps", "How well places are told", (Text(_OF_MAPS), *_left_out(stations), Gallery(tuple(maps))))
     yield _solve(material)
 
 
@@ -72,13 +88,12 @@ def _left_out(names: list[str]) -> tuple[Text, ...]:
 
 def _solve(material: Material) -> Chapter:
     closed = material.closed_form
-    found: list[Picture | None] = [correlation(material), by_frame(material), convergence(material)]
+    found: list[Picture | None] = [convergence(material), correlation(material)]
     if isinstance(closed, ClosedForm):
-        found.append(against_closed_form(material, closed))
-    found.append(outliers(material))
+        found.insert(1, against_closed_form(material, closed))
     texts = () if isinstance(closed, ClosedForm) else (Text(f"No closed form to compare with: {closed}.", "note"),)
     pictures = Gallery(tuple(picture for picture in found if picture is not None))
-    return Chapter("solve", "The solve and its observations", (pictures, *texts))
+    return Chapter("solve", "The solve", (pictures, *texts))
 
 
 def _about(material: Material) -> str:

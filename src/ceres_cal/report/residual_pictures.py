@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ceres_cal.camera import Camera
 from ceres_cal.diagnostics import ResidualTable, Summary
@@ -13,6 +14,7 @@ from ceres_cal.report.canvas import CURVE, INK, OUTLIER, PAINT, POINT, QUIET, Dr
 from ceres_cal.report.material import Material
 from ceres_cal.report.page import Picture, Table
 from ceres_cal.report.words import fixed, grouped, short, signed
+from ceres_cal.sights import Rows
 from ceres_cal.transforms import Array
 
 if TYPE_CHECKING:
@@ -21,12 +23,13 @@ if TYPE_CHECKING:
 _MOST_DRAWN = 5000  # strokes of one page, shared among its cameras
 _MEAN_GRID = 16  # cells along the image's longer side
 _FEWEST = 4  # observations of a cell
+_NOT_NOISE = 13.8  # squared length of a mean in its sigmas that noise reaches once in a thousand
 _TYPICAL = 0.02  # of the image's width: what the rms is enlarged to
 _ENLARGED = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
 _MOST_FRAMES_NAMED = 24
 
 
-def drawn_rows(material: Material, rows: Array) -> Array:
+def drawn_rows(material: Material, rows: Rows) -> Rows:
     """Evenly spread ones of some rows of the table, few enough for the page."""
     most = max(_MOST_DRAWN // len(material.observations.cameras), 200)
     return rows[:: -(-len(rows) // most)] if len(rows) > most else rows
@@ -48,7 +51,7 @@ def vectors(material: Material, name: str) -> Picture:
     wanted = _TYPICAL * camera.image_size[0] / max(rms, 1e-12)
     enlarged = max((e for e in _ENLARGED if e <= wanted), default=1)
     shown, crossed = drawn_rows(material, inliers), drawn_rows(material, outliers)
-    places, means = mean_vectors(table, inliers, camera)
+    places, means, cells = telling_means(table, inliers, camera)
     paint = _paint_in_image(material, name)
 
     def draw(axes: Axes, width_in: float) -> None:
@@ -62,8 +65,9 @@ def vectors(material: Material, name: str) -> Picture:
             if len(rows):
                 ends = table.pixel[rows] + enlarged * table.residual_px[rows]
                 canvas.strokes(axes, table.pixel[rows], ends, color, 0.7, alpha=0.8, label=label)
-        canvas.strokes(axes, places, places + enlarged * means, INK, 1.5, label="mean of a region")
-        canvas.dots(axes, places, INK, 2.6)
+        if len(places):
+            canvas.strokes(axes, places, places + enlarged * means, INK, 1.6, label="mean of a region")
+            canvas.dots(axes, places, INK, 3.2)
         if len(crossed):
             canvas.crosses(axes, table.pixel[crossed], OUTLIER, 0.012 * camera.image_size[0])
             axes.plot([], [], "x", color=OUTLIER, markersize=4, label="taken out")
@@ -74,10 +78,10 @@ def vectors(material: Material, name: str) -> Picture:
     drawing = Drawing(draw, camera.image_size[1] / camera.image_size[0] + 0.06)
     return Picture(
         f"vectors-{_place(material, name)}",
-        f"Residual vectors over the image of {name}",
-        f"Each stroke leads from an observation to where the model puts it, {enlarged} times enlarged; of a line or arc "
-        "it is the shortest way to the curve. Strokes that point anyhow are noise; dark ones that turn or grow together "
-        f"across the image say that the model is wrong there.{thinned}",
+        f"Residual vectors over the image{_whose(material, name)}",
+        f"Each stroke leads from an observation to where the model puts it, {enlarged} times enlarged; of a line or "
+        "arc it is the shortest way to the curve. Strokes that point anyhow are noise. Dark: means of regions that noise "
+        f"does not explain ({len(places)} of {cells}): where they turn or grow together, the model is wrong.{thinned}",
         drawing,
         _region_table(material.diagnosis.summaries.regions, name),
         wide=True,
@@ -85,12 +89,17 @@ def vectors(material: Material, name: str) -> Picture:
     )
 
 
+def _whose(material: Material, camera: str) -> str:
+    return f", {camera}" if len(material.observations.cameras) > 1 else ""
+
+
 def _place(material: Material, camera: str) -> int:
     return list(material.observations.cameras).index(camera)
 
 
-def mean_vectors(table: ResidualTable, rows: Array, camera: Camera) -> tuple[Array, Array]:
-    """Mean displacement of each region of the image where the residuals tell it: places (C, 2) and vectors (C, 2), px.
+def telling_means(table: ResidualTable, rows: Rows, camera: Camera) -> tuple[Array, Array, int]:
+    """Mean displacements of the image's regions that noise does not explain: places (C, 2) and vectors (C, 2), px; and
+    how many regions could tell one.
 
     A point tells both of its coordinates, a curve the one across it: least squares over the region, in their sigmas.
     """
@@ -111,7 +120,9 @@ def mean_vectors(table: ResidualTable, rows: Array, camera: Camera) -> tuple[Arr
     np.add.at(centre, region, pixel)
     sizes = np.linalg.eigvalsh(normal)
     good = (count >= _FEWEST) & (sizes[:, 0] > 0.1 * sizes[:, 1])
-    return centre[good] / count[good, None], np.linalg.solve(normal[good], moved[good, :, None])[:, :, 0]
+    places, means = centre[good] / count[good, None], np.linalg.solve(normal[good], moved[good, :, None])[:, :, 0]
+    telling = np.sum(means * moved[good], axis=1) > _NOT_NOISE
+    return places[telling], means[telling], len(places)
 
 
 def _paint_in_image(material: Material, camera: str) -> list[Array]:
@@ -139,7 +150,7 @@ def _scale_bar(axes: Axes, camera: Camera, enlarged: int, rms: float) -> None:
     """A stroke as long as the rms residual, in a corner."""
     width, height = camera.image_size
     start = np.array([[0.03 * width, 0.95 * height]])
-    end = start + (enlarged * rms, 0.0)
+    end = start + np.array([enlarged * rms, 0.0])
     canvas.strokes(axes, start, end, INK, 1.5)
     text = axes.text(end[0, 0] + 0.012 * width, start[0, 1], f"rms {short(rms)} px", va="center", fontsize=7.0)
     text.set_bbox({"facecolor": "white", "edgecolor": "none", "pad": 1.0, "alpha": 0.85})
@@ -192,7 +203,7 @@ def against_radius(material: Material, name: str) -> Picture:
 
     return Picture(
         f"radius-{_place(material, name)}",
-        f"Residuals against the radius, {name}",
+        f"Residuals against the radius{_whose(material, name)}",
         "Each dot is the part of a residual that points away from the principal point. The trend should stay at 0 "
         f"within its band: a wave means that the lens polynomial is too short.{_said_of(len(shown), len(told))}",
         Drawing(draw, 0.66),
@@ -209,10 +220,10 @@ def against_radius(material: Material, name: str) -> Picture:
     )  # fmt: skip
 
 
-def _outward(table: ResidualTable, rows: Array, camera: Camera) -> tuple[Array, Array]:
+def _outward(table: ResidualTable, rows: Rows, camera: Camera) -> tuple[Array, Array]:
     """Radius and outward residual of some rows, px; NaN of a curve that runs outwards, and so tells nothing of it."""
     offsets, residual = camera.offsets(table.pixel[rows]), table.residual_px[rows]
-    radius = np.linalg.norm(offsets, axis=1)
+    radius = np.asarray(np.linalg.norm(offsets, axis=1))
     outward = np.sum(residual * offsets, axis=1) / np.maximum(radius, 1e-9)
     length = np.maximum(np.linalg.norm(residual, axis=1), 1e-300)
     cosine = np.abs(outward) / length
@@ -227,7 +238,7 @@ def _outward(table: ResidualTable, rows: Array, camera: Camera) -> tuple[Array, 
 def by_frame(material: Material) -> Picture:
     """Root mean square residual of each frame, in standard deviations."""
     frames = material.diagnosis.summaries.frames
-    number = np.arange(len(frames.names))
+    number = np.arange(len(frames.names), dtype=float)
     few = len(number) <= _MOST_FRAMES_NAMED
     top = 1.25 * float(np.nanmax(frames.rms_sigma, initial=1.0))
 
@@ -236,7 +247,7 @@ def by_frame(material: Material) -> Picture:
         if few:
             canvas.strokes(axes, _at(number, 0.0 * number), _at(number, frames.rms_sigma), PAINT, 1.4)
             names = [_clipped(name) for name in frames.names]
-            axes.set_xticks(number, names, rotation=60, ha="right", rotation_mode="anchor", fontsize=6.0)
+            axes.set_xticks(number, names, rotation=60, ha="right", rotation_mode="anchor", fontsize=6.5)
         canvas.dots(axes, _at(number, frames.rms_sigma), POINT, 5.0 if few else 2.5)
         axes.grid(visible=False, axis="x")
         axes.set(ylim=(0.0, top), xlim=(-0.7, len(number) - 0.3), ylabel="rms, in standard deviations")
@@ -256,7 +267,7 @@ def by_frame(material: Material) -> Picture:
     )
 
 
-def _at(x: Array, y: Array) -> Array:
+def _at(x: Array, y: ArrayLike) -> Array:
     return np.column_stack([x, y])
 
 

@@ -1,8 +1,7 @@
-"""Pictures of the solve: correlation of the numbers, convergence, closed form against bundle, outliers."""
+"""Pictures of the solve: correlation of the numbers, convergence, closed form against bundle."""
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -11,10 +10,10 @@ import numpy as np
 from ceres_cal.calibration import Calibration
 from ceres_cal.quantities import Key
 from ceres_cal.report import canvas
-from ceres_cal.report.canvas import DIVERGING, INK, OUTLIER, PAINT, POINT, QUIET, Drawing
+from ceres_cal.report.canvas import DIVERGING, OUTLIER, PAINT, POINT, Drawing
 from ceres_cal.report.material import ClosedForm, Material
 from ceres_cal.report.page import Picture, Table
-from ceres_cal.report.words import count, fixed, grouped, short, signed
+from ceres_cal.report.words import count, fixed, short, signed
 from ceres_cal.transforms import Array
 
 if TYPE_CHECKING:
@@ -22,7 +21,6 @@ if TYPE_CHECKING:
 
 _MOST_NUMBERS = 24  # of a correlation picture
 _MOST_PAIRS = 30
-_MOST_BARS = 12
 _QUANTILES = (0.1, 0.25, 0.5, 0.75, 0.9, 0.99)
 
 
@@ -49,7 +47,7 @@ def correlation(material: Material) -> Picture | None:
         drawn = axes.pcolormesh(
             matrix, vmin=-1.0, vmax=1.0, cmap=canvas.ramp(DIVERGING), edgecolor="white", linewidth=0.8
         )
-        size = 6.5 if len(keys) <= 14 else 5.0
+        size = 6.5 if len(keys) <= 14 else 5.5
         places = np.arange(len(keys)) + 0.5
         axes.set_xticks(places, labels, rotation=60, ha="right", rotation_mode="anchor", fontsize=size)
         axes.set_yticks(places, labels, fontsize=size)
@@ -60,14 +58,14 @@ def correlation(material: Material) -> Picture | None:
         figure = axes.get_figure()
         assert figure is not None
         bar = figure.colorbar(drawn, ax=axes, ticks=[-1, 0, 1], shrink=0.5, aspect=18, pad=0.02)
-        bar.outline.set_visible(False)  # type: ignore[operator]
+        bar.outline.set_visible(False)
 
     rest = len(posterior.keys) - len(keys)
     return Picture(
         "correlation",
         "Correlation of the numbers",
-        "Dark blue: two numbers may be wrong together in the same sense; brown: in opposite senses. What is nearly 1 or "
-        "-1 (such as phi and the height) is known as a ratio much better than each by itself. Grey: unknown."
+        "Dark blue: two numbers may be wrong together in the same sense; brown: in opposite senses. What is nearly 1 "
+        "or -1 (such as phi and the height) is known as a ratio much better than each by itself. Grey: unknown."
         + (f" {count(rest, 'further number')} not drawn." if rest else ""),
         Drawing(draw, 0.86),
         _pairs(matrix, labels),
@@ -176,69 +174,3 @@ def _comparison(bundle: Calibration, closed: Calibration, curves: dict[str, Arra
     for name, station in bundle.stations.items():
         rows.append((f"height of {name}, m", f"{closed.stations[name].position[2]:.4f}", f"{station.position[2]:.4f}"))
     return Table(("", "closed form", "bundle"), tuple(rows))
-
-
-# ---- outliers -------------------------------------------------------------------------------------------------------
-
-
-def outliers(material: Material) -> Picture | None:
-    """Which features were taken out, how often; None where nothing was."""
-    table = material.diagnosis.table
-    rows = np.flatnonzero(~table.inlier)
-    if not len(rows):
-        return None
-    totals = Counter(table.features[i] for i in table.feature.tolist())
-    named = Counter(table.features[i] for i in table.feature[rows].tolist()).most_common(_MOST_BARS)
-    several = len(material.observations.targets) > 1
-
-    def draw(axes: Axes, width_in: float) -> None:
-        places = np.arange(len(named))
-        axes.barh(places, [number for _, number in named], height=0.62, color=OUTLIER)
-        for place, (name, number) in enumerate(named):
-            axes.text(number, place, f" {number} of {totals[name]}", va="center", fontsize=6.5, color=INK)
-        names = [_short_name(name, several) for name, _ in named]
-        axes.set_yticks(places, names, fontsize=6.5)
-        axes.tick_params(axis="y", length=0)
-        axes.invert_yaxis()
-        axes.set(xlim=(0.0, 1.25 * named[0][1]), xlabel="observations taken out")
-        axes.grid(visible=False, axis="y")
-        axes.spines["left"].set_color(QUIET)
-
-    order = rows[np.argsort(-_sigmas(material, rows), kind="stable")]
-    return Picture(
-        "outliers",
-        "Outliers, by feature",
-        f"{grouped(len(rows))} of {grouped(len(table))} observations did not take part "
-        f"({material.calibration.options.reject_sigma:g} sigma off and more). Here and there one is normal; most of one "
-        "feature means a wrong label, or paint that is not where it was drawn.",
-        Drawing(draw, 0.2 + 0.055 * max(len(named), 6)),
-        Table(
-            ("farthest first", "feature", "frame", "px off", "sigma"),
-            tuple(_outlier_row(material, int(row)) for row in order),
-        ),
-    )
-
-
-def _sigmas(material: Material, rows: Array) -> Array:
-    table = material.diagnosis.table
-    sigmas = np.abs(table.distance_px[rows]) / (table.sigma_px[rows] * table.scale[rows])
-    return np.where(np.isfinite(sigmas), sigmas, np.inf)
-
-
-def _outlier_row(material: Material, row: int) -> tuple[str, ...]:
-    table = material.diagnosis.table
-    frame = str(table.views[table.view[row]]["frame"])
-    sigma = float(_sigmas(material, np.array([row]))[0])
-    off = float(abs(table.distance_px[row]))
-    return (
-        table.id_of(row),
-        table.features[table.feature[row]],
-        frame,
-        fixed(off, 2),
-        short(sigma) if sigma < np.inf else "",
-    )
-
-
-def _short_name(name: str, several: bool) -> str:
-    text = name if several else name.partition("/")[2]
-    return text if len(text) <= 30 else f"{text[:29]}…"

@@ -9,12 +9,17 @@ import numpy as np
 
 from ceres_cal.report.material import HEIGHTS_M, Material
 from ceres_cal.report.page import Chapter, Piece, Points, Text, Tile, Tiles
-from ceres_cal.report.words import bounds, count, fixed, listed, short
+from ceres_cal.report.words import bounds, count, fixed, listed, metres, mm, short
 from ceres_cal.uncertainty import FieldMap, Verdict
 
 GOOD_MM, CARE_MM = 10.0, 50.0
 """95 % of located points nearer than the first is good (the width of a painted line), than the second to be used with
 care, beyond it not to be used."""
+_MEANING = (
+    "The headline holds for 95 % of the points located at the worst place that a camera sees; ± is a standard "
+    "deviation. Both are the calibration's own share: the noise of the pixel that is asked about comes on top. Green: up to "
+    f"{GOOD_MM:g} mm, a painted line's width; amber: up to {CARE_MM:g} mm."
+)
 _MANY_OUTLIERS = 0.3
 _MOST_LINES = 6
 _ORDER = ("good", "care", "no")
@@ -35,7 +40,7 @@ class Reach:
 
     @property
     def where(self) -> str:
-        return "on the floor" if self.height_m == 0.0 else f"at {1e3 * self.height_m:.0f} mm"
+        return "on the floor" if self.height_m == 0.0 else f"at robot height ({mm(1e3 * self.height_m)})"
 
 
 def reaches(material: Material) -> tuple[Reach, ...]:
@@ -68,14 +73,7 @@ def verdict(material: Material) -> Chapter:
     level, sentence = _sentence(material, found, worst("good", *(mark for mark, _ in grounds if mark)))
     pieces: list[Piece] = [Tiles(tuple(_tiles(material))), Points(grounds)]
     if found:
-        pieces.append(
-            Text(
-                "Bounds hold 95 % of the points located at the worst place that a camera sees. They are the "
-                f"calibration's own share, so the noise of the pixel asked about comes on top. Good is up to {GOOD_MM:g} mm, "
-                f"with care up to {CARE_MM:g} mm.",
-                "note",
-            )
-        )
+        pieces.append(Text(_MEANING, "note"))
     return Chapter("verdict", sentence, tuple(pieces), level)
 
 
@@ -88,19 +86,16 @@ def _sentence(material: Material, found: tuple[Reach, ...], grounds: str) -> tup
         how = {"good": "can be trusted", "care": "are to be used with care", "no": "cannot be trusted"}[level]
         return level, f"The intrinsics {how}. No station sees a field: places in the world cannot be told."
     floor, above = found
-    told = " and ".join(f"to {short(r.radius_mm)} mm {r.where}" for r in found if r.level != "no")
+    told = " and ".join(f"to {mm(r.radius_mm)} {r.where}" for r in found if r.level != "no")
     if grounds == "no" or floor.level == "no":
-        return "no", "Do not trust this calibration" + (f", though it claims places {told}." if told else ".")
+        return "no", "Do not trust this calibration" + (f", though its sigmas promise places {told}." if told else ".")
     if above.level == "no":
-        how = "cannot be told" if not np.isfinite(above.radius_mm) else f"only to {short(above.radius_mm)} mm"
-        what = f"places {above.where}, robot height, {how}."
-        return "care", f"Trust it on the floor only, to {short(floor.radius_mm)} mm: {what}"
+        how = f"are known to {mm(above.radius_mm)} only" if np.isfinite(above.radius_mm) else "cannot be told"
+        return "care", f"Trust it on the floor alone, to {mm(floor.radius_mm)}: places {above.where} {how}."
     level = worst(grounds, floor.level, above.level)
     if level == "good":
-        return level, f"This calibration can be trusted: it tells places {told}, robot height."
-    return level, f"Use it with care: it tells places {told}, robot height" + (
-        ", as far as what is said below allows." if grounds != "good" else "."
-    )
+        return level, f"This calibration can be trusted: {told}."
+    return level, f"Use it with care: {told}" + (", as far as what is said below allows." if grounds != "good" else ".")
 
 
 # ---- large numbers --------------------------------------------------------------------------------------------------
@@ -137,8 +132,7 @@ def _map_tile(label: str, one: FieldMap) -> Tile:
         return Tile(
             label, "unknown", "", "the observations do not tell it: add tilted boards or measure the height", level
         )
-    x, y = one.worst_place_m
-    note = f"sd of a located point, mean; worst {short(one.worst_mm)} mm at x {x:.1f}, y {y:.1f} m"
+    note = f"of a located point, in the mean; at worst {mm(one.worst_mm)}, at {metres(one.worst_place_m)}"
     return Tile(label, f"± {short(one.mean_mm)}", "mm", note, level)
 
 
@@ -208,7 +202,7 @@ def _of_findings(material: Material) -> Iterator[tuple[str, str]]:
         yield (
             level,
             (
-                f"The model is wrong: {kinds}; up to {short(largest.effect_mm)} mm rms. No standard deviation on this page "
-                "contains that."
+                f"The model is wrong: {kinds}; up to {mm(largest.effect_mm)} rms. No standard deviation on this "
+                "page contains that."
             ),
         )

@@ -6,7 +6,9 @@ import numpy as np
 
 from ceres_cal.uncertainty import Verdict
 
-DASH = "–"
+DASH = "\N{EN DASH}"
+_SPACE = "\N{NO-BREAK SPACE}"
+_POWERS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def short(value: float) -> str:
@@ -16,6 +18,22 @@ def short(value: float) -> str:
     if np.isinf(value):
         return "unknown"
     return f"{value:.2g}" if abs(value) < 99.5 else f"{value:.0f}"
+
+
+def mm(value: float) -> str:
+    """Two digits with their unit, on one line."""
+    return f"{short(value)}{_SPACE}mm" if np.isfinite(value) else short(value)
+
+
+def metres(place: tuple[float, float]) -> str:
+    """A place on the field."""
+    return f"x{_SPACE}{place[0]:.1f}, y{_SPACE}{place[1]:.1f}{_SPACE}m"
+
+
+def powered(unit: str) -> str:
+    """px^-2 as it is written by hand."""
+    base, _, power = unit.partition("^")
+    return base + power.translate(_POWERS)
 
 
 def fixed(value: float, places: int) -> str:
@@ -45,17 +63,17 @@ def listed(names: tuple[str, ...] | list[str], most: int) -> str:
 
 
 def at_precision(value: float, sd: float, unit: str) -> str:
-    """A value with as many places as its sd deserves (three of its digits); coefficients keep every digit."""
+    """A value with as many places as two digits of its sd; coefficients keep every digit."""
     if unit.startswith("px^"):
         return repr(value)
     if not (np.isfinite(sd) and sd > 0.0):
         return f"{value:.4f}"
-    return f"{value:.{int(np.clip(2 - np.floor(np.log10(sd)), 0, 9))}f}"
+    return f"{value:.{int(np.clip(1 - np.floor(np.log10(sd)), 0, 9))}f}"
 
 
-def bounds(verdict: Verdict, factor: float = 1.0) -> str:
-    """ "848.1 to 889.8", "below 1209", "above 300", "anything"."""
-    low, high = factor * verdict.low, factor * verdict.high
+def bounds(verdict: Verdict) -> str:
+    """What 95 % bounds leave: "848.1 to 889.8", "below 1209", "above 300", "anything"; 0 is no bound."""
+    low, high = verdict.low, verdict.high
     below, above = np.isinf(low) or low == 0.0, np.isinf(high)
     if below or above:
         return "anything" if below and above else f"below {high:.4g}" if below else f"above {low:.4g}"
