@@ -26,8 +26,8 @@ def findings(material: Material, choice: Choice | None) -> Chapter:
             )
         )
     if diagnosis.findings:
-        pieces.append(Text(f"The largest first. {tested}"))
-        pieces += [_card(finding) for finding in diagnosis.findings]
+        pieces.append(Text(f"What is wrong with the model first, then the rest, each by size. {tested}"))
+        pieces += [_card(one) for one in sorted(diagnosis.findings, key=lambda one: not one.is_model_error)]
     else:
         pieces.append(Text(f"Nothing was found: what is left over looks like noise. {tested}"))
     pieces.append(_noise(diagnosis.noise))

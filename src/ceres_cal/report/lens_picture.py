@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _STEPS, _TABLE_STEPS = 120, 10
-_WIDEST = 4.0  # r' over r: what lies beyond is nearly at a right angle to the axis
+_WIDEST = 2.5  # r' over r: what lies beyond is nearly at a right angle to the axis
 
 
 def ideal_radii(camera: Camera, radii: Array) -> Array:

@@ -70,17 +70,19 @@ def map_picture(material: Material, station: str, number: int) -> Picture:
     return Picture(
         f"map-{list(material.maps).index(station)}-{number}",
         where + (f", {station}" if len(material.maps) > 1 else ""),
-        f"Darker is worse: {mm(found.mean_mm)} in the mean{_worst(found)}. Dashed: the border of the image, white "
-        f"beyond it{'; hatched: it cannot be told' if np.isinf(found.sd_mm).any() else ''}. Triangle: the camera.",
+        f"{_said(found)}. Dashed: the border of the image, white beyond it. Triangle: the camera.",
         Drawing(draw, min(max(height * 0.9 + 0.2, 0.4), 1.4)),
         _grid_table(found),
     )
 
 
-def _worst(found: FieldMap) -> str:
-    if not np.isfinite(found.worst_mm):
-        return ""
-    return f", {mm(found.worst_mm)} at worst (ring, {metres(found.worst_place_m)})"
+def _said(found: FieldMap) -> str:
+    if np.isnan(found.worst_mm):
+        return "The image shows no place of the field"
+    if np.isinf(found.worst_mm):
+        return "Hatched: the observations cannot tell how far off a located point is"
+    worst = f"{mm(found.worst_mm)} at worst (ring, {metres(found.worst_place_m)})"
+    return f"Darker is worse: {mm(found.mean_mm)} in the mean, {worst}"
 
 
 def _fill(axes: Axes, found: FieldMap, levels: Array) -> None:
@@ -96,7 +98,7 @@ def _fill(axes: Axes, found: FieldMap, levels: Array) -> None:
     if np.isfinite(shown).any():
         axes.contourf(x, y, shown, levels, cmap=colors, norm=norm)
         axes.contour(x, y, shown, levels[1:-1], colors="white", linewidths=0.5)
-        _bar(axes, colors, norm, levels)
+    _bar(axes, colors, norm, levels)
 
 
 def _bar(axes: Axes, colors: object, norm: object, levels: Array) -> None:

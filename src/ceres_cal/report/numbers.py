@@ -58,7 +58,7 @@ def _row(name: str, value: float, unit: str, found: Verdict | None) -> _Row:
     """A number; without a verdict it was held, or nothing was minimised."""
     space = f" {unit}" if unit else ""
     if found is None:
-        return name, f"{value:.10g}{space}", "", "", "held"
+        return name, f"{value:.10g}{space}", "", "", "not free"
     if found.key.kind == "camera" and not unit:
         shown, width = repr(value), f"{found.sd:.2g}" if np.isfinite(found.sd) else "unknown"
     elif unit == "m":

@@ -24,7 +24,8 @@ _MOST_DRAWN = 5000  # strokes of one page, shared among its cameras
 _MEAN_GRID = 16  # cells along the image's longer side
 _FEWEST = 4  # observations of a cell
 _NOT_NOISE = 13.8  # squared length of a mean in its sigmas that noise reaches once in a thousand
-_TYPICAL = 0.02  # of the image's width: what the rms is enlarged to
+_VAGUE = 0.3  # of the residuals' reach: a ring's mean that is less sure than that is in the table alone
+_TYPICAL = 0.015  # of the image's width: what the median is enlarged to
 _ENLARGED = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
 _MOST_FRAMES_NAMED = 24
 
@@ -47,8 +48,8 @@ def vectors(material: Material, name: str) -> Picture:
     table, camera = material.diagnosis.table, material.calibration.cameras[name]
     own = material.of_camera(name)
     inliers, outliers = np.flatnonzero(own & table.inlier), np.flatnonzero(own & ~table.inlier)
-    rms = float(np.sqrt(np.mean(table.distance_px[inliers] ** 2))) if len(inliers) else 1.0
-    wanted = _TYPICAL * camera.image_size[0] / max(rms, 1e-12)
+    typical = float(np.median(np.abs(table.distance_px[inliers]))) if len(inliers) else 1.0
+    wanted = _TYPICAL * camera.image_size[0] / max(typical, 1e-12)
     enlarged = max((e for e in _ENLARGED if e <= wanted), default=1)
     shown, crossed = drawn_rows(material, inliers), drawn_rows(material, outliers)
     places, means, cells = telling_means(table, inliers, camera)
@@ -71,21 +72,22 @@ def vectors(material: Material, name: str) -> Picture:
         if len(crossed):
             canvas.crosses(axes, table.pixel[crossed], OUTLIER, 0.012 * camera.image_size[0])
             axes.plot([], [], "x", color=OUTLIER, markersize=4, label="taken out")
-        _scale_bar(axes, camera, enlarged, rms)
+        _scale_bar(axes, camera, enlarged, typical)
         canvas.key(axes, 4 if width_in > canvas.NARROW_IN else 2)
 
     thinned = _said_of(len(shown) + len(crossed), len(inliers) + len(outliers))
-    drawing = Drawing(draw, camera.image_size[1] / camera.image_size[0] + 0.06)
+    shape = camera.image_size[1] / camera.image_size[0]
     return Picture(
         f"vectors-{_place(material, name)}",
         f"Residual vectors over the image{_whose(material, name)}",
         f"Each stroke leads from an observation to where the model puts it, {enlarged} times enlarged; of a line or "
-        "arc it is the shortest way to the curve. Strokes that point anyhow are noise. Dark: means of regions that noise "
-        f"does not explain ({len(places)} of {cells}): where they turn or grow together, the model is wrong.{thinned}",
-        drawing,
+        "arc it is the shortest way to the curve. Strokes that point anyhow are noise. Dark: means of regions that "
+        f"noise cannot explain ({len(places)} of {cells}); where they grow or turn together, the model is wrong."
+        + thinned,
+        Drawing(draw, 0.93 * shape + 0.07),
         _region_table(material.diagnosis.summaries.regions, name),
         wide=True,
-        narrow_drawing=Drawing(draw, camera.image_size[1] / camera.image_size[0] + 0.15),
+        narrow_drawing=Drawing(draw, 0.86 * shape + 0.18),
     )
 
 
@@ -146,13 +148,13 @@ def _frame_image(axes: Axes, camera: Camera) -> None:
         side.set_visible(True)
 
 
-def _scale_bar(axes: Axes, camera: Camera, enlarged: int, rms: float) -> None:
-    """A stroke as long as the rms residual, in a corner."""
+def _scale_bar(axes: Axes, camera: Camera, enlarged: int, typical: float) -> None:
+    """A stroke as long as the median residual, in a corner."""
     width, height = camera.image_size
     start = np.array([[0.03 * width, 0.95 * height]])
-    end = start + np.array([enlarged * rms, 0.0])
+    end = start + np.array([enlarged * typical, 0.0])
     canvas.strokes(axes, start, end, INK, 1.5)
-    text = axes.text(end[0, 0] + 0.012 * width, start[0, 1], f"rms {short(rms)} px", va="center", fontsize=7.0)
+    text = axes.text(end[0, 0] + 0.012 * width, start[0, 1], f"median {short(typical)} px", va="center", fontsize=7.0)
     text.set_bbox({"facecolor": "white", "edgecolor": "none", "pad": 1.0, "alpha": 0.85})
 
 
@@ -188,15 +190,16 @@ def against_radius(material: Material, name: str) -> Picture:
     shown = drawn_rows(material, told)
     middle = 0.5 * (trend.radius_px[1:] + trend.radius_px[:-1])
     spread = float(np.quantile(np.abs(outward[told]), 0.995)) if len(told) else 1.0
-    reach = 1.15 * max(spread, float(np.nanmax(np.abs(trend.outward_px), initial=0.0)), 1e-9)
+    told_px = np.where(trend.sd_px < _VAGUE * spread, trend.outward_px, np.nan)  # else it hides the others
+    reach = 1.15 * max(spread, float(np.nanmax(np.abs(told_px), initial=0.0)), 1e-9)
 
     def draw(axes: Axes, width_in: float) -> None:
         places = np.column_stack([radius, outward])[shown]
         canvas.dots(axes, places, POINT, 1.6, alpha=0.35)
         axes.axhline(0.0, color=QUIET, linewidth=0.7)
-        low, high = (trend.outward_px + side * 2.0 * trend.sd_px for side in (-1.0, 1.0))
+        low, high = (told_px + side * 2.0 * trend.sd_px for side in (-1.0, 1.0))
         axes.fill_between(middle, low, high, color=OUTLIER, alpha=0.25, linewidth=0.0, label="± 2 sd")
-        axes.plot(middle, trend.outward_px, color=OUTLIER, marker="o", markersize=2.6, label="trend")
+        axes.plot(middle, told_px, color=OUTLIER, marker="o", markersize=2.6, label="trend")
         axes.set(xlim=(0.0, camera.corner_radius), ylim=(-reach, reach))
         axes.set(xlabel="distance from the principal point, px", ylabel="residual outwards, px")
         canvas.key(axes)

@@ -17,8 +17,8 @@ GOOD_MM, CARE_MM = 10.0, 50.0
 care, beyond it not to be used."""
 _MEANING = (
     "The headline holds for 95 % of the points located at the worst place that a camera sees; ± is a standard "
-    "deviation. Both are the calibration's own share: the noise of the pixel that is asked about comes on top. Green: up to "
-    f"{GOOD_MM:g} mm, a painted line's width; amber: up to {CARE_MM:g} mm."
+    "deviation. Both are the calibration's own share: the noise of the pixel that is asked about comes on top. Green: "
+    f"up to {GOOD_MM:g} mm, a painted line's width; amber: up to {CARE_MM:g} mm."
 )
 _MANY_OUTLIERS = 0.3
 _MOST_LINES = 6
@@ -91,11 +91,24 @@ def _sentence(material: Material, found: tuple[Reach, ...], grounds: str) -> tup
         return "no", "Do not trust this calibration" + (f", though its sigmas promise places {told}." if told else ".")
     if above.level == "no":
         how = f"are known to {mm(above.radius_mm)} only" if np.isfinite(above.radius_mm) else "cannot be told"
-        return "care", f"Trust it on the floor alone, to {mm(floor.radius_mm)}: places {above.where} {how}."
+        but = _but(material) or "."
+        return "care", f"Trust it on the floor alone, to {mm(floor.radius_mm)}: places {above.where} {how}{but}"
     level = worst(grounds, floor.level, above.level)
     if level == "good":
         return level, f"This calibration can be trusted: {told}."
-    return level, f"Use it with care: {told}" + (", as far as what is said below allows." if grounds != "good" else ".")
+    return level, f"Use it with care: {told}{_but(material) or '.'}"
+
+
+def _but(material: Material) -> str:
+    """The end of a headline whose numbers do not contain everything, "" where they do."""
+    wrong = model_error_mm(material)
+    return f", but the model is wrong by {mm(wrong)} (rms) beside that." if wrong else ""
+
+
+def model_error_mm(material: Material) -> float:
+    """The largest effect of what is wrong with the model, rms mm; 0 where nothing is known to be."""
+    wrong = [finding.effect_mm for finding in material.diagnosis.findings if finding.is_model_error]
+    return float(np.nanmax([0.0, *wrong]))
 
 
 # ---- large numbers --------------------------------------------------------------------------------------------------
@@ -176,9 +189,10 @@ def _grounds(material: Material) -> Iterator[tuple[str, str]]:
         yield "care", f"{100.0 * out:.0f} % of the observations were taken out: check labels, dimensions and the lens."
     if material.known is not None:
         weak = [direction.words for direction in material.known.weak_directions]
-        yield from (("care", f"{words[0].upper()}{words[1:]}.") for words in weak[:_MOST_LINES])
+        mark = "" if material.maps else "care"  # what they do to places is in the maps
+        yield from ((mark, f"{words[0].upper()}{words[1:]}.") for words in weak[:_MOST_LINES])
         if len(weak) > _MOST_LINES:
-            yield "care", f"{len(weak) - _MOST_LINES} more such directions: see the numbers."
+            yield mark, f"{len(weak) - _MOST_LINES} more such directions: see the numbers."
         if not weak:
             yield "good", "Every number of the cameras and stations is known to 1 % or better."
         lost = material.known.unknown_placements
@@ -196,13 +210,12 @@ def _of_findings(material: Material) -> Iterator[tuple[str, str]]:
         yield "", f"{count(len(diagnosis.findings), 'finding')} below; none says that the model is wrong."
     else:
         wrong = [finding for finding in diagnosis.findings if finding.is_model_error]
-        largest = max(wrong, key=lambda finding: np.nan_to_num(finding.effect_mm))
-        level = "no" if largest.effect_mm > CARE_MM else "care"
+        level = "no" if model_error_mm(material) > CARE_MM else "care"
         kinds = listed(list(dict.fromkeys(f"{finding.kind} ({finding.subject})" for finding in wrong)), 4)
         yield (
             level,
             (
-                f"The model is wrong: {kinds}; up to {mm(largest.effect_mm)} rms. No standard deviation on this "
+                f"The model is wrong: {kinds}; up to {mm(model_error_mm(material))} rms. No standard deviation on this "
                 "page contains that."
             ),
         )
