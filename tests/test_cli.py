@@ -85,7 +85,7 @@ def test_help_lists_every_command(say: Say) -> None:
     said = say("--help")
     assert said.code == 0 and said.err == ""
     assert all(f"  {name:12}  {command.summary}\n" in said.out for name, command in COMMANDS.items())
-    assert set(COMMANDS) == {"detect board", "calibrate", "locate", "project", "simulate", "targets"}
+    assert set(COMMANDS) == {"detect board", "calibrate", "diagnose", "locate", "project", "simulate", "targets"}
     assert say("detect", "-h").out.count("board") > 0
 
 
@@ -509,7 +509,7 @@ def test_no_failure_is_a_traceback(
     def fail(*_: object) -> None:
         raise failure
 
-    monkeypatch.setattr(ceres_cal.calibrate, "calibrate", fail)
+    monkeypatch.setattr(sys.modules["ceres_cal.calibrate"], "calibrate", fail)
     assert refused(say("calibrate", SAMPLE), code) == f"ceres-cal: {line}\n"
     if code == 3:
         monkeypatch.setenv("CERES_CAL_DEBUG", "1")
@@ -521,7 +521,7 @@ def test_no_usable_solution_is_3(say: Say, tmp_path: Path, monkeypatch: pytest.M
     def fail(*_: object) -> None:
         raise ceres_cal.SolutionError("no camera\ncame out")
 
-    monkeypatch.setattr(ceres_cal.calibrate, "calibrate", fail)
+    monkeypatch.setattr(sys.modules["ceres_cal.calibrate"], "calibrate", fail)
     said = say("calibrate", SAMPLE, "-o", tmp_path / "calibration.json")
     assert refused(said, 3) == "ceres-cal: no camera came out\n"
     assert list(tmp_path.iterdir()) == []

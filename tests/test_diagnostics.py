@@ -152,7 +152,7 @@ def test_leverage_is_the_diagonal_of_the_hat_matrix() -> None:
     )[2]
     information = whole.T @ whole + of_prior.T @ of_prior / 0.005**2
     hat = np.einsum("ei,ij,ej->e", whole, np.linalg.inv(information), whole)
-    assert freedom.leverage() == pytest.approx(hat, abs=1e-8)
+    assert freedom.leverage == pytest.approx(hat, abs=1e-8)
     assert freedom.unknowns == layout.size
     # At the end of the solve nothing pulls any more.
     assert np.max(np.abs(freedom.pull)) < 0.1

@@ -8,7 +8,7 @@ OF_LENS = ("radius", "decentring", "aspect", "principal point", "phi")
 MODEL_ERRORS = (*OF_LENS, "curve aside", "point aside", "board bent")
 """Kinds of findings that say the model is wrong: no covariance of the parameters contains them."""
 MOTIONS = ("moved after", "moved in")
-SMALL = 0.5
+SMALL = 0.4
 """Beside the noise: an effect of less than this share of it does not show in a single observation, only in many."""
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -64,10 +65,15 @@ class Freedom:
         filled = np.flatnonzero(np.any(self.private[bounds[:-1]] != 0.0, axis=1))
         return [(int(bounds[i]), int(bounds[i + 1])) for i in filled]
 
+    @cached_property
+    def placed_score(self) -> Array:
+        """(E,) `score` with every private placement at its best."""
+        return self.beyond_private(self.score[:, None])[:, 0]
+
+    @cached_property
     def left_over(self) -> Array:
         """(E,) the residuals, in standard deviations, once every free number is at its best value; 0 where not used."""
-        rest = self.beyond_private(self.score[:, None])[:, 0] - self.shared @ self.pull
-        return np.where(self.used, rest, 0.0)
+        return np.where(self.used, self.placed_score - self.shared @ self.pull, 0.0)
 
     def with_columns(self, columns: Array) -> Freedom:
         """The same model with more free numbers: columns (E, Q), in standard deviations, not yet projected."""
@@ -85,6 +91,7 @@ class Freedom:
             unknowns=self.unknowns + root.shape[1],
         )
 
+    @cached_property
     def leverage(self) -> Array:
         """(E,) the share of each equation that went into the fit; of unused ones, how much the fit's own uncertainty
         adds to their variance.

@@ -58,8 +58,8 @@ def measure_noise(observations: Observations, freedom: Freedom, scales: tuple[fl
 
 
 def _noise_of(observations: Observations, freedom: Freedom, kind: str, rows: Mask, model_scale: float) -> Noise:
-    left, column = freedom.left_over(), observations.curves if kind == "curves" else observations.points
-    spare = float(np.sum(1.0 - freedom.leverage()[rows]))
+    left, column = freedom.left_over, observations.curves if kind == "curves" else observations.points
+    spare = float(np.sum(1.0 - freedom.leverage[rows]))
     squares = float(np.sum(left[rows] ** 2))
     variance = squares / max(spare, 1e-9)
     scale = model_scale * float(np.sqrt(variance))
@@ -114,7 +114,7 @@ def _correlation(freedom: Freedom, pairs: tuple[Ints, Ints], variance: float) ->
     first, second = pairs
     if len(first) < _FEWEST_PAIRS:
         return float("nan"), 0.0
-    left, leverage = freedom.left_over(), np.minimum(freedom.leverage(), 1.0)
+    left, leverage = freedom.left_over, np.minimum(freedom.leverage, 1.0)
     overlap = freedom.overlap(first, second)
     total = float(np.sum(left[first] * left[second] + variance * overlap))
     kept = (1.0 - leverage[first]) * (1.0 - leverage[second])

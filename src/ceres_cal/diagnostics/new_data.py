@@ -69,7 +69,7 @@ def validity_finding(context: Context, freedom: Freedom, calibration: Calibratio
         return []
     own = 2 * calibration.fit.points + calibration.fit.curves
     inflation = 1.0 + np.count_nonzero(used) / max(own, 1)
-    left = freedom.left_over()
+    left = freedom.left_over
     variance = float(left @ left) / max(freedom.spare, 1)
     statistic = float(pull @ pull) / (inflation * len(pull) * variance)
     log_p = float(log_f_tail(np.array([statistic]), np.array([len(pull)]), np.array([max(freedom.spare, 1)]))[0])

@@ -84,6 +84,17 @@ def amounts_of(freedom: Freedom, columns: Array) -> tuple[Array, Array, float]:
     return -root @ z, sd, float(z @ z)
 
 
+def gains_of(freedom: Freedom, columns: Array) -> Array:
+    """(Q,) by how much the squared residuals fall with each of the columns (E, Q), px per unit, alone."""
+    scaled = columns * freedom.weight[:, None]
+    rest = freedom.beyond_private(scaled)[freedom.used]
+    taken = freedom.shared[freedom.used].T @ rest
+    left = np.sum(rest**2, axis=0) - np.sum(taken**2, axis=0)
+    told = left > LEAST_LEFT * np.sum(scaled[freedom.used] ** 2, axis=0)
+    slope = rest.T @ freedom.score[freedom.used] - taken.T @ freedom.pull
+    return np.where(told, slope**2 / np.where(told, left, 1.0), 0.0)
+
+
 def beyond(freedom: Freedom, column: Array) -> Array:
     """(E,) px of a displacement (E,) px that the calibration could not have absorbed."""
     rest = freedom.beyond_private((column * freedom.weight)[:, None])

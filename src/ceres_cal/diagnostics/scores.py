@@ -73,7 +73,7 @@ def score_all(freedom: Freedom, families: Sequence[Family], inflation: float = 1
     Args:
         inflation: how many observations weigh as much as one independent one, where neighbours agree.
     """
-    squares = float(freedom.left_over() @ freedom.left_over())
+    squares = float(freedom.left_over @ freedom.left_over)
     slope = _robust_slope(freedom)
     found: list[tuple[Family, int, Array, Array, Array]] = []
     for family in families:
@@ -115,7 +115,7 @@ def _sums(freedom: Freedom, family: Family) -> tuple[Array, Array, Array]:
     group, count = family.group[rows], len(family.names)
     columns = family.columns[rows] * freedom.weight[rows, None]
     size = columns.shape[1]
-    rest = freedom.beyond_private(freedom.score[:, None])[rows, 0]
+    rest = freedom.placed_score[rows]
 
     def total(values: Array) -> Array:
         sums = _by_group(values, group, count)

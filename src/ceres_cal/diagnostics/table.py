@@ -233,7 +233,7 @@ def plane_shift(equations: Equations, values: Array) -> tuple[Array, Array]:
 
 
 def _mean_leverage(freedom: Freedom, count: int) -> Array:
-    equations, leverage = freedom.equations, freedom.leverage()
+    equations, leverage = freedom.equations, freedom.leverage
     sums = np.bincount(equations.observation, leverage, count)
     numbers = np.bincount(equations.observation, minlength=count)
     return np.where(numbers > 0, sums / np.maximum(numbers, 1), np.nan)
@@ -243,7 +243,7 @@ def _standardised(freedom: Freedom, count: int) -> Array:
     """e' (1 - H)^-1 e as a length; 1 + H where the observation took no part."""
     equations = freedom.equations
     sign = np.where(freedom.used, -1.0, 1.0)
-    residual, leverage = freedom.weight * equations.residual, freedom.leverage()
+    residual, leverage = freedom.weight * equations.residual, freedom.leverage
     answer = np.full(count, np.nan)
     variance = np.maximum(1.0 + sign * leverage, 1e-9)
     curves = equations.is_curve

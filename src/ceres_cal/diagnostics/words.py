@@ -14,7 +14,7 @@ from ceres_cal.diagnostics.findings import SMALL, Amount, Finding
 from ceres_cal.diagnostics.freedom import Freedom
 from ceres_cal.diagnostics.labels import Mislabelled
 from ceres_cal.diagnostics.leftover import Noise
-from ceres_cal.diagnostics.patterns import Selection, amounts_of
+from ceres_cal.diagnostics.patterns import Selection, amounts_of, gains_of
 from ceres_cal.diagnostics.scores import Score
 from ceres_cal.diagnostics.table import ResidualTable, plane_shift
 from ceres_cal.observations import Observations
@@ -78,7 +78,7 @@ def pattern_finding(context: Context, selection: Selection, number: int) -> Find
     for k, other in enumerate(selection.chosen):
         if k != number:
             others = others.with_columns(other.family.of(other.number) * others.weight[:, None])
-    ratio = effect_px / context.noise_px(selection.freedom.left_over(), rows)
+    ratio = effect_px / context.noise_px(selection.freedom.left_over, rows)
     size = f"{effect_px:.2f} px, {effect_mm:.{1 if effect_mm >= 0.1 else 2}f} mm rms, {ratio:.2g} of the noise"
     said = _SPEAKERS[score.family.kind](context, others, score, shift, size, ratio)
     name = score.family.names[score.number]
@@ -103,12 +103,12 @@ def _radius(context: Context, others: Freedom, score: Score, shift: Array, size:
     lens = context.estimate.cameras[name].lens
     own = score.family.group == score.number
     powers = missing_powers(context.estimate, context.layout, name)
-    columns = {power: radial_column(context.equations, context.estimate, name, power) * own for power in powers}
-    gains = {power: amounts_of(others, column[:, None])[2] for power, column in columns.items()}
-    power = max(gains, key=lambda one: gains[one])
+    columns = [radial_column(context.equations, context.estimate, name, one) * own for one in powers]
+    gains = gains_of(others, np.column_stack(columns))
+    power, gain = powers[int(np.argmax(gains))], float(np.max(gains))
     whole = amounts_of(others, score.family.of(score.number))[2]
-    most, share = _most(context, shift * own), 100.0 * min(1.0, gains[power] / whole)
-    judged = "is too short" if ratio >= SMALL else "is long enough for one observation, not for the mean of many"
+    most, share = _most(context, shift * own), 100.0 * min(1.0, gain / whole)
+    judged = "is too short" if ratio >= SMALL else "is too short by little"
     sentence = (
         f"camera {name!r}: residuals follow the radius, up to {most:.2f} px ({size}): the radial polynomial {judged}; "
         f"one more power, r^{power}, explains {share:.0f} % of it"
