@@ -12,7 +12,7 @@ _TRIVIAL, _HUBER, _SOFT_L1, _CAUCHY = 0, 1, 2, 3
 
 
 @jit
-def robust(code: int, scale: float, squared: float) -> tuple[float, float]:
+def robust_loss(code: int, scale: float, squared: float) -> tuple[float, float]:
     """rho and its derivative at the squared residual, as Ceres defines its losses."""
     b = scale * scale
     if code == _TRIVIAL:

@@ -8,7 +8,7 @@ import numpy as np
 
 from ceres_cal.kernels.jit import jit
 from ceres_cal.kernels.lenses import answer_limit, distort, intrinsics_rows, one_dimensional
-from ceres_cal.kernels.losses import robust
+from ceres_cal.kernels.losses import robust_loss
 from ceres_cal.kernels.sight import CHUNK, feet, pose_rows, to_camera
 
 
@@ -22,7 +22,7 @@ def point_rows(
         See `point_residuals`. The pose columns are left perturbations in the camera frame: (dw x R X) + dt.
     """
     size = len(intrinsics)
-    jacobian, scratch = np.empty((size + 7, 2, CHUNK)), np.empty((21, CHUNK))
+    jacobian, scratch = np.empty((size + 6, 2, CHUNK)), np.empty((21, CHUNK))
     local, rotated, rays, image, work = scratch[:3], scratch[3:6], scratch[6:9], scratch[9:16], scratch[16:21]
     dense = one_dimensional(lens, intrinsics, powers)
     limit = answer_limit(lens, dense)
@@ -56,7 +56,7 @@ def curve_rows(
             lies at the pixel plus the signed distance along it.
     """
     size = len(intrinsics)
-    jacobian, scratch = np.empty((size + 7, 2, CHUNK)), np.empty((32, CHUNK))
+    jacobian, scratch = np.empty((size + 6, 2, CHUNK)), np.empty((32, CHUNK))
     local, rotated, rays, image, work, foot = (
         scratch[:3], scratch[3:6], scratch[6:9], scratch[9:16], scratch[16:21], scratch[21:],
     )  # fmt: skip
@@ -86,5 +86,5 @@ def loss_weights(loss: int, scale: float, squared: Any) -> Any:
     """rho' at each squared residual, (N,): the weight an observation has in the solve."""
     weights = np.empty(len(squared))
     for i in range(len(squared)):
-        weights[i] = robust(loss, scale, squared[i])[1]
+        weights[i] = robust_loss(loss, scale, squared[i])[1]
     return weights

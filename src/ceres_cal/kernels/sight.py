@@ -12,7 +12,7 @@ import numpy as np
 
 from ceres_cal.kernels.jit import jit
 from ceres_cal.kernels.lenses import answer_limit, distort, intrinsics_rows, one_dimensional
-from ceres_cal.kernels.losses import robust
+from ceres_cal.kernels.losses import robust_loss
 
 CHUNK = 112  # a board of a hundred corners at once, and all of it in the first cache
 _FOOT_STEPS = 30
@@ -196,7 +196,7 @@ def _add_points(
             w = weights[start + i]
             dx = w * (intrinsics[2] + image[0, i] - pixels[start + i, 0])
             dy = w * (intrinsics[3] + intrinsics[1] * image[1, i] - pixels[start + i, 1])
-            rho, slope = robust(loss, scale, dx * dx + dy * dy)
+            rho, slope = robust_loss(loss, scale, dx * dx + dy * dy)
             cost += rho
             root = np.sqrt(slope)
             error_x[i], error_y[i] = root * dx, root * dy
@@ -256,7 +256,7 @@ def _add_curves(
             length = np.sqrt(foot[7, i])
             nx, ny = -foot[1, i] / length, foot[0, i] / length
             e = weights[start + i] * (nx * foot[2, i] + ny * foot[3, i])
-            rho, slope = robust(loss, scale, e * e)
+            rho, slope = robust_loss(loss, scale, e * e)
             cost += rho
             root = np.sqrt(slope)
             panel[last, i] = root * e
