@@ -105,6 +105,7 @@ def _as_element(figure: Figure, canvas: Any) -> str:
     named = set(re.findall(r'(?:href="|url\()#([^")]+)', text))
     text = re.sub(r' id="([^"]+)"', lambda found: found[0] if found[1] in named else "", text)
     text = re.sub(r' xmlns(?::xlink)?="[^"]*"| version="1.1"', "", text)  # HTML knows them
+    text = re.sub(r' d="[^"]+"', lambda found: re.sub(r"(\.\d\d)\d+", r"\1", found[0]), text)  # a hundredth of a point
     text = text.replace("xlink:href", "href")
     return re.sub(r"\n\s*", "\n", text).strip()
 

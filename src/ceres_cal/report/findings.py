@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+
 import numpy as np
 
 from ceres_cal.diagnostics import Choice, Finding, HeldOut, Noise
 from ceres_cal.report.material import Material
 from ceres_cal.report.page import Card, Chapter, Piece, Table, Text
-from ceres_cal.report.words import DASH, count, fixed, grouped, mm, short, signed
+from ceres_cal.report.words import DASH, count, fixed, grouped, mm, powered, short, signed
+
+_MOST_CARDS = 8
 
 
 def findings(material: Material, choice: Choice | None) -> Chapter:
@@ -27,13 +31,25 @@ def findings(material: Material, choice: Choice | None) -> Chapter:
         )
     if diagnosis.findings:
         pieces.append(Text(f"What is wrong with the model first, then the rest, each by size. {tested}"))
-        pieces += [_card(one) for one in sorted(diagnosis.findings, key=lambda one: not one.is_model_error)]
+        ordered = sorted(diagnosis.findings, key=lambda one: not one.is_model_error)
+        pieces += [_card(one) for one in ordered[:_MOST_CARDS]]
+        pieces += _others(ordered[_MOST_CARDS:])
     else:
         pieces.append(Text(f"Nothing was found: what is left over looks like noise. {tested}"))
     pieces.append(_noise(diagnosis.noise))
     if choice is not None:
         pieces += _held_out(choice)
     return Chapter("findings", "What the residuals say", tuple(pieces))
+
+
+def _others(others: Sequence[Finding]) -> Iterator[Piece]:
+    if others:
+        rows = tuple(
+            (_sentence(one.sentence), short(one.effect_px), short(one.effect_mm), _chance(one.log10_p))
+            for one in others
+        )
+        head = ("", "px", "mm", "false alarm")
+        yield Table(head, rows, f"{count(len(others), 'smaller finding')}", stacked=True)
 
 
 def _card(finding: Finding) -> Card:
@@ -53,8 +69,8 @@ def _sentence(text: str) -> str:
 
 
 def _chance(log10_p: float) -> str:
-    """A probability in words: "0.21 %", "1 in 10^12"."""
-    return f"{100.0 * 10.0**log10_p:.2g} %" if log10_p > -3.0 else f"1 in 10^{-log10_p:.0f}"
+    """A probability in words: "0.21 %", "1 in 10¹²"."""
+    return f"{100.0 * 10.0**log10_p:.2g} %" if log10_p > -3.0 else f"1 in {powered(f'10^{-log10_p:.0f}')}"
 
 
 def _noise(noise: tuple[Noise, ...]) -> Table:

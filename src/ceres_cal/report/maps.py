@@ -123,5 +123,9 @@ def _grid_table(found: FieldMap) -> Table:
     rows = np.unique(np.linspace(0, len(found.y_m) - 1, _TABLE_ROWS).round().astype(int))[::-1]
     return Table(
         ("mm at y \\ x", *(f"{found.x_m[c]:.1f} m" for c in columns)),
-        tuple((f"{found.y_m[r]:.1f} m", *(short(float(found.sd_mm[r, c])) for c in columns)) for r in rows),
+        tuple((f"{found.y_m[r]:.1f} m", *(_cell(float(found.sd_mm[r, c])) for c in columns)) for r in rows),
     )
+
+
+def _cell(sd_mm: float) -> str:
+    return "∞" if np.isinf(sd_mm) else short(sd_mm)

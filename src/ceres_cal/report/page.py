@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
 from importlib.resources import files
@@ -12,6 +12,7 @@ from ceres_cal.report.canvas import NARROW_IN, WIDE_IN, Drawing, to_svg
 from ceres_cal.report.words import grouped
 
 _MOST_ROWS = 200  # of a table
+_SHORT = 14  # letters that stay on one line
 
 
 class Piece(Protocol):
@@ -46,7 +47,7 @@ class Points:
 
 @dataclass(frozen=True)
 class Table:
-    """Columns under their heads; the first column names its row, the others are numbers where `numbers`.
+    """Columns under their heads; the first column names its row.
 
     Of more than 200 rows the first are shown, and how many there are. `stacked`: on a phone each row becomes a card.
     """
@@ -67,12 +68,11 @@ class Table:
         return f'<div class="table">{table}<tbody>{body}</tbody></table>{note}</div>'
 
     def _row(self, row: Sequence[str]) -> str:
-        cells = (f'<td data-head="{escape(name)}">{escape(text)}</td>' for name, text in _beside(self.head, row))
+        cells = (
+            f'<td{_class("short" if len(text) <= _SHORT else "")} data-head="{escape(name)}">{escape(text)}</td>'
+            for name, text in zip(self.head[1:], row[1:], strict=True)
+        )
         return f'<tr><th scope="row">{escape(row[0])}</th>{"".join(cells)}</tr>'
-
-
-def _beside(head: Sequence[str], row: Sequence[str]) -> Iterable[tuple[str, str]]:
-    return zip(head[1:], row[1:], strict=True)
 
 
 @dataclass(frozen=True)

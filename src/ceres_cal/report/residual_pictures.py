@@ -30,10 +30,10 @@ _ENLARGED = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
 _MOST_FRAMES_NAMED = 24
 
 
-def drawn_rows(material: Material, rows: Rows) -> Rows:
-    """Evenly spread ones of some rows of the table, few enough for the page."""
+def stride(material: Material, count: int) -> int:
+    """Every how manieth of so many rows is drawn, so that they are few enough for the page."""
     most = max(_MOST_DRAWN // len(material.observations.cameras), 200)
-    return rows[:: -(-len(rows) // most)] if len(rows) > most else rows
+    return max(-(-count // most), 1)
 
 
 def _said_of(drawn: int, of: int) -> str:
@@ -51,7 +51,8 @@ def vectors(material: Material, name: str) -> Picture:
     typical = float(np.median(np.abs(table.distance_px[inliers]))) if len(inliers) else 1.0
     wanted = _TYPICAL * camera.image_size[0] / max(typical, 1e-12)
     enlarged = max((e for e in _ENLARGED if e <= wanted), default=1)
-    shown, crossed = drawn_rows(material, inliers), drawn_rows(material, outliers)
+    step = stride(material, len(inliers) + len(outliers))
+    shown, crossed = inliers[::step], outliers[::step]
     places, means, cells = telling_means(table, inliers, camera)
     paint = _paint_in_image(material, name)
 
@@ -142,7 +143,7 @@ def _paint_in_image(material: Material, camera: str) -> list[Array]:
 
 def _frame_image(axes: Axes, camera: Camera) -> None:
     width, height = camera.image_size
-    axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), aspect="equal", xlabel="px", ylabel="px")
+    axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), aspect="equal", xlabel="px")
     axes.grid(visible=False)
     for side in axes.spines.values():
         side.set_visible(True)
@@ -187,7 +188,7 @@ def against_radius(material: Material, name: str) -> Picture:
     rows = np.flatnonzero(material.of_camera(name) & table.inlier)
     radius, outward = _outward(table, rows, camera)
     told = np.flatnonzero(np.isfinite(outward))
-    shown = drawn_rows(material, told)
+    shown = told[:: stride(material, len(told))]
     middle = 0.5 * (trend.radius_px[1:] + trend.radius_px[:-1])
     spread = float(np.quantile(np.abs(outward[told]), 0.995)) if len(told) else 1.0
     told_px = np.where(trend.sd_px < _VAGUE * spread, trend.outward_px, np.nan)  # else it hides the others

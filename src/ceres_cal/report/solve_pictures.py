@@ -47,7 +47,7 @@ def correlation(material: Material) -> Picture | None:
         drawn = axes.pcolormesh(
             matrix, vmin=-1.0, vmax=1.0, cmap=canvas.ramp(DIVERGING), edgecolor="white", linewidth=0.8
         )
-        size = 6.5 if len(keys) <= 14 else 5.5
+        size = 6.5 if len(keys) <= 14 else 6.0
         places = np.arange(len(keys)) + 0.5
         axes.set_xticks(places, labels, rotation=60, ha="right", rotation_mode="anchor", fontsize=size)
         axes.set_yticks(places, labels, fontsize=size)

@@ -31,7 +31,7 @@ def metres(place: tuple[float, float]) -> str:
 
 
 def powered(unit: str) -> str:
-    """px^-2 as it is written by hand."""
+    """px^-2, or 10^7, as it is written by hand."""
     base, _, power = unit.partition("^")
     return base + power.translate(_POWERS)
 
