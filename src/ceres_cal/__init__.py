@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from ceres_cal.observations import Observations as Observations
     from ceres_cal.observations import Prior as Prior
     from ceres_cal.parameters import Options as Options
+    from ceres_cal.report import write_report as write_report
     from ceres_cal.transforms import Pose as Pose
 
 _HOME = {
@@ -33,6 +34,7 @@ _HOME = {
     "Prior": "observations",
     "Options": "parameters",
     "Pose": "transforms",
+    "write_report": "report",
 }
 __all__ = list(_HOME)
 

@@ -12,16 +12,18 @@ from ceres_cal.cli.command import (
     Answer,
     Command,
     add_output,
+    add_report,
     finishing,
     parse_number,
     parse_numbers,
-    require_output,
+    require_outputs,
 )
 from ceres_cal.cli.progress import ProgressBar
 from ceres_cal.errors import InputError
 
 if TYPE_CHECKING:
     from ceres_cal.bundle import Progress
+    from ceres_cal.calibration import Calibration
     from ceres_cal.observations import Observations, Prior
     from ceres_cal.parameters import Options
     from ceres_cal.structure import Tolerance
@@ -34,6 +36,7 @@ def _add_arguments(parser: ArgumentParser) -> None:
     add = parser.add_argument
     add("observations", nargs="+", metavar="OBS", help="files of observations (.json or .npz), taken together")
     add_output(parser, "the calibration", required=False)
+    add_report(parser)
     lens = parser.add_argument_group("the camera")
     add = lens.add_argument
     add("--lens", choices=("radial", "brown", "kannala-brandt"), default="radial", help="default: radial")
@@ -92,10 +95,11 @@ def _add_arguments(parser: ArgumentParser) -> None:
 
 
 def _run(args: Namespace) -> Answer:
-    require_output(args.output, args.observations)
+    require_outputs(args.output, args.report, args.observations)
     _require_different(args.observations)
     fixed, powers = _fixed(args.fix), _powers(args)
     from ceres_cal.cli.summary import calibration_data, calibration_text
+    from ceres_cal.files import write_bytes
     from ceres_cal.observations import Observations, combine
 
     observations = combine([Observations.load(path) for path in args.observations])
@@ -109,13 +113,23 @@ def _run(args: Namespace) -> Answer:
         from ceres_cal.calibrate import calibrate
 
         calibration = calibrate(observations, options, _shown_on(bar, options.max_iterations))
-    if args.output is not None:
-        with finishing():
+        page = _page(calibration, observations, bar) if args.report is not None else ""
+    with finishing():
+        if args.output is not None:
             calibration.save(args.output)
+        if args.report is not None:
+            write_bytes(args.report, page.encode())
     return Answer(
-        calibration_data(calibration, observations, args.observations, args.output),
-        lambda: calibration_text(calibration, observations, args.observations, args.output),
+        calibration_data(calibration, observations, args.observations, args.output, args.report),
+        lambda: calibration_text(calibration, observations, args.observations, args.output, args.report),
     )
+
+
+def _page(calibration: Calibration, observations: Observations, bar: ProgressBar) -> str:
+    from ceres_cal.report import make_report
+
+    bar.update(0, 1, "drawing the report")
+    return make_report(calibration, observations)
 
 
 COMMANDS = (Command("calibrate", "calibrate cameras from observations of fields and boards", _add_arguments, _run),)

@@ -94,6 +94,24 @@ def require_output(path: Path | None, inputs: Iterable[str | Path]) -> None:
         raise InputError(f"{path}: is an input, and the output would replace it: name another file")
 
 
+def add_report(parser: argparse.ArgumentParser) -> None:
+    """The option --report PAGE."""
+    parser.add_argument(
+        "--report",
+        metavar="PAGE",
+        type=Path,
+        help="file for a page (.html): may it be trusted, for what, to how many mm",
+    )
+
+
+def require_outputs(output: Path | None, report: Path | None, inputs: Sequence[str | Path]) -> None:
+    """`require_output` of both, and that they are two files."""
+    require_output(output, inputs)
+    require_output(report, inputs)
+    if output is not None and report is not None and output.resolve() == report.resolve():
+        raise InputError(f"{report}: is named as output and as report: give them two names")
+
+
 @contextmanager
 def finishing() -> Iterator[None]:
     """Hold Ctrl-C back while results are written: a command that was interrupted has written nothing."""
@@ -105,6 +123,11 @@ def finishing() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+def written(*paths: Path | None) -> list[str]:
+    """The files that were asked for, as the last section of an answer names them."""
+    return [str(path) for path in paths if path is not None]
 
 
 def plural(count: int, word: str) -> str:

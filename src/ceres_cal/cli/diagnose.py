@@ -6,7 +6,7 @@ import os
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
 
-from ceres_cal.cli.command import Answer, Command, add_output, finishing, parse_number, require_output
+from ceres_cal.cli.command import Answer, Command, add_output, add_report, finishing, parse_number, require_outputs
 from ceres_cal.errors import InputError
 
 
@@ -15,6 +15,7 @@ def _add_arguments(parser: ArgumentParser) -> None:
     add("calibration", metavar="CALIBRATION", type=Path, help="file that `ceres-cal calibrate` wrote")
     add("observations", nargs="+", metavar="OBS", help="the observations it was made from, in the same order")
     add_output(parser, "the residual of every observation (.csv, .json or .npz)", required=False)
+    add_report(parser)
     add("--new-data", action="store_true", help="the observations are others than those it was made from")
     add(
         "--held-out",
@@ -32,7 +33,7 @@ def _add_arguments(parser: ArgumentParser) -> None:
 
 
 def _run(args: Namespace) -> Answer:
-    require_output(args.output, [args.calibration, *args.observations])
+    require_outputs(args.output, args.report, [args.calibration, *args.observations])
     if args.output is not None and args.output.suffix not in (".csv", ".json", ".npz"):
         raise InputError(f"{args.output}: the table is written as .csv, .json or .npz: give one of these endings")
     rate = parse_number(args.false_alarms, "--false-alarms")
@@ -46,18 +47,26 @@ def _run(args: Namespace) -> Answer:
     from ceres_cal.calibration import Calibration
     from ceres_cal.cli.diagnosis import diagnosis_data, diagnosis_text
     from ceres_cal.diagnostics import choose, diagnose
+    from ceres_cal.files import write_bytes
     from ceres_cal.observations import Observations, combine
 
     calibration = Calibration.load(args.calibration)
     observations = combine([Observations.load(path) for path in args.observations])
     diagnosis = diagnose(calibration, observations, new_data=args.new_data, false_alarm_rate=rate)
     choice = choose(observations, calibration.options, args.folds) if args.held_out else None
-    if args.output is not None:
-        with finishing():
+    page = ""
+    if args.report is not None:
+        from ceres_cal.report import make_report
+
+        page = make_report(calibration, observations, diagnosis, choice)
+    with finishing():
+        if args.output is not None:
             diagnosis.table.save(args.output)
+        if args.report is not None:
+            write_bytes(args.report, page.encode())
     return Answer(
-        diagnosis_data(diagnosis, choice, args.output),
-        lambda: diagnosis_text(diagnosis, choice, args.output),
+        diagnosis_data(diagnosis, choice, args.output, args.report),
+        lambda: diagnosis_text(diagnosis, choice, args.output, args.report),
         1 if diagnosis.findings else 0,
     )
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ceres_cal.cli.command import plural
+from ceres_cal.cli.command import plural, written
 from ceres_cal.cli.summary import section
 from ceres_cal.diagnostics import Choice, Diagnosis, Finding, HeldOut, Noise, ResidualTable, Summary
 from ceres_cal.transforms import Array
@@ -24,7 +24,9 @@ _MODEL_ERROR = (
 )
 
 
-def diagnosis_data(diagnosis: Diagnosis, choice: Choice | None, output: Path | None) -> dict[str, Any]:
+def diagnosis_data(
+    diagnosis: Diagnosis, choice: Choice | None, output: Path | None, report: Path | None = None
+) -> dict[str, Any]:
     """Everything but the table of single observations, for --json; what is unknown is null."""
     summaries = diagnosis.summaries
     data: dict[str, Any] = _plain(
@@ -41,6 +43,7 @@ def diagnosis_data(diagnosis: Diagnosis, choice: Choice | None, output: Path | N
             "radius_trend": [vars(trend) for trend in summaries.trends],
             "held_out": None if choice is None else _choice_data(choice),
             "output": None if output is None else str(output),
+            "report": None if report is None else str(report),
         }
     )
     return data
@@ -67,7 +70,7 @@ def _plain(value: Any) -> Any:
     return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
-def diagnosis_text(diagnosis: Diagnosis, choice: Choice | None, output: Path | None) -> str:
+def diagnosis_text(diagnosis: Diagnosis, choice: Choice | None, output: Path | None, report: Path | None = None) -> str:
     """A page: the verdict, the findings by size, then tables."""
     table, summaries = diagnosis.table, diagnosis.summaries
     sections = [section("verdict", [line for part in _verdict(diagnosis) for line in wrap(part, _WIDTH)])]
@@ -86,8 +89,8 @@ def diagnosis_text(diagnosis: Diagnosis, choice: Choice | None, output: Path | N
     ):
         sections.append(section(title, _summary(summary, by_size)))
     sections.append(section("leverage", _leverage(table)))
-    if output is not None:
-        sections.append(section("written", [str(output)]))
+    if files := written(output, report):
+        sections.append(section("written", files))
     return "\n".join(sections)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from ceres_cal.calibration import Calibration, calibration_to_json
 from ceres_cal.camera import Camera
-from ceres_cal.cli.command import plural
+from ceres_cal.cli.command import plural, written
 from ceres_cal.cli.trust import Trust, with_sd
 from ceres_cal.observations import Observations
 from ceres_cal.parameters import Options, anchored_stations
@@ -35,13 +35,18 @@ def tilt_deg(cam_from_world: Pose) -> float:
 
 
 def calibration_data(
-    calibration: Calibration, observations: Observations, inputs: Sequence[str], output: Path | None
+    calibration: Calibration,
+    observations: Observations,
+    inputs: Sequence[str],
+    output: Path | None,
+    report: Path | None = None,
 ) -> dict[str, Any]:
     """Everything, for --json."""
     return {
         "calibration": calibration_to_json(calibration),
         "inputs": list(inputs),
         "output": None if output is None else str(output),
+        "report": None if report is None else str(report),
         "counts": _counts(observations),
         "rms_px": calibration.rms_px,
         "tilt_deg": {name: tilt_deg(camera.cam_from_world) for name, camera in calibration.stations.items()},
@@ -52,7 +57,11 @@ def calibration_data(
 
 
 def calibration_text(
-    calibration: Calibration, observations: Observations, inputs: Sequence[str], output: Path | None
+    calibration: Calibration,
+    observations: Observations,
+    inputs: Sequence[str],
+    output: Path | None,
+    report: Path | None = None,
 ) -> str:
     """A short table for people."""
     anchored, trust = anchored_stations(observations), Trust(calibration, observations)
@@ -75,8 +84,8 @@ def calibration_text(
     sections.append(section("outliers", _outlier_lines(calibration)))
     sections.append(section("stopped", _stop(calibration)))
     sections.extend(section("warning", wrap(text, 100)) for text in _warnings(calibration, observations))
-    if output is not None:
-        sections.append(section("written", [str(output)]))
+    if files := written(output, report):
+        sections.append(section("written", files))
     return "\n".join(sections)
 
 

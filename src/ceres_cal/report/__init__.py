@@ -1,0 +1,8 @@
+"""The report: one HTML page that says whether a calibration may be trusted, for what, and to how many mm.
+
+The only package that imports the plotting library.
+"""
+
+from ceres_cal.report.report import make_report, write_report
+
+__all__ = ["make_report", "write_report"]

@@ -1,0 +1,149 @@
+"""Pictures as SVG, all in one style: the only module that imports the plotting library.
+
+A picture is drawn for the width at which it is shown, so that its letters are as large as the page's. What has many
+parts goes into one path (`dots`, `strokes`): thousands of them cost a few bytes each and stay sharp in print.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ceres_cal.transforms import Array
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+POINT, CURVE, OUTLIER = "#0072b2", "#009e73", "#d55e00"  # Okabe and Ito's, apart for colour-blind readers too
+INK, QUIET, PAINT, FAINT = "#1f2933", "#5b6770", "#b3bcc4", "#e8ecef"
+RAMP = ("#f1f6fa", "#d5e5f1", "#b0d0e6", "#82b4d6", "#5494c0", "#2f72a4", "#185383")
+"""From little to much: lightness alone tells it, in grey print too."""
+DIVERGING = ("#a84a00", "#e8a06b", "#ffffff", "#86b9da", "#004f80")
+
+NARROW_IN, WIDE_IN = 3.65, 7.5
+"""A picture in one column, which is what a phone shows, and one across both."""
+_POINTS_PER_INCH = 72
+_STYLE: dict[str, Any] = {
+    "svg.fonttype": "none",  # letters stay letters: in the page's own face, to be searched and read aloud
+    "text.parse_math": False,  # names come from files
+    "path.simplify": False,
+    "font.family": "DejaVu Sans",
+    "font.size": 7.5,
+    "axes.labelsize": 7.5,
+    "axes.labelcolor": QUIET,
+    "axes.edgecolor": PAINT,
+    "axes.linewidth": 0.7,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "axes.unicode_minus": True,
+    "grid.color": FAINT,
+    "grid.linewidth": 0.7,
+    "text.color": INK,
+    "xtick.color": PAINT,
+    "ytick.color": PAINT,
+    "xtick.labelcolor": QUIET,
+    "ytick.labelcolor": QUIET,
+    "xtick.labelsize": 7.0,
+    "ytick.labelsize": 7.0,
+    "xtick.major.size": 2.5,
+    "ytick.major.size": 2.5,
+    "xtick.major.width": 0.7,
+    "ytick.major.width": 0.7,
+    "xtick.minor.size": 0.0,
+    "ytick.minor.size": 0.0,
+    "legend.frameon": False,
+    "legend.fontsize": 7.0,
+    "legend.handlelength": 1.4,
+    "lines.linewidth": 1.3,
+    "hatch.linewidth": 0.6,
+}
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """What is drawn: `draw(axes, width_in)` into one pair of axes; `height` over width of the whole."""
+
+    draw: Callable[[Axes, float], None]
+    height: float
+
+
+def to_svg(drawing: Drawing, width_in: float, name: str) -> str:
+    """An <svg> element to stand in a page.
+
+    Args:
+        name: one of its own on the page: what the element calls its parts begins with it.
+    """
+    from matplotlib import rc_context
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
+    from matplotlib.figure import Figure
+
+    style: Any = {**_STYLE, "svg.hashsalt": name}
+    with rc_context(style):
+        figure = Figure(figsize=(width_in, width_in * drawing.height), layout="constrained")
+        engine = figure.get_layout_engine()
+        assert engine is not None
+        engine.set(w_pad=0.03, h_pad=0.03)  # type: ignore[call-arg]
+        drawing.draw(figure.add_subplot(), width_in)
+        return _as_element(figure, FigureCanvasSVG)
+
+
+def _as_element(figure: Figure, canvas: Any) -> str:
+    stream = io.StringIO()
+    canvas(figure).print_svg(stream, metadata={"Date": None, "Creator": None})
+    text = stream.getvalue()
+    text = text[text.index("<svg") :]
+    text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.S)
+    text = re.sub(r' (?:width|height)="[\d.]+pt"', "", text)  # as wide as its place
+    named = set(re.findall(r'(?:href="|url\()#([^")]+)', text))
+    text = re.sub(r' id="([^"]+)"', lambda found: found[0] if found[1] in named else "", text)
+    text = re.sub(r' xmlns(?::xlink)?="[^"]*"| version="1.1"', "", text)  # HTML knows them
+    text = re.sub(r' d="[^"]+"', lambda found: re.sub(r"(\.\d\d)\d+", r"\1", found[0]), text)  # a hundredth of a point
+    text = text.replace("xlink:href", "href")
+    return re.sub(r"\n\s*", "\n", text).strip()
+
+
+# ---- many things in one path ----------------------------------------------------------------------------------------
+
+
+def strokes(axes: Axes, starts: Array, ends: Array, color: str, width: float, **how: Any) -> None:
+    """Lines from starts (N, 2) to ends (N, 2), of which a longer one is not cut at the border of the axes."""
+    path = np.full((len(starts), 3, 2), np.nan)
+    path[:, 0], path[:, 1] = starts, ends
+    axes.plot(*path.reshape(-1, 2).T, color=color, linewidth=width, solid_capstyle="round", **how)
+
+
+def dots(axes: Axes, places: Array, color: str, size: float, **how: Any) -> None:
+    """Round dots of `size` points at places (N, 2): strokes without length."""
+    strokes(axes, places, places, color, size, **how)
+
+
+def crosses(axes: Axes, places: Array, color: str, size: float, **how: Any) -> None:
+    """Crosses of `size` units of the axes at places (N, 2)."""
+    for slope in (1.0, -1.0):
+        reach = 0.5 * size * np.array([1.0, slope])
+        strokes(axes, places - reach, places + reach, color, 0.9, **how)
+
+
+def ramp(colors: tuple[str, ...]) -> Any:
+    """A colour map through these colours."""
+    from matplotlib.colors import LinearSegmentedColormap
+
+    return LinearSegmentedColormap.from_list("ramp", list(colors))
+
+
+def key(axes: Axes, columns: int = 4) -> None:
+    """The legend above the axes."""
+    axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=columns, borderaxespad=0.2, columnspacing=1.2)
+
+
+def plain(value: float, _: float) -> str:
+    """A tick of a logarithmic axis: 0.01, 1, 100, 1e+07."""
+    return f"{value:g}"

@@ -1,0 +1,108 @@
+"""The chapter behind the verdict: what the residuals say, cause by cause."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from ceres_cal.diagnostics import Choice, Finding, HeldOut, Noise
+from ceres_cal.report.material import Material
+from ceres_cal.report.page import Card, Chapter, Piece, Table, Text
+from ceres_cal.report.words import DASH, count, fixed, grouped, mm, powered, short, signed
+
+_MOST_CARDS = 8
+
+
+def findings(material: Material, choice: Choice | None) -> Chapter:
+    """Findings, the largest first, the noise that is left, and the held-out errors where they were computed."""
+    diagnosis = material.diagnosis
+    rate = f"{100.0 * diagnosis.false_alarm_rate:g} %"
+    tested = (
+        f"{count(diagnosis.tests, 'alternative')} of the model were tested; of sound data {rate} raise any finding."
+    )
+    pieces: list[Piece] = []
+    if diagnosis.new_data:
+        pieces.append(
+            Text(
+                "These are new data: residuals are those of the calibration as it stands, the findings are what would "
+                "be left if it were refitted to them."
+            )
+        )
+    if diagnosis.findings:
+        pieces.append(Text(f"What is wrong with the model first, then the rest, each by size. {tested}"))
+        ordered = sorted(diagnosis.findings, key=lambda one: not one.is_model_error)
+        pieces += [_card(one) for one in ordered[:_MOST_CARDS]]
+        pieces += _others(ordered[_MOST_CARDS:])
+    else:
+        pieces.append(Text(f"Nothing was found: what is left over looks like noise. {tested}"))
+    pieces.append(_noise(diagnosis.noise))
+    if choice is not None:
+        pieces += _held_out(choice)
+    return Chapter("findings", "What the residuals say", tuple(pieces))
+
+
+def _others(others: Sequence[Finding]) -> Iterator[Piece]:
+    if others:
+        rows = tuple(
+            (_sentence(one.sentence), short(one.effect_px), short(one.effect_mm), _chance(one.log10_p))
+            for one in others
+        )
+        head = ("", "px", "mm", "false alarm")
+        yield Table(head, rows, f"{count(len(others), 'smaller finding')}", stacked=True)
+
+
+def _card(finding: Finding) -> Card:
+    facts = [f"{short(finding.effect_px)} px"]
+    if np.isfinite(finding.effect_mm):
+        facts.append(mm(finding.effect_mm))
+    facts.append(count(finding.observations, "observation"))
+    facts.append(f"false alarm: {_chance(finding.log10_p)}")
+    facts += [f"{one.name} {one.value:+.3g} ± {short(one.sd)} {one.unit}".strip() for one in finding.amounts]
+    return Card(
+        "no" if finding.is_model_error else "care", _sentence(finding.sentence), _sentence(finding.advice), tuple(facts)
+    )
+
+
+def _sentence(text: str) -> str:
+    return f"{text[:1].upper()}{text[1:]}"
+
+
+def _chance(log10_p: float) -> str:
+    """A probability in words: "0.21 %", "1 in 10¹²"."""
+    return f"{100.0 * 10.0**log10_p:.2g} %" if log10_p > -3.0 else f"1 in {powered(f'10^{-log10_p:.0f}')}"
+
+
+def _noise(noise: tuple[Noise, ...]) -> Table:
+    return Table(
+        ("noise of", "observations", "sd, px", "of the stated", "neighbours' correlation"),
+        tuple(
+            (
+                one.kind,
+                grouped(one.observations),
+                fixed(one.sigma_px, 3),
+                f"{one.scale:.2f} times" if np.isfinite(one.stated_px) else "none stated",
+                signed(one.correlation, 2),
+            )
+            for one in noise
+        ),
+        stacked=True,
+    )
+
+
+def _held_out(choice: Choice) -> tuple[Table, Text]:
+    chosen = choice.candidates[choice.chosen]
+    said = "The calibration's lens is the one to take" if choice.chosen == choice.current else f"Take {chosen.label}"
+    rule = f"{said}: the fewest coefficients within one standard error of the least error."
+    thinned = f" On {100.0 * choice.thinned:.0f} % of the observations." if choice.thinned < 1.0 else ""
+    rows = tuple(_candidate(choice, number, one) for number, one in enumerate(choice.candidates))
+    head = ("lens", "held-out px", "mm", "fit px", "")
+    return Table(head, rows, "Frames held out: how well others predict them", stacked=True), Text(rule + thinned)
+
+
+def _candidate(choice: Choice, number: int, one: HeldOut) -> tuple[str, ...]:
+    if one.failed:
+        return one.label, DASH, DASH, DASH, one.failed
+    marks = (("now", choice.current), ("least error", choice.best), ("chosen", choice.chosen))
+    said = ", ".join(word for word, index in marks if index == number)
+    return one.label, fixed(one.rms_px, 4), fixed(one.rms_mm, 3), fixed(one.fit_rms_px, 4), said

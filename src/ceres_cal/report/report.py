@@ -1,0 +1,124 @@
+"""The report: chapters in the order in which they are read, as one page that needs nothing from elsewhere."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from ceres_cal.calibration import Calibration
+from ceres_cal.diagnostics import Choice, Diagnosis, diagnose
+from ceres_cal.files import write_bytes
+from ceres_cal.observations import Observations
+from ceres_cal.report.findings import findings
+from ceres_cal.report.lens_picture import distortion
+from ceres_cal.report.maps import map_picture
+from ceres_cal.report.material import ClosedForm, Material
+from ceres_cal.report.numbers import numbers
+from ceres_cal.report.outlier_picture import outliers
+from ceres_cal.report.page import Chapter, Gallery, Picture, Text, page
+from ceres_cal.report.residual_pictures import against_radius, by_frame, vectors
+from ceres_cal.report.solve_pictures import against_closed_form, convergence, correlation
+from ceres_cal.report.verdict import verdict
+from ceres_cal.report.words import count, listed
+
+MOST_CAMERAS = 8
+"""Cameras, and stations, that have pictures of their own; the others are in the tables alone."""
+
+_OF_MAPS = (
+    "Standard deviation of a point that is located, in mm, over the field as drawn: what the calibration itself is "
+    "unsure of. The noise of the pixel that is asked about comes on top; model error is not in it."
+)
+
+
+def make_report(
+    calibration: Calibration,
+    observations: Observations,
+    diagnosis: Diagnosis | None = None,
+    choice: Choice | None = None,
+) -> str:
+    """One self-contained HTML page on a calibration: verdict, findings, numbers, pictures.
+
+    Args:
+        observations: those it was made from; or others, with a diagnosis of them (`new_data`).
+        diagnosis: of these observations; made here where there is none. choice: of lens, by held-out error.
+
+    Raises:
+        InputError: the observations are not those of the calibration, and no diagnosis says so.
+    """
+    found = diagnose(calibration, observations) if diagnosis is None else diagnosis
+    material = Material(calibration, observations, found)
+    chapters = [verdict(material), findings(material, choice), numbers(material), *_pictures(material)]
+    return page(", ".join(list(observations.cameras)[:4]), _about(material), chapters, _foot(calibration))
+
+
+def write_report(
+    path: str | Path,
+    calibration: Calibration,
+    observations: Observations,
+    diagnosis: Diagnosis | None = None,
+    choice: Choice | None = None,
+) -> None:
+    """Write `make_report`'s page.
+
+    Raises:
+        InputError: see `make_report`; or the file cannot be written.
+    """
+    write_bytes(path, make_report(calibration, observations, diagnosis, choice).encode())
+
+
+def _pictures(material: Material) -> Iterator[Chapter]:
+    cameras = list(material.observations.cameras)
+    shown = cameras[:MOST_CAMERAS]
+    pictures = [vectors(material, name) for name in shown]
+    for name in shown:
+        pictures += [against_radius(material, name), distortion(material, name)]
+    pictures += [picture for picture in (by_frame(material), outliers(material)) if picture is not None]
+    yield Chapter("residuals", "Residuals and the lens", (*_left_out(cameras), Gallery(tuple(pictures))))
+    if material.maps:
+        stations = list(material.maps)
+        maps = [map_picture(material, name, number) for name in stations[:MOST_CAMERAS] for number in (0, 1)]
+        yield Chapter("maps", "How well places are told", (Text(_OF_MAPS), *_left_out(stations), Gallery(tuple(maps))))
+    yield _solve(material)
+
+
+def _left_out(names: list[str]) -> tuple[Text, ...]:
+    rest = names[MOST_CAMERAS:]
+    return (Text(f"Without pictures here: {listed(rest, 12)}."),) if rest else ()
+
+
+def _solve(material: Material) -> Chapter:
+    closed = material.closed_form
+    found: list[Picture | None] = [convergence(material), correlation(material)]
+    if isinstance(closed, ClosedForm):
+        found.insert(1, against_closed_form(material, closed))
+    texts = () if isinstance(closed, ClosedForm) else (Text(f"No closed form to compare with: {closed}.", "note"),)
+    pictures = Gallery(tuple(picture for picture in found if picture is not None))
+    return Chapter("solve", "The solve", (pictures, *texts))
+
+
+def _about(material: Material) -> str:
+    observations = material.observations
+    counts = [
+        count(number, word)
+        for number, word in (
+            (len(observations.views), "view"),
+            (len(observations.cameras), "camera"),
+            (len(observations.stations), "station"),
+            (len(observations.placements), "placement"),
+            (len(observations.points), "point observation"),
+            (len(observations.curves), "curve observation"),
+        )
+        if number
+    ]
+    return ", ".join(counts)
+
+
+def _foot(calibration: Calibration) -> str:
+    options = calibration.options
+    powers = f" with powers {', '.join(map(str, options.powers))}" if options.lens == "radial" else ""
+    versions = ", ".join(f"{name} {version}" for name, version in calibration.versions.items())
+    return (
+        f"Solved with the {options.lens} lens{powers}, {options.loss} loss from {options.loss_scale:g} sigma, outliers "
+        f"from {options.reject_sigma:g} sigma. {calibration.termination.rstrip('.')}. Observations SHA-256 "
+        f"{calibration.digest[:16]}…; {versions}."
+    )

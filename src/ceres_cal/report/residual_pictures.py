@@ -1,0 +1,279 @@
+"""Pictures of residuals: as vectors over the image, against the radius, by frame."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ceres_cal.camera import Camera
+from ceres_cal.diagnostics import ResidualTable, Summary
+from ceres_cal.report import canvas
+from ceres_cal.report.canvas import CURVE, INK, OUTLIER, PAINT, POINT, QUIET, Drawing
+from ceres_cal.report.material import Material
+from ceres_cal.report.page import Picture, Table
+from ceres_cal.report.words import fixed, grouped, short, signed
+from ceres_cal.sights import Rows
+from ceres_cal.transforms import Array
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+_MOST_DRAWN = 5000  # strokes of one page, shared among its cameras
+_MEAN_GRID = 16  # cells along the image's longer side
+_FEWEST = 4  # observations of a cell
+_NOT_NOISE = 13.8  # squared length of a mean in its sigmas that noise reaches once in a thousand
+_VAGUE = 0.3  # of the residuals' reach: a ring's mean that is less sure than that is in the table alone
+_TYPICAL = 0.015  # of the image's width: what the median is enlarged to
+_ENLARGED = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
+_MOST_FRAMES_NAMED = 24
+
+
+def stride(material: Material, count: int) -> int:
+    """Every how manieth of so many rows is drawn, so that they are few enough for the page."""
+    most = max(_MOST_DRAWN // len(material.observations.cameras), 200)
+    return max(-(-count // most), 1)
+
+
+def _said_of(drawn: int, of: int) -> str:
+    return "" if drawn == of else f" Drawn are {grouped(drawn)} of {grouped(of)}, evenly spread."
+
+
+# ---- vectors over the image -----------------------------------------------------------------------------------------
+
+
+def vectors(material: Material, name: str) -> Picture:
+    """Residual vectors over one camera's image."""
+    table, camera = material.diagnosis.table, material.calibration.cameras[name]
+    own = material.of_camera(name)
+    inliers, outliers = np.flatnonzero(own & table.inlier), np.flatnonzero(own & ~table.inlier)
+    typical = float(np.median(np.abs(table.distance_px[inliers]))) if len(inliers) else 1.0
+    wanted = _TYPICAL * camera.image_size[0] / max(typical, 1e-12)
+    enlarged = max((e for e in _ENLARGED if e <= wanted), default=1)
+    step = stride(material, len(inliers) + len(outliers))
+    shown, crossed = inliers[::step], outliers[::step]
+    places, means, cells = telling_means(table, inliers, camera)
+    paint = _paint_in_image(material, name)
+
+    def draw(axes: Axes, width_in: float) -> None:
+        _frame_image(axes, camera)
+        for line in paint:
+            axes.plot(*line.T, color=PAINT, linewidth=1.6 if width_in > canvas.NARROW_IN else 1.0, alpha=0.6)
+        for rows, color, label in (
+            (shown[~table.is_curve[shown]], POINT, "points"),
+            (shown[table.is_curve[shown]], CURVE, "curves"),
+        ):
+            if len(rows):
+                ends = table.pixel[rows] + enlarged * table.residual_px[rows]
+                canvas.strokes(axes, table.pixel[rows], ends, color, 0.7, alpha=0.8, label=label)
+        if len(places):
+            canvas.strokes(axes, places, places + enlarged * means, INK, 1.6, label="mean of a region")
+            canvas.dots(axes, places, INK, 3.2)
+        if len(crossed):
+            canvas.crosses(axes, table.pixel[crossed], OUTLIER, 0.012 * camera.image_size[0])
+            axes.plot([], [], "x", color=OUTLIER, markersize=4, label="taken out")
+        _scale_bar(axes, camera, enlarged, typical)
+        canvas.key(axes, 4 if width_in > canvas.NARROW_IN else 2)
+
+    thinned = _said_of(len(shown) + len(crossed), len(inliers) + len(outliers))
+    shape = camera.image_size[1] / camera.image_size[0]
+    return Picture(
+        f"vectors-{_place(material, name)}",
+        f"Residual vectors over the image{_whose(material, name)}",
+        f"Each stroke leads from an observation to where the model puts it, {enlarged} times enlarged; of a line or "
+        "arc it is the shortest way to the curve. Strokes that point anyhow are noise. Dark: means of regions that "
+        f"noise cannot explain ({len(places)} of {cells}); where they grow or turn together, the model is wrong."
+        + thinned,
+        Drawing(draw, 0.93 * shape + 0.07),
+        _region_table(material.diagnosis.summaries.regions, name),
+        wide=True,
+        narrow_drawing=Drawing(draw, 0.86 * shape + 0.18),
+    )
+
+
+def _whose(material: Material, camera: str) -> str:
+    return f", {camera}" if len(material.observations.cameras) > 1 else ""
+
+
+def _place(material: Material, camera: str) -> int:
+    return list(material.observations.cameras).index(camera)
+
+
+def telling_means(table: ResidualTable, rows: Rows, camera: Camera) -> tuple[Array, Array, int]:
+    """Mean displacements of the image's regions that noise does not explain: places (C, 2) and vectors (C, 2), px; and
+    how many regions could tell one.
+
+    A point tells both of its coordinates, a curve the one across it: least squares over the region, in their sigmas.
+    """
+    width, height = camera.image_size
+    cell = max(width, height) / _MEAN_GRID
+    columns, lines = int(np.ceil(width / cell)), int(np.ceil(height / cell))
+    pixel, residual = table.pixel[rows], table.residual_px[rows]
+    column = np.clip((pixel[:, 0] / cell).astype(int), 0, columns - 1)
+    region = np.clip((pixel[:, 1] / cell).astype(int), 0, lines - 1) * columns + column
+    length = np.maximum(np.linalg.norm(residual, axis=1), 1e-300)
+    across = np.einsum("ni,nj->nij", residual, residual) / length[:, None, None] ** 2
+    told = np.where(table.is_curve[rows, None, None], across, np.eye(2))
+    weight = (table.sigma_px[rows] * table.scale[rows]) ** -2.0
+    count = np.bincount(region, minlength=columns * lines)
+    normal, moved, centre = np.zeros((len(count), 2, 2)), np.zeros((len(count), 2)), np.zeros((len(count), 2))
+    np.add.at(normal, region, weight[:, None, None] * told)
+    np.add.at(moved, region, weight[:, None] * residual)
+    np.add.at(centre, region, pixel)
+    sizes = np.linalg.eigvalsh(normal)
+    good = (count >= _FEWEST) & (sizes[:, 0] > 0.1 * sizes[:, 1])
+    places, means = centre[good] / count[good, None], np.linalg.solve(normal[good], moved[good, :, None])[:, :, 0]
+    telling = np.sum(means * moved[good], axis=1) > _NOT_NOISE
+    return places[telling], means[telling], len(places)
+
+
+def _paint_in_image(material: Material, camera: str) -> list[Array]:
+    """The field's curves as the camera's first placed station sees them, (S, 2) px, NaN outside the image."""
+    stations = [s for s, owner in material.observations.stations.items() if owner == camera]
+    seen = [v.station for v in material.observations.views if v.placement is None and v.station in stations]
+    if not seen:
+        return []
+    posed = material.calibration.estimate.camera_at(seen[0])
+    lines = [posed.project(curve) for curve in material.paint()]
+    with np.errstate(invalid="ignore"):
+        inside = [np.all((line > -1.0) & (line < posed.image_size), axis=1) for line in lines]
+    return [np.where(keep[:, None], line, np.nan) for line, keep in zip(lines, inside, strict=True)]
+
+
+def _frame_image(axes: Axes, camera: Camera) -> None:
+    width, height = camera.image_size
+    axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), aspect="equal", xlabel="px")
+    axes.grid(visible=False)
+    for side in axes.spines.values():
+        side.set_visible(True)
+
+
+def _scale_bar(axes: Axes, camera: Camera, enlarged: int, typical: float) -> None:
+    """A stroke as long as the median residual, in a corner."""
+    width, height = camera.image_size
+    start = np.array([[0.03 * width, 0.95 * height]])
+    end = start + np.array([enlarged * typical, 0.0])
+    canvas.strokes(axes, start, end, INK, 1.5)
+    text = axes.text(end[0, 0] + 0.012 * width, start[0, 1], f"median {short(typical)} px", va="center", fontsize=7.0)
+    text.set_bbox({"facecolor": "white", "edgecolor": "none", "pad": 1.0, "alpha": 0.85})
+
+
+def _region_table(summary: Summary, camera: str) -> Table:
+    rows = [i for i, name in enumerate(summary.names) if name.rpartition(" ")[0] == camera]
+    return Table(
+        ("part of the image (column, row)", "points", "rms px", "curves", "rms px", "out"),
+        tuple(_summary_row(summary, i, summary.names[i].rpartition(" ")[2]) for i in rows),
+    )
+
+
+def _summary_row(summary: Summary, number: int, name: str) -> tuple[str, ...]:
+    return (
+        name,
+        grouped(int(summary.points[number])),
+        fixed(float(summary.points_rms_px[number]), 3),
+        grouped(int(summary.curves[number])),
+        fixed(float(summary.curves_rms_px[number]), 3),
+        grouped(int(summary.rejected[number])),
+    )
+
+
+# ---- against the radius ---------------------------------------------------------------------------------------------
+
+
+def against_radius(material: Material, name: str) -> Picture:
+    """Residuals away from the principal point against the radius, with their trend."""
+    table, camera = material.diagnosis.table, material.calibration.cameras[name]
+    trend = next(trend for trend in material.diagnosis.summaries.trends if trend.camera == name)
+    rows = np.flatnonzero(material.of_camera(name) & table.inlier)
+    radius, outward = _outward(table, rows, camera)
+    told = np.flatnonzero(np.isfinite(outward))
+    shown = told[:: stride(material, len(told))]
+    middle = 0.5 * (trend.radius_px[1:] + trend.radius_px[:-1])
+    spread = float(np.quantile(np.abs(outward[told]), 0.995)) if len(told) else 1.0
+    told_px = np.where(trend.sd_px < _VAGUE * spread, trend.outward_px, np.nan)  # else it hides the others
+    reach = 1.15 * max(spread, float(np.nanmax(np.abs(told_px), initial=0.0)), 1e-9)
+
+    def draw(axes: Axes, width_in: float) -> None:
+        places = np.column_stack([radius, outward])[shown]
+        canvas.dots(axes, places, POINT, 1.6, alpha=0.35)
+        axes.axhline(0.0, color=QUIET, linewidth=0.7)
+        low, high = (told_px + side * 2.0 * trend.sd_px for side in (-1.0, 1.0))
+        axes.fill_between(middle, low, high, color=OUTLIER, alpha=0.25, linewidth=0.0, label="± 2 sd")
+        axes.plot(middle, told_px, color=OUTLIER, marker="o", markersize=2.6, label="trend")
+        axes.set(xlim=(0.0, camera.corner_radius), ylim=(-reach, reach))
+        axes.set(xlabel="distance from the principal point, px", ylabel="residual outwards, px")
+        canvas.key(axes)
+
+    return Picture(
+        f"radius-{_place(material, name)}",
+        f"Residuals against the radius{_whose(material, name)}",
+        "Each dot is the part of a residual that points away from the principal point. The trend should stay at 0 "
+        f"within its band: a wave means that the lens polynomial is too short.{_said_of(len(shown), len(told))}",
+        Drawing(draw, 0.66),
+        Table(
+            ("radius, px", "trend px", "± sd", "mean / sd"),
+            tuple(
+                (f"{a:.0f} to {b:.0f}", signed(m, 4), fixed(s, 4), signed(m / s, 1) if s else signed(np.nan, 1))
+                for a, b, m, s in zip(
+                    trend.radius_px[:-1], trend.radius_px[1:], trend.outward_px.tolist(), trend.sd_px.tolist(),
+                    strict=True,
+                )
+            ),
+        ),
+    )  # fmt: skip
+
+
+def _outward(table: ResidualTable, rows: Rows, camera: Camera) -> tuple[Array, Array]:
+    """Radius and outward residual of some rows, px; NaN of a curve that runs outwards, and so tells nothing of it."""
+    offsets, residual = camera.offsets(table.pixel[rows]), table.residual_px[rows]
+    radius = np.asarray(np.linalg.norm(offsets, axis=1))
+    outward = np.sum(residual * offsets, axis=1) / np.maximum(radius, 1e-9)
+    length = np.maximum(np.linalg.norm(residual, axis=1), 1e-300)
+    cosine = np.abs(outward) / length
+    with np.errstate(divide="ignore", invalid="ignore"):
+        of_curve = np.where(cosine > 0.7, np.sign(outward) * length / cosine, np.nan)
+    return radius, np.where(table.is_curve[rows], of_curve, outward)
+
+
+# ---- by frame -------------------------------------------------------------------------------------------------------
+
+
+def by_frame(material: Material) -> Picture:
+    """Root mean square residual of each frame, in standard deviations."""
+    frames = material.diagnosis.summaries.frames
+    number = np.arange(len(frames.names), dtype=float)
+    few = len(number) <= _MOST_FRAMES_NAMED
+    top = 1.25 * float(np.nanmax(frames.rms_sigma, initial=1.0))
+
+    def draw(axes: Axes, width_in: float) -> None:
+        axes.axhline(1.0, color=QUIET, linewidth=0.9)
+        if few:
+            canvas.strokes(axes, _at(number, 0.0 * number), _at(number, frames.rms_sigma), PAINT, 1.4)
+            names = [_clipped(name) for name in frames.names]
+            axes.set_xticks(number, names, rotation=60, ha="right", rotation_mode="anchor", fontsize=6.5)
+        canvas.dots(axes, _at(number, frames.rms_sigma), POINT, 5.0 if few else 2.5)
+        axes.grid(visible=False, axis="x")
+        axes.set(ylim=(0.0, top), xlim=(-0.7, len(number) - 0.3), ylabel="rms, in standard deviations")
+        if not few:
+            axes.set_xlabel("frame, in order")
+
+    return Picture(
+        "frames",
+        "Residuals frame by frame",
+        "Root mean square residual of each frame over its expected noise: 1 is as everywhere. A frame that stands out "
+        "has wrong labels, motion blur or a bumped camera; a step that stays means that the camera moved then.",
+        Drawing(draw, 0.66),
+        Table(
+            ("frame", "points", "rms px", "curves", "rms px", "out"),
+            tuple(_summary_row(frames, i, frames.names[i]) for i in range(len(frames.names))),
+        ),
+    )
+
+
+def _at(x: Array, y: ArrayLike) -> Array:
+    return np.column_stack([x, y])
+
+
+def _clipped(name: str) -> str:
+    return name if len(name) <= 14 else f"{name[:6]}…{name[-7:]}"

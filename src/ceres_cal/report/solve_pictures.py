@@ -1,0 +1,176 @@
+"""Pictures of the solve: correlation of the numbers, convergence, closed form against bundle."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ceres_cal.calibration import Calibration
+from ceres_cal.quantities import Key
+from ceres_cal.report import canvas
+from ceres_cal.report.canvas import DIVERGING, OUTLIER, PAINT, POINT, Drawing
+from ceres_cal.report.material import ClosedForm, Material
+from ceres_cal.report.page import Picture, Table
+from ceres_cal.report.words import count, fixed, short, signed
+from ceres_cal.transforms import Array
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+_MOST_NUMBERS = 24  # of a correlation picture
+_MOST_PAIRS = 30
+_QUANTILES = (0.1, 0.25, 0.5, 0.75, 0.9, 0.99)
+
+
+# ---- correlation ----------------------------------------------------------------------------------------------------
+
+
+def correlation(material: Material) -> Picture | None:
+    """Correlation of the shared numbers, cameras and stations first; None where there is no covariance."""
+    posterior = material.calibration.posterior
+    if posterior is None:
+        return None
+    order = sorted(
+        range(len(posterior.keys)), key=lambda place: posterior.keys[place].kind not in ("camera", "station")
+    )
+    chosen = np.array(order[:_MOST_NUMBERS])
+    keys = [posterior.keys[place] for place in chosen]
+    sd = np.sqrt(np.diagonal(posterior.covariance)[chosen])
+    with np.errstate(invalid="ignore", divide="ignore"):
+        matrix = posterior.covariance[np.ix_(chosen, chosen)] / sd[:, None] / sd
+    labels = [label(key, keys) for key in keys]
+
+    def draw(axes: Axes, width_in: float) -> None:
+        axes.set_facecolor(PAINT)
+        drawn = axes.pcolormesh(
+            matrix, vmin=-1.0, vmax=1.0, cmap=canvas.ramp(DIVERGING), edgecolor="white", linewidth=0.8
+        )
+        size = 6.5 if len(keys) <= 14 else 6.0
+        places = np.arange(len(keys)) + 0.5
+        axes.set_xticks(places, labels, rotation=60, ha="right", rotation_mode="anchor", fontsize=size)
+        axes.set_yticks(places, labels, fontsize=size)
+        axes.tick_params(length=0)
+        axes.invert_yaxis()
+        axes.set_aspect("equal")
+        axes.grid(visible=False)
+        figure = axes.get_figure()
+        assert figure is not None
+        bar = figure.colorbar(drawn, ax=axes, ticks=[-1, 0, 1], shrink=0.5, aspect=18, pad=0.02)
+        bar.outline.set_visible(False)
+
+    rest = len(posterior.keys) - len(keys)
+    return Picture(
+        "correlation",
+        "Correlation of the numbers",
+        "Dark blue: two numbers may be wrong together in the same sense; brown: in opposite senses. What is nearly 1 "
+        "or -1 (such as phi and the height) is known as a ratio much better than each by itself. Grey: unknown."
+        + (f" {count(rest, 'further number')} not drawn." if rest else ""),
+        Drawing(draw, 0.86),
+        _pairs(matrix, labels),
+    )
+
+
+def label(key: Key, others: Sequence[Key]) -> str:
+    """A number's name, with its owner where several have one of that name."""
+    same = {other.owner for other in others if (other.kind, other.quantity) == (key.kind, key.quantity)}
+    name = key.quantity.replace("_", " ")
+    whole = f"{name} {key.owner}" if len(same) > 1 or key.kind in ("placement", "structure") else name
+    return whole if len(whole) <= 22 else f"{whole[:21]}…"
+
+
+def _pairs(matrix: Array, labels: Sequence[str]) -> Table:
+    first, second = np.triu_indices(len(labels), 1)
+    strength = matrix[first, second]
+    order = np.argsort(-np.abs(np.nan_to_num(strength)))[:_MOST_PAIRS]
+    return Table(
+        ("strongest pairs", "and", "correlation"),
+        tuple((labels[first[i]], labels[second[i]], signed(float(strength[i]), 4)) for i in order),
+    )
+
+
+# ---- convergence ----------------------------------------------------------------------------------------------------
+
+
+def convergence(material: Material) -> Picture | None:
+    """The cost above its least, iteration by iteration of the last solve; None where nothing was minimised."""
+    history = np.array(material.calibration.history)
+    if len(history) < 2:
+        return None
+    above = history - history.min()
+    floor = max(1e-16 * float(history.min()), 1e-300)
+    shown = np.maximum(above, floor)
+    steps = np.arange(len(history))
+
+    def draw(axes: Axes, width_in: float) -> None:
+        from matplotlib.ticker import MaxNLocator
+
+        drawn = above > floor
+        axes.plot(steps[drawn], shown[drawn], color=POINT, marker="o", markersize=3.2)
+        axes.set(yscale="log", xlim=(-0.3, len(history) - 0.7), xlabel="iteration", ylabel="cost above its least")
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+        axes.yaxis.set_major_formatter(canvas.plain)
+
+    solved = material.calibration
+    how = "It came to rest" if solved.converged else "It did not come to rest"
+    return Picture(
+        "convergence",
+        "Convergence of the last solve",
+        f"A sound solve falls steeply and ends: a long flat tail means that some direction is hardly told. {how} after "
+        f"{count(solved.rounds, 'solve')}; this is the last one, to a cost of {history[-1]:.6g}.",
+        Drawing(draw, 0.66),
+        Table(("iteration", "cost", "fall"), tuple(_cost_row(history, i) for i in range(len(history)))),
+    )
+
+
+def _cost_row(history: Array, number: int) -> tuple[str, ...]:
+    fall = f"{history[number - 1] - history[number]:.3g}" if number else ""
+    return str(number), f"{history[number]:.10g}", fall
+
+
+# ---- closed form against bundle -------------------------------------------------------------------------------------
+
+
+def against_closed_form(material: Material, closed: ClosedForm) -> Picture:
+    """How many residuals are below a length, by the paper's closed form and by the bundle."""
+    table = material.diagnosis.table
+    inlier = table.inlier
+    lengths = {"closed form": closed.lengths[inlier], "bundle": np.abs(table.distance_px[inlier])}
+    lengths = {name: np.where(np.isfinite(values), values, np.inf) for name, values in lengths.items()}
+    shares = np.linspace(0.01, 0.99, 99)
+    curves = {name: np.quantile(values, shares, method="nearest") for name, values in lengths.items()}
+
+    def draw(axes: Axes, width_in: float) -> None:
+        for name, color in (("closed form", OUTLIER), ("bundle", POINT)):
+            shown = np.isfinite(curves[name]) & (curves[name] > 0.0)
+            axes.plot(curves[name][shown], 100.0 * shares[shown], color=color, linewidth=1.8, label=name)
+        axes.set(xscale="log", ylim=(0.0, 100.0), xlabel="residual, px", ylabel="% of the inliers below it")
+        axes.xaxis.set_major_formatter(canvas.plain)
+        canvas.key(axes)
+
+    medians = {name: float(np.median(values)) for name, values in lengths.items()}
+    return Picture(
+        "closed-form",
+        "Closed form against bundle",
+        f"Farther left is better. Half of the residuals are below {short(medians['bundle'])} px by the bundle, below "
+        f"{short(medians['closed form'])} px by the paper's closed form: that is what solving everything together, in "
+        "measured pixels, brings.",
+        Drawing(draw, 0.66),
+        _comparison(material.calibration, closed.calibration, curves, shares),
+    )
+
+
+def _comparison(bundle: Calibration, closed: Calibration, curves: dict[str, Array], shares: Array) -> Table:
+    rows = [
+        (f"{q:.0%} of residuals below, px", *(fixed(float(np.interp(q, shares, c)), 3) for c in curves.values()))
+        for q in _QUANTILES
+    ]
+    for name, camera in bundle.cameras.items():
+        other = closed.cameras[name]
+        rows.append((f"phi of {name}, px", f"{other.phi:.2f}", f"{camera.phi:.2f}"))
+        for key, value in camera.lens.coefficients.items():
+            rows.append((f"{key} of {name}", f"{other.lens.coefficients[key]:.4g}", f"{value:.4g}"))
+    for name, station in bundle.stations.items():
+        rows.append((f"height of {name}, m", f"{closed.stations[name].position[2]:.4f}", f"{station.position[2]:.4f}"))
+    return Table(("", "closed form", "bundle"), tuple(rows))

@@ -1,0 +1,397 @@
+"""The report: a page that needs nothing, says the verdict first, and looks right in a real browser."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import cache
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+from chromium import Browser, browser
+from scenes import SCENES, camera
+
+from ceres_cal import Calibration, Observations, Options, calibrate, write_report
+from ceres_cal.cli import main
+from ceres_cal.diagnostics import diagnose
+from ceres_cal.errors import InputError
+from ceres_cal.lens import Radial
+from ceres_cal.report import make_report
+from ceres_cal.report.lens_picture import ideal_radii
+from ceres_cal.report.maps import levels_of
+from ceres_cal.report.material import Material
+from ceres_cal.report.residual_pictures import telling_means
+from ceres_cal.report.verdict import level_of, verdict, worst
+from ceres_cal.report.words import at_precision, short
+from ceres_cal.simulate import Disturbance, Scene, Station, built_in_scene, field_scene, overhead_pose, simulate
+from ceres_cal.targets import ssl_field
+
+ROOT = Path(__file__).parents[1]
+SAMPLE = ROOT / "data" / "ssl_field" / "observations.json"
+HOSTILE = '<script>alert("x")</script>&\'$a_b$'
+PICTURES = (
+    "vectors-0", "radius-0", "lens-0", "frames", "outliers", "map-0-0", "map-0-1", "correlation", "convergence",
+    "closed-form",
+)  # fmt: skip
+
+
+class Outline(HTMLParser):
+    """Elements, attributes and texts of a page."""
+
+    VOID = frozenset({"meta", "link", "br", "path", "use", "rect", "image"})
+
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.elements: list[tuple[str, dict[str, str]]] = []
+        self.text: list[str] = []
+        self._open: list[str] = []
+        self.feed(page)
+        assert self._open == []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.elements.append((tag, {name: value or "" for name, value in attrs}))
+        if tag not in self.VOID:
+            self._open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.elements.append((tag, {name: value or "" for name, value in attrs}))
+
+    def handle_endtag(self, tag: str) -> None:
+        if tag not in self.VOID:
+            assert self._open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.text.append(data)
+
+
+@cache
+def sample() -> tuple[Calibration, Observations]:
+    observations = Observations.load(SAMPLE)
+    return calibrate(observations), observations
+
+
+@cache
+def sample_page() -> str:
+    return make_report(*sample())
+
+
+def tilted(degrees: float, hidden: float = 0.0) -> tuple[Calibration, Observations]:
+    """A field from 4 m by a camera that leans by so much."""
+    stations = {"overhead": Station("overhead", overhead_pose(0.2, 0.1, 5.2, tilt_x_deg=degrees))}
+    scene = field_scene(ssl_field("B"), {"overhead": camera("radial-2-3")}, stations, points=(), spacing_m=0.25)
+    observations = simulate(scene, Disturbance(0.3, 0.3, hidden_points=hidden), seed=2).observations
+    return calibrate(observations), observations
+
+
+def headline(page: str) -> str:
+    found = re.search(r'<section id="verdict" class="(\w+)"><h2>(.*?)</h2>', page)
+    assert found is not None
+    return f"{found[1]}: {found[2]}"
+
+
+# ---- the page -------------------------------------------------------------------------------------------------------
+
+
+def test_the_page_needs_nothing_from_elsewhere() -> None:
+    page = sample_page()
+    assert len(page.encode()) < 1_000_000  # 0.74 MB measured
+    outline = Outline(page)
+    for tag, attributes in outline.elements:
+        for name in ("src", "href", "xlink:href", "srcset", "data", "action", "poster"):
+            assert re.match(r"#|data:", attributes.get(name, "#")), (tag, attributes)
+    assert not re.search(r"url\((?!#)|@import|https?://", page)
+    assert {"script", "iframe", "object", "base", "form"}.isdisjoint(tag for tag, _ in outline.elements)
+
+
+def test_every_reference_in_the_page_leads_to_one_place() -> None:
+    page = sample_page()
+    ids = re.findall(r' id="([^"]+)"', page)
+    assert len(ids) == len(set(ids))
+    assert set(re.findall(r'href="#([^"]+)"|url\(#([^)]+)\)', page)) and all(
+        a or b in ids for a, b in re.findall(r'href="#([^"]+)"|url\(#([^)]+)\)', page)
+    )
+
+
+def test_verdict_first_then_findings_numbers_pictures() -> None:
+    sections = re.findall(r'<section id="(\w+)"', sample_page())
+    assert sections == ["verdict", "findings", "numbers", "residuals", "maps", "solve"]
+    assert headline(sample_page()).startswith("good: This calibration can be trusted: to 0.")
+
+
+def test_every_picture_has_its_sentence_and_its_table() -> None:
+    figures = re.findall(r"<figure.*?</figure>", sample_page(), flags=re.S)
+    names = [re.search(r'id="([^"]+)"', figure)[1] for figure in figures]  # type: ignore[index]
+    assert sorted(names) == sorted(PICTURES)
+    for name, figure in zip(names, figures, strict=True):
+        reading = re.search(r"<figcaption>(.*?)</figcaption>", figure)
+        assert reading is not None and len(reading[1]) > 60, name
+        assert figure.count("<svg") == (2 if name.startswith("vectors") else 1)
+        table = re.search(r"<details><summary>.*?</summary>.*<tbody>(.*?)</tbody>", figure, flags=re.S)
+        assert table is not None and table[1].count("<tr>") >= 4, name
+
+
+def test_numbers_are_the_calibrations_own() -> None:
+    calibration, _ = sample()
+    page = sample_page()
+    lens = calibration.cameras["overhead"].lens
+    for name, value in lens.coefficients.items():
+        assert repr(value) in page, name
+    found = calibration.uncertainty.verdict("camera", "overhead", "phi")
+    assert f">{found.value:.1f} px</td>" in page and f">{short(found.sd)} px</td>" in page
+    assert calibration.digest[:16] in page
+    floor = calibration.uncertainty.map_sd_mm(height_m=0.0)
+    shown = re.search(r'On the floor</p><p class="value">± ([\d.]+)', page)
+    assert shown is not None and float(shown[1]) == pytest.approx(floor.mean_mm, rel=0.05)  # of a finer grid
+
+
+def test_names_from_files_do_no_harm() -> None:
+    scene, disturbance = built_in_scene("ssl-field")
+    plain = simulate(scene, disturbance, seed=1).observations
+    views = tuple(
+        replace(
+            view,
+            frame=f"{HOSTILE}{number}",
+            station=HOSTILE,
+            camera=HOSTILE,
+            placement=f"{HOSTILE}{number}" if view.placement else None,
+        )
+        for number, view in enumerate(plain.views)
+    )
+    observations = replace(plain, views=views, cameras={HOSTILE: plain.cameras["overhead"]})
+    page = make_report(calibrate(observations), observations)
+    outline = Outline(page)
+    assert "script" not in {tag for tag, _ in outline.elements}
+    assert any(HOSTILE in text for text in "".join(outline.text).split("\n"))
+    assert "alert(&quot;x&quot;)" in page and 'alert("x")' not in re.sub(r"<text.*?</text>", "", page, flags=re.S)
+    assert "<script" not in page
+
+
+def test_a_report_of_other_observations_says_so(tmp_path: Path) -> None:
+    calibration, observations = sample()
+    scene, disturbance = built_in_scene("ssl-field")
+    other = simulate(scene, disturbance, seed=9).observations
+    with pytest.raises(InputError, match="not the observations that the calibration was made from"):
+        make_report(calibration, other)
+    page = make_report(calibration, other, diagnose(calibration, other, new_data=True))
+    assert "These are new data" in page and "No closed form to compare with" in page
+    write_report(tmp_path / "page.html", calibration, observations)
+    assert (tmp_path / "page.html").read_text(encoding="utf-8") == sample_page()
+
+
+# ---- verdicts -------------------------------------------------------------------------------------------------------
+
+
+def test_a_frontal_view_is_trusted_on_the_floor_alone() -> None:
+    page = make_report(*tilted(0.5))
+    assert headline(page).startswith("care: Trust it on the floor alone, to ")
+    assert headline(page).endswith("places at robot height (150\N{NO-BREAK SPACE}mm) cannot be told.")
+    assert "only their ratio is known" in page and "the observations cannot tell how far off" in page.lower()
+    assert "nan" not in re.sub(r"<svg.*?</svg>|<style.*?</style>", "", page, flags=re.S).lower().split()
+
+
+def test_a_wrong_model_is_never_simply_trusted() -> None:
+    observations = sample()[1]
+    page = make_report(calibrate(observations, Options(powers=(3,))), observations)
+    assert headline(page).startswith("care: Use it with care: ")
+    assert "but the model is wrong by" in headline(page) and "No standard deviation on this page contains that" in page
+    cards = re.findall(r'<article class="card (\w+)"><h3>(.*?)</h3>', page)
+    assert cards[0][0] == "no" and "residuals follow the radius" in cards[0][1]
+
+
+def test_boards_alone_tell_no_places() -> None:
+    scene, disturbance = built_in_scene("boards")
+    observations = simulate(scene, disturbance, seed=1).observations
+    page = make_report(calibrate(observations), observations)
+    assert headline(page) == (
+        "good: The intrinsics can be trusted. No station sees a field: places in the world cannot be told."
+    )
+    assert '<figure id="map' not in page and "held as the world" in page
+
+
+def test_the_closed_form_alone_is_not_to_be_used() -> None:
+    observations = sample()[1]
+    page = make_report(calibrate(observations, Options(closed_form_only=True)), observations)
+    assert headline(page).startswith("no: Not to be used: nothing was minimised")
+
+
+def test_a_solve_that_did_not_come_to_rest_is_not_trusted() -> None:
+    calibration, observations = sample()
+    material = Material(replace(calibration, converged=False), observations, diagnose(calibration, observations))
+    chapter = verdict(material)
+    assert chapter.level == "no" and chapter.title.startswith("Do not trust this calibration")
+
+
+@pytest.mark.parametrize(
+    "radius, level", [(0.3, "good"), (10.0, "good"), (10.1, "care"), (50.1, "no"), (np.inf, "no"), (np.nan, "no")]
+)
+def test_levels(radius: float, level: str) -> None:
+    assert level_of(radius) == level
+    assert worst("good", level) == level
+
+
+# ---- what is drawn --------------------------------------------------------------------------------------------------
+
+
+def test_means_of_regions_tell_a_shift_from_noise() -> None:
+    calibration, observations = sample()
+    table = diagnose(calibration, observations).table
+    rows, seen = np.flatnonzero(table.inlier), calibration.cameras["overhead"]
+    assert len(telling_means(table, rows, seen)[0]) <= 1
+    left = table.pixel[:, 0] < 640.0
+    shift = np.array([0.8, -0.6])
+    across = table.residual_px / np.linalg.norm(table.residual_px, axis=1, keepdims=True)
+    along = np.where(table.is_curve[:, None], across * np.sum(across * shift, axis=1, keepdims=True), shift)
+    moved = replace(table, residual_px=table.residual_px + left[:, None] * along)
+    places, means, cells = telling_means(moved, rows, seen)
+    assert len(places) > 15 and np.all(places[:, 0] < 680.0) and cells > 60
+    assert np.mean(means, axis=0) == pytest.approx(shift, abs=0.15)  # 0.05 measured
+
+
+def test_the_distortion_curve_is_the_papers_polynomial() -> None:
+    seen = camera("radial-2-3")
+    r = np.array([0.0, 100.0, 450.0])
+    assert isinstance(seen.lens, Radial)
+    assert ideal_radii(seen, r) == pytest.approx(seen.lens.ideal_radius(r), rel=1e-12)
+    wide = replace(camera("kannala-brandt"), phi=250.0)
+    assert np.isnan(ideal_radii(wide, np.array([700.0]))[0])
+
+
+@pytest.mark.parametrize("low, high", [(0.13, 0.52), (1.0, 1.0), (0.9, 70.0), (3e-4, 5e-4)])
+def test_colours_of_maps_cover_what_there_is(low: float, high: float) -> None:
+    found = sample()[0].uncertainty.map_sd_mm(height_m=0.0)
+    values = np.full(found.sd_mm.shape, low)
+    values[0, 0], values[1, 1], values[2, 2] = high, np.inf, np.nan
+    levels = levels_of((replace(found, sd_mm=values),))
+    assert levels[0] <= low and levels[-1] >= high and 3 <= len(levels) <= 20
+    assert np.all(np.diff(levels) > 0.0)
+
+
+@pytest.mark.parametrize(
+    "value, sd, unit, text",
+    [(868.9123, 1.42, "px", "868.9"), (4.02221, 0.0067, "m", "4.0222"), (-5.2e-05, 1e-9, "px^-1", "-5.2e-05")],
+)
+def test_values_have_the_places_that_they_deserve(value: float, sd: float, unit: str, text: str) -> None:
+    assert at_precision(value, sd, unit) == text
+
+
+@pytest.mark.parametrize("value, text", [(0.2149, "0.21"), (99.4, "99"), (130.4, "130"), (np.inf, "unknown")])
+def test_short_numbers(value: float, text: str) -> None:
+    assert short(value) == text
+
+
+# ---- commands -------------------------------------------------------------------------------------------------------
+
+
+def test_commands_write_the_page(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    one, page, again = tmp_path / "one.json", tmp_path / "one.html", tmp_path / "again.html"
+    assert main(["calibrate", str(SAMPLE), "-o", str(one), "--report", str(page), "--quiet"]) == 0
+    assert str(page) in capsys.readouterr().out
+    assert main(["diagnose", str(one), str(SAMPLE), "--report", str(again), "--json"]) in (0, 1)
+    assert f'"report": "{again}"' in capsys.readouterr().out
+    assert headline(page.read_text(encoding="utf-8")) == headline(again.read_text(encoding="utf-8"))
+
+
+@pytest.mark.parametrize("command", [["calibrate"], ["diagnose", str(ROOT / "pyproject.toml")]])
+def test_a_page_that_cannot_be_written_is_said_before_the_work(
+    command: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    missing = tmp_path / "gone" / "page.html"
+    assert main([*command, str(SAMPLE), "--report", str(missing)]) == 2
+    said = capsys.readouterr()
+    assert said.out == "" and said.err.count("\n") == 1 and "there is no folder" in said.err
+    both = str(tmp_path / "both.csv")
+    assert main([*command, str(SAMPLE), "-o", both, "--report", both]) == 2
+    assert "give them two names" in capsys.readouterr().err
+
+
+def test_the_plotting_library_comes_in_when_a_picture_is_drawn() -> None:
+    code = "import sys, ceres_cal.report; print('matplotlib' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "False\n"
+
+
+# ---- a real browser -------------------------------------------------------------------------------------------------
+
+# Letters that end outside their place, elements that stick out of the window, tables wider than their box.
+_CUT_OFF = """
+(() => {
+  document.querySelectorAll('details').forEach(d => d.open = true);
+  const wide = document.documentElement.clientWidth, found = [];
+  if (document.documentElement.scrollWidth > wide) found.push('the page scrolls sideways');
+  for (const e of document.querySelectorAll('body *')) {
+    const box = e.getBoundingClientRect();
+    if (!box.width) continue;
+    const name = e.tagName + '#' + (e.closest('[id]')?.id) + ': ' + e.textContent.trim().slice(0, 40);
+    if (!e.closest('svg') && (box.right > wide + 0.5 || box.left < -0.5)) found.push('outside of the window: ' + name);
+    if (!e.closest('svg') && e.scrollWidth > e.clientWidth + 1 && getComputedStyle(e).display != 'inline')
+      found.push('wider than its box: ' + name);
+    if (e.tagName == 'text') {
+      const svg = e.closest('svg').getBoundingClientRect();
+      if (box.left < svg.left - 1 || box.right > svg.right + 1 || box.top < svg.top - 1 || box.bottom > svg.bottom + 1)
+        found.push('cut off in its picture: ' + name);
+      if (parseFloat(getComputedStyle(e).fontSize) * svg.width / e.closest('svg').viewBox.baseVal.width < 8)
+        found.push('too small to read: ' + name);
+    }
+  }
+  return found;
+})()
+"""
+
+
+@pytest.fixture(scope="module")
+def window() -> Iterator[Browser]:
+    with browser() as found:
+        yield found
+
+
+@cache
+def two_cameras_page() -> str:
+    scene, disturbance = built_in_scene("two-cameras")
+    observations = simulate(scene, disturbance, seed=1).observations
+    return make_report(calibrate(observations), observations)
+
+
+def crowded() -> Scene:
+    return SCENES["brown/several-stations"]()
+
+
+@pytest.mark.parametrize("width", [1280, 400])
+@pytest.mark.parametrize("name", ["sample", "frontal", "two-cameras", "stations"])
+def test_nothing_is_cut_off_and_nothing_complains(window: Browser, tmp_path: Path, name: str, width: int) -> None:
+    if name == "sample":
+        page = sample_page()
+    elif name == "frontal":
+        page = make_report(*tilted(0.5))
+    elif name == "two-cameras":
+        page = two_cameras_page()
+    else:
+        observations = simulate(crowded(), Disturbance(0.3, 0.3), seed=3).observations
+        page = make_report(calibrate(observations, Options(lens="brown")), observations)
+    file = tmp_path / "page.html"
+    file.write_text(page, encoding="utf-8")
+    window.open(file, width)
+    assert window.run(_CUT_OFF) == []
+    assert window.complaints == [] and window.requests == [file.as_uri()]
+    drawn = window.run("[...document.querySelectorAll('figure svg')].filter(s => s.clientWidth).length")
+    assert drawn == page.count("<figure")
+
+
+def test_hostile_names_run_nothing(window: Browser, tmp_path: Path) -> None:
+    file = tmp_path / "page.html"
+    file.write_text(sample_page().replace("</main>", "<script>console.log('ran')</script></main>"), encoding="utf-8")
+    window.open(file, 1280)
+    assert any("Content Security Policy" in one for one in window.complaints)
+    assert not any("'ran'" in one and "consoleAPICalled" in one for one in window.complaints)
+
+
+def test_it_prints_on_a_few_pages(window: Browser, tmp_path: Path) -> None:
+    file = tmp_path / "page.html"
+    file.write_text(sample_page(), encoding="utf-8")
+    window.open(file, 1280)
+    window.print_pdf(tmp_path / "page.pdf")
+    content = (tmp_path / "page.pdf").read_bytes()
+    assert content.startswith(b"%PDF") and 4 <= len(re.findall(rb"/Type\s*/Page\b(?!s)", content)) <= 7  # 6 measured
