@@ -218,6 +218,26 @@ TASKS: dict[str, Callable[[int, int], Any]] = {
 # ---- growth ---------------------------------------------------------------------------------------------------------
 
 
+def uncertainty_share(frames: int, repeat: int) -> float:
+    """Share of a calibration's seconds that the standard deviations of everything take (median over the turns)."""
+    from ceres_cal.bundle import Weighting
+    from ceres_cal.calibrate import calibrate
+    from ceres_cal.parameters import Options, make_layout
+    from ceres_cal.sights import gather_sights
+    from ceres_cal.uncertainty import Setting, assess
+
+    observations, options = corner_observations(wide_lens(frames).corners), Options(lens="brown", free_aspect=True)
+    calibrate(observations, options)
+    layout, sights, shares = make_layout(observations, options), gather_sights(observations), []
+    for _ in range(repeat):
+        start = time.perf_counter()
+        calibration = calibrate(observations, options)
+        middle = time.perf_counter()
+        assess(Setting(sights, layout, Weighting(calibration.fit.point_scale), options), calibration.estimate, np.inf)
+        shares.append((time.perf_counter() - middle) / (middle - start))
+    return median(shares)
+
+
 def frames_growth(frames: int, repeat: int) -> dict[str, Any]:
     """Our seconds on the wide lens."""
     problem = wide_lens(frames)
@@ -312,6 +332,9 @@ def measure(chosen: argparse.Namespace) -> dict[str, Any]:
     report["first_call_seconds"] = [alone("first", WARM_UP_FRAMES) for _ in range(2)][-1]  # the first may compile
     print(f"a process' first calibration takes {report['first_call_seconds']:.2f} s more: compiled kernels are loaded")
     report["comparison"] = compare_all(chosen, report["import_seconds"])
+    report["uncertainty_share"] = uncertainty_share(max(chosen.frames), chosen.repeat)
+    share = f"{100.0 * report['uncertainty_share']:.1f} % of our time at {max(chosen.frames)} frames"
+    print(f"\nthe standard deviations of everything take {share}")
     if chosen.growth:
         report["frames"] = [frames_growth(frames, chosen.repeat) for frames in chosen.growth]
         print_growth("growth with the frames, ours", report["frames"])

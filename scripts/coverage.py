@@ -23,8 +23,8 @@ from accuracy_scenes import CLEAN_NOISE, GROSS_NOISE, PROBLEMS, Problem, tilted
 
 from ceres_cal.calibration import Calibration
 from ceres_cal.quantities import difference, pose_keys
+from ceres_cal.sights import Mask
 from ceres_cal.simulate import Disturbance
-from ceres_cal.transforms import Array
 from ceres_cal.uncertainty.maps import shown_pixels
 
 WEAKLY, BADLY = frozenset({"weak"}), frozenset({"unknown"})
@@ -69,10 +69,10 @@ class Coverage:
     """
 
     names: tuple[str, ...] = ()
-    parameters: list[Array] = field(default_factory=list)
-    placements: list[Array] = field(default_factory=list)
-    points: dict[float, list[Array]] = field(default_factory=dict)
-    open: dict[float, list[Array]] = field(default_factory=dict)
+    parameters: list[Mask] = field(default_factory=list)
+    placements: list[Mask] = field(default_factory=list)
+    points: dict[float, list[Mask]] = field(default_factory=dict)
+    open: dict[float, list[Mask]] = field(default_factory=dict)
     verdicts: list[list[bool]] = field(default_factory=list)
     failed: int = 0
 
@@ -114,11 +114,11 @@ def _add(found: Coverage, case: Case, trial: Trial, calibration: Calibration) ->
             shown = np.isfinite(pixels[:, 0])
             points = uncertainty.located(pixels[shown], height_m, station)
             held = (points.low <= _PLACES[shown]) & (_PLACES[shown] <= points.high)
-            found.points.setdefault(height_m, []).append(held.ravel())
+            found.points.setdefault(height_m, []).append(np.ravel(held))
             found.open.setdefault(height_m, []).append(np.isinf(points.high - points.low).ravel())
 
 
-def share(held: Sequence[Array]) -> tuple[float, float]:
+def share(held: Sequence[Mask]) -> tuple[float, float]:
     """Mean over everything, and its standard error over the runs."""
     each = np.array([np.mean(run) for run in held])
     return float(np.mean(each)), float(np.std(each, ddof=1) / np.sqrt(len(each)))

@@ -15,6 +15,8 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 import pytest
+from accuracy_bound import make_trial
+from accuracy_scenes import CLEAN_NOISE, tilted
 
 import ceres_cal.calibrate
 from ceres_cal.calibration import Calibration
@@ -181,16 +183,17 @@ def test_calibrate_tells_what_came_out(say: Say, tmp_path: Path) -> None:
     for words in (
         "20 views, 1 camera, 1 station, 12 placements",
         "680 point observations, 1591 curve observations",
-        f"phi             {camera.phi:.4f} px (started from the views)",
-        f"a2              {camera.lens.values[0]!r}",
-        f"height {camera.position[2]:.3f} m",
+        f"phi             {camera.phi:.2f} ± 1.4 px (started from the views)",
+        f"a2              {camera.lens.values[0]!r} ± 2.2e-06",
+        f"height {camera.position[2]:.3f} m ± 6.6 mm",
+        "located   overhead: ± 0.21 mm on the floor (worst 0.44 at 0.8, 3.0 m), ± 0.26 mm at 150 mm",
         "deg from straight down",
         "of 2271 taken out",
         "converged after",
         f"written   {out}",
     ):
         assert words in said.out
-    assert "warning" not in said.out
+    assert "warning" not in said.out and "weak" not in said.out and "seam" not in said.out
 
 
 def test_calibrate_as_json_is_the_file_and_more(say: Say, tmp_path: Path) -> None:
@@ -201,6 +204,13 @@ def test_calibrate_as_json_is_the_file_and_more(say: Say, tmp_path: Path) -> Non
     assert data["calibration"] == json.loads(out.read_text())
     assert data["counts"]["views"] == 20 and data["output"] == str(out) and data["warnings"] == []
     assert sum(data["outliers"].values()) == len(data["calibration"]["rejected"])
+    known = data["uncertainty"]
+    assert {entry["verdict"] for entry in known["numbers"]} == {"known"} and len(known["numbers"]) == 11
+    assert known["numbers"][0]["key"] == {"kind": "camera", "owner": "overhead", "quantity": "phi", "unit": "px"}
+    floor, robots = known["maps"]["overhead"]
+    assert (floor["height_m"], robots["height_m"]) == (0.0, 0.15)
+    assert 0.1 < floor["mean_sd_mm"] < robots["mean_sd_mm"] < robots["worst_sd_mm"] < 1.0
+    assert known["weak_directions"] == [] and known["unknown_placements"] == {} and known["seams"] == []
     # Nothing given on the command line is what nothing given in Python is.
     assert data["calibration"]["options"] == _plain(Options())
 
@@ -278,11 +288,63 @@ def test_files_are_taken_together(say: Say, tmp_path: Path) -> None:
     assert (counts["views"], counts["points"]) == (len(whole.views), len(whole.points))
 
 
-def test_warns_where_phi_and_height_trade(say: Say, tmp_path: Path) -> None:
+def test_says_where_phi_and_height_trade(say: Say, tmp_path: Path) -> None:
     say("simulate", "field-2004", "-o", tmp_path)
     said = say("calibrate", tmp_path / "observations.json")
-    assert said.code == 0 and "(started from a guess)" in said.out
-    assert "warning   " in said.out and "tell phi and distance apart" in " ".join(said.out.split())
+    assert said.code == 0 and "px, weak (started from a guess)" in said.out and "warning" not in said.out
+    assert "weak      phi of 'overhead' and its height trade off: only their ratio is known, to 0.37 %" in said.out
+
+
+def frontal(folder: Path) -> Path:
+    """A scene from straight above, saved."""
+    path = folder / "frontal.json"
+    make_trial(tilted(0.0), CLEAN_NOISE, 1).observations.save(path)
+    return path
+
+
+def test_warns_where_phi_is_unknown(say: Say, tmp_path: Path) -> None:
+    said = say("calibrate", frontal(tmp_path))
+    assert said.code == 0
+    for words in (
+        "px, unknown: anything (",
+        "m, unknown: anything\n",
+        "mm on the floor",
+        "unknown at 150 mm",
+        "warning   ",
+    ):
+        assert words in said.out, words
+    assert "too frontal to tell phi, which is anything at 95 %" in " ".join(said.out.split())
+    held = say("calibrate", tmp_path / "frontal.json", "--prior", "height_m=4:0.01")
+    assert "warning" not in held.out and "weak" not in held.out and "unknown" not in held.out
+
+
+def test_unknown_is_null_for_scripts(say: Say, tmp_path: Path) -> None:
+    data = json.loads(say("calibrate", frontal(tmp_path), "--json").out)["uncertainty"]
+    phi = data["numbers"][0]
+    assert (phi["verdict"], phi["low"], phi["high"], phi["sd"]) == ("unknown", 0.0, None, None)
+    assert data["maps"]["overhead"][1]["worst_sd_mm"] is None
+
+
+def test_says_how_two_cameras_agree(say: Say, tmp_path: Path) -> None:
+    say("simulate", "two-cameras", "-o", tmp_path)
+    said = say("calibrate", tmp_path / "observations.json")
+    assert "seam      left - right: ± 0.47 mm on the floor" in said.out
+    assert "found 1.5 mm where 1.7 were expected (rms of 41 points and stretches that both observed)" in said.out
+
+
+def test_says_what_rings_do_not_tell(say: Say) -> None:
+    folder = ROOT / "data" / "field_2004"
+    said = say("calibrate", folder / "rings.json", folder / "field.json")
+    assert "unknown   turn_z of placement 'rings'" in said.out
+
+
+def test_a_baseline_says_nothing_of_its_uncertainty(say: Say) -> None:
+    folder = ROOT / "data" / "field_2004"
+    files = (folder / "rings.json", folder / "field.json")
+    said = say("calibrate", *files, "--fix", "phi=682.99", "--closed-form-only")
+    assert said.code == 0 and "±" not in said.out and "located" not in said.out
+    data = json.loads(say("calibrate", *files, "--fix", "phi=682.99", "--closed-form-only", "--json").out)
+    assert data["uncertainty"] is None
 
 
 def test_warns_of_a_lens_that_does_not_suit(say: Say, tmp_path: Path) -> None:

@@ -21,14 +21,14 @@ from ceres_cal.parameters import Estimate, Layout, Options, make_layout
 from ceres_cal.residuals import Residuals, residuals
 from ceres_cal.sights import Rows, Sights, gather_sights
 from ceres_cal.transforms import Array
-from ceres_cal.uncertainty import Posterior, Setting, assess
+from ceres_cal.uncertainty import Posterior, Setting, Uncertainty, assess, bounds_text
 
 _MOST_ROUNDS = 15
 _ENOUGH_PLACEMENTS = 32  # of a camera: with them it is known well enough to place all others
 _NO_FIT = 0.015  # of the image diagonal: a median residual beyond it is no calibration
-_GUESSED = (
-    "camera {!r}: the views are too frontal to tell phi and distance apart, so phi started from a guess and may be "
-    "unknown still: add boards tilted by 20 degrees, or a prior on height_m where the camera sees the field"
+_UNKNOWN = (
+    "camera {!r}: its views are too frontal to tell phi, which is {} at 95 %, and its heights go with phi: the floor "
+    "is right, what is above it is not: add boards tilted by 20 degrees, or a prior on height_m where it sees the field"
 )
 
 
@@ -59,7 +59,7 @@ def calibrate(
         settled = _settle(observations, sights, start.estimate, layout, options, progress)
         _require_fits(settled, sights)
         settled, posterior = _assess(observations, settled, sights, layout, options)
-        warnings = _require_usable(settled, sights)
+        warnings = (*_require_usable(settled, sights), *_unknown(settled, posterior))
     return Calibration(
         settled.solution.estimate,
         observations.targets,
@@ -70,7 +70,7 @@ def calibrate(
         settled.rounds,
         settled.solution.history,
         start.phi_from,
-        (*warnings, *(_GUESSED.format(name) for name, source in start.phi_from.items() if source == "guess")),
+        warnings,
         options,
         observations.digest,
         posterior,
@@ -217,6 +217,15 @@ def _assess(
         found = residuals(observations, sights, estimate, places)
         settled = replace(settled, solution=replace(settled.solution, estimate=estimate), residuals=found)
     return settled, posterior
+
+
+def _unknown(settled: _Settled, posterior: Posterior) -> Iterator[str]:
+    """Warnings of cameras whose phi the observations leave open."""
+    known = Uncertainty(settled.solution.estimate, posterior, {})
+    for name in posterior.profiles:
+        verdict = known.verdict("camera", name, "phi")
+        if verdict.verdict == "unknown":
+            yield _UNKNOWN.format(name, bounds_text(verdict.low, verdict.high, "px"))
 
 
 def _of(camera: str, sights: Sights) -> Sights:

@@ -16,12 +16,20 @@ from ceres_cal.camera import Camera
 from ceres_cal.errors import InputError
 from ceres_cal.files import convert, read_json, write_json
 from ceres_cal.lens import make_lens
-from ceres_cal.observations import prior_from_json, prior_to_json
+from ceres_cal.observations import Observations, prior_from_json, prior_to_json
 from ceres_cal.parameters import Estimate, Options, Station
 from ceres_cal.structure import make_structure
 from ceres_cal.targets import Target, target_from_spec
 from ceres_cal.transforms import Pose, euler_from_rotation
-from ceres_cal.uncertainty import Posterior, PosteriorFile, Uncertainty, posterior_from_file, posterior_to_json
+from ceres_cal.uncertainty import (
+    Disagreement,
+    Posterior,
+    PosteriorFile,
+    Uncertainty,
+    disagreement,
+    posterior_from_file,
+    posterior_to_json,
+)
 
 FORMAT, VERSION = "ceres-cal/calibration", 1
 
@@ -144,6 +152,21 @@ class Calibration:
         if self.posterior is None:
             raise InputError("this calibration does not say how well it is known: calibrate again")
         return Uncertainty(self.estimate, self.posterior, self.targets)
+
+    def disagreement(self, observations: Observations, first: str, second: str) -> Disagreement:
+        """What two stations say of what both observed in the observations that this calibration was made from.
+
+        Raises:
+            InputError: there is no uncertainty to compare with, see `uncertainty`; or other observations.
+        """
+        if observations.digest != self.digest:
+            raise InputError("these are not the observations that the calibration was made from: give those")
+        points, curves = np.ones(len(observations.points), bool), np.ones(len(observations.curves), bool)
+        for entry in self.rejected:
+            (points if entry.kind == "point" else curves)[entry.row] = False
+        scales = (self.fit.point_scale, self.fit.curve_scale)
+        known = self.uncertainty
+        return disagreement(observations, known.estimate, known.posterior, (points, curves), scales, first, second)
 
     @property
     def rms_px(self) -> float:

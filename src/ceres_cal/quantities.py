@@ -144,6 +144,18 @@ def from_placement(cam_from_target: Array, cam_from_world: Pose) -> Array:
     return chain
 
 
+def camera_moved(camera: Camera, quantities: Sequence[str], step: Array) -> Camera:
+    """A camera after a step along some of its intrinsics, in the units of the files.
+
+    Raises:
+        InputError: phi or aspect is no longer above 0.
+    """
+    vector, known = intrinsics_vector(camera), intrinsic_names(camera.lens)
+    at = [known.index(name) for name in quantities]
+    vector[at] += step * intrinsics_scales(camera)[at]
+    return with_intrinsics(camera, vector)
+
+
 def moved(estimate: Estimate, keys: Sequence[Key], step: Array) -> Estimate:
     """The estimate after a step (P,) along the keys.
 
@@ -155,11 +167,7 @@ def moved(estimate: Estimate, keys: Sequence[Key], step: Array) -> Estimate:
     for (kind, owner), places in places_of(keys).items():
         names = [keys[place].quantity for place in places]
         if kind == "camera":
-            camera = cameras[owner]
-            vector, known = intrinsics_vector(camera), intrinsic_names(camera.lens)
-            at = [known.index(name) for name in names]
-            vector[at] += step[places] * intrinsics_scales(camera)[at]
-            cameras[owner] = with_intrinsics(camera, vector)
+            cameras[owner] = camera_moved(cameras[owner], names, step[places])
         elif kind == "structure":
             values[[estimate.structure.names.index(f"{owner}/{name}") for name in names]] += step[places]
         else:

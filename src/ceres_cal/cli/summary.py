@@ -13,6 +13,7 @@ import numpy as np
 from ceres_cal.calibration import Calibration, calibration_to_json
 from ceres_cal.camera import Camera
 from ceres_cal.cli.command import plural
+from ceres_cal.cli.trust import Trust, with_sd
 from ceres_cal.observations import Observations
 from ceres_cal.parameters import Options, anchored_stations
 from ceres_cal.transforms import Pose, euler_from_rotation
@@ -44,6 +45,7 @@ def calibration_data(
         "counts": _counts(observations),
         "rms_px": calibration.rms_px,
         "tilt_deg": {name: tilt_deg(camera.cam_from_world) for name, camera in calibration.stations.items()},
+        "uncertainty": Trust(calibration, observations).data(),
         "outliers": dict(_outliers(calibration).most_common()),
         "warnings": list(_warnings(calibration, observations)),
     }
@@ -53,20 +55,23 @@ def calibration_text(
     calibration: Calibration, observations: Observations, inputs: Sequence[str], output: Path | None
 ) -> str:
     """A short table for people."""
-    anchored = anchored_stations(observations)
+    anchored, trust = anchored_stations(observations), Trust(calibration, observations)
     sections = [
         _section("read", [", ".join(map(str, inputs)), *_counted(observations)]),
         _section("fit", _fit(calibration)),
     ]
     for name, camera in calibration.cameras.items():
-        lines = _intrinsics(camera, calibration.options, calibration.phi_from.get(name, ""))
+        lines = _intrinsics(name, camera, calibration.options, calibration.phi_from.get(name, ""), trust)
         sections.append(_section("camera", [f"{name}, {camera.image_size[0]} x {camera.image_size[1]} px", *lines]))
     for name, camera in calibration.stations.items():
         sections.append(
-            _section("station", [f"{name}{_of_camera(calibration, name)}", *_pose(camera, name in anchored)])
+            _section(
+                "station", [f"{name}{_of_camera(calibration, name)}", *_pose(name, camera, name in anchored, trust)]
+            )
         )
     if len(calibration.estimate.structure.names):
         sections.append(_section("as built", _structure(calibration)))
+    sections += [_section(title, lines) for title, lines in trust.sections()]
     sections.append(_section("outliers", _outlier_lines(calibration)))
     sections.append(_section("stopped", _stop(calibration)))
     sections.extend(_section("warning", wrap(text, 100)) for text in _warnings(calibration, observations))
@@ -120,18 +125,22 @@ def _structure(calibration: Calibration) -> list[str]:
     return [*lines, f"and {plural(rest, 'smaller correction')}"] if rest else lines
 
 
-def _intrinsics(camera: Camera, options: Options, phi_from: str) -> list[str]:
+def _intrinsics(name: str, camera: Camera, options: Options, phi_from: str, trust: Trust) -> list[str]:
     def held(*names: str) -> str:
         return " (held)" if all(name in options.fixed for name in names) else ""
 
+    def known(quantity: str, value: float, unit: str = "px") -> str:
+        return with_sd(value, unit, trust.verdict("camera", name, quantity))
+
     cx, cy = camera.principal_point
     centre = held("cx", "cy") if options.free_principal_point else " (held)"
-    rows = [("phi", f"{camera.phi:.4f} px ({_PHI_FROM.get(phi_from, phi_from)})")]
+    rows = [("phi", f"{known('phi', camera.phi)} ({_PHI_FROM.get(phi_from, phi_from)})")]
     if options.free_aspect or camera.aspect != 1.0:
-        rows.append(("aspect", f"{camera.aspect:.7f}{held('aspect')}"))
-    rows.append(("principal point", f"{cx:.4f}, {cy:.4f} px{centre}"))
-    rows += [(name, f"{value!r}{held(name)}") for name, value in camera.lens.coefficients.items()]
-    lines = [f"{name:16}{value}" for name, value in rows]
+        rows.append(("aspect", f"{camera.aspect:.7f}{_plus_minus(trust, name, 'aspect')}{held('aspect')}"))
+    rows.append(("principal point", f"{known('cx', cx)}, {known('cy', cy)}{centre}"))
+    for coefficient, value in camera.lens.coefficients.items():
+        rows.append((coefficient, f"{value!r}{_plus_minus(trust, name, coefficient)}{held(coefficient)}"))
+    lines = [f"{title:16}{value}" for title, value in rows]
     if camera.lens.kind == "radial" and camera.lens.radius_powers == (2, 3):
         lines.append("these are the paper's, with its a1 = 1: another a1 goes with a1 a2, a1 a3 and a1 phi")
     return lines
@@ -142,15 +151,27 @@ def _of_camera(calibration: Calibration, station: str) -> str:
     return "" if camera == station else f", camera {camera}"
 
 
-def _pose(camera: Camera, anchored: bool) -> list[str]:
+def _plus_minus(trust: Trust, camera: str, quantity: str) -> str:
+    verdict = trust.verdict("camera", camera, quantity)
+    return "" if verdict is None else f" ± {verdict.sd:.2g}" if np.isfinite(verdict.sd) else ", unknown"
+
+
+def _pose(name: str, camera: Camera, anchored: bool, trust: Trust) -> list[str]:
     if anchored:
         return ["held as the world: boards alone do not tell where it stands"]
     x, y, z = camera.position
     alpha, beta, gamma = np.degrees(euler_from_rotation(camera.cam_from_world.rotation))
+    position = [
+        f"{q} {with_sd(value, 'm', trust.verdict('station', name, q))}"
+        for q, value in (("x", x), ("y", y), ("height", z))
+    ]
+    turns = [trust.verdict("station", name, f"turn_{axis}") for axis in "xyz"]
+    told = [f"{np.degrees(turn.sd):.2g}" if np.isfinite(turn.sd) else "unknown" for turn in turns if turn is not None]
     return [
-        f"{'position':16}x {x:.3f} m, y {y:.3f} m, height {z:.3f} m",
+        f"{'position':16}{', '.join(position)}",
         f"{'angles':16}alpha {alpha:.4f}, beta {beta:.4f}, gamma {gamma:.4f} deg (the paper's)",
         f"{'tilt':16}{tilt_deg(camera.cam_from_world):.3f} deg from straight down",
+        *([f"{'turns':16}± {', '.join(told)} deg about the camera's x, y and z"] if told else []),
     ]
 
 

@@ -7,7 +7,7 @@ from ceres_cal.uncertainty.posterior import Posterior, make_posterior
 from ceres_cal.uncertainty.profile import Profile, Setting
 from ceres_cal.uncertainty.seam import Disagreement, disagreement
 from ceres_cal.uncertainty.uncertainty import Uncertainty
-from ceres_cal.uncertainty.weak import Verdict, WeakDirection
+from ceres_cal.uncertainty.weak import Verdict, WeakDirection, bounds_text
 
 __all__ = [
     "Disagreement",
@@ -21,6 +21,7 @@ __all__ = [
     "Verdict",
     "WeakDirection",
     "assess",
+    "bounds_text",
     "disagreement",
     "make_posterior",
     "posterior_from_file",

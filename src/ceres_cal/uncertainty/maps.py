@@ -13,7 +13,7 @@ import numpy as np
 
 from ceres_cal.errors import InputError
 from ceres_cal.parameters import Estimate
-from ceres_cal.quantities import Key, moved, natural_sizes, sigma_limits
+from ceres_cal.quantities import STATION_QUANTITIES, Key, camera_moved, moved, natural_sizes, sigma_limits
 from ceres_cal.spread import Spread
 from ceres_cal.transforms import Array
 from ceres_cal.uncertainty.posterior import Posterior
@@ -58,13 +58,33 @@ def station_keys(estimate: Estimate, posterior: Posterior, station: str) -> tupl
 
 
 def locate_slopes(estimate: Estimate, keys: Sequence[Key], station: str, pixels: Array, height_m: float) -> Array:
-    """(N, 2, K) derivatives of where pixels (N, 2) are located on the plane z = height_m, by each of the keys."""
-    slopes = np.empty((len(pixels), 2, len(keys)))
-    for k, size in enumerate(_STEP * natural_sizes(estimate, keys)):
-        step = np.zeros(len(keys))
-        step[k] = size
-        ahead, behind = (moved(estimate, keys, s).camera_at(station).locate(pixels, height_m) for s in (step, -step))
-        slopes[:, :, k] = (ahead - behind) / (2.0 * size)
+    """(N, 2, K) derivatives of where pixels (N, 2) are located on the plane z = height_m, by each of the keys.
+
+    In closed form for the pose, by differences of the rays for the intrinsics.
+    """
+    camera = estimate.camera_at(station)
+    rotation, rays = camera.cam_from_world.rotation, camera.rays(pixels)
+    directions = rays @ rotation
+    slant = directions[:, :2] / directions[:, 2:]
+    distance = (height_m - camera.position[2]) / directions[:, 2:]
+
+    def turned(rays_change: Array) -> Array:
+        change = rays_change @ rotation
+        return np.asarray(distance * (change[:, :2] - slant * change[:, 2:]))
+
+    slopes = np.zeros((len(pixels), 2, len(keys)))
+    for k, (key, size) in enumerate(zip(keys, _STEP * natural_sizes(estimate, keys), strict=True)):
+        if key[:2] == ("station", station):
+            axis = STATION_QUANTITIES.index(key.quantity)
+            if axis == 2:
+                slopes[:, :, k] = -slant
+            elif axis < 2:
+                slopes[:, axis, k] = 1.0
+            else:  # the camera turns by w, so rays in the world turn by -w x ray
+                slopes[:, :, k] = turned(np.cross(rays, np.eye(3)[axis - 3]))
+        elif key[:2] == ("camera", estimate.stations[station].camera):
+            ahead, behind = (camera_moved(camera, [key.quantity], np.array([s])).rays(pixels) for s in (size, -size))
+            slopes[:, :, k] = turned((ahead - behind) / (2.0 * size))
     return slopes
 
 

@@ -25,6 +25,7 @@ from ceres_cal.transforms import Array
 
 _FAR = 9.0  # rise of twice the cost at which the valley is followed no further: three sigma
 _STEPS = (0.02, 0.35)  # of log phi
+_MOST_RISE = 1.5  # from one place to the next
 _MOST_NODES = 60
 _FINE = 16  # places interpolated between two
 _TWICE = (np.log(2.0), np.log(4.0))
@@ -200,13 +201,13 @@ def _walk(camera: str, held: Setting, setting: Setting, first: Node, direction: 
         if node.cost - lowest > _FAR or direction * (wanted - phi) <= 0.0:
             return
         found = _node(held, setting, _ahead(camera, node, wanted))
-        if found is None:
-            step *= 0.5
-            if step < _STEPS[0]:
+        change = np.inf if found is None else abs(found.cost - node.cost)
+        if found is None or (change > _MOST_RISE and node.cost - lowest < _FAR / 2.0 and step > _STEPS[0]):
+            step *= 0.5  # too far to find, or to interpolate where the bounds will lie
+            if step < 0.5 * _STEPS[0]:
                 return
             continue
-        change = abs(found.cost - node.cost)
-        step = float(np.clip(step * (1.5 if change < 0.7 else 0.6 if change > 2.5 else 1.0), *_STEPS))
+        step = float(np.clip(step * (1.5 if change < 0.5 * _MOST_RISE else 1.0), *_STEPS))
         node, lowest = found, min(lowest, found.cost)
         yield node
 

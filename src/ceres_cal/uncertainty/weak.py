@@ -101,6 +101,14 @@ def _word(key: Key, relative: float) -> str:
     return "known" if relative <= known else "weak" if relative <= weak else "unknown"
 
 
+def bounds_text(low: float, high: float, unit: str) -> str:
+    """What 95 % bounds leave: "477 to 672 px", "below 1209 px", "above 300 px", "anything"; 0 is no bound."""
+    digits = ".2f" if unit == "m" else ".0f"
+    if low == 0.0 or np.isinf(low):
+        return "anything" if np.isinf(high) else f"below {high:{digits}} {unit}"
+    return f"above {low:{digits}} {unit}" if np.isinf(high) else f"{low:{digits}} to {high:{digits}} {unit}"
+
+
 def unknown_placements(posterior: Posterior) -> dict[str, tuple[str, ...]]:
     """Placements of which some number is not known at all, and which: the roll of a ring sheet about its axis."""
     found = {}
