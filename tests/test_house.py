@@ -41,6 +41,7 @@ FLOORS = {
     "uncertainty": 4,
     "diagnostics": 4,
     "calibration": 5,
+    "advice": 5,
     "calibrate": 5,
     "formats": 6,
     "report": 6,
