@@ -7,6 +7,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from ceres_cal.advice import advise as advise
     from ceres_cal.calibrate import calibrate as calibrate
     from ceres_cal.calibration import Calibration as Calibration
     from ceres_cal.camera import Camera as Camera
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from ceres_cal.transforms import Pose as Pose
 
 _HOME = {
+    "advise": "advice",
     "calibrate": "calibrate",
     "Calibration": "calibration",
     "Camera": "camera",

@@ -108,42 +108,46 @@ def heights(station: str, camera: Camera) -> Iterator[Measurement]:
 
 
 def poles(search: Search) -> Iterator[Measurement]:
-    """A pole at each place of a grid over the field, and on each of its marked points, where its top is seen."""
+    """A pole at each place of a grid over the field, and on each of its marked points, where its top is seen.
+
+    Where phi is followed along its profile, that is wherever the camera may be by it, if not hardly over the pole.
+    """
     camera, grid = search.camera, search.outlook.today
-    top = min(POLE_M, np.floor(4.0 * camera.position[2]) / 10.0)  # a short one under a low camera
-    marked = {
-        name: place[:2] for _, target in still(search.ground) for name, place in target.points.items() if place[2] == 0
-    }
+    top = min(POLE_M, float(np.floor(4.0 * camera.position[2]) / 10.0))  # a short one under a low camera
+    elsewhere = [estimate.camera_at(search.station) for _, estimate in search.outlook.possible]
+    cameras = [camera, *(other for other in elsewhere if other.position[2] > 2.0 * top)]
     x, y = (np.arange(np.ceil(a[0] / _GRID_M), a[-1] / _GRID_M + 1e-9) * _GRID_M for a in (grid.x_m, grid.y_m))
-    places = [(name, *place) for name, place in marked.items()]
-    places += [("", float(a), float(b)) for a in x for b in y]
-    for name, a, b in places:
-        if well_inside(camera, np.array([[a, b, top]]))[0]:
-            yield _pole(search.station, name, a, b, top)
+    places = [("", float(a), float(b)) for a in x for b in y]
+    for _, target in still(search.ground):
+        places += [(name, a, b) for name, (a, b, z) in target.points.items() if z == 0.0]
+    for mark, a, b in places:
+        if all(well_inside(one, np.array([[a, b, top]]))[0] for one in cameras):
+            yield _pole(search.station, mark, a, b, top)
 
 
 def _pole(station: str, mark: str, x: float, y: float, top: float) -> Measurement:
     name = f"pole_{mark}" if mark else f"pole_{x:.2f}_{y:.2f}"
-    place = f"{mark} ({x:.2f}, {y:.2f} m)" if mark else f"({x:.2f}, {y:.2f} m)"
+    where = f"on {mark} ({x:.2f}, {y:.2f} m)" if mark else f"at ({x:.2f}, {y:.2f} m)"
+    frames = tuple(f"{name}_{number:02d}" for number in range(1, _FRAMES + 1))
     return Measurement(
         "pole",
-        f"top at height {top:.2f} m, on {place}" if mark else f"top at height {top:.2f} m, at {place}",
+        f"{where}, its top {top:.2f} m over the field",
         targets={name: custom({"top": (x, y, top)})},
         tolerances={name: Tolerance(points_m=POLE_SIGMA_M)},
-        views=(ViewPlan((name,), station, name),),
+        views=(ViewPlan(frames, station, name),),
     )
 
 
 def _marked_first(pool: Sequence[Measurement], worst_mm: Array) -> int:
     """The best place, or a marked one that is nearly as good: nobody has to measure where that is."""
-    marked = np.array([" on " in measurement.words for measurement in pool])
+    marked = np.array([measurement.words.startswith("on ") for measurement in pool])
     near = marked & (worst_mm <= _MARKED * np.min(worst_mm))
     return int(np.argmin(np.where(near, worst_mm, np.inf))) if near.any() else int(np.argmin(worst_mm))
 
 
 def _poles_words(taken: Sequence[Measurement]) -> str:
     what = "a pole" if len(taken) == 1 else f"{len(taken)} poles"
-    return f"observe the top of {what} of known height, placed to {1e3 * POLE_SIGMA_M:.0f} mm"
+    return f"stand {what} upright, to {1e3 * POLE_SIGMA_M:.0f} mm, and observe the top in {_FRAMES} frames"
 
 
 # ---- boards ---------------------------------------------------------------------------------------------------------

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -83,6 +84,16 @@ class Outlook:
         sd = Spread.of(self.posterior.information + added, sigma_limits(self.posterior.keys)).sd[place]
         return bool(sd <= _BENT * self.estimate.cameras[camera].phi)
 
+    @cached_property
+    def possible(self) -> tuple[tuple[int, Estimate], ...]:
+        """Some places of the valley within its 95 % bounds, by number; none where phi is not followed."""
+        if self.profile is None:
+            return ()
+        keys, steps = self.profile.keys, self.profile.steps
+        within = np.flatnonzero(self.profile.rises <= self.posterior.half_width**2)
+        some = within[np.unique(np.linspace(0, len(within) - 1, _PLACES).round().astype(int))]
+        return tuple((int(place), moved(self.estimate, keys, steps[place])) for place in some)
+
     def along_valley(self, told_at: Callable[[Estimate], Array]) -> Iterator[tuple[float, Errors]]:
         """phi, px, and the errors there with information `told_at` added, over what phi may be by its 95 % bounds.
 
@@ -90,11 +101,9 @@ class Outlook:
         """
         profile = self.profile
         assert profile is not None
-        within = np.flatnonzero(profile.rises <= self.posterior.half_width**2)
         at = [self.posterior.keys.index(key) for key in profile.keys]
         tangents = np.gradient(profile.steps[:, 1:], profile.steps[:, 0], axis=0)
-        for place in within[np.unique(np.linspace(0, len(within) - 1, _PLACES).round().astype(int))]:
-            there = moved(self.estimate, profile.keys, profile.steps[place])
+        for place, there in self.possible:
             across, along = profile.information[place], tangents[place]
             coupling = -across @ along
             told = np.block([[np.atleast_2d(along @ across @ along), coupling[None]], [coupling[:, None], across]])

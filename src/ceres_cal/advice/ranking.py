@@ -17,8 +17,10 @@ from ceres_cal.parameters import Estimate
 from ceres_cal.targets import Target
 from ceres_cal.transforms import Array
 
+_LARGER, _LESS = 0.5, 0.2
+"""Less work is nearly as good as the best where the error that it leaves is larger by no more than the first share of
+the best's, and what it takes off smaller by no more than the second share of the best's."""
 _WORTH = 0.9  # of today's worst error; what leaves more is not worth doing
-_NEARLY = 1.5  # times the best: less work for nearly as much
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,10 +31,13 @@ class Promise:
         after: the errors that it leaves, where everything is as estimated.
         valley: where phi is followed along its profile today, and the measurement settles it: phi (px) and the errors
             left if that is what phi is, over its 95 % bounds.
+        rough: whether phi is followed along its profile and would have to be still. Then `after` is no more than a
+            guess, good to a factor of two or three.
     """
 
     measurement: Measurement
     after: Errors
+    rough: bool = False
     valley: tuple[tuple[float, Errors], ...] = ()
 
     @property
@@ -152,10 +157,13 @@ def _board(targets: Mapping[str, Target], board: Target | None) -> tuple[str, Ta
 
 
 def _promise(measurement: Measurement, added: Array, ground: Ground, outlook: Outlook) -> Promise:
-    valley: tuple[tuple[float, Errors], ...] = ()
-    if outlook.profile is not None and outlook.settles_phi(added):
-        valley = tuple(outlook.along_valley(lambda there: _told_there(measurement, ground, there, outlook)))
-    return Promise(measurement, outlook.after(added), valley)
+    after = outlook.after(added)
+    if outlook.profile is None:
+        return Promise(measurement, after)
+    if not outlook.settles_phi(added):
+        return Promise(measurement, after, rough=True)
+    valley = tuple(outlook.along_valley(lambda there: _told_there(measurement, ground, there, outlook)))
+    return Promise(measurement, after, valley=valley)
 
 
 def _told_there(measurement: Measurement, ground: Ground, there: Estimate, outlook: Outlook) -> Array:
@@ -169,7 +177,7 @@ def _chosen(promises: Sequence[Promise], before: Errors, enough_mm: float) -> in
     least = min(promise.after.worst_mm for promise in promises)
     if before.worst_mm <= enough_mm or not least < _WORTH * before.worst_mm:
         return None
-    limit = max(_NEARLY * least, enough_mm)
+    limit = max(least + min(_LARGER * least, _LESS * (before.worst_mm - least)), enough_mm)
     return next(number for number, promise in enumerate(promises) if promise.after.worst_mm <= limit)
 
 
