@@ -203,7 +203,8 @@ def rows(case: str, problem: Problem, runs: int) -> Iterator[Row]:
 def short_name(measurement: Measurement) -> str:
     """Its kind, with its sigma or how many of it."""
     if measurement.priors:
-        return f"{measurement.kind} to {1e3 * measurement.priors[0].sigma[0]:.0f} mm"
+        prior = measurement.priors[0]
+        return f"{prior.quantity.removesuffix('_m')} to {1e3 * prior.sigma[0]:.0f} mm"
     return f"{measurement.kind} x {len(measurement.steps) or len(measurement.views[0].frames)}"
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -98,10 +98,10 @@ def heights(station: str, camera: Camera) -> Iterator[Measurement]:
     x, y, height = camera.position.tolist()
     for sigma in HEIGHT_SIGMAS_M:
         prior = Prior("station", station, "height_m", (height,), (sigma,))
-        yield Measurement("height", f"measure the camera's height to {1e3 * sigma:.0f} mm", priors=(prior,))
+        yield Measurement("tape", f"measure the camera's height to {1e3 * sigma:.0f} mm", priors=(prior,))
     place = Prior("station", station, "position_m", (x, y, height), (POSITION_SIGMA_M,) * 3)
     words = f"measure the camera's x, y and height to {1e3 * POSITION_SIGMA_M:.0f} mm each"
-    yield Measurement("position", words, priors=(place,))
+    yield Measurement("tape", words, priors=(place,))
 
 
 # ---- poles ----------------------------------------------------------------------------------------------------------
@@ -118,7 +118,7 @@ def poles(search: Search) -> Iterator[Measurement]:
     cameras = [camera, *(other for other in elsewhere if other.position[2] > 2.0 * top)]
     x, y = (np.arange(np.ceil(a[0] / _GRID_M), a[-1] / _GRID_M + 1e-9) * _GRID_M for a in (grid.x_m, grid.y_m))
     places = [("", float(a), float(b)) for a in x for b in y]
-    for _, target in still(search.ground):
+    for _, target in still(search.ground.targets):
         places += [(name, a, b) for name, (a, b, z) in target.points.items() if z == 0.0]
     for mark, a, b in places:
         if all(well_inside(one, np.array([[a, b, top]]))[0] for one in cameras):
@@ -187,14 +187,14 @@ def boards(search: Search) -> Iterator[Measurement]:
 # ---- the field's own curves -----------------------------------------------------------------------------------------
 
 
-def still(ground: Ground) -> Iterator[tuple[str, Target]]:
+def still(targets: Mapping[str, Target]) -> Iterator[tuple[str, Target]]:
     """The targets that lie in the world."""
-    yield from ((name, target) for name, target in ground.targets.items() if target.kind not in _MOVABLE)
+    yield from ((name, target) for name, target in targets.items() if target.kind not in _MOVABLE)
 
 
 def lines(search: Search) -> Iterator[Measurement]:
     """Each curve of the field that the image shows, observed densely in one more frame."""
-    for name, target in still(search.ground):
+    for name, target in still(search.ground.targets):
         for curve in target.curves:
             stretch = _seen_stretch(search, target, curve)
             if stretch is not None:
@@ -225,7 +225,7 @@ def _lines_words(taken: Sequence[Measurement]) -> str:
 def frames(search: Search) -> Iterator[Measurement]:
     """More frames of the field, as it was observed: its curves, or its points where no curves were."""
     names = tuple(f"advised_{number:02d}" for number in range(1, _FRAMES + 1))
-    for name, target in still(search.ground):
+    for name, target in still(search.ground.targets):
         if search.curves_observed and target.curves:
             plan = ViewPlan(names, search.station, name, None, (), None, _FRAME_SPACING_M)
             what = f"every line, a point each {1e3 * _FRAME_SPACING_M:.0f} mm"

@@ -25,7 +25,7 @@ class Measurement:
     """What to measure besides what was observed.
 
     Attributes:
-        kind: "height", "position", "pole", "board", "line" or "frames".
+        kind: "tape", "pole", "board", "line" or "frames".
         words: one line that says what to do. steps: one line for each part of it, where it has parts.
         priors: what would be known of a station. Their values are the estimate's: what counts is the sigma.
         targets, tolerances: what is brought along and how exactly it stands where it should.

@@ -32,12 +32,14 @@ class Outlook:
     """One station at one height.
 
     Attributes:
-        today: its map. slopes: (N, 2, P) of where the N places that the image shows are located, by the keys.
+        today: its map. keys: (K) the posterior's own that it depends on. slopes: (N, 2, K) by them of where the N
+            places that the image shows are located.
     """
 
     estimate: Estimate
     posterior: Posterior
     today: FieldMap
+    keys: tuple[Key, ...]
     slopes: Array
 
     @classmethod
@@ -48,7 +50,7 @@ class Outlook:
             InputError: see `maps.station_keys`.
         """
         keys = station_keys(estimate, posterior, today.station)
-        return cls(estimate, posterior, today, _among(posterior.keys, keys, _slopes(estimate, today, keys)))
+        return cls(estimate, posterior, today, keys, _slopes(estimate, today, keys))
 
     @property
     def before(self) -> Errors:
@@ -66,10 +68,10 @@ class Outlook:
         By the quadratic picture at the estimate. Where phi was followed along its profile and would have to be still,
         today's errors shrink as the quadratic ones do.
         """
-        quadratic = _errors(self.posterior.information + added, self.posterior.keys, self.slopes)
+        quadratic = _errors(self.posterior.information + added, self.posterior.keys, self.keys, self.slopes)
         if self.profile is None or self.settles_phi(added):
             return quadratic
-        now = _errors(self.posterior.information, self.posterior.keys, self.slopes)
+        now = _errors(self.posterior.information, self.posterior.keys, self.keys, self.slopes)
         with np.errstate(invalid="ignore"):
             worst = self.before.worst_mm * min(float(np.divide(quadratic.worst_mm, now.worst_mm)), 1.0)
             mean = self.before.mean_mm * min(float(np.divide(quadratic.mean_mm, now.mean_mm)), 1.0)
@@ -107,16 +109,18 @@ class Outlook:
             across, along = profile.information[place], tangents[place]
             coupling = -across @ along
             told = np.block([[np.atleast_2d(along @ across @ along), coupling[None]], [coupling[:, None], across]])
-            keys = station_keys(there, self.posterior, self.today.station)
-            slopes = _among(profile.keys, keys, _slopes(there, self.today, keys))
-            errors = _errors(told + told_at(there)[np.ix_(at, at)], profile.keys, slopes)
+            slopes = _slopes(there, self.today, self.keys)
+            errors = _errors(told + told_at(there)[np.ix_(at, at)], profile.keys, self.keys, slopes)
             yield float(profile.phi[place]), errors
 
 
-def _errors(information: Array, keys: tuple[Key, ...], slopes: Array) -> Errors:
-    covariance = Spread.of(information, sigma_limits(keys)).through(slopes)
+def _errors(information: Array, every: tuple[Key, ...], keys: tuple[Key, ...], slopes: Array) -> Errors:
+    """The errors by slopes (N, 2, K), of information about all the keys, those of the slopes among them."""
+    whole, at = Spread.of(information, sigma_limits(every)), [every.index(key) for key in keys]
+    own = Spread(whole.covariance[np.ix_(at, at)], whole.unknown[at], whole.scale[at])
+    covariance = own.through(slopes)
     sd = 1e3 * np.sqrt(np.trace(covariance, axis1=1, axis2=2))
-    return Errors(float(np.max(sd)), float(np.mean(sd))) if len(sd) else Errors(np.nan, np.nan)
+    return Errors(float(np.max(sd)), float(np.mean(sd)))
 
 
 def _slopes(estimate: Estimate, grid: FieldMap, keys: tuple[Key, ...]) -> Array:
@@ -124,10 +128,3 @@ def _slopes(estimate: Estimate, grid: FieldMap, keys: tuple[Key, ...]) -> Array:
     x, y = np.meshgrid(grid.x_m, grid.y_m)
     pixels = shown_pixels(estimate, grid.station, np.column_stack([x.ravel(), y.ravel()]), grid.height_m)
     return locate_slopes(estimate, keys, grid.station, pixels[np.isfinite(pixels[:, 0])], grid.height_m)
-
-
-def _among(every: tuple[Key, ...], keys: tuple[Key, ...], slopes: Array) -> Array:
-    """(N, 2, P) slopes by all the keys, 0 by those that are not among the K."""
-    found = np.zeros((*slopes.shape[:2], len(every)))
-    found[:, :, [every.index(key) for key in keys]] = slopes
-    return found

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ceres_cal.advice.candidates import BOARD, Search
+from ceres_cal.advice.candidates import BOARD, Search, still
 from ceres_cal.advice.measurements import Ground, Measurement
 from ceres_cal.advice.outlook import Errors, Outlook
 from ceres_cal.bundle import Weighting
@@ -16,6 +16,7 @@ from ceres_cal.errors import InputError
 from ceres_cal.parameters import Estimate
 from ceres_cal.targets import Target
 from ceres_cal.transforms import Array
+from ceres_cal.uncertainty import Posterior
 
 _LARGER, _LESS = 0.5, 0.2
 """Less work is nearly as good as the best where the error that it leaves is larger by no more than the first share of
@@ -126,13 +127,24 @@ def promised(
 
 
 def _prepared(calibration: Calibration, station: str | None, height_m: float) -> tuple[Ground, Outlook]:
+    """What to add to, and the outlook: both of the numbers that a measurement at this station can tell of."""
     known = calibration.uncertainty
-    outlook = Outlook.of(known.estimate, known.posterior, known.map_sd_mm(station, height_m))
-    if not len(outlook.slopes):
-        raise InputError(f"station {outlook.today.station!r} sees nothing of the field at {1e3 * height_m:.0f} mm")
-    weighting, tolerances = _weighting(calibration.fit), calibration.options.tolerances
-    ground = Ground(known.estimate, known.posterior.keys, calibration.targets, tolerances, weighting)
-    return ground, outlook
+    if not any(still(calibration.targets)):
+        raise InputError("advice is about a map of a field, and there is none: nothing that was observed stands still")
+    today = known.map_sd_mm(station, height_m)
+    if not np.any(today.sd_mm >= 0.0):
+        raise InputError(f"station {today.station!r} sees nothing of the field at {1e3 * height_m:.0f} mm")
+    posterior = _of_camera(known.posterior, known.estimate, known.estimate.stations[today.station].camera)
+    tolerances, weighting = calibration.options.tolerances, _weighting(calibration.fit)
+    ground = Ground(known.estimate, posterior.keys, calibration.targets, tolerances, weighting)
+    return ground, Outlook.of(known.estimate, posterior, today)
+
+
+def _of_camera(posterior: Posterior, estimate: Estimate, camera: str) -> Posterior:
+    """What is known of a camera, its stations and the targets as built, all else integrated out."""
+    owners = {("camera", camera), *(("station", name) for name, s in estimate.stations.items() if s.camera == camera)}
+    places = np.array([i for i, k in enumerate(posterior.keys) if k[:2] in owners or k.kind == "structure"])
+    return replace(posterior, keys=tuple(posterior.keys[i] for i in places), information=posterior.marginal(places))
 
 
 def _weighting(fit: Fit) -> Weighting:
