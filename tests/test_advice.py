@@ -33,6 +33,7 @@ from ceres_cal.simulate import Disturbance, board_scene, simulate
 from ceres_cal.structure import Tolerance, make_structure
 from ceres_cal.targets import checkerboard, rings
 from ceres_cal.transforms import Array
+from ceres_cal.uncertainty import Uncertainty
 
 PROBLEMS: dict[str, Callable[[], Problem]] = {**CASES, "two cameras": two_cameras, "as built": partial(tilted, 8.0)}
 
@@ -143,6 +144,21 @@ def test_the_noise_is_the_one_that_was_found(name: str) -> None:
         assert weighting.point_scale == pytest.approx(0.3 * fit.point_scale, rel=1e-9)
     else:
         assert weighting.point_scale == weighting.curve_scale
+
+
+@pytest.mark.parametrize("name", ["whole field, 8 deg", "as built", "two cameras"])
+def test_what_would_be_left_is_the_map_of_what_would_be_known(name: str) -> None:
+    """The same by the whole posterior with the information added, nothing integrated out before."""
+    calibration, advice = calibrated(name), advised(name)
+    known, weighting = calibration.uncertainty, _weighting(calibration.fit)
+    tolerances = calibration.options.tolerances
+    ground = Ground(known.estimate, known.posterior.keys, calibration.targets, tolerances, weighting)
+    for promise in first_of(advice).values():
+        more = known.posterior.information + ground.told_by(promise.measurement)
+        there = Uncertainty(known.estimate, replace(known.posterior, information=more), calibration.targets)
+        expected = there.map_sd_mm(advice.station, 0.15)
+        assert promise.after.worst_mm == pytest.approx(expected.worst_mm, rel=1e-6)
+        assert promise.after.mean_mm == pytest.approx(expected.mean_mm, rel=1e-6)
 
 
 # ---- what is obtained -----------------------------------------------------------------------------------------------

@@ -9,7 +9,7 @@ import numpy as np
 
 from ceres_cal.advice.candidates import BOARD, Search, still
 from ceres_cal.advice.measurements import Ground, Measurement
-from ceres_cal.advice.outlook import Errors, Outlook
+from ceres_cal.advice.outlook import BENT, Errors, Outlook
 from ceres_cal.bundle import Weighting
 from ceres_cal.calibration import Calibration, Fit
 from ceres_cal.errors import InputError
@@ -32,7 +32,7 @@ class Promise:
         after: the errors that it leaves, where everything is as estimated.
         valley: where phi is followed along its profile today, and the measurement settles it: phi (px) and the errors
             left if that is what phi is, over its 95 % bounds.
-        rough: whether phi is followed along its profile and would have to be still. Then `after` is no more than a
+        rough: whether phi is followed along its profile and might have to be still. Then `after` is no more than a
             guess, good to a factor of two or three.
     """
 
@@ -169,13 +169,18 @@ def _board(targets: Mapping[str, Target], board: Target | None) -> tuple[str, Ta
 
 
 def _promise(measurement: Measurement, added: Array, ground: Ground, outlook: Outlook) -> Promise:
+    """Sure where phi is not followed along its profile, or would not have to be any more, whatever it is.
+
+    Where the camera would not see what is measured does not count: who measures will see.
+    """
     after = outlook.after(added)
     if outlook.profile is None:
         return Promise(measurement, after)
-    if not outlook.settles_phi(added):
-        return Promise(measurement, after, rough=True)
     valley = tuple(outlook.along_valley(lambda there: _told_there(measurement, ground, there, outlook)))
-    return Promise(measurement, after, valley=valley)
+    known = [sd for _, sd, _ in valley if np.isfinite(sd)]
+    if not known or max(known) > BENT or not np.isfinite(after.worst_mm):
+        return Promise(measurement, outlook.shrunk(added), rough=True)
+    return Promise(measurement, after, valley=tuple((phi, errors) for phi, _, errors in valley))
 
 
 def _told_there(measurement: Measurement, ground: Ground, there: Estimate, outlook: Outlook) -> Array:
@@ -185,12 +190,14 @@ def _told_there(measurement: Measurement, ground: Ground, there: Estimate, outlo
 
 
 def _chosen(promises: Sequence[Promise], before: Errors, enough_mm: float) -> int | None:
-    """Number of the one with the least work that is good enough, or nearly as good as the best."""
-    least = min(promise.after.worst_mm for promise in promises)
+    """Number of the one with the least work that is good enough whatever phi is, or nearly as good as the best."""
+    worst = np.array([promise.after.worst_mm for promise in promises])
+    least = float(np.min(worst))
     if before.worst_mm <= enough_mm or not least < _WORTH * before.worst_mm:
         return None
-    limit = max(least + min(_LARGER * least, _LESS * (before.worst_mm - least)), enough_mm)
-    return next(number for number, promise in enumerate(promises) if promise.after.worst_mm <= limit)
+    surely = np.array([promise.worst_range_mm[1] for promise in promises])
+    nearly = least + min(_LARGER * least, _LESS * (before.worst_mm - least))
+    return int(np.argmax((worst <= nearly) | (surely <= enough_mm)))
 
 
 def _next(
