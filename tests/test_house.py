@@ -41,6 +41,7 @@ FLOORS = {
     "uncertainty": 4,
     "noise": 4,
     "calibration": 5,
+    "advice": 5,
     "calibrate": 5,
     "diagnostics": 5,
     "photographs": 5,

@@ -9,6 +9,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from ceres_cal.advice import advise as advise
     from ceres_cal.calibrate import calibrate as calibrate
     from ceres_cal.calibration import Calibration as Calibration
     from ceres_cal.camera import Camera as Camera
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from ceres_cal.transforms import Pose as Pose
 
 _HOME = {
+    "advise": "advice",
     "calibrate": "calibrate",
     "Calibration": "calibration",
     "Camera": "camera",

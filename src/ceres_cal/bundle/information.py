@@ -72,7 +72,7 @@ def information(
     private = private_placements(sights, layout)
     keys = shared_keys(estimate, layout, private)
     matrix, owned = np.zeros((len(keys), len(keys))), _owned(keys)
-    alone = np.array([key.placement in private for key in sights.keys])
+    alone = np.array([key.placement in private for key in sights.keys], dtype=bool)
     stations = np.array([key.station for key in sights.keys])
     eliminated = []
     for name in dict.fromkeys(stations[alone].tolist()):

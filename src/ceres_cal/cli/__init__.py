@@ -9,6 +9,7 @@ import os
 import sys
 from collections.abc import Sequence
 
+from ceres_cal.cli.advise import COMMANDS as ADVISE
 from ceres_cal.cli.calibrate import COMMANDS as CALIBRATE
 from ceres_cal.cli.command import Command, print_answer
 from ceres_cal.cli.detect import COMMANDS as DETECT_BOARD
@@ -20,7 +21,7 @@ from ceres_cal.cli.simulate import COMMANDS as SIMULATE
 from ceres_cal.cli.targets import COMMANDS as TARGETS
 from ceres_cal.errors import CalibrationError, InputError, SolutionError
 
-_GROUPS = (DETECT_BOARD, DETECT_RINGS, DETECT_FIELD, CALIBRATE, DIAGNOSE, LOCATE, SIMULATE, TARGETS)
+_GROUPS = (DETECT_BOARD, DETECT_RINGS, DETECT_FIELD, CALIBRATE, DIAGNOSE, ADVISE, LOCATE, SIMULATE, TARGETS)
 COMMANDS = {command.name: command for group in _GROUPS for command in group}
 _BEGINNINGS = {"", *(name.partition(" ")[0] for name in COMMANDS if " " in name)}
 _MOST_LETTERS = 200  # of an error that nobody wrote for people

@@ -5,7 +5,16 @@ What draws (`photograph`, `album`) needs OpenCV and is imported where it is used
 
 from ceres_cal.parameters import Station
 from ceres_cal.simulate.built_in import built_in_scene, scene_names
-from ceres_cal.simulate.compose import board_placements, board_scene, field_scene, join, overhead_pose, rings_scene
+from ceres_cal.simulate.compose import (
+    board_placements,
+    board_pose,
+    board_scene,
+    field_scene,
+    join,
+    overhead_pose,
+    rings_scene,
+    well_inside,
+)
 from ceres_cal.simulate.files import load_scene, scene_from_json, scene_to_json, truth_to_json, write_simulation
 from ceres_cal.simulate.photography import Photography
 from ceres_cal.simulate.scene import Disturbance, Scene, ViewPlan
@@ -23,6 +32,7 @@ __all__ = [
     "Truth",
     "ViewPlan",
     "board_placements",
+    "board_pose",
     "board_scene",
     "built_in_scene",
     "field_scene",
@@ -35,5 +45,6 @@ __all__ = [
     "scene_to_json",
     "simulate",
     "truth_to_json",
+    "well_inside",
     "write_simulation",
 ]

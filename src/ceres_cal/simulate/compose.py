@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from ceres_cal.camera import Camera
 from ceres_cal.errors import InputError
@@ -63,7 +64,7 @@ def board_placements(
             return found
         cam_from_board = _random_board_pose(board, cameras[0], distance_m, tilt_deg, rng)
         placement = cameras[0].cam_from_world.inverse @ cam_from_board
-        if all(_sees_all(camera, placement.transform(board.point_array)) for camera in cameras):
+        if all(np.all(well_inside(camera, placement.transform(board.point_array))) for camera in cameras):
             found.append(placement)
     raise InputError(
         f"no {count} places found where {len(cameras)} camera(s) see a whole {board.kind}: "
@@ -78,27 +79,44 @@ def _random_board_pose(
     tilt_deg: tuple[float, float],
     rng: np.random.Generator,
 ) -> Pose:
-    """cam_from_board with the board's middle at a random pixel.
+    """cam_from_board with the board's middle at a random pixel."""
+    pixel = rng.uniform((0.0, 0.0), camera.image_size)
+    direction, spin = rng.uniform(0.0, 2.0 * np.pi, size=2)
+    tilt = np.deg2rad(rng.uniform(*tilt_deg))
+    return board_pose(board, camera, pixel, rng.uniform(*distance_m), tilt, direction, spin)
 
-    Its normal points away from the camera, so that columns run right and rows down before it is turned.
+
+def board_pose(
+    board: Target,
+    camera: Camera,
+    pixel: ArrayLike,
+    distance_m: float,
+    tilt_rad: float,
+    direction_rad: float,
+    spin_rad: float = 0.0,
+) -> Pose:
+    """cam_from_board with the board's middle at a pixel (2,), so far from the camera.
+
+    Its normal points away from the camera, so that columns run right and rows down before it is turned: by spin about
+    its own normal, then by the tilt about an axis across the line of sight. That tilt brings its upper edge nearer to
+    the camera at direction 0, its right one at a quarter turn.
     """
-    line_of_sight = camera.rays(rng.uniform((0.0, 0.0), camera.image_size)[None])[0]
+    line_of_sight = camera.rays(np.reshape(pixel, (1, 2)))[0]
     across = np.array([-line_of_sight[1], line_of_sight[0], 0.0])  # z x line of sight
     sine = np.linalg.norm(across)
     facing = rotation_exp(across / max(sine, 1e-12) * np.arctan2(sine, line_of_sight[2]))
-    direction, spin = rng.uniform(0.0, 2.0 * np.pi, size=2)
-    tilt = np.deg2rad(rng.uniform(*tilt_deg))
-    leaning = rotation_exp((tilt * np.cos(direction), tilt * np.sin(direction), 0.0))
-    rotation = facing @ leaning @ rotation_exp((0.0, 0.0, spin))
+    leaning = rotation_exp((tilt_rad * np.cos(direction_rad), tilt_rad * np.sin(direction_rad), 0.0))
+    rotation = facing @ leaning @ rotation_exp((0.0, 0.0, spin_rad))
     middle = board.point_array.mean(axis=0)
-    return Pose(rotation, line_of_sight * rng.uniform(*distance_m) - rotation @ middle)
+    return Pose(rotation, line_of_sight * distance_m - rotation @ middle)
 
 
-def _sees_all(camera: Camera, points_world: Array) -> bool:
-    if np.any(camera.cam_from_world.transform(points_world)[:, 2] <= 0.0):
-        return False
+def well_inside(camera: Camera, points_world: Array) -> NDArray[np.bool_]:
+    """(N,) whether points (N, 3) are before the camera, so far inside the image that noise keeps them there."""
     pixels = camera.project(points_world)
-    return bool(np.all((pixels >= _MARGIN_PX) & (pixels <= np.array(camera.image_size) - 1.0 - _MARGIN_PX)))
+    with np.errstate(invalid="ignore"):
+        inside = np.all((pixels >= _MARGIN_PX) & (pixels <= np.array(camera.image_size) - 1.0 - _MARGIN_PX), axis=1)
+    return np.asarray(inside & (camera.cam_from_world.transform(points_world)[:, 2] > 0.0))
 
 
 def field_scene(

@@ -1,0 +1,140 @@
+"""Something that could still be measured, as a simulation would have it, and what it would tell."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from ceres_cal.bundle import Weighting, information
+from ceres_cal.errors import InputError
+from ceres_cal.observations import Curves, Observations, Points, Prior
+from ceres_cal.parameters import Estimate, Layout, intrinsic_names
+from ceres_cal.quantities import Key, sigma_limits
+from ceres_cal.sights import gather_sights
+from ceres_cal.simulate import Scene, ViewPlan, simulate
+from ceres_cal.spread import without
+from ceres_cal.structure import Tolerance, make_structure
+from ceres_cal.targets import Target
+from ceres_cal.transforms import Array, Pose
+
+
+@dataclass(frozen=True, eq=False)
+class Measurement:
+    """What to measure besides what was observed.
+
+    Attributes:
+        kind: "tape", "pole", "board", "line" or "frames".
+        words: one line that says what to do. steps: one line for each part of it, where it has parts.
+        priors: what would be known of a station. Their values are the estimate's: what counts is the sigma.
+        targets, tolerances: what is brought along and how exactly it stands where it should.
+        placements: world_from_target. views: what the frames taken then would show.
+    """
+
+    kind: str
+    words: str
+    steps: tuple[str, ...] = ()
+    priors: tuple[Prior, ...] = ()
+    targets: Mapping[str, Target] = field(default_factory=dict)
+    tolerances: Mapping[str, Tolerance] = field(default_factory=dict)
+    placements: Mapping[str, Pose] = field(default_factory=dict)
+    views: tuple[ViewPlan, ...] = ()
+
+    def before(self, cam_from_world: Pose, other: Pose) -> Measurement:
+        """The same with every placement as far before a camera at another pose as it is before one at this."""
+        moved = other.inverse @ cam_from_world
+        return replace(self, placements={name: moved @ pose for name, pose in self.placements.items()})
+
+
+def together(parts: Sequence[Measurement], words: str) -> Measurement:
+    """Several measurements of one kind as one; their names must differ."""
+    return Measurement(
+        parts[0].kind,
+        words,
+        tuple(part.words for part in parts),
+        tuple(prior for part in parts for prior in part.priors),
+        {name: target for part in parts for name, target in part.targets.items()},
+        {name: tolerance for part in parts for name, tolerance in part.tolerances.items()},
+        {name: pose for part in parts for name, pose in part.placements.items()},
+        tuple(plan for part in parts for plan in part.views),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Ground:
+    """What a measurement would add to.
+
+    Attributes:
+        estimate: where everything is thought to be. keys: (P) its free numbers. targets: as drawn.
+        tolerances: those it was calibrated with. weighting: noise, px, of points and of curves, and the loss.
+    """
+
+    estimate: Estimate
+    keys: tuple[Key, ...]
+    targets: Mapping[str, Target]
+    tolerances: Mapping[str, Tolerance]
+    weighting: Weighting
+
+    def told_by(self, measurement: Measurement) -> Array:
+        """(P, P) what a measurement would say of the free numbers, its own unknowns integrated out.
+
+        A placement is one of those, and so is how far a pole stands aside. It is nothing where the camera sees nothing.
+        """
+        targets = {**self.targets, **measurement.targets}
+        estimate = self._with(measurement, targets)
+        observations = replace(_observed(estimate, targets, measurement.views), targets=targets)
+        layout = replace(_layout(estimate, self.keys, measurement.placements), priors=measurement.priors)
+        told = information(gather_sights(observations), estimate, layout, self.weighting)
+        return self._own(told.keys, told.matrix)
+
+    def _with(self, measurement: Measurement, targets: Mapping[str, Target]) -> Estimate:
+        """The estimate with what the measurement brings along; of the placements those that are still free."""
+        structure = make_structure(targets, {**self.tolerances, **measurement.tolerances})
+        known = dict(zip(self.estimate.structure.names, self.estimate.structure.values.tolist(), strict=True))
+        shared = dict.fromkeys(key.owner for key in self.keys if key.kind == "placement")
+        return replace(
+            self.estimate,
+            placements={**{name: self.estimate.placements[name] for name in shared}, **measurement.placements},
+            structure=structure.with_values(np.array([known.get(name, 0.0) for name in structure.names])),
+        )
+
+    def _own(self, keys: Sequence[Key], matrix: Array) -> Array:
+        at = np.array([keys.index(key) for key in self.keys])
+        rest = np.setdiff1d(np.arange(len(keys)), at)
+        here = matrix[np.ix_(at, at)].copy()
+        # Tolerances that the calibration had already are no news.
+        old = [place for place, key in enumerate(self.keys) if key.kind == "structure"]
+        here[old, old] -= self.estimate.structure.sigma_m**-2.0
+        if not len(rest):
+            return np.asarray(here)
+        limits = sigma_limits([keys[place] for place in rest])
+        return without(here, matrix[np.ix_(rest, at)], matrix[np.ix_(rest, rest)], limits)
+
+
+def _layout(estimate: Estimate, keys: Sequence[Key], placements: Iterable[str]) -> Layout:
+    """The layout whose shared numbers are the keys, and the new placements."""
+    free = {
+        name: np.array(
+            [intrinsic_names(camera.lens).index(k.quantity) for k in keys if k[:2] == ("camera", name)], dtype=np.int64
+        )
+        for name, camera in estimate.cameras.items()
+    }
+    owners = {kind: frozenset(k.owner for k in keys if k.kind == kind) for kind in ("station", "placement")}
+    return Layout(free, owners["station"], owners["placement"] | frozenset(placements))
+
+
+def _observed(estimate: Estimate, targets: Mapping[str, Target], views: tuple[ViewPlan, ...]) -> Observations:
+    """What the views would show where everything is as estimated, without noise, in units of sigma 1."""
+    no_rows, no_pixels = np.empty(0, np.int32), np.empty((0, 2))
+    points = Points(no_rows, no_rows, no_pixels, np.empty(0))
+    curves = Curves(no_rows, no_rows, no_pixels, np.empty(0), np.empty(0, np.int8))
+    unseen = Observations(targets, {}, (), points, curves)
+    if not views:
+        return unseen
+    stations = {plan.station: estimate.stations[plan.station] for plan in views}
+    cameras = {station.camera: estimate.cameras[station.camera] for station in stations.values()}
+    try:
+        return simulate(Scene(targets, cameras, stations, estimate.placements, views)).observations
+    except InputError:  # the camera sees nothing of it
+        return unseen

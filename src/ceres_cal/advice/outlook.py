@@ -1,0 +1,154 @@
+"""What a station's map would be if more were known: the worst and the mean error, in mm, at one height."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ceres_cal.parameters import Estimate
+from ceres_cal.quantities import Key, moved, sigma_limits
+from ceres_cal.spread import Spread
+from ceres_cal.transforms import Array
+from ceres_cal.uncertainty import FieldMap, Posterior, Profile
+from ceres_cal.uncertainty.maps import locate_slopes, shown_pixels, station_keys
+
+BENT = 0.05  # relative sigma of phi up to which the quadratic picture holds (`uncertainty.assess` leaves it there)
+_PLACES = 7  # of a valley at which a promise is worked out
+
+
+@dataclass(frozen=True, eq=False)
+class Errors:
+    """Largest and mean standard deviation of located points over what the image shows, mm; infinite where unknown."""
+
+    worst_mm: float
+    mean_mm: float
+
+
+@dataclass(frozen=True, eq=False)
+class Outlook:
+    """One station at one height.
+
+    Attributes:
+        today: its map. keys: (K) the posterior's own that it depends on. slopes: (N, 2, K) by them of where the N
+            places that the image shows are located.
+    """
+
+    estimate: Estimate
+    posterior: Posterior
+    today: FieldMap
+    keys: tuple[Key, ...]
+    slopes: Array
+
+    @classmethod
+    def of(cls, estimate: Estimate, posterior: Posterior, today: FieldMap) -> Outlook:
+        """The outlook from today's map.
+
+        Raises:
+            InputError: see `maps.station_keys`.
+        """
+        keys = station_keys(estimate, posterior, today.station)
+        return cls(estimate, posterior, today, keys, _slopes(estimate, today, keys))
+
+    @property
+    def before(self) -> Errors:
+        """Today's errors."""
+        return Errors(self.today.worst_mm, self.today.mean_mm)
+
+    @property
+    def profile(self) -> Profile | None:
+        """The valley along phi that today's map follows, where it does."""
+        return self.posterior.profiles.get(self.estimate.stations[self.today.station].camera)
+
+    def after(self, added: Array) -> Errors:
+        """The errors with information (P, P) added, by the quadratic picture at the estimate.
+
+        Where phi was followed along its profile and would have to be still, see `shrunk`.
+        """
+        known = self._known(added)
+        bent = self.profile is not None and self._phi_sd(self.estimate, known) > BENT
+        return self.shrunk(added) if bent else _errors(known, self.slopes)
+
+    def shrunk(self, added: Array) -> Errors:
+        """Today's errors, smaller as those of the quadratic picture get smaller with information (P, P) added."""
+        now, then = (_errors(self._known(more), self.slopes) for more in (np.zeros_like(added), added))
+        if not np.isfinite(now.worst_mm):
+            return then
+        worst = self.before.worst_mm * min(then.worst_mm / now.worst_mm, 1.0)
+        return Errors(worst, self.before.mean_mm * min(then.mean_mm / now.mean_mm, 1.0))
+
+    def _phi_sd(self, estimate: Estimate, known: Spread) -> float:
+        """Relative standard deviation of phi by what is known of the K numbers; 0 where it is held."""
+        camera = estimate.stations[self.today.station].camera
+        place = next((i for i, key in enumerate(self.keys) if key[:3] == ("camera", camera, "phi")), None)
+        return 0.0 if place is None else float(known.sd[place]) / estimate.cameras[camera].phi
+
+    def _known(self, added: Array) -> Spread:
+        """What is known of the K numbers with information (P, P) added."""
+        at = self._places
+        if not np.any(np.delete(added, at, axis=0)):  # it tells of nothing else: that can be integrated out before
+            return Spread.of(self._own + added[np.ix_(at, at)], sigma_limits(self.keys))
+        return _part(Spread.of(self.posterior.information + added, sigma_limits(self.posterior.keys)), at)
+
+    @cached_property
+    def _places(self) -> NDArray[np.int64]:
+        return _indices(self.keys, self.posterior.keys)
+
+    @cached_property
+    def _own(self) -> Array:
+        return self.posterior.marginal(self._places)
+
+    @cached_property
+    def possible(self) -> tuple[tuple[int, Estimate], ...]:
+        """Some places of the valley within its 95 % bounds, by number; none where phi is not followed."""
+        if self.profile is None:
+            return ()
+        keys, steps = self.profile.keys, self.profile.steps
+        within = np.flatnonzero(self.profile.rises <= self.posterior.half_width**2)
+        some = within[np.unique(np.linspace(0, len(within) - 1, _PLACES).round().astype(int))]
+        return tuple((int(place), moved(self.estimate, keys, steps[place])) for place in some)
+
+    def along_valley(self, told_at: Callable[[Estimate], Array]) -> Iterator[tuple[float, float, Errors]]:
+        """phi (px), its relative standard deviation and the errors if that is what it is and information `told_at` is
+        added, over what phi may be by its 95 % bounds.
+
+        There the field itself is taken to tell phi nothing but the valley's direction, which is on the careful side.
+        """
+        profile = self.profile
+        assert profile is not None
+        at = _indices(profile.keys, self.posterior.keys)
+        own, limits = _indices(self.keys, profile.keys), sigma_limits(profile.keys)
+        tangents = np.gradient(profile.steps[:, 1:], profile.steps[:, 0], axis=0)
+        for place, there in self.possible:
+            across, along = profile.information[place], tangents[place]
+            coupling = -across @ along
+            told = np.block([[np.atleast_2d(along @ across @ along), coupling[None]], [coupling[:, None], across]])
+            known = _part(Spread.of(told + told_at(there)[np.ix_(at, at)], limits), own)
+            errors = _errors(known, _slopes(there, self.today, self.keys))
+            yield float(profile.phi[place]), self._phi_sd(there, known), errors
+
+
+def _indices(keys: tuple[Key, ...], every: tuple[Key, ...]) -> NDArray[np.int64]:
+    """Where some keys are among all of them."""
+    return np.array([every.index(key) for key in keys], dtype=np.int64)
+
+
+def _part(known: Spread, at: NDArray[np.int64]) -> Spread:
+    """What is known of some of the numbers."""
+    return Spread(known.covariance[np.ix_(at, at)], known.unknown[at], known.scale[at])
+
+
+def _errors(known: Spread, slopes: Array) -> Errors:
+    """The errors of places with slopes (N, 2, K) by numbers of which so much is known."""
+    sd = 1e3 * np.sqrt(np.trace(known.through(slopes), axis1=1, axis2=2))
+    return Errors(float(np.max(sd)), float(np.mean(sd)))
+
+
+def _slopes(estimate: Estimate, grid: FieldMap, keys: tuple[Key, ...]) -> Array:
+    """(N, 2, K) of the N places of the grid that the image shows."""
+    x, y = np.meshgrid(grid.x_m, grid.y_m)
+    pixels = shown_pixels(estimate, grid.station, np.column_stack([x.ravel(), y.ravel()]), grid.height_m)
+    return locate_slopes(estimate, keys, grid.station, pixels[np.isfinite(pixels[:, 0])], grid.height_m)

@@ -1,0 +1,215 @@
+"""What to measure next, and what it would bring, in mm."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ceres_cal.advice.candidates import BOARD, Search, still
+from ceres_cal.advice.measurements import Ground, Measurement
+from ceres_cal.advice.outlook import BENT, Errors, Outlook
+from ceres_cal.bundle import Weighting
+from ceres_cal.calibration import Calibration, Fit
+from ceres_cal.errors import InputError
+from ceres_cal.parameters import Estimate
+from ceres_cal.targets import Target
+from ceres_cal.transforms import Array
+from ceres_cal.uncertainty import Posterior
+
+_LARGER, _LESS = 0.5, 0.2
+"""Less work is nearly as good as the best where the error that it leaves is larger by no more than the first share of
+the best's, and what it takes off smaller by no more than the second share of the best's."""
+_WORTH = 0.9  # of today's worst error; what leaves more is not worth doing
+
+
+@dataclass(frozen=True, eq=False)
+class Promise:
+    """What one measurement would bring.
+
+    Attributes:
+        after: the errors that it leaves, where everything is as estimated.
+        valley: where phi is followed along its profile today, and the measurement settles it: phi (px) and the errors
+            left if that is what phi is, over its 95 % bounds.
+        rough: whether phi is followed along its profile and might have to be still. Then `after` is no more than a
+            guess, good to a factor of two or three.
+    """
+
+    measurement: Measurement
+    after: Errors
+    rough: bool = False
+    valley: tuple[tuple[float, Errors], ...] = ()
+
+    @property
+    def worst_range_mm(self) -> tuple[float, float]:
+        """Least and largest worst error, over what phi may be."""
+        worst = [self.after.worst_mm, *(errors.worst_mm for _, errors in self.valley)]
+        return min(worst), max(worst)
+
+
+@dataclass(frozen=True, eq=False)
+class Advice:
+    """Measurements and their promises, the one that leaves the smallest worst error first.
+
+    Attributes:
+        station: whose map. height_m: at which height. before: its errors today; worst_place_m: where they are largest.
+        promises: best first. best: the one to follow, with the least work of those that are nearly as good as the best;
+            None where nothing is worth doing. then: what to do after it, with what both together leave.
+        good_enough_mm: what the worst error may be; None where nobody said.
+    """
+
+    station: str
+    height_m: float
+    before: Errors
+    worst_place_m: tuple[float, float]
+    promises: tuple[Promise, ...]
+    best: Promise | None
+    then: Promise | None
+    good_enough_mm: float | None
+
+
+def advise(
+    calibration: Calibration,
+    station: str | None = None,
+    height_m: float = 0.15,
+    good_enough_mm: float | None = None,
+    board: Target | None = None,
+) -> Advice:
+    """What to measure besides, ranked by the worst error that it leaves on a station's map.
+
+    Computed from the posterior and what each measurement would add to it at the estimate (no observations are needed),
+    with the noise that the calibration found. It promises what the next calibration will say of itself; model error (a
+    lens with too few coefficients, a field painted amiss) is in neither.
+
+    Args:
+        station: may be left out where there is only one. board: that could be shown; by default the calibration's own,
+            or one of 9 x 6 corners, 100 mm apart.
+
+    Raises:
+        InputError: no such station, one that was held as the world, or a calibration that says nothing of how well it
+            is known.
+    """
+    if board is not None and board.kind != "checkerboard":
+        raise InputError(f"a board to show is a checkerboard, not of kind {board.kind!r}")
+    ground, outlook = _prepared(calibration, station, height_m)
+    search = Search(ground, outlook, _board(calibration.targets, board), calibration.fit.curves > 0)
+    candidates = list(search.candidates())
+    told = [ground.told_by(measurement) for measurement in candidates]
+    promises = [_promise(*each, ground, outlook) for each in zip(candidates, told, strict=True)]
+    enough = 0.0 if good_enough_mm is None else good_enough_mm
+    best = _chosen(promises, outlook.before, enough)
+    then = None if best is None else _next(best, candidates, told, outlook, enough)
+    ranked = sorted(promises, key=lambda promise: (promise.after.worst_mm, promise.after.mean_mm))
+    today = outlook.today
+    return Advice(
+        today.station,
+        height_m,
+        outlook.before,
+        today.worst_place_m,
+        tuple(ranked),
+        None if best is None else promises[best],
+        then,
+        good_enough_mm,
+    )
+
+
+def promised(
+    calibration: Calibration, measurements: Sequence[Measurement], station: str | None = None, height_m: float = 0.15
+) -> tuple[Promise, ...]:
+    """What measurements of one's own would bring, each by itself.
+
+    Raises:
+        InputError: see `advise`.
+    """
+    ground, outlook = _prepared(calibration, station, height_m)
+    return tuple(_promise(one, ground.told_by(one), ground, outlook) for one in measurements)
+
+
+def _prepared(calibration: Calibration, station: str | None, height_m: float) -> tuple[Ground, Outlook]:
+    """What to add to, and the outlook: both of the numbers that a measurement at this station can tell of."""
+    known = calibration.uncertainty
+    if not any(still(calibration.targets)):
+        raise InputError("advice is about a map of a field, and there is none: nothing that was observed stands still")
+    today = known.map_sd_mm(station, height_m)
+    if not np.any(today.sd_mm >= 0.0):
+        raise InputError(f"station {today.station!r} sees nothing of the field at {1e3 * height_m:.0f} mm")
+    posterior = _of_camera(known.posterior, known.estimate, known.estimate.stations[today.station].camera)
+    tolerances, weighting = calibration.options.tolerances, _weighting(calibration.fit)
+    ground = Ground(known.estimate, posterior.keys, calibration.targets, tolerances, weighting)
+    return ground, Outlook.of(known.estimate, posterior, today)
+
+
+def _of_camera(posterior: Posterior, estimate: Estimate, camera: str) -> Posterior:
+    """What is known of a camera, its stations and the targets as built, all else integrated out."""
+    owners = {("camera", camera), *(("station", name) for name, s in estimate.stations.items() if s.camera == camera)}
+    places = np.array([i for i, k in enumerate(posterior.keys) if k[:2] in owners or k.kind == "structure"])
+    return replace(posterior, keys=tuple(posterior.keys[i] for i in places), information=posterior.marginal(places))
+
+
+def _weighting(fit: Fit) -> Weighting:
+    """Noise in px of points and curves, as the fit found it; of a kind that nobody observed that of the other."""
+    spare = max(1.0 - fit.unknowns / max(2 * fit.points + fit.curves, 1), 1e-3)
+    found = [fit.points_rms_px / np.sqrt(2.0 * spare), fit.curves_rms_px / np.sqrt(spare)]
+    points, curves = (float(mine or other) for mine, other in (found, found[::-1]))
+    if not points > 0.0:
+        raise InputError("the calibration found no noise at all: advice would promise miracles")
+    return Weighting(points, curves, "trivial")
+
+
+def _board(targets: Mapping[str, Target], board: Target | None) -> tuple[str, Target]:
+    """The board to show, and a name for it."""
+    for name, target in targets.items():
+        if target.kind == "checkerboard" and board in (None, target):
+            return name, target
+    name = "board"
+    while name in targets:
+        name += "_"
+    return name, board or BOARD
+
+
+def _promise(measurement: Measurement, added: Array, ground: Ground, outlook: Outlook) -> Promise:
+    """Sure where phi is not followed along its profile, or would not have to be any more, whatever it is.
+
+    Where the camera would not see what is measured does not count: who measures will see.
+    """
+    after = outlook.after(added)
+    if outlook.profile is None:
+        return Promise(measurement, after)
+    valley = tuple(outlook.along_valley(lambda there: _told_there(measurement, ground, there, outlook)))
+    known = [sd for _, sd, _ in valley if np.isfinite(sd)]
+    if not known or max(known) > BENT or not np.isfinite(after.worst_mm):
+        return Promise(measurement, outlook.shrunk(added), rough=True)
+    return Promise(measurement, after, valley=tuple((phi, errors) for phi, _, errors in valley))
+
+
+def _told_there(measurement: Measurement, ground: Ground, there: Estimate, outlook: Outlook) -> Array:
+    """What it would say if everything were elsewhere: boards are held before the camera, wherever that is."""
+    here, other = (e.stations[outlook.today.station].cam_from_world for e in (ground.estimate, there))
+    return replace(ground, estimate=there).told_by(measurement.before(here, other))
+
+
+def _chosen(promises: Sequence[Promise], before: Errors, enough_mm: float) -> int | None:
+    """Number of the one with the least work that is good enough whatever phi is, or nearly as good as the best."""
+    worst = np.array([promise.after.worst_mm for promise in promises])
+    least = float(np.min(worst))
+    if before.worst_mm <= enough_mm or not least < _WORTH * before.worst_mm:
+        return None
+    surely = np.array([promise.worst_range_mm[1] for promise in promises])
+    nearly = least + min(_LARGER * least, _LESS * (before.worst_mm - least))
+    return int(np.argmax((worst <= nearly) | (surely <= enough_mm)))
+
+
+def _next(
+    first: int,
+    candidates: Sequence[Measurement],
+    told: Sequence[Array],
+    outlook: Outlook,
+    enough_mm: float,
+) -> Promise | None:
+    """What brings most after the first, of another kind; None where nothing does, or the first is good enough."""
+    kind = candidates[first].kind
+    others = [number for number, candidate in enumerate(candidates) if candidate.kind != kind]
+    promises = [Promise(candidates[number], outlook.after(told[first] + told[number])) for number in others]
+    chosen = _chosen(promises, outlook.after(told[first]), enough_mm) if promises else None
+    return None if chosen is None else promises[chosen]

@@ -1,0 +1,179 @@
+"""`ceres-cal advise`: what to measure next, and what it would bring in mm."""
+
+from __future__ import annotations
+
+from argparse import ArgumentParser, Namespace
+from collections.abc import Iterator
+from pathlib import Path
+from textwrap import wrap
+from typing import TYPE_CHECKING, Any
+
+from ceres_cal.cli.command import Answer, Command, parse_number
+from ceres_cal.errors import InputError
+
+if TYPE_CHECKING:
+    from ceres_cal.advice import Advice, Errors, Measurement, Promise
+    from ceres_cal.targets import Target
+
+_WIDTH = 100
+
+
+def _add_arguments(parser: ArgumentParser) -> None:
+    add = parser.add_argument
+    add("calibration", metavar="CALIBRATION", type=Path, help="file that `ceres-cal calibrate` wrote")
+    add("--height-mm", default="150", metavar="MM", help="height of what is to be located; default: 150, a robot's top")
+    add("--station", help="whose map; may be left out where there is only one")
+    add("--good-enough-mm", metavar="MM", help="the worst error that will do; nothing is advised where it is reached")
+    add(
+        "--board",
+        metavar="COLUMNSxROWSxMM",
+        help="the board that could be shown: inner corners and size of a square, such as 9x6x100; default: the "
+        "calibration's own, or that one",
+    )
+
+
+def _run(args: Namespace) -> Answer:
+    height_m = parse_number(args.height_mm, "--height-mm") / 1000.0
+    enough = None if args.good_enough_mm is None else parse_number(args.good_enough_mm, "--good-enough-mm")
+    if enough is not None and not enough > 0.0:
+        raise InputError(f"--good-enough-mm {args.good_enough_mm}: give a number of millimetres above 0")
+    board = None if args.board is None else _board(args.board)
+    from ceres_cal.advice import advise
+    from ceres_cal.calibration import Calibration
+
+    calibration = Calibration.load(args.calibration)
+    if args.station is None and len(calibration.stations) > 1:
+        raise InputError(
+            f"{args.calibration} has several stations, name one: --station {' or '.join(calibration.stations)}"
+        )
+    try:
+        found = advise(calibration, args.station, height_m, enough, board)
+    except InputError as error:
+        raise InputError(f"{args.calibration}: {error}") from None
+    weak = [direction.words for direction in calibration.uncertainty.weak_directions]
+    return Answer(_data(found, weak), lambda: _text(found, weak))
+
+
+COMMANDS = (Command("advise", "what to measure next, and what it would bring in mm", _add_arguments, _run),)
+
+
+def _board(text: str) -> Target:
+    from ceres_cal.targets import checkerboard
+
+    parts = text.split("x")
+    if len(parts) != 3 or not (parts[0].isdecimal() and parts[1].isdecimal()):
+        raise InputError(f"--board {text!r}: write COLUMNSxROWSxMM, such as 9x6x100")
+    return checkerboard(int(parts[0]), int(parts[1]), parse_number(parts[2], f"--board {text!r}") / 1000.0)
+
+
+# ---- for people -----------------------------------------------------------------------------------------------------
+
+
+def _text(advice: Advice, weak: list[str]) -> str:
+    x, y = advice.worst_place_m
+    before, height = advice.before, f"{1e3 * advice.height_m:.0f} mm"
+    where = f" at ({x:.1f}, {y:.1f} m)" if before.worst_mm < float("inf") else ""
+    today = f"station {advice.station!r} at {height}: worst {_mm(before.worst_mm)}{where}, mean {_mm(before.mean_mm)}"
+    lines = [*_section("advice", _verdict(advice)), *_section("today", [today, *weak[:1]])]
+    lines += ["", f"{'worst':>9}  {'mean':>9}  would be left at {height} if you"]
+    for promise in advice.promises:
+        lines.append(f"{_mm(promise.after.worst_mm):>9}  {_mm(promise.after.mean_mm):>9}  {_headline(promise)}")
+        lines += [f"{'':24}{step}" for step in promise.measurement.steps]
+    return "\n".join(lines)
+
+
+def _verdict(advice: Advice) -> Iterator[str]:
+    """What to do, in a sentence or two."""
+    before, best, enough = advice.before, advice.best, advice.good_enough_mm
+    worst = f"the worst error at {1e3 * advice.height_m:.0f} mm"
+    if best is None:
+        if enough is not None and before.worst_mm <= enough:
+            yield f"nothing needs to be measured: {worst} is {_mm(before.worst_mm)}, and {enough:g} mm are good enough"
+        else:
+            left = _mm(advice.promises[0].after.worst_mm)
+            yield f"none of this is worth the work: {worst} is {_mm(before.worst_mm)}, and {left} at best afterwards"
+        return
+    yield f"{best.measurement.words}: {worst} falls from {_fall(before, best.after)}{_range(best)}"
+    yield from (f"  {step}" for step in best.measurement.steps)
+    if advice.then is not None:
+        yield f"and then {advice.then.measurement.words}: it falls to {_mm(advice.then.after.worst_mm)}"
+        yield from (f"  {step}" for step in advice.then.measurement.steps)
+    last = advice.then or best
+    if enough is not None and last.after.worst_mm > enough:
+        yield f"that is still more than the {enough:g} mm asked for: do more than one of these"
+
+
+def _headline(promise: Promise) -> str:
+    return f"{promise.measurement.words}{_range(promise)}"
+
+
+def _range(promise: Promise) -> str:
+    """What a promise that depends on phi may become; nothing where it hardly does."""
+    if promise.rough:
+        return " (roughly: phi stays open)"
+    low, high = promise.worst_range_mm
+    return f" ({_mm(low)} to {_mm(high)} over what phi may be)" if high > 1.1 * low else ""
+
+
+def _fall(before: Errors, after: Errors) -> str:
+    start = _mm(before.worst_mm)
+    return f"{start.removesuffix(' mm')} to {_mm(after.worst_mm)}"
+
+
+def _mm(value: float) -> str:
+    if value == float("inf"):
+        return "unknown"
+    return f"{value:.1f} mm" if value >= 0.95 else f"{value:.2f} mm"
+
+
+def _section(title: str, texts: list[str] | Iterator[str]) -> Iterator[str]:
+    lines = [line for text in texts for line in wrap(text, _WIDTH)]
+    return (f"{'' if number else title:10}{line}" for number, line in enumerate(lines))
+
+
+# ---- for scripts ----------------------------------------------------------------------------------------------------
+
+
+def _data(advice: Advice, weak: list[str]) -> dict[str, Any]:
+    """Everything; what is infinite, and so unknown, becomes null."""
+    return {
+        "station": advice.station,
+        "height_m": advice.height_m,
+        "good_enough_mm": advice.good_enough_mm,
+        "verdict": list(_verdict(advice)),
+        "today": {**vars(advice.before), "worst_place_m": list(advice.worst_place_m), "weak_directions": weak},
+        "best": None if advice.best is None else advice.promises.index(advice.best),
+        "then": None if advice.then is None else _promise_data(advice.then),
+        "promises": [_promise_data(promise) for promise in advice.promises],
+    }
+
+
+def _promise_data(promise: Promise) -> dict[str, Any]:
+    return {
+        **_measurement_data(promise.measurement),
+        **vars(promise.after),
+        "worst_range_mm": list(promise.worst_range_mm),
+        "rough": promise.rough,
+        "over_phi": [{"phi_px": phi, **vars(errors)} for phi, errors in promise.valley],
+    }
+
+
+def _measurement_data(measurement: Measurement) -> dict[str, Any]:
+    """The measurement as files of observations have its parts."""
+    from dataclasses import asdict
+
+    from ceres_cal.observations import prior_to_json
+
+    return {
+        "kind": measurement.kind,
+        "words": measurement.words,
+        "steps": list(measurement.steps),
+        "priors": [prior_to_json(prior) for prior in measurement.priors],
+        "targets": {name: target.spec for name, target in measurement.targets.items()},
+        "tolerances": {name: asdict(tolerance) for name, tolerance in measurement.tolerances.items()},
+        "placements": {
+            name: {"rotation": pose.rotation.tolist(), "translation_m": pose.translation.tolist()}
+            for name, pose in measurement.placements.items()
+        },
+        "views": [asdict(plan) for plan in measurement.views],
+    }
