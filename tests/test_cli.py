@@ -91,6 +91,7 @@ def test_help_lists_every_command(say: Say) -> None:
         "detect field",
         "calibrate",
         "diagnose",
+        "advise",
         "locate",
         "project",
         "simulate",
