@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from ceres_cal.diagnostics import Choice, Finding, HeldOut, Noise
+from ceres_cal.report.grounds import is_against
 from ceres_cal.report.material import Material
 from ceres_cal.report.page import Card, Chapter, Piece, Table, Text
 from ceres_cal.report.words import DASH, count, fixed, grouped, mm, powered, short, signed
@@ -30,8 +31,8 @@ def findings(material: Material, choice: Choice | None) -> Chapter:
             )
         )
     if diagnosis.findings:
-        pieces.append(Text(f"What is wrong with the model first, then the rest, each by size. {tested}"))
-        ordered = sorted(diagnosis.findings, key=lambda one: not one.is_model_error)
+        pieces.append(Text(f"What is wrong with the calibration first, then the rest, each by size. {tested}"))
+        ordered = sorted(diagnosis.findings, key=lambda one: not is_against(one))
         pieces += [_card(one) for one in ordered[:_MOST_CARDS]]
         pieces += _others(ordered[_MOST_CARDS:])
     else:
@@ -60,7 +61,7 @@ def _card(finding: Finding) -> Card:
     facts.append(f"false alarm: {_chance(finding.log10_p)}")
     facts += [f"{one.name} {one.value:+.3g} ± {short(one.sd)} {one.unit}".strip() for one in finding.amounts]
     return Card(
-        "no" if finding.is_model_error else "care", _sentence(finding.sentence), _sentence(finding.advice), tuple(facts)
+        "no" if is_against(finding) else "care", _sentence(finding.sentence), _sentence(finding.advice), tuple(facts)
     )
 
 

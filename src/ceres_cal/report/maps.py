@@ -46,14 +46,15 @@ def levels_of(maps: tuple[FieldMap, ...]) -> Array:
 def map_picture(material: Material, station: str, number: int) -> Picture:
     """One map of one station; the colours are the same on both of its heights."""
     maps = material.maps[station]
-    found, levels = maps[number], levels_of(maps)
+    found, drawn = maps[number], material.drawn_maps[station][number]
+    levels = levels_of((*maps, *material.drawn_maps[station]))
     where = "On the floor" if found.height_m == 0.0 else f"At {1e3 * found.height_m:.0f} mm, robot height"
     border = material.border(station, found.height_m)
     paint = [line[:, :2] for line in material.paint()]
     camera = material.calibration.estimate.camera_at(station).position
 
     def draw(axes: Axes, width_in: float) -> None:
-        _fill(axes, found, levels)
+        _fill(axes, drawn, levels)
         for line in paint:
             axes.plot(*line.T, color="white", linewidth=1.8, alpha=0.8)
             axes.plot(*line.T, color=QUIET, linewidth=0.6)

@@ -87,14 +87,19 @@ class Material:
         """Of each placed station, at HEIGHTS_M."""
         if self.known is None:
             return {}
-        return {name: tuple(self._map(self.known, name, h) for h in HEIGHTS_M) for name in self.placed}
+        return {name: tuple(self.known.map_sd_mm(name, h) for h in HEIGHTS_M) for name in self.placed}
 
-    def _map(self, known: Uncertainty, station: str, height_m: float) -> FieldMap:
-        found = known.map_sd_mm(station, height_m)
-        if self.observations.stations[station] in known.posterior.profiles:  # each place takes long there
+    @cached_property
+    def drawn_maps(self) -> dict[str, tuple[FieldMap, ...]]:
+        """The same on the finer grid that is drawn; what is said in numbers is the maps' own, as everywhere."""
+        return {name: tuple(self._finer(one) for one in maps) for name, maps in self.maps.items()}
+
+    def _finer(self, found: FieldMap) -> FieldMap:
+        known = self.calibration.uncertainty
+        if self.observations.stations[found.station] in known.posterior.profiles:  # each place takes long there
             return found
         x, y = (np.linspace(axis[0], axis[-1], _FINER * (len(axis) - 1) + 1) for axis in (found.x_m, found.y_m))
-        return known.map_sd_mm(station, height_m, x, y)
+        return known.map_sd_mm(found.station, found.height_m, x, y)
 
     @cached_property
     def seams(self) -> tuple[Seam, ...]:

@@ -7,22 +7,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ceres_cal.report.grounds import CARE_MM, GOOD_MM, grounds, level_of, misfit_mm, model_error_mm, worst
 from ceres_cal.report.material import HEIGHTS_M, Material
 from ceres_cal.report.page import Chapter, Piece, Points, Text, Tile, Tiles
-from ceres_cal.report.words import bounds, count, fixed, listed, metres, mm, short
+from ceres_cal.report.words import bounds, count, fixed, metres, mm, short
 from ceres_cal.uncertainty import FieldMap, Verdict
 
-GOOD_MM, CARE_MM = 10.0, 50.0
-"""95 % of located points nearer than the first is good (the width of a painted line), than the second to be used with
-care, beyond it not to be used."""
 _MEANING = (
     "The headline holds for 95 % of the points located at the worst place that a camera sees; ± is a standard "
     "deviation. Both are the calibration's own share: the noise of the pixel that is asked about comes on top. Green: "
     f"up to {GOOD_MM:g} mm, a painted line's width; amber: up to {CARE_MM:g} mm."
 )
-_MANY_OUTLIERS = 0.3
-_MOST_LINES = 6
-_ORDER = ("good", "care", "no")
 
 
 @dataclass(frozen=True)
@@ -56,44 +51,36 @@ def reaches(material: Material) -> tuple[Reach, ...]:
     return tuple(found)
 
 
-def level_of(radius_mm: float) -> str:
-    """By GOOD_MM and CARE_MM; nothing seen is nothing to trust."""
-    return "good" if radius_mm <= GOOD_MM else "care" if radius_mm <= CARE_MM else "no"
-
-
-def worst(*levels: str) -> str:
-    """The last of them in the order good, care, no."""
-    return max(levels, key=_ORDER.index)
-
-
 def verdict(material: Material) -> Chapter:
     """The chapter, its level the colour of the page's first box."""
-    grounds = tuple(_grounds(material))
+    reasons = tuple(grounds(material))
     found = reaches(material)
-    level, sentence = _sentence(material, found, worst("good", *(mark for mark, _ in grounds if mark)))
-    pieces: list[Piece] = [Tiles(tuple(_tiles(material))), Points(grounds)]
+    level, sentence = _sentence(material, found, worst("good", *(mark for mark, _ in reasons if mark)))
+    pieces: list[Piece] = [Tiles(tuple(_tiles(material))), Points(reasons)]
     if found:
         pieces.append(Text(_MEANING, "note"))
     return Chapter("verdict", sentence, tuple(pieces), level)
 
 
-def _sentence(material: Material, found: tuple[Reach, ...], grounds: str) -> tuple[str, str]:
+def _sentence(material: Material, found: tuple[Reach, ...], reasons: str) -> tuple[str, str]:
     """Level and headline."""
     if material.known is None:
         return "no", "Not to be used: nothing was minimised, this is the paper's closed form alone."
     if not found:
-        level = worst(grounds, *(_level_of_verdict(verdict) for verdict in _focal(material)))
+        level = worst(reasons, *(_level_of_verdict(verdict) for verdict in _focal(material)))
         how = {"good": "can be trusted", "care": "are to be used with care", "no": "cannot be trusted"}[level]
         return level, f"The intrinsics {how}. No station sees a field: places in the world cannot be told."
     floor, above = found
     told = " and ".join(f"to {mm(r.radius_mm)} {r.where}" for r in found if r.level != "no")
-    if grounds == "no" or floor.level == "no":
+    if misfit_mm(material) > GOOD_MM:
+        return "no", f"It does not hold: on these new data it is off by {mm(misfit_mm(material))} (rms)."
+    if reasons == "no" or floor.level == "no":
         return "no", "Do not trust this calibration" + (f", though its sigmas promise places {told}." if told else ".")
     if above.level == "no":
         how = f"are known to {mm(above.radius_mm)} only" if np.isfinite(above.radius_mm) else "cannot be told"
         but = _but(material) or "."
         return "care", f"Trust it on the floor alone, to {mm(floor.radius_mm)}: places {above.where} {how}{but}"
-    level = worst(grounds, floor.level, above.level)
+    level = worst(reasons, floor.level, above.level)
     if level == "good":
         return level, f"This calibration can be trusted: {told}."
     return level, f"Use it with care: {told}{_but(material) or '.'}"
@@ -101,14 +88,10 @@ def _sentence(material: Material, found: tuple[Reach, ...], grounds: str) -> tup
 
 def _but(material: Material) -> str:
     """The end of a headline whose numbers do not contain everything, "" where they do."""
-    wrong = model_error_mm(material)
+    off, wrong = misfit_mm(material), model_error_mm(material)
+    if off:
+        return f", but on these new data it is off by {mm(off)} (rms)."
     return f", but the model is wrong by {mm(wrong)} (rms) beside that." if wrong else ""
-
-
-def model_error_mm(material: Material) -> float:
-    """The largest effect of what is wrong with the model, rms mm; 0 where nothing is known to be."""
-    wrong = [finding.effect_mm for finding in material.diagnosis.findings if finding.is_model_error]
-    return float(np.nanmax([0.0, *wrong]))
 
 
 # ---- large numbers --------------------------------------------------------------------------------------------------
@@ -166,56 +149,3 @@ def _focal_tile(found: Verdict) -> Tile:
     value = f"± {short(100.0 * found.relative)}" if known else "unknown"
     note = f"{fixed(found.value, 1)} px, 95 %: {bounds(found)}"
     return Tile(f"phi of {found.key.owner}", value, "%" if known else "", note, _level_of_verdict(found))
-
-
-# ---- grounds --------------------------------------------------------------------------------------------------------
-
-
-def _grounds(material: Material) -> Iterator[tuple[str, str]]:
-    """What speaks for and against it, each with its level."""
-    calibration, diagnosis = material.calibration, material.diagnosis
-    if calibration.rounds:
-        yield (
-            ("good", "The solve came to rest.")
-            if calibration.converged
-            else (
-                "no",
-                "The solve did not come to rest: raise --max-iterations.",
-            )
-        )
-    yield from _of_findings(material)
-    out = 1.0 - float(np.mean(diagnosis.table.inlier)) if len(diagnosis.table) else 0.0
-    if out > _MANY_OUTLIERS:
-        yield "care", f"{100.0 * out:.0f} % of the observations were taken out: check labels, dimensions and the lens."
-    if material.known is not None:
-        weak = [direction.words for direction in material.known.weak_directions]
-        mark = "" if material.maps else "care"  # what they do to places is in the maps
-        yield from ((mark, f"{words[0].upper()}{words[1:]}.") for words in weak[:_MOST_LINES])
-        if len(weak) > _MOST_LINES:
-            yield mark, f"{len(weak) - _MOST_LINES} more such directions: see the numbers."
-        if not weak:
-            yield "good", "Every number of the cameras and stations is known to 1 % or better."
-        lost = material.known.unknown_placements
-        if lost:
-            named = listed([f"{' and '.join(parts)} of {name}" for name, parts in lost.items()], 3)
-            yield "", f"Not known of placements: {named}. The cameras do not need it."
-    yield from (("care", f"{text[0].upper()}{text[1:]}.") for text in calibration.warnings)
-
-
-def _of_findings(material: Material) -> Iterator[tuple[str, str]]:
-    diagnosis = material.diagnosis
-    if not diagnosis.findings:
-        yield "good", "What the model leaves over looks like noise."
-    elif not diagnosis.model_error:
-        yield "", f"{count(len(diagnosis.findings), 'finding')} below; none says that the model is wrong."
-    else:
-        wrong = [finding for finding in diagnosis.findings if finding.is_model_error]
-        level = "no" if model_error_mm(material) > CARE_MM else "care"
-        kinds = listed(list(dict.fromkeys(f"{finding.kind} ({finding.subject})" for finding in wrong)), 4)
-        yield (
-            level,
-            (
-                f"The model is wrong: {kinds}; up to {mm(model_error_mm(material))} rms. No standard deviation on this "
-                "page contains that."
-            ),
-        )

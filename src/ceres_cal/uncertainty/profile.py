@@ -115,7 +115,10 @@ class Profile:
         deviations `sds` (N, m) across it; infinite on a side where the valley is open and they grow on.
         """
         weights, widths = self.reaches(half_width)
-        middle, spread = weights @ values, widths[:, None] * (weights @ sds)
+        known = np.isfinite(sds)
+        spread = widths[:, None] * (weights @ np.where(known, sds, 0.0))
+        spread[weights @ ~known > 0.0] = np.inf  # no 0 times infinity
+        middle = weights @ values
         low, high = np.min(middle - spread, axis=0), np.max(middle + spread, axis=0)
         for is_open, end in ((self.open_below, 0), (self.open_above, -1)):
             if is_open:
