@@ -43,7 +43,14 @@ def test_courses_are_where_the_camera_sees_the_paint(shot: script.Shot) -> None:
     left = course.pixels + 2.0 * course.normals
     assert np.allclose(script.distances_px(shot, course.curve, left), 2.0, atol=0.02)  # the circle bends
     circle = course.curve == FIELD.curve_names.index("CenterCircle")
-    assert np.median(np.abs(course.curvature[circle])) == pytest.approx(1.0 / 100.0, rel=0.15)
+    floor = 0.5 * np.column_stack([np.cos(course.s[circle]), np.sin(course.s[circle]), np.zeros(np.sum(circle))])
+    assert np.allclose(shot.camera.project(floor), course.pixels[circle])
+    a, b, c = course.pixels[circle][:-2], course.pixels[circle][1:-1], course.pixels[circle][2:]
+    sides = [np.linalg.norm(difference, axis=1) for difference in (b - a, c - b, c - a)]
+    area = 0.5 * np.abs((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0])
+    in_a_row = sides[2] < 20.0
+    expected = (4.0 * area / np.prod(sides, axis=0))[in_a_row]  # of the circle through three places
+    assert np.abs(course.curvature[circle])[1:-1][in_a_row] == pytest.approx(expected, rel=0.03)
     assert np.max(np.abs(course.curvature[~circle])) < 1.5e-3
     steps = np.linalg.norm(np.diff(course.pixels, axis=0), axis=1)[np.diff(course.curve) == 0]
     assert np.median(steps) == pytest.approx(SPACING_PX, rel=0.02)

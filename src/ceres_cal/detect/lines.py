@@ -23,7 +23,8 @@ _SEARCH_STEP_PX = 0.5
 _BAND_PX = 3.0  # of background, to either side of the paint, in the search
 _SHAPE_WINDOWS = 150
 _LEAST_CLARITY = 4.0  # contrast over noise
-_LEAST_CONTRAST, _LEAST_OF_NEARBY = 0.15, 0.45  # shares of the usual contrast, and of that nearby
+_LEAST_CONTRAST = 0.15  # share of the usual contrast
+_OF_NEARBY = 0.45, 1.7  # least and most share of the contrast nearby: a robot's marker is brighter than paint in shadow
 _NOISY = 3.0  # times the usual misfit: something else is in the window
 _NEARBY = 4  # places to each side that a place is compared with
 _FAR, _FAR_PX = 5.0, 0.25  # off its neighbours: standard deviations, and at least so much
@@ -173,7 +174,8 @@ def _is_paint(course: Course, fits: Profiles, contrast: Array) -> Mask:
         return clear
     usual = float(np.median(contrast[clear]))
     clear &= contrast > _LEAST_CONTRAST * usual
-    clear &= contrast > _LEAST_OF_NEARBY * _medians(np.where(clear, contrast, np.nan), course.curve)
+    nearby = _medians(np.where(clear, contrast, np.nan), course.curve)
+    clear &= (contrast > _OF_NEARBY[0] * nearby) & (contrast < _OF_NEARBY[1] * nearby)
     return np.asarray(clear & (fits.noise < _NOISY * np.median(fits.noise[clear])))
 
 
