@@ -115,17 +115,20 @@ class Outlook:
         """phi (px), its relative standard deviation and the errors if that is what it is and information `told_at` is
         added, over what phi may be by its 95 % bounds.
 
-        There the field itself is taken to tell phi nothing but the valley's direction, which is on the careful side.
+        There the observations of today tell everything but phi as the valley has it, and phi by the parabola that fits
+        the valley best.
         """
         profile = self.profile
         assert profile is not None
         at = _indices(profile.keys, self.posterior.keys)
         own, limits = _indices(self.keys, profile.keys), sigma_limits(profile.keys)
         tangents = np.gradient(profile.steps[:, 1:], profile.steps[:, 0], axis=0)
+        bend = max(float(np.polyfit(np.log(profile.phi), profile.rises, 2)[0]), 0.0) if len(profile.phi) > 2 else 0.0
         for place, there in self.possible:
             across, along = profile.information[place], tangents[place]
             coupling = -across @ along
-            told = np.block([[np.atleast_2d(along @ across @ along), coupling[None]], [coupling[:, None], across]])
+            phi = along @ across @ along + bend / profile.phi[place] ** 2
+            told = np.block([[np.atleast_2d(phi), coupling[None]], [coupling[:, None], across]])
             known = _part(Spread.of(told + told_at(there)[np.ix_(at, at)], limits), own)
             errors = _errors(known, _slopes(there, self.today, self.keys))
             yield float(profile.phi[place]), self._phi_sd(there, known), errors
