@@ -25,7 +25,7 @@ from ceres_cal.calibration import Calibration
 from ceres_cal.camera import Camera
 from ceres_cal.errors import CalibrationError
 from ceres_cal.lens import Radial
-from ceres_cal.moves import refit
+from ceres_cal.moves import check, refit
 from ceres_cal.moves.carried import layouts, make_plan
 from ceres_cal.observations import Observations
 from ceres_cal.parameters import Estimate
@@ -215,9 +215,40 @@ def _from_scratch(observations: Observations, seed: int) -> Calibration | None:
         return None
 
 
+# ---- does it still hold? --------------------------------------------------------------------------------------------
+
+LINE_POINTS = 100
+ALARMS = 0.01
+SMALL_TILT = Pose.looking(HOME.position, rotation_exp((np.deg2rad(0.05), 0.0, 0.0)) @ HOME.rotation)
+SMALL_SHIFT = Pose.looking(HOME.position + np.array([0.003, 0.0, 0.0]), HOME.rotation)
+
+
+def check_case(runs: int) -> Iterator[Row]:
+    """How often an unmoved camera is called moved, and small moves are found, from 100 line points."""
+    false = _alarms(HOME, 2 * runs, 0)
+    error = float(np.sqrt(ALARMS * (1.0 - ALARMS) / (2 * runs)))
+    yield Row("check", "false alarms at 1 %", false, error, 0.005, 0.02, f"{2 * runs} unmoved cases")
+    count = max(runs // 2, 1)
+    for what, pose in (("0.05 deg of tilt found", SMALL_TILT), ("3 mm at 4 m found", SMALL_SHIFT)):
+        found = _alarms(pose, count, 1)
+        error = float(np.sqrt(max(found * (1.0 - found), 0.01 / count) / count))
+        yield Row("check", what, found, error, least=0.99, note=f"{count} cases")
+
+
+def _alarms(pose: Pose, runs: int, kind: int) -> float:
+    """Share of cases in which the calibration is said not to hold, each with a calibration of its own."""
+    alarms = 0
+    for seed in range(runs):
+        simulation = seen(pose, DAY, 10_000 * (kind + 1) + seed, spacing_m=0.12)
+        observations = thinned(simulation.observations, (), LINE_POINTS, seed)
+        alarms += not check(calibrated(seed), observations, ALARMS).holds
+    return alarms / runs
+
+
 CASES: dict[str, Callable[[int], Iterator[Row]]] = {
     "moves": moves_case,
     "bound": bound_case,
+    "check": check_case,
 }
 
 

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from ceres_cal.errors import DegenerateError as DegenerateError
     from ceres_cal.errors import InputError as InputError
     from ceres_cal.errors import SolutionError as SolutionError
+    from ceres_cal.moves import check as check
     from ceres_cal.moves import refit as refit
     from ceres_cal.observations import Observations as Observations
     from ceres_cal.observations import Prior as Prior
@@ -29,6 +30,7 @@ _HOME = {
     "InputError": "errors",
     "SolutionError": "errors",
     "refit": "moves",
+    "check": "moves",
     "Observations": "observations",
     "Prior": "observations",
     "Options": "parameters",

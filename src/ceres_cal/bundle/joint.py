@@ -25,7 +25,8 @@ from ceres_cal.transforms import Array, Pose, left_jacobian, rotation_exp, rotat
 
 def offsets(joint: JointPrior, estimate: Estimate) -> Array:
     """(K,) estimate less mean, along the joint prior's keys."""
-    stations = {name: Station(estimate.stations[name].camera, pose) for name, pose in joint.stations.items()}
+    here = estimate.stations
+    stations = {name: Station(here[name].camera, pose) for name, pose in joint.stations.items() if name in here}
     names, values = estimate.structure.names, estimate.structure.values
     mean = [joint.structure.get(name, value) for name, value in zip(names, values.tolist(), strict=True)]
     reference = replace(

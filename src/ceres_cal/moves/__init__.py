@@ -1,5 +1,6 @@
 """After a move: refit, check and compare calibrations."""
 
+from ceres_cal.moves.checking import FALSE_ALARMS, Check, StationCheck, check
 from ceres_cal.moves.refitting import movements, refit
 
-__all__ = ["movements", "refit"]
+__all__ = ["FALSE_ALARMS", "Check", "StationCheck", "check", "movements", "refit"]

@@ -14,7 +14,7 @@ from ceres_cal.joint import JointPrior
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.parameters import Estimate, Layout, Options, Station, intrinsic_names
 from ceres_cal.quantities import Key, camera_keys, pose_keys
-from ceres_cal.structure import make_structure
+from ceres_cal.structure import Structure, make_structure
 from ceres_cal.transforms import Pose
 
 WHAT = ("pose", "pose-only", "zoom", "iris", "everything")
@@ -78,7 +78,7 @@ def make_plan(
         raise InputError(f"what={what!r} is unknown: choose one of {', '.join(WHAT)}")
     if calibration.posterior is None:
         raise InputError("the calibration does not say how well it is known: calibrate again")
-    _require_same_things(calibration, observations)
+    require_same_things(calibration, observations)
     stations = observations.stations
     chosen = frozenset(stations if moved is None else moved)
     for name in chosen - stations.keys():
@@ -97,7 +97,8 @@ def make_plan(
     return Plan(calibration, observed, options, what, stations, chosen, stays, hold_others, prior, scales)
 
 
-def _require_same_things(calibration: Calibration, observations: Observations) -> None:
+def require_same_things(calibration: Calibration, observations: Observations) -> None:
+    """Raise an error where cameras, image sizes or targets are not those that were calibrated."""
     for name, size in observations.cameras.items():
         if name not in calibration.cameras:
             known = ", ".join(map(repr, calibration.cameras))
@@ -131,13 +132,18 @@ def prior_for(calibration: Calibration, observations: Observations, stays: froze
         return _among(before, calibration, stays)
     posterior = calibration.posterior
     assert posterior is not None
-    kept = [i for i, key in enumerate(posterior.keys) if _is_kept(key, stays)]
-    keys, estimate = tuple(posterior.keys[i] for i in kept), calibration.estimate
+    return kept_prior(calibration, [i for i, key in enumerate(posterior.keys) if _is_kept(key, stays)], stays)
+
+
+def kept_prior(calibration: Calibration, kept: Sequence[int], stations: frozenset[str]) -> JointPrior:
+    """What the posterior says of the keys at these places, all others integrated out."""
+    posterior, estimate = calibration.posterior, calibration.estimate
+    assert posterior is not None
     return JointPrior(
-        keys,
+        tuple(posterior.keys[i] for i in kept),
         posterior.marginal(np.array(kept, dtype=np.int64)),
         estimate.cameras,
-        {name: estimate.stations[name].cam_from_world for name in stays},
+        {name: estimate.stations[name].cam_from_world for name in stations},
         dict(zip(estimate.structure.names, estimate.structure.values.tolist(), strict=True)),
     )
 
@@ -206,12 +212,15 @@ def first_estimate(plan: Plan, poses: dict[str, Pose], placements: dict[str, Pos
     old = plan.calibration.estimate
     stations = {name: old.stations[name] for name in old.stations if name in plan.stays}
     stations |= {name: Station(plan.stations[name], pose) for name, pose in poses.items()}
-    structure = make_structure(plan.observations.targets, plan.options.tolerances)
+    structure = with_structure(old, plan.observations, plan.options)
+    return Estimate(old.cameras, _ordered(stations, [*old.stations, *plan.stations]), placements, structure)
+
+
+def with_structure(old: Estimate, observations: Observations, options: Options) -> Structure:
+    """The targets as they were found built, in the order of the observations' targets; new ones as drawn."""
+    structure = make_structure(observations.targets, options.tolerances)
     known = dict(zip(old.structure.names, old.structure.values.tolist(), strict=True))
-    values = np.array([known.get(name, 0.0) for name in structure.names])
-    return Estimate(
-        old.cameras, _ordered(stations, [*old.stations, *plan.stations]), placements, structure.with_values(values)
-    )
+    return structure.with_values(np.array([known.get(name, 0.0) for name in structure.names]))
 
 
 def _ordered(stations: dict[str, Station], names: Sequence[str]) -> dict[str, Station]:

@@ -87,7 +87,7 @@ class Uncertainty:
             InputError: no such station, none named where there are several, or it was held as the world.
         """
         name = self._station(station)
-        return field_map(self.estimate, self.posterior, name, height_m, *self._grid(x_m, y_m))
+        return field_map(self.estimate, self.posterior, name, height_m, *self.grid(x_m, y_m))
 
     def seam_sd_mm(
         self,
@@ -102,7 +102,7 @@ class Uncertainty:
         Raises:
             InputError: see `map_sd_mm`.
         """
-        return seam_map(self.estimate, self.posterior, first, second, height_m, *self._grid(x_m, y_m))
+        return seam_map(self.estimate, self.posterior, first, second, height_m, *self.grid(x_m, y_m))
 
     def _station(self, name: str | None) -> str:
         if name is None and len(self.estimate.stations) == 1:
@@ -112,8 +112,12 @@ class Uncertainty:
             raise InputError(f"station {name!r} is not there: there are {names}")
         return name
 
-    def _grid(self, x_m: ArrayLike | None, y_m: ArrayLike | None) -> tuple[Array, Array]:
-        """A grid over the box around what does not move; without such a target over what the cameras look at."""
+    def grid(self, x_m: ArrayLike | None = None, y_m: ArrayLike | None = None) -> tuple[Array, Array]:
+        """x and y of a grid over the box around what does not move, where they are not given.
+
+        Raises:
+            InputError: there is nothing that does not move.
+        """
         if x_m is not None and y_m is not None:
             return np.asarray(x_m, dtype=float), np.asarray(y_m, dtype=float)
         box = [_corners(target) for target in self.targets.values() if target.kind not in _MOVABLE]
