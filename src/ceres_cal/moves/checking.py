@@ -30,7 +30,7 @@ from ceres_cal.uncertainty.maps import shown_pixels
 
 FALSE_ALARMS = 0.01
 HEIGHTS_M = (0.0, 0.15)
-_INLIER_SIGMA = 5.0
+_INLIER_SIGMA = 3.5
 _LEAST_SHARE = 0.5  # of observations that fit somewhere; with fewer nothing is understood
 _MANY_OUTLIERS = 0.25
 _WILL_DO = 10.8  # fall of twice the cost that a phi at its place exceeds one time in a thousand
