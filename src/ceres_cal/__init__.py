@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from ceres_cal.errors import InputError as InputError
     from ceres_cal.errors import SolutionError as SolutionError
     from ceres_cal.moves import check as check
+    from ceres_cal.moves import compare as compare
     from ceres_cal.moves import refit as refit
     from ceres_cal.observations import Observations as Observations
     from ceres_cal.observations import Prior as Prior
@@ -31,6 +32,7 @@ _HOME = {
     "SolutionError": "errors",
     "refit": "moves",
     "check": "moves",
+    "compare": "moves",
     "Observations": "observations",
     "Prior": "observations",
     "Options": "parameters",

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from ceres_cal.cli.calibrate import COMMANDS as CALIBRATE
 from ceres_cal.cli.check import COMMANDS as CHECK
 from ceres_cal.cli.command import Command, print_answer
+from ceres_cal.cli.compare import COMMANDS as COMPARE
 from ceres_cal.cli.detect import COMMANDS as DETECT
 from ceres_cal.cli.locate import COMMANDS as LOCATE
 from ceres_cal.cli.refit import COMMANDS as REFIT
@@ -19,7 +20,9 @@ from ceres_cal.cli.simulate import COMMANDS as SIMULATE
 from ceres_cal.cli.targets import COMMANDS as TARGETS
 from ceres_cal.errors import CalibrationError, InputError, SolutionError
 
-COMMANDS = {command.name: command for command in (*DETECT, *CALIBRATE, *REFIT, *CHECK, *LOCATE, *SIMULATE, *TARGETS)}
+COMMANDS = {
+    command.name: command for command in (*DETECT, *CALIBRATE, *REFIT, *CHECK, *COMPARE, *LOCATE, *SIMULATE, *TARGETS)
+}
 _BEGINNINGS = {"", *(name.partition(" ")[0] for name in COMMANDS if " " in name)}
 _MOST_LETTERS = 200  # of an error that nobody wrote for people
 _INTERRUPTED, _PIPE_CLOSED = 130, 141  # what a shell reports of a program that SIGINT or SIGPIPE ended

@@ -27,6 +27,7 @@ from ceres_cal.spread import Spread
 from ceres_cal.transforms import Array, Pose
 from ceres_cal.uncertainty import Posterior
 from ceres_cal.uncertainty.maps import shown_pixels
+from ceres_cal.uncertainty.uncertainty import field_grid
 
 FALSE_ALARMS = 0.01
 HEIGHTS_M = (0.0, 0.15)
@@ -301,7 +302,7 @@ def _answer(
 
 def _field_grid(case: _Case, height_m: float) -> Array:
     """Places (N, 3) of the map's grid that the station sees."""
-    grid = case.calibration.uncertainty.grid()
+    grid = field_grid(case.calibration.targets)
     x, y = (part.ravel() for part in np.meshgrid(*grid))
     places_seen = np.column_stack([x, y])
     shown = np.isfinite(shown_pixels(case.estimate, case.name, places_seen, height_m)[:, 0])
