@@ -29,7 +29,7 @@ def test_equals_differ_nowhere(calibration: Calibration) -> None:
 
 
 def test_repetitions_differ_as_expected(calibration: Calibration) -> None:
-    """What two calibrations of the same camera differ by, over what they are expected to: 1, and every probability is as
+    """What two calibrations of the same camera differ by, over what they are expected to: 1, and any probability is as
     likely.
     """
     every = [calibrated_at_home(seed) for seed in range(1, 25)]
