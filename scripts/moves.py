@@ -48,6 +48,7 @@ from ceres_cal.uncertainty.maps import locate_slopes, shown_pixels
 
 CAMERA = Camera((1280, 960), 868.0, (646.5, 473.8), Radial((-5.2e-5, 6.1e-7)))
 HOME = overhead_pose(-2.27, -0.12, 4.02, tilt_x_deg=1.8, tilt_y_deg=-2.4, yaw_deg=90.6)
+MOVED = overhead_pose(-2.0, 0.06, 4.0, tilt_x_deg=-3.1, tilt_y_deg=1.2, yaw_deg=88.9)
 NOISE = Disturbance(points_sigma_px=0.3, curves_sigma_px=0.3)
 DAY = replace(NOISE, outliers=0.04, wrong_labels=0.01)
 MOST_SIGMA = 5.0

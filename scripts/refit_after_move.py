@@ -3,9 +3,10 @@
     python scripts/refit_after_move.py calibration.json new.json                  # these files, once
     python scripts/refit_after_move.py calibration.json --watch incoming/         # every file that appears there
 
-Every event is one line of JSON on standard output, or in --log: "holds", "refitted", "refused" (nothing was changed,
-the reason says what to do) or "unreadable". The calibration is replaced in one step, the one before is kept in previous/
-beside it. Exits with 0 when the calibration is right at the end, 3 when the last file was refused or unreadable.
+Every event is one line of JSON on standard output, or in --log: "holds", "refitted", "refused" (nothing was changed;
+the reason says what to do) or "unreadable". The calibration is replaced in one step, and the one before is kept in
+previous/ beside it. Exits with 0 when the calibration is right at the end, 3 when the last file was refused or could
+not be read.
 """
 
 from __future__ import annotations

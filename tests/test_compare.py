@@ -5,15 +5,12 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from moves import CAMERA, DAY, HOME, seen
+from moves import CAMERA, DAY, HOME, MOVED, seen
 from moves import calibrated as calibrated_at_home
 
 from ceres_cal.calibration import Calibration
 from ceres_cal.errors import InputError
 from ceres_cal.moves import compare, picture, refit
-from ceres_cal.simulate import overhead_pose
-
-MOVED = overhead_pose(-2.0, 0.06, 4.0, -3.1, 1.2, 88.9)
 
 
 @pytest.fixture(scope="module")

@@ -26,6 +26,7 @@ FLOORS = {
     "observations": 1,
     "sights": 1,
     "kernels": 1,
+    "table": 2,
     "structure": 2,
     "joint": 2,
     "closed_forms": 2,

@@ -12,6 +12,7 @@ from moves import (
     DAY,
     HOME,
     MOST_SIGMA,
+    MOVED,
     NOISE,
     TILTED,
     bound_case,
@@ -42,7 +43,6 @@ from ceres_cal.structure import Tolerance
 from ceres_cal.targets import ssl_field
 from ceres_cal.transforms import Pose, rotation_exp
 
-MOVED = overhead_pose(-2.0, 0.06, 4.0, -3.1, 1.2, 88.9)
 FAR = overhead_pose(-2.3, -1.9, 3.9, tilt_y_deg=-25.0, yaw_deg=90.0)
 
 

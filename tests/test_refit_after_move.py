@@ -11,16 +11,14 @@ from pathlib import Path
 
 import pytest
 import refit_after_move
-from moves import DAY, HOME, NOISE, seen
+from moves import DAY, HOME, MOVED, NOISE, seen
 from moves import calibrated as calibrated_at_home
 
 from ceres_cal.calibration import Calibration
 from ceres_cal.moves import check
 from ceres_cal.moves.labels import MIRRORED, relabelled
-from ceres_cal.simulate import overhead_pose
 
 ROOT = Path(__file__).resolve().parents[1]
-MOVED = overhead_pose(-2.0, 0.06, 4.0, -3.1, 1.2, 88.9)
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT / "src")}
 
 

@@ -17,11 +17,13 @@ from ceres_cal.cli.detect import COMMANDS as DETECT
 from ceres_cal.cli.locate import COMMANDS as LOCATE
 from ceres_cal.cli.refit import COMMANDS as REFIT
 from ceres_cal.cli.simulate import COMMANDS as SIMULATE
+from ceres_cal.cli.table import COMMANDS as TABLE
 from ceres_cal.cli.targets import COMMANDS as TARGETS
 from ceres_cal.errors import CalibrationError, InputError, SolutionError
 
 COMMANDS = {
-    command.name: command for command in (*DETECT, *CALIBRATE, *REFIT, *CHECK, *COMPARE, *LOCATE, *SIMULATE, *TARGETS)
+    command.name: command
+    for command in (*DETECT, *CALIBRATE, *REFIT, *CHECK, *COMPARE, *LOCATE, *TABLE, *SIMULATE, *TARGETS)
 }
 _BEGINNINGS = {"", *(name.partition(" ")[0] for name in COMMANDS if " " in name)}
 _MOST_LETTERS = 200  # of an error that nobody wrote for people
