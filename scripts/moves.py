@@ -9,7 +9,10 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
+import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -246,10 +249,76 @@ def _alarms(pose: Pose, runs: int, kind: int) -> float:
     return alarms / runs
 
 
+# ---- the same question twice, and how long it takes -----------------------------------------------------------------
+
+PHASES = """
+import sys, time
+marks = [time.perf_counter()]
+import ceres_cal.moves
+from ceres_cal.calibration import Calibration
+from ceres_cal.observations import Observations
+marks.append(time.perf_counter())
+old, new = Calibration.load(sys.argv[1]), Observations.load(sys.argv[2])
+marks.append(time.perf_counter())
+result = ceres_cal.moves.refit(old, new)
+marks.append(time.perf_counter())
+ceres_cal.moves.refit(old, new)
+marks.append(time.perf_counter())
+result.save(sys.argv[3])
+marks.append(time.perf_counter())
+print(*(b - a for a, b in zip(marks, marks[1:])))
+"""
+
+
+def time_case(runs: int) -> Iterator[Row]:
+    """`ceres-cal refit` from a cold process to the written file, with the kernels compiled before; and its parts."""
+    count = int(np.clip(runs, 2, 9))
+    with tempfile.TemporaryDirectory() as folder:
+        old, new, out = (str(Path(folder) / name) for name in ("old.json", "new.json", "out.json"))
+        calibrated(0).save(old)
+        seen(MOVED, DAY, 1).observations.save(new)
+        command = [sys.executable, "-c", "from ceres_cal.cli import main; raise SystemExit(main())"]
+        whole, processor = [], []
+        for _ in range(count):
+            begin, used = time.perf_counter(), os.times()
+            subprocess.run([*command, "refit", old, new, "-o", out], check=True, capture_output=True)
+            whole.append(time.perf_counter() - begin)
+            now = os.times()
+            processor.append(now.children_user + now.children_system - used.children_user - used.children_system)
+        note = f"processor {min(processor):.2f} s; the least of {count} runs"
+        yield Row("time", "ceres-cal refit, cold, s", min(whole), most=1.5, note=note)
+        parts = []
+        for _ in range(count):
+            done = subprocess.run([sys.executable, "-c", PHASES, old, new, out], check=True, capture_output=True)
+            parts.append([float(part) for part in done.stdout.split()])
+        imports, reading, first, again, writing = np.min(parts, axis=0)
+        yield Row("time", "of it: imports (numpy, numba, pyceres), s", imports)
+        yield Row("time", "of it: compiled kernels from their cache, s", first - again)
+        yield Row("time", "of it: the refit itself, s", again)
+        yield Row("time", "of it: reading and writing, s", reading + writing)
+
+
+def again_case(runs: int) -> Iterator[Row]:
+    """Refits of a refit with the same observations."""
+    worst = 0.0
+    count = min(runs, 100)
+    for seed in range(count):
+        observations = seen(random_move(seed), DAY, seed).observations
+        first = refit(calibrated(seed % 8), observations)
+        second = refit(first, observations)
+        posterior = first.posterior
+        assert posterior is not None
+        change = difference(second.estimate, first.estimate, posterior.keys) / posterior.sd
+        worst = max(worst, float(np.max(np.abs(change))))
+    yield Row("again", "largest change of any number, sigma", worst, most=1e-3, note=f"{count} refits of refits")
+
+
 CASES: dict[str, Callable[[int], Iterator[Row]]] = {
     "moves": moves_case,
     "bound": bound_case,
     "check": check_case,
+    "again": again_case,
+    "time": time_case,
 }
 
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -20,9 +21,11 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-import ceres_cal as cc
-from ceres_cal.files import read_bytes, write_bytes
-from ceres_cal.moves import FALSE_ALARMS, Check, movements
+os.environ.setdefault("GLOG_minloglevel", "3")  # what Ceres logs of a failed step is no error; it reads this once
+
+import ceres_cal as cc  # noqa: E402
+from ceres_cal.files import read_bytes, write_bytes  # noqa: E402
+from ceres_cal.moves import FALSE_ALARMS, Check, movements  # noqa: E402
 
 ROBOT_M = 0.15
 PATIENCE = 3  # times that a file is read before it counts as unreadable: it may still be on its way
