@@ -23,9 +23,9 @@ from typing import Any
 
 os.environ.setdefault("GLOG_minloglevel", "3")  # what Ceres logs of a failed step is no error; it reads this once
 
-import ceres_cal as cc  # noqa: E402
-from ceres_cal.files import read_bytes, write_bytes  # noqa: E402
-from ceres_cal.moves import FALSE_ALARMS, Check, movements  # noqa: E402
+import ceres_cal as cc
+from ceres_cal.files import read_bytes, write_bytes
+from ceres_cal.moves import FALSE_ALARMS, Check, movements
 
 ROBOT_M = 0.15
 PATIENCE = 3  # times that a file is read before it counts as unreadable: it may still be on its way
