@@ -92,8 +92,12 @@ def test_help_lists_every_command(say: Say) -> None:
         "calibrate",
         "diagnose",
         "advise",
+        "refit",
+        "check",
+        "compare",
         "locate",
         "project",
+        "export-table",
         "simulate",
         "targets",
     }

@@ -17,6 +17,9 @@ if TYPE_CHECKING:
     from ceres_cal.errors import DegenerateError as DegenerateError
     from ceres_cal.errors import InputError as InputError
     from ceres_cal.errors import SolutionError as SolutionError
+    from ceres_cal.moves import check as check
+    from ceres_cal.moves import compare as compare
+    from ceres_cal.moves import refit as refit
     from ceres_cal.observations import Observations as Observations
     from ceres_cal.observations import Prior as Prior
     from ceres_cal.parameters import Options as Options
@@ -32,6 +35,9 @@ _HOME = {
     "DegenerateError": "errors",
     "InputError": "errors",
     "SolutionError": "errors",
+    "refit": "moves",
+    "check": "moves",
+    "compare": "moves",
     "Observations": "observations",
     "Prior": "observations",
     "Options": "parameters",

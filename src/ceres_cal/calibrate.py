@@ -12,7 +12,7 @@ from ceres_cal.bundle import Progress, Solution, Weighting, private_placements, 
 from ceres_cal.calibration import Calibration, Fit, Rejected
 from ceres_cal.camera import Camera
 from ceres_cal.errors import DegenerateError, SolutionError
-from ceres_cal.initialise import initialise
+from ceres_cal.initialise import Start, initialise
 from ceres_cal.lost import with_lost_boards_found
 from ceres_cal.mirrored import without_mirrored_poses
 from ceres_cal.noise import Inliers, judge, start_weights
@@ -24,6 +24,7 @@ from ceres_cal.transforms import Array
 from ceres_cal.uncertainty import Posterior, Setting, Uncertainty, assess, bounds_text
 
 _MOST_ROUNDS = 15
+_SETTLED_SCALE, _SETTLED_AGAIN = 1e-2, 1e-5  # relative change of a noise scale that is no change
 _ENOUGH_PLACEMENTS = 32  # of a camera: with them it is known well enough to place all others
 _NO_FIT = 0.015  # of the image diagonal: a median residual beyond it is no calibration
 _UNKNOWN = (
@@ -51,15 +52,49 @@ def calibrate(
     sights = gather_sights(observations)
     layout = make_layout(observations, options)
     start = initialise(observations, sights, options)
+    return solved_from(start, observations, sights, layout, options, progress)
+
+
+@dataclass(frozen=True)
+class Again:
+    """How a calibration is taken up again after an earlier one.
+
+    Attributes:
+        known: the layout of everything that is known by a posterior, also where the solve holds it.
+        scales: noise scales of points and curves that were seen before.
+        assessed: whether the posterior is wanted.
+    """
+
+    known: Layout
+    scales: tuple[float, float]
+    assessed: bool = True
+
+
+def solved_from(
+    start: Start,
+    observations: Observations,
+    sights: Sights,
+    layout: Layout,
+    options: Options,
+    progress: Callable[[Progress], None] | None = None,
+    again: Again | None = None,
+) -> Calibration:
+    """Solve, reject, solve, assess, from a start.
+
+    Raises:
+        CalibrationError: see `calibrate`.
+    """
     warnings: tuple[str, ...] = ()
     posterior = None
     if options.closed_form_only:
         settled = _unsolved(observations, sights, four_point_baseline(sights, start.estimate))
     else:
-        settled = _settle(observations, sights, start.estimate, layout, options, progress)
+        settled = _settle(observations, sights, start.estimate, layout, options, progress, again)
         _require_fits(settled, sights)
-        settled, posterior = _assess(observations, settled, sights, layout, options)
-        warnings = (*_require_usable(settled, sights), *_unknown(settled, posterior))
+        if again is None or again.assessed:
+            settled, posterior = _assess(observations, settled, sights, again.known if again else layout, options)
+            warnings = tuple(_unknown(settled, posterior))
+        warnings = (*_require_usable(settled, sights), *warnings)
     return Calibration(
         settled.solution.estimate,
         observations.targets,
@@ -98,6 +133,7 @@ def _settle(
     layout: Layout,
     options: Options,
     progress: Callable[[Progress], None] | None,
+    again: Again | None,
 ) -> _Settled:
     """Solve, judge the noise and the outliers, solve again, until nothing changes.
 
@@ -108,7 +144,12 @@ def _settle(
     def judged(at: Estimate, places: Array) -> tuple[Residuals, Inliers]:
         found = residuals(observations, sights, at, places)
         return found, judge(
-            observations, found, layout.size, options.reject_sigma, estimate_noise=options.noise_scale == "estimate"
+            observations,
+            found,
+            layout.unknowns,
+            options.reject_sigma,
+            estimate_noise=options.noise_scale == "estimate",
+            usual=again.scales if again else None,
         )
 
     found = residuals(observations, sights, estimate)
@@ -132,7 +173,7 @@ def _settle(
     rounds = 1
     while rounds < _MOST_ROUNDS:
         weighting = Weighting(inliers.point_scale, inliers.curve_scale, options.loss, options.loss_scale)
-        at_rest = rounds > 1 and inliers.same_as(before)
+        at_rest = rounds > 1 and inliers.same_as(before, _SETTLED_AGAIN if again else _SETTLED_SCALE)
         estimate = solution.estimate
         if not at_rest:
             used = sights.used(inliers.points, inliers.curves)

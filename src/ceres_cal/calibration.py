@@ -15,6 +15,7 @@ import numpy as np
 from ceres_cal.camera import Camera
 from ceres_cal.errors import InputError
 from ceres_cal.files import convert, read_json, write_json
+from ceres_cal.joint import JointPrior
 from ceres_cal.lens import make_lens
 from ceres_cal.observations import Observations, prior_from_json, prior_to_json
 from ceres_cal.parameters import Estimate, Options, Station
@@ -27,8 +28,10 @@ from ceres_cal.uncertainty import (
     PosteriorFile,
     Uncertainty,
     disagreement,
+    lower_triangle,
     posterior_from_file,
     posterior_to_json,
+    symmetric,
 )
 
 FORMAT, VERSION = "ceres-cal/calibration", 1
@@ -73,6 +76,26 @@ class Fit:
         return float((total / max(self.points + self.curves, 1)) ** 0.5)
 
 
+@dataclass(frozen=True, eq=False)
+class Refitted:
+    """How a calibration came from an earlier one.
+
+    Attributes:
+        what: was free, one of `moves.WHAT`. moved: stations whose poses were sought.
+        explanation: what the observations say has happened, in words.
+        prior: what was known beforehand of everything that was carried over.
+        scales: noise scales of points and curves of the calibration before.
+        digests: of the observations that are in the prior.
+    """
+
+    what: str
+    moved: tuple[str, ...]
+    explanation: str
+    prior: JointPrior
+    scales: tuple[float, float]
+    digests: tuple[str, ...]
+
+
 @cache
 def package_versions() -> dict[str, str]:
     """Versions of what the numbers depend on."""
@@ -94,10 +117,12 @@ class Calibration:
         fit: residuals and noise. rejected: every observation that was taken out.
         termination: why the last solve stopped. converged: whether it had come to rest.
         rounds: solves it took. history: cost at each iteration of the last one.
-        phi_from: camera -> "fixed", "views", "prior" or "guess": what the start for phi rested on.
+        phi_from: camera -> "fixed", "views", "prior" or "guess": what the start for phi rested on; after a refit
+            "posterior", where phi is under what was known of it.
         warnings: what to know before using it, each one line.
         posterior: what is known of every number; None where nothing was minimised, or a file says nothing of it.
         options: how it was solved. digest: SHA-256 of the observations. versions: of the packages that solved it.
+        refitted: how it came from an earlier calibration; None for one from scratch.
     """
 
     estimate: Estimate
@@ -114,6 +139,7 @@ class Calibration:
     digest: str
     posterior: Posterior | None = None
     versions: Mapping[str, str] = field(default_factory=package_versions)
+    refitted: Refitted | None = None
 
     @property
     def cameras(self) -> Mapping[str, Camera]:
@@ -221,6 +247,23 @@ class _PlacementFile(msgspec.Struct, forbid_unknown_fields=True):
     translation_m: _Vector
 
 
+class _JointPriorFile(msgspec.Struct, forbid_unknown_fields=True):
+    keys: list[tuple[str, str, str, str]]
+    information: list[float]
+    cameras: dict[str, _CameraFile]
+    stations: dict[str, _PlacementFile]
+    structure_m: dict[str, float]
+
+
+class _RefittedFile(msgspec.Struct, forbid_unknown_fields=True):
+    what: str
+    moved: tuple[str, ...]
+    explanation: str
+    prior: _JointPriorFile
+    scales: tuple[float, float]
+    digests: tuple[str, ...]
+
+
 class _CalibrationFile(msgspec.Struct, forbid_unknown_fields=True):
     format: str
     version: int
@@ -243,6 +286,7 @@ class _CalibrationFile(msgspec.Struct, forbid_unknown_fields=True):
     digest: str
     versions: dict[str, str]
     posterior: PosteriorFile | None = None
+    refitted: _RefittedFile | None = None
 
 
 def camera_to_json(camera: Camera) -> dict[str, Any]:
@@ -293,19 +337,53 @@ def calibration_to_json(calibration: Calibration) -> dict[str, Any]:
         "digest": calibration.digest,
         "versions": dict(calibration.versions),
         "posterior": None if calibration.posterior is None else posterior_to_json(calibration.posterior),
+        "refitted": None if calibration.refitted is None else _refitted_to_json(calibration.refitted),
     }
+
+
+def _refitted_to_json(refitted: Refitted) -> dict[str, Any]:
+    prior = refitted.prior
+    return {
+        "what": refitted.what,
+        "moved": list(refitted.moved),
+        "explanation": refitted.explanation,
+        "prior": {
+            "keys": [list(key) for key in prior.keys],
+            "information": lower_triangle(prior.information),
+            "cameras": {name: camera_to_json(camera) for name, camera in prior.cameras.items()},
+            "stations": {name: _pose_to_json(pose) for name, pose in prior.stations.items()},
+            "structure_m": dict(prior.structure),
+        },
+        "scales": list(refitted.scales),
+        "digests": list(refitted.digests),
+    }
+
+
+def _refitted_from_file(data: _RefittedFile) -> Refitted:
+    prior = JointPrior(
+        tuple(data.prior.keys),
+        symmetric(data.prior.information, len(data.prior.keys), "refitted.prior.information"),
+        {name: _camera(entry) for name, entry in data.prior.cameras.items()},
+        {name: Pose(p.rotation, p.translation_m) for name, p in data.prior.stations.items()},  # type: ignore[arg-type]
+        data.prior.structure_m,
+    )
+    return Refitted(data.what, data.moved, data.explanation, prior, data.scales, data.digests)
 
 
 def _pose_to_json(pose: Pose) -> dict[str, Any]:
     return {"rotation": pose.rotation.tolist(), "translation_m": pose.translation.tolist()}
 
 
+def _camera(entry: _CameraFile) -> Camera:
+    lens = make_lens(entry.lens.kind, entry.lens.powers or (2, 3), entry.lens.coefficients)
+    return Camera(entry.image_size, entry.phi, entry.principal_point, lens, entry.aspect)
+
+
 def _from_file(data: _CalibrationFile) -> Calibration:
     cameras = {}
     for name, entry in data.cameras.items():
-        lens = make_lens(entry.lens.kind, entry.lens.powers or (2, 3), entry.lens.coefficients)
-        cameras[name] = Camera(entry.image_size, entry.phi, entry.principal_point, lens, entry.aspect)
-        if lens.kind == "radial":  # the others may fold in corners that nobody saw: `locate` gives NaN there
+        cameras[name] = _camera(entry)
+        if entry.lens.kind == "radial":  # the others may fold in corners that nobody saw: `locate` gives NaN there
             cameras[name].require_monotone(name)
     stations = {}
     for name, station in data.stations.items():
@@ -335,4 +413,5 @@ def _from_file(data: _CalibrationFile) -> Calibration:
         data.digest,
         None if data.posterior is None else posterior_from_file(data.posterior),
         data.versions,
+        None if data.refitted is None else _refitted_from_file(data.refitted),
     )

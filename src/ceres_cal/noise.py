@@ -16,6 +16,7 @@ from ceres_cal.sights import Mask
 from ceres_cal.transforms import Array
 
 _LEAST_FREEDOM = 8.0  # spare equations below which a spread says nothing
+_USUAL_FREEDOM = 10.0  # spare equations that a scale seen before stands for
 _ENOUGH = 20_000
 _LEAST_SCALE_PX = 1e-4  # no image is measured better than that
 _RAYLEIGH_MEDIAN = 1.177410022515474  # of the length of a two-dimensional standard normal
@@ -41,13 +42,13 @@ class Inliers:
     curve_sigmas: Array
     freedom: float = np.inf
 
-    def same_as(self, other: Inliers) -> bool:
-        """Whether nothing worth another solve changed: the same rows, scales within a hundredth."""
+    def same_as(self, other: Inliers, relative: float = 1e-2) -> bool:
+        """Whether nothing worth another solve changed: the same rows, and scales by no more than `relative`."""
         return (
             np.array_equal(self.points, other.points)
             and np.array_equal(self.curves, other.curves)
-            and abs(self.point_scale - other.point_scale) <= 1e-2 * other.point_scale
-            and abs(self.curve_scale - other.curve_scale) <= 1e-2 * other.curve_scale
+            and abs(self.point_scale - other.point_scale) <= relative * other.point_scale
+            and abs(self.curve_scale - other.curve_scale) <= relative * other.curve_scale
         )
 
 
@@ -75,7 +76,13 @@ def _median_scale(lengths: Array, median_of_one: float) -> float:
 
 
 def judge(
-    observations: Observations, residuals: Residuals, unknowns: int, reject_sigma: float, *, estimate_noise: bool
+    observations: Observations,
+    residuals: Residuals,
+    unknowns: int,
+    reject_sigma: float,
+    *,
+    estimate_noise: bool,
+    usual: tuple[float, float] | None = None,
 ) -> Inliers:
     """Noise scales and inliers at one estimate.
 
@@ -84,20 +91,27 @@ def judge(
     Args:
         unknowns: free numbers; they use up equations in proportion.
         reject_sigma: longer residuals are outliers. estimate_noise: else the stated sigmas hold (scale 1).
+        usual: scales of points and curves seen before; they count as much as a few spare equations do.
     """
     points, curves = relative_lengths(observations, residuals)
     if not estimate_noise:
         return Inliers(points <= reject_sigma, curves <= reject_sigma, 1.0, 1.0, points, curves)
-    point_spread = _spread(points, _RAYLEIGH_MEDIAN, reject_sigma)
-    curve_spread = _spread(curves, _NORMAL_MEDIAN, reject_sigma)
+    floor = usual or (0.0, 0.0)
+    point_spread = _spread(points, _RAYLEIGH_MEDIAN, reject_sigma, floor[0])
+    curve_spread = _spread(curves, _NORMAL_MEDIAN, reject_sigma, floor[1])
     spare = 1.0 - unknowns / max(2.0 * point_spread.count + curve_spread.count, 1.0)
-    point_scale, curve_scale = point_spread.scale(2.0 * spare), curve_spread.scale(spare)
-    # A kind with too few spare equations borrows the other's scale; if both have, the stated sigmas are all there is.
-    known = [scale for scale in (point_scale, curve_scale) if scale is not None]
-    fallback = known[0] if known else 1.0
-    p = fallback if point_scale is None else point_scale
-    c = fallback if curve_scale is None else curve_scale
-    freedom = spare * (2.0 * point_spread.count + curve_spread.count) if known else np.inf
+    freedom = spare * (2.0 * point_spread.count + curve_spread.count)
+    if usual is not None:
+        p, c = point_spread.scale_from(usual[0], 2.0 * spare), curve_spread.scale_from(usual[1], spare)
+        freedom = max(freedom, 0.0) + _USUAL_FREEDOM
+    else:
+        point_scale, curve_scale = point_spread.scale(2.0 * spare), curve_spread.scale(spare)
+        # A kind with too few spare equations borrows the other's scale; if both have, the stated sigmas hold.
+        known = [scale for scale in (point_scale, curve_scale) if scale is not None]
+        fallback = known[0] if known else 1.0
+        p = fallback if point_scale is None else point_scale
+        c = fallback if curve_scale is None else curve_scale
+        freedom = freedom if known else np.inf
     return Inliers(points <= reject_sigma * p, curves <= reject_sigma * c, p, c, points / p, curves / c, freedom)
 
 
@@ -114,9 +128,14 @@ class _Spread:
             return None
         return max(float(np.sqrt(self.squares / (self.count * freedom))), _LEAST_SCALE_PX)
 
+    def scale_from(self, usual: float, freedom: float) -> float:
+        """Their scale, when the usual one counts as much as a few spare equations: few exact ones do not make it 0."""
+        equations = self.count * max(freedom, 0.0)
+        return float(np.sqrt((self.squares + _USUAL_FREEDOM * usual**2) / (equations + _USUAL_FREEDOM)))
 
-def _spread(lengths: Array, median_of_one: float, reject_sigma: float) -> _Spread:
+
+def _spread(lengths: Array, median_of_one: float, reject_sigma: float, least: float) -> _Spread:
     finite = np.isfinite(lengths)
     seen = lengths if finite.all() else lengths[finite]
-    inside = seen <= reject_sigma * _median_scale(seen, median_of_one)
+    inside = seen <= reject_sigma * max(_median_scale(seen, median_of_one), least)
     return _Spread(int(np.count_nonzero(inside)), float(np.sum(seen**2, where=inside)))

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from ceres_cal.camera import Camera
 from ceres_cal.errors import InputError
+from ceres_cal.joint import JointPrior
 from ceres_cal.lens import LENS_KINDS, Lens, make_lens
 from ceres_cal.observations import Observations, Prior, View
 from ceres_cal.sights import SightKey
@@ -168,18 +169,24 @@ class Layout:
     Attributes:
         free: camera -> indices into its intrinsics vector.
         stations, placements: names of the poses that are free.
-        priors: on free numbers.
+        priors: on free numbers. joint: what an earlier calibration knew of many numbers together.
     """
 
     free: Mapping[str, NDArray[np.int64]]
     stations: frozenset[str]
     placements: frozenset[str]
     priors: tuple[Prior, ...] = ()
+    joint: JointPrior | None = None
 
     @property
     def size(self) -> int:
         """Number of free numbers."""
         return sum(len(f) for f in self.free.values()) + 6 * (len(self.stations) + len(self.placements))
+
+    @property
+    def unknowns(self) -> int:
+        """Number of free numbers that use up observations: what is known beforehand does not."""
+        return self.size if self.joint is None else max(self.size - self.joint.rank, 0)
 
     def of(self, keys: Iterable[SightKey]) -> Layout:
         """The layout of a problem with these sights alone: no placement that they do not show is free."""

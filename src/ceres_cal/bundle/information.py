@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ceres_cal import kernels
 from ceres_cal.bundle.costs import Weighting, _columns, _track_slots
-from ceres_cal.bundle.problem import private_placements
+from ceres_cal.bundle.problem import own_structure, private_placements
 from ceres_cal.errors import SolutionError
 from ceres_cal.parameters import Estimate, Layout, intrinsics_scales
 from ceres_cal.quantities import Key, from_placement, from_station, places_of, pose_keys, shared_keys, sigma_limits
@@ -176,5 +176,10 @@ def _add_priors(keys: Sequence[Key], estimate: Estimate, layout: Layout, matrix:
             place = places.get((prior.owner, prior.name, quantity))
             if place is not None:  # a number that is held needs no prior
                 matrix[place, place] += sigma**-2.0
-    structure = [place for place, key in enumerate(keys) if key.kind == "structure"]
-    matrix[structure, structure] += estimate.structure.sigma_m**-2.0
+    structure, fresh = _owned(keys)("structure", ""), own_structure(layout, estimate)
+    matrix[structure[fresh], structure[fresh]] += estimate.structure.sigma_m[fresh] ** -2.0
+    if layout.joint is not None:  # what it says of numbers that are held now, it says with them held
+        own = [i for i, key in enumerate(layout.joint.keys) if key in keys]
+        at = [keys.index(Key(*layout.joint.keys[i])) for i in own]
+        if own:
+            matrix[np.ix_(at, at)] += layout.joint.information[np.ix_(own, own)]

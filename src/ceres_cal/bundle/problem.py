@@ -6,7 +6,7 @@ import os
 from collections import Counter
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -22,6 +22,7 @@ from ceres_cal.bundle.costs import (
     SightCost,
     Weighting,
 )
+from ceres_cal.bundle.joint import joint_block
 from ceres_cal.errors import DegenerateError, InputError, SolutionError
 from ceres_cal.observations import Prior
 from ceres_cal.parameters import (
@@ -150,7 +151,8 @@ def _assemble(
                 sight_cost = SightCost(run, part, estimate, layout, weighting, places)
                 assembly.costs.append((sight_cost, blocks.of(key, sight_cost.slots)))
     assembly.costs += [(cost, [array]) for cost, array in _prior_blocks(layout, estimate, blocks)]
-    return assembly
+    joint = joint_block(run, estimate, layout, blocks)
+    return assembly if joint is None else replace(assembly, costs=[*assembly.costs, joint])
 
 
 class _Watcher(pyceres.IterationCallback):
@@ -296,10 +298,10 @@ def private_placements(sights: Sights, layout: Layout) -> frozenset[str | None]:
 def _require_enough(sights: Sights, layout: Layout) -> None:
     equations = 2 * len(sights.point_rows) + len(sights.curve_rows)
     equations += sum(len(prior.value) for prior in layout.priors)  # each structure number has a prior of its own
-    if equations < layout.size:
+    if equations < layout.unknowns:
         raise DegenerateError(
             f"{equations} measured numbers (two a point, one a curve observation or prior) cannot determine "
-            f"{layout.size} unknowns: add observations, or fix some of the unknowns"
+            f"{layout.unknowns} unknowns: add observations, or fix some of the unknowns"
         )
 
 
@@ -343,10 +345,15 @@ def _prior_blocks(layout: Layout, estimate: Estimate, blocks: _Blocks) -> Iterab
         if len(places):
             array = blocks.cameras[prior.name]
             yield LinearPriorCost(places, mean, sigma, len(array)), array
-    sigma_m = estimate.structure.sigma_m
-    if len(sigma_m):
-        every = np.arange(len(sigma_m))
-        yield LinearPriorCost(every, np.zeros(len(sigma_m)), sigma_m, len(sigma_m)), blocks.structure
+    sigma_m, fresh = estimate.structure.sigma_m, own_structure(layout, estimate)
+    if len(fresh):
+        yield LinearPriorCost(fresh, np.zeros(len(fresh)), sigma_m[fresh], len(sigma_m)), blocks.structure
+
+
+def own_structure(layout: Layout, estimate: Estimate) -> NDArray[np.int64]:
+    """Places of the structure numbers under their tolerance, not under the joint prior, which holds theirs."""
+    known = frozenset() if layout.joint is None else layout.joint.structure_names
+    return np.array([i for i, name in enumerate(estimate.structure.names) if name not in known], dtype=np.int64)
 
 
 def prior_on_intrinsics(

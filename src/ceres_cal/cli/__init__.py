@@ -11,17 +11,25 @@ from collections.abc import Sequence
 
 from ceres_cal.cli.advise import COMMANDS as ADVISE
 from ceres_cal.cli.calibrate import COMMANDS as CALIBRATE
+from ceres_cal.cli.check import COMMANDS as CHECK
 from ceres_cal.cli.command import Command, print_answer
+from ceres_cal.cli.compare import COMMANDS as COMPARE
 from ceres_cal.cli.detect import COMMANDS as DETECT_BOARD
 from ceres_cal.cli.detect_field import COMMANDS as DETECT_FIELD
 from ceres_cal.cli.detect_rings import COMMANDS as DETECT_RINGS
 from ceres_cal.cli.diagnose import COMMANDS as DIAGNOSE
 from ceres_cal.cli.locate import COMMANDS as LOCATE
+from ceres_cal.cli.refit import COMMANDS as REFIT
 from ceres_cal.cli.simulate import COMMANDS as SIMULATE
+from ceres_cal.cli.table import COMMANDS as TABLE
 from ceres_cal.cli.targets import COMMANDS as TARGETS
 from ceres_cal.errors import CalibrationError, InputError, SolutionError
 
-_GROUPS = (DETECT_BOARD, DETECT_RINGS, DETECT_FIELD, CALIBRATE, DIAGNOSE, ADVISE, LOCATE, SIMULATE, TARGETS)
+_GROUPS = (
+    *(DETECT_BOARD, DETECT_RINGS, DETECT_FIELD),
+    *(CALIBRATE, DIAGNOSE, ADVISE, REFIT, CHECK, COMPARE),
+    *(LOCATE, TABLE, SIMULATE, TARGETS),
+)
 COMMANDS = {command.name: command for group in _GROUPS for command in group}
 _BEGINNINGS = {"", *(name.partition(" ")[0] for name in COMMANDS if " " in name)}
 _MOST_LETTERS = 200  # of an error that nobody wrote for people

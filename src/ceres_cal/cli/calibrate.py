@@ -96,7 +96,7 @@ def _add_arguments(parser: ArgumentParser) -> None:
 
 def _run(args: Namespace) -> Answer:
     require_outputs(args.output, args.report, args.observations)
-    _require_different(args.observations)
+    require_different(args.observations)
     fixed, powers = _fixed(args.fix), _powers(args)
     from ceres_cal.cli.summary import calibration_data, calibration_text
     from ceres_cal.files import write_bytes
@@ -135,7 +135,7 @@ def _page(calibration: Calibration, observations: Observations, bar: ProgressBar
 COMMANDS = (Command("calibrate", "calibrate cameras from observations of fields and boards", _add_arguments, _run),)
 
 
-def _require_different(files: list[str]) -> None:
+def require_different(files: list[str]) -> None:
     """A file that counts twice would make its observations look better than they are."""
     places = [Path(file).resolve() for file in files]
     for file, place in zip(files, places, strict=True):

@@ -25,6 +25,7 @@ _PHI_FROM = {
     "views": "started from the views",
     "prior": "started from its prior",
     "guess": "started from a guess",
+    "posterior": "under what was known of it",
 }
 
 

@@ -1,7 +1,7 @@
 """How well a calibration is known: covariance, weak directions, bounds beyond the quadratic picture, maps in mm."""
 
 from ceres_cal.uncertainty.assess import assess
-from ceres_cal.uncertainty.files import PosteriorFile, posterior_from_file, posterior_to_json
+from ceres_cal.uncertainty.files import PosteriorFile, lower_triangle, posterior_from_file, posterior_to_json, symmetric
 from ceres_cal.uncertainty.maps import FieldMap, PointSpread
 from ceres_cal.uncertainty.posterior import Posterior, make_posterior
 from ceres_cal.uncertainty.profile import Profile, Setting
@@ -23,7 +23,9 @@ __all__ = [
     "assess",
     "bounds_text",
     "disagreement",
+    "lower_triangle",
     "make_posterior",
     "posterior_from_file",
     "posterior_to_json",
+    "symmetric",
 ]

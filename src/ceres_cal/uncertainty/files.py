@@ -41,7 +41,7 @@ def posterior_to_json(posterior: Posterior) -> dict[str, Any]:
     rows, columns = np.tril_indices(6)
     return {
         "keys": [list(key) for key in posterior.keys],
-        "information": posterior.information[np.tril_indices(len(posterior.keys))].tolist(),
+        "information": lower_triangle(posterior.information),
         "placements": {name: matrix[rows, columns].tolist() for name, matrix in posterior.placements.items()},
         "freedom": posterior.freedom if np.isfinite(posterior.freedom) else None,
         "profiles": {name: _profile_to_json(profile) for name, profile in posterior.profiles.items()},
@@ -69,8 +69,8 @@ def posterior_from_file(data: PosteriorFile) -> Posterior:
     """
     return Posterior(
         tuple(data.keys),
-        _symmetric(data.information, len(data.keys), "posterior.information"),
-        {name: _symmetric(row, 6, f"posterior.placements.{name}") for name, row in data.placements.items()},
+        symmetric(data.information, len(data.keys), "posterior.information"),
+        {name: symmetric(row, 6, f"posterior.placements.{name}") for name, row in data.placements.items()},
         np.inf if data.freedom is None else data.freedom,
         {name: _profile_from_file(name, entry) for name, entry in data.profiles.items()},
     )
@@ -81,7 +81,7 @@ def _profile_from_file(name: str, data: ProfileFile) -> Profile:
     counts = {len(data.steps), len(data.rises), len(data.information)}
     if len(counts) != 1 or any(len(row) != size for row in data.steps):
         raise InputError(f"{where}: steps, rises and information do not fit each other: calibrate again")
-    told = [_symmetric(row, size - 1, f"{where}.information") for row in data.information]
+    told = [symmetric(row, size - 1, f"{where}.information") for row in data.information]
     return Profile(
         name,
         tuple(data.keys),
@@ -94,7 +94,17 @@ def _profile_from_file(name: str, data: ProfileFile) -> Profile:
     )
 
 
-def _symmetric(triangle: list[float], size: int, where: str) -> Array:
+def lower_triangle(matrix: Array) -> list[float]:
+    """Row by row, the diagonal included."""
+    return list(matrix[np.tril_indices(len(matrix))].tolist())
+
+
+def symmetric(triangle: list[float], size: int, where: str) -> Array:
+    """The matrix of a lower triangle.
+
+    Raises:
+        InputError: not as many numbers as it takes.
+    """
     rows, columns = np.tril_indices(size)
     if len(triangle) != len(rows):
         raise InputError(f"{where} has {len(triangle)} numbers, not {len(rows)}: calibrate again")

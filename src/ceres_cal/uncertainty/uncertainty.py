@@ -113,18 +113,32 @@ class Uncertainty:
         return name
 
     def _grid(self, x_m: ArrayLike | None, y_m: ArrayLike | None) -> tuple[Array, Array]:
-        """A grid over the box around what does not move; without such a target over what the cameras look at."""
+        """x and y of a grid over the box around what does not move, where they are not given.
+
+        Raises:
+            InputError: there is nothing that does not move.
+        """
         if x_m is not None and y_m is not None:
             return np.asarray(x_m, dtype=float), np.asarray(y_m, dtype=float)
-        box = [_corners(target) for target in self.targets.values() if target.kind not in _MOVABLE]
-        if not box:
-            raise InputError("no field to draw a map of: give x_m and y_m")
-        low, high = np.min([b[0] for b in box], axis=0), np.max([b[1] for b in box], axis=0)
-        spacing = float(np.max(high - low)) / _GRID
-        counts = np.maximum(np.round((high - low) / spacing).astype(int) + 1, 2)
-        found = [np.linspace(a, b, n) for a, b, n in zip(low, high, counts, strict=True)]
-        x, y = found if x_m is None else [np.asarray(x_m, dtype=float), found[1]]
+        found = field_grid(self.targets)
+        x, y = found if x_m is None else (np.asarray(x_m, dtype=float), found[1])
         return x, (y if y_m is None else np.asarray(y_m, dtype=float))
+
+
+def field_grid(targets: Mapping[str, Target]) -> tuple[Array, Array]:
+    """x and y of a grid over the box around what does not move.
+
+    Raises:
+        InputError: there is nothing that does not move.
+    """
+    box = [_corners(target) for target in targets.values() if target.kind not in _MOVABLE]
+    if not box:
+        raise InputError("no field to draw a map of: give x_m and y_m")
+    low, high = np.min([b[0] for b in box], axis=0), np.max([b[1] for b in box], axis=0)
+    spacing = float(np.max(high - low)) / _GRID
+    counts = np.maximum(np.round((high - low) / spacing).astype(int) + 1, 2)
+    x, y = (np.linspace(a, b, n) for a, b, n in zip(low, high, counts, strict=True))
+    return x, y
 
 
 def _corners(target: Target) -> tuple[Array, Array]:

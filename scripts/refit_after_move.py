@@ -1,0 +1,155 @@
+"""Keeps a calibration right: checks it against new observations, and refits it where a camera has moved. Copy it.
+
+    python scripts/refit_after_move.py calibration.json new.json                  # these files, once
+    python scripts/refit_after_move.py calibration.json --watch incoming/         # every file that appears there
+
+Every event is one line of JSON on standard output, or in --log: "holds", "refitted", "refused" (nothing was changed;
+the reason says what to do) or "unreadable". The calibration is replaced in one step, and the one before is kept in
+previous/ beside it. Exits with 0 when the calibration is right at the end, 3 when the last file was refused or could
+not be read.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("GLOG_minloglevel", "3")  # what Ceres logs of a failed step is no error; it reads this once
+
+import ceres_cal as cc
+from ceres_cal.files import read_bytes, write_bytes
+from ceres_cal.moves import FALSE_ALARMS, Check, movements
+
+ROBOT_M = 0.15
+PATIENCE = 3  # times that a file is read before it counts as unreadable: it may still be on its way
+
+
+def handle(place: Path, source: Path, what: str, false_alarms: float, limit_mm: float) -> dict[str, Any]:
+    """Check the calibration at `place` against a file of observations, refit it where it does not hold; the event."""
+    begin = time.perf_counter()
+    event: dict[str, Any] = {"time": datetime.now(UTC).isoformat(), "file": str(source)}
+    try:
+        observations = cc.Observations.load(source)
+    except cc.InputError as error:
+        return {**event, "event": "unreadable", "reason": str(error)}
+    try:
+        old = cc.Calibration.load(place)
+        found = cc.check(old, observations, false_alarms)
+        event["check"] = told(found)
+        if found.holds:
+            return {**event, "event": "holds", "seconds": round(time.perf_counter() - begin, 3)}
+        new = cc.refit(old, observations, what)
+        worst = {name: new.uncertainty.map_sd_mm(name, ROBOT_M).worst_mm for name in observations.stations}
+        event["sd_mm_at_robot_height"] = worst
+        if not all(value <= limit_mm for value in worst.values()):
+            reason = f"known to {max(worst.values()):.1f} mm at robot height only, asked for are {limit_mm:g} mm"
+            return {**event, "event": "refused", "reason": f"{reason}: observe more lines and corners"}
+    except cc.CalibrationError as error:
+        return {**event, "event": "refused", "reason": str(error)}
+    event["kept"] = str(keep(place))
+    new.save(place)
+    explanation = new.refitted.explanation if new.refitted else ""
+    moves = {name: {"mm": 1e3 * shift_m, "deg": deg} for name, (shift_m, deg) in movements(old, new).items()}
+    event |= {"explanation": explanation, "moved": moves, "warnings": list(new.warnings), "rms_px": new.rms_px}
+    return {**event, "event": "refitted", "seconds": round(time.perf_counter() - begin, 3)}
+
+
+def told(found: Check) -> dict[str, str]:
+    """The answer of each station, in words."""
+    return {name: station.words for name, station in found.stations.items()}
+
+
+def keep(place: Path) -> Path:
+    """A copy of the calibration in previous/, named after the moment."""
+    folder = place.parent / "previous"
+    folder.mkdir(exist_ok=True)
+    copy = folder / f"{place.stem}-{datetime.now(UTC):%Y%m%dT%H%M%S%f}{place.suffix}"
+    write_bytes(copy, read_bytes(place))
+    return copy
+
+
+def appearing(folder: Path, every_s: float) -> Iterator[Path]:
+    """Files of observations that appear in a folder, in the order of their times; one that changes comes again."""
+    done = {path: stamp(path) for path in files_in(folder)}
+    before = dict(done)
+    while True:
+        time.sleep(every_s)
+        now = {path: stamp(path) for path in files_in(folder)}
+        # A file that is still being written has grown since the last look.
+        ready = [path for path in now if now[path] != done.get(path) and now[path] == before.get(path)]
+        before = now
+        for path in sorted(ready, key=lambda p: now[p]):
+            done[path] = now[path]
+            yield path
+
+
+def files_in(folder: Path) -> list[Path]:
+    return [p for p in folder.iterdir() if p.suffix in (".json", ".npz") and not p.name.startswith(".")]
+
+
+def stamp(path: Path) -> tuple[int, int]:
+    """Time and size; nothing for a file that has just gone."""
+    try:
+        found = path.stat()
+    except FileNotFoundError:
+        return (0, 0)
+    return (found.st_mtime_ns, found.st_size)
+
+
+def events(given: argparse.Namespace) -> Iterator[dict[str, Any]]:
+    def answer(source: Path) -> dict[str, Any]:
+        return handle(given.calibration, source, given.what, given.false_alarms, given.limit_mm)
+
+    yield from map(answer, given.observations)
+    if given.watch is None:
+        return
+    for source in appearing(given.watch, given.every_s):
+        for attempt in range(PATIENCE):
+            event = answer(source)
+            if event["event"] != "unreadable" or attempt == PATIENCE - 1:
+                yield event
+                break
+            time.sleep(given.every_s)
+
+
+def main(arguments: Sequence[str]) -> int:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0], allow_abbrev=False)
+    parser.add_argument("calibration", type=Path, help="is checked, and replaced where a camera has moved")
+    parser.add_argument("observations", type=Path, nargs="*", help="files of new observations, one after the other")
+    parser.add_argument("--watch", type=Path, metavar="FOLDER", help="then wait for files that appear there")
+    parser.add_argument("--every-s", type=float, default=0.5, help="how often to look (default 0.5 s)")
+    parser.add_argument("--what", default="pose", help="what is free in a refit, see `ceres-cal refit --help`")
+    parser.add_argument("--false-alarms", type=float, default=FALSE_ALARMS, help="of each check (default 0.01)")
+    parser.add_argument("--limit-mm", type=float, default=20.0, help="worst sigma at 150 mm still used (default 20)")
+    parser.add_argument("--log", type=Path, help="add the events to this file instead of printing them")
+    given = parser.parse_args(arguments)
+    if not given.calibration.is_file():
+        parser.error(f"{given.calibration}: no such file")
+    if given.watch is not None and not given.watch.is_dir():
+        parser.error(f"{given.watch}: no such folder")
+    if not given.observations and given.watch is None:
+        parser.error("name files of observations, or a folder to --watch")
+    last = 0
+    try:
+        for event in events(given):
+            line = json.dumps(event)
+            last = 0 if event["event"] in ("holds", "refitted") else 3
+            if given.log is None:
+                print(line, flush=True)
+            else:
+                with given.log.open("a", encoding="utf-8") as log:
+                    log.write(line + "\n")
+    except KeyboardInterrupt:
+        return 0  # a watch ends so
+    return last
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,131 @@
+"""`ceres-cal refit`: after a move, the poses anew from few observations and all that was known."""
+
+from __future__ import annotations
+
+import os
+from argparse import ArgumentParser, Namespace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ceres_cal.cli.command import Answer, Command, add_output, finishing, parse_numbers, require_output
+from ceres_cal.errors import InputError
+
+if TYPE_CHECKING:
+    from ceres_cal.calibration import Calibration
+    from ceres_cal.observations import Observations, Prior
+
+_HELP = {
+    "pose": "poses, the intrinsics under what is known of them (default)",
+    "pose-only": "poses, the intrinsics held",
+    "zoom": "phi, too: nothing is known of it any more",
+    "iris": "the lens's coefficients, too",
+    "everything": "all intrinsics, too",
+}
+
+
+def add_inputs(parser: ArgumentParser) -> None:
+    """A calibration and files of observations."""
+    parser.add_argument("calibration", metavar="CALIBRATION", type=Path, help="the calibration from before")
+    parser.add_argument("observations", nargs="+", metavar="OBS", help="files of new observations, taken together")
+
+
+def read_inputs(args: Namespace) -> tuple[Calibration, Observations]:
+    """What `add_inputs` names; each file once."""
+    from ceres_cal.calibration import Calibration
+    from ceres_cal.cli.calibrate import require_different
+    from ceres_cal.observations import Observations, combine
+
+    require_different(args.observations)
+    calibration = Calibration.load(args.calibration)
+    return calibration, combine([Observations.load(path) for path in args.observations])
+
+
+def _add_arguments(parser: ArgumentParser) -> None:
+    add_inputs(parser)
+    add_output(parser, "the new calibration", required=False)
+    add = parser.add_argument
+    what = "; ".join(f"{name}: {text}" for name, text in _HELP.items())
+    add("--what", choices=tuple(_HELP), default="pose", help=f"what is free: {what}")
+    add("--moved", metavar="STATION", action="append", help="only this one moved (repeatable); default: all observed")
+    add("--hold-others", action="store_true", help="hold stations that did not move, and their cameras, exactly")
+    add(
+        "--labels",
+        choices=("check", "as-given", "turned"),
+        default="check",
+        help="refuse labels that look turned by 180 degrees (default), believe them, or turn them",
+    )
+    add(
+        "--prior",
+        action="append",
+        default=[],
+        metavar="STATION.height_m=VALUE:SIGMA",
+        help="a height measured after the move; repeatable",
+    )
+
+
+def _run(args: Namespace) -> Answer:
+    require_output(args.output, args.observations)  # to replace the old calibration is what many want
+    calibration, observations = read_inputs(args)
+    os.environ.setdefault("GLOG_minloglevel", "3")  # what Ceres logs of a failed step is no error yet
+    from ceres_cal.moves import refit
+
+    priors = tuple(_height(spec, observations) for spec in args.prior)
+    result = refit(
+        calibration,
+        observations,
+        args.what,
+        moved=args.moved,
+        hold_others=args.hold_others,
+        labels=args.labels,
+        priors=priors,
+    )
+    if args.output is not None:
+        with finishing():
+            result.save(args.output)
+    return Answer(_data(result, calibration, observations, args), lambda: _text(result, observations, args))
+
+
+COMMANDS = (Command("refit", "after a move: poses anew, everything else under what was known", _add_arguments, _run),)
+
+
+def _height(spec: str, observations: Observations) -> Prior:
+    """The prior of `--prior [STATION.]height_m=VALUE:SIGMA`."""
+    from ceres_cal.observations import prior_from_json
+
+    where = f"--prior {spec!r}"
+    left, equals, right = spec.rpartition("=")
+    value, colon, sigma = right.partition(":")
+    owner, _, quantity = left.strip().rpartition(".")
+    stations = tuple(observations.stations)
+    if not (equals and colon) or quantity != "height_m":
+        raise InputError(f"{where}: write STATION.height_m=VALUE:SIGMA, such as overhead.height_m=4.02:0.01")
+    if not owner and len(stations) == 1:
+        owner = stations[0]
+    if owner not in stations:
+        raise InputError(f"{where}: name one station before the dot: {', '.join(stations)}")
+    numbers = (*parse_numbers(value, where), *parse_numbers(sigma, f"{where}: sigma"))
+    if len(numbers) != 2 or numbers[1] <= 0.0:
+        raise InputError(f"{where}: give one height and one sigma above 0")
+    return prior_from_json({"station": owner, "height_m": numbers[0], "sigma_m": numbers[1]}, where)
+
+
+def _data(result: Calibration, before: Calibration, observations: Observations, args: Namespace) -> dict[str, Any]:
+    from ceres_cal.cli.summary import calibration_data
+    from ceres_cal.moves import movements
+
+    found = calibration_data(result, observations, args.observations, args.output)
+    moves = {
+        name: {"mm": 1e3 * shift_m, "deg": turn_deg} for name, (shift_m, turn_deg) in movements(before, result).items()
+    }
+    refitted = result.refitted
+    assert refitted is not None
+    return {**found, "what": refitted.what, "explanation": refitted.explanation, "moved": moves}
+
+
+def _text(result: Calibration, observations: Observations, args: Namespace) -> str:
+    from ceres_cal.cli.summary import calibration_text
+
+    refitted = result.refitted
+    assert refitted is not None
+    told = "\n".join(f"{'' if i else 'refit':10}{line}" for i, line in enumerate(refitted.explanation.split("; ")))
+    return f"{told}\n{calibration_text(result, observations, args.observations, args.output)}"

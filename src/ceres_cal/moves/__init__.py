@@ -1,0 +1,18 @@
+"""After a move: refit, check and compare calibrations."""
+
+from ceres_cal.moves.checking import FALSE_ALARMS, Check, StationCheck, check
+from ceres_cal.moves.comparison import StationComparison, compare
+from ceres_cal.moves.picture import picture
+from ceres_cal.moves.refitting import movements, refit
+
+__all__ = [
+    "FALSE_ALARMS",
+    "Check",
+    "StationCheck",
+    "StationComparison",
+    "check",
+    "compare",
+    "movements",
+    "picture",
+    "refit",
+]

@@ -1,0 +1,317 @@
+"""Does a calibration still hold? A test of each station's pose and phi against new observations.
+
+The old numbers are known to within the old posterior only. So what is asked is by how much the least cost of posterior
+and new observations together falls when the station may stand elsewhere, with another phi, than it did: for an unmoved
+camera that fall is a chi-squared variable, whatever the posterior leaves open.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ceres_cal.bundle import Weighting, information, solve
+from ceres_cal.calibration import Calibration
+from ceres_cal.camera import Camera
+from ceres_cal.chi_squared import upper_tail
+from ceres_cal.errors import CalibrationError, InputError
+from ceres_cal.joint import JointPrior
+from ceres_cal.moves.carried import kept_prior, require_same_things, with_structure, without_keys
+from ceres_cal.moves.poses import Place, Scene, movement, places
+from ceres_cal.observations import Observations
+from ceres_cal.parameters import Estimate, Layout, intrinsic_names
+from ceres_cal.quantities import Key, sigma_limits
+from ceres_cal.sights import Mask, Sights, gather_sights
+from ceres_cal.spread import Spread
+from ceres_cal.transforms import Array, Pose
+from ceres_cal.uncertainty import Posterior
+from ceres_cal.uncertainty.maps import shown_pixels
+from ceres_cal.uncertainty.uncertainty import field_grid
+
+FALSE_ALARMS = 0.01
+HEIGHTS_M = (0.0, 0.15)
+_INLIER_SIGMA = 3.5
+_LEAST_SHARE = 0.5  # of observations that fit somewhere; with fewer nothing is understood
+_MANY_OUTLIERS = 0.25
+_WILL_DO = 10.8  # fall of twice the cost that a phi at its place exceeds one time in a thousand
+_NOISY = 1e-3  # how rare a noise must be to be believed larger than that of the calibration
+
+
+@dataclass(frozen=True)
+class StationCheck:
+    """Whether one station still is as it was calibrated.
+
+    Attributes:
+        holds: whether the probability is not below the false-alarm rate of one station, and the observations are
+            understood. probability: of such observations, or stranger ones, from an unmoved camera.
+        statistic: fall of twice the cost. degrees: of freedom that it has.
+        used, outliers: observations. noise: times that of the calibration.
+        moved_mm, turned_deg: best estimate of the movement. phi_change: relative; both with phi under what is known
+            of it, unless that does not explain the observations.
+        shift_px: root mean square shift of the picture over the field. shift_mm: height_m -> mean and largest shift of
+            the map over what the station sees of the field.
+        words: the answer, in a line.
+    """
+
+    station: str
+    holds: bool
+    probability: float
+    statistic: float
+    degrees: int
+    used: int
+    outliers: int
+    noise: float
+    moved_mm: float
+    turned_deg: float
+    phi_change: float
+    shift_px: float
+    shift_mm: dict[float, tuple[float, float]]
+    words: str
+
+
+@dataclass(frozen=True)
+class Check:
+    """The answer for all stations together.
+
+    Attributes:
+        false_alarms: probability that an unmoved set of cameras is said to have moved. stations: by name.
+    """
+
+    false_alarms: float
+    stations: dict[str, StationCheck]
+
+    @property
+    def holds(self) -> bool:
+        """Whether every station still is as it was."""
+        return all(found.holds for found in self.stations.values())
+
+
+def check(calibration: Calibration, observations: Observations, false_alarms: float = FALSE_ALARMS) -> Check:
+    """Test whether a calibration still holds for new observations of its stations.
+
+    Seven numbers of each station that was observed are tested at once: its pose and its camera's phi. The noise is that
+    of the calibration, unless the new observations show beyond doubt that it is larger now. Outliers are those that no
+    pose near by explains. A yes means that these observations show no movement, not that there is none: see the sizes.
+
+    Args:
+        false_alarms: how often an unmoved set of cameras may be said to have moved; shared among the stations.
+
+    Raises:
+        InputError: a station that the calibration does not have, or that it says nothing of.
+        SolutionError: another camera or another field than those calibrated.
+    """
+    if not 0.0 < false_alarms < 1.0:
+        raise InputError(f"false_alarms must be a probability between 0 and 1, not {false_alarms}")
+    if calibration.posterior is None:
+        raise InputError("the calibration does not say how well it is known: calibrate again")
+    require_same_things(calibration, observations)
+    for name in observations.stations:
+        if name not in calibration.estimate.stations:
+            names = ", ".join(map(repr, calibration.estimate.stations))
+            raise InputError(f"station {name!r} is not in the calibration, which has {names}: name it as there")
+    observed = replace(observations, targets={**calibration.targets, **observations.targets})
+    sights = gather_sights(observed)
+    world = {key.station: sights[i] for i, key in enumerate(sights.keys) if key.placement is None}
+    for name in observations.stations:
+        if name not in world:
+            raise InputError(f"station {name!r} sees nothing that lies in the world: observe the field with it")
+    level = false_alarms / len(world)
+    return Check(false_alarms, {name: _checked(calibration, observed, sight, level) for name, sight in world.items()})
+
+
+# ---- one station ----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class _Case:
+    """One station's new observations and what was known of its numbers."""
+
+    calibration: Calibration
+    sight: Sights
+    estimate: Estimate
+    prior: JointPrior
+    tested: tuple[Key, ...]
+
+    @property
+    def name(self) -> str:
+        return self.sight.key.station
+
+    def layout(self, joint: JointPrior) -> Layout:
+        names = intrinsic_names(self.estimate.cameras[self.sight.key.camera].lens)
+        free = sorted(names.index(key[2]) for key in self.prior.keys if key[0] == "camera")
+        return Layout(
+            {self.sight.key.camera: np.array(free, dtype=np.int64)},
+            frozenset([self.name]),
+            frozenset(),
+            (),
+            joint,
+        )
+
+    def least(self, used: Sights, joint: JointPrior, pose: Pose) -> tuple[float, Estimate] | None:
+        """Twice the least cost under a prior, and where, from a pose; None where the solver does not get there."""
+        station = replace(self.estimate.stations[self.name], cam_from_world=pose)
+        start = replace(self.estimate, stations={self.name: station})
+        try:
+            found = solve(used, start, self.layout(joint), self.weighting, self.calibration.options)
+        except CalibrationError:
+            return None
+        return None if found.failed else (2.0 * found.cost, found.estimate)
+
+    @property
+    def weighting(self) -> Weighting:
+        fit = self.calibration.fit
+        return Weighting(fit.point_scale, fit.curve_scale, "trivial")
+
+
+def _case(calibration: Calibration, observed: Observations, sight: Sights) -> _Case:
+    key, old, posterior = sight.key, calibration.estimate, calibration.posterior
+    assert posterior is not None
+    owners = {("camera", key.camera), ("station", key.station)}
+    kept = [i for i, k in enumerate(posterior.keys) if k[:2] in owners or k.kind == "structure"]
+    if not any(posterior.keys[i].kind == "station" for i in kept):
+        raise InputError(f"station {key.station!r} was held as the world: it cannot be said to have moved")
+    prior = kept_prior(calibration, kept, frozenset([key.station]))
+    structure = with_structure(old, observed, calibration.options)
+    estimate = Estimate({key.camera: old.cameras[key.camera]}, {key.station: old.stations[key.station]}, {}, structure)
+    phi = ("camera", key.camera, "phi")
+    tested = tuple(Key(*k) for k in prior.keys if k[:2] == ("station", key.station) or k[:3] == phi)
+    return _Case(calibration, sight, estimate, prior, tested)
+
+
+def _checked(calibration: Calibration, observed: Observations, sight: Sights, level: float) -> StationCheck:
+    case = _case(calibration, observed, sight)
+    fit = calibration.fit
+    scene = Scene(observed, sight, case.estimate, (fit.point_scale, fit.curve_scale))
+    found = places(scene, [case.estimate.stations[case.name].cam_from_world], patience=0)
+    count = len(sight.point_rows) + len(sight.curve_rows)
+    points, curves = _inliers(scene, found[0] if found else None)
+    used = sight.used(points, curves)
+    inside = int(np.count_nonzero(points) + np.count_nonzero(curves))
+    if inside < _LEAST_SHARE * count:
+        return _not_understood(case, inside, count)
+    free = without_keys(case.prior, case.tested)
+    old, new = case.estimate.stations[case.name].cam_from_world, found[0].pose
+    as_was, anew = case.least(used, case.prior, old), case.least(used, free, new)
+    if anew is None:
+        return _not_understood(case, inside, count)
+    degrees = _degrees(case, used, anew[1], free)
+    spare = 2 * len(used.point_rows) + len(used.curve_rows) - degrees
+    noise = float(np.sqrt(anew[0] / spare)) if spare > 0 else 1.0
+    noisy = spare > 0 and upper_tail(anew[0], spare) < _NOISY
+    statistic = np.inf if as_was is None else max(as_was[0] - anew[0], 0.0) / (noise**2 if noisy else 1.0)
+    assert calibration.posterior is not None
+    freedom = float(spare) if noisy else calibration.posterior.freedom
+    probability = 0.0 if np.isinf(statistic) else upper_tail(statistic, degrees, freedom)
+    # Sizes are told with phi under what is known of it, where that will do: next to it a height says little.
+    posed = case.least(used, without_keys(case.prior, [key for key in case.tested if key.kind == "station"]), new)
+    at = posed[1] if posed is not None and posed[0] - anew[0] < _WILL_DO else anew[1]
+    return _answer(case, at, probability >= level, probability, float(statistic), degrees, inside, count, noise)
+
+
+def _inliers(scene: Scene, place: Place | None) -> tuple[Mask, Mask]:
+    """Which rows of the observations some pose near by explains."""
+    observations = scene.observations
+    points, curves = (np.zeros(len(c), dtype=bool) for c in (observations.points, observations.curves))
+    if place is None:
+        return points, curves
+    found, sight = scene.residuals(place.pose), scene.sight
+    limit = _INLIER_SIGMA * max(1.0, min(place.scale, 2.0))
+    with np.errstate(invalid="ignore"):
+        p = np.linalg.norm(found.points[sight.point_rows], axis=1) <= limit * scene.scales[0] * sight.sigma_px
+        c = np.abs(found.curves[sight.curve_rows]) <= limit * scene.scales[1] * sight.curve_sigma_px
+    points[sight.point_rows], curves[sight.curve_rows] = p, c
+    return points, curves
+
+
+def _degrees(case: _Case, used: Sights, estimate: Estimate, free: JointPrior) -> int:
+    """How many of the tested numbers' directions both the old posterior and the new observations tell."""
+    told = information(used, estimate, case.layout(free), case.weighting)
+    new = _rank(Posterior(told.keys, told.matrix), case.tested)
+    old = _rank(Posterior(tuple(Key(*key) for key in case.prior.keys), case.prior.information), case.tested)
+    return max(min(new, old), 1)
+
+
+def _rank(posterior: Posterior, keys: tuple[Key, ...]) -> int:
+    places_of_keys = np.array([posterior.keys.index(key) for key in keys], dtype=np.int64)
+    spread = Spread.of(posterior.marginal(places_of_keys), sigma_limits(keys))
+    return len(keys) - int(spread.unknown.shape[1])
+
+
+# ---- in words -------------------------------------------------------------------------------------------------------
+
+
+def _not_understood(case: _Case, inside: int, count: int) -> StationCheck:
+    words = (
+        f"moved far, or not understood: only {inside} of {count} observations fit the known lens from anywhere near: "
+        "refit, or check labels and camera"
+    )
+    nothing = dict.fromkeys(HEIGHTS_M, (np.inf, np.inf))
+    return StationCheck(
+        case.name, False, 0.0, np.inf, 0, inside, count - inside, np.inf, np.inf, np.inf, np.inf, np.inf, nothing, words
+    )
+
+
+def _answer(
+    case: _Case,
+    anew: Estimate,
+    holds: bool,
+    probability: float,
+    statistic: float,
+    degrees: int,
+    inside: int,
+    count: int,
+    noise: float,
+) -> StationCheck:
+    old, new = case.estimate.camera_at(case.name), anew.camera_at(case.name)
+    shift_m, turn = movement(new.cam_from_world, old.cam_from_world)
+    maps = {
+        height_m: _map_shift_mm(case.estimate.camera_at(case.name), new, _field_grid(case, height_m), height_m)
+        for height_m in HEIGHTS_M
+    }
+    floor = _field_grid(case, 0.0)
+    pixels = np.linalg.norm(old.project(floor) - new.project(floor), axis=1)
+    seen = pixels[np.isfinite(pixels)]
+    shift_px = float(np.sqrt(np.mean(seen**2))) if len(seen) else np.nan
+    worst = maps[0.0][1]
+    words = (
+        f"holds: no movement beyond what is known ({worst:.1f} mm on the floor at most, probability {probability:.2g})"
+        if holds
+        else f"no longer holds: moved by about {1e3 * shift_m:.1f} mm and {np.degrees(turn):.3f} deg, "
+        f"which shifts the map by up to {worst:.1f} mm on the floor (probability {probability:.1g})"
+    )
+    if count - inside > _MANY_OUTLIERS * count:
+        words += f"; but {count - inside} of {count} observations fit nowhere: check labels"
+    return StationCheck(
+        case.name,
+        holds,
+        probability,
+        statistic,
+        degrees,
+        inside,
+        count - inside,
+        noise,
+        1e3 * shift_m,
+        float(np.degrees(turn)),
+        new.phi / old.phi - 1.0,
+        shift_px,
+        maps,
+        words,
+    )
+
+
+def _field_grid(case: _Case, height_m: float) -> Array:
+    """Places (N, 3) of the map's grid that the station sees."""
+    grid = field_grid(case.calibration.targets)
+    x, y = (part.ravel() for part in np.meshgrid(*grid))
+    places_seen = np.column_stack([x, y])
+    shown = np.isfinite(shown_pixels(case.estimate, case.name, places_seen, height_m)[:, 0])
+    return np.column_stack([places_seen[shown], np.full(np.count_nonzero(shown), height_m)])
+
+
+def _map_shift_mm(old: Camera, new: Camera, seen: Array, height_m: float) -> tuple[float, float]:
+    """Mean and largest distance (mm) between where the old and the new camera locate the same pixels."""
+    pixels = old.project(seen)
+    off = 1e3 * np.linalg.norm(new.locate(pixels, height_m) - seen[:, :2], axis=1)
+    off = off[np.isfinite(off)]
+    return (float(np.mean(off)), float(np.max(off))) if len(off) else (np.nan, np.nan)

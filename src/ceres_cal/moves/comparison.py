@@ -1,0 +1,165 @@
+"""Where on the field two calibrations differ, how far the cameras stand apart, and whether their uncertainties explain
+it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ceres_cal.calibration import Calibration
+from ceres_cal.chi_squared import upper_tail
+from ceres_cal.errors import InputError
+from ceres_cal.moves.poses import movement
+from ceres_cal.parameters import Estimate
+from ceres_cal.quantities import Key, difference, sigma_limits
+from ceres_cal.spread import Spread, known_inverses
+from ceres_cal.transforms import Array
+from ceres_cal.uncertainty.maps import field_map, shown_pixels
+from ceres_cal.uncertainty.uncertainty import field_grid
+
+_DOUBTFUL = 0.01  # probability below which uncertainty alone does not explain a difference
+
+
+@dataclass(frozen=True, eq=False)
+class StationComparison:
+    """One station in two calibrations, a and b.
+
+    Attributes:
+        moved_mm, turned_deg: from a to b. phi_px: of a and of b.
+        height_m, x_m (X,), y_m (Y,): the map's height and grid.
+        difference_mm: (Y, X, 2) where b locates what a sees there, less the place itself; NaN where a does not show it.
+        expected_mm: (Y, X) standard deviation of its length if nothing but noise lies between a and b, whose errors
+            count as independent; NaN where that cannot be said.
+        probability: of numbers as far apart or farther, from their uncertainties alone; None where one of the two does
+            not say how well it is known, or has other free numbers.
+    """
+
+    station: str
+    moved_mm: float
+    turned_deg: float
+    phi_px: tuple[float, float]
+    height_m: float
+    x_m: Array
+    y_m: Array
+    difference_mm: Array
+    expected_mm: Array
+    probability: float | None
+
+    @property
+    def length_mm(self) -> Array:
+        """(Y, X) length of the difference."""
+        return np.asarray(np.linalg.norm(self.difference_mm, axis=2))
+
+    @property
+    def mean_mm(self) -> float:
+        """Mean length over what a shows; NaN where it shows nothing."""
+        shown = self.length_mm[np.isfinite(self.length_mm)]
+        return float(np.mean(shown)) if len(shown) else np.nan
+
+    @property
+    def worst_mm(self) -> float:
+        """Largest length."""
+        shown = self.length_mm[np.isfinite(self.length_mm)]
+        return float(np.max(shown)) if len(shown) else np.nan
+
+    @property
+    def explained(self) -> bool | None:
+        """Whether the uncertainties explain the difference; None where they are not known."""
+        return None if self.probability is None else self.probability >= _DOUBTFUL
+
+
+def compare(
+    a: Calibration, b: Calibration, height_m: float = 0.0, station: str | None = None
+) -> list[StationComparison]:
+    """Compare two calibrations, station by station.
+
+    The two count as independent of each other. Where b is a refit of a they share what was known before, and the
+    difference that is to be expected is smaller than stated.
+
+    Raises:
+        InputError: no station that both have, or not the one named; no field to draw a map of.
+    """
+    common = [name for name in a.estimate.stations if name in b.estimate.stations]
+    if station is not None and station not in common:
+        raise InputError(f"station {station!r} is not in both calibrations: both have {_listed(common)}")
+    if not common:
+        raise InputError(
+            f"no station is in both calibrations: one has {_listed(list(a.estimate.stations))}, the other "
+            f"{_listed(list(b.estimate.stations))}"
+        )
+    return [_compared(a, b, name, height_m) for name in ([station] if station is not None else common)]
+
+
+def _listed(names: Sequence[str]) -> str:
+    return ", ".join(map(repr, names)) or "none"
+
+
+def _compared(a: Calibration, b: Calibration, station: str, height_m: float) -> StationComparison:
+    first, second = a.station(station), b.station(station)
+    x, y = field_grid(a.targets)
+    places = np.column_stack([part.ravel() for part in np.meshgrid(x, y)])
+    pixels = shown_pixels(a.estimate, station, places, height_m)
+    off = 1e3 * (second.locate(pixels, height_m) - places)
+    shift_m, turn = movement(second.cam_from_world, first.cam_from_world)
+    return StationComparison(
+        station,
+        1e3 * shift_m,
+        float(np.degrees(turn)),
+        (first.phi, second.phi),
+        height_m,
+        x,
+        y,
+        off.reshape(len(y), len(x), 2),
+        _expected_mm(a, b, station, height_m, x, y),
+        _probability(a, b, station),
+    )
+
+
+def _is_told(calibration: Calibration, station: str) -> bool:
+    posterior = calibration.posterior
+    return posterior is not None and any(key[:2] == ("station", station) for key in posterior.keys)
+
+
+def _expected_mm(a: Calibration, b: Calibration, station: str, height_m: float, x: Array, y: Array) -> Array:
+    if not (_is_told(a, station) and _is_told(b, station)):
+        return np.full((len(y), len(x)), np.nan)
+    maps = [field_map(c.estimate, c.posterior, station, height_m, x, y).sd_mm for c in (a, b) if c.posterior]
+    return np.asarray(np.hypot(*maps))
+
+
+def _probability(a: Calibration, b: Calibration, station: str) -> float | None:
+    """Of a chi-squared as large: the difference d under (A^-1 + B^-1)^-1 = A (A + B)^+ B, which needs no inverse of
+    either information where a direction is not told.
+    """
+    if not (_is_told(a, station) and _is_told(b, station)):
+        return None
+    keys = _keys(a, station)
+    if set(keys) != set(_keys(b, station)):
+        return None
+    told = []
+    for calibration in (a, b):
+        posterior = calibration.posterior
+        assert posterior is not None
+        told.append(posterior.marginal(np.array([posterior.keys.index(key) for key in keys])))
+    limits = sigma_limits(keys)
+    both = told[0] @ known_inverses(told[0] + told[1], limits) @ told[1]
+    off = difference(_only(b, station), _only(a, station), keys)
+    degrees = len(keys) - max(int(Spread.of(matrix, limits).unknown.shape[1]) for matrix in told)
+    return upper_tail(float(off @ both @ off), degrees) if degrees > 0 else None
+
+
+def _keys(calibration: Calibration, station: str) -> list[Key]:
+    owners = {("station", station), ("camera", calibration.estimate.stations[station].camera)}
+    posterior = calibration.posterior
+    assert posterior is not None
+    return [key for key in posterior.keys if key[:2] in owners]
+
+
+def _only(calibration: Calibration, station: str) -> Estimate:
+    """One station and its camera."""
+    old = calibration.estimate
+    camera = old.stations[station].camera
+    return Estimate({camera: old.cameras[camera]}, {station: old.stations[station]}, {}, old.structure)

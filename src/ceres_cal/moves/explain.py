@@ -1,0 +1,265 @@
+"""What has happened to a camera: explanations tried on its observations, and which of them they support.
+
+As long as the chosen freedom explains everything, nothing else is asked. Where it does not, others are tried and named.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ceres_cal.bundle.joint import offsets
+from ceres_cal.calibration import Calibration
+from ceres_cal.chi_squared import upper_bound
+from ceres_cal.errors import CalibrationError, SolutionError
+from ceres_cal.moves.carried import Plan, without_keys
+from ceres_cal.moves.labels import MIRRORED, TURNED, other_divisions, relabelled
+from ceres_cal.moves.poses import Place, Scene, misfit, movement, places
+from ceres_cal.observations import Observations
+from ceres_cal.parameters import Estimate
+from ceres_cal.residuals import residuals
+from ceres_cal.sights import gather_sights
+from ceres_cal.transforms import Pose
+
+_ZOOMS = 15
+_HALF = 0.5
+_FEW = 0.2  # share of observations that may be taken out
+_RARE = 1e-4  # how often an unchanged lens is doubted
+_NOISIER = 1.5  # times the noise of the old calibration, from where on the lens is doubted
+_TOO_NOISY = 4.0  # from where on nothing is explained
+_SUPPORTED = 10.0  # nats by which another explanation must be better
+_FAR_M, _NEAR_M, _NEAR_RAD = 1.5, 1.0, np.pi / 4.0
+_TURN = Pose(np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
+
+_WIDER = {
+    "pose-only": ("zoom", "iris", "everything"),
+    "pose": ("zoom", "iris", "everything"),
+    "zoom": ("everything",),
+    "iris": ("everything",),
+    "everything": (),
+}
+WORDS = {
+    "zoom": "the zoom was changed",
+    "iris": "the lens's distortion has changed (another iris or focus)",
+    "everything": "this is another lens or another camera",
+}
+
+
+def labels_turned(found: Pose, old: Pose) -> tuple[float, float] | None:
+    """How far (m) the camera moved with the labels as given and with the field's labels turned by half a turn, where
+    the latter is the likelier story: a camera at its place, not one across the field.
+    """
+    given_m, _ = movement(found, old)
+    turned_m, turn = movement(found @ _TURN, old)
+    likelier = given_m > _FAR_M and turned_m < min(_NEAR_M, given_m / 3.0) and turn < _NEAR_RAD
+    return (given_m, turned_m) if likelier else None
+
+
+def require_labels(plan: Plan, poses: Mapping[str, Pose]) -> None:
+    """Raise SolutionError where the field's labels look turned by half a turn."""
+    for name, pose in poses.items():
+        old = plan.calibration.estimate.stations.get(name)
+        moves = None if old is None else labels_turned(pose, old.cam_from_world)
+        if moves is not None and relabelled(plan.observations, TURNED) is not None:
+            raise SolutionError(
+                f"station {name!r}: labels are swapped, it seems: as given they put the camera {moves[0]:.2f} m from "
+                f"where it was, turned by 180 degrees {moves[1]:.2f} m: relabel with --labels turned, or confirm them "
+                "with --labels as-given"
+            )
+
+
+def old_poses(plan: Plan, scene: Scene) -> list[Pose]:
+    """Where the camera of a scene stood before, the scene's own station first."""
+    stations, key = plan.calibration.estimate.stations, scene.sight.key
+    names = sorted((n for n in stations if stations[n].camera == key.camera), key=lambda name: name != key.station)
+    return [stations[name].cam_from_world for name in names]
+
+
+# ---- where nothing fits ---------------------------------------------------------------------------------------------
+
+
+def why_nothing_fits(plan: Plan, scenes: Sequence[Scene]) -> SolutionError:
+    """What else the observations of the stations could be, as the error that refuses them."""
+    for scene in scenes:
+        words = next(_others(plan, scene), None)
+        station = scene.sight.key.station
+        if words is not None:
+            return SolutionError(f"station {station!r}: its observations do not fit the known lens and field; {words}")
+    names = ", ".join(repr(scene.sight.key.station) for scene in scenes)
+    return SolutionError(
+        f"station {names}: no explanation fits, neither a move, another zoom or lens, mirrored labels nor another "
+        "field: check labels, which camera and which field it is"
+    )
+
+
+def _others(plan: Plan, scene: Scene) -> Iterator[str]:
+    """Explanations that fit, in words, with what to do."""
+    old = old_poses(plan, scene)
+    mirrored = relabelled(scene.observations, MIRRORED)
+    if mirrored is not None and _fits(_seen_as(scene, mirrored), old):
+        yield "with mirrored labels they do: left and right are swapped, or the image is flipped: correct that"
+    for name, observations in other_divisions(scene.observations).items():
+        if _fits(_seen_as(scene, observations), old):
+            yield f"on {name} they do: this is the wrong field: correct the target's dimensions"
+    zoomed = zoomed_place(scene, old)
+    if zoomed is not None and _good(zoomed[1]) and plan.what not in ("zoom", "everything"):
+        phi = zoomed[0].camera.phi
+        before = scene.camera.phi
+        yield f"with phi {phi:.0f} px in place of {before:.0f} they do: {WORDS['zoom']}: refit with --what zoom"
+    from ceres_cal.calibrate import calibrate
+
+    try:
+        fresh = calibrate(_of_camera(scene), replace(plan.options, priors=()))
+    except CalibrationError:
+        return
+    noise = max(fresh.fit.point_scale / scene.scales[0], fresh.fit.curve_scale / scene.scales[1])
+    if noise < _NOISIER and len(fresh.rejected) < _FEW * (fresh.fit.points + fresh.fit.curves):
+        yield f"with another lens they do: {WORDS['everything']}: calibrate it anew"
+
+
+def _fits(scene: Scene, old: list[Pose]) -> bool:
+    found = places(scene, old, patience=0)
+    return bool(found) and _good(found[0])
+
+
+def _good(place: Place) -> bool:
+    """Whether a pose explains the observations about as well as the old calibration did its own."""
+    return place.fits and place.scale < _NOISIER
+
+
+def _seen_as(scene: Scene, observations: Observations) -> Scene:
+    """The scene with its observations renamed or its targets exchanged; structure is left out of it."""
+    from ceres_cal.structure import make_structure
+
+    sights = gather_sights(observations)
+    number = sights.keys.index(scene.sight.key)
+    estimate = replace(scene.estimate, structure=make_structure(observations.targets, {}))
+    return replace(scene, observations=observations, sight=sights[number], estimate=estimate)
+
+
+def _of_camera(scene: Scene) -> Observations:
+    """The observations of the scene's station alone."""
+    observations = scene.observations
+    views = [n for n, view in enumerate(observations.views) if view.station == scene.sight.key.station]
+    order = np.full(len(observations.views), -1, dtype=np.int32)
+    order[views] = np.arange(len(views))
+
+    def kept(columns: object) -> object:
+        rows = order[columns.view] >= 0  # type: ignore[attr-defined]
+        changed = {name: values[rows] for name, values in vars(columns).items()}
+        return replace(columns, **(changed | {"view": order[columns.view[rows]]}))  # type: ignore[attr-defined,type-var]
+
+    camera = scene.sight.key.camera
+    return Observations(
+        observations.targets,
+        {camera: observations.cameras[camera]},
+        tuple(observations.views[n] for n in views),
+        kept(observations.points),  # type: ignore[arg-type]
+        kept(observations.curves),  # type: ignore[arg-type]
+    )
+
+
+def zoomed_place(scene: Scene, old: list[Pose]) -> tuple[Scene, Place] | None:
+    """The scene with the phi that explains it best, and the pose there; None where none explains half of it."""
+    best: tuple[Scene, Place] | None = None
+    for width in (2.0, 1.05, 1.008):  # each grid is finer, around the best of the one before
+        middle = scene.camera.phi if best is None else best[0].camera.phi
+        for phi in middle * np.geomspace(1.0 / width, width, _ZOOMS):
+            zoomed = scene.with_camera(replace(scene.camera, phi=float(phi)))
+            for place in places(zoomed, old, patience=0)[:1]:
+                if best is None or place.misfit < best[1].misfit:
+                    best = zoomed, place
+    return best if best is not None and best[1].share >= _HALF else None
+
+
+# ---- where a solve is to be judged ----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Judged:
+    """How a solved refit stands to what was known.
+
+    Attributes:
+        strain: squared distance of intrinsics, structure and stations that stay from their prior, in its sigmas.
+        rank: what it is expected to be at most. noise: times that of the old calibration.
+    """
+
+    strain: float
+    rank: int
+    noise: float
+
+    @property
+    def noisy(self) -> bool:
+        """Whether the noise is worth a word."""
+        return self.noise > _NOISIER
+
+    @property
+    def doubtful(self) -> bool:
+        """Whether another explanation should be looked for."""
+        return self.noisy or (self.rank > 0 and self.strain > upper_bound(_RARE, self.rank))
+
+
+def judged(plan: Plan, what: str, result: Calibration) -> Judged:
+    """Strain and noise of a result."""
+    prior = without_keys(plan.prior, plan.loosened(what))
+    strain = float(np.sum((prior.root @ offsets(prior, result.estimate)) ** 2)) if prior.rank else 0.0
+    fit, (points, curves) = result.fit, plan.scales
+    ratios = ((fit.points, fit.point_scale / points), (fit.curves, fit.curve_scale / curves))
+    noise = [ratio for count, ratio in ratios if count]
+    return Judged(strain, prior.rank, max(noise, default=1.0))
+
+
+def require_supported(plan: Plan, result: Calibration, attempt: Callable[[str, Estimate], Calibration]) -> bool:
+    """Whether nothing fits; SolutionError where another explanation than the chosen one is supported.
+
+    Args:
+        attempt: solves again with another freedom, from an estimate.
+    """
+    doubtful = judged(plan, plan.what, result).doubtful
+    results = {plan.what: result}
+    for what in _WIDER[plan.what] if doubtful else _WIDER[plan.what][:2]:
+        try:
+            results[what] = attempt(what, result.estimate)
+        except CalibrationError:
+            continue
+    quiet = {w: r for w, r in results.items() if judged(plan, w, r).noise < _TOO_NOISY or w == plan.what}
+    scores = _scores(plan, quiet)
+    # Of explanations that are about as good the one that lets least go is taken.
+    best = next(what for what in quiet if scores[what] < min(scores.values()) + _SUPPORTED)
+    if best != plan.what and judged(plan, best, results[best]).noise < _NOISIER:
+        gain = scores[plan.what] - scores[best]
+        raise SolutionError(
+            f"{WORDS[best]}, the observations say{_changes(plan, best, results[best])}: not what was known of the lens "
+            f"(better by {gain:.0f} nats): refit with --what {best}"
+        )
+    return judged(plan, plan.what, result).noise > _TOO_NOISY or best != plan.what
+
+
+def _changes(plan: Plan, what: str, result: Calibration) -> str:
+    if what == "iris":
+        return ""
+    old = plan.calibration.cameras
+    changes = [f"{name!r} {old[name].phi:.1f} -> {result.cameras[name].phi:.1f} px" for name in plan.moved_cameras]
+    return f" (phi of camera {', '.join(changes)})"
+
+
+def _scores(plan: Plan, results: Mapping[str, Calibration]) -> dict[str, float]:
+    """Misfit of observations and prior, and half the logarithm of the count for every number let go; in nats."""
+    sights = gather_sights(plan.observations)
+    fits = [result.fit for result in results.values()]
+    scales = (
+        max(plan.scales[0], min(fit.point_scale for fit in fits)),
+        max(plan.scales[1], min(fit.curve_scale for fit in fits)),
+    )
+    count = len(sights.point_rows) + len(sights.curve_rows)
+    scores = {}
+    for what, result in results.items():
+        found = residuals(plan.observations, sights, result.estimate)
+        total = 0.5 * judged(plan, what, result).strain + 0.5 * len(plan.loosened(what)) * np.log(count)
+        for name in dict.fromkeys(key.camera for key in sights.keys):
+            own = sights.take(np.array([i for i, key in enumerate(sights.keys) if key.camera == name], dtype=np.int64))
+            total += misfit(own, result.cameras[name], found, scales)
+        scores[what] = float(total)
+    return scores

@@ -1,0 +1,216 @@
+"""After a move: the poses anew, everything else under what was known of it (design, sections 3 and 8).
+
+The same path as `calibrate`, from the old calibration's closed form with a known lens to solve, reject, solve, assess;
+the old posterior is one more prior, as a full matrix.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection
+from dataclasses import replace
+
+import numpy as np
+
+from ceres_cal.bundle import Progress
+from ceres_cal.calibrate import solved_from
+from ceres_cal.calibration import Calibration, Refitted
+from ceres_cal.errors import DegenerateError, InputError, SolutionError
+from ceres_cal.initialise import Start
+from ceres_cal.moves.carried import Plan, again, first_estimate, layouts, make_plan
+from ceres_cal.moves.explain import judged, old_poses, require_labels, require_supported, why_nothing_fits, zoomed_place
+from ceres_cal.moves.labels import TURNED, relabelled
+from ceres_cal.moves.poses import Scene, movement, places
+from ceres_cal.observations import Observations, Prior
+from ceres_cal.parameters import Estimate
+from ceres_cal.sights import Sights, gather_sights
+from ceres_cal.transforms import Pose
+
+LABELS = ("check", "as-given", "turned")
+_NATS_ALIKE = 10.0
+
+
+def refit(
+    calibration: Calibration,
+    observations: Observations,
+    what: str = "pose",
+    *,
+    moved: Collection[str] | None = None,
+    hold_others: bool = False,
+    labels: str = "check",
+    priors: tuple[Prior, ...] = (),
+    progress: Callable[[Progress], None] | None = None,
+) -> Calibration:
+    """A calibration after cameras were moved, from few new observations and all that was known.
+
+    Stations that were not observed stay under the old posterior, but for those of a camera that was observed elsewhere:
+    they are dropped, the camera is not there any more. Placements are not carried over, only what the new observations
+    show is placed. Priors of the old options are in the posterior already; those on the new observations count as new.
+    Refitting a calibration to the observations that it was made of asks the same question once more: what was known
+    before them is the prior then, and nothing counts twice.
+
+    Args:
+        what: "pose" (intrinsics under their posterior), "pose-only" (intrinsics held; how well they are known still
+            counts in the new posterior), "zoom" (nothing is known of phi any more), "iris" (nothing of the lens's
+            coefficients), "everything" (nothing of the intrinsics).
+        moved: observed stations that moved; by default all. The other observed ones stay under their posterior.
+        hold_others: hold stations that stay and their cameras exactly; their posterior still learns.
+        labels: "check" them against a turn by 180 degrees, take them "as-given", or "turned".
+        priors: new knowledge, such as a height measured after the move.
+
+    Raises:
+        InputError: names that do not fit the calibration, or one that does not say how well it is known.
+        DegenerateError: the observations cannot tell a pose.
+        SolutionError: no explanation fits, or another one than `what` allows for does; the message says which.
+    """
+    if labels not in LABELS:
+        raise InputError(f"labels={labels!r} is unknown: choose one of {', '.join(LABELS)}")
+    given = _turned(observations) if labels == "turned" else observations
+    plan = make_plan(calibration, observations, what, moved, hold_others, priors)
+    if given is not observations:
+        plan = replace(plan, observations=replace(given, targets=plan.observations.targets))
+    sights = gather_sights(plan.observations)
+    estimate = _start(plan, sights, check_labels=labels == "check")
+
+    def attempt(freedom: str, start: Estimate, *, assessed: bool = False) -> Calibration:
+        solved, known = layouts(plan, freedom, start, set(start.placements))
+        begin, taken_up = Start(start, _phi_from(plan)), again(plan, known, assessed=assessed)
+        return solved_from(begin, plan.observations, sights, solved, plan.options, progress, taken_up)
+
+    result = attempt(what, estimate, assessed=True)
+    others = require_supported(plan, result, attempt)
+    if others:
+        raise why_nothing_fits(plan, [_scene(plan, sight, estimate) for sight in _moved_sights(plan, sights)])
+    _require_known(plan, result)
+    explanation = _explained(plan, result)
+    seen = (*calibration.refitted.digests, calibration.digest) if calibration.refitted else (calibration.digest,)
+    if calibration.digest == observations.digest:
+        seen = calibration.refitted.digests if calibration.refitted else ()
+    refitted = Refitted(what, tuple(sorted(plan.moved)), explanation, plan.prior, plan.scales, seen)
+    warnings = (*_warnings(plan, result), *([_TWICE] if observations.digest in seen else []))
+    return replace(result, digest=observations.digest, refitted=refitted, warnings=warnings)
+
+
+_TWICE = "these observations are in the old calibration's past already: what they say counts twice now"
+
+
+def _turned(observations: Observations) -> Observations:
+    turned = relabelled(observations, TURNED)
+    if turned is None:
+        raise InputError("labels turned: some observed feature has no counterpart half a turn away: label anew")
+    return turned
+
+
+def _start(plan: Plan, sights: Sights, *, check_labels: bool) -> Estimate:
+    """Poses of everything that is sought, lenses as they were (or zoomed, where that may be)."""
+    old = plan.calibration.estimate
+    poses: dict[str, Pose] = {}
+    cameras = dict(old.cameras)
+    empty = first_estimate(plan, {name: Pose.identity() for name in plan.moved}, {})
+    for sight in _moved_sights(plan, sights):
+        scene, pose = _sought(plan, _scene(plan, sight, empty))
+        poses[sight.key.station], cameras[sight.key.camera] = pose, scene.camera
+    if check_labels:
+        require_labels(plan, poses)
+    estimate = replace(first_estimate(plan, poses, {}), cameras=cameras)
+    return replace(estimate, placements=_placements(plan, sights, estimate))
+
+
+def _moved_sights(plan: Plan, sights: Sights) -> list[Sights]:
+    """What each station that moved sees of the world."""
+    found = {k.station: sights[i] for i, k in enumerate(sights.keys) if k.placement is None and k.station in plan.moved}
+    for name in sorted(plan.moved - found.keys()):
+        raise DegenerateError(
+            f"station {name!r} sees nothing that lies in the world: observe lines or points of the field with it"
+        )
+    return list(found.values())
+
+
+def _scene(plan: Plan, sight: Sights, estimate: Estimate) -> Scene:
+    return Scene(plan.observations, sight, estimate, plan.scales)
+
+
+def _sought(plan: Plan, scene: Scene) -> tuple[Scene, Pose]:
+    """The scene as it is understood, and the station's pose there."""
+    old = old_poses(plan, scene)
+    found = places(scene, old)
+    fitting = [place for place in found if place.fits and place.misfit <= found[0].misfit + _NATS_ALIKE]
+    if fitting:
+        return scene, min(fitting, key=lambda place: _far(place.pose, old)).pose
+    if plan.what in ("zoom", "iris", "everything"):
+        zoomed = zoomed_place(scene, old)
+        if zoomed is not None:
+            return zoomed[0], zoomed[1].pose
+    raise why_nothing_fits(plan, [scene])
+
+
+def _phi_from(plan: Plan) -> dict[str, str]:
+    free = plan.moved_cameras if plan.what in ("zoom", "everything") else ()
+    return {name: "views" if name in free else "posterior" for name in plan.calibration.cameras}
+
+
+def _far(pose: Pose, old: list[Pose]) -> float:
+    """How large a move is: of explanations that fit alike the nearest is taken."""
+    return min((sum(movement(pose, before)) for before in old), default=0.0)
+
+
+def _placements(plan: Plan, sights: Sights, estimate: Estimate) -> dict[str, Pose]:
+    """Every placement that the observations show, from the first sight that can tell its pose."""
+    found: dict[str, Pose] = {}
+    for number, key in enumerate(sights.keys):
+        if key.placement is None or key.placement in found:
+            continue
+        seen = places(_scene(plan, sights[number], replace(estimate, placements={})), [], patience=0)
+        if seen:
+            found[key.placement] = estimate.stations[key.station].cam_from_world.inverse @ seen[0].pose
+    for key in sights.keys:
+        if key.placement is not None and key.placement not in found:
+            raise DegenerateError(f"{key}: its pose cannot be told: show at least four points, not on one line")
+    return found
+
+
+# ---- what came out --------------------------------------------------------------------------------------------------
+
+
+def _require_known(plan: Plan, result: Calibration) -> None:
+    """Raise DegenerateError where the observations leave a pose open."""
+    assert result.posterior is not None
+    for place, key in enumerate(result.posterior.keys):
+        if key.kind == "station" and key.owner in plan.moved and not np.isfinite(result.posterior.sd[place]):
+            raise DegenerateError(
+                f"station {key.owner!r}: the observations do not tell its {key.quantity.replace('_', ' ')}: "
+                "add points, or lines in another direction"
+            )
+    for name in plan.moved:
+        if not np.all(np.isfinite(result.estimate.stations[name].cam_from_world.matrix)):
+            raise SolutionError(f"station {name!r}: the solve ended nowhere: check labels and target dimensions")
+
+
+def _explained(plan: Plan, result: Calibration) -> str:
+    """What has happened to each station that was sought, in words."""
+    words, moves = [], movements(plan.calibration, result)
+    for name in sorted(plan.moved):
+        how = "is new" if name not in moves else f"moved by {1e3 * moves[name][0]:.1f} mm and {moves[name][1]:.3f} deg"
+        words.append(f"station {name!r} {how}")
+    if plan.what in ("zoom", "everything"):
+        for name in sorted(plan.moved_cameras):
+            before, after = plan.calibration.cameras[name].phi, result.cameras[name].phi
+            words.append(f"phi of camera {name!r} went from {before:.2f} to {after:.2f} px")
+    return "; ".join(words)
+
+
+def movements(before: Calibration, after: Calibration) -> dict[str, tuple[float, float]]:
+    """How far (m) and by how much (degrees) each station that both have stands elsewhere."""
+    found = {}
+    for name, station in after.estimate.stations.items():
+        if name in before.estimate.stations:
+            old = before.estimate.stations[name].cam_from_world
+            shift_m, turn = movement(station.cam_from_world, old)
+            found[name] = (shift_m, float(np.degrees(turn)))
+    return found
+
+
+def _warnings(plan: Plan, result: Calibration) -> tuple[str, ...]:
+    """Those of the solve, and what the noise says."""
+    found = judged(plan, plan.what, result)
+    noisy = f"the noise is {found.noise:.1f} times that of the calibration before"
+    return (*result.warnings, noisy) if found.noisy else result.warnings

@@ -1,0 +1,113 @@
+"""Whether calibrations still hold, on the scenes of scripts/moves.py."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from accuracy_scenes import FIELD
+from moves import CAMERA, DAY, HOME, NOISE, SMALL_SHIFT, SMALL_TILT, check_case, seen, thinned
+from moves import calibrated as calibrated_at_home
+
+from ceres_cal.calibrate import calibrate
+from ceres_cal.calibration import Calibration
+from ceres_cal.camera import Camera
+from ceres_cal.errors import InputError, SolutionError
+from ceres_cal.moves import check
+from ceres_cal.moves.labels import MIRRORED, relabelled
+from ceres_cal.observations import Observations
+from ceres_cal.parameters import Options, Station
+from ceres_cal.simulate import Disturbance, field_scene, overhead_pose, simulate
+from ceres_cal.structure import Tolerance
+from ceres_cal.transforms import Pose, rotation_exp
+
+
+@pytest.fixture(scope="module")
+def calibration() -> Calibration:
+    return calibrated_at_home(0)
+
+
+def lines(pose: Pose, seed: int, disturbance: Disturbance = DAY, camera: Camera = CAMERA) -> Observations:
+    found = seen(pose, disturbance, seed, camera=camera, spacing_m=0.12).observations
+    return thinned(found, (), 100, seed)
+
+
+def test_alarms_come_as_often_as_stated() -> None:
+    rows = list(check_case(10))
+    assert rows[0].value <= 0.1  # of 20; about 0.01 of 2000
+    assert rows[1].value == rows[2].value == 1.0  # of 500, too
+
+
+def test_the_probability_is_even(calibration: Calibration) -> None:
+    """For unmoved cameras every probability is as likely, whatever the old posterior leaves open."""
+    found = np.array(
+        [check(calibrated_at_home(s), lines(HOME, 1000 + s), 0.01).stations["overhead"].probability for s in range(24)]
+    )
+    edges = np.sort(found)
+    distance = np.max(np.abs(edges - (np.arange(24) + 0.5) / 24))
+    assert distance < 0.32  # 0.1; Kolmogorov and Smirnov have 0.32 at 1 % for 24
+
+
+@pytest.mark.parametrize("pose", [SMALL_TILT, SMALL_SHIFT])
+def test_sizes_are_those_of_the_movement(calibration: Calibration, pose: Pose) -> None:
+    found = check(calibration, lines(pose, 1)).stations["overhead"]
+    assert not found.holds and "no longer holds" in found.words
+    x, y = (part.ravel() for part in np.meshgrid(np.linspace(-4.0, -1.0, 9), np.linspace(-2.0, 2.0, 9)))
+    floor = np.column_stack([x, y, 0.0 * x])
+    off = 1e3 * np.linalg.norm(CAMERA.at(pose).locate(CAMERA.at(HOME).project(floor)) - floor[:, :2], axis=1)
+    assert found.shift_mm[0.0][0] == pytest.approx(float(np.mean(off)), rel=0.4)  # 3.2 of 3.7 mm, 2.7 of 3.0 mm
+
+
+def test_outliers_and_more_noise_are_no_movement(calibration: Calibration) -> None:
+    gross = replace(NOISE, outliers=0.2)
+    assert check(calibration, lines(HOME, 2, gross)).holds
+    dim = replace(NOISE, points_sigma_px=0.6, curves_sigma_px=0.6)
+    observations = lines(HOME, 3, dim)
+    observations = replace(
+        observations, curves=replace(observations.curves, sigma_px=0.5 * observations.curves.sigma_px)
+    )
+    found = check(calibration, observations).stations["overhead"]
+    assert found.holds and found.noise == pytest.approx(2.0, rel=0.2)  # 1.9
+
+
+def test_what_is_not_understood_does_not_hold(calibration: Calibration) -> None:
+    observations = lines(HOME, 4)
+    shuffled = np.random.default_rng(0).permutation(observations.curves.feature)
+    found = check(calibration, replace(observations, curves=replace(observations.curves, feature=shuffled)))
+    assert not found.holds and "not understood" in found.stations["overhead"].words
+    mirrored = relabelled(observations, MIRRORED)  # two thirds of it look the same: the camera is where it was
+    assert mirrored is not None
+    found = check(calibration, mirrored)
+    assert found.holds and "check labels" in found.stations["overhead"].words
+    far = Pose.looking(HOME.position + np.array([0.5, 0.2, 0.3]), rotation_exp((0.2, 0.1, np.pi)) @ HOME.rotation)
+    assert not check(calibration, lines(far, 5)).holds
+    zoomed = replace(CAMERA, phi=1.05 * CAMERA.phi)
+    assert not check(calibration, lines(HOME, 6, NOISE, zoomed)).holds
+
+
+def test_each_station_by_itself() -> None:
+    cameras = {"left": CAMERA, "right": replace(CAMERA, phi=873.4)}
+    stations = {
+        "left": Station("left", overhead_pose(-2.3, 0.05, 4.4, 4.0, 2.0, 90.0)),
+        "right": Station("right", overhead_pose(2.35, -0.08, 4.5, 5.0, -2.5, -90.8)),
+    }
+    scene = field_scene(FIELD, cameras, stations, spacing_m=0.2)
+    options = Options(tolerances={"field": Tolerance(lines_m=0.003)})
+    both = calibrate(simulate(scene, NOISE, 0).observations, options)
+    pose = stations["right"].cam_from_world
+    moved = Station("right", Pose.looking(pose.position, rotation_exp((0.003, 0.0, 0.0)) @ pose.rotation))
+    there = field_scene(FIELD, cameras, {**stations, "right": moved}, spacing_m=0.3)
+    found = check(both, simulate(there, NOISE, 1).observations)
+    assert found.stations["left"].holds and not found.stations["right"].holds and not found.holds
+
+
+def test_wrong_use(calibration: Calibration) -> None:
+    observations = lines(HOME, 7)
+    with pytest.raises(InputError, match="between 0 and 1"):
+        check(calibration, observations, 1.5)
+    with pytest.raises(InputError, match="does not say how well"):
+        check(replace(calibration, posterior=None), observations)
+    with pytest.raises(SolutionError, match="wrong camera"):
+        check(calibration, replace(observations, cameras={"overhead": (640, 480)}))
+    views = tuple(replace(view, station="second") for view in observations.views)
+    with pytest.raises(InputError, match="not in the calibration"):
+        check(calibration, replace(observations, views=views))

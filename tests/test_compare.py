@@ -1,0 +1,75 @@
+"""Two calibrations side by side."""
+
+from dataclasses import replace
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from moves import CAMERA, DAY, HOME, MOVED, seen
+from moves import calibrated as calibrated_at_home
+
+from ceres_cal.calibration import Calibration
+from ceres_cal.errors import InputError
+from ceres_cal.moves import compare, picture, refit
+
+
+@pytest.fixture(scope="module")
+def calibration() -> Calibration:
+    return calibrated_at_home(0)
+
+
+def test_equals_differ_nowhere(calibration: Calibration) -> None:
+    (found,) = compare(calibration, calibration, 0.15)
+    assert found.moved_mm == 0.0 and found.turned_deg < 1e-6
+    assert found.worst_mm < 1e-6
+    assert found.explained and found.probability == pytest.approx(1.0)
+
+
+def test_repetitions_differ_as_expected(calibration: Calibration) -> None:
+    """What two calibrations of the same camera differ by, over what they are expected to: 1, and any probability is as
+    likely.
+    """
+    every = [calibrated_at_home(seed) for seed in range(1, 25)]
+    pairs = [compare(a, b)[0] for a, b in zip(every[::2], every[1::2], strict=True)]
+    ratio = [np.nanmean(pair.length_mm**2) / np.nanmean(pair.expected_mm**2) for pair in pairs]
+    assert 0.4 < np.mean(ratio) < 2.0  # 0.9
+    probabilities = np.sort([pair.probability for pair in pairs if pair.probability is not None])
+    assert len(probabilities) == 12
+    assert np.max(np.abs(probabilities - (np.arange(12) + 0.5) / 12)) < 0.45  # 0.2
+
+
+def test_a_move_is_found(calibration: Calibration) -> None:
+    moved = refit(calibration, seen(MOVED, DAY, 1).observations)
+    (found,) = compare(calibration, moved)
+    assert found.moved_mm == pytest.approx(1e3 * np.linalg.norm(MOVED.position - HOME.position), abs=5.0)  # 1.2 mm off
+    assert found.explained is False
+    row, column = 12, 8  # halfway up, in what both see
+    place = np.array([[found.x_m[column], found.y_m[row], 0.0]])
+    pixel = calibration.station().project(place)
+    expected = 1e3 * (moved.station().locate(pixel) - place[:, :2])
+    np.testing.assert_allclose(found.difference_mm[row, column], expected[0], rtol=1e-9)
+    assert np.isnan(found.length_mm[:, -1]).all()  # the far end of the field is not in the picture
+
+
+def test_without_uncertainty_nothing_is_explained(calibration: Calibration) -> None:
+    (found,) = compare(calibration, replace(calibration, posterior=None))
+    assert found.explained is None and np.isnan(found.expected_mm).all()
+
+
+def test_no_station_in_common(calibration: Calibration) -> None:
+    other = replace(calibration.estimate, stations={"elsewhere": calibration.estimate.stations["overhead"]})
+    with pytest.raises(InputError, match="no station is in both"):
+        compare(calibration, replace(calibration, estimate=other))
+    with pytest.raises(InputError, match="not in both"):
+        compare(calibration, calibration, station="elsewhere")
+
+
+def test_the_picture_is_svg(calibration: Calibration) -> None:
+    moved = replace(calibration.estimate.cameras["overhead"], phi=1.01 * CAMERA.phi)
+    zoomed = replace(calibration, estimate=replace(calibration.estimate, cameras={"overhead": moved}))
+    (found,) = compare(calibration, zoomed)
+    root = ElementTree.fromstring(picture(found, calibration.targets))
+    tags = [child.tag.rpartition("}")[2] for child in root]
+    shown = np.count_nonzero(np.isfinite(found.length_mm))
+    assert tags.count("rect") == 1 + shown + 8
+    assert tags.count("polyline") == len(calibration.targets["field"].curves)

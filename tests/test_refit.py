@@ -1,0 +1,343 @@
+"""Refits after a move, on the scenes of scripts/moves.py."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from accuracy_scenes import FIELD
+from moves import (
+    CAMERA,
+    CORNERS,
+    DAY,
+    HOME,
+    MOST_SIGMA,
+    MOVED,
+    NOISE,
+    TILTED,
+    bound_case,
+    moves_case,
+    seen,
+    sigmas_off,
+    thinned,
+    truth_of,
+)
+from moves import calibrated as calibrated_at_home
+
+from ceres_cal.bundle.costs import Run
+from ceres_cal.bundle.joint import JointPriorCost, offsets
+from ceres_cal.calibrate import calibrate
+from ceres_cal.calibration import Calibration
+from ceres_cal.errors import DegenerateError, InputError, SolutionError
+from ceres_cal.joint import JointPrior
+from ceres_cal.lens import Radial
+from ceres_cal.moves import refit
+from ceres_cal.moves.carried import make_plan, prior_for, without_keys
+from ceres_cal.moves.labels import MIRRORED, TURNED, relabelled
+from ceres_cal.moves.poses import movement
+from ceres_cal.observations import Observations
+from ceres_cal.parameters import Layout, Options, Station
+from ceres_cal.quantities import difference, moved
+from ceres_cal.simulate import field_scene, overhead_pose, simulate
+from ceres_cal.structure import Tolerance
+from ceres_cal.targets import ssl_field
+from ceres_cal.transforms import Pose, rotation_exp
+
+FAR = overhead_pose(-2.3, -1.9, 3.9, tilt_y_deg=-25.0, yaw_deg=90.0)
+
+
+@pytest.fixture(scope="module")
+def calibration() -> Calibration:
+    return calibrated_at_home(0)
+
+
+@pytest.fixture(scope="module")
+def observations() -> Observations:
+    return seen(MOVED, DAY, 1).observations
+
+
+@pytest.fixture(scope="module")
+def two_cameras() -> tuple[Calibration, dict[str, Station]]:
+    """Two cameras over one field that is not as drawn: its tolerances tie them together."""
+    cameras = {"left": CAMERA, "right": replace(CAMERA, phi=873.4)}
+    stations = {
+        "left": Station("left", overhead_pose(-2.3, 0.05, 4.4, 4.0, 2.0, 90.0)),
+        "right": Station("right", overhead_pose(2.35, -0.08, 4.5, 5.0, -2.5, -90.8)),
+    }
+    scene = field_scene(FIELD, cameras, stations, frames=2, spacing_m=0.15)
+    options = Options(tolerances={"field": Tolerance(lines_m=0.005)})
+    return calibrate(simulate(scene, NOISE, 0).observations, options), stations
+
+
+# ---- the prior ------------------------------------------------------------------------------------------------------
+
+
+def test_the_joint_prior_says_what_its_matrix_says(two_cameras: tuple[Calibration, dict[str, Station]]) -> None:
+    """Residual and Jacobian of the block, against r = root (x - mean) by differences."""
+    calibration, _ = two_cameras
+    posterior, estimate = calibration.posterior, calibration.estimate
+    assert posterior is not None
+    poses = {name: station.cam_from_world for name, station in estimate.stations.items()}
+    structure = dict(zip(estimate.structure.names, estimate.structure.values.tolist(), strict=True))
+    joint = JointPrior(posterior.keys, posterior.information, estimate.cameras, poses, structure)
+    scale = 1.0 / np.sqrt(np.diagonal(posterior.information))
+    told = scale[:, None] * (joint.root.T @ joint.root - posterior.information) * scale
+    assert np.max(np.abs(told)) < 1e-12  # 2e-15
+    free = {name: np.array([0, 2, 3, 4, 5]) for name in estimate.cameras}
+    layout = Layout(free, frozenset(poses), frozenset(), (), joint)
+    step = np.random.default_rng(0).normal(size=len(posterior.keys)) * 30.0 * posterior.sd
+    away = moved(estimate, posterior.keys, step)
+    np.testing.assert_allclose(offsets(joint, away), step, rtol=1e-6, atol=1e-12)
+    cost = JointPriorCost(Run(), joint, away, layout)
+    from ceres_cal.bundle.problem import _Blocks
+
+    blocks = _Blocks.pack(away, layout, frozenset())
+    of = {"camera": blocks.cameras, "station": blocks.stations}
+    arrays = [of[kind][name] if kind in of else blocks.structure for kind, name in cost.owners]
+
+    def value(arrays: list[np.ndarray]) -> np.ndarray:
+        found = np.empty(joint.rank)
+        assert cost.Evaluate(arrays, found, None)
+        return found
+
+    np.testing.assert_allclose(value(arrays), joint.root @ step, rtol=1e-6, atol=1e-6)
+    slopes = [np.empty(joint.rank * len(array)) for array in arrays]
+    assert cost.Evaluate(arrays, np.empty(joint.rank), slopes)
+    for number, (array, slope) in enumerate(zip(arrays, slopes, strict=True)):
+        for k in range(len(array)):
+            size = 1e-6 * max(1.0, abs(array[k]))
+            ends = []
+            for sign in (1.0, -1.0):
+                there = [a.copy() for a in arrays]
+                there[number][k] += sign * size
+                ends.append(value(there))
+            numeric = (ends[0] - ends[1]) / (2.0 * size)
+            analytic = slope.reshape(joint.rank, -1)[:, k]
+            np.testing.assert_allclose(analytic, numeric, rtol=1e-5, atol=1e-5 * max(np.abs(numeric).max(), 1.0))
+
+
+def test_integrating_out_is_the_inverse_of_the_covariance(calibration: Calibration, observations: Observations) -> None:
+    prior = prior_for(calibration, observations, frozenset())
+    posterior = calibration.posterior
+    assert posterior is not None
+    kept = [i for i, key in enumerate(posterior.keys) if key.kind == "camera"]
+    covariance = np.linalg.inv(prior.information)
+    np.testing.assert_allclose(covariance, posterior.covariance[np.ix_(kept, kept)], rtol=1e-6)
+    gone = [key for key in prior.keys if key[2] == "phi"]
+    rest = [i for i, key in enumerate(prior.keys) if key not in gone]
+    left = without_keys(prior, gone)
+    np.testing.assert_allclose(np.linalg.inv(left.information), covariance[np.ix_(rest, rest)], rtol=1e-6)
+
+
+def test_the_new_posterior_is_data_and_prior(calibration: Calibration, observations: Observations) -> None:
+    """What is known of phi can only grow, and hardly does from a floor seen from above."""
+    result = refit(calibration, observations)
+    before, after = (c.uncertainty.posterior.sd_of("camera", "overhead", "phi") for c in (calibration, result))
+    assert 0.8 * before < after < before
+    held = refit(calibration, observations, "pose-only")
+    assert held.cameras == calibration.cameras
+    assert held.uncertainty.posterior.sd_of("camera", "overhead", "phi") == pytest.approx(after, rel=0.1)
+
+
+# ---- moves ----------------------------------------------------------------------------------------------------------
+
+
+def test_moves_are_picked_up() -> None:
+    rows = {row.what: row for row in moves_case(40)}
+    assert rows["share within 5 sigma of the truth"].value == 1.0  # 1.0 of 1000
+    assert rows["farther off, not refused"].value == 0
+
+
+def test_few_observations_reach_the_bound() -> None:
+    rows = list(bound_case(12))
+    for row in rows[:2]:
+        assert row.value < 1.1 + 2.0 * row.error  # 1.01 +- 0.04 and 1.00 +- 0.04 of 60 runs
+    assert rows[2].value > 3.0  # 5.4 of 60 runs
+
+
+@pytest.mark.parametrize("turn", [0.0, np.pi])
+def test_four_corners_are_enough(calibration: Calibration, turn: float) -> None:
+    pose = Pose.looking(TILTED.position, rotation_exp((0.0, 0.0, turn)) @ TILTED.rotation)
+    few = thinned(seen(pose, NOISE, 2).observations, CORNERS, 0, 0)
+    assert len(few.points) == 4 and len(few.curves) == 0
+    result = refit(calibration, few)
+    assert np.max(sigmas_off(result, truth_of(calibration, pose))) < MOST_SIGMA
+
+
+def test_two_lines_and_an_arc_are_enough_after_a_small_move(calibration: Calibration) -> None:
+    pose = Pose.looking(
+        HOME.position + np.array([0.02, -0.03, 0.01]), rotation_exp((0.01, -0.02, 0.015)) @ HOME.rotation
+    )
+    lines = seen(pose, NOISE, 3).observations
+    names = lines.targets["field"].curve_names
+    wanted = [names.index(name) for name in ("HalfwayLine", "TopTouchLine", "CenterCircle")]
+    rows = np.isin(lines.curves.feature, wanted)
+    none = np.zeros(len(lines.points), dtype=bool)
+    lines = replace(
+        lines,
+        points=replace(lines.points, **{n: v[none] for n, v in vars(lines.points).items()}),
+        curves=replace(lines.curves, **{n: v[rows] for n, v in vars(lines.curves).items()}),
+    )
+    result = refit(calibration, lines)
+    assert np.max(sigmas_off(result, truth_of(calibration, pose))) < MOST_SIGMA
+
+
+def test_parallel_lines_are_refused(calibration: Calibration) -> None:
+    lines = seen(HOME, NOISE, 3).observations
+    names = lines.targets["field"].curve_names
+    rows = np.isin(lines.curves.feature, [names.index("CenterLine"), names.index("TopTouchLine")])
+    none = np.zeros(len(lines.points), dtype=bool)
+    lines = replace(
+        lines,
+        points=replace(lines.points, **{n: v[none] for n, v in vars(lines.points).items()}),
+        curves=replace(lines.curves, **{n: v[rows] for n, v in vars(lines.curves).items()}),
+    )
+    with pytest.raises(DegenerateError, match="do not tell its"):
+        refit(calibration, lines)
+
+
+# ---- nothing counts twice -------------------------------------------------------------------------------------------
+
+
+def test_a_refit_of_a_refit_changes_nothing(
+    calibration: Calibration, observations: Observations, tmp_path: Path
+) -> None:
+    first = refit(calibration, observations)
+    first.save(tmp_path / "first.json")
+    again = refit(Calibration.load(tmp_path / "first.json"), observations)
+    posterior = first.posterior
+    assert posterior is not None and again.posterior is not None
+    change = difference(again.estimate, first.estimate, posterior.keys) / posterior.sd
+    assert np.max(np.abs(change)) < 1e-3  # 2.5e-6
+    np.testing.assert_allclose(again.posterior.sd, posterior.sd, rtol=1e-4)
+    assert not again.warnings
+
+
+def test_other_observations_do_count(calibration: Calibration, observations: Observations) -> None:
+    first = refit(calibration, observations)
+    second = refit(first, seen(MOVED, DAY, 2).observations)
+    third = refit(second, observations)
+    assert first.digest in second.refitted.digests  # type: ignore[union-attr]
+    assert any("twice" in text for text in third.warnings)
+
+
+# ---- explanations ---------------------------------------------------------------------------------------------------
+
+
+def test_another_zoom_is_said_and_can_be_asked_for(calibration: Calibration) -> None:
+    zoomed = seen(FAR, DAY, 2, camera=replace(CAMERA, phi=1.1 * CAMERA.phi)).observations
+    with pytest.raises(SolutionError, match=r"the zoom was changed.*--what zoom"):
+        refit(calibration, zoomed)
+    result = refit(calibration, zoomed, "zoom")
+    assert result.station().phi == pytest.approx(1.1 * CAMERA.phi, rel=5e-3)  # 2e-3
+    with pytest.raises(SolutionError, match=r"zoom was changed.*--what zoom"):
+        refit(calibration, seen(FAR, DAY, 2, camera=replace(CAMERA, phi=0.7 * CAMERA.phi)).observations)
+
+
+def test_another_iris_is_said_and_can_be_asked_for(calibration: Calibration) -> None:
+    camera = replace(CAMERA, lens=Radial((-4.0e-5, 6.3e-7)))
+    changed = seen(MOVED, DAY, 3, camera=camera).observations
+    with pytest.raises(SolutionError, match=r"distortion has changed.*--what iris"):
+        refit(calibration, changed)
+    result = refit(calibration, changed, "iris")
+    truth = truth_of(calibration, MOVED, camera)
+    assert np.max(sigmas_off(result, truth)) < MOST_SIGMA
+
+
+def test_turned_labels_are_refused_or_turned_back(calibration: Calibration, observations: Observations) -> None:
+    turned = relabelled(observations, TURNED)
+    assert turned is not None
+    with pytest.raises(SolutionError, match="turned by 180 degrees"):
+        refit(calibration, turned)
+    for labels, there in (("turned", observations), ("as-given", turned)):
+        result = refit(calibration, turned, labels=labels)
+        best = refit(calibration, there, labels="as-given")
+        shift_m, turn = movement(result.station().cam_from_world, best.station().cam_from_world)
+        assert shift_m < 1e-6 and turn < 1e-6
+
+
+def test_mirrored_labels_are_said(calibration: Calibration, observations: Observations) -> None:
+    mirrored = relabelled(observations, MIRRORED)
+    assert mirrored is not None
+    with pytest.raises(SolutionError, match="mirrored labels"):
+        refit(calibration, mirrored)
+
+
+def test_another_field_is_said(calibration: Calibration) -> None:
+    stations = {"overhead": Station("overhead", MOVED)}
+    scene = field_scene(ssl_field("A"), {"overhead": CAMERA}, stations, spacing_m=0.3)
+    elsewhere = simulate(scene, DAY, 6).observations
+    with pytest.raises(SolutionError, match="wrong field"):
+        refit(calibration, elsewhere)
+    with pytest.raises(SolutionError, match="division A"):
+        refit(calibration, replace(elsewhere, targets={"field": FIELD}))
+
+
+def test_another_camera_is_said(calibration: Calibration, observations: Observations) -> None:
+    with pytest.raises(SolutionError, match="wrong camera"):
+        refit(calibration, replace(observations, cameras={"overhead": (640, 480)}))
+
+
+def test_nonsense_is_refused(calibration: Calibration, observations: Observations) -> None:
+    rng = np.random.default_rng(0)
+    points = replace(observations.points, feature=rng.permutation(observations.points.feature))
+    curves = replace(observations.curves, feature=rng.permutation(observations.curves.feature))
+    with pytest.raises(SolutionError, match="no explanation fits"):
+        refit(calibration, replace(observations, points=points, curves=curves))
+
+
+def test_relabelling_twice_gives_the_same(observations: Observations) -> None:
+    for image in (TURNED, MIRRORED):
+        once = relabelled(observations, image)
+        assert once is not None and once.digest != observations.digest
+        twice = relabelled(once, image)
+        assert twice is not None and twice.digest == observations.digest
+
+
+# ---- several cameras ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("both_seen", [False, True])
+def test_the_moved_one_of_two_cameras(two_cameras: tuple[Calibration, dict[str, Station]], both_seen: bool) -> None:
+    calibration, stations = two_cameras
+    position = stations["right"].cam_from_world.position + np.array([0.1, 0.2, -0.05])
+    pose = Pose.looking(position, rotation_exp((0.0, 0.0, np.pi)) @ MOVED.rotation)
+    there = {**stations, "right": Station("right", pose)}
+    cameras = {"left": CAMERA, "right": replace(CAMERA, phi=873.4)}
+    if not both_seen:
+        cameras, there = ({"right": d["right"]} for d in (cameras, there))  # type: ignore[assignment]
+    observed = simulate(field_scene(FIELD, cameras, there, spacing_m=0.3), NOISE, 5).observations
+    result = refit(calibration, observed, moved=["right"])
+    posterior, before = result.posterior, calibration.posterior
+    assert posterior is not None and before is not None
+    assert list(result.stations) == ["left", "right"]
+    left = [key for key in posterior.keys if key.owner == "left"]
+    assert len(left) == len([key for key in before.keys if key.owner == "left"])
+    sd = np.array([posterior.sd_of(*key[:3]) for key in left])
+    old = np.array([before.sd_of(*key[:3]) for key in left])
+    assert np.all(np.abs(difference(result.estimate, calibration.estimate, left)) < 4.0 * old)
+    assert np.all(sd < 1.001 * old)
+    shift_m, turn = movement(result.estimate.stations["right"].cam_from_world, pose)
+    assert shift_m < 0.05 and turn < 0.01  # 0.010 m, 0.0017 rad
+    held = refit(calibration, observed, moved=["right"], hold_others=True)
+    assert held.cameras["left"] == calibration.cameras["left"]
+    assert held.estimate.stations["left"] == calibration.estimate.stations["left"]
+    assert any(key.owner == "left" for key in held.posterior.keys)  # type: ignore[union-attr]
+
+
+# ---- wrong use ------------------------------------------------------------------------------------------------------
+
+
+def test_names_that_do_not_fit(calibration: Calibration, observations: Observations) -> None:
+    with pytest.raises(InputError, match="what="):
+        refit(calibration, observations, "phi")
+    with pytest.raises(InputError, match="was not observed"):
+        refit(calibration, observations, moved=["elsewhere"])
+    with pytest.raises(InputError, match="does not say how well"):
+        refit(replace(calibration, posterior=None), observations)
+    views = tuple(replace(view, station="second") for view in observations.views)
+    result = refit(calibration, replace(observations, views=views))
+    assert list(result.stations) == ["second"]  # the camera is not where it was
+    assert result.refitted is not None and "is new" in result.refitted.explanation
+    plan = make_plan(calibration, observations, "pose", None, False)
+    assert plan.loosened("zoom") == {("camera", "overhead", "phi", "px")}

@@ -1,0 +1,125 @@
+"""The script that a lab copies, and that a refit killed at any moment leaves a whole calibration."""
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import refit_after_move
+from moves import DAY, HOME, MOVED, NOISE, seen
+from moves import calibrated as calibrated_at_home
+
+from ceres_cal.calibration import Calibration
+from ceres_cal.moves import check
+from ceres_cal.moves.labels import MIRRORED, relabelled
+
+ROOT = Path(__file__).resolve().parents[1]
+ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT / "src")}
+
+
+@pytest.fixture
+def place(tmp_path: Path) -> Path:
+    """A folder with a calibration, observations from before and after a move, and such that nothing explains."""
+    calibrated_at_home(0).save(tmp_path / "calibration.json")
+    seen(HOME, DAY, 1000).observations.save(tmp_path / "same.json")
+    after = seen(MOVED, DAY, 1001).observations
+    after.save(tmp_path / "after.json")
+    mirrored = relabelled(after, MIRRORED)
+    assert mirrored is not None
+    mirrored.save(tmp_path / "mirrored.json")
+    (tmp_path / "broken.json").write_text('{"format": "ceres-cal/obs')
+    return tmp_path
+
+
+def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, list[dict[str, object]]]:
+    code = refit_after_move.main([str(argument) for argument in arguments])
+    return code, [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+
+
+def test_one_file_after_the_other(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    calibration = place / "calibration.json"
+    before = calibration.read_bytes()
+    names = ["same.json", "mirrored.json", "after.json", "after.json", "broken.json"]
+    code, events = run(capsys, calibration, *(place / name for name in names))
+    assert [event["event"] for event in events] == ["holds", "refused", "refitted", "holds", "unreadable"]
+    assert code == 3  # of the last one
+    assert "mirrored labels" in str(events[1]["reason"]) and "not valid JSON" in str(events[4]["reason"])
+    assert Path(str(events[2]["kept"])).read_bytes() == before
+    after = Calibration.load(calibration)
+    assert after.refitted is not None
+    assert check(after, seen(MOVED, NOISE, 5).observations).holds
+
+
+def test_what_is_known_too_little_is_not_used(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = (place / "calibration.json").read_bytes()
+    code, events = run(capsys, place / "calibration.json", place / "after.json", "--limit-mm", 0.1)
+    assert code == 3 and events[0]["event"] == "refused" and "asked for are 0.1 mm" in str(events[0]["reason"])
+    assert (place / "calibration.json").read_bytes() == before and not (place / "previous").exists()
+
+
+def test_a_folder_is_watched(place: Path) -> None:
+    incoming = place / "incoming"
+    incoming.mkdir()
+    log = place / "events.jsonl"
+    script = [sys.executable, str(ROOT / "scripts" / "refit_after_move.py"), str(place / "calibration.json")]
+    watching = [*script, "--watch", str(incoming), "--every-s", "0.05", "--log", str(log)]
+    process = subprocess.Popen(watching, env=ENVIRONMENT)
+    try:
+        time.sleep(0.5)
+        (incoming / "new.json").write_bytes((place / "after.json").read_bytes())
+        deadline = time.monotonic() + 20.0
+        while time.monotonic() < deadline and not (log.exists() and log.read_text().endswith("\n")):
+            (incoming / "new.json").touch()  # it may have come before the watch began
+            time.sleep(0.3)
+        events = [json.loads(line) for line in log.read_text().splitlines()]
+    finally:
+        process.send_signal(signal.SIGINT)
+        assert process.wait(10) in (0, -signal.SIGINT)
+    assert events[0]["event"] == "refitted"
+
+
+def test_a_killed_refit_leaves_a_whole_calibration(place: Path) -> None:
+    """Killed at random moments of its life, and, in a loop of nothing but writing, at random moments of that."""
+    calibration, rng = place / "calibration.json", random.Random(0)
+    old = calibration.read_bytes()
+    refit = ["-c", "import sys; from ceres_cal.cli import main; sys.exit(main(sys.argv[1:]))", "refit"]
+    arguments = [*refit, str(calibration), str(place / "after.json"), "-o", str(calibration), "--json"]
+    whole, left = {old}, set()
+    for _ in range(2):
+        calibration.write_bytes(old)
+        process = subprocess.Popen([sys.executable, *arguments], env=ENVIRONMENT, stdout=subprocess.DEVNULL)
+        time.sleep(rng.uniform(0.3, 1.5))
+        process.kill()
+        process.wait()
+        left.add(calibration.read_bytes())
+    calibration.write_bytes(old)
+    subprocess.run([sys.executable, *arguments], env=ENVIRONMENT, stdout=subprocess.DEVNULL, check=True)
+    whole.add(calibration.read_bytes())
+    assert len(whole) == 2 and left <= whole
+    code = (
+        "import sys; from ceres_cal.calibration import Calibration\n"
+        "both = [Calibration.load(path) for path in sys.argv[1:3]]\n"
+        "print('ready', flush=True)\n"
+        "while True:\n"
+        "    for one in both: one.save(sys.argv[3])\n"
+    )
+    for name, content in zip(("a.json", "b.json"), sorted(whole), strict=True):
+        (place / name).write_bytes(content)
+    seen_contents = set()
+    for _ in range(4):
+        process = subprocess.Popen(
+            [sys.executable, "-c", code, str(place / "a.json"), str(place / "b.json"), str(calibration)],
+            env=ENVIRONMENT,
+            stdout=subprocess.PIPE,
+        )
+        assert process.stdout is not None and process.stdout.readline() == b"ready\n"
+        time.sleep(rng.uniform(0.0, 0.05))
+        process.kill()
+        process.communicate()
+        seen_contents.add(calibration.read_bytes())
+    assert seen_contents <= whole
