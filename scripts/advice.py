@@ -226,14 +226,19 @@ def main(arguments: Sequence[str]) -> int:
     given = parser.parse_args(arguments)
     if given.runs < 2:
         parser.error("--runs must be 2 or more: one run has no spread")
-    missed = False
+    every: list[Row] = []
     for name in given.case:
         start = time.perf_counter()
         for row in rows(name, CASES[name](), given.runs):
-            missed |= row.verdict == "no"
+            every.append(row)
             print(row, flush=True)
         print(f"  {name}: {time.perf_counter() - start:.0f} s", flush=True)
-    return 1 if missed else 0
+    for what in ("stated", "in fact"):
+        ratios = [row.value for row in every if row.what.endswith(f" {what}")]
+        if ratios:
+            note = f"{min(ratios):.2f} to {max(ratios):.2f}"
+            print(Row("everything", f"{what}, over what was promised, mean", float(np.mean(ratios)), note=note))
+    return 1 if any(row.verdict == "no" for row in every) else 0
 
 
 if __name__ == "__main__":

@@ -116,7 +116,7 @@ class Outlook:
         added, over what phi may be by its 95 % bounds.
 
         There the observations of today tell everything but phi as the valley has it, and phi by the parabola that fits
-        the valley best.
+        the valley best. Where nothing would be seen of what is added, all of it is infinite.
         """
         profile = self.profile
         assert profile is not None
@@ -125,11 +125,15 @@ class Outlook:
         tangents = np.gradient(profile.steps[:, 1:], profile.steps[:, 0], axis=0)
         bend = max(float(np.polyfit(np.log(profile.phi), profile.rises, 2)[0]), 0.0) if len(profile.phi) > 2 else 0.0
         for place, there in self.possible:
+            added = told_at(there)[np.ix_(at, at)]
+            if not np.any(added):
+                yield float(profile.phi[place]), np.inf, Errors(np.inf, np.inf)
+                continue
             across, along = profile.information[place], tangents[place]
             coupling = -across @ along
             phi = along @ across @ along + bend / profile.phi[place] ** 2
             told = np.block([[np.atleast_2d(phi), coupling[None]], [coupling[:, None], across]])
-            known = _part(Spread.of(told + told_at(there)[np.ix_(at, at)], limits), own)
+            known = _part(Spread.of(told + added, limits), own)
             errors = _errors(known, _slopes(there, self.today, self.keys))
             yield float(profile.phi[place]), self._phi_sd(there, known), errors
 

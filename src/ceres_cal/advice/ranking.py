@@ -32,8 +32,8 @@ class Promise:
         after: the errors that it leaves, where everything is as estimated.
         valley: where phi is followed along its profile today, and the measurement settles it: phi (px) and the errors
             left if that is what phi is, over its 95 % bounds.
-        rough: whether phi is followed along its profile and might have to be still. Then `after` is no more than a
-            guess, good to a factor of two or three.
+        rough: whether phi is followed along its profile and might have to be still. Then `after` is a guess: what was
+            obtained in simulation is from a tenth to five times of it, or known where it says unknown.
     """
 
     measurement: Measurement
