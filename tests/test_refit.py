@@ -17,6 +17,7 @@ from moves import (
     TILTED,
     bound_case,
     moves_case,
+    random_move,
     seen,
     sigmas_off,
     thinned,
@@ -180,6 +181,13 @@ def test_two_lines_and_an_arc_are_enough_after_a_small_move(calibration: Calibra
     )
     result = refit(calibration, lines)
     assert np.max(sigmas_off(result, truth_of(calibration, pose))) < MOST_SIGMA
+
+
+def test_few_lines_do_not_tell_a_large_move(calibration: Calibration) -> None:
+    """One corner, two parallel lines and a bit of the circle have a second solution, 0.8 m from the truth."""
+    few = thinned(seen(random_move(26), NOISE, 5026).observations, CORNERS[:3], 10, 26)
+    with pytest.raises(DegenerateError, match="7 equations"):
+        refit(calibration, few)
 
 
 def test_parallel_lines_are_refused(calibration: Calibration) -> None:
