@@ -33,7 +33,7 @@ def lines(pose: Pose, seed: int, disturbance: Disturbance = DAY, camera: Camera 
 
 def test_alarms_come_as_often_as_stated() -> None:
     rows = list(check_case(10))
-    assert rows[0].value <= 0.1  # of 20; about 0.01 of 2000
+    assert rows[0].value <= 0.1  # of 20; 0.016 of 2000
     assert rows[1].value == rows[2].value == 1.0  # of 500, too
 
 

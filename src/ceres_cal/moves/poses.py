@@ -118,6 +118,15 @@ def _grid(pose: Pose) -> list[Pose]:
     return [Pose.looking(pose.position, rotation_exp(turn) @ pose.rotation) for turn in product(angles, repeat=3)]
 
 
+def equations(sight: Sights) -> int:
+    """What a sight can say of a pose's six numbers and more: two for each point and straight line, three for each arc,
+    but no more than its observations.
+    """
+    tracks, counts = np.unique(sight.track, return_counts=True)
+    most = np.where(sight.is_arc[tracks], 3, 2)
+    return 2 * len(np.unique(sight.points, axis=0)) + int(np.sum(np.minimum(counts, most)))
+
+
 def closed_form(scene: Scene) -> Pose | None:
     """The pose by a linear homography between undistorted rays and the floor, from points and straight lines; None
     where they are too few (a point gives two equations, a line two) or lie so that they tell none.

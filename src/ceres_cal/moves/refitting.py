@@ -19,7 +19,7 @@ from ceres_cal.initialise import Start
 from ceres_cal.moves.carried import Plan, again, first_estimate, layouts, make_plan
 from ceres_cal.moves.explain import judged, old_poses, require_labels, require_supported, why_nothing_fits, zoomed_place
 from ceres_cal.moves.labels import TURNED, relabelled
-from ceres_cal.moves.poses import Scene, movement, places
+from ceres_cal.moves.poses import Scene, equations, movement, places
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.parameters import Estimate
 from ceres_cal.sights import Sights, gather_sights
@@ -27,6 +27,8 @@ from ceres_cal.transforms import Pose
 
 LABELS = ("check", "as-given", "turned")
 _NATS_ALIKE = 10.0
+_UNIQUE = 8  # equations with which a pose is the only one
+_SMALL = (0.3, np.deg2rad(15.0))
 
 
 def refit(
@@ -59,7 +61,7 @@ def refit(
 
     Raises:
         InputError: names that do not fit the calibration, or one that does not say how well it is known.
-        DegenerateError: the observations cannot tell a pose.
+        DegenerateError: the observations cannot tell a pose, or not for sure after so large a move.
         SolutionError: no explanation fits, or another one than `what` allows for does; the message says which.
     """
     if labels not in LABELS:
@@ -135,12 +137,29 @@ def _sought(plan: Plan, scene: Scene) -> tuple[Scene, Pose]:
     found = places(scene, old)
     fitting = [place for place in found if place.fits and place.misfit <= found[0].misfit + _NATS_ALIKE]
     if fitting:
-        return scene, min(fitting, key=lambda place: _far(place.pose, old)).pose
+        pose = min(fitting, key=lambda place: _far(place.pose, old)).pose
+        _require_unique(scene, pose, old)
+        return scene, pose
     if plan.what in ("zoom", "iris", "everything"):
         zoomed = zoomed_place(scene, old)
         if zoomed is not None:
             return zoomed[0], zoomed[1].pose
     raise why_nothing_fits(plan, [scene])
+
+
+def _require_unique(scene: Scene, pose: Pose, old: list[Pose]) -> None:
+    """Raise DegenerateError where so few features cannot tell a large move from another one."""
+    told = equations(scene.sight)
+    if told >= _UNIQUE or any(_is_small(*movement(pose, before)) for before in old):
+        return
+    raise DegenerateError(
+        f"station {scene.sight.key.station!r}: its points, lines and arcs give {told} equations, which tell a small "
+        f"move but not a large one for sure: show {_UNIQUE} (two a point or straight line, three an arc)"
+    )
+
+
+def _is_small(shift_m: float, turn: float) -> bool:
+    return shift_m < _SMALL[0] and turn < _SMALL[1]
 
 
 def _phi_from(plan: Plan) -> dict[str, str]:
