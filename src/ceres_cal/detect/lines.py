@@ -79,8 +79,6 @@ def search(grey: Grey, course: Course, reach_px: float, spare_px: float = 0.0) -
     Args:
         reach_px: how far to look to either side. spare_px: of two lines alike the one nearer than by this is taken.
     """
-    if not len(course):
-        return np.empty(0), np.empty(0)
     far = reach_px + float(np.max(course.width_px)) + _BAND_PX + 2.0
     steps = np.arange(-np.ceil(far / _SEARCH_STEP_PX), np.ceil(far / _SEARCH_STEP_PX) + 1.0) * _SEARCH_STEP_PX
     light = np.mean([_along_normals(grey, course, steps, shift) for shift in (-2.0, 0.0, 2.0)], axis=0)
@@ -119,10 +117,14 @@ def measure(grey: Grey, course: Course, reach_px: float) -> Lines:
     Args:
         reach_px: how far the course may be off.
     """
+    if not len(course):
+        none = np.empty(0)
+        return Lines(course, np.empty(0, dtype=bool), none, none, none, 1.0, 1.0)
     rough, bright = search(grey, course, reach_px)
     places = course.pixels + rough[:, None] * course.normals
     half_length = 0.5 * course.width_px + _BEYOND_PX
-    windows = cut_windows(grey, places, course.normals, course.curvature, _usual_length(half_length), HALF_WIDTH_PX)
+    usual_length = float(np.quantile(half_length, 0.9))
+    windows = cut_windows(grey, places, course.normals, course.curvature, usual_length, HALF_WIDTH_PX)
     edges = np.column_stack([-0.5 * course.width_px, 0.5 * course.width_px])
     blur, stretch = _shape(windows, edges, bright)
     fits = fit_profiles(windows, stretch * edges, blur, 1.5)
@@ -146,10 +148,6 @@ def measure(grey: Grey, course: Course, reach_px: float) -> Lines:
 def window_px(course: Course) -> Array:
     """(N,) how far from a place its window may reach: other paint must be farther away."""
     return np.asarray(1.2 * (course.width_px + _BEYOND_PX) + HALF_WIDTH_PX)
-
-
-def _usual_length(half_length: Array) -> float:
-    return float(np.quantile(half_length, 0.9)) if len(half_length) else _BEYOND_PX
 
 
 def _shape(windows: Windows, edges: Array, bright: Array) -> tuple[float, float]:

@@ -9,7 +9,7 @@ import numpy as np
 
 from ceres_cal.calibrate import calibrate
 from ceres_cal.camera import Camera
-from ceres_cal.detect.courses import Course, clear_px, predict
+from ceres_cal.detect.courses import clear_px, predict
 from ceres_cal.detect.lines import SPACING_PX, Lines, measure, search, window_px
 from ceres_cal.detect.profiles import Grey
 from ceres_cal.detect.registration import nearness, shifted
@@ -105,14 +105,9 @@ def follow(
         tried.append(_close_in(grey, target, camera, curves, freedom, _FAR_REACHES_PX))
         if tried[-1].holds and tried[-1].share >= _SURE_SHARE:
             break
-    best = max(tried or [_nothing(starts[0])], key=lambda one: (one.holds, one.share))
+    tried = tried or [_close_in(grey, target, starts[0], curves, freedom, ())]  # as it is: nothing to search
+    best = max(tried, key=lambda one: (one.holds, one.share))
     return _with_its_lens(grey, target, best, curves) if best.holds and freedom.names else best
-
-
-def _nothing(camera: Camera) -> Followed:
-    none = np.empty(0)
-    course = Course(np.empty(0, np.int32), none, np.empty((0, 2)), np.empty((0, 2)), none, none)
-    return Followed(camera, Lines(course, np.empty(0, bool), none, none, none, 1.0, 1.0), np.inf)
 
 
 # ---- near enough to search ------------------------------------------------------------------------------------------
