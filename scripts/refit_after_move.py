@@ -13,15 +13,12 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import sys
 import time
 from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
-
-os.environ.setdefault("GLOG_minloglevel", "3")  # what Ceres logs of a failed step is no error; it reads this once
 
 import ceres_cal as cc
 from ceres_cal.files import read_bytes, write_bytes

@@ -77,9 +77,9 @@ class SightCost(pyceres.CostFunction):
         code, vector, powers, unit = lens_arguments(estimate.cameras[key.camera])
         free = layout.free[key.camera]
         self._static = (
-            code, vector, free, powers, unit, *_columns(sight, estimate.structure, weighting),
+            code, vector, free, powers, unit, *kernel_columns(sight, estimate.structure, weighting),
             starting_places(sight, estimate, places),
-            *_track_slots(estimate.structure), kernels.LOSS_CODES[weighting.loss], weighting.loss_scale,
+            *kernel_track_slots(estimate.structure), kernels.LOSS_CODES[weighting.loss], weighting.loss_scale,
         )  # fmt: skip
         self._poses = [estimate.stations[key.station].cam_from_world.log(), np.zeros(6)]
         if key.placement is not None:
@@ -123,7 +123,7 @@ class SightCost(pyceres.CostFunction):
         return (at, residuals, [outputs[slot] for slot in self.slots]) if answered else None
 
 
-def _columns(sights: Sights, structure: Structure, weighting: Weighting) -> tuple[NDArray[Any], ...]:
+def kernel_columns(sights: Sights, structure: Structure, weighting: Weighting) -> tuple[NDArray[Any], ...]:
     """The observations as the kernels take them, but for points and tracks, which the structure moves."""
     moves = len(structure.values) > 0
     feature = sights.feature if moves else sights.feature[:0]
@@ -139,7 +139,8 @@ def _columns(sights: Sights, structure: Structure, weighting: Weighting) -> tupl
     )
 
 
-def _track_slots(structure: Structure) -> tuple[NDArray[np.int32]]:
+def kernel_track_slots(structure: Structure) -> tuple[NDArray[np.int32]]:
+    """Which structure numbers move the tracks, as the kernels take it: nothing where nothing moves."""
     return (structure.track_slots if len(structure.values) else structure.track_slots[:0],)
 
 
@@ -186,12 +187,12 @@ class EliminatedCost(pyceres.CostFunction):
         self._run, self._sights, self._structure = run, sights, estimate.structure
         self._optics = lens_arguments(estimate.cameras[self.camera])
         self._free = layout.free[self.camera]
-        pixels, weights, slots, bends, is_arc, track, curve_pixels, curve_weights = _columns(
+        pixels, weights, slots, bends, is_arc, track, curve_pixels, curve_weights = kernel_columns(
             sights, estimate.structure, weighting
         )
         self._observations = (
             sights.point_bounds, pixels, weights, slots, bends, is_arc, sights.curve_bounds, track, curve_pixels,
-            curve_weights, starting_places(sights, estimate, places), *_track_slots(estimate.structure),
+            curve_weights, starting_places(sights, estimate, places), *kernel_track_slots(estimate.structure),
         )  # fmt: skip
         self._loss = (kernels.LOSS_CODES[weighting.loss], weighting.loss_scale)
         self._tolerance = 1e-2 if weighting.rough else 1e-4

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ceres_cal import kernels
-from ceres_cal.bundle.costs import Weighting, _columns, _track_slots
+from ceres_cal.bundle.costs import Weighting, kernel_columns, kernel_track_slots
 from ceres_cal.bundle.problem import own_structure, private_placements
 from ceres_cal.errors import SolutionError
 from ceres_cal.parameters import Estimate, Layout, intrinsics_scales
@@ -107,7 +107,9 @@ def _normals(
     camera = estimate.cameras[sights.keys[0].camera]
     code, vector, powers, unit = lens_arguments(camera)
     free, structure = layout.free[sights.keys[0].camera], estimate.structure
-    pixels, weights, slots, bends, is_arc, track, curve_pixels, curve_weights = _columns(sights, structure, weighting)
+    pixels, weights, slots, bends, is_arc, track, curve_pixels, curve_weights = kernel_columns(
+        sights, structure, weighting
+    )
     starts = starting_places(sights, estimate, places)
     poses = estimate.pose_stack(sights.keys)
     size = len(free) + len(structure.values) + 6
@@ -119,7 +121,7 @@ def _normals(
         normals = np.empty((last - first, size, size))
         if not kernels.sight_normals(
             first, last, code, vector, free, powers, unit, sights.point_bounds, pixels, weights, slots, bends, is_arc,
-            sights.curve_bounds, track, curve_pixels, curve_weights, starts, *_track_slots(structure),
+            sights.curve_bounds, track, curve_pixels, curve_weights, starts, *kernel_track_slots(structure),
             kernels.LOSS_CODES[weighting.loss], weighting.loss_scale, structure.points(sights),
             structure.tracks(sights), len(structure.values), poses, normals,
         ):  # fmt: skip

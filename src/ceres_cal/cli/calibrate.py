@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from argparse import ArgumentParser, Namespace
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -104,7 +103,6 @@ def _run(args: Namespace) -> Answer:
 
     observations = combine([Observations.load(path) for path in args.observations])
     options = _options(args, fixed, powers, observations)
-    os.environ.setdefault("GLOG_minloglevel", "3")  # what Ceres logs of a failed step is no error yet
     with ProgressBar(silent=args.quiet or args.json) as bar:
         from ceres_cal.kernels.jit import CACHE_FOLDER
 

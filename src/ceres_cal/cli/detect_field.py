@@ -57,7 +57,6 @@ def _run(args: Namespace) -> Answer:
     if (args.start is None) == (not args.corner):
         raise InputError(f"say where to start: --start FILE, or --corner {_CORNER} four times")
     os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")  # what it warns of in an image, we say ourselves
-    os.environ.setdefault("GLOG_minloglevel", "3")  # what Ceres logs of a failed step is no error yet
     from ceres_cal.photographs import detect_field
 
     start = _start(args)

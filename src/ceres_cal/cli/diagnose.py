@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
 
@@ -43,7 +42,6 @@ def _run(args: Namespace) -> Answer:
         raise InputError(f"--folds must be at least 2, not {args.folds}")
     if args.held_out and args.new_data:
         raise InputError("--held-out calibrates the observations anew: leave out --new-data")
-    os.environ.setdefault("GLOG_minloglevel", "3")
     from ceres_cal.calibration import Calibration
     from ceres_cal.cli.diagnosis import diagnosis_data, diagnosis_text
     from ceres_cal.diagnostics import choose, diagnose

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -66,7 +65,6 @@ def _add_arguments(parser: ArgumentParser) -> None:
 def _run(args: Namespace) -> Answer:
     require_output(args.output, args.observations)  # to replace the old calibration is what many want
     calibration, observations = read_inputs(args)
-    os.environ.setdefault("GLOG_minloglevel", "3")  # what Ceres logs of a failed step is no error yet
     from ceres_cal.moves import refit
 
     priors = tuple(_height(spec, observations) for spec in args.prior)
