@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ceres_cal.baseline import four_point_baseline
+from ceres_cal.blas import single_threaded_blas
 from ceres_cal.bundle import Progress, Solution, Weighting, private_placements, settle_placements, solve
 from ceres_cal.calibration import Calibration, Fit, Rejected
 from ceres_cal.camera import Camera
@@ -49,10 +50,11 @@ def calibrate(
         InputError: a prior or a fixed number that the camera does not have.
     """
     options = options or Options()
-    sights = gather_sights(observations)
-    layout = make_layout(observations, options)
-    start = initialise(observations, sights, options)
-    return solved_from(start, observations, sights, layout, options, progress)
+    with single_threaded_blas():
+        sights = gather_sights(observations)
+        layout = make_layout(observations, options)
+        start = initialise(observations, sights, options)
+        return solved_from(start, observations, sights, layout, options, progress)
 
 
 @dataclass(frozen=True)
