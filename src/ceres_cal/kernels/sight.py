@@ -14,8 +14,7 @@ from ceres_cal.kernels.jit import jit
 from ceres_cal.kernels.lenses import answer_limit, distort, intrinsics_rows, one_dimensional
 from ceres_cal.kernels.losses import robust_loss
 
-CHUNK = 112  # a board of a hundred corners at once, all of it in the first cache; whole cache lines
-_LINE = 8  # numbers
+CHUNK = 112  # a board of a hundred corners at once, all of it in the first cache
 _FOOT_STEPS = 30
 _FOOT_TOLERANCE_PX = 1e-9
 
@@ -290,23 +289,13 @@ def layout_of_rows(free: Any, intrinsics: int, structure: int) -> tuple[Any, Any
 
 
 @jit
-def aligned(count: int) -> Any:
-    """An array that begins where a cache line does: registers are filled from one line, not two, twice as fast."""
-    room = np.empty(count + _LINE)
-    skip = (-(room.ctypes.data // 8)) % _LINE
-    return room[skip : skip + count]
-
-
-@jit
 def working_space(intrinsics: int, rows: int) -> tuple[Any, Any, Any, Any]:
     """Where `normal_equations` works: the chunk's Jacobian, its weighted rows, their products, and what leads there."""
-    panel = aligned((rows + 2) * 2 * CHUNK).reshape(rows + 2, 2 * CHUNK)
-    panel[:] = 0.0
     return (
-        aligned((intrinsics + 6) * 2 * CHUNK).reshape(intrinsics + 6, 2, CHUNK),
-        panel,
+        np.empty((intrinsics + 6, 2, CHUNK)),
+        np.zeros((rows + 2, 2 * CHUNK)),
         np.empty((rows + 2, rows + 2)),
-        aligned(32 * CHUNK).reshape(32, CHUNK),
+        np.empty((32, CHUNK)),
     )
 
 
