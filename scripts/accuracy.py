@@ -39,7 +39,7 @@ from ceres_cal.calibrate import calibrate
 from ceres_cal.calibration import Calibration
 from ceres_cal.camera import Camera
 from ceres_cal.observations import Observations
-from ceres_cal.parameters import Options, make_layout
+from ceres_cal.parameters import Options
 from ceres_cal.quantities import moved
 from ceres_cal.sights import gather_sights
 from ceres_cal.simulate import Disturbance, simulate
@@ -123,15 +123,14 @@ def mirrored_count(calibration: Calibration, observations: Observations, cam_fro
             poses have it in the same place.
     """
     sights = gather_sights(observations)
-    layout = make_layout(observations, calibration.options)
     weighting = Weighting(calibration.fit.point_scale, 1.0, calibration.options.loss, calibration.options.loss_scale)
     poses = calibration.estimate.pose_stack(sights.keys)
     rotations = np.array([cam_from_board[str(key.placement)] for key in sights.keys])
     middle = calibration.targets[observations.views[0].target].point_array.mean(axis=0)
     translations = poses[:, :, :3] @ middle + poses[:, :, 3] - rotations @ middle
     truly = np.concatenate([rotations, translations[:, :, None]], axis=2)
-    there, _ = placement_costs(sights, calibration.estimate, layout, weighting, truly)
-    here, _ = placement_costs(sights, calibration.estimate, layout, weighting, poses)
+    there, _ = placement_costs(sights, calibration.estimate, weighting, truly)
+    here, _ = placement_costs(sights, calibration.estimate, weighting, poses)
     return int(np.count_nonzero(there < here * (1.0 - LEAST_GAIN)))
 
 

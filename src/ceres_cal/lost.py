@@ -36,8 +36,8 @@ def with_lost_boards_found(
         pose = _by_consensus(sight, estimate, weighting) if sight.key.placement in private else None
         if pose is None:
             continue
-        as_is, _ = placement_costs(sight, estimate, layout, weighting, estimate.pose_stack(sight.keys))
-        tried = [placement_costs(sight, estimate, layout, weighting, p) for p in (pose, mirrored(sight, pose))]
+        as_is, _ = placement_costs(sight, estimate, weighting, estimate.pose_stack(sight.keys))
+        tried = [placement_costs(sight, estimate, weighting, p) for p in (pose, mirrored(sight, pose))]
         cost, found = min(tried, key=lambda one: float(one[0][0]))
         if cost[0] < 0.99 * as_is[0]:
             estimate = estimate.with_placements(sight.keys, found)

@@ -41,8 +41,8 @@ def _with_better_poses(
     if not len(doubtful):
         return estimate, 0
     few = sights.take(doubtful)
-    as_is, _ = placement_costs(few, estimate, layout, weighting, poses[doubtful])
-    costs, found = placement_costs(few, estimate, layout, weighting, mirrored(few, poses[doubtful]))
+    as_is, _ = placement_costs(few, estimate, weighting, poses[doubtful])
+    costs, found = placement_costs(few, estimate, weighting, mirrored(few, poses[doubtful]))
     better = np.flatnonzero(costs < as_is * (1.0 - 1e-6))
     return estimate.with_placements([few.keys[i] for i in better], found[better]), len(better)
 

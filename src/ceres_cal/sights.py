@@ -98,6 +98,11 @@ class Sights(Sequence["Sights"]):
         (key,) = self.keys
         return key
 
+    @property
+    def equations(self) -> int:
+        """Measured numbers: two of each point, one of each curve observation."""
+        return 2 * len(self.point_rows) + len(self.curve_rows)
+
     def take(self, numbers: Rows) -> Sights:
         """The sights with these numbers, in this order."""
         if len(numbers) == len(self) and np.array_equal(numbers, np.arange(len(self))):

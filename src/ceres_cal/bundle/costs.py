@@ -177,7 +177,7 @@ class EliminatedCost(pyceres.CostFunction):
         run: Run,
         sights: Sights,
         estimate: Estimate,
-        layout: Layout,
+        free: NDArray[np.int64],
         weighting: Weighting,
         threads: int,
         places: Array | None = None,
@@ -186,7 +186,7 @@ class EliminatedCost(pyceres.CostFunction):
         self.camera = sights.keys[0].camera
         self._run, self._sights, self._structure = run, sights, estimate.structure
         self._optics = lens_arguments(estimate.cameras[self.camera])
-        self._free = layout.free[self.camera]
+        self._free = free
         pixels, weights, slots, bends, is_arc, track, curve_pixels, curve_weights = kernel_columns(
             sights, estimate.structure, weighting
         )
@@ -195,7 +195,7 @@ class EliminatedCost(pyceres.CostFunction):
             curve_weights, starting_places(sights, estimate, places), *kernel_track_slots(estimate.structure),
         )  # fmt: skip
         self._loss = (kernels.LOSS_CODES[weighting.loss], weighting.loss_scale)
-        self._tolerance = 1e-2 if weighting.rough else 1e-4
+        self._tolerance = 1e-2 if weighting.rough else 1e-3
         sizes = (len(self._free), len(estimate.structure.values))
         self._size = sum(sizes)
         start = np.concatenate([self._optics[1][self._free], estimate.structure.values])
@@ -233,18 +233,22 @@ class EliminatedCost(pyceres.CostFunction):
 
     def _evaluated(self, at: Array, tolerance: float) -> _Evaluation | None:
         """The cost in a place, or None where an observation cannot be projected from there."""
-        swept = self._swept(at, tolerance)
-        cost = float(np.sum(swept.costs))
-        if not np.isfinite(cost):
-            return None
         upper = np.empty((self._size + 1, self._size + 1))
-        kernels.cholesky(swept.reduced, upper)
-        residuals = upper[:, -1].copy()
-        residuals[-1] = np.sqrt(max(cost - float(residuals[:-1] @ residuals[:-1]), 0.0))
+        for newton in (True, False):
+            swept = self._swept(at, tolerance, newton)
+            cost = float(np.sum(swept.costs))
+            if not np.isfinite(cost):
+                return None
+            kernels.cholesky(swept.reduced, upper)
+            residuals = upper[:, -1].copy()
+            missing = cost - float(residuals[:-1] @ residuals[:-1])
+            if missing > -kernels.ROUNDING * cost:  # else Newton's step promises more than there is
+                break
+        residuals[-1] = np.sqrt(max(missing, 0.0))
         upper[-1] = 0.0
         return _Evaluation(at, residuals, upper[:, :-1], swept.poses, swept.gains)
 
-    def _swept(self, at: Array, tolerance: float) -> _Sweep:
+    def _swept(self, at: Array, tolerance: float, newton: bool = True) -> _Sweep:
         """Every placement brought to its best in a place, from the last accepted one."""
         count = len(self._free)
         code, intrinsics, powers, unit = self._optics
@@ -257,8 +261,8 @@ class EliminatedCost(pyceres.CostFunction):
         def part(first: int, last: int) -> Array:
             reduced = np.zeros((self._size + 1, self._size + 1))
             kernels.eliminate_placements(
-                first, last, code, intrinsics, self._free, powers, unit, *self._observations, *self._loss, points,
-                tracks, self._size - count, tolerance, at - self._accepted.at, poses, gains, costs, reduced,
+                first, last, code, intrinsics, self._free, powers, unit, *self._observations, *self._loss, newton,
+                points, tracks, self._size - count, tolerance, at - self._accepted.at, poses, gains, costs, reduced,
             )  # fmt: skip
             return reduced
 

@@ -39,6 +39,8 @@ from ceres_cal.sights import SightKey, Sights
 from ceres_cal.transforms import Array, Pose, Poses
 
 _AT_REST = 10  # iterations
+_NOTHING_LEFT = "Nothing left to gain."
+_SUCCESS = (pyceres.TerminationType.CONVERGENCE, pyceres.TerminationType.USER_SUCCESS)
 _POSED = 1e-3  # relative change of a placement's cost that a start may leave
 _DENSE_LIMIT = 600  # numbers that stay after the Schur complement; above it a sparse factorisation is faster
 
@@ -140,7 +142,7 @@ def _assemble(
     for camera in estimate.cameras:
         own = _numbers(sights, camera, private)
         if len(own):
-            cost = EliminatedCost(run, sights.take(own), estimate, layout, weighting, threads, places)
+            cost = EliminatedCost(run, sights.take(own), estimate, layout.free[camera], weighting, threads, places)
             assembly.eliminated.append((cost, blocks.of(sights.keys[own[0]], cost.slots)))
     assembly.costs += assembly.eliminated
     for number, key in enumerate(sights.keys):
@@ -156,21 +158,38 @@ def _assemble(
 
 
 class _Watcher(pyceres.IterationCallback):
-    """Passes progress on, and ends the solve when a callback has failed or Ctrl-C was pressed."""
+    """Passes progress on; ends the solve when nothing is left to gain, a callback has failed or Ctrl-C was pressed."""
 
-    def __init__(self, run: Run, progress: Callable[[Progress], None] | None) -> None:
+    def __init__(self, run: Run, progress: Callable[[Progress], None] | None, precision: float) -> None:
         super().__init__()
-        self._run, self._progress = run, progress
+        self._run, self._progress, self._precision = run, progress, precision
+        self._accepted: list[float] = []
 
     def __call__(self, summary: Any) -> Any:
         try:
             self._run.history.append(float(summary.cost))
+            if summary.step_is_successful:
+                self._accepted.append(float(summary.cost))
             if self._progress is not None:
                 self._progress(Progress(int(summary.iteration), float(summary.cost), float(summary.step_norm)))
         except BaseException as error:
             self._run.failure = self._run.failure or error
-        stop = self._run.failure is not None
-        return pyceres.CallbackReturnType.SOLVER_ABORT if stop else pyceres.CallbackReturnType.SOLVER_CONTINUE
+        if self._run.failure is not None:
+            return pyceres.CallbackReturnType.SOLVER_ABORT
+        if summary.step_is_successful and _left_to_gain(self._accepted) <= self._precision:
+            return pyceres.CallbackReturnType.SOLVER_TERMINATE_SUCCESSFULLY
+        return pyceres.CallbackReturnType.SOLVER_CONTINUE
+
+
+def _left_to_gain(costs: Sequence[float]) -> float:
+    """The share of the cost that all further steps bring if the gains go on shrinking as the last two did.
+
+    Ceres waits for a gain of nothing, which near the end of Newton's way is an iteration in vain.
+    """
+    if len(costs) < 3:
+        return np.inf
+    before, last = costs[-3] - costs[-2], costs[-2] - costs[-1]
+    return last * last / ((before - last) * costs[-1]) if before > last > 0.0 else np.inf
 
 
 @contextmanager
@@ -211,6 +230,8 @@ def solve(
     _require_enough(sights, layout)
     run = Run()
     assembly = _assemble(run, sights, estimate, layout, weighting, _threads(options), places)
+    # Far from the end gains come and go: there it is for Ceres to say that they are small.
+    watcher = _Watcher(run, progress, 0.0 if weighting.rough else weighting.precision)
     problem = pyceres.Problem()
     for cost, arrays in assembly.costs:
         if arrays:
@@ -218,7 +239,7 @@ def solve(
     summary = pyceres.SolverSummary()
     with _quiet():
         pyceres.solve(
-            _solver_options(layout, assembly.blocks, options, weighting, assembly.threads, _Watcher(run, progress)),
+            _solver_options(layout, assembly.blocks, options, weighting, assembly.threads, watcher),
             problem,
             summary,
         )
@@ -233,8 +254,8 @@ def solve(
     return Solution(
         solved,
         float(summary.final_cost),
-        summary.termination_type == pyceres.TerminationType.CONVERGENCE or _rests(run.history),
-        str(summary.message),
+        summary.termination_type in _SUCCESS or _rests(run.history),
+        _NOTHING_LEFT if summary.termination_type == pyceres.TerminationType.USER_SUCCESS else str(summary.message),
         tuple(run.history),
         not summary.IsSolutionUsable(),
     )
@@ -243,7 +264,6 @@ def solve(
 def placement_costs(
     sights: Sights,
     estimate: Estimate,
-    layout: Layout,
     weighting: Weighting,
     poses: Array,
     tolerance: float = 1e-6,
@@ -255,7 +275,8 @@ def placement_costs(
         poses: (S, 3, 4) where the search for each cam_from_target starts; a start from where an observation cannot be
             projected costs infinity. tolerance: relative, of each cost.
     """
-    return EliminatedCost(Run(), sights, estimate, layout, weighting, threads).from_poses(poses, tolerance)
+    held = np.empty(0, dtype=np.int64)
+    return EliminatedCost(Run(), sights, estimate, held, weighting, threads).from_poses(poses, tolerance)
 
 
 def settle_placements(
@@ -267,7 +288,7 @@ def settle_placements(
         own = sights.take(_numbers(sights, camera, private))
         if len(own):
             poses = estimate.pose_stack(own.keys)
-            _, found = placement_costs(own, estimate, layout, weighting, poses, _POSED, _threads(options))
+            _, found = placement_costs(own, estimate, weighting, poses, _POSED, _threads(options))
             estimate = estimate.with_placements(own.keys, found)
     return estimate
 
@@ -296,8 +317,9 @@ def private_placements(sights: Sights, layout: Layout) -> frozenset[str | None]:
 
 
 def _require_enough(sights: Sights, layout: Layout) -> None:
-    equations = 2 * len(sights.point_rows) + len(sights.curve_rows)
-    equations += sum(len(prior.value) for prior in layout.priors)  # each structure number has a prior of its own
+    equations = sights.equations + sum(
+        len(prior.value) for prior in layout.priors
+    )  # each structure number has a prior of its own
     if equations < layout.unknowns:
         raise DegenerateError(
             f"{equations} measured numbers (two a point, one a curve observation or prior) cannot determine "

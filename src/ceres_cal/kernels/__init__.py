@@ -1,6 +1,6 @@
 """The inner loops, compiled by numba: the only place that imports it. They release the GIL."""
 
-from ceres_cal.kernels.block import cholesky, evaluate_block
+from ceres_cal.kernels.block import ROUNDING, cholesky, evaluate_block
 from ceres_cal.kernels.elimination import eliminate_placements
 from ceres_cal.kernels.groups import grouped_products, grouped_scatter
 from ceres_cal.kernels.information import sight_normals
@@ -14,6 +14,7 @@ __all__ = [
     "INTRINSICS",
     "LENS_CODES",
     "LOSS_CODES",
+    "ROUNDING",
     "cholesky",
     "curve_residuals",
     "curve_rows",

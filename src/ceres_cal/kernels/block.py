@@ -15,6 +15,9 @@ from ceres_cal.kernels.lenses import answer_limit, one_dimensional
 from ceres_cal.kernels.sight import layout_of_rows, normal_equations, working_space
 
 
+ROUNDING = 1e-9  # of a cost
+
+
 @jit
 def cholesky(normal: Any, upper: Any) -> None:
     """U with U^T U = A from A's lower triangle; where A is singular the row of U is zero."""
@@ -159,20 +162,23 @@ def evaluate_block(
     dense = one_dimensional(lens, intrinsics, powers)
     limit = answer_limit(lens, dense)
     normal = np.empty((shared + 7, shared + 7))
-    cost = normal_equations(
-        lens, intrinsics, powers, dense, limit, unit, pose, points, pixels, weights, slots, bends, tracks, is_arc,
-        track, curve_pixels, curve_weights, s, track_slots, loss, scale, rows, places, normal,
-        working_space(len(intrinsics), len(rows)),
-    )  # fmt: skip
-    if not np.isfinite(cost):
-        return False
+    space = working_space(len(intrinsics), len(rows))
     upper = np.empty((shared + 7, shared + 7))
-    cholesky(normal, upper)
     last = shared + 6
-    missing = cost
-    for row in range(last):
-        residuals[row] = upper[row, last]
-        missing -= upper[row, last] * upper[row, last]
+    for newton in (True, False):
+        cost = normal_equations(
+            lens, intrinsics, powers, dense, limit, unit, pose, points, pixels, weights, slots, bends, tracks, is_arc,
+            track, curve_pixels, curve_weights, s, track_slots, loss, scale, newton, rows, places, normal, space,
+        )  # fmt: skip
+        if not np.isfinite(cost):
+            return False
+        cholesky(normal, upper)
+        missing = cost
+        for row in range(last):
+            residuals[row] = upper[row, last]
+            missing -= upper[row, last] * upper[row, last]
+        if missing > -ROUNDING * cost:  # else Newton's step promises more than there is
+            break
     residuals[last] = np.sqrt(max(missing, 0.0))
     _copy_plain(upper, 0, count, camera_jacobian)
     _copy_plain(upper, count, structure, structure_jacobian)

@@ -64,13 +64,13 @@ def eliminate_placements(
     first: int, last: int, lens: int, intrinsics: Any, free: Any, powers: Any, unit: float,
     bounds: Any, pixels: Any, weights: Any, slots: Any, bends: Any,
     is_arc: Any, curve_bounds: Any, track: Any, curve_pixels: Any, curve_weights: Any, s: Any, track_slots: Any,
-    loss: int, scale: float, points: Any, tracks: Any, structure: int, tolerance: float, change: Any, poses: Any,
+    loss: int, scale: float, newton: bool, points: Any, tracks: Any, structure: int, tolerance: float, change: Any, poses: Any,
     gains: Any, costs: Any, reduced: Any,
 ) -> None:  # fmt: skip
     """The sights first to last at their best poses: their costs, and what they say of the free intrinsics.
 
     Args:
-        intrinsics, free, powers, unit, loss, scale and the observations: see `normal_equations`; bounds, curve_bounds
+        intrinsics, free, powers, unit, loss, scale, newton and the observations: see `normal_equations`; bounds, curve_bounds
             (S + 1,) say where each sight's rows begin.
         tolerance: how much of a sight's cost a step of its pose may still promise when it is left to the complement.
         points, tracks: as built, with the `structure` numbers of the moment put in.
@@ -98,7 +98,7 @@ def eliminate_placements(
         cost = normal_equations(
             lens, intrinsics, powers, dense, limit, unit, pose, points[p], pixels[p], weights[p], slots[moving],
             bends[moving], tracks, is_arc, track[c], curve_pixels[c], curve_weights[c], s[c], track_slots, loss, scale,
-            rows, places, normal, space,
+            newton, rows, places, normal, space,
         )  # fmt: skip
         damping = 0.0
         for _ in range(_MOST_STEPS):
@@ -115,7 +115,7 @@ def eliminate_placements(
             moved_cost = normal_equations(
                 lens, intrinsics, powers, dense, limit, unit, moved, points[p], pixels[p], weights[p], slots[moving],
                 bends[moving], tracks, is_arc, track[c], curve_pixels[c], curve_weights[c], s[c], track_slots, loss,
-                scale, rows, places, trial, space,
+                scale, newton, rows, places, trial, space,
             )  # fmt: skip
             if moved_cost <= cost:
                 pose, moved, normal, trial, cost, damping = moved, pose, trial, normal, moved_cost, 0.1 * damping

@@ -35,7 +35,7 @@ def sight_normals(
         cost = normal_equations(
             lens, intrinsics, powers, dense, limit, unit, poses[v], points[p], pixels[p], weights[p], slots[moving],
             bends[moving], tracks, is_arc, track[c], curve_pixels[c], curve_weights[c], s[c], track_slots, loss, scale,
-            rows, places, normal, space,
+            False, rows, places, normal, space,
         )  # fmt: skip
         if not np.isfinite(cost):
             return False

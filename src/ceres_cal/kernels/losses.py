@@ -9,6 +9,7 @@ from ceres_cal.kernels.jit import jit
 LOSS_CODES = {"trivial": 0, "huber": 1, "soft_l1": 2, "cauchy": 3, "tukey": 4}
 
 _TRIVIAL, _HUBER, _SOFT_L1, _CAUCHY = 0, 1, 2, 3
+_STRAIGHT = 0.1  # in place of 0, where a loss has no curvature left
 
 
 @jit
@@ -31,3 +32,17 @@ def robust_loss(code: int, scale: float, squared: float) -> tuple[float, float]:
         return b / 3.0, 0.0
     rest = 1.0 - squared / b
     return b / 3.0 * (1.0 - rest * rest * rest), rest * rest
+
+
+@jit
+def bend(code: int, scale: float, squared: float) -> float:
+    """sqrt(1 + 2 s rho'' / rho') at the squared residual s: how the loss' own bend shortens the Jacobian along the
+    residual (Triggs et al., Bundle Adjustment - A Modern Synthesis, section 4.3).
+
+    1 for the redescending losses: along their bend a step may climb.
+    """
+    if code == _HUBER and squared > scale * scale:
+        return _STRAIGHT
+    if code == _SOFT_L1:
+        return 1.0 / np.sqrt(1.0 + squared / (scale * scale))
+    return 1.0

@@ -12,9 +12,11 @@ import numpy as np
 
 from ceres_cal.kernels.jit import jit
 from ceres_cal.kernels.lenses import answer_limit, distort, intrinsics_rows, one_dimensional
-from ceres_cal.kernels.losses import robust_loss
+from ceres_cal.kernels.losses import bend, robust_loss
 
 CHUNK = 112  # a board of a hundred corners at once, all of it in the first cache
+_POSE_ALONE = 7  # rows: nothing of the camera is free
+_FLAT, _MOSTLY_FLAT = 0.7, 0.5  # a bend; share of a chunk beyond which it says nothing of where the minimum lies
 _FOOT_STEPS = 30
 _FOOT_TOLERANCE_PX = 1e-9
 
@@ -139,6 +141,31 @@ def _add_products(n: int, count: int, panel: Any, products: Any) -> None:
 
 
 @jit
+def _bend_rows(n: int, components: int, loss: int, scale: float, squared: Any, last: int, panel: Any) -> None:
+    """Take the second derivative of rho into the panel's rows: Newton's step on the loss, its gradient unchanged."""
+    flat = 0
+    for i in range(n):
+        flat += bend(loss, scale, squared[i]) < _FLAT
+    if flat > _MOSTLY_FLAT * n:
+        return
+    for i in range(n):
+        left = bend(loss, scale, squared[i])
+        if left == 1.0:
+            continue
+        length2 = 0.0
+        for c in range(components):
+            length2 += panel[last, c * n + i] * panel[last, c * n + i]
+        for k in range(last):
+            along = 0.0
+            for c in range(components):
+                along += panel[last, c * n + i] * panel[k, c * n + i]
+            for c in range(components):
+                panel[k, c * n + i] -= (1.0 - left) * along / length2 * panel[last, c * n + i]
+        for c in range(components):
+            panel[last, c * n + i] /= left
+
+
+@jit
 def _add_structure(
     i: int, n: int, components: int, slots: Any, directions: Any, pose: Any, places: Any, panel: Any, columns: Any,
     normal: Any,
@@ -176,8 +203,8 @@ def _add_structure(
 @jit
 def _add_points(
     lens: int, intrinsics: Any, powers: Any, dense: Any, unit: float, limit: float, pose: Any, points: Any, pixels: Any,
-    weights: Any, slots: Any, bends: Any, loss: int, scale: float, rows: Any, places: Any, normal: Any,
-    products: Any, jacobian: Any, panel: Any, scratch: Any,
+    weights: Any, slots: Any, bends: Any, loss: int, scale: float, newton: bool, rows: Any, places: Any,
+    normal: Any, products: Any, jacobian: Any, panel: Any, scratch: Any,
 ) -> float:  # fmt: skip
     """Sum of rho over the point observations, NaN where one cannot be projected; their share of `normal`."""
     last = len(rows) - 1
@@ -191,22 +218,26 @@ def _add_points(
         to_camera(n, pose, local, rotated, rays)
         if not distort(lens, n, intrinsics, dense, unit, limit, rays, image, work):
             return np.nan
-        error_x, error_y = panel[last, :n], panel[last, n : 2 * n]
+        error_x, error_y, factor, squared = panel[last, :n], panel[last, n : 2 * n], local[0], local[1]
         for i in range(n):
             w = weights[start + i]
             dx = w * (intrinsics[2] + image[0, i] - pixels[start + i, 0])
             dy = w * (intrinsics[3] + intrinsics[1] * image[1, i] - pixels[start + i, 1])
-            rho, slope = robust_loss(loss, scale, dx * dx + dy * dy)
+            squared[i] = dx * dx + dy * dy
+            rho, slope = robust_loss(loss, scale, squared[i])
             cost += rho
             root = np.sqrt(slope)
             error_x[i], error_y[i] = root * dx, root * dy
-            local[0, i] = root * w
-        intrinsics_rows(lens, n, intrinsics, powers, unit, image, work, jacobian)
+            factor[i] = root * w
+        if len(rows) > _POSE_ALONE:
+            intrinsics_rows(lens, n, intrinsics, powers, unit, image, work, jacobian)
         pose_rows(n, len(intrinsics), intrinsics[1], rotated, image, jacobian)
         for k in range(last):
             own, x, y = jacobian[rows[k]], panel[k, :n], panel[k, n : 2 * n]  # whole rows: SIMD needs plain indices
             for i in range(n):
-                x[i], y[i] = local[0, i] * own[0, i], local[0, i] * own[1, i]
+                x[i], y[i] = factor[i] * own[0, i], factor[i] * own[1, i]
+        if newton:
+            _bend_rows(n, 2, loss, scale, squared, last, panel)
         _add_products(2 * n, len(rows), panel, products)
         if len(slots) > 0:
             directions, columns = np.eye(4, 3), np.empty((4, 2))
@@ -233,8 +264,8 @@ def _curve_directions(i: int, k: int, tracks: Any, is_arc: Any, foot: Any, direc
 @jit
 def _add_curves(
     lens: int, intrinsics: Any, powers: Any, dense: Any, unit: float, limit: float, pose: Any, tracks: Any,
-    is_arc: Any, track: Any, pixels: Any, weights: Any, s: Any, track_slots: Any, loss: int, scale: float, rows: Any,
-    places: Any, normal: Any, products: Any, jacobian: Any, panel: Any, scratch: Any,
+    is_arc: Any, track: Any, pixels: Any, weights: Any, s: Any, track_slots: Any, loss: int, scale: float, newton: bool,
+    rows: Any, places: Any, normal: Any, products: Any, jacobian: Any, panel: Any, scratch: Any,
 ) -> float:  # fmt: skip
     """The same for the curve observations: one residual each, the distance along the image normal at the foot.
 
@@ -256,17 +287,21 @@ def _add_curves(
             length = np.sqrt(foot[7, i])
             nx, ny = -foot[1, i] / length, foot[0, i] / length
             e = weights[start + i] * (nx * foot[2, i] + ny * foot[3, i])
+            local[2, i] = e * e
             rho, slope = robust_loss(loss, scale, e * e)
             cost += rho
             root = np.sqrt(slope)
             panel[last, i] = root * e
             local[0, i], local[1, i] = root * weights[start + i] * nx, root * weights[start + i] * ny
-        intrinsics_rows(lens, n, intrinsics, powers, unit, image, work, jacobian)
+        if len(rows) > _POSE_ALONE:
+            intrinsics_rows(lens, n, intrinsics, powers, unit, image, work, jacobian)
         pose_rows(n, len(intrinsics), intrinsics[1], rotated, image, jacobian)
         for k in range(last):
             own, x = jacobian[rows[k]], panel[k]
             for i in range(n):
                 x[i] = local[0, i] * own[0, i] + local[1, i] * own[1, i]
+        if newton:
+            _bend_rows(n, 1, loss, scale, local[2], last, panel)
         _add_products(n, len(rows), panel, products)
         if len(track_slots) > 0:
             directions, columns = np.eye(3, 3), np.empty((3, 2))
@@ -303,8 +338,8 @@ def working_space(intrinsics: int, rows: int) -> tuple[Any, Any, Any, Any]:
 def normal_equations(
     lens: int, intrinsics: Any, powers: Any, dense: Any, limit: float, unit: float, pose: Any, points: Any,
     pixels: Any, weights: Any, slots: Any, bends: Any, tracks: Any, is_arc: Any, track: Any, curve_pixels: Any,
-    curve_weights: Any, s: Any, track_slots: Any, loss: int, scale: float, rows: Any, places: Any, normal: Any,
-    space: Any,
+    curve_weights: Any, s: Any, track_slots: Any, loss: int, scale: float, newton: bool, rows: Any, places: Any,
+    normal: Any, space: Any,
 ) -> float:  # fmt: skip
     """Sum of rho over one sight, NaN where an observation cannot be projected; A added up in `normal`'s lower triangle.
 
@@ -317,7 +352,8 @@ def normal_equations(
             s (M,): place on the track, read as a start and left at the foot.
         slots (N, 4) with bends (N, 2), and track_slots (T, 3): the structure numbers that move each point and track,
             -1 for none; empty without structure (see `structure.Structure`).
-        loss, scale: a LOSS_CODES value and its scale in standard deviations.
+        loss, scale: a LOSS_CODES value and its scale in standard deviations. newton: whether A takes rho'' along, for
+            a step, or rho' alone, as the weight that each observation has.
         rows: which numbers take part: indices into [intrinsics | 6 pose | residual], the last one the residual's.
         places: their rows in A; structure numbers come after the intrinsics, before the pose.
         space: from `working_space`, used again and again.
@@ -329,12 +365,12 @@ def normal_equations(
     if len(points) > 0:
         cost += _add_points(
             lens, intrinsics, powers, dense, unit, limit, pose, points, pixels, weights, slots, bends, loss, scale,
-            rows, places, normal, products, jacobian, panel, scratch,
+            newton, rows, places, normal, products, jacobian, panel, scratch,
         )  # fmt: skip
     if len(curve_pixels) > 0:
         cost += _add_curves(
             lens, intrinsics, powers, dense, unit, limit, pose, tracks, is_arc, track, curve_pixels, curve_weights, s,
-            track_slots, loss, scale, rows, places, normal, products, jacobian, panel, scratch,
+            track_slots, loss, scale, newton, rows, places, normal, products, jacobian, panel, scratch,
         )  # fmt: skip
     for k in range(len(rows)):
         for j in range(k + 1):

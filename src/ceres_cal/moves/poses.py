@@ -16,7 +16,7 @@ from ceres_cal.bundle import Weighting, placement_costs
 from ceres_cal.camera import Camera
 from ceres_cal.closed_forms import null_vector, polar_pose
 from ceres_cal.observations import Observations
-from ceres_cal.parameters import Estimate, Layout
+from ceres_cal.parameters import Estimate
 from ceres_cal.residuals import Residuals, residuals
 from ceres_cal.sights import SightKey, Sights
 from ceres_cal.transforms import Array, Pose, rotation_exp
@@ -197,8 +197,7 @@ def _searched(scene: Scene, stack: Array, weighting: Weighting, tolerance: float
     world = scene.estimate.stations[key.station].cam_from_world
     placements = {k.placement: world for k in keys if k.placement is not None}
     estimate = replace(scene.estimate, placements=placements).with_placements(keys, stack)
-    layout = Layout({key.camera: np.empty(0, dtype=np.int64)}, frozenset(), frozenset(placements))
-    costs, found = placement_costs(replace(many, keys=keys), estimate, layout, weighting, stack, tolerance)
+    costs, found = placement_costs(replace(many, keys=keys), estimate, weighting, stack, tolerance)
     return found[np.isfinite(costs)]
 
 
