@@ -14,7 +14,6 @@ from ceres_cal.kernels.jit import jit
 from ceres_cal.kernels.lenses import answer_limit, one_dimensional
 from ceres_cal.kernels.sight import layout_of_rows, normal_equations, working_space
 
-
 ROUNDING = 1e-9  # of a cost
 
 

@@ -64,14 +64,14 @@ def eliminate_placements(
     first: int, last: int, lens: int, intrinsics: Any, free: Any, powers: Any, unit: float,
     bounds: Any, pixels: Any, weights: Any, slots: Any, bends: Any,
     is_arc: Any, curve_bounds: Any, track: Any, curve_pixels: Any, curve_weights: Any, s: Any, track_slots: Any,
-    loss: int, scale: float, newton: bool, points: Any, tracks: Any, structure: int, tolerance: float, change: Any, poses: Any,
-    gains: Any, costs: Any, reduced: Any,
+    loss: int, scale: float, newton: bool, points: Any, tracks: Any, structure: int, tolerance: float, change: Any,
+    poses: Any, gains: Any, costs: Any, reduced: Any,
 ) -> None:  # fmt: skip
     """The sights first to last at their best poses: their costs, and what they say of the free intrinsics.
 
     Args:
-        intrinsics, free, powers, unit, loss, scale, newton and the observations: see `normal_equations`; bounds, curve_bounds
-            (S + 1,) say where each sight's rows begin.
+        intrinsics, free, powers, unit, loss, scale, newton and the observations: see `normal_equations`; bounds and
+            curve_bounds (S + 1,) say where each sight's rows begin.
         tolerance: how much of a sight's cost a step of its pose may still promise when it is left to the complement.
         points, tracks: as built, with the `structure` numbers of the moment put in.
         change: (free + structure,) by how much these have moved since `poses` and `gains` were made.

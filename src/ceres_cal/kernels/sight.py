@@ -12,11 +12,11 @@ import numpy as np
 
 from ceres_cal.kernels.jit import jit
 from ceres_cal.kernels.lenses import answer_limit, distort, intrinsics_rows, one_dimensional
-from ceres_cal.kernels.losses import bend, robust_loss
+from ceres_cal.kernels.losses import robust_loss
+from ceres_cal.kernels.panel import add_products, add_structure, bend_rows
 
 CHUNK = 112  # a board of a hundred corners at once, all of it in the first cache
 _POSE_ALONE = 7  # rows: nothing of the camera is free
-_FLAT, _MOSTLY_FLAT = 0.7, 0.5  # a bend; share of a chunk beyond which it says nothing of where the minimum lies
 _FOOT_STEPS = 30
 _FOOT_TOLERANCE_PX = 1e-9
 
@@ -108,99 +108,6 @@ def feet(
 
 
 @jit
-def _add_products(n: int, count: int, panel: Any, products: Any) -> None:
-    """products += P P^T over the panel's first n columns, lower triangle; three rows by three, to read each one less.
-
-    Both have room for a multiple of three rows.
-    """
-    for k in range(0, count, 3):
-        a, b, c = panel[k], panel[k + 1], panel[k + 2]
-        for j in range(0, k + 1, 3):
-            x, y, z = panel[j], panel[j + 1], panel[j + 2]
-            s00, s01, s02, s10, s11, s12, s20, s21, s22 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-            for i in range(n):
-                s00 += a[i] * x[i]
-                s01 += a[i] * y[i]
-                s02 += a[i] * z[i]
-                s10 += b[i] * x[i]
-                s11 += b[i] * y[i]
-                s12 += b[i] * z[i]
-                s20 += c[i] * x[i]
-                s21 += c[i] * y[i]
-                s22 += c[i] * z[i]
-            upper, middle, lower = products[k], products[k + 1], products[k + 2]
-            upper[j] += s00
-            upper[j + 1] += s01
-            upper[j + 2] += s02
-            middle[j] += s10
-            middle[j + 1] += s11
-            middle[j + 2] += s12
-            lower[j] += s20
-            lower[j + 1] += s21
-            lower[j + 2] += s22
-
-
-@jit
-def _bend_rows(n: int, components: int, loss: int, scale: float, squared: Any, last: int, panel: Any) -> None:
-    """Take the second derivative of rho into the panel's rows: Newton's step on the loss, its gradient unchanged."""
-    flat = 0
-    for i in range(n):
-        flat += bend(loss, scale, squared[i]) < _FLAT
-    if flat > _MOSTLY_FLAT * n:
-        return
-    for i in range(n):
-        left = bend(loss, scale, squared[i])
-        if left == 1.0:
-            continue
-        length2 = 0.0
-        for c in range(components):
-            length2 += panel[last, c * n + i] * panel[last, c * n + i]
-        for k in range(last):
-            along = 0.0
-            for c in range(components):
-                along += panel[last, c * n + i] * panel[k, c * n + i]
-            for c in range(components):
-                panel[k, c * n + i] -= (1.0 - left) * along / length2 * panel[last, c * n + i]
-        for c in range(components):
-            panel[last, c * n + i] /= left
-
-
-@jit
-def _add_structure(
-    i: int, n: int, components: int, slots: Any, directions: Any, pose: Any, places: Any, panel: Any, columns: Any,
-    normal: Any,
-) -> None:  # fmt: skip
-    """The share of the chunk's observation i in the rows of the structure numbers `slots` (-1: none) that move it.
-
-    Moving the target along a direction moves the point by R times it in the camera frame: the pose's translation rows
-    of the panel say what that does. Structure numbers stand between the free intrinsics and the pose.
-    """
-    base, translation = len(places) - 7, len(places) - 4
-    for a in range(len(slots)):
-        if slots[a] < 0:
-            continue
-        for c in range(components):
-            columns[a, c] = 0.0
-            for j in range(3):
-                turned = 0.0
-                for k in range(3):
-                    turned += pose[j, k] * directions[a, k]
-                columns[a, c] += panel[translation + j, c * n + i] * turned
-        for k in range(len(places)):
-            value = 0.0
-            for c in range(components):
-                value += columns[a, c] * panel[k, c * n + i]
-            row, column = max(base + slots[a], places[k]), min(base + slots[a], places[k])
-            normal[row, column] += value
-        for b in range(a + 1):
-            if slots[b] >= 0:
-                value = 0.0
-                for c in range(components):
-                    value += columns[a, c] * columns[b, c]
-                normal[base + max(slots[a], slots[b]), base + min(slots[a], slots[b])] += value
-
-
-@jit
 def _add_points(
     lens: int, intrinsics: Any, powers: Any, dense: Any, unit: float, limit: float, pose: Any, points: Any, pixels: Any,
     weights: Any, slots: Any, bends: Any, loss: int, scale: float, newton: bool, rows: Any, places: Any,
@@ -237,13 +144,13 @@ def _add_points(
             for i in range(n):
                 x[i], y[i] = factor[i] * own[0, i], factor[i] * own[1, i]
         if newton:
-            _bend_rows(n, 2, loss, scale, squared, last, panel)
-        _add_products(2 * n, len(rows), panel, products)
+            bend_rows(n, 2, loss, scale, squared, last, panel)
+        add_products(2 * n, len(rows), panel, products)
         if len(slots) > 0:
             directions, columns = np.eye(4, 3), np.empty((4, 2))
             for i in range(n):
                 directions[2, 2], directions[3, 2] = bends[start + i, 0], bends[start + i, 1]
-                _add_structure(i, n, 2, slots[start + i], directions, pose, places, panel, columns, normal)
+                add_structure(i, n, 2, slots[start + i], directions, pose, places, panel, columns, normal)
     return cost
 
 
@@ -301,13 +208,13 @@ def _add_curves(
             for i in range(n):
                 x[i] = local[0, i] * own[0, i] + local[1, i] * own[1, i]
         if newton:
-            _bend_rows(n, 1, loss, scale, local[2], last, panel)
-        _add_products(n, len(rows), panel, products)
+            bend_rows(n, 1, loss, scale, local[2], last, panel)
+        add_products(n, len(rows), panel, products)
         if len(track_slots) > 0:
             directions, columns = np.eye(3, 3), np.empty((3, 2))
             for i in range(n):
                 _curve_directions(i, track[start + i], tracks, is_arc, foot, directions)
-                _add_structure(i, n, 1, track_slots[track[start + i]], directions, pose, places, panel, columns, normal)
+                add_structure(i, n, 1, track_slots[track[start + i]], directions, pose, places, panel, columns, normal)
     return cost
 
 
