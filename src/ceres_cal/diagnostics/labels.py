@@ -13,10 +13,10 @@ import numpy as np
 from ceres_cal import kernels
 from ceres_cal.camera import Camera
 from ceres_cal.diagnostics.equations import Ints
-from ceres_cal.diagnostics.tails import log_binomial_tail
 from ceres_cal.observations import Observations
 from ceres_cal.parameters import Estimate
 from ceres_cal.residuals import lens_arguments
+from ceres_cal.tails import log_binomial_tail
 from ceres_cal.targets import SIDES, Target, along_track, nearest_on_track
 from ceres_cal.transforms import Array
 
@@ -91,7 +91,7 @@ def _of_view(
         tried = named == label
         chosen = fits & tried & (nearest == instead)
         near = _chance(target, camera, is_curve, float(away[chosen].max()))
-        log_p = float(log_binomial_tail(np.array([chosen.sum()]), np.array([tried.sum()]), np.array([near]))[0])
+        log_p = float(log_binomial_tail(chosen.sum(), tried.sum(), near))
         found.append(
             Mislabelled(
                 is_curve, view, int(label), int(instead), rows[chosen], away[chosen], int(tried.sum()), log_p

@@ -12,7 +12,6 @@ import numpy as np
 
 from ceres_cal.bundle.joint import offsets
 from ceres_cal.calibration import Calibration
-from ceres_cal.chi_squared import upper_bound
 from ceres_cal.errors import CalibrationError, SolutionError
 from ceres_cal.moves.carried import Plan, without_keys
 from ceres_cal.moves.labels import MIRRORED, TURNED, other_divisions, relabelled
@@ -21,6 +20,7 @@ from ceres_cal.observations import Observations
 from ceres_cal.parameters import Estimate
 from ceres_cal.residuals import residuals
 from ceres_cal.sights import gather_sights
+from ceres_cal.tails import upper_tail
 from ceres_cal.transforms import Pose
 
 _ZOOMS = 15
@@ -198,7 +198,7 @@ class Judged:
     @property
     def doubtful(self) -> bool:
         """Whether another explanation should be looked for."""
-        return self.noisy or (self.rank > 0 and self.strain > upper_bound(_RARE, self.rank))
+        return self.noisy or (upper_tail(self.strain, self.rank) < _RARE)
 
 
 def judged(plan: Plan, what: str, result: Calibration) -> Judged:
