@@ -17,6 +17,7 @@ MAX_LINES = 450
 FLOORS = {
     "errors": 0,
     "blas": 0,
+    "digits": 0,
     "files": 0,
     "transforms": 0,
     "lens": 0,
