@@ -29,7 +29,7 @@ from ceres_cal.errors import CalibrationError
 from ceres_cal.lens import Radial
 from ceres_cal.moves import check, refit
 from ceres_cal.moves.carried import layouts, make_plan
-from ceres_cal.observations import Observations
+from ceres_cal.observations import Observations, taken
 from ceres_cal.parameters import Estimate
 from ceres_cal.quantities import Key, difference
 from ceres_cal.sights import gather_sights
@@ -154,8 +154,8 @@ def thinned(observations: Observations, points: Sequence[str], curves: int, seed
     picked = np.random.default_rng([seed, 3]).permutation(len(observations.curves))[:curves]
     return replace(
         observations,
-        points=replace(observations.points, **{n: v[p] for n, v in vars(observations.points).items()}),
-        curves=replace(observations.curves, **{n: v[np.sort(picked)] for n, v in vars(observations.curves).items()}),
+        points=taken(observations.points, p),
+        curves=taken(observations.curves, np.sort(picked)),
     )
 
 
