@@ -7,15 +7,9 @@ Exits with 1 when a figure is missed.
 
 from __future__ import annotations
 
-import argparse
-import json
 import sys
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 from accuracy_bound import attempts, best, bound, efficiency, make_trial, mean_and_error
@@ -33,6 +27,7 @@ from accuracy_scenes import (
     small_boards,
 )
 from benchmark_problems import corner_observations, wide_lens
+from cases import Row, run
 
 from ceres_cal.bundle import Weighting, placement_costs
 from ceres_cal.calibrate import calibrate
@@ -53,38 +48,6 @@ LEAST_GAIN = 1e-6  # share of a pose's cost; what a better pose must save to be 
 DIVERGED = 5.0  # times the expected mean error; no bad luck goes so far
 TOLERANCES = {"field": Tolerance(lines_m=0.010)}
 DRAWS = 4000  # from a covariance, to tell the median of what is not normally distributed
-
-
-@dataclass(frozen=True)
-class Row:
-    """One figure. `error` is its standard error, 0 where it is no mean; it must lie between `least` and `most`."""
-
-    case: str
-    what: str
-    value: float
-    error: float = 0.0
-    least: float = -np.inf
-    most: float = np.inf
-    note: str = ""
-
-    @property
-    def verdict(self) -> str:
-        missed = max(self.least - self.value, self.value - self.most)
-        if np.isinf(missed) and missed < 0.0:
-            return ""
-        return "yes" if missed <= 0.0 else "open" if missed <= 2.0 * self.error else "no"
-
-    def to_json(self) -> dict[str, Any]:
-        """Its fields, without limits that it does not have, and the verdict."""
-        return {name: value for name, value in vars(self).items() if value not in (np.inf, -np.inf)} | {
-            "verdict": self.verdict
-        }
-
-    def __str__(self) -> str:
-        value = f"{self.value:.4g}" + (f" ± {self.error:.2g}" if self.error else "")
-        both = (("from", self.least), ("to", self.most))
-        limits = [f"{word} {limit:.3g}" for word, limit in both if np.isfinite(limit)]
-        return f"{self.case:33}{self.what:42}{value:>18}  {' '.join(limits):20}{self.verdict:6}{self.note}".rstrip()
 
 
 # ---- against the Cramer-Rao bound -----------------------------------------------------------------------------------
@@ -294,23 +257,7 @@ CASES: dict[str, Callable[[int], Iterator[Row]]] = {
 
 
 def main(arguments: Sequence[str]) -> int:
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0], allow_abbrev=False)
-    parser.add_argument("--runs", type=int, default=400, help="simulated calibrations of each problem (default 400)")
-    parser.add_argument("--case", nargs="+", choices=CASES, default=list(CASES), help="only these")
-    parser.add_argument("--json", type=Path, help="write the figures there, too")
-    given = parser.parse_args(arguments)
-    if given.runs < 2:
-        parser.error("--runs must be 2 or more: one run has no spread")
-    rows: list[Row] = []
-    for name in given.case:
-        start = time.perf_counter()
-        for row in CASES[name](given.runs):
-            rows.append(row)
-            print(row, flush=True)
-        print(f"  {name}: {time.perf_counter() - start:.0f} s", flush=True)
-    if given.json:
-        given.json.write_text(json.dumps([row.to_json() for row in rows], indent=1), encoding="utf-8")
-    return 1 if any(row.verdict == "no" for row in rows) else 0
+    return run(CASES, arguments, __doc__, (400, "simulated calibrations of each problem"), 2)
 
 
 if __name__ == "__main__":

@@ -10,17 +10,15 @@ shown and not judged. Exits with 1 when a figure is missed by more than two of i
 
 from __future__ import annotations
 
-import argparse
 import sys
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
-from accuracy import Row
 from accuracy_bound import attempts
 from accuracy_scenes import CLEAN_NOISE, FIELD, Problem, tilted
+from cases import Row, run
 
 from ceres_cal.advice import Measurement, Promise, advise, promised
 from ceres_cal.calibrate import calibrate
@@ -180,8 +178,9 @@ def errors_m(calibration: Calibration, scene: Scene, places: Array) -> Array:
     return np.asarray(np.where(shown[:, None], camera.locate(pixels, HEIGHT_M) - places, np.nan))
 
 
-def rows(case: str, problem: Problem, runs: int) -> Iterator[Row]:
+def rows(case: str, make: Callable[[], Problem], runs: int) -> Iterator[Row]:
     """The advice of the first run, followed in all of them, with the promises of each."""
+    problem = make()
     measurements: list[Measurement] = []
     kept: list[tuple[Kept, Kept]] = []
     failed: list[str] = []
@@ -219,26 +218,18 @@ def short_name(measurement: Measurement) -> str:
     return f"{measurement.kind} x {len(measurement.steps) or len(measurement.views[0].frames)}"
 
 
-def main(arguments: Sequence[str]) -> int:
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0], allow_abbrev=False)
-    parser.add_argument("--runs", type=int, default=100, help="simulated calibrations of each scene (default 100)")
-    parser.add_argument("--case", nargs="+", choices=CASES, default=list(CASES), help="only these")
-    given = parser.parse_args(arguments)
-    if given.runs < 2:
-        parser.error("--runs must be 2 or more: one run has no spread")
-    every: list[Row] = []
-    for name in given.case:
-        start = time.perf_counter()
-        for row in rows(name, CASES[name](), given.runs):
-            every.append(row)
-            print(row, flush=True)
-        print(f"  {name}: {time.perf_counter() - start:.0f} s", flush=True)
+def over_all(every: Sequence[Row]) -> Iterator[Row]:
+    """What is stated, and what it is in fact, over what was promised: mean and range of all scenes and measurements."""
     for what in ("stated", "in fact"):
         ratios = [row.value for row in every if row.what.endswith(f" {what}")]
         if ratios:
             note = f"{min(ratios):.2f} to {max(ratios):.2f}"
-            print(Row("everything", f"{what}, over what was promised, mean", float(np.mean(ratios)), note=note))
-    return 1 if any(row.verdict == "no" for row in every) else 0
+            yield Row("everything", f"{what}, over what was promised, mean", float(np.mean(ratios)), note=note)
+
+
+def main(arguments: Sequence[str]) -> int:
+    cases = {name: partial(rows, name, make) for name, make in CASES.items()}
+    return run(cases, arguments, __doc__, (100, "simulated calibrations of each scene"), 2, over_all)
 
 
 if __name__ == "__main__":

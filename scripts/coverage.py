@@ -7,19 +7,16 @@ verdicts are those that were built in. Exits with 1 when a figure is missed by m
 
 from __future__ import annotations
 
-import argparse
-import json
 import sys
-import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from pathlib import Path
 
 import numpy as np
-from accuracy import HEIGHTS_M, Row
+from accuracy import HEIGHTS_M
 from accuracy_bound import Trial, attempts
 from accuracy_scenes import CLEAN_NOISE, GROSS_NOISE, PROBLEMS, Problem, tilted
+from cases import Row, run
 
 from ceres_cal.calibration import Calibration
 from ceres_cal.quantities import difference, pose_keys
@@ -148,23 +145,8 @@ def rows(name: str, case: Case, runs: int) -> Iterator[Row]:
 
 
 def main(arguments: Sequence[str]) -> int:
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0], allow_abbrev=False)
-    parser.add_argument("--runs", type=int, default=500, help="simulated calibrations of each problem (default 500)")
-    parser.add_argument("--case", nargs="+", choices=CASES, default=list(CASES), help="only these")
-    parser.add_argument("--json", type=Path, help="write the figures there, too")
-    given = parser.parse_args(arguments)
-    if given.runs < 2:
-        parser.error("--runs must be 2 or more: one run has no spread")
-    every: list[Row] = []
-    for name in given.case:
-        start = time.perf_counter()
-        for row in rows(name, CASES[name], given.runs):
-            every.append(row)
-            print(row, flush=True)
-        print(f"  {name}: {time.perf_counter() - start:.0f} s", flush=True)
-    if given.json:
-        given.json.write_text(json.dumps([row.to_json() for row in every], indent=1), encoding="utf-8")
-    return 1 if any(row.verdict == "no" for row in every) else 0
+    cases = {name: partial(rows, name, case) for name, case in CASES.items()}
+    return run(cases, arguments, __doc__, (500, "simulated calibrations of each problem"), 2)
 
 
 if __name__ == "__main__":

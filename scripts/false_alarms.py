@@ -23,9 +23,9 @@ from diagnostic_scenes import CLEAN, FAULTS, NOISE, USUAL, Problem, held_boards
 
 from ceres_cal.calibrate import calibrate
 from ceres_cal.diagnostics import FALSE_ALARM_RATE, Diagnosis, diagnose
-from ceres_cal.diagnostics.tails import log_binomial_tail
 from ceres_cal.parameters import Options
 from ceres_cal.simulate import simulate
+from ceres_cal.tails import log_binomial_tail
 
 MOST_SECONDS = 5.0
 SURE = 0.001  # a count of false alarms less probable than this exceeds the rate
@@ -56,8 +56,7 @@ class Row:
 
 def _chance(alarms: int, scenes: int) -> float:
     """Probability of so many false alarms at the stated rate."""
-    tail = log_binomial_tail(np.array([alarms]), np.array([scenes]), np.array([FALSE_ALARM_RATE]))
-    return float(np.exp(tail[0]))
+    return float(np.exp(log_binomial_tail(alarms, scenes, FALSE_ALARM_RATE)))
 
 
 def diagnosed(problem: Problem, seed: int) -> Diagnosis:

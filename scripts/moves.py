@@ -7,8 +7,6 @@ Exits with 1 when a figure is missed.
 
 from __future__ import annotations
 
-import argparse
-import json
 import os
 import subprocess
 import sys
@@ -19,8 +17,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from accuracy import HEIGHTS_M, Row, map_errors_mm
+from accuracy import HEIGHTS_M, map_errors_mm
 from accuracy_scenes import FIELD, field_places
+from cases import Row, run
 
 from ceres_cal.bundle import Weighting, information
 from ceres_cal.calibrate import calibrate
@@ -30,7 +29,7 @@ from ceres_cal.errors import CalibrationError
 from ceres_cal.lens import Radial
 from ceres_cal.moves import check, refit
 from ceres_cal.moves.carried import layouts, make_plan
-from ceres_cal.observations import Observations
+from ceres_cal.observations import Observations, taken
 from ceres_cal.parameters import Estimate
 from ceres_cal.quantities import Key, difference
 from ceres_cal.sights import gather_sights
@@ -155,8 +154,8 @@ def thinned(observations: Observations, points: Sequence[str], curves: int, seed
     picked = np.random.default_rng([seed, 3]).permutation(len(observations.curves))[:curves]
     return replace(
         observations,
-        points=replace(observations.points, **{n: v[p] for n, v in vars(observations.points).items()}),
-        curves=replace(observations.curves, **{n: v[np.sort(picked)] for n, v in vars(observations.curves).items()}),
+        points=taken(observations.points, p),
+        curves=taken(observations.curves, np.sort(picked)),
     )
 
 
@@ -323,21 +322,7 @@ CASES: dict[str, Callable[[int], Iterator[Row]]] = {
 
 
 def main(arguments: Sequence[str]) -> int:
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0], allow_abbrev=False)
-    parser.add_argument("--runs", type=int, default=1000, help="simulated moves (default 1000)")
-    parser.add_argument("--case", nargs="+", choices=CASES, default=list(CASES), help="only these")
-    parser.add_argument("--json", type=Path, help="write the figures there, too")
-    given = parser.parse_args(arguments)
-    rows: list[Row] = []
-    for name in given.case:
-        start = time.perf_counter()
-        for row in CASES[name](given.runs):
-            rows.append(row)
-            print(row, flush=True)
-        print(f"  {name}: {time.perf_counter() - start:.0f} s", flush=True)
-    if given.json:
-        given.json.write_text(json.dumps([row.to_json() for row in rows], indent=1), encoding="utf-8")
-    return 1 if any(row.verdict == "no" for row in rows) else 0
+    return run(CASES, arguments, __doc__, (1000, "simulated moves"))
 
 
 if __name__ == "__main__":

@@ -7,7 +7,6 @@ stands beside the value it must keep to. Exits with 1 when a figure is missed.
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import sys
 import tempfile
@@ -18,7 +17,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from accuracy import Row
+from cases import Row, exit_code, json_text, printed
 from numpy.typing import NDArray
 
 from ceres_cal.calibrate import calibrate
@@ -377,15 +376,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args(arguments)
     real = None if options.real is None else Path(options.real)
-    found = []
-    for case in options.case or CASES:
-        for row in rows_of(case, options.runs, real, options.picture):
-            found.append(row)
-            if not options.json:
-                print(row, flush=True)
+    rows = (row for case in options.case or CASES for row in rows_of(case, options.runs, real, options.picture))
+    found = list(rows if options.json else printed(rows))
     if options.json:
-        print(json.dumps([row.to_json() for row in found], indent=1))
-    return int(any(row.verdict == "no" for row in found))
+        print(json_text(found))
+    return exit_code(found)
 
 
 if __name__ == "__main__":

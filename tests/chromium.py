@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import json
 import os
-import shutil
 import subprocess
 import tempfile
 from collections.abc import Iterator
@@ -15,13 +14,12 @@ from types import TracebackType
 from typing import Any
 
 import pytest
-
-_NAMES = ("chromium", "chromium-browser", "google-chrome")
+from make_report_picture import chromium
 
 
 def chromium_path() -> str:
     """The program; skips the test where there is none."""
-    found = next((path for path in map(shutil.which, _NAMES) if path), None)
+    found = chromium()
     if found is None:
         pytest.skip("no chromium here (Debian, Ubuntu: apt install chromium)")
     return found

@@ -4,8 +4,10 @@ import os
 from pathlib import Path
 
 import pytest
+from moves import DAY, HOME, MOVED, calibrated, seen
 
 from ceres_cal.detect.boards import BoardDetections, detect_boards
+from ceres_cal.moves.labels import MIRRORED, relabelled
 from ceres_cal.targets import checkerboard
 
 
@@ -28,3 +30,19 @@ def sony_boards(real_data: Path) -> BoardDetections:
 def gopro_boards(real_data: Path) -> BoardDetections:
     """What is detected in the 36 wide-angle photographs; the size of a square is not known."""
     return detect_boards(sorted((real_data / "udacity_gopro_wide").glob("GOPR*.jpg")), checkerboard(8, 6, 1.0))
+
+
+@pytest.fixture(scope="session")
+def files_of_a_move(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder to copy: a calibration (old.json), observations from before (same.json) and after a move (after.json),
+    and such that nothing explains (mirrored.json).
+    """
+    folder = tmp_path_factory.mktemp("move")
+    calibrated(0).save(folder / "old.json")
+    seen(HOME, DAY, 1000).observations.save(folder / "same.json")
+    after = seen(MOVED, DAY, 1001).observations
+    after.save(folder / "after.json")
+    mirrored = relabelled(after, MIRRORED)
+    assert mirrored is not None
+    mirrored.save(folder / "mirrored.json")
+    return folder

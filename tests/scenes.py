@@ -50,6 +50,15 @@ def _upright(lens: str) -> tuple[dict[str, Camera], dict[str, Station]]:
     return {"overhead": camera(lens)}, {"overhead": Station("overhead", pose)}
 
 
+def side_by_side(left: Camera) -> tuple[dict[str, Camera], dict[str, Station]]:
+    """Two cameras of nearly the same phi, each over its half of the field."""
+    stations = {
+        "left": Station("left", overhead_pose(-2.3, 0.05, 4.4, 4.0, 2.0, 90.0)),
+        "right": Station("right", overhead_pose(2.35, -0.08, 4.5, 5.0, -2.5, -90.8)),
+    }
+    return {"left": left, "right": replace(left, phi=873.4)}, stations
+
+
 def corners(lens: str) -> Scene:
     """The points of the field alone."""
     return field_scene(ssl_field("B"), *_leaning(lens), curves=())

@@ -164,14 +164,6 @@ def test_tolerances_do_no_harm_where_two_cameras_can_tell_little(heights_known: 
 # ---- the script -----------------------------------------------------------------------------------------------------
 
 
-def test_verdicts() -> None:
-    row = accuracy.Row("case", "what", 1.06, 0.02, 0.95, 1.05)
-    assert row.verdict == "open"
-    assert replace(row, value=1.10).verdict == "no"
-    assert replace(row, value=0.96).verdict == "yes"
-    assert replace(row, least=-np.inf, most=np.inf).verdict == ""
-
-
 def test_the_script_prints_and_writes_its_rows(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "figures.json"
     assert accuracy.main(["--case", "as-built", "--runs", "2", "--json", str(path)]) == 0

@@ -15,7 +15,7 @@ from scipy.optimize import least_squares
 from ceres_cal.bundle import Progress, Weighting, solve
 from ceres_cal.errors import DegenerateError
 from ceres_cal.initialise import initialise
-from ceres_cal.observations import Observations, Prior
+from ceres_cal.observations import Observations, Prior, taken
 from ceres_cal.parameters import (
     Estimate,
     Layout,
@@ -250,14 +250,9 @@ def test_priors_on_what_is_held_are_no_contradiction() -> None:
 
 def test_fewer_numbers_than_unknowns() -> None:
     observations, options = case("radial-2-3/corners")
-    sights = gather_sights(replace(observations, points=replace_rows(observations, 5)))
+    sights = gather_sights(replace(observations, points=taken(observations.points, np.arange(5))))
     with pytest.raises(DegenerateError, match=r"10 measured numbers .* cannot determine 11 unknowns: add observations"):
         solve(sights, start_of("radial-2-3/corners"), make_layout(observations, options), Weighting(), options)
-
-
-def replace_rows(observations: Observations, count: int) -> Any:
-    points = observations.points
-    return type(points)(**{name: column[:count] for name, column in vars(points).items()})
 
 
 # ---- how it ends ----------------------------------------------------------------------------------------------------

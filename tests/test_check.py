@@ -7,6 +7,7 @@ import pytest
 from accuracy_scenes import FIELD
 from moves import CAMERA, DAY, HOME, NOISE, SMALL_SHIFT, SMALL_TILT, check_case, seen, thinned
 from moves import calibrated as calibrated_at_home
+from scenes import side_by_side
 
 from ceres_cal.calibrate import calibrate
 from ceres_cal.calibration import Calibration
@@ -16,7 +17,7 @@ from ceres_cal.moves import check
 from ceres_cal.moves.labels import MIRRORED, relabelled
 from ceres_cal.observations import Observations
 from ceres_cal.parameters import Options, Station
-from ceres_cal.simulate import Disturbance, field_scene, overhead_pose, simulate
+from ceres_cal.simulate import Disturbance, field_scene, simulate
 from ceres_cal.structure import Tolerance
 from ceres_cal.transforms import Pose, rotation_exp
 
@@ -85,11 +86,7 @@ def test_what_is_not_understood_does_not_hold(calibration: Calibration) -> None:
 
 
 def test_each_station_by_itself() -> None:
-    cameras = {"left": CAMERA, "right": replace(CAMERA, phi=873.4)}
-    stations = {
-        "left": Station("left", overhead_pose(-2.3, 0.05, 4.4, 4.0, 2.0, 90.0)),
-        "right": Station("right", overhead_pose(2.35, -0.08, 4.5, 5.0, -2.5, -90.8)),
-    }
+    cameras, stations = side_by_side(CAMERA)
     scene = field_scene(FIELD, cameras, stations, spacing_m=0.2)
     options = Options(tolerances={"field": Tolerance(lines_m=0.003)})
     both = calibrate(simulate(scene, NOISE, 0).observations, options)

@@ -1,31 +1,21 @@
 """refit, check, compare and export-table as someone types them."""
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
-from moves import DAY, HOME, MOVED, seen
-from moves import calibrated as calibrated_at_home
 from test_cli import Say, refused, say
 
 from ceres_cal.calibration import Calibration
-from ceres_cal.moves.labels import MIRRORED, relabelled
 from ceres_cal.table import LookupTable
 
 __all__ = ["say"]
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    place = tmp_path_factory.mktemp("moves")
-    calibrated_at_home(0).save(place / "old.json")
-    seen(HOME, DAY, 1000).observations.save(place / "same.json")
-    after = seen(MOVED, DAY, 1001).observations
-    after.save(place / "after.json")
-    mirrored = relabelled(after, MIRRORED)
-    assert mirrored is not None
-    mirrored.save(place / "mirrored.json")
-    return place
+def folder(files_of_a_move: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return Path(shutil.copytree(files_of_a_move, tmp_path_factory.mktemp("moves"), dirs_exist_ok=True))
 
 
 def test_refit(say: Say, folder: Path) -> None:

@@ -11,9 +11,6 @@ import diagnostic_scenes as scenes
 import numpy as np
 import pytest
 import scenes as usual
-from hypothesis import given
-from hypothesis import strategies as st
-from scipy import stats
 
 from ceres_cal.calibrate import calibrate
 from ceres_cal.calibration import Calibration
@@ -22,7 +19,6 @@ from ceres_cal.detect.boards import BoardDetections
 from ceres_cal.diagnostics import Diagnosis, choose, cross_validate, diagnose
 from ceres_cal.diagnostics.equations import Equations, write_equations
 from ceres_cal.diagnostics.freedom import _shared_columns, make_freedom
-from ceres_cal.diagnostics.tails import log_binomial_tail, log_chi2_tail, log_f_tail
 from ceres_cal.errors import InputError
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.parameters import Options, intrinsics_vector, make_layout, with_intrinsics
@@ -47,39 +43,6 @@ def calibration(observations: Observations) -> Calibration:
 @pytest.fixture(scope="module")
 def diagnosis(calibration: Calibration, observations: Observations) -> Diagnosis:
     return diagnose(calibration, observations)
-
-
-# ---- tail probabilities ---------------------------------------------------------------------------------------------
-
-
-@given(st.floats(0.01, 1e4), st.integers(1, 30), st.integers(3, 200_000))
-def test_tail_of_f(value: float, d1: int, d2: int) -> None:
-    expected = stats.f.logsf(value, d1, d2)
-    if expected > -600.0:  # scipy's own underflows
-        found = float(log_f_tail(np.array([value]), np.array([d1]), np.array([d2]))[0])
-        assert found == pytest.approx(expected, rel=2e-8, abs=2e-8)
-
-
-@given(st.integers(1, 50), st.integers(0, 100), st.floats(1e-6, 0.999))
-def test_tail_of_the_binomial(count: int, more: int, probability: float) -> None:
-    trials = count + more
-    expected = stats.binom.logsf(count - 1, trials, probability)
-    found = float(log_binomial_tail(np.array([count]), np.array([trials]), np.array([probability]))[0])
-    assert found == pytest.approx(expected, rel=1e-8, abs=1e-8)
-
-
-@given(st.floats(0.0, 2e4), st.floats(1.0, 1e4))
-def test_tail_of_chi_square(value: float, freedom: float) -> None:
-    expected = stats.chi2.logsf(value, freedom)
-    if expected > -600.0:
-        assert log_chi2_tail(value, freedom) == pytest.approx(expected, rel=1e-8, abs=1e-8)
-
-
-def test_tails_do_not_underflow() -> None:
-    assert float(log_f_tail(np.array([1e4]), np.array([3]), np.array([100_000]))[0]) == pytest.approx(
-        -13116.0, rel=1e-3
-    )
-    assert log_chi2_tail(1e5, 10.0) < -4e4
 
 
 # ---- derivatives and leverage against brute force -------------------------------------------------------------------

@@ -24,6 +24,7 @@ from moves import (
     truth_of,
 )
 from moves import calibrated as calibrated_at_home
+from scenes import side_by_side
 
 from ceres_cal.bundle.costs import Run
 from ceres_cal.bundle.joint import JointPriorCost, offsets
@@ -36,7 +37,7 @@ from ceres_cal.moves import refit
 from ceres_cal.moves.carried import make_plan, prior_for, without_keys
 from ceres_cal.moves.labels import MIRRORED, TURNED, relabelled
 from ceres_cal.moves.poses import movement
-from ceres_cal.observations import Observations
+from ceres_cal.observations import Observations, taken
 from ceres_cal.parameters import Layout, Options, Station
 from ceres_cal.quantities import difference, moved
 from ceres_cal.simulate import field_scene, overhead_pose, simulate
@@ -57,14 +58,18 @@ def observations() -> Observations:
     return seen(MOVED, DAY, 1).observations
 
 
+def only(observations: Observations, *names: str) -> Observations:
+    """What was observed of these curves, and nothing else."""
+    known = observations.targets["field"].curve_names
+    rows = np.isin(observations.curves.feature, [known.index(name) for name in names])
+    none = np.zeros(len(observations.points), dtype=bool)
+    return replace(observations, points=taken(observations.points, none), curves=taken(observations.curves, rows))
+
+
 @pytest.fixture(scope="module")
 def two_cameras() -> tuple[Calibration, dict[str, Station]]:
     """Two cameras over one field that is not as drawn: its tolerances tie them together."""
-    cameras = {"left": CAMERA, "right": replace(CAMERA, phi=873.4)}
-    stations = {
-        "left": Station("left", overhead_pose(-2.3, 0.05, 4.4, 4.0, 2.0, 90.0)),
-        "right": Station("right", overhead_pose(2.35, -0.08, 4.5, 5.0, -2.5, -90.8)),
-    }
+    cameras, stations = side_by_side(CAMERA)
     scene = field_scene(FIELD, cameras, stations, frames=2, spacing_m=0.15)
     options = Options(tolerances={"field": Tolerance(lines_m=0.005)})
     return calibrate(simulate(scene, NOISE, 0).observations, options), stations
@@ -169,16 +174,7 @@ def test_two_lines_and_an_arc_are_enough_after_a_small_move(calibration: Calibra
     pose = Pose.looking(
         HOME.position + np.array([0.02, -0.03, 0.01]), rotation_exp((0.01, -0.02, 0.015)) @ HOME.rotation
     )
-    lines = seen(pose, NOISE, 3).observations
-    names = lines.targets["field"].curve_names
-    wanted = [names.index(name) for name in ("HalfwayLine", "TopTouchLine", "CenterCircle")]
-    rows = np.isin(lines.curves.feature, wanted)
-    none = np.zeros(len(lines.points), dtype=bool)
-    lines = replace(
-        lines,
-        points=replace(lines.points, **{n: v[none] for n, v in vars(lines.points).items()}),
-        curves=replace(lines.curves, **{n: v[rows] for n, v in vars(lines.curves).items()}),
-    )
+    lines = only(seen(pose, NOISE, 3).observations, "HalfwayLine", "TopTouchLine", "CenterCircle")
     result = refit(calibration, lines)
     assert np.max(sigmas_off(result, truth_of(calibration, pose))) < MOST_SIGMA
 
@@ -191,15 +187,7 @@ def test_few_lines_do_not_tell_a_large_move(calibration: Calibration) -> None:
 
 
 def test_parallel_lines_are_refused(calibration: Calibration) -> None:
-    lines = seen(HOME, NOISE, 3).observations
-    names = lines.targets["field"].curve_names
-    rows = np.isin(lines.curves.feature, [names.index("CenterLine"), names.index("TopTouchLine")])
-    none = np.zeros(len(lines.points), dtype=bool)
-    lines = replace(
-        lines,
-        points=replace(lines.points, **{n: v[none] for n, v in vars(lines.points).items()}),
-        curves=replace(lines.curves, **{n: v[rows] for n, v in vars(lines.curves).items()}),
-    )
+    lines = only(seen(HOME, NOISE, 3).observations, "CenterLine", "TopTouchLine")
     with pytest.raises(DegenerateError, match="do not tell its"):
         refit(calibration, lines)
 

@@ -3,6 +3,7 @@
 import json
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -11,27 +12,20 @@ from pathlib import Path
 
 import pytest
 import refit_after_move
-from moves import DAY, HOME, MOVED, NOISE, seen
-from moves import calibrated as calibrated_at_home
+from moves import MOVED, NOISE, seen
 
 from ceres_cal.calibration import Calibration
 from ceres_cal.moves import check
-from ceres_cal.moves.labels import MIRRORED, relabelled
 
 ROOT = Path(__file__).resolve().parents[1]
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT / "src")}
 
 
 @pytest.fixture
-def place(tmp_path: Path) -> Path:
-    """A folder with a calibration, observations from before and after a move, and such that nothing explains."""
-    calibrated_at_home(0).save(tmp_path / "calibration.json")
-    seen(HOME, DAY, 1000).observations.save(tmp_path / "same.json")
-    after = seen(MOVED, DAY, 1001).observations
-    after.save(tmp_path / "after.json")
-    mirrored = relabelled(after, MIRRORED)
-    assert mirrored is not None
-    mirrored.save(tmp_path / "mirrored.json")
+def place(files_of_a_move: Path, tmp_path: Path) -> Path:
+    """A folder with a calibration, observations from before and after a move, such that nothing explains, and none."""
+    shutil.copytree(files_of_a_move, tmp_path, dirs_exist_ok=True)
+    (tmp_path / "old.json").rename(tmp_path / "calibration.json")
     (tmp_path / "broken.json").write_text('{"format": "ceres-cal/obs')
     return tmp_path
 

@@ -134,11 +134,7 @@ class Estimate:
     """The targets as built."""
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "placements", Poses.of(self.placements))
-
-    @property
-    def _placements(self) -> Poses:
-        return Poses.of(self.placements)
+        object.__setattr__(self, "placements", Poses.of(self.placements))  # which costs nothing from then on
 
     def camera_at(self, station: str, placement: str | None = None) -> Camera:
         """The station's camera in the world, or in the frame of a placement (its cam_from_world is cam_from_target)."""
@@ -149,13 +145,13 @@ class Estimate:
 
     def pose_stack(self, keys: Sequence[SightKey]) -> Array:
         """cam_from_frame of each sight as [R t], (S, 3, 4)."""
-        return chained(self._station_stack(keys), self._placements.of_names([key.placement for key in keys]))
+        return chained(self._station_stack(keys), Poses.of(self.placements).of_names([key.placement for key in keys]))
 
     def with_placements(self, keys: Sequence[SightKey], cam_from_target: Array) -> Estimate:
         """The estimate with the placement of each key where its station sees it, cam_from_target (S, 3, 4)."""
         names = [key.placement for key in keys if key.placement is not None]
         moved = chained(inverted(self._station_stack(keys)), cam_from_target)
-        return replace(self, placements=self._placements.updated(names, moved))
+        return replace(self, placements=Poses.of(self.placements).updated(names, moved))
 
     def _station_stack(self, keys: Sequence[SightKey]) -> Array:
         poses = Poses.of({name: station.cam_from_world for name, station in self.stations.items()})

@@ -74,23 +74,7 @@ class Sights(Sequence["Sights"]):
         number %= len(self)
         p = slice(self.point_bounds[number], self.point_bounds[number + 1])
         c = slice(self.curve_bounds[number], self.curve_bounds[number + 1])
-        return Sights(
-            (self.keys[number],),
-            (self.views[number],),
-            np.array([0, p.stop - p.start]),
-            self.point_rows[p],
-            self.feature[p],
-            self.points[p],
-            self.pixels[p],
-            self.sigma_px[p],
-            np.array([0, c.stop - c.start]),
-            self.curve_rows[c],
-            self.track[c],
-            self.curve_pixels[c],
-            self.curve_sigma_px[c],
-            self.tracks,
-            self.is_arc,
-        )
+        return self._rows(np.array([number]), p, c, np.array([p.stop - p.start]), np.array([c.stop - c.start]))
 
     @property
     def key(self) -> SightKey:

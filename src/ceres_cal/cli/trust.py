@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ceres_cal.digits import two_digits
 from ceres_cal.uncertainty import bounds_text
 
 if TYPE_CHECKING:
@@ -70,7 +71,7 @@ class Trust:
             text = f"{first} - {second}: {_on_floor_and_above(maps)}"
             seams.append(text)
             if len(found.what):
-                told = f"found {short(found.rms_mm)} mm where {short(found.expected_rms_mm)} were expected"
+                told = f"found {two_digits(found.rms_mm)} mm where {two_digits(found.expected_rms_mm)} were expected"
                 seams.append(f"{told} (rms of {len(found.what)} points and stretches that both observed)")
         if seams:
             yield "seam", seams
@@ -120,18 +121,13 @@ def with_sd(value: float, unit: str, verdict: Verdict | None) -> str:
     if not np.isfinite(verdict.sd):
         return f"{value:.{3 if unit == 'm' else 0}f} {unit}{word}"
     if unit == "m":
-        return f"{value:.3f} m ± {short(1e3 * verdict.sd)} mm{word}"
+        return f"{value:.3f} m ± {two_digits(1e3 * verdict.sd)} mm{word}"
     places = int(np.clip(2 - np.floor(np.log10(verdict.sd)), 0, 9))
-    return f"{value:.{places}f} ± {short(verdict.sd)} {unit}{word}"
-
-
-def short(value: float) -> str:
-    """Two digits: 0.21, 6.6, 24, 130."""
-    return f"{value:.2g}" if abs(value) < 100.0 else f"{value:.0f}"
+    return f"{value:.{places}f} ± {two_digits(verdict.sd)} {unit}{word}"
 
 
 def _millimetres(value: float) -> str:
-    return f"± {short(value)} mm" if np.isfinite(value) else "unknown"
+    return f"± {two_digits(value)} mm" if np.isfinite(value) else "unknown"
 
 
 def _on_floor_and_above(maps: Sequence[FieldMap]) -> str:
@@ -139,7 +135,7 @@ def _on_floor_and_above(maps: Sequence[FieldMap]) -> str:
     for m in maps:
         where = "on the floor" if m.height_m == 0.0 else f"at {1e3 * m.height_m:.0f} mm"
         x, y = m.worst_place_m
-        worst = f" (worst {short(m.worst_mm)} at {x:.1f}, {y:.1f} m)" if np.isfinite(m.worst_mm) else ""
+        worst = f" (worst {two_digits(m.worst_mm)} at {x:.1f}, {y:.1f} m)" if np.isfinite(m.worst_mm) else ""
         parts.append(f"{_millimetres(m.mean_mm)} {where}{worst}")
     return ", ".join(parts)
 

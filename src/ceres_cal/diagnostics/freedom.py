@@ -176,14 +176,14 @@ class _Places:
 
 
 def _places(estimate: Estimate, layout: Layout, equations: Equations) -> _Places:
-    private = private_placements(equations.sights, layout)
     shown = {key.placement for key in equations.sights.keys}
+    shared = (layout.placements & shown) - private_placements(equations.sights, layout)
     at = 0
     groups: list[dict[str, int]] = []
     for names, sizes in (
         (list(estimate.cameras), [len(layout.free[name]) for name in estimate.cameras]),
         ([name for name in estimate.stations if name in layout.stations], None),
-        ([name for name in estimate.placements if name in layout.placements & shown and name not in private], None),
+        ([name for name in estimate.placements if name in shared], None),
     ):
         group = {}
         for number, name in enumerate(names):

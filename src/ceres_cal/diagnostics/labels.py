@@ -7,16 +7,17 @@ any other feature, for each observation; for several of one frame and label that
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache, cached_property
 
 import numpy as np
 
 from ceres_cal import kernels
 from ceres_cal.camera import Camera
 from ceres_cal.diagnostics.equations import Ints
-from ceres_cal.diagnostics.tails import log_binomial_tail
-from ceres_cal.observations import Observations
+from ceres_cal.observations import Curves, Observations, Points
 from ceres_cal.parameters import Estimate
 from ceres_cal.residuals import lens_arguments
+from ceres_cal.tails import log_binomial_tail
 from ceres_cal.targets import SIDES, Target, along_track, nearest_on_track
 from ceres_cal.transforms import Array
 
@@ -55,31 +56,53 @@ def find_mislabelled(
     """
     found: list[Mislabelled] = []
     groups = 0
+
+    @cache  # all frames of one station show a field from the same place
+    def sight(target: str, station: str, placement: str | None) -> _Sight:
+        return _Sight(observations.targets[target], estimate.camera_at(station, placement))
+
     for is_curve, rows in ((False, rejected_points), (True, rejected_curves)):
         column = observations.curves if is_curve else observations.points
         rows = rows[:: max(1, len(rows) // _MOST)]
         for view in np.unique(column.view[rows]):
             own = rows[column.view[rows] == view]
             groups += len(np.unique(column.feature[own]))
-            bound = reject_sigma * scales[is_curve] * column.sigma_px[own]
-            found += _of_view(observations, estimate, is_curve, int(view), own, bound)
+            one = observations.views[view]
+            if one.placement is None or one.placement in estimate.placements:
+                bound = reject_sigma * scales[is_curve] * column.sigma_px[own]
+                found += _of_view(sight(one.target, one.station, one.placement), column, int(view), own, bound)
     return found, groups
 
 
-def _of_view(
-    observations: Observations, estimate: Estimate, is_curve: bool, view: int, rows: Ints, bound: Array
-) -> list[Mislabelled]:
+@dataclass(frozen=True, eq=False)
+class _Sight:
+    """A target as a camera sees it from one pose."""
+
+    target: Target
+    camera: Camera
+
+    @cached_property
+    def length_px(self) -> float:
+        """Length of all its curves within the image."""
+        tracks = zip(self.target.curves.values(), self.target.tracks[0], self.target.is_arc, strict=True)
+        return sum(_visible_length_px(self.camera, curve.parameter_range, track, arc) for curve, track, arc in tracks)
+
+    def chance(self, is_curve: bool, distance_px: float) -> float:
+        """The share of the image that lies within a distance of any feature."""
+        width, height = self.camera.image_size
+        if not is_curve:
+            return min(1.0, len(self.target.points) * np.pi * distance_px**2 / (width * height))
+        return min(1.0, 2.0 * distance_px * self.length_px / (width * height))
+
+
+def _of_view(sight: _Sight, column: Points | Curves, view: int, rows: Ints, bound: Array) -> list[Mislabelled]:
     """The groups of one view."""
-    one = observations.views[view]
-    if one.placement is not None and one.placement not in estimate.placements:
-        return []
-    column = observations.curves if is_curve else observations.points
-    target, camera = observations.targets[one.target], estimate.camera_at(one.station, one.placement)
+    is_curve = isinstance(column, Curves)
     pixels, named = column.pixels[rows], column.feature[rows]
     if is_curve:
-        distance = _curve_distances(target, camera, pixels)
+        distance = _curve_distances(sight.target, sight.camera, pixels)
     else:
-        places = camera.project(target.point_array)
+        places = sight.camera.project(sight.target.point_array)
         distance = np.linalg.norm(pixels[:, None] - places[None], axis=2)
     distance = np.where(np.isfinite(distance), distance, np.inf)
     distance[np.arange(len(rows)), named] = np.inf
@@ -90,8 +113,8 @@ def _of_view(
     for label, instead in np.unique(np.column_stack([named, nearest])[fits], axis=0):
         tried = named == label
         chosen = fits & tried & (nearest == instead)
-        near = _chance(target, camera, is_curve, float(away[chosen].max()))
-        log_p = float(log_binomial_tail(np.array([chosen.sum()]), np.array([tried.sum()]), np.array([near]))[0])
+        near = sight.chance(is_curve, float(away[chosen].max()))
+        log_p = float(log_binomial_tail(chosen.sum(), tried.sum(), near))
         found.append(
             Mislabelled(
                 is_curve, view, int(label), int(instead), rows[chosen], away[chosen], int(tried.sum()), log_p
@@ -100,19 +123,8 @@ def _of_view(
     return found
 
 
-def _chance(target: Target, camera: Camera, is_curve: bool, distance_px: float) -> float:
-    """The share of the image that lies within a distance of any feature of the target."""
-    width, height = camera.image_size
-    if not is_curve:
-        return min(1.0, len(target.points) * np.pi * distance_px**2 / (width * height))
-    length = sum(_visible_length_px(target, camera, number) for number in range(len(target.curves)))
-    return min(1.0, 2.0 * distance_px * length / (width * height))
-
-
-def _visible_length_px(target: Target, camera: Camera, number: int) -> float:
-    curve = list(target.curves.values())[number]
-    s = np.linspace(*curve.parameter_range, 200)
-    pixels = camera.project(along_track(target.tracks[0, number], bool(target.is_arc[number]), s))
+def _visible_length_px(camera: Camera, parameter_range: tuple[float, float], track: Array, arc: bool) -> float:
+    pixels = camera.project(along_track(track, arc, np.linspace(*parameter_range, 200)))
     inside = np.all((pixels >= 0.0) & (pixels <= np.array(camera.image_size)), axis=1)
     steps = np.linalg.norm(np.diff(pixels, axis=0), axis=1)
     return float(np.sum(steps[inside[1:] & inside[:-1]]))

@@ -8,9 +8,9 @@ import numpy as np
 
 from ceres_cal.diagnostics.equations import Ints
 from ceres_cal.diagnostics.freedom import Freedom
-from ceres_cal.diagnostics.tails import log_chi2_tail
 from ceres_cal.observations import Observations
 from ceres_cal.sights import Mask
+from ceres_cal.tails import log_chi2_tail
 from ceres_cal.transforms import Array
 
 LARGER = 1.15  # noise within so much of what was stated is as stated
@@ -67,7 +67,7 @@ def _noise_of(observations: Observations, freedom: Freedom, kind: str, rows: Mas
     stated = float("nan") if np.all(column.sigma_px == 1.0) else float(np.sqrt(np.mean(column.sigma_px**2)))
     log_p = 0.0
     if np.isfinite(stated) and spare >= 1.0:
-        log_p = log_chi2_tail(squares * model_scale**2 / LARGER**2, spare)
+        log_p = float(log_chi2_tail(squares * model_scale**2 / LARGER**2, spare))
     typical = scale * float(np.sqrt(np.mean(column.sigma_px**2)))
     correlation, pairs_log_p = _correlation(freedom, _neighbours(observations, freedom, kind), variance)
     agree = max(correlation, 0.0) if np.isfinite(correlation) and pairs_log_p < np.log(0.01) else 0.0

@@ -10,7 +10,6 @@ from ceres_cal.bundle import Weighting
 from ceres_cal.calibration import Calibration
 from ceres_cal.diagnostics.findings import Finding
 from ceres_cal.diagnostics.freedom import Freedom
-from ceres_cal.diagnostics.tails import log_f_tail
 from ceres_cal.diagnostics.words import Context
 from ceres_cal.errors import DegenerateError
 from ceres_cal.lost import with_lost_boards_found
@@ -18,6 +17,7 @@ from ceres_cal.noise import Inliers
 from ceres_cal.observations import Observations
 from ceres_cal.parameters import Estimate, Layout
 from ceres_cal.sights import Sights
+from ceres_cal.tails import log_f_tail
 from ceres_cal.transforms import Pose
 
 
@@ -72,7 +72,7 @@ def validity_finding(context: Context, freedom: Freedom, calibration: Calibratio
     left = freedom.left_over
     variance = float(left @ left) / max(freedom.spare, 1)
     statistic = float(pull @ pull) / (inflation * len(pull) * variance)
-    log_p = float(log_f_tail(np.array([statistic]), np.array([len(pull)]), np.array([max(freedom.spare, 1)]))[0])
+    log_p = float(log_f_tail(statistic, len(pull), max(freedom.spare, 1)))
     if log_p > log_level:
         return []
     shift = np.where(used, (freedom.shared @ pull) / freedom.weight, 0.0)

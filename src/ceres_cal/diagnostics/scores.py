@@ -15,7 +15,7 @@ import numpy as np
 
 from ceres_cal.diagnostics.equations import Ints
 from ceres_cal.diagnostics.freedom import Freedom, inverse_root
-from ceres_cal.diagnostics.tails import log_f_tail
+from ceres_cal.tails import log_f_tail
 from ceres_cal.transforms import Array
 
 LEAST_LEFT = 1e-7

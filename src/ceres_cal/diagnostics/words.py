@@ -17,6 +17,7 @@ from ceres_cal.diagnostics.leftover import Noise
 from ceres_cal.diagnostics.patterns import Selection, amounts_of, gains_of
 from ceres_cal.diagnostics.scores import Score
 from ceres_cal.diagnostics.table import ResidualTable, plane_shift
+from ceres_cal.digits import two_digits
 from ceres_cal.observations import Observations
 from ceres_cal.parameters import Estimate, Layout
 from ceres_cal.sights import Mask
@@ -79,7 +80,7 @@ def pattern_finding(context: Context, selection: Selection, number: int) -> Find
         if k != number:
             others = others.with_columns(other.family.of(other.number) * others.weight[:, None])
     ratio = effect_px / context.noise_px(selection.freedom.left_over, rows)
-    size = f"{effect_px:.2f} px, {effect_mm:.{1 if effect_mm >= 0.1 else 2}f} mm rms, {ratio:.2g} of the noise"
+    size = f"{effect_px:.2f} px, {effect_mm:.{1 if effect_mm >= 0.1 else 2}f} mm rms, {two_digits(ratio)} of the noise"
     said = _SPEAKERS[score.family.kind](context, others, score, shift, size, ratio)
     name = score.family.names[score.number]
     return Finding(

@@ -14,7 +14,6 @@ import numpy as np
 from ceres_cal.bundle import Weighting, information, solve
 from ceres_cal.calibration import Calibration
 from ceres_cal.camera import Camera
-from ceres_cal.chi_squared import upper_tail
 from ceres_cal.errors import CalibrationError, InputError
 from ceres_cal.joint import JointPrior
 from ceres_cal.moves.carried import kept_prior, require_same_things, with_structure, without_keys
@@ -24,6 +23,7 @@ from ceres_cal.parameters import Estimate, Layout, intrinsic_names
 from ceres_cal.quantities import Key, sigma_limits
 from ceres_cal.sights import Mask, Sights, gather_sights
 from ceres_cal.spread import Spread
+from ceres_cal.tails import upper_tail
 from ceres_cal.transforms import Array, Pose
 from ceres_cal.uncertainty import Posterior
 from ceres_cal.uncertainty.maps import shown_pixels

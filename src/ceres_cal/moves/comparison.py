@@ -10,12 +10,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from ceres_cal.calibration import Calibration
-from ceres_cal.chi_squared import upper_tail
 from ceres_cal.errors import InputError
 from ceres_cal.moves.poses import movement
 from ceres_cal.parameters import Estimate
 from ceres_cal.quantities import Key, difference, sigma_limits
 from ceres_cal.spread import Spread, known_inverses
+from ceres_cal.tails import upper_tail
 from ceres_cal.transforms import Array
 from ceres_cal.uncertainty.maps import field_map, shown_pixels
 from ceres_cal.uncertainty.uncertainty import field_grid

@@ -12,15 +12,15 @@ import numpy as np
 
 from ceres_cal.bundle.joint import offsets
 from ceres_cal.calibration import Calibration
-from ceres_cal.chi_squared import upper_bound
 from ceres_cal.errors import CalibrationError, SolutionError
 from ceres_cal.moves.carried import Plan, without_keys
 from ceres_cal.moves.labels import MIRRORED, TURNED, other_divisions, relabelled
 from ceres_cal.moves.poses import Place, Scene, misfit, movement, places
-from ceres_cal.observations import Observations
+from ceres_cal.observations import Observations, taken
 from ceres_cal.parameters import Estimate
 from ceres_cal.residuals import residuals
 from ceres_cal.sights import gather_sights
+from ceres_cal.tails import upper_tail
 from ceres_cal.transforms import Pose
 
 _ZOOMS = 15
@@ -146,18 +146,15 @@ def _of_camera(scene: Scene) -> Observations:
     order = np.full(len(observations.views), -1, dtype=np.int32)
     order[views] = np.arange(len(views))
 
-    def kept(columns: object) -> object:
-        rows = order[columns.view] >= 0  # type: ignore[attr-defined]
-        changed = {name: values[rows] for name, values in vars(columns).items()}
-        return replace(columns, **(changed | {"view": order[columns.view[rows]]}))  # type: ignore[attr-defined,type-var]
-
+    points = taken(observations.points, order[observations.points.view] >= 0)
+    curves = taken(observations.curves, order[observations.curves.view] >= 0)
     camera = scene.sight.key.camera
     return Observations(
         observations.targets,
         {camera: observations.cameras[camera]},
         tuple(observations.views[n] for n in views),
-        kept(observations.points),  # type: ignore[arg-type]
-        kept(observations.curves),  # type: ignore[arg-type]
+        replace(points, view=order[points.view]),
+        replace(curves, view=order[curves.view]),
     )
 
 
@@ -198,7 +195,7 @@ class Judged:
     @property
     def doubtful(self) -> bool:
         """Whether another explanation should be looked for."""
-        return self.noisy or (self.rank > 0 and self.strain > upper_bound(_RARE, self.rank))
+        return self.noisy or (upper_tail(self.strain, self.rank) < _RARE)
 
 
 def judged(plan: Plan, what: str, result: Calibration) -> Judged:

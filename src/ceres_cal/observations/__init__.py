@@ -1,6 +1,6 @@
 """Observations: what the frames show, as columns, in memory and in files."""
 
-from ceres_cal.observations.columns import Columns, Curves, Points, Prior, View
+from ceres_cal.observations.columns import Columns, Curves, Points, Prior, View, taken
 from ceres_cal.observations.files import FORMAT, VERSION, prior_from_json, prior_to_json
 from ceres_cal.observations.observations import Observations, combine
 
@@ -16,4 +16,5 @@ __all__ = [
     "combine",
     "prior_from_json",
     "prior_to_json",
+    "taken",
 ]

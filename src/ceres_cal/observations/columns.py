@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,7 @@ from ceres_cal.errors import InputError
 from ceres_cal.transforms import Array
 
 Ints = NDArray[np.int32]
+Rows = NDArray[np.int64] | NDArray[np.int32] | NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -101,6 +103,12 @@ class Curves:
 
 
 Columns = Points | Curves
+C = TypeVar("C")
+
+
+def taken(columns: C, rows: Rows) -> C:
+    """Points, curves, or columns of another kind, at these rows only: their numbers, or True for each that stays."""
+    return type(columns)(**{name: column[rows] for name, column in vars(columns).items()})
 
 
 def place_of(number: int, views: Sequence[View]) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ceres_cal.digits import two_digits
 from ceres_cal.uncertainty import Verdict
 
 DASH = "\N{EN DASH}"
@@ -17,7 +18,7 @@ def short(value: float) -> str:
         return DASH
     if np.isinf(value):
         return "unknown"
-    return f"{value:.2g}" if abs(value) < 99.5 else f"{value:.0f}"
+    return two_digits(value)
 
 
 def mm(value: float) -> str:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from ceres_cal.errors import InputError
 from ceres_cal.files import write_bytes
+from ceres_cal.observations import taken
 from ceres_cal.simulate.files import make_folder, write_simulation
 from ceres_cal.simulate.photograph import Photograph, frames, photograph
 from ceres_cal.simulate.photography import Photography
@@ -95,18 +96,14 @@ def _hidden_rows(simulation: Simulation, shot: Photograph, truth: Truth, view: N
 
 def _without(simulation: Simulation, points: NDArray[np.bool_], curves: NDArray[np.bool_]) -> Simulation:
     """A simulation with these rows only."""
-
-    def rows(columns: Any, kept: NDArray[np.bool_]) -> Any:
-        return replace(columns, **{name: column[kept] for name, column in vars(columns).items()})
-
     observations = simulation.observations
     return replace(
         simulation,
         observations=replace(
-            observations, points=rows(observations.points, points), curves=rows(observations.curves, curves)
+            observations, points=taken(observations.points, points), curves=taken(observations.curves, curves)
         ),
-        points=rows(simulation.points, points),
-        curves=rows(simulation.curves, curves),
+        points=taken(simulation.points, points),
+        curves=taken(simulation.curves, curves),
     )
 
 

@@ -12,7 +12,7 @@ from ceres_cal.parameters import Station
 from ceres_cal.simulate.compose import board_scene, field_scene, join, overhead_pose, rings_scene
 from ceres_cal.simulate.photography import Photography
 from ceres_cal.simulate.scene import Disturbance, Scene
-from ceres_cal.targets import Arc, Curve, Segment, Target, checkerboard, custom, rings, ssl_field
+from ceres_cal.targets import Target, checkerboard, custom, rings, ssl_field
 from ceres_cal.transforms import Pose
 
 _WORKDAY = Disturbance(
@@ -49,29 +49,13 @@ def _station_2004() -> Station:
 
 def _field_of_2004() -> Target:
     """A small field of 4.9 x 3.4 m (the paper gives no size): its outline, halfway line and circle."""
-    x, y, radius, width = 2.45, 1.7, 0.5, 0.01
-    ends = {
-        "TopTouchLine": (-x, y, x, y),
-        "BottomTouchLine": (-x, -y, x, -y),
-        "LeftGoalLine": (-x, -y, -x, y),
-        "RightGoalLine": (x, -y, x, y),
-        "HalfwayLine": (0.0, -y, 0.0, y),
-    }
-    curves: dict[str, Curve] = {
-        name: Segment((x1, y1, 0.0), (x2, y2, 0.0), width) for name, (x1, y1, x2, y2) in ends.items()
-    }
-    curves["CenterCircle"] = Arc((0.0, 0.0, 0.0), radius, width_m=width)
-    points = {
-        "TopLeftCorner": (-x, y, 0.0),
-        "TopRightCorner": (x, y, 0.0),
-        "BottomLeftCorner": (-x, -y, 0.0),
-        "BottomRightCorner": (x, -y, 0.0),
-        "TopHalfwayCrossing": (0.0, y, 0.0),
-        "BottomHalfwayCrossing": (0.0, -y, 0.0),
-        "TopCircleCrossing": (0.0, radius, 0.0),
-        "BottomCircleCrossing": (0.0, -radius, 0.0),
-    }
-    return custom(points, curves)
+    whole = ssl_field("B", field_length_m=4.9, field_width_m=3.4, center_circle_radius_m=0.5)
+    points = [
+        *("TopLeftCorner", "TopRightCorner", "BottomLeftCorner", "BottomRightCorner"),
+        *("TopHalfwayCrossing", "BottomHalfwayCrossing", "TopCircleCrossing", "BottomCircleCrossing"),
+    ]
+    curves = ["TopTouchLine", "BottomTouchLine", "LeftGoalLine", "RightGoalLine", "HalfwayLine", "CenterCircle"]
+    return custom({name: whole.points[name] for name in points}, {name: whole.curves[name] for name in curves})
 
 
 def _ssl_field() -> tuple[Scene, Disturbance]:

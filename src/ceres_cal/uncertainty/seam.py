@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,7 +10,7 @@ from numpy.typing import NDArray
 
 from ceres_cal.observations import Columns, Observations
 from ceres_cal.parameters import Estimate
-from ceres_cal.targets import along_track, nearest_on_track
+from ceres_cal.targets import Target, along_track, nearest_on_track
 from ceres_cal.transforms import Array
 from ceres_cal.uncertainty.maps import FieldMap, field_map, locate_slopes, radius_95, shown_pixels, station_keys
 from ceres_cal.uncertainty.posterior import Posterior
@@ -151,15 +152,19 @@ def _compare(here: _Sighting, there: _Sighting, covariance: Array, taken: float)
     return float(here.normal @ gap), float(np.sqrt(np.maximum(here.normal @ noise @ here.normal, 0.0)))
 
 
-def _rows(observations: Observations, columns: Columns, station: str, inlier: NDArray[np.bool_]) -> dict[str, Array]:
-    """Rows of what a station saw of each target that lies in the world."""
-    views = observations.views
-    rows: dict[str, list[Array]] = {}
-    for number, view in enumerate(views):
+def _rows(
+    observations: Observations, columns: Columns, station: str, inlier: NDArray[np.bool_]
+) -> Iterator[tuple[Target, int, NDArray[np.int64]]]:
+    """What a station saw of targets that lie in the world: the number of each feature, and its rows."""
+    rows: dict[str, list[NDArray[np.int64]]] = {}
+    for number, view in enumerate(observations.views):
         if view.station == station and view.placement is None:
             first, last = np.searchsorted(columns.view, [number, number + 1])
             rows.setdefault(view.target, []).append(np.arange(first, last)[inlier[first:last]])
-    return {target: np.concatenate(parts) for target, parts in rows.items()}
+    for name, parts in rows.items():
+        every = np.concatenate(parts)
+        for feature in np.unique(columns.feature[every]):
+            yield observations.targets[name], int(feature), every[columns.feature[every] == feature]
 
 
 def _metres_per_px(estimate: Estimate, station: str, pixels: Array, height_m: float) -> float:
@@ -174,15 +179,12 @@ def _points(
 ) -> dict[_Thing, _Sighting]:
     found: dict[_Thing, _Sighting] = {}
     columns = observations.points
-    for target, rows in _rows(observations, columns, station, inlier).items():
-        points = observations.targets[target].point_array
-        for feature in np.unique(columns.feature[rows]):
-            own = rows[columns.feature[rows] == feature]
-            pixels, place = columns.pixels[own], points[feature]
-            off = np.mean(estimate.camera_at(station).locate(pixels, place[2]), axis=0) - place[:2]
-            sigma_px = scale * float(np.mean(columns.sigma_px[own])) / np.sqrt(len(own))
-            noise = sigma_px * _metres_per_px(estimate, station, pixels, place[2])
-            found[observations.targets[target].point_names[feature], 0] = _Sighting(place, off, None, noise)
+    for target, feature, own in _rows(observations, columns, station, inlier):
+        pixels, place = columns.pixels[own], target.point_array[feature]
+        off = np.mean(estimate.camera_at(station).locate(pixels, place[2]), axis=0) - place[:2]
+        sigma_px = scale * float(np.mean(columns.sigma_px[own])) / np.sqrt(len(own))
+        noise = sigma_px * _metres_per_px(estimate, station, pixels, place[2])
+        found[target.point_names[feature], 0] = _Sighting(place, off, None, noise)
     return found
 
 
@@ -191,28 +193,25 @@ def _stretches(
 ) -> dict[_Thing, _Sighting]:
     found: dict[_Thing, _Sighting] = {}
     columns = observations.curves
-    for target_name, rows in _rows(observations, columns, station, inlier).items():
-        target = observations.targets[target_name]
-        for feature in np.unique(columns.feature[rows]):
-            own = rows[columns.feature[rows] == feature]
-            tracks, is_arc = target.tracks[columns.side[own], feature], np.repeat(target.is_arc[feature], len(own))
-            height = float(tracks[0, 0, 2])
-            located = estimate.camera_at(station).locate(columns.pixels[own], height)
-            there = np.column_stack([located, np.full(len(own), height)])
-            s = nearest_on_track(tracks, is_arc, there)
-            feet = along_track(tracks, is_arc, s)
-            turned = s - target.curves[target.curve_names[feature]].parameter_range[0]
-            radius = np.linalg.norm(tracks[:, 1], axis=1)
-            stretch = np.floor((turned % (2.0 * np.pi) if is_arc[0] else turned) * radius / _BIN_M).astype(int)
-            for number in np.unique(stretch):
-                part = stretch == number
-                if np.count_nonzero(part) < _FEWEST:
-                    continue
-                place, off = np.mean(feet[part], axis=0), np.mean(there[part] - feet[part], axis=0)[:2]
-                sigma_px = scale * float(np.mean(columns.sigma_px[own[part]])) / np.sqrt(np.count_nonzero(part))
-                noise = sigma_px * _metres_per_px(estimate, station, columns.pixels[own[part]], height)
-                normal = _normal(tracks[0], bool(is_arc[0]), place)
-                found[target.curve_names[feature], int(number)] = _Sighting(place, off, normal, noise)
+    for target, feature, own in _rows(observations, columns, station, inlier):
+        tracks, is_arc = target.tracks[columns.side[own], feature], np.repeat(target.is_arc[feature], len(own))
+        height = float(tracks[0, 0, 2])
+        located = estimate.camera_at(station).locate(columns.pixels[own], height)
+        there = np.column_stack([located, np.full(len(own), height)])
+        s = nearest_on_track(tracks, is_arc, there)
+        feet = along_track(tracks, is_arc, s)
+        turned = s - target.curves[target.curve_names[feature]].parameter_range[0]
+        radius = np.linalg.norm(tracks[:, 1], axis=1)
+        stretch = np.floor((turned % (2.0 * np.pi) if is_arc[0] else turned) * radius / _BIN_M).astype(int)
+        for number in np.unique(stretch):
+            part = stretch == number
+            if np.count_nonzero(part) < _FEWEST:
+                continue
+            place, off = np.mean(feet[part], axis=0), np.mean(there[part] - feet[part], axis=0)[:2]
+            sigma_px = scale * float(np.mean(columns.sigma_px[own[part]])) / np.sqrt(np.count_nonzero(part))
+            noise = sigma_px * _metres_per_px(estimate, station, columns.pixels[own[part]], height)
+            normal = _normal(tracks[0], bool(is_arc[0]), place)
+            found[target.curve_names[feature], int(number)] = _Sighting(place, off, normal, noise)
     return found
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ceres_cal.digits import two_digits
 from ceres_cal.parameters import Estimate, intrinsic_names, intrinsics_scales, intrinsics_vector
 from ceres_cal.quantities import PLACEMENT_QUANTITIES, Key, natural_sizes
 from ceres_cal.transforms import Array
@@ -153,13 +154,14 @@ def _words(estimate: Estimate, posterior: Posterior, keys: Sequence[Key], relati
         if ratio < _TOGETHER * relative:
             stations = ", ".join(repr(key.owner) for key in heights)
             whose = "its height" if stations == repr(phi.owner) else f"the height of {stations}"
-            return f"phi of {phi.owner!r} and {whose} trade off: only their ratio is known, to {100.0 * ratio:.2g} %"
+            told = f"only their ratio is known, to {two_digits(100.0 * ratio)} %"
+            return f"phi of {phi.owner!r} and {whose} trade off: {told}"
     owners = dict.fromkeys(key.owner for key in keys)
     parts = [f"{' and '.join(key.quantity for key in keys if key.owner == o)} of {o!r}" for o in owners]
     many, names = len(keys) > 1, " and ".join(parts)
     if np.isinf(relative):
         return f"nothing tells {names}{' apart' if many else ''}"
-    return f"{names}{' trade off: each' if many else ':'} known to {100.0 * relative:.2g} % only"
+    return f"{names}{' trade off: each' if many else ':'} known to {two_digits(100.0 * relative)} % only"
 
 
 def _camera(estimate: Estimate, key: Key) -> str:
