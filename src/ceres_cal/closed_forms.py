@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ceres_cal.errors import DegenerateError
-from ceres_cal.kernels import grouped_products, plane_homographies
+from ceres_cal.kernels import align_sights, alignment_errors, normalised_planes, plane_homographies, usual_by_radius
 from ceres_cal.transforms import Array, Pose, nearest_rotation
 
 Ints = NDArray[np.int64]
@@ -170,11 +170,6 @@ class PlaneData:
     plane: Array
     offsets: Array
 
-    @property
-    def sight(self) -> Ints:
-        """(N,) number of each point's sight."""
-        return np.repeat(np.arange(len(self.bounds) - 1), np.diff(self.bounds))
-
 
 @dataclass(frozen=True, eq=False)
 class RadialAlignment:
@@ -197,25 +192,23 @@ def radial_alignment(data: PlaneData, unit_px: float, terms: int, rounds: int) -
     r (h3 . X) - q sum c_k r^2k = q with q = (h1 . X, h2 . X) . p / r is linear in h3 of each sight and in the shared c.
     Rounds of reweighting keep wrong labels from deciding. Fewer than six points in a sight leave its answer to chance.
     """
-    sight = data.sight
-    x, restore = _normalised_by_sight(data, sight)
     p = data.offsets / unit_px
     radius = np.linalg.norm(p, axis=1)
+    sights = len(data.bounds) - 1
+    x, lifts = np.empty((2, len(p))), np.empty((sights, 3))
+    normalised_planes(data.bounds, data.plane, x, lifts)
+    h12, shares, errors = np.empty((sights, 6)), np.empty((sights, 3, terms + 1)), np.empty(len(p))
     weights = np.ones(len(p))
     for _ in range(rounds):
-        h12 = _alignment(x, p, weights, data.bounds)
-        sent = np.matmul(h12[sight], x[:, :, None])[:, :, 0]
-        across = p[:, 0] * sent[:, 1] - p[:, 1] * sent[:, 0]
-        q = np.sum(sent * p, axis=1) / np.maximum(radius, 1e-9)
-        c, h3 = _depth_and_profile(x, radius, q, weights, data.bounds, terms)
-        depth = np.sum(h3[sight] * x, axis=1)
-        w = 1.0 + (radius[:, None] ** (2 * np.arange(1, terms + 1))) @ c
-        along = radius - q * w / np.where(np.abs(depth) > 1e-9, depth, 1e-9)
-        error = np.hypot(across / np.maximum(np.linalg.norm(sent, axis=1), 1e-9) * radius, along)
-        usual = usual_by_radius(error, radius)
-        weights = 1.0 / (1.0 + (error / (1.5 * usual)) ** 2)
-    homographies = np.concatenate([h12 * unit_px, h3[:, None, :]], axis=1) @ restore
-    return RadialAlignment(Profile(tuple(float(v) for v in c), unit_px), homographies, error * unit_px, error / usual)
+        reduced = np.zeros((terms + 1, terms + 1))
+        align_sights(data.bounds, x, p, weights, h12, shares, reduced)
+        c = np.linalg.lstsq(reduced[:terms, :terms], reduced[:terms, terms], rcond=1e-10)[0]
+        h3 = shares[:, :, terms] - shares[:, :, :terms] @ c
+        alignment_errors(data.bounds, x, p, h12, h3, c, errors)
+        usual = usual_by_radius(errors, radius)
+        weights = 1.0 / (1.0 + (errors / (1.5 * usual)) ** 2)
+    homographies = np.concatenate([h12.reshape(-1, 2, 3) * unit_px, h3[:, None, :]], axis=1) @ _restored(lifts)
+    return RadialAlignment(Profile(tuple(float(v) for v in c), unit_px), homographies, errors * unit_px, errors / usual)
 
 
 def homographies_of_sights(data: PlaneData, profile: Profile) -> tuple[Array, Array]:
@@ -230,54 +223,13 @@ def homographies_of_sights(data: PlaneData, profile: Profile) -> tuple[Array, Ar
     return np.array([[profile.unit_px], [profile.unit_px], [1.0]]) * homographies, errors * profile.unit_px
 
 
-def usual_by_radius(error: Array, radius: Array) -> Array:
-    """(N,) the median error at each point's distance from the centre: profiles fit worst where lenses bend most."""
-    rings = int(np.clip(len(error) // 200, 1, 16))  # few points in a ring, and its outliers would be the usual there
-    ring = np.minimum((radius * (rings / (np.max(radius) + 1e-300))).astype(int), rings - 1)
-    medians = np.full(rings, 1e-12)
-    for number in range(rings):
-        inside = error[ring == number]
-        if len(inside):
-            medians[number] = max(float(np.median(inside)), 1e-12)
-    return np.asarray(medians[ring])
-
-
-def _normalised_by_sight(data: PlaneData, sight: Ints) -> tuple[Array, Array]:
-    """Homogeneous plane points with each sight's centroid at 0 and unit spread, and the (S, 3, 3) that did it."""
-    starts, number = data.bounds[:-1], np.diff(data.bounds)[:, None]
-    centre = np.add.reduceat(data.plane, starts) / number
-    away = data.plane - centre[sight]
-    spread = np.sqrt(np.add.reduceat(np.sum(away**2, axis=1), starts) / number[:, 0]) + 1e-12
-    x = np.column_stack([away / spread[sight][:, None], np.ones(len(away))])
-    restore = np.zeros((len(starts), 3, 3))
-    restore[:, 0, 0] = restore[:, 1, 1] = 1.0 / spread
-    restore[:, :2, 2] = -centre / spread[:, None]
+def _restored(lifts: Array) -> Array:
+    """(S, 3, 3) from plane points (x, y, 1) to those of `normalised_planes`."""
+    restore = np.zeros((len(lifts), 3, 3))
+    restore[:, 0, 0] = restore[:, 1, 1] = lifts[:, 2]
+    restore[:, :2, 2] = -lifts[:, :2] * lifts[:, 2:]
     restore[:, 2, 2] = 1.0
-    return x, restore
-
-
-def _alignment(x: Array, p: Array, weights: Array, bounds: Ints) -> Array:
-    """(S, 2, 3): h1 and h2 of each sight, scaled so that |(h1 . X, h2 . X)| is |p| on average."""
-    rows = np.hstack([-p[:, 1:] * x, p[:, :1] * x])
-    h = np.linalg.eigh(grouped_products(rows, weights, bounds))[1][:, :, 0].reshape(-1, 2, 3)
-    sent = np.matmul(np.repeat(h, np.diff(bounds), axis=0), x[:, :, None])[:, :, 0]
-    agree = np.add.reduceat(weights * np.sum(sent * p, axis=1), bounds[:-1])
-    size = np.add.reduceat(weights * np.sum(p * p, axis=1), bounds[:-1])
-    return np.asarray(h * (size / np.where(np.abs(agree) > 1e-12, agree, 1e-12))[:, None, None])
-
-
-def _depth_and_profile(
-    x: Array, radius: Array, q: Array, weights: Array, bounds: Ints, terms: int
-) -> tuple[Array, Array]:
-    """c (terms,) and h3 (S, 3) of r (h3 . X) - q sum c_k r^2k = q, by elimination of each sight's h3."""
-    shared = -q[:, None] * radius[:, None] ** (2 * np.arange(1, terms + 1))
-    rows = np.hstack([radius[:, None] * x, shared, q[:, None]])
-    products = grouped_products(rows, weights, bounds)
-    own = products[:, :3, :3] + 1e-12 * np.trace(products[:, :3, :3], axis1=1, axis2=2)[:, None, None] * np.eye(3)
-    eliminated = np.linalg.solve(own, products[:, :3, 3:])
-    reduced = products[:, 3:, 3:].sum(axis=0) - np.einsum("sij,sik->jk", products[:, :3, 3:], eliminated)
-    c = np.linalg.lstsq(reduced[:terms, :terms], reduced[:terms, terms], rcond=1e-10)[0]
-    return c, eliminated[:, :, terms] - eliminated[:, :, :terms] @ c
+    return restore
 
 
 def line_moments(lines: Array, offsets: Array, weights: Array, unit_px: float, terms: int) -> Array:

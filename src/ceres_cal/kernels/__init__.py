@@ -1,8 +1,9 @@
 """The inner loops, compiled by numba: the only place that imports it. They release the GIL."""
 
+from ceres_cal.kernels.alignment import align_sights, alignment_errors, normalised_planes, usual_by_radius
 from ceres_cal.kernels.block import ROUNDING, cholesky, evaluate_block
 from ceres_cal.kernels.elimination import eliminate_placements
-from ceres_cal.kernels.groups import grouped_products, grouped_scatter
+from ceres_cal.kernels.groups import grouped_scatter
 from ceres_cal.kernels.information import sight_normals
 from ceres_cal.kernels.lenses import INTRINSICS, LENS_CODES
 from ceres_cal.kernels.losses import LOSS_CODES
@@ -15,17 +16,20 @@ __all__ = [
     "LENS_CODES",
     "LOSS_CODES",
     "ROUNDING",
+    "align_sights",
+    "alignment_errors",
     "cholesky",
     "curve_residuals",
     "curve_rows",
     "eliminate_placements",
     "evaluate_block",
-    "grouped_products",
     "grouped_scatter",
     "loss_weights",
     "normal_equations",
+    "normalised_planes",
     "plane_homographies",
     "point_residuals",
     "point_rows",
     "sight_normals",
+    "usual_by_radius",
 ]

@@ -1,4 +1,4 @@
-"""Sums of outer products by group: very many small linear problems at once."""
+"""Sums by group."""
 
 from __future__ import annotations
 
@@ -7,23 +7,6 @@ from typing import Any
 import numpy as np
 
 from ceres_cal.kernels.jit import jit
-
-
-@jit
-def grouped_products(rows: Any, weights: Any, bounds: Any) -> Any:
-    """sum w row row^T over rows[bounds[g]:bounds[g + 1]] for every group g: (groups, k, k) from rows (N, k)."""
-    groups, size = len(bounds) - 1, rows.shape[1]
-    products = np.zeros((groups, size, size))
-    for g in range(groups):
-        for n in range(bounds[g], bounds[g + 1]):
-            for i in range(size):
-                scaled = weights[n] * rows[n, i]
-                for j in range(i + 1):
-                    products[g, i, j] += scaled * rows[n, j]
-        for i in range(size):
-            for j in range(i):
-                products[g, j, i] = products[g, i, j]
-    return products
 
 
 @jit

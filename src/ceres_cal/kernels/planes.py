@@ -14,7 +14,7 @@ _WRONG = 8.0  # medians: no clean residual is that long
 
 
 @jit
-def _normalise(plane: Any, x: Any, lift: Any) -> None:
+def normalise(plane: Any, x: Any, lift: Any) -> None:
     """x (2, n): the points with their centroid at 0 and unit spread; `lift` (3): centroid and 1 / spread."""
     n = len(plane)
     lift[0], lift[1] = np.sum(plane[:, 0]) / n, np.sum(plane[:, 1]) / n
@@ -65,7 +65,7 @@ def _moments(x: Any, q: Any, weights: Any, columns: Any, normal: Any) -> None:
 
 
 @jit
-def _least_direction(normal: Any, upper: Any, h: Any) -> None:
+def least_direction(normal: Any, upper: Any, h: Any) -> None:
     """The unit vector that `normal` shrinks most, by inverse iteration from h."""
     size = len(h)
     trace = 0.0
@@ -120,14 +120,14 @@ def plane_homographies(
         n = bounds[g + 1] - bounds[g]
         q, e = lifted[:n], errors[rows]
         _lift(offsets[rows], profile, unit, q)
-        _normalise(plane[rows], x, lift)
+        normalise(plane[rows], x, lift)
         weights[:n] = 1.0
         for i in range(9):
             h[i] = 1.0 + 0.1 * i  # anything: what the moments shrink more vanishes within a few iterations
         usual = 0.0
         for _ in range(_PATIENCE):
             _moments(x, q, weights, columns, normal)
-            _least_direction(normal, upper, h)
+            least_direction(normal, upper, h)
             _errors(x, q, h, e, weights)
             usual = np.median(e)
             if np.max(e) <= _WRONG * usual:
