@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ceres_cal.detect.saddles import REACH, measure_saddles
 from ceres_cal.detect.scatter import scatter_px
-from ceres_cal.errors import InputError
+from ceres_cal.errors import InputError, NothingShownError
 from ceres_cal.files import read_bytes
 from ceres_cal.observations import Curves, Observations, Points, View
 from ceres_cal.targets import Target
@@ -97,15 +97,17 @@ def detect_boards(
 
     Raises:
         InputError: an image cannot be read or has another size (each named), the target is no checkerboard or too
-            small, the markers do not fit it, or no image shows the board.
+            small, or the markers do not fit it.
+        NothingShownError: no image shows the board.
     """
     paths = [Path(path) for path in images]
     placements = _placement_names(paths)
     size, found, missed = _find_all(paths, _finder(board, charuco, corner_fit), progress)
     if not found:
-        raise InputError(
+        raise NothingShownError(
             f"no board of {board.spec['columns']} x {board.spec['rows']} inner corners in any of {len(paths)} images "
-            f"(count the corners between squares, not the squares); {missed[0][0]}: {missed[0][1]}"
+            f"(count the corners between squares, not the squares); {missed[0][0]}: {missed[0][1]}",
+            tuple(missed),
         )
     views = tuple(View(path.stem, camera, station or camera, TARGET_NAME, placements[path]) for path in found)
     points = _points(list(found.values()), board)
