@@ -10,7 +10,8 @@ import numpy as np
 from ceres_cal.transforms import Array
 
 USUAL_PX = 0.1
-_MOST_DEGREES = 5
+_MOST_DEGREES = 6
+_SHARE = 2.0 / 3.0  # of the corners, as many terms as a polynomial may have
 _FEWEST_SPARE = 8  # equations below which a board says nothing
 _LEAST_PX = 1e-3
 
@@ -19,8 +20,8 @@ def scatter_px(grids: Iterable[Array]) -> float:
     """Standard deviation (px) of each coordinate of boards' corners about a smooth picture of their board.
 
     A lens and a bent board move neighbouring corners alike: a homography and a polynomial take that up, of as many
-    degrees as half the corners can tell. What is left is how precisely corners were measured, and what an unevenly
-    printed board adds; a wrong lens model is not in it.
+    degrees as two thirds of the corners can tell. What is left is how precisely corners were measured, and what an
+    unevenly printed board adds; a wrong lens model is not in it.
 
     Args:
         grids: each (rows, columns, 2) px, NaN where a corner was not seen.
@@ -40,7 +41,7 @@ def _of_board(grid: Array) -> float | None:
         return None
     flat = cv2.perspectiveTransform(places[None], homography)[0]
     x, y = (places - places.mean(axis=0)).T / max(grid.shape[:2])
-    degrees = next(d for d in range(_MOST_DEGREES, -1, -1) if (d + 1) * (d + 2) <= len(places) or d == 0)
+    degrees = next(d for d in range(_MOST_DEGREES, -1, -1) if (d + 1) * (d + 2) <= 2.0 * _SHARE * len(places))
     terms = np.column_stack([x**i * y**j for i in range(degrees + 1) for j in range(degrees + 1 - i)])
     solved, _, rank, _ = np.linalg.lstsq(terms, pixels - flat, rcond=None)
     spare = 2 * (len(places) - rank)
