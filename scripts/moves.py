@@ -280,7 +280,7 @@ def photographs_case(runs: int) -> Iterator[Row]:
             yield Row("check by photographs", what, found, least=0.99, note=f"{2 * count} photographs")
         far = Pose.looking(HOME.position, rotation_exp((0.0, np.deg2rad(50.0), 0.0)) @ HOME.rotation)
         found, _ = _photographed_alarms(known[:2], far, 1, 4, folder)
-        yield Row("check by photographs", "turned away by 50 deg: said not to be found", found, least=1.0)
+        yield Row("check by photographs", "turned away by 50 deg: does not hold", found, least=1.0)
 
 
 def _from_photographs(folder: Path, seed: int) -> Calibration:
