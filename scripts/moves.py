@@ -16,25 +16,30 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 from accuracy import HEIGHTS_M, map_errors_mm
 from accuracy_scenes import FIELD, field_places
 from cases import Row, run
+from photographs import varied
 
 from ceres_cal.bundle import Weighting, information
 from ceres_cal.calibrate import calibrate
 from ceres_cal.calibration import Calibration
 from ceres_cal.camera import Camera
+from ceres_cal.detect.boards import detect_boards
 from ceres_cal.errors import CalibrationError
 from ceres_cal.lens import Radial
 from ceres_cal.moves import check, refit
 from ceres_cal.moves.carried import layouts, make_plan
-from ceres_cal.observations import Observations, taken
+from ceres_cal.observations import Observations, combine, taken
 from ceres_cal.parameters import Estimate
+from ceres_cal.photographs import check_photographs, detect_field
 from ceres_cal.quantities import Key, difference
 from ceres_cal.sights import gather_sights
 from ceres_cal.simulate import (
     Disturbance,
+    Scene,
     Simulation,
     Station,
     board_scene,
@@ -43,6 +48,7 @@ from ceres_cal.simulate import (
     overhead_pose,
     simulate,
 )
+from ceres_cal.simulate.photograph import frames, photograph
 from ceres_cal.structure import make_structure
 from ceres_cal.targets import checkerboard
 from ceres_cal.transforms import Array, Pose, rotation_exp
@@ -248,6 +254,69 @@ def _alarms(pose: Pose, runs: int, kind: int) -> float:
     return alarms / runs
 
 
+# ---- does it still hold, by photographs? ----------------------------------------------------------------------------
+
+BOARD = checkerboard(9, 6, 0.1)
+FIELD_SHOTS, BOARD_SHOTS, CHECKS = 2, 6, 10  # photographs that a calibration is made from, and checked with
+
+
+def photographs_case(runs: int) -> Iterator[Row]:
+    """The same from photographs: calibrations made of some, checked with others of other light, noise and robots."""
+    count = int(np.clip(runs // CHECKS, 1, 10))
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        known = [_from_photographs(folder, seed) for seed in range(count)]
+        false, noise = _photographed_alarms(known, HOME, CHECKS, 1, folder)
+        total = count * CHECKS
+        error = float(np.sqrt(ALARMS * (1.0 - ALARMS) / total))
+        note = f"{total} photographs, {count} calibrations"
+        yield Row("check by photographs", "false alarms at 1 %", false, error, most=0.01 + 3.0 * error, note=note)
+        yield Row(
+            "check by photographs", "noise of detection over that of the calibration", noise, least=0.8, most=1.25
+        )
+        for kind, what, pose in ((2, "0.05 deg of tilt found", SMALL_TILT), (3, "3 mm at 4 m found", SMALL_SHIFT)):
+            found, _ = _photographed_alarms(known, pose, 2, kind, folder)
+            yield Row("check by photographs", what, found, least=0.99, note=f"{2 * count} photographs")
+        far = Pose.looking(HOME.position, rotation_exp((0.0, np.deg2rad(50.0), 0.0)) @ HOME.rotation)
+        found, _ = _photographed_alarms(known[:2], far, 1, 4, folder)
+        yield Row("check by photographs", "turned away by 50 deg: does not hold", found, least=1.0)
+
+
+def _from_photographs(folder: Path, seed: int) -> Calibration:
+    """The camera at home, calibrated with photographs of the field and of boards."""
+    stations = {"overhead": Station("overhead", HOME)}
+    boards = board_scene(BOARD, {"overhead": CAMERA}, stations, BOARD_SHOTS, seed=seed)
+    shown = [_saved(folder, boards, frame, 100 * seed + i) for i, (_, frame) in enumerate(frames(boards))]
+    fields = [_field_photograph(folder, HOME, 10_000 + 100 * seed + i) for i in range(FIELD_SHOTS)]
+    lines = detect_field(fields, FIELD, CAMERA.at(HOME), camera="overhead").observations
+    return calibrate(combine([lines, detect_boards(shown, BOARD, "overhead").observations]))
+
+
+def _field_photograph(folder: Path, pose: Pose, seed: int) -> Path:
+    scene = field_scene(FIELD, {"overhead": CAMERA}, {"overhead": Station("overhead", pose)})
+    return _saved(folder, scene, "0001", seed)
+
+
+def _saved(folder: Path, scene: Scene, frame: str, seed: int) -> Path:
+    path = folder / f"{frame}-{seed}.png"
+    cv2.imwrite(str(path), photograph(scene, "overhead", frame, varied(seed), seed).image)
+    return path
+
+
+def _photographed_alarms(
+    known: Sequence[Calibration], pose: Pose, each: int, kind: int, folder: Path
+) -> tuple[float, float]:
+    """Share of photographs by which a calibration is said not to hold, and the median of their noise."""
+    alarms, noise = 0, []
+    for number, calibration in enumerate(known):
+        for i in range(each):
+            path = _field_photograph(folder, pose, 100_000 * kind + 100 * number + i)
+            found, _ = check_photographs(calibration, [path], false_alarms=ALARMS)
+            alarms += not found.holds
+            noise.append(found.stations["overhead"].noise)
+    return alarms / (len(known) * each), float(np.median(noise))
+
+
 # ---- the same question twice, and how long it takes -----------------------------------------------------------------
 
 PHASES = """
@@ -255,7 +324,7 @@ import sys, time
 marks = [time.perf_counter()]
 import ceres_cal.moves
 from ceres_cal.calibration import Calibration
-from ceres_cal.observations import Observations
+from ceres_cal.observations import Observations, combine
 marks.append(time.perf_counter())
 old, new = Calibration.load(sys.argv[1]), Observations.load(sys.argv[2])
 marks.append(time.perf_counter())
@@ -316,6 +385,7 @@ CASES: dict[str, Callable[[int], Iterator[Row]]] = {
     "moves": moves_case,
     "bound": bound_case,
     "check": check_case,
+    "photographs": photographs_case,
     "again": again_case,
     "time": time_case,
 }

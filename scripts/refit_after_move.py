@@ -1,8 +1,9 @@
 """Keeps a calibration right: checks it against new observations, and refits it where a camera has moved. Copy it.
 
-    python scripts/refit_after_move.py calibration.json new.json                  # these files, once
+    python scripts/refit_after_move.py calibration.json new.json photograph.jpg   # these files, once
     python scripts/refit_after_move.py calibration.json --watch incoming/         # every file that appears there
 
+A file holds observations, or is a photograph in which the field is found from where the calibration has it.
 Every event is one line of JSON on standard output, or in --log: "holds", "refitted", "refused" (nothing was changed;
 the reason says what to do) or "unreadable". The calibration is replaced in one step, and the one before is kept in
 previous/ beside it. Exits with 0 when the calibration is right at the end, 3 when the last file was refused or could
@@ -21,32 +22,37 @@ from pathlib import Path
 from typing import Any
 
 import ceres_cal as cc
+from ceres_cal.cli.detect import IMAGE_ENDINGS
+from ceres_cal.detect.boards import read_grey
 from ceres_cal.files import read_bytes, write_bytes
 from ceres_cal.moves import FALSE_ALARMS, Check, movements
+from ceres_cal.photographs import check_photographs
 
 ROBOT_M = 0.15
 PATIENCE = 3  # times that a file is read before it counts as unreadable: it may still be on its way
 
 
-def handle(place: Path, source: Path, what: str, false_alarms: float, limit_mm: float) -> dict[str, Any]:
-    """Check the calibration at `place` against a file of observations, refit it where it does not hold; the event."""
+def handle(place: Path, source: Path, given: argparse.Namespace) -> dict[str, Any]:
+    """Check the calibration at `place` against a file, refit it where it does not hold; the event."""
     begin = time.perf_counter()
     event: dict[str, Any] = {"time": datetime.now(UTC).isoformat(), "file": str(source)}
     try:
-        observations = cc.Observations.load(source)
+        content = read(source)
     except cc.InputError as error:
         return {**event, "event": "unreadable", "reason": str(error)}
     try:
         old = cc.Calibration.load(place)
-        found = cc.check(old, observations, false_alarms)
+        found, observations = checked(old, source, content, given)
         event["check"] = told(found)
         if found.holds:
             return {**event, "event": "holds", "seconds": round(time.perf_counter() - begin, 3)}
-        new = cc.refit(old, observations, what)
+        if observations is None:
+            return {**event, "event": "refused", "reason": "; ".join(told(found).values())}
+        new = cc.refit(old, observations, given.what)
         worst = {name: new.uncertainty.map_sd_mm(name, ROBOT_M).worst_mm for name in observations.stations}
         event["sd_mm_at_robot_height"] = worst
-        if not all(value <= limit_mm for value in worst.values()):
-            reason = f"known to {max(worst.values()):.1f} mm at robot height only, asked for are {limit_mm:g} mm"
+        if not all(value <= given.limit_mm for value in worst.values()):
+            reason = f"known to {max(worst.values()):.1f} mm at robot height only, asked for are {given.limit_mm:g} mm"
             return {**event, "event": "refused", "reason": f"{reason}: observe more lines and corners"}
     except cc.CalibrationError as error:
         return {**event, "event": "refused", "reason": str(error)}
@@ -56,6 +62,24 @@ def handle(place: Path, source: Path, what: str, false_alarms: float, limit_mm: 
     moves = {name: {"mm": 1e3 * shift_m, "deg": deg} for name, (shift_m, deg) in movements(old, new).items()}
     event |= {"explanation": explanation, "moved": moves, "warnings": list(new.warnings), "rms_px": new.rms_px}
     return {**event, "event": "refitted", "seconds": round(time.perf_counter() - begin, 3)}
+
+
+def read(source: Path) -> cc.Observations | None:
+    """The observations in a file, or None for a photograph; InputError where it is neither."""
+    if source.suffix.lower() not in IMAGE_ENDINGS:
+        return cc.Observations.load(source)
+    read_grey(source)
+    return None
+
+
+def checked(
+    old: cc.Calibration, source: Path, content: cc.Observations | None, given: argparse.Namespace
+) -> tuple[Check, cc.Observations | None]:
+    """The answer to a file, and its observations; None where a photograph shows no field."""
+    if content is not None:
+        return cc.check(old, content, given.false_alarms), content
+    found, seen = check_photographs(old, [source], given.station, given.false_alarms)
+    return found, seen.observations
 
 
 def told(found: Check) -> dict[str, str]:
@@ -73,7 +97,7 @@ def keep(place: Path) -> Path:
 
 
 def appearing(folder: Path, every_s: float) -> Iterator[Path]:
-    """Files of observations that appear in a folder, in the order of their times; one that changes comes again."""
+    """Files that appear in a folder, in the order of their times; one that changes comes again."""
     done = {path: stamp(path) for path in files_in(folder)}
     before = dict(done)
     while True:
@@ -88,7 +112,8 @@ def appearing(folder: Path, every_s: float) -> Iterator[Path]:
 
 
 def files_in(folder: Path) -> list[Path]:
-    return [p for p in folder.iterdir() if p.suffix in (".json", ".npz") and not p.name.startswith(".")]
+    endings = {".json", ".npz", *IMAGE_ENDINGS}
+    return [p for p in folder.iterdir() if p.suffix.lower() in endings and not p.name.startswith(".")]
 
 
 def stamp(path: Path) -> tuple[int, int]:
@@ -102,9 +127,9 @@ def stamp(path: Path) -> tuple[int, int]:
 
 def events(given: argparse.Namespace) -> Iterator[dict[str, Any]]:
     def answer(source: Path) -> dict[str, Any]:
-        return handle(given.calibration, source, given.what, given.false_alarms, given.limit_mm)
+        return handle(given.calibration, source, given)
 
-    yield from map(answer, given.observations)
+    yield from map(answer, given.files)
     if given.watch is None:
         return
     for source in appearing(given.watch, given.every_s):
@@ -119,20 +144,21 @@ def events(given: argparse.Namespace) -> Iterator[dict[str, Any]]:
 def main(arguments: Sequence[str]) -> int:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0], allow_abbrev=False)
     parser.add_argument("calibration", type=Path, help="is checked, and replaced where a camera has moved")
-    parser.add_argument("observations", type=Path, nargs="*", help="files of new observations, one after the other")
+    parser.add_argument("files", type=Path, nargs="*", help="new observations or photographs, one after the other")
     parser.add_argument("--watch", type=Path, metavar="FOLDER", help="then wait for files that appear there")
     parser.add_argument("--every-s", type=float, default=0.5, help="how often to look (default 0.5 s)")
     parser.add_argument("--what", default="pose", help="what is free in a refit, see `ceres-cal refit --help`")
     parser.add_argument("--false-alarms", type=float, default=FALSE_ALARMS, help="of each check (default 0.01)")
     parser.add_argument("--limit-mm", type=float, default=20.0, help="worst sigma at 150 mm still used (default 20)")
+    parser.add_argument("--station", help="station that takes the photographs (default: the only one)")
     parser.add_argument("--log", type=Path, help="add the events to this file instead of printing them")
     given = parser.parse_args(arguments)
     if not given.calibration.is_file():
         parser.error(f"{given.calibration}: no such file")
     if given.watch is not None and not given.watch.is_dir():
         parser.error(f"{given.watch}: no such folder")
-    if not given.observations and given.watch is None:
-        parser.error("name files of observations, or a folder to --watch")
+    if not given.files and given.watch is None:
+        parser.error("name files of observations or photographs, or a folder to --watch")
     last = 0
     try:
         for event in events(given):

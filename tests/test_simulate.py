@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import msgspec
 import numpy as np
 import pytest
@@ -529,8 +530,21 @@ def test_sample_data_come_from_the_script(tmp_path: Path) -> None:
     shipped = {path.relative_to(ROOT / "data"): path.read_bytes() for path in (ROOT / "data").glob("*/*.json")}
     made = {path.relative_to(tmp_path): path.read_bytes() for path in tmp_path.glob("*/*.json")}
     assert made == shipped
-    assert len(shipped) == len(printed.splitlines()) == 5
     assert sum(map(len, shipped.values())) < 400_000
+    images = [path.relative_to(ROOT / "data") for path in (ROOT / "data").rglob("*.jpg")]
+    assert len(shipped) == 7 and len(images) == 14 and len(printed.splitlines()) == 21
+    assert max((ROOT / "data" / path).stat().st_size for path in images) < 300_000
+    for path in images:
+        ours, theirs = (cv2.imread(str(root / path), cv2.IMREAD_GRAYSCALE) for root in (ROOT / "data", tmp_path))
+        assert ours is not None and theirs is not None
+        assert np.mean(cv2.absdiff(ours, theirs)) < 0.5, path  # 0; another OpenCV may draw and compress otherwise
+
+
+def test_the_truth_of_the_photographs_is_beside_them() -> None:
+    for folder in (ROOT / "data").iterdir():
+        if folder.is_dir():
+            truth = msgspec.json.decode((folder / "truth.json").read_bytes())["photographs"]
+            assert sorted(truth) == sorted(str(path.relative_to(folder)) for path in folder.rglob("*.jpg"))
 
 
 def test_ssl_field_is_what_it_says() -> None:

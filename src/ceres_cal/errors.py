@@ -14,6 +14,18 @@ class InputError(CalibrationError):
     """A file, an option or an observation is wrong: nothing was computed."""
 
 
+class NothingShownError(InputError):
+    """No image shows what was looked for.
+
+    Attributes:
+        missed: path and reason of every image.
+    """
+
+    def __init__(self, message: str, missed: tuple[tuple[str, str], ...]) -> None:
+        super().__init__(message)
+        self.missed = missed
+
+
 class DegenerateError(CalibrationError):
     """The observations are well formed but cannot determine what was asked for."""
 

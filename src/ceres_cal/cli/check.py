@@ -4,14 +4,25 @@ from __future__ import annotations
 
 import math
 from argparse import ArgumentParser, Namespace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ceres_cal.cli.command import Answer, Command, parse_number
-from ceres_cal.cli.refit import add_inputs, read_inputs
+from ceres_cal.cli.moved import (
+    add_inputs,
+    not_painted,
+    photographs_data,
+    photographs_in,
+    photographs_text,
+    progress_bar,
+    read_calibration,
+    read_observations,
+)
 from ceres_cal.errors import InputError
 
 if TYPE_CHECKING:
     from ceres_cal.moves import Check, StationCheck
+    from ceres_cal.photographs import KnownDetections
 
 
 def _add_arguments(parser: ArgumentParser) -> None:
@@ -26,11 +37,24 @@ def _add_arguments(parser: ArgumentParser) -> None:
 
 def _run(args: Namespace) -> Answer:
     level = _share(args.false_alarms)
-    calibration, observations = read_inputs(args)
+    images = photographs_in(args)
+    found, seen = _photographed(args, images, level) if images else (_observed(args, level), None)
+    return Answer(_data(found) | photographs_data(seen), lambda: _text(found, seen), 0 if found.holds else 1)
+
+
+def _observed(args: Namespace, level: float) -> Check:
     from ceres_cal.moves import check
 
-    found = check(calibration, observations, level)
-    return Answer(_data(found), lambda: _text(found), 0 if found.holds else 1)
+    return check(read_calibration(args), read_observations(args), level)
+
+
+def _photographed(args: Namespace, images: list[Path], level: float) -> tuple[Check, KnownDetections]:
+    from ceres_cal.photographs import check_photographs
+
+    with progress_bar(args) as bar:
+        return check_photographs(
+            read_calibration(args), images, args.station, level, not_painted=not_painted(args), progress=bar.update
+        )
 
 
 COMMANDS = (Command("check", "does a calibration still hold? exit code 0 yes, 1 no", _add_arguments, _run),)
@@ -63,8 +87,9 @@ def _told(value: object) -> bool:
     return not isinstance(value, float) or math.isfinite(value)
 
 
-def _text(found: Check) -> str:
+def _text(found: Check, seen: KnownDetections | None) -> str:
     lines = [f"{'check':10}{'yes' if found.holds else 'no'} ({100.0 * found.false_alarms:g} % false alarms)"]
+    lines += photographs_text(seen)
     for name, one in found.stations.items():
         lines.append(f"{'station':10}{name} {one.words}")
         if not _told(one.statistic) and not one.degrees:

@@ -16,7 +16,7 @@ from ceres_cal.errors import InputError
 if TYPE_CHECKING:
     from ceres_cal.detect.boards import BoardDetections
 
-_IMAGES = {".bmp", ".jp2", ".jpeg", ".jpg", ".pbm", ".pgm", ".png", ".pnm", ".ppm", ".tif", ".tiff", ".webp"}
+IMAGE_ENDINGS = {".bmp", ".jp2", ".jpeg", ".jpg", ".pbm", ".pgm", ".png", ".pnm", ".ppm", ".tif", ".tiff", ".webp"}
 
 
 def _add_board(parser: ArgumentParser) -> None:
@@ -80,7 +80,7 @@ def image_files(given: Iterable[str]) -> Iterator[Path]:
     for name in given:
         path = Path(name)
         if path.is_dir():
-            inside = sorted(file for file in path.iterdir() if file.suffix.lower() in _IMAGES and file.is_file())
+            inside = sorted(file for file in path.iterdir() if file.suffix.lower() in IMAGE_ENDINGS and file.is_file())
             if not inside:
                 raise InputError(f"{name}: there are no images in this folder")
             yield from inside
@@ -91,6 +91,11 @@ def image_files(given: Iterable[str]) -> Iterator[Path]:
             if not matches:
                 raise InputError(f"{name}: no such file")
             yield from map(Path, matches)
+
+
+def parse_names(text: str) -> list[str]:
+    """Names between commas."""
+    return [name.strip() for name in text.split(",") if name.strip()]
 
 
 def _data(found: BoardDetections, output: Path) -> dict[str, Any]:

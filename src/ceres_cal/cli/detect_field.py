@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ceres_cal.cli.command import Answer, Command, add_output, finishing, parse_numbers, plural, require_output
-from ceres_cal.cli.detect import image_files, require_observations_file
+from ceres_cal.cli.detect import image_files, parse_names, require_observations_file
 from ceres_cal.cli.progress import ProgressBar
 from ceres_cal.errors import InputError
 
@@ -63,8 +63,8 @@ def _run(args: Namespace) -> Answer:
     target = start.target if args.target is None else _target(args.target)
     if target is None:
         raise InputError("name the field with --target, such as --target ssl-b")
-    left_out = {name.strip() for name in args.not_painted.split(",") if name.strip()}
-    if unknown := sorted(left_out - target.curves.keys()):
+    left_out = parse_names(args.not_painted)
+    if unknown := sorted(set(left_out) - target.curves.keys()):
         raise InputError(f"--not-painted: curve {unknown[0]!r} is not one of the target's: see `ceres-cal targets`")
     with ProgressBar(silent=args.quiet or args.json) as bar:
         found = detect_field(
@@ -104,13 +104,14 @@ def _start(args: Namespace) -> _Start:
         return _Start(_corners(args.corner), camera, args.station or camera, None)
     from ceres_cal.calibration import FORMAT, Calibration
     from ceres_cal.photographs.clicks import load_clicks
+    from ceres_cal.photographs.known import is_painted
 
     if _json(args.start).get("format") != FORMAT:
         return _Start(load_clicks(args.start), camera, args.station or camera, None)
     calibration = Calibration.load(args.start)
     posed = calibration.station(args.station)
     station = args.station or next(iter(calibration.stations))
-    fields = [target for target in calibration.targets.values() if _is_painted(target)]
+    fields = [target for target in calibration.targets.values() if is_painted(target)]
     name = args.camera or calibration.estimate.stations[station].camera
     return _Start(posed, name, station, fields[0] if len(fields) == 1 else None)
 
@@ -153,10 +154,6 @@ def _json(path: Path) -> Mapping[str, Any]:
     if not isinstance(content, dict):
         raise InputError(f"{path}: it must hold one JSON object")
     return content
-
-
-def _is_painted(target: Target) -> bool:
-    return any(curve.width_m > 0.0 for curve in target.curves.values())
 
 
 # ---- the answer -----------------------------------------------------------------------------------------------------

@@ -7,11 +7,22 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ceres_cal.cli.command import Answer, Command, add_output, finishing, parse_numbers, require_output
+from ceres_cal.cli.moved import (
+    add_inputs,
+    not_painted,
+    photographs_data,
+    photographs_in,
+    photographs_text,
+    progress_bar,
+    read_calibration,
+    read_observations,
+)
 from ceres_cal.errors import InputError
 
 if TYPE_CHECKING:
     from ceres_cal.calibration import Calibration
     from ceres_cal.observations import Observations, Prior
+    from ceres_cal.photographs import KnownDetections
 
 _HELP = {
     "pose": "poses, the intrinsics under what is known of them (default)",
@@ -20,23 +31,6 @@ _HELP = {
     "iris": "the lens's coefficients, too",
     "everything": "all intrinsics, too",
 }
-
-
-def add_inputs(parser: ArgumentParser) -> None:
-    """A calibration and files of observations."""
-    parser.add_argument("calibration", metavar="CALIBRATION", type=Path, help="the calibration from before")
-    parser.add_argument("observations", nargs="+", metavar="OBS", help="files of new observations, taken together")
-
-
-def read_inputs(args: Namespace) -> tuple[Calibration, Observations]:
-    """What `add_inputs` names; each file once."""
-    from ceres_cal.calibration import Calibration
-    from ceres_cal.cli.calibrate import require_different
-    from ceres_cal.observations import Observations, combine
-
-    require_different(args.observations)
-    calibration = Calibration.load(args.calibration)
-    return calibration, combine([Observations.load(path) for path in args.observations])
 
 
 def _add_arguments(parser: ArgumentParser) -> None:
@@ -63,8 +57,11 @@ def _add_arguments(parser: ArgumentParser) -> None:
 
 
 def _run(args: Namespace) -> Answer:
-    require_output(args.output, args.observations)  # to replace the old calibration is what many want
-    calibration, observations = read_inputs(args)
+    images = photographs_in(args)
+    require_output(args.output, images or args.inputs)  # to replace the old calibration is what many want
+    calibration = read_calibration(args)
+    found = _photographed(args, calibration, images) if images else None
+    observations = read_observations(args) if found is None else found.require()
     from ceres_cal.moves import refit
 
     priors = tuple(_height(spec, observations) for spec in args.prior)
@@ -80,7 +77,15 @@ def _run(args: Namespace) -> Answer:
     if args.output is not None:
         with finishing():
             result.save(args.output)
-    return Answer(_data(result, calibration, observations, args), lambda: _text(result, observations, args))
+    data = _data(result, calibration, observations, args) | photographs_data(found)
+    return Answer(data, lambda: _text(result, observations, found, args))
+
+
+def _photographed(args: Namespace, calibration: Calibration, images: list[Path]) -> KnownDetections:
+    from ceres_cal.photographs import detect_known
+
+    with progress_bar(args) as bar:
+        return detect_known(calibration, images, args.station, not_painted=not_painted(args), progress=bar.update)
 
 
 COMMANDS = (Command("refit", "after a move: poses anew, everything else under what was known", _add_arguments, _run),)
@@ -111,7 +116,7 @@ def _data(result: Calibration, before: Calibration, observations: Observations, 
     from ceres_cal.cli.summary import calibration_data
     from ceres_cal.moves import movements
 
-    found = calibration_data(result, observations, args.observations, args.output)
+    found = calibration_data(result, observations, args.inputs, args.output)
     moves = {
         name: {"mm": 1e3 * shift_m, "deg": turn_deg} for name, (shift_m, turn_deg) in movements(before, result).items()
     }
@@ -120,10 +125,11 @@ def _data(result: Calibration, before: Calibration, observations: Observations, 
     return {**found, "what": refitted.what, "explanation": refitted.explanation, "moved": moves}
 
 
-def _text(result: Calibration, observations: Observations, args: Namespace) -> str:
+def _text(result: Calibration, observations: Observations, found: KnownDetections | None, args: Namespace) -> str:
     from ceres_cal.cli.summary import calibration_text
 
     refitted = result.refitted
     assert refitted is not None
     told = "\n".join(f"{'' if i else 'refit':10}{line}" for i, line in enumerate(refitted.explanation.split("; ")))
-    return f"{told}\n{calibration_text(result, observations, args.observations, args.output)}"
+    summary = calibration_text(result, observations, args.inputs, args.output)
+    return "\n".join([told, *photographs_text(found), summary])

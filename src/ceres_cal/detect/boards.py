@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ceres_cal.detect.saddles import REACH, measure_saddles
-from ceres_cal.errors import InputError
+from ceres_cal.detect.scatter import scatter_px
+from ceres_cal.errors import InputError, NothingShownError
 from ceres_cal.files import read_bytes
 from ceres_cal.observations import Curves, Observations, Points, View
 from ceres_cal.targets import Target
@@ -79,8 +80,8 @@ def detect_boards(
     columns + rows being odd: then the square between "0,0" and "1,1" is dark; otherwise the board may be named as if
     turned, which the placement takes up.
 
-    `sigma_px` is left at 1: the fit of a corner is good to about 0.01 px, but what an unflat board and an unmodelled
-    lens add is ten times that in real sets, and only the solve can tell.
+    `sigma_px` is one number for all images: the scatter of corners about a smooth picture of their board. What an
+    unflat board and an unmodelled lens add to it is up to ten times that in real sets, and only the solve can tell.
 
     Args:
         images: files of any kind OpenCV reads, colour or grey, 8 or 16 bit, all of one size. A rotation noted in the
@@ -96,15 +97,17 @@ def detect_boards(
 
     Raises:
         InputError: an image cannot be read or has another size (each named), the target is no checkerboard or too
-            small, the markers do not fit it, or no image shows the board.
+            small, or the markers do not fit it.
+        NothingShownError: no image shows the board.
     """
     paths = [Path(path) for path in images]
     placements = _placement_names(paths)
     size, found, missed = _find_all(paths, _finder(board, charuco, corner_fit), progress)
     if not found:
-        raise InputError(
+        raise NothingShownError(
             f"no board of {board.spec['columns']} x {board.spec['rows']} inner corners in any of {len(paths)} images "
-            f"(count the corners between squares, not the squares); {missed[0][0]}: {missed[0][1]}"
+            f"(count the corners between squares, not the squares); {missed[0][0]}: {missed[0][1]}",
+            tuple(missed),
         )
     views = tuple(View(path.stem, camera, station or camera, TARGET_NAME, placements[path]) for path in found)
     points = _points(list(found.values()), board)
@@ -207,7 +210,7 @@ def right_handed(grid: Array) -> Array:
 
 def _find_chessboard(image: NDArray[np.uint8], columns: int, rows: int) -> Array | None:
     """Roughly where the corners are, (rows, columns, 2) px, by OpenCV's two detectors at several scales."""
-    legacy = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
+    legacy = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
     for scale in _scales(image.size):
         how = cv2.INTER_AREA if scale < 1.0 else cv2.INTER_CUBIC
         scaled = image if scale == 1.0 else cv2.resize(image, None, fx=scale, fy=scale, interpolation=how)
@@ -311,7 +314,7 @@ def _points(grids: Sequence[Array], board: Target) -> Points:
         view=np.repeat(np.arange(len(grids), dtype=np.int32), count),
         feature=np.concatenate([features[s] for s in seen]),
         pixels=np.concatenate([grid[s] for grid, s in zip(grids, seen, strict=True)]),
-        sigma_px=np.ones(sum(count)),
+        sigma_px=np.full(sum(count), scatter_px(grids)),
     )
 
 

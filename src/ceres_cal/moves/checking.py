@@ -69,6 +69,12 @@ class StationCheck:
     shift_mm: dict[float, tuple[float, float]]
     words: str
 
+    @classmethod
+    def untold(cls, station: str, words: str, used: int = 0, outliers: int = 0) -> StationCheck:
+        """A station that does not hold, of which nothing more can be told."""
+        nothing, far = dict.fromkeys(HEIGHTS_M, (np.inf, np.inf)), (np.inf,) * 5
+        return cls(station, False, 0.0, np.inf, 0, used, outliers, *far, nothing, words)
+
 
 @dataclass(frozen=True)
 class Check:
@@ -246,10 +252,7 @@ def _not_understood(case: _Case, inside: int, count: int) -> StationCheck:
         f"moved far, or not understood: only {inside} of {count} observations fit the known lens from anywhere near: "
         "refit, or check labels and camera"
     )
-    nothing = dict.fromkeys(HEIGHTS_M, (np.inf, np.inf))
-    return StationCheck(
-        case.name, False, 0.0, np.inf, 0, inside, count - inside, np.inf, np.inf, np.inf, np.inf, np.inf, nothing, words
-    )
+    return StationCheck.untold(case.name, words, inside, count - inside)
 
 
 def _answer(

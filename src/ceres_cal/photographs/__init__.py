@@ -3,5 +3,16 @@
 from ceres_cal.photographs.clicks import Clicks, load_clicks
 from ceres_cal.photographs.field import FieldDetections, detect_field
 from ceres_cal.photographs.follow import Followed, follow
+from ceres_cal.photographs.known import KnownDetections, check_photographs, detect_known
 
-__all__ = ["Clicks", "FieldDetections", "Followed", "detect_field", "follow", "load_clicks"]
+__all__ = [
+    "Clicks",
+    "FieldDetections",
+    "Followed",
+    "KnownDetections",
+    "check_photographs",
+    "detect_field",
+    "detect_known",
+    "follow",
+    "load_clicks",
+]

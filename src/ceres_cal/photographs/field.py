@@ -13,7 +13,7 @@ from ceres_cal.camera import Camera
 from ceres_cal.detect.boards import read_grey
 from ceres_cal.detect.crossings import Crossings, find_crossings
 from ceres_cal.detect.lines import Lines
-from ceres_cal.errors import InputError
+from ceres_cal.errors import InputError, NothingShownError
 from ceres_cal.observations import Curves, Observations, Points, View, combine
 from ceres_cal.photographs.clicks import Clicks, starts_from_clicks
 from ceres_cal.photographs.follow import LEAST_SHARE, Followed, Freedom, follow
@@ -62,8 +62,9 @@ def detect_field(
         progress: called after each image with (images done, images in all, file name).
 
     Raises:
-        InputError: an image cannot be read or has another size than the camera, a name that the target does not have,
-            or no image shows the field.
+        InputError: an image cannot be read or has another size than the camera, or a name that the target does not
+            have.
+        NothingShownError: no image shows the field.
     """
     painted = _painted(target, curves)
     paths = [Path(path) for path in images]
@@ -84,7 +85,8 @@ def detect_field(
         if progress is not None:
             progress(number, len(paths), path.name)
     if not found:
-        raise InputError(f"no field in any of {len(paths)} images; {missed[0][0]}: {missed[0][1]}")
+        first = f"{missed[0][0]}: {missed[0][1]}"
+        raise NothingShownError(f"no field in any of {len(paths)} images; {first}", tuple(missed))
     parts = [
         _observations(path, one, crossings[path], target, (camera, station or camera), edges)
         for path, one in found.items()

@@ -64,20 +64,22 @@ def _ssl_field() -> tuple[Scene, Disturbance]:
     stations = {"overhead": Station("overhead", pose)}
     field = field_scene(ssl_field("B"), cameras, stations, frames=8, spacing_m=0.15)
     boards = board_scene(checkerboard(9, 6, 0.1), cameras, stations, count=12, seed=1)
-    return join(field, boards), _WORKDAY
+    how = Photography(robots=8, balls=1, shadows=1, wear=0.03, jpeg_quality=90)
+    return replace(join(field, boards), photography=how), _WORKDAY
 
 
 def _rings_2004() -> tuple[Scene, Disturbance]:
     sheet = rings([i / 100 for i in range(1, 37)])
     cam_from_sheet = Pose.exp((0.012, -0.016, 0.3, 0.002, 0.0015, 0.4))
     scene = rings_scene(sheet, {"overhead": _camera_2004()}, {"overhead": _station_2004()}, cam_from_sheet)
-    return scene, Disturbance(curves_sigma_px=0.2)
+    return replace(scene, photography=Photography(jpeg_quality=95)), Disturbance(curves_sigma_px=0.2)
 
 
 def _field_2004() -> tuple[Scene, Disturbance]:
     cameras, stations = {"overhead": _camera_2004()}, {"overhead": _station_2004()}
     scene = field_scene(_field_of_2004(), cameras, stations, frames=1, spacing_m=0.03)
-    return scene, Disturbance(points_sigma_px=0.3, curves_sigma_px=0.3)
+    how = Photography(robots=5, balls=1, shadows=1, wear=0.03, jpeg_quality=95)
+    return replace(scene, photography=how), Disturbance(points_sigma_px=0.3, curves_sigma_px=0.3)
 
 
 def _two_cameras() -> tuple[Scene, Disturbance]:

@@ -1,0 +1,50 @@
+"""How well the corners of boards were measured, as the pictures themselves tell it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import cv2
+import numpy as np
+
+from ceres_cal.transforms import Array
+
+USUAL_PX = 0.1
+_MOST_DEGREES = 6
+_SHARE = 2.0 / 3.0  # of the corners, as many terms as a polynomial may have
+_FEWEST_SPARE = 8  # equations below which a board says nothing
+_LEAST_PX = 1e-3
+
+
+def scatter_px(grids: Iterable[Array]) -> float:
+    """Standard deviation (px) of each coordinate of boards' corners about a smooth picture of their board.
+
+    A lens and a bent board move neighbouring corners alike: a homography and a polynomial take that up, of as many
+    degrees as two thirds of the corners can tell. What is left is how precisely corners were measured, and what an
+    unevenly printed board adds; a wrong lens model is not in it.
+
+    Args:
+        grids: each (rows, columns, 2) px, NaN where a corner was not seen.
+
+    Returns:
+        The median over the boards; USUAL_PX where none has corners enough to tell.
+    """
+    told = [found for grid in grids if (found := _of_board(grid)) is not None]
+    return max(float(np.median(told)), _LEAST_PX) if told else USUAL_PX
+
+
+def _of_board(grid: Array) -> float | None:
+    row, column = np.nonzero(~np.isnan(grid[..., 0]))
+    pixels, places = grid[row, column], np.column_stack([column, row]).astype(float)
+    homography, _ = cv2.findHomography(places, pixels)
+    if homography is None:
+        return None
+    flat = cv2.perspectiveTransform(places[None], homography)[0]
+    x, y = (places - places.mean(axis=0)).T / max(grid.shape[:2])
+    degrees = next(d for d in range(_MOST_DEGREES, -1, -1) if (d + 1) * (d + 2) <= 2.0 * _SHARE * len(places))
+    terms = np.column_stack([x**i * y**j for i in range(degrees + 1) for j in range(degrees + 1 - i)])
+    solved, _, rank, _ = np.linalg.lstsq(terms, pixels - flat, rcond=None)
+    spare = 2 * (len(places) - rank)
+    if degrees < 2 or spare < _FEWEST_SPARE:  # the homography has taken up equations of its own
+        return None
+    return float(np.sqrt(np.sum((pixels - flat - terms @ solved) ** 2) / spare))

@@ -1,0 +1,168 @@
+"""refit and check from photographs: the shipped ones, of a camera before and after it was knocked."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import refit_after_move
+from test_cli import ROOT, Say, refused, say
+
+from ceres_cal.calibrate import calibrate
+from ceres_cal.calibration import Calibration
+from ceres_cal.camera import Camera
+from ceres_cal.detect.boards import detect_boards
+from ceres_cal.errors import InputError, NothingShownError
+from ceres_cal.moves import check, movements, refit
+from ceres_cal.observations import Observations, combine
+from ceres_cal.photographs import check_photographs, detect_field, detect_known
+from ceres_cal.simulate import built_in_scene
+from ceres_cal.transforms import Pose
+
+__all__ = ["say"]
+
+HOME = ROOT / "data" / "ssl_field" / "photographs"
+NEW, BOARD = HOME / "0003.jpg", HOME / "board_08.jpg"
+KNOCKED = ROOT / "data" / "ssl_field_moved" / "photographs" / "0001.jpg"
+
+
+@pytest.fixture(scope="module")
+def calibration() -> Calibration:
+    """The sample camera, from two photographs of its field and four of boards, which are not those of the tests."""
+    scene, _ = built_in_scene("ssl-field")
+    field = detect_field([HOME / "0001.jpg", HOME / "0002.jpg"], scene.targets["field"], scene.camera_at("overhead"))
+    boards = detect_boards([HOME / f"board_{i:02d}.jpg" for i in range(1, 5)], scene.targets["board"])
+    return calibrate(combine([field.observations, boards.observations]))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory, calibration: Calibration) -> Path:
+    place = tmp_path_factory.mktemp("photographs")
+    calibration.save(place / "old.json")
+    cv2.imwrite(str(place / "dark.png"), np.zeros((960, 1280), np.uint8))
+    return place
+
+
+def floor_error_mm(truth: Camera, found: Camera) -> float:
+    """How far off the floor is located, at worst, over the middle nine tenths of the image."""
+    x, y = np.meshgrid(np.linspace(64.0, 1216.0, 15), np.linspace(48.0, 912.0, 12))
+    pixels = np.column_stack([x.ravel(), y.ravel()])
+    return float(np.max(1e3 * np.linalg.norm(found.locate(pixels) - truth.locate(pixels), axis=1)))
+
+
+def knocked_truth() -> Camera:
+    scene, _ = built_in_scene("ssl-field")
+    entry = json.loads((KNOCKED.parents[1] / "truth.json").read_text())["stations"]["overhead"]
+    return scene.camera_at("overhead").at(Pose.looking(entry["position_m"], np.array(entry["rotation"])))
+
+
+def test_boards_and_fields_are_weighed_together(calibration: Calibration) -> None:
+    assert calibration.fit.point_scale == pytest.approx(1.0, abs=0.1)  # 0.98
+    assert calibration.fit.curve_scale == pytest.approx(1.0, abs=0.1)  # 0.98
+    assert len(calibration.rejected) <= 3  # 0: stated at 1 px, boards made outliers of all crossings
+    scene, _ = built_in_scene("ssl-field")
+    assert floor_error_mm(scene.camera_at("overhead"), calibration.station()) < 0.3  # 0.05 mm
+
+
+def test_an_unmoved_camera_holds(calibration: Calibration) -> None:
+    found, seen = check_photographs(calibration, [NEW])
+    station = found.stations["camera"]
+    assert found.holds and station.noise == pytest.approx(1.0, abs=0.2)  # 0.97
+    assert station.moved_mm < 1.0 and station.turned_deg < 0.02
+    assert seen.shown == {"field": 1} and seen.missed == () and seen.station == "camera"
+
+
+def test_a_knock_is_found_and_mended(calibration: Calibration) -> None:
+    found, seen = check_photographs(calibration, [KNOCKED])
+    station, truth = found.stations["camera"], knocked_truth()
+    assert not found.holds and station.probability < 1e-9
+    assert station.moved_mm == pytest.approx(18.79, abs=1.0)
+    assert station.turned_deg == pytest.approx(1.077, abs=0.01)
+    mended = refit(calibration, seen.require())
+    assert floor_error_mm(truth, calibration.station()) > 20.0
+    assert floor_error_mm(truth, mended.station()) < 0.5  # 0.07 mm
+    assert check(mended, seen.require()).holds
+    assert movements(calibration, mended)["camera"][1] == pytest.approx(1.077, abs=0.005)
+
+
+def test_everything_known_is_found_and_what_shows_nothing_is_named(calibration: Calibration, folder: Path) -> None:
+    steps: list[tuple[int, int, str]] = []
+    images = [NEW, BOARD, folder / "dark.png"]
+    found = detect_known(calibration, images, progress=lambda *step: steps.append(step))
+    seen = found.require()
+    assert found.shown == {"field": 1, "board": 1} and found.images == 3
+    ((path, reason),) = found.missed
+    assert path == str(folder / "dark.png") and "lines were not found" in reason and "no chessboard" in reason
+    assert {(view.frame, view.target, view.placement) for view in seen.views} == {
+        ("0003", "field", None),
+        ("board_08", "board", "board_08"),
+    }
+    with pytest.raises(NothingShownError, match=r"in any of 3 photographs, within .*dark\.png"):
+        replace(found, observations=None).require()
+    assert [step[:2] for step in steps] == [(i, 6) for i in range(1, 7)]
+
+
+def test_names_are_those_of_the_calibration(calibration: Calibration) -> None:
+    targets = {"pitch": calibration.targets["field"]}
+    found = detect_known(replace(calibration, targets=targets), [NEW], not_painted=["CenterLine"]).require()
+    assert found.targets == targets and {view.target for view in found.views} == {"pitch"}
+    painted = {found.feature_name("curve", row) for row in range(len(found.curves))}
+    assert "HalfwayLine" in painted and "CenterLine" not in painted
+
+
+def test_what_cannot_be_looked_for(calibration: Calibration) -> None:
+    with pytest.raises(InputError, match="station 'left' is not there"):
+        detect_known(calibration, [NEW], "left")
+    with pytest.raises(InputError, match="curve 'Nowhere' is not one of"):
+        detect_known(calibration, [NEW], not_painted=["Nowhere"])
+    boards_only = replace(calibration, targets={"board": calibration.targets["board"]})
+    with pytest.raises(InputError, match=r"targets \(board\) have no painted lines: give a file"):
+        check_photographs(boards_only, [NEW])
+
+
+def test_commands(say: Say, folder: Path) -> None:
+    old = folder / "old.json"
+    held = say("check", old, NEW, "--quiet")
+    assert held.code == 0 and "\nimages    1 photograph of station camera: field in 1\n" in held.out
+    moved = say("check", old, KNOCKED, "--json")
+    data = json.loads(moved.out)
+    assert moved.code == 1 and data["photographs"] == {"images": 1, "shown": {"field": 1}, "missed": []}
+    lost = say("check", old, folder / "dark.png", "--quiet")
+    assert lost.code == 1 and "station   camera not found: no field within" in lost.out
+    assert f"field in 0\n          {folder / 'dark.png'}: its lines were not found" in lost.out
+    mended = say("refit", old, KNOCKED.parent, "-o", folder / "new.json", "--quiet")
+    assert mended.code == 0 and "images    1 photograph of station camera: field in 1, board in 0\n" in mended.out
+    assert floor_error_mm(knocked_truth(), Calibration.load(folder / "new.json").station()) < 0.5
+
+
+def test_wrong_input_is_refused_in_one_line(say: Say, folder: Path) -> None:
+    old = folder / "old.json"
+    detect_known(Calibration.load(old), [NEW], boards=False).require().save(folder / "seen.json")
+    assert Observations.load(folder / "seen.json").views[0].frame == "0003"
+    for arguments, message in (
+        (("check", old, NEW, folder / "seen.json"), "observations beside photographs"),
+        (("check", old, NEW, NEW), "given twice"),
+        (("check", old, folder / "gone.jpg"), "no such file"),
+        (("check", old, NEW, "--station", "left"), "station 'left' is not there"),
+        (("check", old, folder / "seen.json", "--station", "camera"), "are of photographs"),
+        (("check", old, ROOT / "data" / "field_2004" / "photographs"), "780 x 580 px"),
+        (("check", old, NEW, "--not-painted", "Nowhere"), "curve 'Nowhere' is not one of"),
+        (("refit", old, NEW, "-o", NEW), "is an input"),
+    ):
+        assert message in refused(say(*arguments, "--quiet"))
+
+
+def test_a_folder_of_photographs_is_kept_up_with(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    place = tmp_path / "calibration.json"
+    place.write_bytes((folder / "old.json").read_bytes())
+    (tmp_path / "cut.jpg").write_bytes(NEW.read_bytes()[:200])
+    images = [NEW, folder / "dark.png", KNOCKED, KNOCKED, tmp_path / "cut.jpg"]
+    assert refit_after_move.main([str(path) for path in (place, *images)]) == 3
+    events = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert [event["event"] for event in events] == ["holds", "refused", "refitted", "holds", "unreadable"]
+    assert "no field within" in events[1]["reason"]
+    assert floor_error_mm(knocked_truth(), Calibration.load(place).station()) < 0.5
