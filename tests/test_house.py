@@ -16,13 +16,13 @@ MAX_LINES = 450
 # A new module, or a package with all that is in it, is one line here.
 FLOORS = {
     "errors": 0,
-    "blas": 0,
     "digits": 0,
     "files": 0,
     "transforms": 0,
     "lens": 0,
     "targets": 0,
     "tails": 0,
+    "threads": 0,
     "camera": 1,
     "spread": 1,
     "observations": 1,

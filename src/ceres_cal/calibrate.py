@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ceres_cal.baseline import four_point_baseline
-from ceres_cal.blas import single_threaded_blas
 from ceres_cal.bundle import Progress, Solution, Weighting, private_placements, settle_placements, solve
 from ceres_cal.calibration import Calibration, Fit, Rejected
 from ceres_cal.camera import Camera
@@ -20,7 +19,8 @@ from ceres_cal.noise import Inliers, judge, start_weights
 from ceres_cal.observations import Observations
 from ceres_cal.parameters import Estimate, Layout, Options, make_layout
 from ceres_cal.residuals import Residuals, residuals
-from ceres_cal.sights import Rows, Sights, gather_sights
+from ceres_cal.sights import Rows, SightKey, Sights, gather_sights
+from ceres_cal.threads import at_most, single_threaded_blas
 from ceres_cal.transforms import Array
 from ceres_cal.uncertainty import Posterior, Setting, Uncertainty, assess, bounds_text
 
@@ -50,7 +50,7 @@ def calibrate(
         InputError: a prior or a fixed number that the camera does not have.
     """
     options = options or Options()
-    with single_threaded_blas():
+    with single_threaded_blas(), at_most(options.threads):
         sights = gather_sights(observations)
         layout = make_layout(observations, options)
         start = initialise(observations, sights, options)
@@ -170,9 +170,9 @@ def _settle(
     few = used.take(_spread(used, layout))
     solution = solve(few, estimate, layout.of(few.keys), rough, options, progress, found.places)
     if len(few) < len(used):
-        solution = replace(solution, estimate=settle_placements(used, solution.estimate, layout, rough, options))
+        solution = replace(solution, estimate=settle_placements(used, solution.estimate, layout, rough))
     before, (found, inliers) = everything, judged(solution.estimate, found.places)
-    rounds = 1
+    rounds, undecided = 1, frozenset(used.keys)
     while rounds < _MOST_ROUNDS:
         weighting = Weighting(inliers.point_scale, inliers.curve_scale, options.loss, options.loss_scale)
         at_rest = rounds > 1 and inliers.same_as(before, _SETTLED_AGAIN if again else _SETTLED_SCALE)
@@ -180,7 +180,7 @@ def _settle(
         if not at_rest:
             used = sights.used(inliers.points, inliers.curves)
         if rounds == 1 or at_rest:
-            estimate, changed = _mended(sights, used, inliers, estimate, layout, weighting)
+            estimate, changed, undecided = _mended(sights, used, inliers, estimate, layout, weighting, undecided)
             if changed:
                 found, inliers = judged(estimate, found.places)
                 used = sights.used(inliers.points, inliers.curves)
@@ -205,12 +205,20 @@ def _spread(sights: Sights, layout: Layout) -> Rows:
 
 
 def _mended(
-    sights: Sights, used: Sights, inliers: Inliers, estimate: Estimate, layout: Layout, weighting: Weighting
-) -> tuple[Estimate, int]:
-    """The estimate with lost boards posed again and mirrored poses turned over, and how many there were of both."""
+    sights: Sights,
+    used: Sights,
+    inliers: Inliers,
+    estimate: Estimate,
+    layout: Layout,
+    weighting: Weighting,
+    undecided: frozenset[SightKey],
+) -> tuple[Estimate, int, frozenset[SightKey]]:
+    """The estimate with lost boards posed again and mirrored poses turned over, how many there were of both, and which
+    sights' poses compete still.
+    """
     estimate, lost = with_lost_boards_found(sights, inliers, estimate, layout, replace(weighting, loss="cauchy"))
-    estimate, turned = without_mirrored_poses(used, estimate, layout, weighting)
-    return estimate, lost + turned
+    estimate, turned, undecided = without_mirrored_poses(used, estimate, layout, weighting, undecided)
+    return estimate, lost + turned, undecided
 
 
 def _require_fits(settled: _Settled, sights: Sights) -> None:
@@ -279,10 +287,10 @@ def _require_fit(name: str, camera: Camera, settled: _Settled, sights: Sights) -
     """Raise SolutionError where half of a camera's observations are missed by more than any lens could explain."""
     own = _of(name, sights)
     limit_px = _NO_FIT * float(np.hypot(*camera.image_size))
-    points, curves = settled.residuals.points[own.point_rows], settled.residuals.curves[own.curve_rows]
-    met = np.count_nonzero(np.einsum("ij,ij->i", points, points) <= limit_px**2)  # NaN is not
-    met += np.count_nonzero(np.abs(curves) <= limit_px)
-    if 2 * met < len(points) + len(curves):
+    points, curves = settled.residuals.lengths
+    met = np.count_nonzero(points[own.point_rows] <= limit_px)  # NaN is not
+    met += np.count_nonzero(curves[own.curve_rows] <= limit_px)
+    if 2 * met < len(own.point_rows) + len(own.curve_rows):
         raise SolutionError(
             f"camera {name!r}: the best solution misses half of its observations by more than {limit_px:.0f} px: "
             "check labels, target dimensions and which lens it is"
@@ -298,13 +306,13 @@ def _lost(inliers: Inliers, sights: Sights) -> Iterator[str]:
 
 
 def _fit(settled: _Settled, layout: Layout) -> Fit:
-    points = settled.residuals.points[settled.inliers.points]
-    curves = settled.residuals.curves[settled.inliers.curves]
+    points, curves = settled.residuals.lengths
+    points, curves = points[settled.inliers.points], curves[settled.inliers.curves]
     return Fit(
         len(points),
         len(curves),
-        float(np.sqrt(np.sum(points**2) / max(len(points), 1))),
-        float(np.sqrt(np.sum(curves**2) / max(len(curves), 1))),
+        float(np.sqrt(points @ points / max(len(points), 1))),
+        float(np.sqrt(curves @ curves / max(len(curves), 1))),
         settled.inliers.point_scale,
         settled.inliers.curve_scale,
         layout.size,

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ceres_cal.errors import DegenerateError
 from ceres_cal.kernels import align_sights, alignment_errors, normalised_planes, plane_homographies, usual_by_radius
+from ceres_cal.threads import parts_of, run_parts
 from ceres_cal.transforms import Array, Pose, nearest_rotation
 
 Ints = NDArray[np.int64]
@@ -217,9 +218,13 @@ def homographies_of_sights(data: PlaneData, profile: Profile) -> tuple[Array, Ar
     The normalised DLT, reweighted to distances in the image, and against wrong labels where some points do not fit.
     """
     homographies, errors = np.empty((len(data.bounds) - 1, 3, 3)), np.empty(len(data.plane))
-    plane_homographies(
-        data.bounds, data.plane, data.offsets, np.array(profile.coefficients), profile.unit_px, homographies, errors
-    )
+    coefficients = np.array(profile.coefficients)
+
+    def part(first: int, last: int) -> None:
+        bounds, found = data.bounds[first : last + 1], homographies[first:last]
+        plane_homographies(bounds, data.plane, data.offsets, coefficients, profile.unit_px, found, errors)
+
+    run_parts(part, parts_of(len(homographies), len(errors)))
     return np.array([[profile.unit_px], [profile.unit_px], [1.0]]) * homographies, errors * profile.unit_px
 
 

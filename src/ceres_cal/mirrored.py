@@ -10,41 +10,55 @@ import numpy as np
 
 from ceres_cal.bundle import Weighting, placement_costs, private_placements
 from ceres_cal.parameters import Estimate, Layout
-from ceres_cal.sights import Rows, Sights
+from ceres_cal.sights import Rows, SightKey, Sights
 from ceres_cal.transforms import Array
 
 _DECIDED_SIGMA = 100.0  # perspective that bends a view by so many standard deviations leaves no doubt
+_MUCH_WORSE = 2.0  # a cost that the last of the noise and of the lens will not make up for
 
 
 def without_mirrored_poses(
-    sights: Sights, estimate: Estimate, layout: Layout, weighting: Weighting
-) -> tuple[Estimate, int]:
-    """The estimate with every private placement in the better one of its two poses, and how many were changed."""
+    sights: Sights, estimate: Estimate, layout: Layout, weighting: Weighting, among: frozenset[SightKey]
+) -> tuple[Estimate, int, frozenset[SightKey]]:
+    """The estimate with private placements in the better one of their two poses.
+
+    Args:
+        among: keys of the sights that are tried.
+
+    Returns:
+        The estimate, how many placements were changed, and the keys of those whose other pose is not much worse.
+    """
     private = private_placements(sights, layout)
-    changed = 0
+    changed, undecided = 0, frozenset[SightKey]()
     for camera in estimate.cameras:
         own = np.array(
-            [i for i, key in enumerate(sights.keys) if key.camera == camera and key.placement in private],
+            [
+                number
+                for number, key in enumerate(sights.keys)
+                if key.camera == camera and key.placement in private and key in among
+            ],
             dtype=np.int64,
         )
         if len(own):
-            estimate, count = _with_better_poses(sights.take(own), estimate, layout, weighting)
-            changed += count
-    return estimate, changed
+            estimate, count, open_ones = _with_better_poses(sights.take(own), estimate, weighting)
+            changed, undecided = changed + count, undecided | open_ones
+    return estimate, changed, undecided
 
 
 def _with_better_poses(
-    sights: Sights, estimate: Estimate, layout: Layout, weighting: Weighting
-) -> tuple[Estimate, int]:
+    sights: Sights, estimate: Estimate, weighting: Weighting
+) -> tuple[Estimate, int, frozenset[SightKey]]:
     poses = estimate.pose_stack(sights.keys)
     doubtful = _doubtful(sights, poses, estimate, weighting)
     if not len(doubtful):
-        return estimate, 0
+        return estimate, 0, frozenset()
     few = sights.take(doubtful)
-    as_is, _ = placement_costs(few, estimate, weighting, poses[doubtful])
-    costs, found = placement_costs(few, estimate, weighting, mirrored(few, poses[doubtful]))
+    twice = np.concatenate([poses[doubtful], mirrored(few, poses[doubtful])])
+    costs, found = placement_costs(sights.take(np.tile(doubtful, 2)), estimate, weighting, twice)
+    as_is, costs, found = costs[: len(few)], costs[len(few) :], found[len(few) :]
     better = np.flatnonzero(costs < as_is * (1.0 - 1e-6))
-    return estimate.with_placements([few.keys[i] for i in better], found[better]), len(better)
+    undecided = frozenset(few.keys[i] for i in np.flatnonzero(costs < _MUCH_WORSE * as_is))
+    return estimate.with_placements([few.keys[i] for i in better], found[better]), len(better), undecided
 
 
 def _boxes(sights: Sights) -> tuple[Array, Array]:

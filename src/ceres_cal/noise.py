@@ -54,8 +54,8 @@ class Inliers:
 
 def relative_lengths(observations: Observations, residuals: Residuals) -> tuple[Array, Array]:
     """Lengths of the residuals of points and of curves in their stated sigmas; infinite where there is none."""
-    points = np.sqrt(np.einsum("ij,ij->i", residuals.points, residuals.points)) / observations.points.sigma_px
-    curves = np.abs(residuals.curves) / observations.curves.sigma_px
+    points, curves = residuals.lengths
+    points, curves = points / observations.points.sigma_px, curves / observations.curves.sigma_px
     return np.where(np.isfinite(points), points, np.inf), np.where(np.isfinite(curves), curves, np.inf)
 
 

@@ -6,6 +6,7 @@ be of order one) and one 6-vector (rotation vector, translation) per free statio
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -229,6 +230,7 @@ def anchored_stations(observations: Observations) -> frozenset[str]:
     Boards alone tell poses among themselves only; holding one station removes that freedom.
     """
     shown = _shown_views(observations)
+    times = Counter([view.placement for view in shown])
     group = {view.station: view.station for view in shown}
     first_seen: dict[str, str] = {}
     tied: set[str] = set()
@@ -241,7 +243,7 @@ def anchored_stations(observations: Observations) -> frozenset[str]:
     for view in shown:
         if view.placement is None:
             tied.add(view.station)
-        else:
+        elif times[view.placement] > 1:
             group[root(view.station)] = root(first_seen.setdefault(view.placement, view.station))
     tied_groups = {root(name) for name in tied}
     anchors: dict[str, str] = {}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -11,6 +12,7 @@ from ceres_cal.camera import Camera
 from ceres_cal.observations import Observations
 from ceres_cal.parameters import Estimate, intrinsics_vector, unit_px
 from ceres_cal.sights import Sights, nearest_places
+from ceres_cal.threads import parts_of, run_parts
 from ceres_cal.transforms import Array
 
 
@@ -26,6 +28,11 @@ class Residuals:
     points: Array
     curves: Array
     places: Array
+
+    @cached_property
+    def lengths(self) -> tuple[Array, Array]:
+        """Lengths of the residuals of points (N,) and of curves (M,), px."""
+        return np.sqrt(np.einsum("ij,ij->i", self.points, self.points)), np.abs(self.curves)
 
 
 def lens_arguments(camera: Camera) -> tuple[int, Array, Array, float]:
@@ -52,10 +59,7 @@ def residuals(observations: Observations, sights: Sights, estimate: Estimate, pl
         numbers = np.array([number for number, key in enumerate(sights.keys) if key.camera == name], dtype=np.int64)
         own = sights.take(numbers)
         optics = lens_arguments(estimate.cameras[name])
-        offsets = np.empty((len(own.point_rows), 2))
-        kernels.point_residuals(
-            *optics, poses[numbers], own.point_bounds, estimate.structure.points(own), own.pixels, offsets
-        )
+        offsets = _point_residuals(optics, poses[numbers], own, estimate.structure.points(own))
         points[own.point_rows] = offsets
         if len(own.curve_rows):
             distances = np.empty(len(own.curve_rows))
@@ -66,6 +70,17 @@ def residuals(observations: Observations, sights: Sights, estimate: Estimate, pl
             )  # fmt: skip
             curves[own.curve_rows], feet[own.curve_rows] = distances, starts
     return Residuals(points, curves, feet)
+
+
+def _point_residuals(optics: tuple[int, Array, Array, float], poses: Array, sights: Sights, points: Array) -> Array:
+    found = np.empty((len(points), 2))
+
+    def part(first: int, last: int) -> None:
+        bounds = sights.point_bounds[first : last + 1]
+        kernels.point_residuals(*optics, poses[first:last], bounds, points, sights.pixels, found)
+
+    run_parts(part, parts_of(len(sights), len(points)))
+    return found
 
 
 def starting_places(sights: Sights, estimate: Estimate, places: Array | None) -> Array:

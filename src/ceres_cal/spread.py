@@ -16,6 +16,7 @@ from ceres_cal.transforms import Array
 NOTHING = 2e-14
 """Eigenvalue of an information matrix with unit diagonal below which a direction counts as unknown: rounding reaches
 1e-15 for each ten numbers, and a sigma millions of times larger than what each number would have alone is infinite."""
+_REGULAR = 1e6  # the inverse of such an eigenvalue; plain inverses are good to 1e-9 there
 _RESIDUE = 1e-11  # what a Schur complement leaves of a direction that is not told, relative to what went in
 
 
@@ -23,15 +24,14 @@ def _nothing(count: int) -> float:
     return NOTHING * max(1.0, count / 10.0)
 
 
-def _decomposed(information: Array, limits: Array) -> tuple[Array, Array, Array]:
-    """Scale (..., n) that makes the diagonal one, eigenvalues (..., n) and eigenvectors (..., n, n) of the scaled."""
+def _scaled(information: Array, limits: Array) -> tuple[Array, Array]:
+    """Scale (..., n) that makes the diagonal one, and the information (..., n, n) in it."""
     diagonal = np.diagonal(information, axis1=-2, axis2=-1)
     told = diagonal > limits**-2.0
     scale = np.where(told, 1.0 / np.sqrt(np.where(told, diagonal, 1.0)), 1.0)
     # What is not told at all has rounding on its diagonal, which must not be scaled up.
     information = np.where(told[..., :, None] & told[..., None, :], information, 0.0)
-    values, vectors = np.linalg.eigh(information * scale[..., :, None] * scale[..., None, :])
-    return scale, values, vectors
+    return scale, information * scale[..., :, None] * scale[..., None, :]
 
 
 def known_inverses(information: Array, limits: Array) -> Array:
@@ -40,11 +40,26 @@ def known_inverses(information: Array, limits: Array) -> Array:
     Args:
         limits: (n,) see `Spread.of`.
     """
-    scale, values, vectors = _decomposed(information, limits)
+    scale, scaled = _scaled(information, limits)
+    inverse = _regular_inverses(scaled)
+    if inverse is not None:
+        return np.asarray(inverse * scale[..., :, None] * scale[..., None, :])
+    values, vectors = np.linalg.eigh(scaled)
     told = values > _nothing(values.shape[-1])
     kept = np.where(told, 1.0 / np.where(told, values, 1.0), 0.0)
     half = vectors * np.sqrt(kept)[..., None, :] * scale[..., :, None]
     return np.asarray(half @ np.swapaxes(half, -1, -2))
+
+
+def _regular_inverses(scaled: Array) -> Array | None:
+    """Their plain inverses, ten times as fast, where no direction of any of them comes near to being unknown."""
+    try:
+        inverse = np.linalg.inv(scaled)
+    except np.linalg.LinAlgError:
+        return None
+    sizes = np.trace(inverse, axis1=-2, axis2=-1)  # not less than one by the least eigenvalue
+    regular = np.all((sizes > 0.0) & (sizes < _REGULAR))
+    return np.asarray(0.5 * (inverse + np.swapaxes(inverse, -1, -2))) if regular else None
 
 
 def without(here: Array, coupling: Array, others: Array, limits: Array) -> Array:
@@ -82,7 +97,8 @@ class Spread:
         Args:
             limits: (n,) a number whose sigma would be larger even if all others were known is not known at all.
         """
-        scale, values, vectors = _decomposed(np.asarray(information, dtype=float), limits)
+        scale, scaled = _scaled(np.asarray(information, dtype=float), limits)
+        values, vectors = np.linalg.eigh(scaled)
         lost = values <= _nothing(len(values))
         half = vectors[:, ~lost] / np.sqrt(values[~lost]) * scale[:, None]
         return cls(half @ half.T, vectors[:, lost] * scale[:, None], scale)

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
-from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,17 +15,11 @@ from ceres_cal.parameters import Estimate, Layout
 from ceres_cal.residuals import lens_arguments, starting_places
 from ceres_cal.sights import SightKey, Sights
 from ceres_cal.structure import Structure
+from ceres_cal.threads import parts_of, run_parts
 from ceres_cal.transforms import Array, left_jacobian, rotation_exp, skew
 
 ROWS_WORTH_A_THREAD = 20_000
-_ROWS_OF_A_PART = 3_000  # of many sights; below it a thread costs more than it brings
 _NOTHING = np.empty(0)
-
-
-@cache
-def _pool() -> ThreadPoolExecutor:
-    """For the parts of a sweep that its own thread does not take."""
-    return ThreadPoolExecutor(thread_name_prefix="ceres_cal")
 
 
 @dataclass(frozen=True)
@@ -179,7 +171,6 @@ class EliminatedCost(pyceres.CostFunction):
         estimate: Estimate,
         free: NDArray[np.int64],
         weighting: Weighting,
-        threads: int,
         places: Array | None = None,
     ) -> None:
         super().__init__()
@@ -203,9 +194,7 @@ class EliminatedCost(pyceres.CostFunction):
         # Every step starts from the poses of the last accepted one: a rejected step may have led them astray.
         self._accepted = _Evaluation(start, _NOTHING, _NOTHING, poses, gains)
         self._known: _Evaluation | None = None
-        work = len(sights.points) + len(sights.curve_pixels)
-        parts = max(1, min(threads, work // _ROWS_OF_A_PART))
-        self._parts = np.linspace(0, len(sights), parts + 1).astype(int).tolist()
+        self._parts = parts_of(len(sights), len(sights.points) + len(sights.curve_pixels))
         self.slots = [slot for slot, size in zip((0, 3), sizes, strict=True) if size]
         self.set_num_residuals(self._size + 1)
         self.set_parameter_block_sizes([size for size in sizes if size])
@@ -266,9 +255,7 @@ class EliminatedCost(pyceres.CostFunction):
             )  # fmt: skip
             return reduced
 
-        others = [_pool().submit(part, *self._parts[i : i + 2]) for i in range(1, len(self._parts) - 1)]
-        reduced = sum((other.result() for other in others), start=part(*self._parts[:2]))
-        return _Sweep(poses, gains, costs, reduced)
+        return _Sweep(poses, gains, costs, np.sum(run_parts(part, self._parts), axis=0))
 
     def from_poses(self, poses: Array, tolerance: float) -> tuple[Array, Array]:
         """Costs (S,) and poses (S, 3, 4) that the search for each placement ends with when it starts from `poses`,

@@ -21,6 +21,7 @@ from ceres_cal.quantities import Key, from_placement, from_station, places_of, p
 from ceres_cal.residuals import lens_arguments, starting_places
 from ceres_cal.sights import SightKey, Sights
 from ceres_cal.spread import known_inverses
+from ceres_cal.threads import parts_of, run_parts
 from ceres_cal.transforms import Array
 
 Places = NDArray[np.int64]
@@ -112,20 +113,27 @@ def _normals(
     )
     starts = starting_places(sights, estimate, places)
     poses = estimate.pose_stack(sights.keys)
+    points, tracks = structure.points(sights), structure.tracks(sights)
     size = len(free) + len(structure.values) + 6
     units = np.ones(size)
     units[: len(free)] = intrinsics_scales(camera)[free]
-    batch = max(1, _BATCH // size**2)
-    for first in range(0, len(sights), batch):
-        last = min(first + batch, len(sights))
+
+    def told(first: int, last: int) -> Array:
         normals = np.empty((last - first, size, size))
         if not kernels.sight_normals(
             first, last, code, vector, free, powers, unit, sights.point_bounds, pixels, weights, slots, bends, is_arc,
             sights.curve_bounds, track, curve_pixels, curve_weights, starts, *kernel_track_slots(structure),
-            kernels.LOSS_CODES[weighting.loss], weighting.loss_scale, structure.points(sights),
-            structure.tracks(sights), len(structure.values), poses, normals,
+            kernels.LOSS_CODES[weighting.loss], weighting.loss_scale, points, tracks, len(structure.values), poses,
+            normals,
         ):  # fmt: skip
             raise SolutionError("an observation cannot be projected where the solve ended: no uncertainty can be given")
+        return normals
+
+    batch = max(1, _BATCH // size**2)
+    for first in range(0, len(sights), batch):
+        last = min(first + batch, len(sights))
+        parts = [first + place for place in parts_of(last - first, len(points) + len(curve_pixels))]
+        normals = np.concatenate(run_parts(told, parts))
         yield poses[first:last], normals * units[:, None] * units
 
 

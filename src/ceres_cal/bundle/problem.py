@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections import Counter
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -36,6 +35,7 @@ from ceres_cal.parameters import (
     with_intrinsics,
 )
 from ceres_cal.sights import SightKey, Sights
+from ceres_cal.threads import at_most, available
 from ceres_cal.transforms import Array, Pose, Poses
 
 _AT_REST = 10  # iterations
@@ -133,7 +133,6 @@ def _assemble(
     estimate: Estimate,
     layout: Layout,
     weighting: Weighting,
-    threads: int,
     places: Array | None = None,
 ) -> _Assembly:
     private = private_placements(sights, layout)
@@ -142,12 +141,12 @@ def _assemble(
     for camera in estimate.cameras:
         own = _numbers(sights, camera, private)
         if len(own):
-            cost = EliminatedCost(run, sights.take(own), estimate, layout.free[camera], weighting, threads, places)
+            cost = EliminatedCost(run, sights.take(own), estimate, layout.free[camera], weighting, places)
             assembly.eliminated.append((cost, blocks.of(sights.keys[own[0]], cost.slots)))
     assembly.costs += assembly.eliminated
     for number, key in enumerate(sights.keys):
         if key.placement not in private:
-            parts = list(_parts(sights[number], threads))
+            parts = list(_parts(sights[number]))
             assembly.threads = max(assembly.threads, len(parts))
             for part in parts:
                 sight_cost = SightCost(run, part, estimate, layout, weighting, places)
@@ -203,9 +202,9 @@ def _quiet() -> Iterator[None]:
         pyceres.logging.minloglevel = before
 
 
-def _parts(sight: Sights, threads: int) -> list[Sights]:
+def _parts(sight: Sights) -> list[Sights]:
     """A sight of very many observations as one for each thread."""
-    count = max(1, min(threads, (len(sight.points) + len(sight.curve_pixels)) // ROWS_WORTH_A_THREAD))
+    count = max(1, min(available(), (len(sight.points) + len(sight.curve_pixels)) // ROWS_WORTH_A_THREAD))
     return [sight.part(number, count) for number in range(count)] if count > 1 else [sight]
 
 
@@ -229,7 +228,8 @@ def solve(
     """
     _require_enough(sights, layout)
     run = Run()
-    assembly = _assemble(run, sights, estimate, layout, weighting, _threads(options), places)
+    with at_most(options.threads):
+        assembly = _assemble(run, sights, estimate, layout, weighting, places)
     # Far from the end gains come and go: there it is for Ceres to say that they are small.
     watcher = _Watcher(run, progress, 0.0 if weighting.rough else weighting.precision)
     problem = pyceres.Problem()
@@ -267,7 +267,6 @@ def placement_costs(
     weighting: Weighting,
     poses: Array,
     tolerance: float = 1e-6,
-    threads: int = 1,
 ) -> tuple[Array, Array]:
     """Costs (S,) and cam_from_target (S, 3, 4) of one camera's sights after each placement alone was solved for.
 
@@ -276,25 +275,19 @@ def placement_costs(
             projected costs infinity. tolerance: relative, of each cost.
     """
     held = np.empty(0, dtype=np.int64)
-    return EliminatedCost(Run(), sights, estimate, held, weighting, threads).from_poses(poses, tolerance)
+    return EliminatedCost(Run(), sights, estimate, held, weighting).from_poses(poses, tolerance)
 
 
-def settle_placements(
-    sights: Sights, estimate: Estimate, layout: Layout, weighting: Weighting, options: Options
-) -> Estimate:
+def settle_placements(sights: Sights, estimate: Estimate, layout: Layout, weighting: Weighting) -> Estimate:
     """The estimate with every private placement where it fits best, everything else held."""
     private = private_placements(sights, layout)
     for camera in estimate.cameras:
         own = sights.take(_numbers(sights, camera, private))
         if len(own):
             poses = estimate.pose_stack(own.keys)
-            _, found = placement_costs(own, estimate, weighting, poses, _POSED, _threads(options))
+            _, found = placement_costs(own, estimate, weighting, poses, _POSED)
             estimate = estimate.with_placements(own.keys, found)
     return estimate
-
-
-def _threads(options: Options) -> int:
-    return options.threads or min(os.cpu_count() or 1, 8)
 
 
 def _numbers(sights: Sights, camera: str, placements: Container[str | None]) -> NDArray[np.int64]:

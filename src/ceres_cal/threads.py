@@ -1,0 +1,68 @@
+"""Work in parts, a thread each where that pays: the kernels release Python's lock (design, section 6)."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from contextvars import ContextVar
+from functools import cache
+from typing import TypeVar
+
+import numpy as np  # noqa: F401 its BLAS is what the controller looks for
+from threadpoolctl import ThreadpoolController
+
+_ROWS_OF_A_PART = 3_000  # observations; below it a thread costs more than it brings
+_MOST = 8
+_allowed: ContextVar[int] = ContextVar("allowed", default=0)
+_T = TypeVar("_T")
+
+
+@cache
+def _pool() -> ThreadPoolExecutor:
+    """For the parts that the caller's own thread does not take."""
+    return ThreadPoolExecutor(thread_name_prefix="ceres_cal")
+
+
+@cache
+def _controller() -> ThreadpoolController:
+    return ThreadpoolController()
+
+
+@contextmanager
+def at_most(threads: int) -> Iterator[None]:
+    """While it lasts this thread's work is cut into so many parts at most; 0 chooses."""
+    token = _allowed.set(threads)
+    try:
+        yield
+    finally:
+        _allowed.reset(token)
+
+
+@contextmanager
+def single_threaded_blas() -> Iterator[None]:
+    """While it lasts BLAS works in the calling thread alone, in the whole process.
+
+    Our matrices are small: OpenBLAS's other threads bring nothing, but spin for milliseconds after each call, on the
+    cores that our own parts need.
+    """
+    with _controller().limit(limits=1, user_api="blas"):
+        yield
+
+
+def available() -> int:
+    """How many threads may work."""
+    return _allowed.get() or min(os.cpu_count() or 1, _MOST)
+
+
+def parts_of(items: int, rows: int) -> list[int]:
+    """Where each part of so many items begins, and where the last one ends, when they hold so many rows in all."""
+    count = max(1, min(available(), rows // _ROWS_OF_A_PART))
+    return [items * number // count for number in range(count + 1)]
+
+
+def run_parts(function: Callable[[int, int], _T], parts: Sequence[int]) -> list[_T]:
+    """function(first, last) of every part, at the same time."""
+    others = [_pool().submit(function, *parts[i : i + 2]) for i in range(1, len(parts) - 1)]
+    return [function(*parts[:2]), *(other.result() for other in others)]
