@@ -13,7 +13,7 @@ from ceres_cal.camera import Camera
 from ceres_cal.observations import Prior
 from ceres_cal.simulate import ViewPlan, board_pose, well_inside
 from ceres_cal.structure import Tolerance
-from ceres_cal.targets import Arc, Target, along_track, checkerboard, custom
+from ceres_cal.targets import MOVABLE, Arc, Target, along_track, checkerboard, custom
 from ceres_cal.transforms import Array
 
 HEIGHT_SIGMAS_M = (0.02, 0.01, 0.005)

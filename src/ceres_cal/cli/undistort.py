@@ -44,7 +44,7 @@ def _add_arguments(parser: ArgumentParser) -> None:
     scale.add_argument("--size", metavar="WxH", help="size of the straight image, px; default: the photograph's")
     scale.add_argument("--phi", metavar="PX", help="its focal length instead; the camera's own keeps the scale")
     group.add_argument(
-        "--angle", metavar="DEG", help="widest angle of view; default: 150, a straight image ends at 180"
+        "--angle", metavar="DEG", help="widest angle of view; default: 150 with --whole, else as far as detail goes"
     )
     group = parser.add_argument_group("the field from above")
     group.add_argument("--top-view", action="store_true", help="the field from straight above, to scale")
@@ -208,7 +208,7 @@ def _write(path: Path, picture: Image) -> None:
 
 def _straight(args: Namespace, calibration: Calibration) -> _Making:
     from ceres_cal.calibration import camera_to_json
-    from ceres_cal.pictures.straight import WIDEST_DEG, straighten
+    from ceres_cal.pictures.straight import straighten
 
     name, station, camera = _camera(args, calibration)
     found = straighten(
@@ -216,7 +216,7 @@ def _straight(args: Namespace, calibration: Calibration) -> _Making:
         whole=args.whole,
         size=None if args.size is None else _size(args.size),
         phi=None if args.phi is None else parse_number(args.phi, "--phi"),
-        angle_deg=WIDEST_DEG if args.angle is None else parse_number(args.angle, "--angle"),
+        angle_deg=None if args.angle is None else parse_number(args.angle, "--angle"),
     )
     straight, black = found.camera, found.warp.black
     facts = {
@@ -236,7 +236,7 @@ def _straight(args: Namespace, calibration: Calibration) -> _Making:
         f"{across:.1f} x {down:.1f} degrees, "
         f"{100.0 * found.shown:.1f} % of the photograph, {_black(found.warp.size, black)}"
     )
-    if found.limit_deg is not None:
+    if args.whole and found.limit_deg is not None:
         line += f"; nothing from {found.limit_deg:.1f} degrees off the axis on"
     return _Making(
         lambda path: (found.warp.apply(_read(path, camera, name)), {}, line),

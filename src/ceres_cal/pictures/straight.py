@@ -18,10 +18,13 @@ from ceres_cal.pictures.warp import Warp, make_warp, require_size
 from ceres_cal.transforms import Array, Pose
 
 WIDEST_DEG = 150.0
+MOST_STRETCH = 4.0
 _LEAST_DEG, _MOST_DEG = 1.0, 175.0
 _BORDER_STEP_PX = 0.25
 _RIM_STEPS = 20_000
 _HALVINGS = 60
+_ANGLE_STEP = 1e-6
+_ENDLESS = 1e12  # a stretch that no limit is meant to forbid
 _ROUGHLY = 2000  # places of the outline, for the search
 _GRID, _ROUNDS, _SHRINK = 9, 24, 0.6
 _ASPECTS = np.linspace(-1.2, 1.2, _GRID)  # logarithms
@@ -37,8 +40,8 @@ class Straight:
             the straight image.
         warp: makes the images.
         shown: share of the photograph's pixels that the straight image shows.
-        limit_deg: angle off the axis from which on nothing is shown, because the lens has no answer there or for
-            `angle_deg`; None where the photograph ends before.
+        limit_deg: angle off the axis from which on nothing is shown, because the lens has no answer there or draws
+            pixels out too much, or for `angle_deg`; None where the photograph ends before.
     """
 
     camera: Camera
@@ -60,7 +63,7 @@ def straighten(
     whole: bool = False,
     size: tuple[int, int] | None = None,
     phi: float | None = None,
-    angle_deg: float = WIDEST_DEG,
+    angle_deg: float | None = None,
 ) -> Straight:
     """How to straighten a camera's photographs.
 
@@ -71,18 +74,20 @@ def straighten(
         size: (width, height) px of the straight image; the photograph's by default.
         phi: instead of a size: the focal length, px; the camera's own keeps the scale in the middle.
         angle_deg: what is farther than half of it off the axis is left out: whatever the lens, a straight image ends
-            before 180 degrees.
+            before 180 degrees. None: 150 and, of a rectangle, as far as pixels are not drawn out more than 4 times as
+            in the middle. What lies close to where a lens folds is nothing but that.
 
     Raises:
         InputError: an image without pixels or too large, or nothing within the angle.
     """
-    if not _LEAST_DEG <= angle_deg <= _MOST_DEG:
+    if angle_deg is not None and not _LEAST_DEG <= angle_deg <= _MOST_DEG:
         raise InputError(f"the angle of view must be {_LEAST_DEG:g} to {_MOST_DEG:g} degrees, not {angle_deg:g}")
     if phi is not None and not (np.isfinite(phi) and phi > 0.0):
         raise InputError(f"phi must be above 0 px, not {phi:g}")
     wanted = camera.image_size if size is None else size
     require_size(wanted, "ask for another size")
-    region = _region(camera, np.radians(0.5 * angle_deg))
+    stretch = np.inf if whole or angle_deg is not None else MOST_STRETCH
+    region = _region(camera, _last_angle(camera, np.radians(0.5 * (angle_deg or WIDEST_DEG)), stretch))
     aspect = wanted[0] / wanted[1] if phi is None else None
     box = _box(region) if whole else _largest_rectangle(region, aspect)
     new_phi, new_size = _scaled(box, wanted, phi, whole=whole)
@@ -158,8 +163,7 @@ def _at_depth_1(camera: Camera, pixels: Array, slope: float) -> Array:
     return np.asarray(there)
 
 
-def _region(camera: Camera, most_rad: float) -> _Region:
-    angle = _last_angle(camera, most_rad)
+def _region(camera: Camera, angle: float) -> _Region:
     slope = float(np.tan(angle))
     border = _at_depth_1(camera, _border(camera.image_size), slope)
     turn = np.linspace(0.0, 2.0 * np.pi, _RIM_STEPS, endpoint=False)
@@ -175,12 +179,17 @@ def _region(camera: Camera, most_rad: float) -> _Region:
     return _Region(camera, slope, float(np.degrees(angle)) if len(rim) else None, outline)
 
 
-def _last_angle(camera: Camera, most_rad: float) -> float:
-    """The largest angle off the axis, up to `most_rad`, at which the lens has an answer: the same all around."""
+def _last_angle(camera: Camera, most_rad: float, most_stretch: float) -> float:
+    """The angle off the axis, up to `most_rad`, to which the lens has answers and draws nothing out more than that.
+
+    Measured along the image's x axis: lenses are the same all around, but for Brown's decentring.
+    """
 
     def answers(angle: float) -> bool:
-        ray = np.array([[np.sin(angle), 0.0, np.cos(angle)]])
-        return bool(np.isfinite(camera.lens.distort(ray, camera.phi)[0, 0]))
+        angles = np.array([angle - _ANGLE_STEP, angle])
+        rays = np.column_stack([np.sin(angles), np.zeros(2), np.cos(angles)])
+        measured = float(np.diff(camera.lens.distort(rays, camera.phi)[:, 0])[0])  # NaN where there is no answer
+        return camera.phi * float(np.diff(np.tan(angles))[0]) <= min(most_stretch, _ENDLESS) * measured
 
     low, high = 0.0, most_rad
     if answers(high):

@@ -80,18 +80,17 @@ def make_warp(size: tuple[int, int], photograph_size: tuple[int, int], places: C
         size: (width, height) of the picture, one that `require_size` lets pass.
         places: pixels (N, 2) of the picture -> pixels (N, 2) of the photograph, NaN where there are none.
     """
-    x, y = _placed(size, 1, places)
+    x, y = _placed(size, places)
     fine = _squares_along(x, y)
-    if fine > 1:
-        x, y = _placed(size, fine, places)
+    x, y = (_divided(plane, fine) for plane in (x, y))
     limit = np.array(photograph_size) - 0.5
     seen = (x >= -0.5) & (x <= limit[0]) & (y >= -0.5) & (y <= limit[1])  # False for NaN
     return Warp(size, photograph_size, fine, np.where(seen, x, -1.0), np.where(seen, y, -1.0), seen)
 
 
-def _placed(size: tuple[int, int], fine: int, places: Callable[[Array], Array]) -> tuple[Plane, Plane]:
-    """Places of the middles of all small squares."""
-    across, down = ((np.arange(fine * count) + 0.5) / fine - 0.5 for count in size)
+def _placed(size: tuple[int, int], places: Callable[[Array], Array]) -> tuple[Plane, Plane]:
+    """Places of all pixels and of one more around them."""
+    across, down = (np.arange(-1.0, count + 1.0) for count in size)
     found = np.empty((len(down), len(across), 2), dtype=np.float32)
     rows = max(1, _BLOCK // len(across))
     for top in range(0, len(down), rows):
@@ -101,8 +100,15 @@ def _placed(size: tuple[int, int], fine: int, places: Callable[[Array], Array]) 
     return found[..., 0], found[..., 1]
 
 
+def _divided(plane: Plane, fine: int) -> Plane:
+    """Of each pixel `fine` x `fine` squares, between their neighbours' middles; without the pixels around."""
+    size = fine * plane.shape[1], fine * plane.shape[0]
+    squares = plane if fine == 1 else cv2.resize(plane, size, interpolation=cv2.INTER_LINEAR)
+    return np.asarray(squares[fine:-fine, fine:-fine])
+
+
 def _squares_along(x: Plane, y: Plane) -> int:
-    """How many photograph's pixels a new one spans, as far as most of them go."""
+    """How many pixels of the photograph most of the new ones span."""
     spans = [np.hypot(np.diff(x, axis=axis), np.diff(y, axis=axis)).ravel() for axis in (0, 1)]
     finite = np.concatenate(spans)
     finite = finite[np.isfinite(finite)]
