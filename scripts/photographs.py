@@ -20,6 +20,7 @@ import cv2
 import numpy as np
 from accuracy import Row
 from numpy.typing import NDArray
+from straightness import straight_rows
 
 from ceres_cal.calibrate import calibrate
 from ceres_cal.camera import Camera
@@ -350,7 +351,7 @@ def draw(path: Path, found: FieldDetections, picture: Path) -> None:
     cv2.imwrite(str(picture), image)
 
 
-CASES = ("lines", "floor", "starts", "speed", "rings", "real")
+CASES = ("lines", "floor", "starts", "speed", "rings", "real", "straight")
 
 
 def rows_of(case: str, runs: int, real: Path | None, picture: Path | None) -> Iterator[Row]:
@@ -364,6 +365,9 @@ def rows_of(case: str, runs: int, real: Path | None, picture: Path | None) -> It
         yield from speed_rows(min(runs, 20))
     elif case == "rings":
         yield from rings_rows(min(runs, 20))
+    elif real is not None and case == "straight":
+        for keep_scale in (False, True):
+            yield from straight_rows(real, keep_scale)
     elif real is not None:
         yield from real_rows(real, picture)
 

@@ -6,7 +6,8 @@ from argparse import ArgumentParser, Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ceres_cal.cli.command import Answer, Command, add_output, finishing, parse_numbers, require_output
+from ceres_cal.cli.album import album_of
+from ceres_cal.cli.command import Answer, Command, add_output, add_report, finishing, parse_numbers, require_outputs
 from ceres_cal.errors import InputError
 
 if TYPE_CHECKING:
@@ -42,6 +43,7 @@ def read_inputs(args: Namespace) -> tuple[Calibration, Observations]:
 def _add_arguments(parser: ArgumentParser) -> None:
     add_inputs(parser)
     add_output(parser, "the new calibration", required=False)
+    add_report(parser)
     add = parser.add_argument
     what = "; ".join(f"{name}: {text}" for name, text in _HELP.items())
     add("--what", choices=tuple(_HELP), default="pose", help=f"what is free: {what}")
@@ -63,10 +65,12 @@ def _add_arguments(parser: ArgumentParser) -> None:
 
 
 def _run(args: Namespace) -> Answer:
-    require_output(args.output, args.observations)  # to replace the old calibration is what many want
+    require_outputs(args.output, args.report, args.observations)  # to replace the old calibration is what many want
     calibration, observations = read_inputs(args)
+    from ceres_cal.files import write_bytes
     from ceres_cal.moves import refit
 
+    album = album_of(args, observations, calibration)
     priors = tuple(_height(spec, observations) for spec in args.prior)
     result = refit(
         calibration,
@@ -77,9 +81,16 @@ def _run(args: Namespace) -> Answer:
         labels=args.labels,
         priors=priors,
     )
-    if args.output is not None:
-        with finishing():
+    page = ""
+    if args.report is not None:
+        from ceres_cal.report import make_report
+
+        page = make_report(result, observations, album=album)
+    with finishing():
+        if args.output is not None:
             result.save(args.output)
+        if args.report is not None:
+            write_bytes(args.report, page.encode())
     return Answer(_data(result, calibration, observations, args), lambda: _text(result, observations, args))
 
 
@@ -111,7 +122,7 @@ def _data(result: Calibration, before: Calibration, observations: Observations, 
     from ceres_cal.cli.summary import calibration_data
     from ceres_cal.moves import movements
 
-    found = calibration_data(result, observations, args.observations, args.output)
+    found = calibration_data(result, observations, args.observations, args.output, args.report)
     moves = {
         name: {"mm": 1e3 * shift_m, "deg": turn_deg} for name, (shift_m, turn_deg) in movements(before, result).items()
     }
@@ -126,4 +137,4 @@ def _text(result: Calibration, observations: Observations, args: Namespace) -> s
     refitted = result.refitted
     assert refitted is not None
     told = "\n".join(f"{'' if i else 'refit':10}{line}" for i, line in enumerate(refitted.explanation.split("; ")))
-    return f"{told}\n{calibration_text(result, observations, args.observations, args.output)}"
+    return f"{told}\n{calibration_text(result, observations, args.observations, args.output, args.report)}"

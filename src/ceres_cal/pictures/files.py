@@ -8,6 +8,8 @@ from ceres_cal.errors import InputError
 from ceres_cal.pictures.overlay import in_8_bit_colour
 from ceres_cal.pictures.warp import Image
 
+_QUALITIES = (90, 80, 70, 55, 40, 25)
+
 
 def encoded(picture: Image, ending: str, jpeg_quality: int) -> bytes:
     """The content of an image file: ".png" as it is, ".jpg" in 8 bit.
@@ -20,3 +22,16 @@ def encoded(picture: Image, ending: str, jpeg_quality: int) -> bytes:
     if not done:
         raise InputError(f"a picture of {picture.shape[1]} x {picture.shape[0]} px cannot be written as {ending}")
     return bytes(content)
+
+
+def jpeg_of_at_most(picture: Image, widest_px: int, most_bytes: int) -> bytes:
+    """A JPEG no wider than that, as good as the bytes allow."""
+    width, height = picture.shape[1], picture.shape[0]
+    if width > widest_px:
+        size = (widest_px, max(1, round(height * widest_px / width)))
+        picture = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
+    for quality in _QUALITIES:
+        content = encoded(picture, ".jpg", quality)
+        if len(content) <= most_bytes:
+            break
+    return content

@@ -42,10 +42,10 @@ class Layer:
 
 @dataclass(frozen=True, eq=False)
 class Marks:
-    """Observed pixels (N, 2) in one colour; dots, or crosses for what was taken out."""
+    """Observed pixels (N, 2) in one colour, with what they are; dots, or crosses for what was taken out."""
 
     pixels: Array
-    label: str
+    what: str
     colour: Colour
     crosses: bool = False
 
@@ -69,7 +69,7 @@ def draw_overlay(photograph: Image, layers: Sequence[Layer], marks: Sequence[Mar
             _draw_dots(canvas, mark.pixels, _DOT_PX * thick, mark.colour)
     return _with_legend(
         canvas,
-        [*((layer.label, layer.colour) for layer in layers), *((mark.label, mark.colour) for mark in marks)],
+        [*((layer.label, layer.colour) for layer in layers), *((mark.what, mark.colour) for mark in marks)],
         thick,
     )
 
