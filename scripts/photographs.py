@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 from accuracy import Row
 from numpy.typing import NDArray
-from straightness import straight_rows
+from straightness import observed_boards, straight_rows
 
 from ceres_cal.calibrate import calibrate
 from ceres_cal.camera import Camera
@@ -366,8 +366,9 @@ def rows_of(case: str, runs: int, real: Path | None, picture: Path | None) -> It
     elif case == "rings":
         yield from rings_rows(min(runs, 20))
     elif real is not None and case == "straight":
+        boards = observed_boards(real)
         for keep_scale in (False, True):
-            yield from straight_rows(real, keep_scale)
+            yield from straight_rows(real, boards, keep_scale)
     elif real is not None:
         yield from real_rows(real, picture)
 

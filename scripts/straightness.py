@@ -29,6 +29,7 @@ from ceres_cal.pictures.warp import Image
 from ceres_cal.targets import checkerboard
 from ceres_cal.transforms import Array, Pose
 
+FOLDER = "udacity_gopro_wide"
 COLUMNS, ROWS = 8, 6
 THREE = Options(lens="brown", free_aspect=True, fixed={"p1": 0.0, "p2": 0.0})
 CLICKS = ((227.0, 205.0), (1112.0, 188.0), (1005.0, 880.0), (367.0, 908.0))
@@ -84,21 +85,24 @@ def opencv_calibration(boards: BoardDetections, size: tuple[int, int]) -> tuple[
     return np.asarray(matrix, dtype=float), np.asarray(lens, dtype=float)
 
 
-def straight_rows(real: Path, keep_scale: bool = False) -> Iterator[Row]:
+def observed_boards(real: Path) -> BoardDetections:
+    """The boards of all photographs."""
+    return detect_boards(sorted((real / FOLDER).glob("GOPR*.jpg")), checkerboard(COLUMNS, ROWS, 1.0))
+
+
+def straight_rows(real: Path, boards: BoardDetections, keep_scale: bool = False) -> Iterator[Row]:
     """Of test_image.jpg and of the boards: how far corners lie off their rows and columns, ours and OpenCV's.
 
     Args:
         keep_scale: in a straight image as large as keeps the photograph's scale in the middle, not of its size.
     """
-    folder = real / "udacity_gopro_wide"
-    boards = detect_boards(sorted(folder.glob("GOPR*.jpg")), checkerboard(COLUMNS, ROWS, 1.0))
     camera = calibrate(boards.observations, THREE).station()
     straight = straighten(camera, whole=True, phi=camera.phi if keep_scale else None)
     pinhole = (straight.camera.matrix, straight.camera.image_size)
     matrix, lens = opencv_calibration(boards, camera.image_size)
     peer_maps = cv2.initUndistortRectifyMap(matrix, lens, np.eye(3), *pinhole, cv2.CV_32FC1)  # as cv2.undistort does
     case = f"straight, phi {straight.camera.phi:.0f} px"
-    starts = {folder / "test_image.jpg": clicked_grid(camera, straight)}
+    starts = {real / FOLDER / "test_image.jpg": clicked_grid(camera, straight)}
     points = boards.observations.points
     for view, path in enumerate(boards.found):
         grid = np.empty((ROWS * COLUMNS, 2))

@@ -86,8 +86,8 @@ def _picture(material: Material, album: Album, frame: Frame, number: int) -> Pho
         layers.insert(0, Layer(model_of(before, frame), name, BEFORE))
         median, worst = model.apart_px(layers[0].model)
         said.append(f"Cyan: {name}, {fixed(median, 2)} px away in the median and {fixed(worst, 2)} px at most.")
-    marks = marks_of(calibration, material.observations, frame)
-    said += [f"{count(len(one.pixels), 'observation')} {one.what}." for one in marks]
+    marks = [one for one in marks_of(calibration, material.observations, frame) if one.crosses]  # dots would hide paint
+    said += [f"Crosses: {count(len(one.pixels), 'observation')} taken out." for one in marks]
     drawn = draw_overlay(image, layers, marks)
     return Photograph(
         f"photograph-{number}",
