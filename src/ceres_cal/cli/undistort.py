@@ -186,16 +186,9 @@ class _Making:
 
 
 def _read(path: Path, camera: Camera, name: str) -> Image:
-    from ceres_cal.detect.boards import read_colour
+    from ceres_cal.pictures.files import read_photograph
 
-    image = read_colour(path)
-    size = (image.shape[1], image.shape[0])
-    if size != camera.image_size:
-        raise InputError(
-            f"{path}: {size[0]} x {size[1]} px, but camera {name!r} has {camera.image_size[0]} x "
-            f"{camera.image_size[1]}: give photographs of the size that was calibrated"
-        )
-    return image
+    return read_photograph(path, camera.image_size, name)
 
 
 def _write(path: Path, picture: Image) -> None:

@@ -1,14 +1,33 @@
-"""Pictures as bytes of image files."""
+"""Photographs out of image files, and pictures as bytes of them."""
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import cv2
 
+from ceres_cal.detect.boards import read_colour
 from ceres_cal.errors import InputError
 from ceres_cal.pictures.overlay import in_8_bit_colour
 from ceres_cal.pictures.warp import Image
 
 _QUALITIES = (90, 80, 70, 55, 40, 25)
+
+
+def read_photograph(path: Path, image_size: tuple[int, int], camera: str) -> Image:
+    """A camera's photograph as (height, width) or (height, width, 3), pixels as stored.
+
+    Raises:
+        InputError: no image, or of another size than the camera's.
+    """
+    image = read_colour(path)
+    size = (image.shape[1], image.shape[0])
+    if size != image_size:
+        raise InputError(
+            f"{path}: {size[0]} x {size[1]} px, but camera {camera!r} has {image_size[0]} x {image_size[1]}: "
+            "give photographs of the size that was calibrated"
+        )
+    return image
 
 
 def encoded(picture: Image, ending: str, jpeg_quality: int) -> bytes:

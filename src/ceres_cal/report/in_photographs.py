@@ -9,9 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ceres_cal.calibration import Calibration
-from ceres_cal.detect.boards import read_colour
-from ceres_cal.errors import InputError
-from ceres_cal.pictures.files import jpeg_of_at_most
+from ceres_cal.pictures.files import jpeg_of_at_most, read_photograph
 from ceres_cal.pictures.frames import Frame, frames_of, marks_of, model_of
 from ceres_cal.pictures.overlay import AFTER, BEFORE, Layer, draw_overlay
 from ceres_cal.report.material import ClosedForm, Material
@@ -75,12 +73,8 @@ def _rms_px(material: Material, frame: Frame) -> float:
 def _picture(material: Material, album: Album, frame: Frame, number: int) -> Photograph:
     calibration, path = material.calibration, album.paths[frame.name]
     model = model_of(calibration, frame)
-    image = read_colour(path)
-    if image.shape[1::-1] != model.image_size:
-        raise InputError(
-            f"{path}: {image.shape[1]} x {image.shape[0]} px, but its camera has {model.image_size[0]} x "
-            f"{model.image_size[1]}: give the photographs that were observed"
-        )
+    owner = calibration.estimate.stations[frame.station].camera
+    photograph = read_photograph(path, model.image_size, owner)
     layers, said = [Layer(model, "this calibration", AFTER)], []
     for before, name in _before(material, album, frame):
         layers.insert(0, Layer(model_of(before, frame), name, BEFORE))
@@ -88,7 +82,7 @@ def _picture(material: Material, album: Album, frame: Frame, number: int) -> Pho
         said.append(f"Cyan: {name}, {fixed(median, 2)} px away in the median and {fixed(worst, 2)} px at most.")
     marks = [one for one in marks_of(calibration, material.observations, frame) if one.crosses]  # dots would hide paint
     said += [f"Crosses: {count(len(one.pixels), 'observation')} taken out." for one in marks]
-    drawn = draw_overlay(image, layers, marks)
+    drawn = draw_overlay(photograph, layers, marks)
     return Photograph(
         f"photograph-{number}",
         f"Frame {frame.name}, {frame.station}",
