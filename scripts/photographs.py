@@ -19,6 +19,7 @@ import cv2
 import numpy as np
 from cases import Row, exit_code, json_text, printed
 from numpy.typing import NDArray
+from straightness import observed_boards, straight_rows
 
 from ceres_cal.calibrate import calibrate
 from ceres_cal.camera import Camera
@@ -349,7 +350,7 @@ def draw(path: Path, found: FieldDetections, picture: Path) -> None:
     cv2.imwrite(str(picture), image)
 
 
-CASES = ("lines", "floor", "starts", "speed", "rings", "real")
+CASES = ("lines", "floor", "starts", "speed", "rings", "real", "straight")
 
 
 def rows_of(case: str, runs: int, real: Path | None, picture: Path | None) -> Iterator[Row]:
@@ -363,6 +364,10 @@ def rows_of(case: str, runs: int, real: Path | None, picture: Path | None) -> It
         yield from speed_rows(min(runs, 20))
     elif case == "rings":
         yield from rings_rows(min(runs, 20))
+    elif real is not None and case == "straight":
+        boards = observed_boards(real)
+        for keep_scale in (False, True):
+            yield from straight_rows(real, boards, keep_scale)
     elif real is not None:
         yield from real_rows(real, picture)
 

@@ -100,6 +100,7 @@ def test_help_lists_every_command(say: Say) -> None:
         "export-table",
         "simulate",
         "targets",
+        "undistort",
     }
     assert say("detect", "-h").out.count("board") > 0
 

@@ -50,6 +50,7 @@ FLOORS = {
     "calibrate": 5,
     "diagnostics": 5,
     "photographs": 5,
+    "pictures": 5,
     "moves": 5,
     "formats": 6,
     "report": 6,
@@ -60,7 +61,7 @@ FLOORS = {
 DOORS = {
     "pyceres": {"bundle"},
     "numba": {"kernels"},
-    "cv2": {"detect", "simulate", "formats"},
+    "cv2": {"detect", "simulate", "pictures", "formats"},
     "pycolmap": {"planes", "formats"},
     "matplotlib": {"report"},
     "scipy": set(),  # for the tests only

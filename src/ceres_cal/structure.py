@@ -43,6 +43,15 @@ class Tolerance:
 
 
 @dataclass(frozen=True, eq=False)
+class Built:
+    """A target as built: where its points (P, 3) lie, m, and its tracks (3, C, 3, 3) as `Target.tracks` has them."""
+
+    target: Target
+    points: Array
+    tracks: Array
+
+
+@dataclass(frozen=True, eq=False)
 class Structure:
     """The corrections of all targets.
 
@@ -66,25 +75,44 @@ class Structure:
 
     def points(self, sights: Sights) -> Array:
         """(N, 3) where the observed points of the sights lie, m."""
-        if not len(self.values):
-            return sights.points
-        moved = np.append(self.values, 0.0)[self.point_slots[sights.feature]]  # slot -1 is the 0 at the end
-        bow = np.sum(moved[:, 2:] * self.bends[sights.feature], axis=1)
-        return np.asarray(sights.points + np.column_stack([moved[:, :2], bow]))
+        return self._points(sights.points, sights.feature)
 
     def tracks(self, sights: Sights) -> Array:
         """(T, 3, 3) the tracks of all targets as built."""
+        return self._tracks(sights.tracks, sights.is_arc)
+
+    def built(self, targets: Mapping[str, Target]) -> dict[str, Built]:
+        """Every target as built; `targets` are those that the corrections were made for, in that order."""
+        points = np.concatenate([target.point_array for target in targets.values()])
+        tracks = np.concatenate([target.tracks.reshape(-1, 3, 3) for target in targets.values()])
+        is_arc = np.concatenate([np.tile(target.is_arc, 3) for target in targets.values()])
+        points, tracks = self._points(points, np.arange(len(points))), self._tracks(tracks, is_arc)
+        found = {}
+        for name, target in targets.items():
+            own, points = np.split(points, [len(target.points)])
+            curves, tracks = np.split(tracks, [3 * len(target.curves)])
+            found[name] = Built(target, own, curves.reshape(3, -1, 3, 3))
+        return found
+
+    def _points(self, points: Array, feature: NDArray[np.int64]) -> Array:
         if not len(self.values):
-            return sights.tracks
+            return points
+        moved = np.append(self.values, 0.0)[self.point_slots[feature]]  # slot -1 is the 0 at the end
+        bow = np.sum(moved[:, 2:] * self.bends[feature], axis=1)
+        return np.asarray(points + np.column_stack([moved[:, :2], bow]))
+
+    def _tracks(self, given: Array, is_arc: NDArray[np.bool_]) -> Array:
+        if not len(self.values):
+            return given
         moved = np.append(self.values, 0.0)[self.track_slots]
-        tracks = sights.tracks.copy()
-        straight = ~sights.is_arc
+        tracks = given.copy()
+        straight = ~is_arc
         along = tracks[straight, 1, :2]
         length = np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-300)
         tracks[straight, 0, :2] += moved[straight, :1] * np.column_stack([-along[:, 1], along[:, 0]]) / length
-        tracks[sights.is_arc, 0, :2] += moved[sights.is_arc, :2]
-        tracks[sights.is_arc, 1, 0] += moved[sights.is_arc, 2]
-        tracks[sights.is_arc, 2, 1] += moved[sights.is_arc, 2]
+        tracks[is_arc, 0, :2] += moved[is_arc, :2]
+        tracks[is_arc, 1, 0] += moved[is_arc, 2]
+        tracks[is_arc, 2, 1] += moved[is_arc, 2]
         return tracks
 
 

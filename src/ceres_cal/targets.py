@@ -20,6 +20,8 @@ from ceres_cal.errors import InputError
 from ceres_cal.files import convert
 from ceres_cal.transforms import Array
 
+MOVABLE = ("checkerboard", "rings")
+"""Kinds of targets that lie where somebody put them; the others are the world."""
 SIDES = {"centre": 0, "left": 1, "right": -1}
 """Which part of a painted curve was observed. Left and right are those of someone walking along it: from `start` to
 `end` of a segment, counter-clockwise on an arc (so left is the inside)."""

@@ -13,7 +13,7 @@ from ceres_cal.camera import Camera
 from ceres_cal.observations import Prior
 from ceres_cal.simulate import ViewPlan, board_pose, well_inside
 from ceres_cal.structure import Tolerance
-from ceres_cal.targets import Arc, Target, along_track, checkerboard, custom
+from ceres_cal.targets import MOVABLE, Arc, Target, along_track, checkerboard, custom
 from ceres_cal.transforms import Array
 
 HEIGHT_SIGMAS_M = (0.02, 0.01, 0.005)
@@ -32,7 +32,6 @@ _BOARD_PLACES = (0.2, 0.5, 0.8)  # of the image's width and height
 _BOARD_TILTS_DEG = (20.0, 40.0)
 _NEARER = ("upper", "right", "lower", "left")  # the edge that leans towards the camera, by quarter turns
 _LEAST_HEIGHT_M = 0.05  # of any corner of a board over the floor
-_MOVABLE = ("checkerboard", "rings")
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,7 +188,7 @@ def boards(search: Search) -> Iterator[Measurement]:
 
 def still(targets: Mapping[str, Target]) -> Iterator[tuple[str, Target]]:
     """The targets that lie in the world."""
-    yield from ((name, target) for name, target in targets.items() if target.kind not in _MOVABLE)
+    yield from ((name, target) for name, target in targets.items() if target.kind not in MOVABLE)
 
 
 def lines(search: Search) -> Iterator[Measurement]:

@@ -23,12 +23,13 @@ from ceres_cal.cli.refit import COMMANDS as REFIT
 from ceres_cal.cli.simulate import COMMANDS as SIMULATE
 from ceres_cal.cli.table import COMMANDS as TABLE
 from ceres_cal.cli.targets import COMMANDS as TARGETS
+from ceres_cal.cli.undistort import COMMANDS as UNDISTORT
 from ceres_cal.errors import CalibrationError, InputError, SolutionError
 
 _GROUPS = (
     *(DETECT_BOARD, DETECT_RINGS, DETECT_FIELD),
     *(CALIBRATE, DIAGNOSE, ADVISE, REFIT, CHECK, COMPARE),
-    *(LOCATE, TABLE, SIMULATE, TARGETS),
+    *(LOCATE, UNDISTORT, TABLE, SIMULATE, TARGETS),
 )
 COMMANDS = {command.name: command for group in _GROUPS for command in group}
 _BEGINNINGS = {"", *(name.partition(" ")[0] for name in COMMANDS if " " in name)}

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ceres_cal.cli.album import album_of
 from ceres_cal.cli.command import (
     Answer,
     Command,
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from ceres_cal.calibration import Calibration
     from ceres_cal.observations import Observations, Prior
     from ceres_cal.parameters import Options
+    from ceres_cal.report import Album
     from ceres_cal.structure import Tolerance
 
 _STATION_QUANTITIES = ("height_m", "position_m")
@@ -102,6 +104,7 @@ def _run(args: Namespace) -> Answer:
     from ceres_cal.observations import Observations, combine
 
     observations = combine([Observations.load(path) for path in args.observations])
+    album = album_of(args, observations)
     options = _options(args, fixed, powers, observations)
     with ProgressBar(silent=args.quiet or args.json) as bar:
         from ceres_cal.kernels.jit import CACHE_FOLDER
@@ -111,7 +114,7 @@ def _run(args: Namespace) -> Answer:
         from ceres_cal.calibrate import calibrate
 
         calibration = calibrate(observations, options, _shown_on(bar, options.max_iterations))
-        page = _page(calibration, observations, bar) if args.report is not None else ""
+        page = _page(calibration, observations, album, bar) if args.report is not None else ""
     with finishing():
         if args.output is not None:
             calibration.save(args.output)
@@ -123,11 +126,11 @@ def _run(args: Namespace) -> Answer:
     )
 
 
-def _page(calibration: Calibration, observations: Observations, bar: ProgressBar) -> str:
+def _page(calibration: Calibration, observations: Observations, album: Album | None, bar: ProgressBar) -> str:
     from ceres_cal.report import make_report
 
     bar.update(0, 1, "drawing the report")
-    return make_report(calibration, observations)
+    return make_report(calibration, observations, album=album)
 
 
 COMMANDS = (Command("calibrate", "calibrate cameras from observations of fields and boards", _add_arguments, _run),)

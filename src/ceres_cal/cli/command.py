@@ -102,6 +102,14 @@ def add_report(parser: argparse.ArgumentParser) -> None:
         type=Path,
         help="file for a page (.html): may it be trusted, for what, to how many mm",
     )
+    parser.add_argument(
+        "--images",
+        metavar="PHOTOGRAPH",
+        action="append",
+        default=[],
+        help="with --report: a photograph, or a folder of them, named like the frames: the model is drawn into them; "
+        "repeatable",
+    )
 
 
 def require_outputs(output: Path | None, report: Path | None, inputs: Sequence[str | Path]) -> None:

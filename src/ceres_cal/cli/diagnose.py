@@ -5,6 +5,7 @@ from __future__ import annotations
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
 
+from ceres_cal.cli.album import album_of
 from ceres_cal.cli.command import Answer, Command, add_output, add_report, finishing, parse_number, require_outputs
 from ceres_cal.errors import InputError
 
@@ -50,13 +51,14 @@ def _run(args: Namespace) -> Answer:
 
     calibration = Calibration.load(args.calibration)
     observations = combine([Observations.load(path) for path in args.observations])
+    album = album_of(args, observations)
     diagnosis = diagnose(calibration, observations, new_data=args.new_data, false_alarm_rate=rate)
     choice = choose(observations, calibration.options, args.folds) if args.held_out else None
     page = ""
     if args.report is not None:
         from ceres_cal.report import make_report
 
-        page = make_report(calibration, observations, diagnosis, choice)
+        page = make_report(calibration, observations, diagnosis, choice, album)
     with finishing():
         if args.output is not None:
             diagnosis.table.save(args.output)

@@ -6,7 +6,8 @@ from argparse import ArgumentParser, Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ceres_cal.cli.command import Answer, Command, add_output, finishing, parse_numbers, require_output
+from ceres_cal.cli.album import album_of
+from ceres_cal.cli.command import Answer, Command, add_output, add_report, finishing, parse_numbers, require_outputs
 from ceres_cal.cli.moved import (
     add_inputs,
     not_painted,
@@ -36,6 +37,7 @@ _HELP = {
 def _add_arguments(parser: ArgumentParser) -> None:
     add_inputs(parser)
     add_output(parser, "the new calibration", required=False)
+    add_report(parser)
     add = parser.add_argument
     what = "; ".join(f"{name}: {text}" for name, text in _HELP.items())
     add("--what", choices=tuple(_HELP), default="pose", help=f"what is free: {what}")
@@ -58,12 +60,15 @@ def _add_arguments(parser: ArgumentParser) -> None:
 
 def _run(args: Namespace) -> Answer:
     images = photographs_in(args)
-    require_output(args.output, images or args.inputs)  # to replace the old calibration is what many want
+    # To replace the old calibration is what many want.
+    require_outputs(args.output, args.report, images or args.inputs)
     calibration = read_calibration(args)
     found = _photographed(args, calibration, images) if images else None
     observations = read_observations(args) if found is None else found.require()
+    from ceres_cal.files import write_bytes
     from ceres_cal.moves import refit
 
+    album = album_of(args, observations, calibration, images)
     priors = tuple(_height(spec, observations) for spec in args.prior)
     result = refit(
         calibration,
@@ -74,9 +79,16 @@ def _run(args: Namespace) -> Answer:
         labels=args.labels,
         priors=priors,
     )
-    if args.output is not None:
-        with finishing():
+    page = ""
+    if args.report is not None:
+        from ceres_cal.report import make_report
+
+        page = make_report(result, observations, album=album)
+    with finishing():
+        if args.output is not None:
             result.save(args.output)
+        if args.report is not None:
+            write_bytes(args.report, page.encode())
     data = _data(result, calibration, observations, args) | photographs_data(found)
     return Answer(data, lambda: _text(result, observations, found, args))
 
@@ -116,7 +128,7 @@ def _data(result: Calibration, before: Calibration, observations: Observations, 
     from ceres_cal.cli.summary import calibration_data
     from ceres_cal.moves import movements
 
-    found = calibration_data(result, observations, args.inputs, args.output)
+    found = calibration_data(result, observations, args.inputs, args.output, args.report)
     moves = {
         name: {"mm": 1e3 * shift_m, "deg": turn_deg} for name, (shift_m, turn_deg) in movements(before, result).items()
     }
@@ -131,5 +143,5 @@ def _text(result: Calibration, observations: Observations, found: KnownDetection
     refitted = result.refitted
     assert refitted is not None
     told = "\n".join(f"{'' if i else 'refit':10}{line}" for i, line in enumerate(refitted.explanation.split("; ")))
-    summary = calibration_text(result, observations, args.inputs, args.output)
+    summary = calibration_text(result, observations, args.inputs, args.output, args.report)
     return "\n".join([told, *photographs_text(found), summary])

@@ -121,8 +121,17 @@ def read_grey(path: str | Path) -> Image:
     Raises:
         InputError: the file is missing or no image.
     """
+    return _decoded(path, cv2.IMREAD_GRAYSCALE)
+
+
+def read_colour(path: str | Path) -> Image:
+    """An image as (height, width) grey levels or (height, width, 3) blue, green and red; otherwise as `read_grey`."""
+    return _decoded(path, cv2.IMREAD_ANYCOLOR)
+
+
+def _decoded(path: str | Path, channels: int) -> Image:
     content = np.frombuffer(read_bytes(path), np.uint8)
-    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+    flags = channels | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
     image = cv2.imdecode(content, flags) if content.size else None
     if image is None:
         raise InputError(f"{path}: not an image that OpenCV can read (cut short?): convert it to PNG or leave it out")

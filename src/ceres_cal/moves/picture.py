@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 
 from ceres_cal.moves.comparison import StationComparison
-from ceres_cal.targets import Arc, Target, along_track
+from ceres_cal.targets import MOVABLE, Arc, Target, along_track
 
 _SCALE = 80.0  # px per metre
 _MARGIN_M = 0.6
@@ -52,7 +52,7 @@ def _colour(share: float) -> str:
 
 def _field(targets: Mapping[str, Target], left: float, top: float) -> Iterator[str]:
     for target in targets.values():
-        if target.kind in ("checkerboard", "rings"):
+        if target.kind in MOVABLE:
             continue
         for curve in target.curves.values():
             is_arc = isinstance(curve, Arc)

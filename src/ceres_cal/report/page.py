@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from base64 import b64encode
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
@@ -106,10 +107,29 @@ class Picture:
 
 
 @dataclass(frozen=True)
+class Photograph:
+    """A picture that is an image (JPEG), across both columns, and a sentence on what it shows."""
+
+    name: str
+    title: str
+    reading: str
+    jpeg: bytes
+    wide: bool = True
+
+    def html(self) -> str:
+        content = b64encode(self.jpeg).decode("ascii")
+        return (
+            f'<figure id="{escape(self.name)}" class="wide"><h3>{escape(self.title)}</h3>'
+            f'<img alt="{escape(self.title)}" src="data:image/jpeg;base64,{content}">'
+            f"<figcaption>{escape(self.reading)}</figcaption></figure>"
+        )
+
+
+@dataclass(frozen=True)
 class Gallery:
     """Pictures, two beside one another where there is room; one that is left over has its words beside it."""
 
-    pictures: tuple[Picture, ...]
+    pictures: tuple[Picture | Photograph, ...]
 
     def html(self) -> str:
         elements = [picture.html() for picture in self.pictures]

@@ -10,6 +10,7 @@ from ceres_cal.diagnostics import Choice, Diagnosis, diagnose
 from ceres_cal.files import write_bytes
 from ceres_cal.observations import Observations
 from ceres_cal.report.findings import findings
+from ceres_cal.report.in_photographs import Album, in_photographs
 from ceres_cal.report.lens_picture import distortion
 from ceres_cal.report.maps import map_picture
 from ceres_cal.report.material import ClosedForm, Material
@@ -35,19 +36,24 @@ def make_report(
     observations: Observations,
     diagnosis: Diagnosis | None = None,
     choice: Choice | None = None,
+    album: Album | None = None,
 ) -> str:
     """One self-contained HTML page on a calibration: verdict, findings, numbers, pictures.
 
     Args:
         observations: those it was made from; or others, with a diagnosis of them (`new_data`).
         diagnosis: of these observations; made here where there is none. choice: of lens, by held-out error.
+        album: photographs of the frames, for a chapter with the model drawn into them.
 
     Raises:
-        InputError: the observations are not those of the calibration, and no diagnosis says so.
+        InputError: the observations are not those of the calibration, and no diagnosis says so; or a photograph cannot
+            be read.
     """
     found = diagnose(calibration, observations) if diagnosis is None else diagnosis
     material = Material(calibration, observations, found)
-    chapters = [verdict(material), findings(material, choice), numbers(material), *_pictures(material)]
+    chapters = [verdict(material), findings(material, choice), numbers(material)]
+    chapters += [] if album is None else [in_photographs(material, album)]
+    chapters += _pictures(material)
     return page(", ".join(list(observations.cameras)[:4]), _about(material), chapters, _foot(calibration))
 
 
@@ -57,13 +63,14 @@ def write_report(
     observations: Observations,
     diagnosis: Diagnosis | None = None,
     choice: Choice | None = None,
+    album: Album | None = None,
 ) -> None:
     """Write `make_report`'s page.
 
     Raises:
         InputError: see `make_report`; or the file cannot be written.
     """
-    write_bytes(path, make_report(calibration, observations, diagnosis, choice).encode())
+    write_bytes(path, make_report(calibration, observations, diagnosis, choice, album).encode())
 
 
 def _pictures(material: Material) -> Iterator[Chapter]:

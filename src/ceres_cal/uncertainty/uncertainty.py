@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from ceres_cal.errors import InputError
 from ceres_cal.parameters import Estimate
-from ceres_cal.targets import Target
+from ceres_cal.targets import MOVABLE, Target
 from ceres_cal.transforms import Array
 from ceres_cal.uncertainty.maps import FieldMap, PointSpread, field_map, spread_of_points
 from ceres_cal.uncertainty.posterior import Posterior
@@ -25,7 +25,6 @@ from ceres_cal.uncertainty.weak import (
     weak_directions,
 )
 
-_MOVABLE = ("checkerboard", "rings")
 _GRID = 36  # steps along the longer side
 
 
@@ -131,7 +130,7 @@ def field_grid(targets: Mapping[str, Target]) -> tuple[Array, Array]:
     Raises:
         InputError: there is nothing that does not move.
     """
-    box = [_corners(target) for target in targets.values() if target.kind not in _MOVABLE]
+    box = [_corners(target) for target in targets.values() if target.kind not in MOVABLE]
     if not box:
         raise InputError("no field to draw a map of: give x_m and y_m")
     low, high = np.min([b[0] for b in box], axis=0), np.max([b[1] for b in box], axis=0)

@@ -1,0 +1,330 @@
+"""`ceres-cal undistort`: straight images, top views to scale, and the model drawn into photographs."""
+
+from __future__ import annotations
+
+import os
+from argparse import ArgumentParser, Namespace
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ceres_cal.cli.command import Answer, Command, finishing, parse_number, parse_numbers
+from ceres_cal.cli.detect import image_files
+from ceres_cal.cli.progress import ProgressBar
+from ceres_cal.errors import InputError
+
+if TYPE_CHECKING:
+    from ceres_cal.calibration import Calibration
+    from ceres_cal.camera import Camera
+    from ceres_cal.pictures.warp import Image
+
+_MARGIN_M = 0.3  # around the field in a top view
+_JPEG_QUALITY = 95
+_FORMAT, _VERSION = "ceres-cal/pictures", 1
+_OF_STRAIGHT = ("whole", "crop", "size", "phi", "angle")
+_OF_TOP = ("mm_per_px", "area")
+_OF_OVERLAY = ("before", "observations")
+
+
+def _add_arguments(parser: ArgumentParser) -> None:
+    add = parser.add_argument
+    add("calibration", metavar="CALIBRATION", type=Path, help="file that `ceres-cal calibrate` or `refit` wrote")
+    add("images", nargs="+", metavar="IMAGE", help="photographs of one camera, or folders of them")
+    add("-o", "--output", metavar="FOLDER", type=Path, required=True, help="for the pictures; made if missing")
+    add("--camera", metavar="NAME", help="which camera; may be left out where there is only one")
+    add("--station", metavar="NAME", help="which station; may be left out where there is only one")
+    add("--format", choices=("png", "jpg"), default="png", help="default: png, which loses nothing")
+    add("--quiet", action="store_true", help="no progress")
+    group = parser.add_argument_group("straight images (default)")
+    either = group.add_mutually_exclusive_group()
+    either.add_argument("--crop", action="store_true", help="the largest rectangle without black (default)")
+    either.add_argument("--whole", action="store_true", help="everything that the photograph shows, black around it")
+    scale = group.add_mutually_exclusive_group()
+    scale.add_argument("--size", metavar="WxH", help="size of the straight image, px; default: the photograph's")
+    scale.add_argument("--phi", metavar="PX", help="its focal length instead; the camera's own keeps the scale")
+    group.add_argument(
+        "--angle", metavar="DEG", help="widest angle of view; default: 150 with --whole, else as far as detail goes"
+    )
+    group = parser.add_argument_group("the field from above")
+    group.add_argument("--top-view", action="store_true", help="the field from straight above, to scale")
+    group.add_argument("--mm-per-px", metavar="MM", help="scale of the top view; default: 5")
+    group.add_argument("--area", metavar="X0,Y0,X1,Y1", help="area in metres; default: the field and 0.3 m around it")
+    group = parser.add_argument_group("the model in the photograph")
+    group.add_argument("--overlay", action="store_true", help="draw the calibrated lines and boards into photographs")
+    group.add_argument("--before", metavar="CALIBRATION", type=Path, help="draw an earlier calibration too")
+    group.add_argument("--observations", metavar="OBS", type=Path, help="say what each frame shows, and draw them too")
+    parser.add_argument("--height-mm", metavar="MM", help="plane of the top view, or of a second drawing in an overlay")
+
+
+def _run(args: Namespace) -> Answer:
+    require_fitting(args)
+    images = list(image_files(args.images))
+    kind = "top" if args.top_view else "overlay" if args.overlay else "straight"
+    outputs = _outputs(images, args.output, f"-{kind}.{args.format}", f"{kind}.json")
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")  # what it warns of in an image, we say ourselves
+    from ceres_cal.calibration import Calibration
+    from ceres_cal.files import write_json
+
+    calibration = Calibration.load(args.calibration)
+    make = {"top": _top_view, "overlay": _overlay, "straight": _straight}[kind](args, calibration)
+    args.output.mkdir(parents=True, exist_ok=True)
+    told: dict[str, str] = {}
+    written: list[dict[str, Any]] = []
+    with ProgressBar(silent=args.quiet or args.json) as bar:
+        for number, (path, output) in enumerate(outputs.items(), start=1):
+            picture, facts, told[str(output)] = make.picture(path)
+            _write(output, picture)
+            written.append({"image": str(path), "output": str(output), **facts})
+            bar.update(number, len(outputs), path.name)
+    about = args.output / f"{kind}.json"
+    data = {"format": _FORMAT, "version": _VERSION, "calibration": str(args.calibration), "kind": kind, **make.facts}
+    with finishing():
+        write_json(about, {**data, "pictures": written})
+    lines = [*(f"{output}: {text}" for output, text in told.items()), f"{about}: {make.about}"]
+    return Answer({**data, "pictures": written, "output": str(about)}, lambda: "\n".join(lines))
+
+
+COMMANDS = (
+    Command("undistort", "straight images, top views to scale, the model in a photograph", _add_arguments, _run),
+)
+
+
+# ---- options --------------------------------------------------------------------------------------------------------
+
+
+def require_fitting(args: Namespace) -> None:
+    """Raise InputError where options of different pictures are mixed."""
+    if args.top_view and args.overlay:
+        raise InputError("--top-view and --overlay are two kinds of pictures: make one at a time")
+    groups = (
+        (_OF_STRAIGHT, not (args.top_view or args.overlay), "straight images"),
+        (_OF_TOP, args.top_view, "--top-view"),
+        (_OF_OVERLAY, args.overlay, "--overlay"),
+        (("height_mm",), args.top_view or args.overlay, "--top-view and --overlay"),
+    )
+    for names, chosen, what in groups:
+        given = [name for name in names if getattr(args, name)]
+        if given and not chosen:
+            raise InputError(f"--{given[0].replace('_', '-')} is for {what}: leave it out, or ask for that")
+
+
+def _outputs(images: list[Path], folder: Path, ending: str, about: str) -> dict[Path, Path]:
+    """Where the picture of each image goes; InputError where two would have one name, or an input would be lost."""
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"{folder}: is a file: name a folder")
+    outputs: dict[Path, Path] = {}
+    taken: dict[Path, Path] = {}
+    for image in images:
+        outputs[image] = folder / f"{image.stem}{ending}"
+        if taken.setdefault(outputs[image], image) != image:
+            raise InputError(f"{image} and {taken[outputs[image]]} would both become {outputs[image]}: one at a time")
+    for output in (*outputs.values(), folder / about):
+        if output.exists() and any(output.samefile(image) for image in images):
+            raise InputError(f"{output}: is an input, and the output would replace it: name another folder")
+    return outputs
+
+
+def _size(text: str) -> tuple[int, int]:
+    across, by, down = text.lower().partition("x")
+    if not (by and across.isdecimal() and down.isdecimal()):
+        raise InputError(f"--size {text!r}: write WIDTHxHEIGHT in px, such as 1280x960")
+    return int(across), int(down)
+
+
+def _area(text: str) -> tuple[float, float, float, float]:
+    numbers = parse_numbers(text, f"--area {text!r}")
+    if len(numbers) != 4:
+        raise InputError(f"--area {text!r}: write X0,Y0,X1,Y1 in metres, such as -4.5,-3,0,3")
+    return numbers[0], numbers[1], numbers[2], numbers[3]
+
+
+def _height_m(args: Namespace) -> float:
+    return 0.0 if args.height_mm is None else parse_number(args.height_mm, "--height-mm") / 1000.0
+
+
+def _station(args: Namespace, calibration: Calibration) -> str:
+    """The station that took the photographs; --camera is enough where it stood at one only."""
+    stations = calibration.estimate.stations
+    if args.station is not None:
+        calibration.station(args.station)  # or says which there are
+    if args.camera is not None and args.camera not in calibration.cameras:
+        raise InputError(f"camera {args.camera!r} is not there: there are {', '.join(map(repr, calibration.cameras))}")
+    found = [
+        name
+        for name, station in stations.items()
+        if args.station in (None, name) and args.camera in (None, station.camera)
+    ]
+    if not found:
+        raise InputError(f"station {args.station!r} is of camera {stations[args.station].camera!r}: leave out --camera")
+    if len(found) > 1:
+        raise InputError(f"there are several stations, name one: --station {' or '.join(found)}")
+    return found[0]
+
+
+def _camera(args: Namespace, calibration: Calibration) -> tuple[str, str | None, Camera]:
+    """Names of the camera and of its station, where that is one, and the camera, posed in that case."""
+    owners = {name: station.camera for name, station in calibration.estimate.stations.items()}
+    wanted = set(calibration.cameras) if args.camera is None else {args.camera}
+    if args.station is None and len(wanted) == 1 and list(owners.values()).count(*wanted) > 1:
+        (name,) = wanted
+        return name, None, calibration.cameras[name]  # several stations: straight all the same
+    station = _station(args, calibration)
+    return owners[station], station, calibration.stations[station]
+
+
+# ---- pictures -------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Making:
+    """How each picture is made: from a path to picture, facts and a line about it; facts on all, and what they are."""
+
+    picture: Callable[[Path], tuple[Image, dict[str, Any], str]]
+    facts: Mapping[str, Any]
+    about: str
+
+
+def _read(path: Path, camera: Camera, name: str) -> Image:
+    from ceres_cal.pictures.files import read_photograph
+
+    return read_photograph(path, camera.image_size, name)
+
+
+def _write(path: Path, picture: Image) -> None:
+    from ceres_cal.files import write_bytes
+    from ceres_cal.pictures.files import encoded
+
+    with finishing():
+        write_bytes(path, encoded(picture, path.suffix, _JPEG_QUALITY))
+
+
+def _straight(args: Namespace, calibration: Calibration) -> _Making:
+    from ceres_cal.calibration import camera_to_json
+    from ceres_cal.pictures.straight import straighten
+
+    name, station, camera = _camera(args, calibration)
+    found = straighten(
+        camera,
+        whole=args.whole,
+        size=None if args.size is None else _size(args.size),
+        phi=None if args.phi is None else parse_number(args.phi, "--phi"),
+        angle_deg=None if args.angle is None else parse_number(args.angle, "--angle"),
+    )
+    straight, black = found.camera, found.warp.black
+    facts = {
+        "camera": name,
+        "station": station,
+        "matrix": straight.matrix.tolist(),
+        **camera_to_json(straight),
+        **({} if station is None else _pose(straight)),
+        "view_deg": list(found.view_deg),
+        "shown": found.shown,
+        "limit_deg": found.limit_deg,
+        "black_px": black,
+    }
+    across, down = found.view_deg
+    line = (
+        f"{straight.image_size[0]} x {straight.image_size[1]} px, phi {straight.phi:.2f} px, "
+        f"{across:.1f} x {down:.1f} degrees, "
+        f"{100.0 * found.shown:.1f} % of the photograph, {_black(found.warp.size, black)}"
+    )
+    if args.whole and found.limit_deg is not None:
+        line += f"; nothing from {found.limit_deg:.1f} degrees off the axis on"
+    return _Making(
+        lambda path: (found.warp.apply(_read(path, camera, name)), {}, line),
+        facts,
+        "the straight image's camera: its matrix K, no distortion" + ("" if station is None else ", its pose"),
+    )
+
+
+def _pose(camera: Camera) -> dict[str, Any]:
+    pose = camera.cam_from_world
+    return {
+        "rotation": pose.rotation.tolist(),
+        "translation_m": pose.translation.tolist(),
+        "position_m": pose.position.tolist(),
+    }
+
+
+def _black(size: tuple[int, int], count: int) -> str:
+    return "nothing black" if count == 0 else f"{count} px ({100.0 * count / (size[0] * size[1]):.1f} %) black"
+
+
+def _top_view(args: Namespace, calibration: Calibration) -> _Making:
+    from ceres_cal.pictures.top_view import make_plan, top_view
+
+    station = _station(args, calibration)
+    camera, name = calibration.stations[station], calibration.estimate.stations[station].camera
+    area = _field(calibration) if args.area is None else _area(args.area)
+    mm_per_px = 5.0 if args.mm_per_px is None else parse_number(args.mm_per_px, "--mm-per-px")
+    plan = make_plan(area, mm_per_px / 1000.0, _height_m(args))
+    warp = top_view(camera, plan)
+    x0, y0, x1, y1 = plan.area_m
+    facts = {
+        "camera": name,
+        "station": station,
+        "image_size": list(plan.size),
+        "mm_per_px": mm_per_px,
+        "area_m": [x0, y0, x1, y1],
+        "height_m": plan.height_m,
+        "top_left_pixel_m": plan.places([[0.0, 0.0]])[0].tolist(),
+        "black_px": warp.black,
+    }
+    line = (
+        f"{plan.size[0]} x {plan.size[1]} px of {mm_per_px:g} mm, x {x0:g} to {x1:g} m, y {y0:g} to {y1:g} m "
+        f"at {1e3 * plan.height_m:g} mm, {_black(plan.size, warp.black)}"
+    )
+    return _Making(
+        lambda path: (warp.apply(_read(path, camera, name)), {}, line), facts, "scale and area: x right, y up"
+    )
+
+
+def _field(calibration: Calibration) -> tuple[float, float, float, float]:
+    """The box around what lies in the world, and a margin."""
+    from ceres_cal.uncertainty.uncertainty import field_grid
+
+    try:
+        x, y = field_grid(calibration.targets)
+    except InputError:
+        raise InputError("the calibration has no field to be seen from above: say --area X0,Y0,X1,Y1") from None
+    ends = (x[0] - _MARGIN_M, y[0] - _MARGIN_M, x[-1] + _MARGIN_M, y[-1] + _MARGIN_M)
+    x0, y0, x1, y1 = (round(float(end), 9) for end in ends)
+    return x0, y0, x1, y1
+
+
+def _overlay(args: Namespace, calibration: Calibration) -> _Making:
+    from ceres_cal.calibration import Calibration as File
+    from ceres_cal.observations import Observations
+    from ceres_cal.pictures.frames import Frame, frame_by_name, frames_of, marks_of, model_of
+    from ceres_cal.pictures.overlay import AFTER, BEFORE, LIFTED, Layer, draw_overlay
+
+    station, height_m = _station(args, calibration), _height_m(args)
+    camera, name = calibration.stations[station], calibration.estimate.stations[station].camera
+    before = None if args.before is None else File.load(args.before)
+    observations = None if args.observations is None else Observations.load(args.observations)
+    known = {} if observations is None else {f.name: f for f in frames_of(observations) if f.station == station}
+
+    def layers(frame: Frame) -> Iterator[Layer]:
+        if before is not None:
+            yield Layer(model_of(before, frame), f"before: {args.before.name}", BEFORE)
+        if height_m:
+            yield Layer(model_of(calibration, frame, height_m), f"{1e3 * height_m:g} mm above", LIFTED)
+        yield Layer(model_of(calibration, frame), args.calibration.name, AFTER)
+
+    def picture(path: Path) -> tuple[Image, dict[str, Any], str]:
+        image = _read(path, camera, name)
+        if observations is not None and path.stem not in known:
+            raise InputError(f"{path}: {args.observations} has no frame {path.stem!r} of station {station!r}")
+        frame = known.get(path.stem) or frame_by_name(calibration, station, path.stem)
+        drawn = list(layers(frame))
+        marks = () if observations is None else marks_of(calibration, observations, frame)
+        model = drawn[-1].model
+        facts: dict[str, Any] = {"shown": [list(one) for one in frame.shown], "in_view": model.in_view}
+        line = f"{', '.join(target for target, _ in frame.shown)}: {model.in_view} lines and points in view"
+        if before is not None:
+            facts["moved_px"] = moved = model.apart_px(drawn[0].model)
+            line += f"; {moved[0]:.2f} px from before in the median, {moved[1]:.2f} px at most"
+        return draw_overlay(image, drawn, marks), facts, line
+
+    return _Making(picture, {"camera": name, "station": station}, "what was drawn")

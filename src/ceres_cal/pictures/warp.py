@@ -1,0 +1,116 @@
+"""Resampling a photograph: every pixel of a new picture from the place in the photograph that it shows.
+
+Pixel (0, 0) is the centre of the top-left pixel in both. A photograph reaches half a pixel beyond the centres of its
+outermost pixels; a new pixel that looks past that, or at what the camera has no answer for, is black.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ceres_cal.errors import InputError
+from ceres_cal.transforms import Array
+
+Image = NDArray[Any]
+Plane = NDArray[np.float32]
+
+MOST_PIXELS, LONGEST_SIDE = 100_000_000, 32_000  # OpenCV's remap ends at 32 767
+_FINEST = 4  # small squares along a pixel
+_USUAL = 0.9  # of all pixels: those that decide how many squares are needed
+_BLOCK = 1 << 18  # new pixels at a time
+
+
+@dataclass(frozen=True, eq=False)
+class Warp:
+    """Where in the photograph the pixels of a new picture lie.
+
+    Where many pixels of the photograph fall into one of the picture, that one is the mean over `fine` x `fine` small
+    squares, so that thin lines become fainter there, not broken.
+
+    Attributes:
+        size: (width, height) of the picture. photograph_size: of the photographs that it is made of.
+        fine: squares along a pixel. x, y: (height, width) times `fine`, place of each square in the photograph, px.
+        seen: (height, width) times `fine`, whether the photograph shows it.
+    """
+
+    size: tuple[int, int]
+    photograph_size: tuple[int, int]
+    fine: int
+    x: Plane
+    y: Plane
+    seen: NDArray[np.bool_]
+
+    @property
+    def black(self) -> int:
+        """How many pixels of the picture show nothing."""
+        width, height = self.size
+        squares = self.seen.reshape(height, self.fine, width, self.fine)
+        return int(np.count_nonzero(~np.any(squares, axis=(1, 3))))
+
+    def apply(self, photograph: Image) -> Image:
+        """The picture, in the photograph's depth and channels; cubic, to 1/64 px of where it should be taken from.
+
+        Raises:
+            ValueError: the photograph has another size.
+        """
+        if photograph.shape[1::-1] != self.photograph_size:
+            raise ValueError(f"a photograph of {self.photograph_size} px is needed, not {photograph.shape[1::-1]}")
+        squares = cv2.remap(photograph, self.x, self.y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        squares[~self.seen] = 0
+        return squares if self.fine == 1 else cv2.resize(squares, self.size, interpolation=cv2.INTER_AREA)
+
+
+def require_size(size: tuple[int, int], advice: str) -> None:
+    """Raise InputError, with this advice, where a picture would have no pixels, or more than 100 million."""
+    width, height = size
+    if min(size) < 1 or width * height > MOST_PIXELS or max(size) > LONGEST_SIDE:
+        raise InputError(f"the picture would have {width} x {height} px: {advice}")
+
+
+def make_warp(size: tuple[int, int], photograph_size: tuple[int, int], places: Callable[[Array], Array]) -> Warp:
+    """The warp of a new picture.
+
+    Args:
+        size: (width, height) of the picture, one that `require_size` lets pass.
+        places: pixels (N, 2) of the picture -> pixels (N, 2) of the photograph, NaN where there are none.
+    """
+    x, y = _placed(size, places)
+    fine = _squares_along(x, y)
+    x, y = (_divided(plane, fine) for plane in (x, y))
+    limit = np.array(photograph_size) - 0.5
+    seen = (x >= -0.5) & (x <= limit[0]) & (y >= -0.5) & (y <= limit[1])  # False for NaN
+    return Warp(size, photograph_size, fine, np.where(seen, x, -1.0), np.where(seen, y, -1.0), seen)
+
+
+def _placed(size: tuple[int, int], places: Callable[[Array], Array]) -> tuple[Plane, Plane]:
+    """Places of all pixels and of one more around them."""
+    across, down = (np.arange(-1.0, count + 1.0) for count in size)
+    found = np.empty((len(down), len(across), 2), dtype=np.float32)
+    rows = max(1, _BLOCK // len(across))
+    for top in range(0, len(down), rows):
+        part = down[top : top + rows]
+        pixels = np.column_stack([np.tile(across, len(part)), np.repeat(part, len(across))])
+        found[top : top + rows] = places(pixels).reshape(len(part), len(across), 2)
+    return found[..., 0], found[..., 1]
+
+
+def _divided(plane: Plane, fine: int) -> Plane:
+    """Of each pixel `fine` x `fine` squares, between their neighbours' middles; without the pixels around."""
+    size = fine * plane.shape[1], fine * plane.shape[0]
+    squares = plane if fine == 1 else cv2.resize(plane, size, interpolation=cv2.INTER_LINEAR)
+    return np.asarray(squares[fine:-fine, fine:-fine])
+
+
+def _squares_along(x: Plane, y: Plane) -> int:
+    """How many pixels of the photograph most of the new ones span."""
+    spans = [np.hypot(np.diff(x, axis=axis), np.diff(y, axis=axis)).ravel() for axis in (0, 1)]
+    finite = np.concatenate(spans)
+    finite = finite[np.isfinite(finite)]
+    span = float(np.quantile(finite, _USUAL)) if len(finite) else 1.0
+    return int(np.clip(np.ceil(span - 0.25), 1, _FINEST))
