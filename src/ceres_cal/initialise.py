@@ -26,7 +26,7 @@ PHI_RANGE = (0.15, 15.0)
 """In half image diagonals: 163 to 8 degrees across the image's diagonal. What lies beyond is no lens over a field."""
 USUAL_PHI = 1.4
 """In half image diagonals: 71 degrees across the diagonal, a usual lens."""
-_ENOUGH_VIEWS = 100  # for phi
+_ENOUGH_VIEWS = 50  # for phi
 
 
 @dataclass(frozen=True)

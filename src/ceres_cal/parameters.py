@@ -155,8 +155,10 @@ class Estimate:
         return replace(self, placements=Poses.of(self.placements).updated(names, moved))
 
     def _station_stack(self, keys: Sequence[SightKey]) -> Array:
-        poses = Poses.of({name: station.cam_from_world for name, station in self.stations.items()})
-        return poses.of_names([key.station for key in keys])
+        """cam_from_world of each sight, (S, 3, 4); (3, 4) where one station has them all."""
+        names = [key.station for key in keys]
+        poses = Poses.of({name: self.stations[name].cam_from_world for name in dict.fromkeys(names)})
+        return poses.stack[0] if len(poses) == 1 else poses.of_names(names)
 
 
 @dataclass(frozen=True)

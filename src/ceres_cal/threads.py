@@ -26,6 +26,11 @@ def _pool() -> ThreadPoolExecutor:
 
 
 @cache
+def _cores() -> int:
+    return min(os.cpu_count() or 1, _MOST)
+
+
+@cache
 def _controller() -> ThreadpoolController:
     return ThreadpoolController()
 
@@ -53,7 +58,7 @@ def single_threaded_blas() -> Iterator[None]:
 
 def available() -> int:
     """How many threads may work."""
-    return _allowed.get() or min(os.cpu_count() or 1, _MOST)
+    return _allowed.get() or _cores()
 
 
 def parts_of(items: int, rows: int) -> list[int]:

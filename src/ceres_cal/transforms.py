@@ -195,6 +195,9 @@ def inverted(poses: Array) -> Array:
     return np.concatenate([rotations, -rotations @ poses[..., 3:]], axis=-1)
 
 
+_IDENTITY = np.eye(3, 4)[None]
+
+
 @dataclass(frozen=True, eq=False)
 class Poses(Mapping[str, Pose]):
     """Poses by name, held as one stack.
@@ -229,7 +232,7 @@ class Poses(Mapping[str, Pose]):
 
     def of_names(self, names: Sequence[str | None]) -> Array:
         """(N, 3, 4) the poses of these names, None being the identity."""
-        every = np.concatenate([self.stack, np.eye(3, 4)[None]])
+        every = np.concatenate([self.stack, _IDENTITY])
         return np.asarray(every[[len(self.stack) if name is None else self.numbers[name] for name in names]])
 
     def updated(self, names: Sequence[str], stack: Array) -> Poses:
