@@ -178,7 +178,7 @@ def _profile_of_boards(board: Sights, camera: Camera, unit: float) -> Profile:
 
 
 def _plane_data(board: Sights, camera: Camera) -> PlaneData:
-    return PlaneData(board.point_bounds, board.points[:, :2], camera.offsets(board.pixels))
+    return PlaneData(board.point_bounds, np.ascontiguousarray(board.points[:, :2]), camera.offsets(board.pixels))
 
 
 def _as_lines(plane: PlaneSight, scale: float) -> tuple[Array, Array]:

@@ -123,8 +123,8 @@ def _normals(
         if not kernels.sight_normals(
             first, last, code, vector, free, powers, unit, sights.point_bounds, pixels, weights, slots, bends, is_arc,
             sights.curve_bounds, track, curve_pixels, curve_weights, starts, *kernel_track_slots(structure),
-            kernels.LOSS_CODES[weighting.loss], weighting.loss_scale, points, tracks, len(structure.values), poses,
-            normals,
+            kernels.LOSS_CODES[weighting.loss], weighting.loss_scale, False, points, tracks, len(structure.values),
+            poses, normals,
         ):  # fmt: skip
             raise SolutionError("an observation cannot be projected where the solve ended: no uncertainty can be given")
         return normals

@@ -16,7 +16,7 @@ def sight_normals(
     first: int, last: int, lens: int, intrinsics: Any, free: Any, powers: Any, unit: float,
     bounds: Any, pixels: Any, weights: Any, slots: Any, bends: Any,
     is_arc: Any, curve_bounds: Any, track: Any, curve_pixels: Any, curve_weights: Any, s: Any, track_slots: Any,
-    loss: int, scale: float, points: Any, tracks: Any, structure: int, poses: Any, normals: Any,
+    loss: int, scale: float, newton: bool, points: Any, tracks: Any, structure: int, poses: Any, normals: Any,
 ) -> bool:  # fmt: skip
     """False where an observation cannot be projected; else J^T W J of the sights first to last, each by itself.
 
@@ -35,7 +35,7 @@ def sight_normals(
         cost = normal_equations(
             lens, intrinsics, powers, dense, limit, unit, poses[v], points[p], pixels[p], weights[p], slots[moving],
             bends[moving], tracks, is_arc, track[c], curve_pixels[c], curve_weights[c], s[c], track_slots, loss, scale,
-            False, rows, places, normal, space,
+            newton, rows, places, normal, space,
         )  # fmt: skip
         if not np.isfinite(cost):
             return False
