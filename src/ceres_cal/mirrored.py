@@ -14,7 +14,8 @@ from ceres_cal.sights import Rows, SightKey, Sights
 from ceres_cal.transforms import Array
 
 _DECIDED_SIGMA = 100.0  # perspective that bends a view by so many standard deviations leaves no doubt
-_MUCH_WORSE = 2.0  # a cost that the last of the noise and of the lens will not make up for
+_SAME = 1e-3  # of rotations and metres
+_MUCH_WORSE = 100.0  # squared standard deviations: ten of them decide, whatever the lens still does
 
 
 def without_mirrored_poses(
@@ -55,10 +56,12 @@ def _with_better_poses(
     few = sights.take(doubtful)
     twice = np.concatenate([poses[doubtful], mirrored(few, poses[doubtful])])
     costs, found = placement_costs(sights.take(np.tile(doubtful, 2)), estimate, weighting, twice)
-    as_is, costs, found = costs[: len(few)], costs[len(few) :], found[len(few) :]
-    better = np.flatnonzero(costs < as_is * (1.0 - 1e-6))
-    undecided = frozenset(few.keys[i] for i in np.flatnonzero(costs < _MUCH_WORSE * as_is))
-    return estimate.with_placements([few.keys[i] for i in better], found[better]), len(better), undecided
+    (as_is, other), (found, turned) = np.split(costs, 2), np.split(found, 2)
+    better = np.flatnonzero(other < as_is * (1.0 - 1e-6))
+    two = np.max(np.abs(turned - found), axis=(1, 2)) > _SAME  # else the search came back from the mirrored pose
+    close = np.flatnonzero(two & (np.abs(other - as_is) < _MUCH_WORSE))
+    undecided = frozenset(few.keys[i] for i in close)
+    return estimate.with_placements([few.keys[i] for i in better], turned[better]), len(better), undecided
 
 
 def _boxes(sights: Sights) -> tuple[Array, Array]:

@@ -94,16 +94,20 @@ def eliminate_placements(
             step[k] = 0.0
             for j in range(count):
                 step[k] -= gains[v, k, j] * change[j]
-        _move(poses[v], step, turned, pose)
-        cost = normal_equations(
-            lens, intrinsics, powers, dense, limit, unit, pose, points[p], pixels[p], weights[p], slots[moving],
-            bends[moving], tracks, is_arc, track[c], curve_pixels[c], curve_weights[c], s[c], track_slots, loss, scale,
-            newton, rows, places, normal, space,
-        )  # fmt: skip
-        damping = 0.0
+        _move(poses[v], step, turned, moved)
+        cost, promise, damping = np.inf, np.inf, 0.0
         for _ in range(_MOST_STEPS):
-            if not np.isfinite(cost):
-                break
+            moved_cost = normal_equations(
+                lens, intrinsics, powers, dense, limit, unit, moved, points[p], pixels[p], weights[p], slots[moving],
+                bends[moving], tracks, is_arc, track[c], curve_pixels[c], curve_weights[c], s[c], track_slots, loss,
+                scale, newton, rows, places, trial, space,
+            )  # fmt: skip
+            if moved_cost <= cost:
+                pose, moved, normal, trial, cost, damping = moved, pose, trial, normal, moved_cost, 0.1 * damping
+            elif not np.isfinite(cost) or promise <= 1e-12 * cost:
+                break  # nothing to be seen from where it starts; rounding
+            else:
+                damping = max(1e-3, 10.0 * damping)
             _solve_pose(normal, count, damping, lower, gain)
             promise = 0.0
             for k in range(6):
@@ -112,17 +116,6 @@ def eliminate_placements(
             if promise <= max(tolerance * cost, _NOTHING_LEFT):
                 break
             _move(pose, step, turned, moved)
-            moved_cost = normal_equations(
-                lens, intrinsics, powers, dense, limit, unit, moved, points[p], pixels[p], weights[p], slots[moving],
-                bends[moving], tracks, is_arc, track[c], curve_pixels[c], curve_weights[c], s[c], track_slots, loss,
-                scale, newton, rows, places, trial, space,
-            )  # fmt: skip
-            if moved_cost <= cost:
-                pose, moved, normal, trial, cost, damping = moved, pose, trial, normal, moved_cost, 0.1 * damping
-            elif promise <= 1e-12 * cost:
-                break  # rounding
-            else:
-                damping = max(1e-3, 10.0 * damping)
         if not np.isfinite(cost):
             costs[v] = np.inf
             continue
