@@ -66,14 +66,14 @@ def test_a_folder_is_watched(place: Path) -> None:
     try:
         time.sleep(0.5)
         (incoming / "new.json").write_bytes((place / "after.json").read_bytes())
-        deadline = time.monotonic() + 20.0
+        deadline = time.monotonic() + 120.0  # kernels may have to be compiled first
         while time.monotonic() < deadline and not (log.exists() and log.read_text().endswith("\n")):
             (incoming / "new.json").touch()  # it may have come before the watch began
             time.sleep(0.3)
         events = [json.loads(line) for line in log.read_text().splitlines()]
     finally:
         process.send_signal(signal.SIGINT)
-        assert process.wait(10) in (0, -signal.SIGINT)
+        assert process.wait(120) in (0, -signal.SIGINT)
     assert events[0]["event"] == "refitted"
 
 
