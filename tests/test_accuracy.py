@@ -94,6 +94,14 @@ def test_bound_by_differences() -> None:
 # ---- mirrored poses -------------------------------------------------------------------------------------------------
 
 
+def test_poses_that_a_bad_start_decided_are_tried_again() -> None:
+    """From a start with twice the noise, where phi is 21 px off, six boards seem to have decided for the wrong pose."""
+    simulation = simulate(scenes.small_boards(1000, 11), scenes.CLEAN_NOISE, 11)
+    calibration = calibrate(simulation.observations, Options(lens="brown"))
+    rotations = {name: pose.rotation for name, pose in simulation.scene.placements.items()}
+    assert accuracy.mirrored_count(calibration, simulation.observations, rotations) == 0
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_no_pose_is_mirrored_before_a_wide_lens(seed: int) -> None:
     problem = wide_lens(200, seed)

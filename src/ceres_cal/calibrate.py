@@ -186,6 +186,8 @@ def _settle(
                 used = sights.used(inliers.points, inliers.curves)
             elif at_rest:
                 break
+        else:
+            undecided = frozenset(used.keys)  # what was decided about mirrored poses, another lens had decided
         solution = solve(used, estimate, layout, weighting, options, progress, found.places)
         before, (found, inliers) = inliers, judged(solution.estimate, found.places)
         rounds += 1
