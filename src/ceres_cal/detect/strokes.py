@@ -40,6 +40,13 @@ class Strokes:
         return np.asarray(np.linalg.norm(self.ends[:, 1] - self.ends[:, 0], axis=1))
 
 
+def drawn(strokes: Strokes, image_size: tuple[int, int]) -> NDArray[np.bool_]:
+    """(height, width) where strokes are."""
+    mask = np.zeros(image_size[::-1], np.uint8)
+    cv2.polylines(mask, list(np.round(strokes.ends).astype(np.int32)), isClosed=False, color=1)
+    return mask > 0
+
+
 def find_strokes(grey: Grey) -> Strokes:
     """Every stroke of a photograph, of paint up to some 12 px wide."""
     found = []

@@ -1,0 +1,213 @@
+"""Which line of a target is which in a photograph whose floor is known but for place, size and quarter turns.
+
+Two parallel lines of the floor taken for two of the target tell the camera's height and one coordinate of its place, one
+line across tells the other: every such choice, in all four turns, is a hypothesis. It is worth what the target that it
+predicts covers of the paint that was found, and how much of the target in view lies on such paint. Mirrored choices
+do not arise: the camera stands above a floor whose z points up, and a rotation mirrors nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ceres_cal.detect.registration import Nearness
+from ceres_cal.errors import InputError
+from ceres_cal.photographs.upright import Upright
+from ceres_cal.targets import Arc, Segment, Target, along_track
+from ceres_cal.transforms import Array
+
+_PEAK = 0.012  # of lines on the floor, in camera heights
+_MOST_PEAKS, _LEAST_PEAK = 9, 0.015  # of lines in one direction; of all strokes, in one line
+_CELL = 0.03  # within which two hypotheses are one, in camera heights
+_FEW, _MANY = 50, 200  # places on the target at which all, and the best, are tried
+_KEPT = 600
+_BLOCK = 2000
+_AXIS = 1e-6  # sine of the angle to the main direction of a line that is parallel to it
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """A target's lines in its main direction and across.
+
+    Attributes:
+        turn: (2, 2) target from grid: columns are the main direction and the one across.
+        along, across: the offsets of lines that run so, in the grid's y and x.
+    """
+
+    turn: Array
+    along: Array
+    across: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Match:
+    """A hypothesis: how good it is, and the camera's place (3,) and turn (3, 3) camera from target."""
+
+    score: float
+    position: Array
+    rotation: Array
+
+
+def grid_of(target: Target, curves: Collection[str]) -> Grid:
+    """The painted lines that are parallel to the longest of them, or across.
+
+    Raises:
+        InputError: fewer than two lines in one direction and one across.
+    """
+    lines = [(c, c.track()) for name, c in target.curves.items() if name in curves and isinstance(c, Segment)]
+    if lines:
+        direction = max(lines, key=lambda one: one[0].length_m)[1][1, :2]
+        x, y = direction / np.linalg.norm(direction)
+        turn = np.array([[x, -y], [y, x]])
+        offsets: tuple[list[float], list[float]] = ([], [])
+        for curve, track in lines:
+            place, way = track[0, :2] @ turn, track[1, :2] @ turn / curve.length_m
+            for axis in (0, 1):
+                if abs(way[1 - axis]) < _AXIS:
+                    offsets[axis].append(float(place[1 - axis]))
+        along, across = (np.unique(np.round(values, 6)) for values in offsets)
+        if max(len(along), len(across)) > 1 and min(len(along), len(across)) > 0:
+            return Grid(turn, along, across)
+    raise InputError(
+        "a field is found without a start by straight lines at right angles, two one way and one across at least: "
+        "this target has fewer; start from a calibration or from corners"
+    )
+
+
+def match(
+    upright: Upright,
+    ends: Array,
+    weights: Array,
+    near: Nearness,
+    target: Target,
+    curves: Collection[str],
+    image_size: tuple[int, int],
+) -> list[Match]:
+    """The best hypotheses for strokes with these ends (N, 2, 2) and lengths (N,) px, the best first, each once."""
+    grid = grid_of(target, curves)
+    picture = _Picture(near, image_size, float(weights.sum()))
+    floor = np.stack([upright.floor(ends[:, 0]), upright.floor(ends[:, 1])], axis=1)
+    seen = np.all(np.isfinite(floor), axis=(1, 2))
+    floor, weights = floor[seen], weights[seen]
+    few, many = (_places(target, grid, curves, count) for count in (_FEW, _MANY))
+    found: list[tuple[float, Array, Array]] = []
+    for quarter in range(4):
+        cosine, sine = ((1, 0), (0, 1), (-1, 0), (0, -1))[quarter]
+        spin = np.array([[cosine, -sine], [sine, cosine]], dtype=float)
+        rotation = upright.rotation @ np.block([[spin, np.zeros((2, 1))], [np.zeros((1, 2)), np.ones((1, 1))]])
+        turned = Upright(upright.bend, upright.phi, rotation, upright.share)
+        hypotheses = _hypotheses(floor @ spin, weights, grid)
+        score = picture.scores(turned, hypotheses, few)
+        best = np.argsort(-score)[:_KEPT]
+        score = picture.scores(turned, hypotheses[best], many)
+        found += [(float(value), hypotheses[row], rotation) for value, row in zip(score, best, strict=True)]
+    found.sort(key=lambda one: -one[0])
+    return [_as_match(score, place, rotation, grid) for score, place, rotation in found[:_KEPT]]
+
+
+def _as_match(score: float, place: Array, rotation: Array, grid: Grid) -> Match:
+    height, x, y = place
+    turn = np.eye(3)
+    turn[:2, :2] = grid.turn.T
+    return Match(score, np.array([*(grid.turn @ [x, y]), height]), rotation @ turn)
+
+
+# ---- hypotheses -----------------------------------------------------------------------------------------------------
+
+
+def _hypotheses(floor: Array, weights: Array, grid: Grid) -> Array:
+    """(K, 3) camera height and place x, y in the grid that put two lines one way and one across on lines of it."""
+    along = np.diff(floor, axis=1)[:, 0]
+    level = np.abs(along[:, 1]) < np.abs(along[:, 0])
+    middle = floor.mean(axis=1)
+    y = _peaks(middle[level, 1], weights[level], float(weights.sum()))
+    x = _peaks(middle[~level, 0], weights[~level], float(weights.sum()))
+    height_y, place_y = _pairs(y, grid.along)
+    height_x, place_x = _pairs(x, grid.across)
+    parts = [
+        _crossed(height_y, place_y, x, grid.across)[:, [0, 2, 1]],
+        _crossed(height_x, place_x, y, grid.along),
+    ]
+    every = np.concatenate(parts)
+    every = every[every[:, 0] > 0.0]
+    cells = np.column_stack([np.log(every[:, 0]), every[:, 1:] / every[:, :1]]) / _CELL
+    return every[np.unique(np.round(cells).astype(np.int64), axis=0, return_index=True)[1]]
+
+
+def _pairs(peaks: Array, lines: Array) -> tuple[Array, Array]:
+    """Camera height and place for every two lines seen taken for two of the grid, in the same order."""
+    i, j = np.triu_indices(len(peaks), 1)
+    a, b = np.triu_indices(len(lines), 1)
+    height = (lines[b] - lines[a])[None] / (peaks[j] - peaks[i])[:, None]
+    return height.ravel(), (lines[a][None] - height * peaks[i][:, None]).ravel()
+
+
+def _crossed(height: Array, place: Array, peaks: Array, lines: Array) -> Array:
+    """(K, 3) each height and place with, third, the place across for each line seen taken for each of the grid."""
+    other = lines[None, None] - height[:, None, None] * peaks[None, :, None]
+    count = len(peaks) * len(lines)
+    return np.column_stack([np.repeat(height, count), np.repeat(place, count), other.ravel()])
+
+
+def _peaks(values: Array, weights: Array, total: float) -> Array:
+    """Where most strokes lie, in increasing order."""
+    chosen: list[float] = []
+    left = weights.copy()
+    for _ in range(_MOST_PEAKS):
+        density = np.exp(-(((values[:, None] - values) / _PEAK) ** 2)) @ left if len(values) else left
+        if not len(density) or np.max(density) < _LEAST_PEAK * total:
+            break
+        near = np.abs(values - values[np.argmax(density)]) < 2.0 * _PEAK
+        chosen.append(float(np.average(values[near], weights=left[near] + 1e-9)))
+        left[near] = 0.0
+    return np.sort(np.array(chosen))
+
+
+# ---- what they are worth --------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class _Places:
+    """Places (P, 2) along the painted curves in the grid's frame; `first` (P,) is 1 where a curve begins."""
+
+    grid: Array
+    first: NDArray[np.bool_]
+
+
+def _places(target: Target, grid: Grid, curves: Collection[str], count: int) -> _Places:
+    painted = [(i, c) for i, (name, c) in enumerate(target.curves.items()) if name in curves and c.width_m > 0.0]
+    spacing = sum(curve.length_m for _, curve in painted) / count
+    places, first = [], []
+    for number, curve in painted:
+        s = np.linspace(*curve.parameter_range, max(int(curve.length_m / spacing), 2) + 1)
+        places.append(along_track(target.tracks[0, number], isinstance(curve, Arc), s)[:, :2] @ grid.turn)
+        first.append(np.arange(len(s)) == 0)
+    return _Places(np.concatenate(places).astype(np.float32), np.concatenate(first))
+
+
+@dataclass(frozen=True, eq=False)
+class _Picture:
+    near: Nearness
+    image_size: tuple[int, int]
+    paint_px: float
+
+    def scores(self, upright: Upright, hypotheses: Array, places: _Places) -> Array:
+        """(K,) of each hypothesis, from 0 to 1."""
+        blocks = range(0, len(hypotheses), _BLOCK)
+        return np.concatenate([np.empty(0), *(self._scores(upright, hypotheses[b : b + _BLOCK], places) for b in blocks)])
+
+    def _scores(self, upright: Upright, hypotheses: Array, places: _Places) -> Array:
+        size = np.array(self.image_size, dtype=np.float32)
+        floor = (places.grid - hypotheses[:, None, 1:].astype(np.float32)) / hypotheses[:, None, :1].astype(np.float32)
+        pixels = 0.5 * (size - 1.0) + 0.5 * float(np.hypot(*size)) * upright.offsets(floor)
+        with np.errstate(invalid="ignore"):
+            inside = np.all((pixels > -0.5) & (pixels < size - 0.5), axis=2)
+        step = np.linalg.norm(np.diff(pixels, axis=1, prepend=pixels[:, :1]), axis=2)
+        step = np.where(inside & ~places.first & np.isfinite(step), step, 0.0)
+        near = self.near.at(pixels[..., 0], pixels[..., 1])
+        covered, shown = np.sum(step * near, axis=1), np.sum(step, axis=1)
+        return np.asarray(2.0 * covered / (shown + self.paint_px))
