@@ -58,7 +58,9 @@ def predict(
     ]
     number = np.concatenate([np.empty(0, np.int32), *(np.full(len(s), i, np.int32) for i, s in parts)])
     s = np.concatenate([np.empty(0), *(s for _, s in parts)])
-    return course_at(target, camera, number, s)
+    course = course_at(target, camera, number, s)
+    whole = np.isfinite(course.width_px + course.curvature + np.sum(course.pixels + course.normals, axis=1))
+    return course.take(whole)  # where the lens folds over, paint may have one edge only
 
 
 def _places(target: Target, camera: Camera, number: int, spacing_px: float, margin_px: float) -> tuple[int, Array]:
