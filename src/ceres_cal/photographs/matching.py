@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ceres_cal.detect.registration import Nearness
+from ceres_cal.detect.strokes import Strokes
 from ceres_cal.errors import InputError
 from ceres_cal.photographs.upright import Upright
 from ceres_cal.targets import Arc, Segment, Target, along_track
@@ -22,9 +23,11 @@ from ceres_cal.transforms import Array
 
 _PEAK = 0.012  # of lines on the floor, in camera heights
 _MOST_PEAKS, _LEAST_PEAK = 9, 0.015  # of lines in one direction; of all strokes, in one line
+_PARALLEL = 0.15  # sine of the angle by which a stroke may be off the direction of its line
 _CELL = 0.03  # within which two hypotheses are one, in camera heights
-_FEW, _MANY = 50, 200  # places on the target at which all, and the best, are tried
-_KEPT = 600
+_FEW, _MANY = 80, 400  # places on the target at which all, and the best, are tried
+_KEPT = 800
+_LEAST_IN_VIEW = 0.03  # of the places on the target: a camera nearer than that sees too little of it
 _BLOCK = 2000
 _AXIS = 1e-6  # sine of the angle to the main direction of a line that is parallel to it
 
@@ -34,13 +37,21 @@ class Grid:
     """A target's lines in its main direction and across.
 
     Attributes:
+        curves: names of the painted ones.
         turn: (2, 2) target from grid: columns are the main direction and the one across.
-        along, across: the offsets of lines that run so, in the grid's y and x.
+        along, across: the offsets of lines that run so, and of the arcs' tangents, in the grid's y and x.
     """
 
+    target: Target
+    curves: tuple[str, ...]
     turn: Array
     along: Array
     across: Array
+
+    @property
+    def outline(self) -> Array:
+        """(P, 2) places all along the painted curves, in the grid."""
+        return _places(self, _MANY).grid
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,31 +80,52 @@ def grid_of(target: Target, curves: Collection[str]) -> Grid:
             for axis in (0, 1):
                 if abs(way[1 - axis]) < _AXIS:
                     offsets[axis].append(float(place[1 - axis]))
-        along, across = (np.unique(np.round(values, 6)) for values in offsets)
-        if max(len(along), len(across)) > 1 and min(len(along), len(across)) > 0:
-            return Grid(turn, along, across)
+        lines_along, lines_across = (len({round(value, 6) for value in values}) for values in offsets)
+        for axis, tangents in enumerate(_tangents(target, curves, turn)):
+            offsets[1 - axis].extend(tangents)
+        if max(lines_along, lines_across) > 1 and min(lines_along, lines_across) > 0:
+            return Grid(target, tuple(curves), turn, *(np.unique(np.round(values, 6)) for values in offsets))
     raise InputError(
         "a field is found without a start by straight lines at right angles, two one way and one across at least: "
         "this target has fewer; start from a calibration or from corners"
     )
 
 
-def match(
-    upright: Upright,
-    ends: Array,
-    weights: Array,
-    near: Nearness,
-    target: Target,
-    curves: Collection[str],
-    image_size: tuple[int, int],
-) -> list[Match]:
-    """The best hypotheses for strokes with these ends (N, 2, 2) and lengths (N,) px, the best first, each once."""
-    grid = grid_of(target, curves)
-    picture = _Picture(near, image_size, float(weights.sum()))
+def _tangents(target: Target, curves: Collection[str], turn: Array) -> Array:
+    """(2, T) grid coordinates x and y of the lines across and along that touch the painted arcs."""
+    arcs = [c for name, c in target.curves.items() if name in curves and isinstance(c, Arc)]
+    centres = np.array([arc.centre[:2] for arc in arcs]).reshape(-1, 2) @ turn
+    radii = np.array([[arc.radius_m] for arc in arcs]).reshape(-1, 1)
+    return np.concatenate([centres - radii, centres + radii]).T
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """What a photograph shows: strokes, how near each pixel is to them, and the place (2,) px that the lens centres on."""
+
+    strokes: Strokes
+    near: Nearness
+    image_size: tuple[int, int]
+    centre: Array
+
+    @property
+    def unit_px(self) -> float:
+        """Half the image's diagonal."""
+        return 0.5 * float(np.hypot(*self.image_size))
+
+    @property
+    def ends(self) -> Array:
+        """(N, 2, 2) the strokes' ends from the centre, in half image diagonals."""
+        return np.asarray((self.strokes.ends - self.centre) / self.unit_px)
+
+
+def match(upright: Upright, picture: Picture, grid: Grid) -> list[Match]:
+    """The best hypotheses, the best first."""
+    ends, weights = picture.ends, picture.strokes.length_px
     floor = np.stack([upright.floor(ends[:, 0]), upright.floor(ends[:, 1])], axis=1)
     seen = np.all(np.isfinite(floor), axis=(1, 2))
     floor, weights = floor[seen], weights[seen]
-    few, many = (_places(target, grid, curves, count) for count in (_FEW, _MANY))
+    few, many = (_places(grid, count) for count in (_FEW, _MANY))
     found: list[tuple[float, Array, Array]] = []
     for quarter in range(4):
         cosine, sine = ((1, 0), (0, 1), (-1, 0), (0, -1))[quarter]
@@ -101,9 +133,9 @@ def match(
         rotation = upright.rotation @ np.block([[spin, np.zeros((2, 1))], [np.zeros((1, 2)), np.ones((1, 1))]])
         turned = Upright(upright.bend, upright.phi, rotation, upright.share)
         hypotheses = _hypotheses(floor @ spin, weights, grid)
-        score = picture.scores(turned, hypotheses, few)
+        score = _scores(picture, turned, hypotheses, few)
         best = np.argsort(-score)[:_KEPT]
-        score = picture.scores(turned, hypotheses[best], many)
+        score = _scores(picture, turned, hypotheses[best], many)
         found += [(float(value), hypotheses[row], rotation) for value, row in zip(score, best, strict=True)]
     found.sort(key=lambda one: -one[0])
     return [_as_match(score, place, rotation, grid) for score, place, rotation in found[:_KEPT]]
@@ -122,10 +154,12 @@ def _as_match(score: float, place: Array, rotation: Array, grid: Grid) -> Match:
 def _hypotheses(floor: Array, weights: Array, grid: Grid) -> Array:
     """(K, 3) camera height and place x, y in the grid that put two lines one way and one across on lines of it."""
     along = np.diff(floor, axis=1)[:, 0]
-    level = np.abs(along[:, 1]) < np.abs(along[:, 0])
+    slope = np.abs(along / np.linalg.norm(along, axis=1, keepdims=True))
     middle = floor.mean(axis=1)
-    y = _peaks(middle[level, 1], weights[level], float(weights.sum()))
-    x = _peaks(middle[~level, 0], weights[~level], float(weights.sum()))
+    x, y = (
+        _peaks(middle[rows, axis], weights[rows], float(weights.sum()))
+        for axis, rows in enumerate((slope[:, 0] < _PARALLEL, slope[:, 1] < _PARALLEL))
+    )
     height_y, place_y = _pairs(y, grid.along)
     height_x, place_x = _pairs(x, grid.across)
     parts = [
@@ -178,36 +212,33 @@ class _Places:
     first: NDArray[np.bool_]
 
 
-def _places(target: Target, grid: Grid, curves: Collection[str], count: int) -> _Places:
-    painted = [(i, c) for i, (name, c) in enumerate(target.curves.items()) if name in curves and c.width_m > 0.0]
-    spacing = sum(curve.length_m for _, curve in painted) / count
+def _places(grid: Grid, count: int) -> _Places:
+    painted = [grid.target.curves[name] for name in grid.curves]
+    spacing = sum(curve.length_m for curve in painted) / count
     places, first = [], []
-    for number, curve in painted:
+    for curve in painted:
         s = np.linspace(*curve.parameter_range, max(int(curve.length_m / spacing), 2) + 1)
-        places.append(along_track(target.tracks[0, number], isinstance(curve, Arc), s)[:, :2] @ grid.turn)
+        places.append(along_track(curve.track(), isinstance(curve, Arc), s)[:, :2] @ grid.turn)
         first.append(np.arange(len(s)) == 0)
     return _Places(np.concatenate(places).astype(np.float32), np.concatenate(first))
 
 
-@dataclass(frozen=True, eq=False)
-class _Picture:
-    near: Nearness
-    image_size: tuple[int, int]
-    paint_px: float
+def _scores(picture: Picture, upright: Upright, hypotheses: Array, places: _Places) -> Array:
+    """(K,) of each hypothesis, from 0 to 1."""
+    blocks = range(0, len(hypotheses), _BLOCK)
+    parts = [_scored(picture, upright, hypotheses[b : b + _BLOCK].astype(np.float32), places) for b in blocks]
+    return np.concatenate([np.empty(0), *parts])
 
-    def scores(self, upright: Upright, hypotheses: Array, places: _Places) -> Array:
-        """(K,) of each hypothesis, from 0 to 1."""
-        blocks = range(0, len(hypotheses), _BLOCK)
-        return np.concatenate([np.empty(0), *(self._scores(upright, hypotheses[b : b + _BLOCK], places) for b in blocks)])
 
-    def _scores(self, upright: Upright, hypotheses: Array, places: _Places) -> Array:
-        size = np.array(self.image_size, dtype=np.float32)
-        floor = (places.grid - hypotheses[:, None, 1:].astype(np.float32)) / hypotheses[:, None, :1].astype(np.float32)
-        pixels = 0.5 * (size - 1.0) + 0.5 * float(np.hypot(*size)) * upright.offsets(floor)
-        with np.errstate(invalid="ignore"):
-            inside = np.all((pixels > -0.5) & (pixels < size - 0.5), axis=2)
-        step = np.linalg.norm(np.diff(pixels, axis=1, prepend=pixels[:, :1]), axis=2)
-        step = np.where(inside & ~places.first & np.isfinite(step), step, 0.0)
-        near = self.near.at(pixels[..., 0], pixels[..., 1])
-        covered, shown = np.sum(step * near, axis=1), np.sum(step, axis=1)
-        return np.asarray(2.0 * covered / (shown + self.paint_px))
+def _scored(picture: Picture, upright: Upright, hypotheses: Array, places: _Places) -> Array:
+    floor = (places.grid - hypotheses[:, None, 1:]) / hypotheses[:, None, :1]
+    pixels = picture.centre + picture.unit_px * upright.offsets(floor)
+    with np.errstate(invalid="ignore"):
+        inside = np.all((pixels > -0.5) & (pixels < np.array(picture.image_size) - 0.5), axis=2)
+    step = np.linalg.norm(np.diff(pixels, axis=1, prepend=pixels[:, :1]), axis=2)
+    step = np.where(inside & ~places.first & np.isfinite(step), step, 0.0)
+    near = picture.near.at(pixels[..., 0], pixels[..., 1])
+    paint_px = float(picture.strokes.length_px.sum())
+    covered, shown = np.minimum(np.sum(step * near, axis=1), paint_px), np.sum(step, axis=1)
+    enough = np.mean(inside, axis=1) >= _LEAST_IN_VIEW
+    return np.asarray(np.where(enough, 2.0 * covered / (shown + paint_px), 0.0))

@@ -1,4 +1,4 @@
-"""The field in a photograph without any start: strokes of paint, how the camera looks, which line is which, all turns."""
+"""The field in a photograph without any start: candidates are followed and judged, and one of its turns is chosen."""
 
 from __future__ import annotations
 
@@ -8,30 +8,24 @@ from dataclasses import dataclass
 import numpy as np
 
 from ceres_cal.camera import Camera
-from ceres_cal.detect.courses import predict
 from ceres_cal.detect.profiles import Grey
-from ceres_cal.detect.registration import Nearness, nearness_to
-from ceres_cal.detect.strokes import Strokes, drawn, find_strokes
 from ceres_cal.errors import InputError
-from ceres_cal.lens import Radial
+from ceres_cal.photographs.candidates import Seen, alike, candidates, see
 from ceres_cal.photographs.clicks import SIGMA_PX, unknown_optics
-from ceres_cal.photographs.facing import Facing, settled_by_facing, side_of, telling_feature, turns_of
+from ceres_cal.photographs.facing import Facing, settled_by_facing, side_of, telling_feature
 from ceres_cal.photographs.follow import Followed, follow
-from ceres_cal.photographs.matching import match
+from ceres_cal.photographs.judgement import doubt, explained, same_labels, worth
 from ceres_cal.photographs.refit import Shown
-from ceres_cal.photographs.upright import Upright, find_upright
 from ceres_cal.targets import Target
-from ceres_cal.transforms import Pose, rotation_log
+from ceres_cal.transforms import rotation_log
 
-_UPRIGHTS = 2  # answers for lens and tilt that are matched
-_POWERS = (2, 3, 4, 5)
-_WORTH_A_LOOK = 0.75  # of the best match's score
-_MOST_FOLLOWED = 4
+_SURE = 0.95  # of the strokes explained, by the first that is not doubted: no other is followed
 _AS_GOOD = 0.92  # of the best one's worth
-_FAR_BETTER = 1.12
-_SAME_PLACE, _SAME_TURN = 0.08, 0.1  # in heights, rad
-_COURSE_PX = 6.0
 _NEARER_DEG = 30.0  # by which an old calibration must be nearer to one turn than to the next
+_NO_LINES = (
+    "no lines at right angles that could be this field's, two one way and one across: "
+    "check the target's dimensions, or start from corners"
+)
 
 
 @dataclass(frozen=True)
@@ -52,12 +46,13 @@ class Searched:
     """What a search found.
 
     Attributes:
-        followed: the field, or the best that was taken for it (`Followed.holds` tells), or None: nothing was.
+        followed: the field, or None. reason: why none was found.
         ways: in how many ways the photograph can be taken for the field. settled_by: what chose one of them: "facing",
             "before", or nothing, where there is but one.
     """
 
     followed: Followed | None
+    reason: str = ""
     ways: int = 0
     settled_by: str = ""
 
@@ -74,34 +69,47 @@ def search(grey: Grey, target: Target, curves: Collection[str], auto: Auto) -> S
         InputError: the photograph can be taken for the field in several ways, and nothing settles which; or the target
             has too few straight lines.
     """
-    strokes = find_strokes(grey)
-    size = (int(grey.shape[1]), int(grey.shape[0]))
-    near = nearness_to(drawn(strokes, size))
-    turns = turns_of(target, curves)
-    tried = []
-    for score, camera in _distinct(_cameras(strokes, near, target, curves, size), turns):
-        if tried and (tried[0][0] > _FAR_BETTER * score and tried[0][1].holds):
+    seen = see(grey, target, curves)
+    good, reason = [], _NO_LINES
+    for number, camera in enumerate(candidates(seen)):
+        followed = _followed(seen, camera)
+        against = doubt(seen, followed)
+        if not against:
+            good.append(followed)
+        elif number == 0:
+            reason = against
+        if good and explained(seen, good[-1].camera) > _SURE:
             break
-        followed = follow(grey, target, [camera], curves, unknown_optics(size, camera.phi, _shown(camera, target)))
-        tried.append((_worth(followed.camera, near, strokes, target, curves), followed))
-    if not tried:
-        return Searched(None)
-    holding = [one for one in tried if one[1].holds]
-    if not holding:
-        return Searched(max(tried, key=lambda one: one[0])[1])
-    best = max(worth for worth, _ in holding)
-    found = [followed for worth, followed in holding if worth >= _AS_GOOD * best]
-    return _settled(grey, target, curves, auto, found, turns)
+    if not good:
+        return Searched(None, reason)
+    best = max(good, key=lambda one: worth(seen, one.camera))
+    others = [one for camera in alike(seen, best.camera) if not doubt(seen, one := _followed(seen, camera))]
+    found = [best]
+    for other in (*good, *others):
+        as_good = worth(seen, other.camera) >= _AS_GOOD * worth(seen, best.camera)
+        if as_good and not any(same_labels(seen, other, one) for one in found):
+            found.append(other)
+    return _settled(seen, auto, found)
+
+
+def _followed(seen: Seen, camera: Camera) -> Followed:
+    """The target's lines from a camera that is about right, held by the points that it puts into the picture."""
+    pixels = camera.project(seen.target.point_array)
+    with np.errstate(invalid="ignore"):
+        inside = np.all((pixels > -0.5) & (pixels < np.array(camera.image_size) - 0.5), axis=1)
+    rows = np.flatnonzero(inside)
+    shown = Shown(rows.astype(np.int32), pixels[rows], np.full(len(rows), SIGMA_PX))
+    freedom = unknown_optics(camera.image_size, camera.phi, shown)
+    return follow(seen.grey, seen.target, [camera], seen.curves, freedom)
 
 
 # ---- which way round ------------------------------------------------------------------------------------------------
 
 
-def _settled(
-    grey: Grey, target: Target, curves: Collection[str], auto: Auto, found: Sequence[Followed], turns: Sequence[Pose]
-) -> Searched:
+def _settled(seen: Seen, auto: Auto, found: Sequence[Followed]) -> Searched:
     """The one way that what is known settles; InputError where it settles none."""
-    ways = [(one, turn, one.camera.at(one.camera.cam_from_world @ turn)) for one in found for turn in turns]
+    target, curves = seen.target, seen.curves
+    ways = [(one, turn, one.camera.at(one.camera.cam_from_world @ turn)) for one in found for turn in seen.turns]
     cameras = [camera for _, _, camera in ways]
     left, settled_by = list(range(len(ways))), ""
     if auto.facing:
@@ -117,9 +125,9 @@ def _settled(
             f"{_sides([cameras[number] for number in left], target, curves)}"
         )
     followed, turn, camera = ways[left[0]]
-    if turn is not turns[0]:
-        followed = follow(grey, target, [camera], curves)
-    return Searched(followed, len(ways), settled_by if len(ways) > 1 else "")
+    if turn is not seen.turns[0]:
+        followed = follow(seen.grey, target, [camera], curves)
+    return Searched(followed, "", len(ways), settled_by if len(ways) > 1 else "")
 
 
 def _nearest(cameras: Sequence[Camera], before: Camera) -> list[int]:
@@ -145,68 +153,3 @@ def _sides(cameras: Sequence[Camera], target: Target, curves: Collection[str]) -
     )
 
 
-# ---- candidates -----------------------------------------------------------------------------------------------------
-
-
-def _cameras(
-    strokes: Strokes, near: Nearness, target: Target, curves: Collection[str], size: tuple[int, int]
-) -> list[tuple[float, Camera]]:
-    """Cameras that may have seen these strokes of the target, with their scores, the best first."""
-    half = 0.5 * float(np.hypot(*size))
-    ends = (strokes.ends - 0.5 * (np.array(size) - 1.0)) / half
-    found = []
-    for upright in find_upright(ends, strokes.length_px, _UPRIGHTS):
-        optics = _optics(upright, size)
-        for one in match(upright, ends, strokes.length_px, near, target, curves, size):
-            found.append((one.score, optics.at(Pose.looking(one.position, one.rotation))))
-    found.sort(key=lambda one: -one[0])
-    return found
-
-
-def _optics(upright: Upright, size: tuple[int, int]) -> Camera:
-    """A camera with the polynomial that is nearest to the one coefficient, over the image."""
-    half = 0.5 * float(np.hypot(*size))
-    share = np.linspace(0.0, 1.02, 60)
-    basis = share[:, None] ** np.array(_POWERS)
-    values = np.linalg.lstsq(basis, share / (1.0 + upright.bend * share**2) - share, rcond=None)[0]
-    lens = Radial(tuple(values / half ** (np.array(_POWERS) - 1.0)), _POWERS)
-    middle = 0.5 * (np.array(size) - 1.0)
-    return Camera(size, upright.phi * half, (float(middle[0]), float(middle[1])), lens)
-
-
-def _distinct(cameras: Sequence[tuple[float, Camera]], turns: Sequence[Pose]) -> list[tuple[float, Camera]]:
-    """The best of those that put the target, in any of its turns, into the same place."""
-    chosen: list[tuple[float, Camera]] = []
-    for score, camera in cameras:
-        if len(chosen) == _MOST_FOLLOWED or (chosen and score < _WORTH_A_LOOK * chosen[0][0]):
-            break
-        if not any(_same(camera, other, turns) for _, other in chosen):
-            chosen.append((score, camera))
-    return chosen
-
-
-def _same(one: Camera, other: Camera, turns: Sequence[Pose]) -> bool:
-    for turn in turns:
-        between = (one.cam_from_world @ turn) @ other.cam_from_world.inverse
-        near = np.linalg.norm(between.translation) < _SAME_PLACE * max(one.position[2], other.position[2])
-        if near and np.linalg.norm(rotation_log(between.rotation)) < _SAME_TURN:
-            return True
-    return False
-
-
-def _shown(camera: Camera, target: Target) -> Shown:
-    """The target's points that a camera sees, as somebody might have shown them."""
-    pixels = camera.project(target.point_array)
-    with np.errstate(invalid="ignore"):
-        inside = np.all((pixels > -0.5) & (pixels < np.array(camera.image_size) - 0.5), axis=1)
-    rows = np.flatnonzero(inside)
-    return Shown(rows.astype(np.int32), pixels[rows], np.full(len(rows), SIGMA_PX))
-
-
-def _worth(camera: Camera, near: Nearness, strokes: Strokes, target: Target, curves: Collection[str]) -> float:
-    """Twice what the target covers of the strokes, over strokes and target in view together, in px: 1 at best."""
-    course = predict(target, camera, curves, _COURSE_PX)
-    if not len(course):
-        return 0.0
-    shown = _COURSE_PX * len(course)
-    return 2.0 * near.score(course.pixels) * shown / (shown + float(np.sum(strokes.length_px)))

@@ -22,13 +22,16 @@ BENDS = (0.05, -0.05, -0.15, -0.25, -0.35, -0.45)
 PHIS = (0.8, 1.15, 1.6)
 _USUAL_PHI, _PHI_FACTOR = 1.1, 1.4
 _USUAL_BEND, _BEND_SIGMA = -0.15, 0.2
+_USUAL_TILT = 0.5  # rad
 _PRIOR_WEIGHT = 0.03  # of all strokes, at one standard deviation
 _RINGS_DEG = ((0.0, 1), (11.0, 6), (22.0, 12), (33.0, 16), (44.0, 20), (54.0, 24))  # tilt, directions of it
 _ROLL_DEG = 5.0
 _ROUGH, _FINE = 0.06, 0.015  # sine of the angle by which a stroke may be off
 _ROUNDS = 12
 _LEAST_SHARE = 0.06  # of the strokes, in the direction that has fewer
-_APART = 0.05  # of two answers' strokes on the floor, in camera heights
+_DOWN = np.diag([1.0, -1.0, -1.0])
+_FROM_EACH, _REFINED = 3, 24  # of each lens and focal length, and of all
+_APART = 0.1  # of two answers' uprights, rad
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,33 +73,33 @@ def find_upright(ends: Array, weights: Array, most: int) -> list[Upright]:
     """The best answers for strokes with these ends (N, 2, 2), in half image diagonals from the middle, the best first."""
     found: list[tuple[float, Upright]] = []
     rotations = _rotations()
+    lean = _PRIOR_WEIGHT * (np.arccos(np.clip(-rotations[:, 2, 2], -1.0, 1.0)) / _USUAL_TILT) ** 2
     for bend in BENDS:
         for phi in PHIS:
-            optics = Upright(bend, phi, np.eye(3), 0.0)
+            optics = Upright(bend, phi, _DOWN, 0.0)
             normals = _normals(optics, ends).astype(np.float32)
-            value = _score(normals, weights, rotations, _ROUGH) - _penalty(optics)
-            for best in np.argsort(-value)[: most // 2]:
-                found.append((float(value[best]), replace(optics, rotation=rotations[best].astype(float))))
+            value = _score(normals, weights, rotations, _ROUGH) - lean
+            for best in np.argsort(-value)[:_FROM_EACH]:
+                turned = replace(optics, rotation=rotations[best].astype(float))
+                found.append((float(value[best]) - _penalty(optics), turned))
     found.sort(key=lambda one: -one[0])
-    refined = [_refined(one, ends, weights) for _, one in found[: 4 * most]]
+    refined = [_refined(one, ends, weights) for _, one in found[:_REFINED]]
     refined.sort(key=lambda one: -(one.share - _penalty(one)))
     chosen: list[Upright] = []
-    middles = ends.mean(axis=1)
     for one in refined:
-        if len(chosen) < most and all(_apart(one, other, middles) for other in chosen):
+        if len(chosen) < most and all(_apart(one, other) for other in chosen):
             chosen.append(one)
     return chosen
 
 
 def _rotations() -> Array:
     """(B, 3, 3) every way to look at the floor, but for quarter turns about the upright."""
-    down = np.diag([1.0, -1.0, -1.0])
     rolls = np.deg2rad(np.arange(-45.0, 45.0, _ROLL_DEG))
     found = []
     for tilt, count in _RINGS_DEG:
         for direction in 2.0 * np.pi * np.arange(count) / count:
             lean = rotation_exp(np.deg2rad(tilt) * np.array([np.cos(direction), np.sin(direction), 0.0]))
-            found += [lean @ down @ rotation_exp([0.0, 0.0, roll]) for roll in rolls]
+            found += [lean @ _DOWN @ rotation_exp([0.0, 0.0, roll]) for roll in rolls]
     return np.array(found, dtype=np.float32)
 
 
@@ -116,7 +119,8 @@ def _score(normals: Array, weights: Array, rotations: Array, tolerance: float) -
 
 def _penalty(optics: Upright) -> float:
     phi = np.log(optics.phi / _USUAL_PHI) / np.log(_PHI_FACTOR)
-    return float(_PRIOR_WEIGHT * (phi**2 + ((optics.bend - _USUAL_BEND) / _BEND_SIGMA) ** 2))
+    tilt = np.arccos(np.clip(-optics.rotation[2, 2], -1.0, 1.0)) / _USUAL_TILT
+    return float(_PRIOR_WEIGHT * (phi**2 + ((optics.bend - _USUAL_BEND) / _BEND_SIGMA) ** 2 + tilt**2))
 
 
 def _moved(one: Upright, step: Array) -> Upright:
@@ -151,7 +155,7 @@ def _deviation(one: Upright, ends: Array, which: Array | None) -> tuple[Array, A
     return off[np.arange(len(off)), which], which
 
 
-def _apart(one: Upright, other: Upright, middles: Array) -> bool:
-    """Whether two answers put the strokes into different places, but for quarter turns."""
+def _apart(one: Upright, other: Upright) -> bool:
+    """Whether two answers are two, but for quarter turns."""
     away = np.linalg.norm(one.rotation[:, 2] - other.rotation[:, 2])
     return bool(away > _APART or abs(one.bend - other.bend) > 0.05 or abs(np.log(one.phi / other.phi)) > 0.15)
