@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass
+from math import gcd
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 from ceres_cal.detect.registration import Nearness
 from ceres_cal.detect.strokes import Strokes
 from ceres_cal.errors import InputError
+from ceres_cal.photographs.facing import turns_of
 from ceres_cal.photographs.upright import Upright
 from ceres_cal.targets import Arc, Segment, Target, along_track
 from ceres_cal.transforms import Array
@@ -25,7 +27,7 @@ _PEAK = 0.012  # of lines on the floor, in camera heights
 _MOST_PEAKS, _LEAST_PEAK = 9, 0.015  # of lines in one direction; of all strokes, in one line
 _PARALLEL = 0.15  # sine of the angle by which a stroke may be off the direction of its line
 _CELL = 0.03  # within which two hypotheses are one, in camera heights
-_FEW, _MANY = 80, 400  # places on the target at which all, and the best, are tried
+_FEW, _MANY = 60, 300  # places on the target at which all, and the best, are tried
 _KEPT = 800
 _LEAST_IN_VIEW = 0.03  # of the places on the target: a camera nearer than that sees too little of it
 _BLOCK = 2000
@@ -37,13 +39,14 @@ class Grid:
     """A target's lines in its main direction and across.
 
     Attributes:
-        curves: names of the painted ones.
+        curves: names of the painted ones. turns: in how many turns they look the same.
         turn: (2, 2) target from grid: columns are the main direction and the one across.
         along, across: the offsets of lines that run so, and of the arcs' tangents, in the grid's y and x.
     """
 
     target: Target
     curves: tuple[str, ...]
+    turns: int
     turn: Array
     along: Array
     across: Array
@@ -84,7 +87,7 @@ def grid_of(target: Target, curves: Collection[str]) -> Grid:
         for axis, tangents in enumerate(_tangents(target, curves, turn)):
             offsets[1 - axis].extend(tangents)
         if max(lines_along, lines_across) > 1 and min(lines_along, lines_across) > 0:
-            return Grid(target, tuple(curves), turn, *(np.unique(np.round(values, 6)) for values in offsets))
+            return Grid(target, tuple(curves), len(turns_of(target, curves)), turn, *(np.unique(np.round(values, 6)) for values in offsets))
     raise InputError(
         "a field is found without a start by straight lines at right angles, two one way and one across at least: "
         "this target has fewer; start from a calibration or from corners"
@@ -127,7 +130,7 @@ def match(upright: Upright, picture: Picture, grid: Grid) -> list[Match]:
     floor, weights = floor[seen], weights[seen]
     few, many = (_places(grid, count) for count in (_FEW, _MANY))
     found: list[tuple[float, Array, Array]] = []
-    for quarter in range(4):
+    for quarter in range(4 // gcd(4, grid.turns)):
         cosine, sine = ((1, 0), (0, 1), (-1, 0), (0, -1))[quarter]
         spin = np.array([[cosine, -sine], [sine, cosine]], dtype=float)
         rotation = upright.rotation @ np.block([[spin, np.zeros((2, 1))], [np.zeros((1, 2)), np.ones((1, 1))]])
@@ -232,7 +235,7 @@ def _scores(picture: Picture, upright: Upright, hypotheses: Array, places: _Plac
 
 def _scored(picture: Picture, upright: Upright, hypotheses: Array, places: _Places) -> Array:
     floor = (places.grid - hypotheses[:, None, 1:]) / hypotheses[:, None, :1]
-    pixels = picture.centre + picture.unit_px * upright.offsets(floor)
+    pixels = picture.centre.astype(np.float32) + np.float32(picture.unit_px) * upright.offsets(floor)
     with np.errstate(invalid="ignore"):
         inside = np.all((pixels > -0.5) & (pixels < np.array(picture.image_size) - 0.5), axis=2)
     step = np.linalg.norm(np.diff(pixels, axis=1, prepend=pixels[:, :1]), axis=2)

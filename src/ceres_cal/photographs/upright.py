@@ -61,7 +61,8 @@ class Upright:
 
     def offsets(self, floor: Array) -> Array:
         """(..., 2) of places (..., 2) on the floor: the other way; NaN behind the camera."""
-        d = floor[..., :1] * self.rotation[:, 0] + floor[..., 1:] * self.rotation[:, 1] - self.rotation[:, 2]
+        x, y, z = self.rotation.T.astype(floor.dtype)
+        d = floor[..., :1] * x + floor[..., 1:] * y - z
         with np.errstate(divide="ignore", invalid="ignore"):
             ideal = self.phi * np.where(d[..., 2:] > 0.0, d[..., :2] / d[..., 2:], np.nan)
             # p = ideal (1 + c p^2): the root that is near ideal for small c.
