@@ -1,7 +1,7 @@
 """Short straight strokes of paint in a photograph, found without knowing where: thin, and brighter than both sides.
 
-Ridges are found as Steger does (An Unbiased Detector of Curvilinear Structures, 1998): where the second derivative across
-is most negative, at its sub-pixel top. What is connected and straight over a few dozen pixels is a stroke.
+Ridges are found as Steger does (An Unbiased Detector of Curvilinear Structures, 1998): where the second derivative
+across is most negative, at its sub-pixel top. What is connected and straight over a few dozen pixels is a stroke.
 """
 
 from __future__ import annotations
@@ -51,7 +51,9 @@ def find_strokes(grey: Grey) -> Strokes:
     """Every stroke of a photograph, of paint up to some 12 px wide."""
     found = []
     for scale in _SCALES:
-        plane = grey if scale == 1 else cv2.resize(grey, None, fx=1.0 / scale, fy=1.0 / scale, interpolation=cv2.INTER_AREA)
+        plane = (
+            grey if scale == 1 else cv2.resize(grey, None, fx=1.0 / scale, fy=1.0 / scale, interpolation=cv2.INTER_AREA)
+        )
         strokes = _strokes(_ridge_points(np.asarray(plane, np.float32)))
         found.append(Strokes((strokes.ends + 0.5) * scale - 0.5, strokes.strength))
     return found[0] if np.sum(found[0].length_px) > 0.7 * np.sum(found[1].length_px) else found[1]

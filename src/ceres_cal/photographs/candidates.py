@@ -116,7 +116,7 @@ def _upright_of(camera: Camera, seen: Seen) -> Upright:
 def _distinct(
     found: Sequence[tuple[float, Camera]], turns: Sequence[Pose], least: float, known: Camera | None = None
 ) -> list[Camera]:
-    """The best of those, the best first, that put the target elsewhere, whatever its turn, and not where it is known."""
+    """The best of those that put the target elsewhere, whatever its turn, and not where it is known; best first."""
     chosen: list[Camera] = [] if known is None else [known]
     for score, camera in found:
         if len(chosen) == _MOST or score < least * found[0][0]:

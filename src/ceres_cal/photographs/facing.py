@@ -44,7 +44,7 @@ class Facing:
 
     def __post_init__(self) -> None:
         if self.side not in SIDES:
-            raise InputError(f"{self.feature}={self.side}: a side of the picture is one of {', '.join(SIDES)}")
+            raise InputError(f"facing {self.feature}={self.side}: a side of the picture is one of {', '.join(SIDES)}")
 
 
 def turns_of(target: Target, curves: Collection[str]) -> list[Pose]:
@@ -62,19 +62,25 @@ def _turn(angle_rad: float, middle: Array) -> Pose:
     return Pose(rotation, middle - rotation @ middle)
 
 
-def facing_cosine(facing: Facing, camera: Camera, target: Target, curves: Collection[str]) -> float:
-    """Cosine of the angle, on the floor, between the side of the picture and the way to the feature.
-
-    Raises:
-        InputError: the target has no such feature, or it lies in its middle.
-    """
-    way = _place(facing.feature, target) - _middle(target, curves)[:2]
+def require_sides(facings: Sequence[Facing], target: Target, curves: Collection[str]) -> None:
+    """Raise InputError for a feature that the target does not have, or that lies in its middle."""
     size = float(np.max(np.ptp(_samples(target, curves), axis=0)))
-    if np.linalg.norm(way) < _MIDDLE * size:
-        raise InputError(
-            f"--facing {facing.feature}={facing.side}: {facing.feature} lies in the middle of the field, on no side: "
-            "name another line or point"
-        )
+    for one in facings:
+        if one.feature not in target.points and one.feature not in target.curves:
+            raise InputError(
+                f"facing {one.feature}={one.side}: the target has no line, arc or point {one.feature!r}: "
+                "`ceres-cal targets` lists the names"
+            )
+        if np.linalg.norm(_place(one.feature, target) - _middle(target, curves)[:2]) < _MIDDLE * size:
+            raise InputError(
+                f"facing {one.feature}={one.side}: {one.feature} lies in the middle of the field, towards no side: "
+                "name another line or point"
+            )
+
+
+def facing_cosine(facing: Facing, camera: Camera, target: Target, curves: Collection[str]) -> float:
+    """Cosine of the angle, on the floor, between the side of the picture and the way from the middle to the feature."""
+    way = _place(facing.feature, target) - _middle(target, curves)[:2]
     x, y = SIDES[facing.side]
     towards = (x * camera.cam_from_world.rotation[0] + y * camera.cam_from_world.rotation[1])[:2]
     return float(way @ towards / np.linalg.norm(way) / max(float(np.linalg.norm(towards)), 1e-9))
@@ -96,11 +102,9 @@ def side_of(feature: str, camera: Camera, target: Target, curves: Collection[str
 
 
 def telling_feature(target: Target, curves: Collection[str]) -> str:
-    """The painted curve whose middle lies farthest from the target's, or the point if no curve's does."""
+    """The painted curve whose middle lies farthest from the target's: to say by it which way round the target is."""
     middle = _middle(target, curves)[:2]
-    names = [name for name in target.curves if name in curves] + list(target.points)
-    away = {name: float(np.linalg.norm(_place(name, target) - middle)) for name in names}
-    return max(away, key=lambda name: round(away[name], 6))
+    return max(curves, key=lambda name: round(float(np.linalg.norm(_place(name, target) - middle)), 6))
 
 
 # ---- geometry -------------------------------------------------------------------------------------------------------
@@ -110,8 +114,6 @@ def _place(feature: str, target: Target) -> Array:
     """(2,) a point, or the middle of a curve."""
     if feature in target.points:
         return np.array(target.points[feature][:2])
-    if feature not in target.curves:
-        raise InputError(f"--facing: the target has no line, arc or point {feature!r}: see `ceres-cal targets`")
     curve = target.curves[feature]
     return np.asarray(along_track(curve.track(), isinstance(curve, Arc), np.linspace(*curve.parameter_range, 3))[1, :2])
 

@@ -86,7 +86,7 @@ def same_labels(seen: Seen, one: Followed, other: Followed) -> bool:
 
 
 def _distances(a: Array, b: Array) -> Array:
-    return np.nan_to_num(np.linalg.norm(a - b, axis=1), nan=np.inf)
+    return np.asarray(np.nan_to_num(np.linalg.norm(a - b, axis=1), nan=np.inf))
 
 
 def _told(followed: Followed) -> list[int]:

@@ -1,8 +1,8 @@
 """Which line of a target is which in a photograph whose floor is known but for place, size and quarter turns.
 
-Two parallel lines of the floor taken for two of the target tell the camera's height and one coordinate of its place, one
-line across tells the other: every such choice, in all four turns, is a hypothesis. It is worth what the target that it
-predicts covers of the paint that was found, and how much of the target in view lies on such paint. Mirrored choices
+Two parallel lines of the floor taken for two of the target tell the camera's height and one coordinate of its place,
+one line across tells the other: every such choice, in all four turns, is a hypothesis. It is worth what the target that
+it predicts covers of the paint that was found, and how much of the target in view lies on such paint. Mirrored choices
 do not arise: the camera stands above a floor whose z points up, and a rotation mirrors nothing.
 """
 
@@ -87,7 +87,13 @@ def grid_of(target: Target, curves: Collection[str]) -> Grid:
         for axis, tangents in enumerate(_tangents(target, curves, turn)):
             offsets[1 - axis].extend(tangents)
         if max(lines_along, lines_across) > 1 and min(lines_along, lines_across) > 0:
-            return Grid(target, tuple(curves), len(turns_of(target, curves)), turn, *(np.unique(np.round(values, 6)) for values in offsets))
+            return Grid(
+                target,
+                tuple(curves),
+                len(turns_of(target, curves)),
+                turn,
+                *(np.unique(np.round(values, 6)) for values in offsets),
+            )
     raise InputError(
         "a field is found without a start by straight lines at right angles, two one way and one across at least: "
         "this target has fewer; start from a calibration or from corners"
@@ -104,7 +110,7 @@ def _tangents(target: Target, curves: Collection[str], turn: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """What a photograph shows: strokes, how near each pixel is to them, and the place (2,) px that the lens centres on."""
+    """What a photograph shows: strokes, how near each pixel is to them, and the lens's centre (2,) px."""
 
     strokes: Strokes
     near: Nearness

@@ -12,14 +12,14 @@ from ceres_cal.detect.profiles import Grey
 from ceres_cal.errors import InputError
 from ceres_cal.photographs.candidates import Seen, alike, candidates, see
 from ceres_cal.photographs.clicks import SIGMA_PX, unknown_optics
-from ceres_cal.photographs.facing import Facing, settled_by_facing, side_of, telling_feature
+from ceres_cal.photographs.facing import Facing, require_sides, settled_by_facing, side_of, telling_feature
 from ceres_cal.photographs.follow import Followed, follow
 from ceres_cal.photographs.judgement import doubt, explained, same_labels, worth
 from ceres_cal.photographs.refit import Shown
 from ceres_cal.targets import Target
 from ceres_cal.transforms import rotation_log
 
-_SURE = 0.95  # of the strokes explained, by the first that is not doubted: no other is followed
+_SURE = 0.9  # of the strokes explained, by the first that is not doubted: no other is followed
 _AS_GOOD = 0.92  # of the best one's worth
 _NEARER_DEG = 30.0  # by which an old calibration must be nearer to one turn than to the next
 _NO_LINES = (
@@ -43,12 +43,12 @@ class Auto:
 
 @dataclass(frozen=True, eq=False)
 class Searched:
-    """What a search found.
+    """What came of looking for the field.
 
     Attributes:
         followed: the field, or None. reason: why none was found.
-        ways: in how many ways the photograph can be taken for the field. settled_by: what chose one of them: "facing",
-            "before", or nothing, where there is but one.
+        ways: in how many ways the photograph can be taken for the field; 0: none was looked for, a start was given.
+            settled_by: what chose one of them: "facing", "before", or nothing, where there is but one.
     """
 
     followed: Followed | None
@@ -66,13 +66,14 @@ def search(grey: Grey, target: Target, curves: Collection[str], auto: Auto) -> S
     image looks like another one's: it cannot be told, and is not.
 
     Raises:
-        InputError: the photograph can be taken for the field in several ways, and nothing settles which; or the target
-            has too few straight lines.
+        InputError: the photograph can be taken for the field in several ways, and nothing settles which; the target has
+            too few straight lines; or nothing that `auto.facing` names.
     """
+    require_sides(auto.facing, target, curves)
     seen = see(grey, target, curves)
     good, reason = [], _NO_LINES
     for number, camera in enumerate(candidates(seen)):
-        followed = _followed(seen, camera)
+        followed = _followed(seen, _turned(seen, auto, camera))
         against = doubt(seen, followed)
         if not against:
             good.append(followed)
@@ -83,13 +84,20 @@ def search(grey: Grey, target: Target, curves: Collection[str], auto: Auto) -> S
     if not good:
         return Searched(None, reason)
     best = max(good, key=lambda one: worth(seen, one.camera))
-    others = [one for camera in alike(seen, best.camera) if not doubt(seen, one := _followed(seen, camera))]
+    others = [_followed(seen, _turned(seen, auto, camera)) for camera in alike(seen, best.camera)]
     found = [best]
-    for other in (*good, *others):
+    for other in (*good, *(one for one in others if not doubt(seen, one))):
         as_good = worth(seen, other.camera) >= _AS_GOOD * worth(seen, best.camera)
         if as_good and not any(same_labels(seen, other, one) for one in found):
             found.append(other)
     return _settled(seen, auto, found)
+
+
+def _turned(seen: Seen, auto: Auto, camera: Camera) -> Camera:
+    """The one of a camera's turns that what is known favours, so that it need not be followed again."""
+    ways = [camera.at(camera.cam_from_world @ turn) for turn in seen.turns]
+    left = _left(seen, auto, ways)
+    return ways[left[0]] if left else camera
 
 
 def _followed(seen: Seen, camera: Camera) -> Followed:
@@ -111,14 +119,10 @@ def _settled(seen: Seen, auto: Auto, found: Sequence[Followed]) -> Searched:
     target, curves = seen.target, seen.curves
     ways = [(one, turn, one.camera.at(one.camera.cam_from_world @ turn)) for one in found for turn in seen.turns]
     cameras = [camera for _, _, camera in ways]
-    left, settled_by = list(range(len(ways))), ""
-    if auto.facing:
-        left, settled_by = settled_by_facing(cameras, auto.facing, target, curves), "facing"
-        if not left:
-            given = ", ".join(f"{one.feature}={one.side}" for one in auto.facing)
-            raise InputError(f"--facing {given}: in this photograph {_sides(cameras, target, curves)}")
-    elif auto.before is not None and len(ways) > 1:
-        left, settled_by = _nearest(cameras, auto.before), "before"
+    left = _left(seen, auto, cameras)
+    if not left:
+        given = ", ".join(f"{one.feature}={one.side}" for one in auto.facing)
+        raise InputError(f"not with {given}: in this photograph {_sides(cameras, target, curves)}")
     if len(left) > 1:
         raise InputError(
             f"the field is found, but it looks alike in {len(left)} ways: "
@@ -127,7 +131,19 @@ def _settled(seen: Seen, auto: Auto, found: Sequence[Followed]) -> Searched:
     followed, turn, camera = ways[left[0]]
     if turn is not seen.turns[0]:
         followed = follow(seen.grey, target, [camera], curves)
-    return Searched(followed, "", len(ways), settled_by if len(ways) > 1 else "")
+        if against := doubt(seen, followed):
+            return Searched(None, against)
+    settled_by = "" if len(ways) == 1 else "facing" if auto.facing else "before"
+    return Searched(followed, "", len(ways), settled_by)
+
+
+def _left(seen: Seen, auto: Auto, cameras: Sequence[Camera]) -> list[int]:
+    """Numbers of the cameras that agree with what is known; one alone needs no old calibration to agree with."""
+    if auto.facing:
+        return settled_by_facing(cameras, auto.facing, seen.target, seen.curves)
+    if auto.before is not None and len(cameras) > 1:
+        return _nearest(cameras, auto.before)
+    return list(range(len(cameras)))
 
 
 def _nearest(cameras: Sequence[Camera], before: Camera) -> list[int]:
@@ -151,5 +167,3 @@ def _sides(cameras: Sequence[Camera], target: Target, curves: Collection[str]) -
         f"{name} lies towards the {' or the '.join(sides)} of the picture: "
         f"say which, such as --facing {name}={sides[0]}, or give an old calibration of the station (--start)"
     )
-
-
