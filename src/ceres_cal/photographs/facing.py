@@ -10,7 +10,7 @@ import numpy as np
 from ceres_cal.camera import Camera
 from ceres_cal.errors import InputError
 from ceres_cal.targets import Arc, Target, along_track, nearest_on_track
-from ceres_cal.transforms import Array, Pose, rotation_exp
+from ceres_cal.transforms import Array, Pose, rotation_exp, rotation_log
 
 SIDES = {
     "left": (-1.0, 0.0),
@@ -24,6 +24,7 @@ SIDES = {
 }
 _FACES = 0.3  # cosine of the angle between a side of the picture and a feature that lies towards it, at least
 _AS_WELL = 0.2  # a cosine less by no more than this is no worse
+_NEARER_DEG = 30.0  # by which an old calibration must be nearer to one turn than to the next
 _MOST_TURNS = 12
 _SAME_M = 1e-6
 _MIDDLE = 0.02  # of the target's size: nearer to its middle a feature lies on no side
@@ -93,6 +94,16 @@ def settled_by_facing(
     cosines = np.array([[facing_cosine(one, camera, target, curves) for one in facings] for camera in cameras])
     worst = cosines.reshape(len(cameras), -1).min(axis=1)
     return [int(n) for n in np.flatnonzero((worst > _FACES) & (worst >= worst.max(initial=0.0) - _AS_WELL))]
+
+
+def settled_by_before(cameras: Sequence[Camera], before: Camera) -> list[int]:
+    """Numbers of the cameras that are turned least from the one before, and of those turned little more."""
+    angles = [
+        float(np.linalg.norm(rotation_log(one.cam_from_world.rotation @ before.cam_from_world.rotation.T)))
+        for one in cameras
+    ]
+    limit = min(angles) + np.deg2rad(_NEARER_DEG)
+    return [number for number, angle in enumerate(angles) if angle <= limit]
 
 
 def side_of(feature: str, camera: Camera, target: Target, curves: Collection[str]) -> str:

@@ -12,16 +12,21 @@ from ceres_cal.detect.profiles import Grey
 from ceres_cal.errors import InputError
 from ceres_cal.photographs.candidates import Seen, alike, candidates, see
 from ceres_cal.photographs.clicks import SIGMA_PX, unknown_optics
-from ceres_cal.photographs.facing import Facing, require_sides, settled_by_facing, side_of, telling_feature
+from ceres_cal.photographs.facing import (
+    Facing,
+    require_sides,
+    settled_by_before,
+    settled_by_facing,
+    side_of,
+    telling_feature,
+)
 from ceres_cal.photographs.follow import Followed, follow
 from ceres_cal.photographs.judgement import doubt, explained, same_labels, worth
 from ceres_cal.photographs.refit import Shown
 from ceres_cal.targets import Target
-from ceres_cal.transforms import rotation_log
 
 _SURE = 0.9  # of the strokes explained, by the first that is not doubted: no other is followed
 _AS_GOOD = 0.92  # of the best one's worth
-_NEARER_DEG = 30.0  # by which an old calibration must be nearer to one turn than to the next
 _NO_LINES = (
     "no lines at right angles that could be this field's, two one way and one across: "
     "check the target's dimensions, or start from corners"
@@ -142,18 +147,8 @@ def _left(seen: Seen, auto: Auto, cameras: Sequence[Camera]) -> list[int]:
     if auto.facing:
         return settled_by_facing(cameras, auto.facing, seen.target, seen.curves)
     if auto.before is not None and len(cameras) > 1:
-        return _nearest(cameras, auto.before)
+        return settled_by_before(cameras, auto.before)
     return list(range(len(cameras)))
-
-
-def _nearest(cameras: Sequence[Camera], before: Camera) -> list[int]:
-    """Numbers of the cameras that are turned least from the one before, and of those turned little more."""
-    angles = [
-        float(np.linalg.norm(rotation_log(one.cam_from_world.rotation @ before.cam_from_world.rotation.T)))
-        for one in cameras
-    ]
-    limit = min(angles) + np.deg2rad(_NEARER_DEG)
-    return [number for number, angle in enumerate(angles) if angle <= limit]
 
 
 def _sides(cameras: Sequence[Camera], target: Target, curves: Collection[str]) -> str:
