@@ -20,7 +20,7 @@ from ceres_cal.observations import Observations
 from ceres_cal.photographs import Auto, Facing, detect_field
 from ceres_cal.photographs.candidates import candidates, see
 from ceres_cal.photographs.facing import settled_by_before, settled_by_facing, side_of, turns_of
-from ceres_cal.photographs.matching import grid_of
+from ceres_cal.photographs.grid import grid_of
 from ceres_cal.photographs.search import search
 from ceres_cal.photographs.upright import find_upright
 from ceres_cal.simulate import Scene, Station, field_scene, overhead_pose

@@ -13,7 +13,8 @@ from ceres_cal.detect.registration import nearness_to
 from ceres_cal.detect.strokes import drawn, find_strokes
 from ceres_cal.lens import Radial
 from ceres_cal.photographs.facing import turns_of
-from ceres_cal.photographs.matching import Grid, Match, Picture, grid_of, match
+from ceres_cal.photographs.grid import Grid, grid_of
+from ceres_cal.photographs.matching import Match, Picture, match
 from ceres_cal.photographs.upright import Upright, find_upright
 from ceres_cal.targets import Target
 from ceres_cal.transforms import Pose, rotation_log

@@ -8,19 +8,15 @@ do not arise: the camera stands above a floor whose z points up, and a rotation 
 
 from __future__ import annotations
 
-from collections.abc import Collection
 from dataclasses import dataclass
 from math import gcd
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ceres_cal.detect.registration import Nearness
 from ceres_cal.detect.strokes import Strokes
-from ceres_cal.errors import InputError
-from ceres_cal.photographs.facing import turns_of
+from ceres_cal.photographs.grid import Grid, Places, places_along
 from ceres_cal.photographs.upright import Upright
-from ceres_cal.targets import Arc, Segment, Target, along_track
 from ceres_cal.transforms import Array
 
 _PEAK = 0.012  # of lines on the floor, in camera heights
@@ -31,30 +27,6 @@ _FEW, _MANY = 60, 300  # places on the target at which all, and the best, are tr
 _KEPT = 800
 _LEAST_IN_VIEW = 0.03  # of the places on the target: a camera nearer than that sees too little of it
 _BLOCK = 2000
-_AXIS = 1e-6  # sine of the angle to the main direction of a line that is parallel to it
-
-
-@dataclass(frozen=True, eq=False)
-class Grid:
-    """A target's lines in its main direction and across.
-
-    Attributes:
-        curves: names of the painted ones. turns: in how many turns they look the same.
-        turn: (2, 2) target from grid: columns are the main direction and the one across.
-        along, across: the offsets of lines that run so, and of the arcs' tangents, in the grid's y and x.
-    """
-
-    target: Target
-    curves: tuple[str, ...]
-    turns: int
-    turn: Array
-    along: Array
-    across: Array
-
-    @property
-    def outline(self) -> Array:
-        """(P, 2) places all along the painted curves, in the grid."""
-        return _places(self, _MANY).grid
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,48 +36,6 @@ class Match:
     score: float
     position: Array
     rotation: Array
-
-
-def grid_of(target: Target, curves: Collection[str]) -> Grid:
-    """The painted lines that are parallel to the longest of them, or across.
-
-    Raises:
-        InputError: fewer than two lines in one direction and one across.
-    """
-    lines = [(c, c.track()) for name, c in target.curves.items() if name in curves and isinstance(c, Segment)]
-    if lines:
-        direction = max(lines, key=lambda one: one[0].length_m)[1][1, :2]
-        x, y = direction / np.linalg.norm(direction)
-        turn = np.array([[x, -y], [y, x]])
-        offsets: tuple[list[float], list[float]] = ([], [])
-        for curve, track in lines:
-            place, way = track[0, :2] @ turn, track[1, :2] @ turn / curve.length_m
-            for axis in (0, 1):
-                if abs(way[1 - axis]) < _AXIS:
-                    offsets[axis].append(float(place[1 - axis]))
-        lines_along, lines_across = (len({round(value, 6) for value in values}) for values in offsets)
-        for axis, tangents in enumerate(_tangents(target, curves, turn)):
-            offsets[1 - axis].extend(tangents)
-        if max(lines_along, lines_across) > 1 and min(lines_along, lines_across) > 0:
-            return Grid(
-                target,
-                tuple(curves),
-                len(turns_of(target, curves)),
-                turn,
-                *(np.unique(np.round(values, 6)) for values in offsets),
-            )
-    raise InputError(
-        "a field is found without a start by straight lines at right angles, two one way and one across at least: "
-        "this target has fewer; start from a calibration or from corners"
-    )
-
-
-def _tangents(target: Target, curves: Collection[str], turn: Array) -> Array:
-    """(2, T) grid coordinates x and y of the lines across and along that touch the painted arcs."""
-    arcs = [c for name, c in target.curves.items() if name in curves and isinstance(c, Arc)]
-    centres = np.array([arc.centre[:2] for arc in arcs]).reshape(-1, 2) @ turn
-    radii = np.array([[arc.radius_m] for arc in arcs]).reshape(-1, 1)
-    return np.concatenate([centres - radii, centres + radii]).T
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +64,7 @@ def match(upright: Upright, picture: Picture, grid: Grid) -> list[Match]:
     floor = np.stack([upright.floor(ends[:, 0]), upright.floor(ends[:, 1])], axis=1)
     seen = np.all(np.isfinite(floor), axis=(1, 2))
     floor, weights = floor[seen], weights[seen]
-    few, many = (_places(grid, count) for count in (_FEW, _MANY))
+    few, many = (places_along(grid, count) for count in (_FEW, _MANY))
     found: list[tuple[float, Array, Array]] = []
     for quarter in range(4 // gcd(4, grid.turns)):
         cosine, sine = ((1, 0), (0, 1), (-1, 0), (0, -1))[quarter]
@@ -213,33 +143,14 @@ def _peaks(values: Array, weights: Array, total: float) -> Array:
 # ---- what they are worth --------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
-class _Places:
-    """Places (P, 2) along the painted curves in the grid's frame; `first` (P,) is 1 where a curve begins."""
-
-    grid: Array
-    first: NDArray[np.bool_]
-
-
-def _places(grid: Grid, count: int) -> _Places:
-    painted = [grid.target.curves[name] for name in grid.curves]
-    spacing = sum(curve.length_m for curve in painted) / count
-    places, first = [], []
-    for curve in painted:
-        s = np.linspace(*curve.parameter_range, max(int(curve.length_m / spacing), 2) + 1)
-        places.append(along_track(curve.track(), isinstance(curve, Arc), s)[:, :2] @ grid.turn)
-        first.append(np.arange(len(s)) == 0)
-    return _Places(np.concatenate(places).astype(np.float32), np.concatenate(first))
-
-
-def _scores(picture: Picture, upright: Upright, hypotheses: Array, places: _Places) -> Array:
+def _scores(picture: Picture, upright: Upright, hypotheses: Array, places: Places) -> Array:
     """(K,) of each hypothesis, from 0 to 1."""
     blocks = range(0, len(hypotheses), _BLOCK)
     parts = [_scored(picture, upright, hypotheses[b : b + _BLOCK].astype(np.float32), places) for b in blocks]
     return np.concatenate([np.empty(0), *parts])
 
 
-def _scored(picture: Picture, upright: Upright, hypotheses: Array, places: _Places) -> Array:
+def _scored(picture: Picture, upright: Upright, hypotheses: Array, places: Places) -> Array:
     floor = (places.grid - hypotheses[:, None, 1:]) / hypotheses[:, None, :1]
     pixels = picture.centre.astype(np.float32) + np.float32(picture.unit_px) * upright.offsets(floor)
     with np.errstate(invalid="ignore"):
