@@ -145,7 +145,7 @@ def test_targets_without_lines_at_right_angles() -> None:
 
 @pytest.mark.parametrize("view", ["quarter", "tilted 20 to 45 degrees"])
 def test_views_of_any_kind(view: str) -> None:
-    shot = auto_script.take_view(view, auto_script.VIEWS[view], 3)
+    shot = auto_script.take_view(view, auto_script.VIEWS[view], 1)
     (found,) = auto_script.searched(iter([shot]))
     assert found.what == "right", found
 

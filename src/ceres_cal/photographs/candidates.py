@@ -19,11 +19,11 @@ from ceres_cal.photographs.upright import Upright, find_upright
 from ceres_cal.targets import Target
 from ceres_cal.transforms import Pose, rotation_log
 
-_UPRIGHTS = 5  # answers for lens and tilt, at most, that are matched
+_UPRIGHTS = 4  # answers for lens and tilt, at most, that are matched
 _SURE = 0.88  # the score of a match after which no other lens and tilt is tried
 _POWERS = (2, 3, 4, 5)
 _WORTH_A_LOOK, _ALIKE = 0.75, 0.85  # of the best match's score: another's, and that of another way to take the picture
-_MOST = 4
+_MOST, _MOST_ALIKE = 3, 8
 _SAME_PLACE, _SAME_TURN = 0.08, 0.1  # in heights, rad
 
 
@@ -71,7 +71,7 @@ def candidates(seen: Seen) -> list[Camera]:
         found += [(one.score, _posed(optics, one)) for one in match(upright, seen.picture, seen.grid)]
         if found and max(score for score, _ in found) > _SURE:
             break
-    return _distinct(sorted(found, key=lambda one: -one[0]), seen.turns, _WORTH_A_LOOK)
+    return _distinct(sorted(found, key=lambda one: -one[0]), seen.turns, _WORTH_A_LOOK)[:_MOST]
 
 
 def alike(seen: Seen, camera: Camera) -> list[Camera]:
@@ -120,7 +120,7 @@ def _distinct(
     """The best of those that put the target elsewhere, whatever its turn, and not where it is known; best first."""
     chosen: list[Camera] = [] if known is None else [known]
     for score, camera in found:
-        if len(chosen) == _MOST or score < least * found[0][0]:
+        if len(chosen) > _MOST_ALIKE or score < least * found[0][0]:
             break
         if not any(_same_place(camera, other, turns) for other in chosen):
             chosen.append(camera)
