@@ -162,7 +162,7 @@ def test_without_a_word_on_which_way_round(shot: script.Shot) -> None:
 
 
 def test_a_quarter_turn_that_looks_alike_too() -> None:
-    optics = Camera((1280, 960), 700.0, (640.0, 480.0), Radial((0.0, 0.0), (2, 3)))
+    optics = Camera((640, 480), 350.0, (320.0, 240.0), Radial((0.0, 0.0), (2, 3)))
     pose = overhead_pose(-0.1, 0.3, 1.6, 12.0, 4.0, 20.0)  # sees circle and cross only
     stations = {"overhead": Station("overhead", pose)}
     scene = replace(field_scene(FIELD, {"overhead": optics}, stations), photography=script.varied(0))
