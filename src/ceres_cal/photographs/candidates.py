@@ -13,8 +13,8 @@ from ceres_cal.detect.registration import nearness_to
 from ceres_cal.detect.strokes import drawn, find_strokes
 from ceres_cal.lens import Radial
 from ceres_cal.photographs.facing import turns_of
-from ceres_cal.photographs.grid import Grid, grid_of
-from ceres_cal.photographs.matching import Match, Picture, match
+from ceres_cal.photographs.grid import Grid, grid_of, offsets_of
+from ceres_cal.photographs.matching import FloorLines, Match, Picture, lines_seen, match
 from ceres_cal.photographs.upright import Upright, find_upright
 from ceres_cal.targets import Target
 from ceres_cal.transforms import Pose, rotation_log
@@ -22,8 +22,8 @@ from ceres_cal.transforms import Pose, rotation_log
 _UPRIGHTS = 4  # answers for lens and tilt, at most, that are matched
 _SURE = 0.88  # the score of a match after which no other lens and tilt is tried
 _POWERS = (2, 3, 4, 5)
-_WORTH_A_LOOK, _ALIKE = 0.75, 0.85  # of the best match's score: another's, and that of another way to take the picture
-_MOST, _MOST_ALIKE = 3, 8
+_WORTH_A_LOOK, _ALIKE = 0.75, 0.9  # of the best match's score: another's, and that of another way to take the picture
+_MOST, _MOST_ALIKE = 3, 5
 _SAME_PLACE, _SAME_TURN = 0.08, 0.1  # in heights, rad
 
 
@@ -68,18 +68,26 @@ def candidates(seen: Seen) -> list[Camera]:
     found: list[tuple[float, Camera]] = []
     for upright in find_upright(seen.picture.ends, seen.picture.strokes.length_px, _UPRIGHTS):
         optics = _optics(upright, seen.picture)
-        found += [(one.score, _posed(optics, one)) for one in match(upright, seen.picture, seen.grid)]
+        matches = match(upright, seen.picture, seen.grid, lines_seen(upright, seen.picture))
+        found += [(one.score, _posed(optics, one)) for one in matches]
         if found and max(score for score, _ in found) > _SURE:
             break
     return _distinct(sorted(found, key=lambda one: -one[0]), seen.turns, _WORTH_A_LOOK)[:_MOST]
 
 
-def alike(seen: Seen, camera: Camera) -> list[Camera]:
-    """Other cameras with about these optics, turned by quarters, moved, higher or lower, that may have taken it too."""
+def alike(seen: Seen, camera: Camera, found: Collection[str]) -> list[Camera]:
+    """Other cameras with about these optics, turned by quarters, moved, higher or lower, that may have taken it too.
+
+    Args:
+        camera: that may have. found: names of the curves that were found from there.
+    """
     picture, upright = replace(seen.picture, centre=np.array(camera.principal_point)), _upright_of(camera, seen)
+    x, y = camera.position[:2] @ seen.grid.turn
+    along, across = offsets_of(seen.target, found, seen.grid.turn)
+    lines = FloorLines((across - x) / camera.position[2], (along - y) / camera.position[2])
     optics = _optics(upright, picture)
-    found = match(upright, picture, seen.grid)
-    return _distinct([(one.score, _posed(optics, one)) for one in found], seen.turns, _ALIKE, camera)
+    others = [(one.score, _posed(optics, one)) for one in match(upright, picture, seen.grid, lines)]
+    return _distinct(others, seen.turns, _ALIKE, camera)
 
 
 def _posed(optics: Camera, one: Match) -> Camera:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +14,7 @@ from ceres_cal.targets import Arc, Segment, Target, along_track
 from ceres_cal.transforms import Array
 
 _AXIS = 1e-6  # sine of the angle to the main direction of a line that is parallel to it
+_DIGITS = 6  # of metres, after which two offsets are one
 _OUTLINE = 300
 
 
@@ -66,22 +67,31 @@ def grid_of(target: Target, curves: Collection[str]) -> Grid:
     Raises:
         InputError: fewer than two lines in one direction and one across.
     """
-    lines = [curve for name, curve in target.curves.items() if name in curves and isinstance(curve, Segment)]
+    lines = _segments(target, curves)
     if lines:
         x, y = _way(max(lines, key=lambda one: one.length_m))
         turn = np.array([[x, -y], [y, x]])
-        across, along = (
-            [place for line in lines if (place := _offset(line, turn, axis)) is not None] for axis in (0, 1)
-        )
-        numbers = len(np.unique(along)), len(np.unique(across))
+        numbers = [len(_offsets(lines, turn, axis)) for axis in (0, 1)]
         if max(numbers) > 1 and min(numbers) > 0:
-            touching = _tangents(target, curves, turn)
-            both = (np.unique(np.round([*along, *touching[1]], 6)), np.unique(np.round([*across, *touching[0]], 6)))
+            both = offsets_of(target, curves, turn)
             return Grid(target, tuple(curves), len(turns_of(target, curves)), turn, *both)
     raise InputError(
         "a field is found without a start by straight lines at right angles, two one way and one across at least: "
         "this target has fewer; start from a calibration or from corners"
     )
+
+
+def offsets_of(target: Target, curves: Collection[str], turn: Array) -> tuple[Array, Array]:
+    """What a grid calls `along` and `across`, of these curves alone."""
+    across, along = (
+        np.unique([*_offsets(_segments(target, curves), turn, axis), *tangents])
+        for axis, tangents in enumerate(_tangents(target, curves, turn))
+    )
+    return along, across
+
+
+def _segments(target: Target, curves: Collection[str]) -> list[Segment]:
+    return [curve for name, curve in target.curves.items() if name in curves and isinstance(curve, Segment)]
 
 
 def _way(line: Segment) -> Array:
@@ -90,11 +100,10 @@ def _way(line: Segment) -> Array:
     return np.asarray(way / np.linalg.norm(way))
 
 
-def _offset(line: Segment, turn: Array, axis: int) -> float | None:
-    """The grid coordinate that a line keeps; None where it does not keep that one."""
-    if abs(_way(line) @ turn[:, axis]) > _AXIS:
-        return None
-    return float(np.round(np.array(line.start[:2]) @ turn[:, axis], 6))
+def _offsets(lines: Sequence[Segment], turn: Array, axis: int) -> Array:
+    """The grid coordinates x (axis 0) or y that lines keep, of those that keep it."""
+    kept = [line.start[:2] @ turn[:, axis] for line in lines if abs(_way(line) @ turn[:, axis]) < _AXIS]
+    return np.unique(np.round(kept, _DIGITS))
 
 
 def _tangents(target: Target, curves: Collection[str], turn: Array) -> Array:
@@ -102,4 +111,4 @@ def _tangents(target: Target, curves: Collection[str], turn: Array) -> Array:
     arcs = [c for name, c in target.curves.items() if name in curves and isinstance(c, Arc)]
     centres = np.array([arc.centre[:2] for arc in arcs]).reshape(-1, 2) @ turn
     radii = np.array([[arc.radius_m] for arc in arcs]).reshape(-1, 1)
-    return np.concatenate([centres - radii, centres + radii]).T
+    return np.asarray(np.round(np.concatenate([centres - radii, centres + radii]).T, _DIGITS))

@@ -36,10 +36,9 @@ def doubt(seen: Seen, followed: Followed) -> str:
     """What speaks against taking what was followed for the field, or nothing."""
     if not followed.holds:
         return why_missed(followed, seen.target)
-    numbers = _told(followed)
-    if len(numbers) < _FEWEST_CURVES or not _spread(seen, numbers):
-        names = ", ".join(seen.target.curve_names[number] for number in numbers)
-        return f"only {names} would be in the picture: too little to find a field by; start from corners"
+    names = told(seen, followed)
+    if len(names) < _FEWEST_CURVES or not _spread(seen, names):
+        return f"only {', '.join(names)} would be in the picture: too little to find a field by; start from corners"
     phi = followed.camera.phi / seen.picture.unit_px
     if -followed.camera.cam_from_world.rotation[2, 2] < _LEAST_UPRIGHT or not _PHI[0] < phi < _PHI[1]:
         return "its lines were not found in any view from above: start from corners"
@@ -89,14 +88,15 @@ def _distances(a: Array, b: Array) -> Array:
     return np.asarray(np.nan_to_num(np.linalg.norm(a - b, axis=1), nan=np.inf))
 
 
-def _told(followed: Followed) -> list[int]:
-    """The curves that were found."""
+def told(seen: Seen, followed: Followed) -> list[str]:
+    """Names of the curves that were found."""
     numbers, places = np.unique(followed.lines.course.curve[followed.lines.found], return_counts=True)
-    return [int(number) for number in numbers[places >= _FEWEST_PLACES]]
+    return [seen.target.curve_names[number] for number in numbers[places >= _FEWEST_PLACES]]
 
 
-def _spread(seen: Seen, numbers: list[int]) -> bool:
+def _spread(seen: Seen, names: list[str]) -> bool:
     """Whether these curves run in more than one direction."""
+    numbers = [seen.target.curve_names.index(name) for name in names]
     tracks, is_arc = seen.target.tracks[0, numbers], seen.target.is_arc[numbers]
     ways = tracks[~is_arc, 1, :2]
     parallel = np.abs(ways[:, 0] * ways[:1, 1] - ways[:, 1] * ways[:1, 0]) < 1e-6 * np.linalg.norm(ways, axis=1)

@@ -8,7 +8,7 @@ do not arise: the camera stands above a floor whose z points up, and a rotation 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import gcd
 
 import numpy as np
@@ -27,6 +27,7 @@ _FEW, _MANY = 60, 300  # places on the target at which all, and the best, are tr
 _KEPT = 800
 _LEAST_IN_VIEW = 0.03  # of the places on the target: a camera nearer than that sees too little of it
 _BLOCK = 2000
+_QUARTERS = np.array([[[c, -s, 0], [s, c, 0], [0, 0, 1]] for c, s in ((1, 0), (0, 1), (-1, 0), (0, -1))], dtype=float)
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,24 +59,51 @@ class Picture:
         return np.asarray((self.strokes.ends - self.centre) / self.unit_px)
 
 
-def match(upright: Upright, picture: Picture, grid: Grid) -> list[Match]:
-    """The best hypotheses, the best first."""
+@dataclass(frozen=True, eq=False)
+class FloorLines:
+    """Where lines lie on the floor, in increasing order: x of those that run along y, and y of those along x.
+
+    In camera heights from the place below the camera.
+    """
+
+    x: Array
+    y: Array
+
+    def turned(self, quarters: int) -> FloorLines:
+        """The same in axes that are turned by quarters, counter-clockwise."""
+        lines = self
+        for _ in range(quarters):
+            lines = FloorLines(lines.y, -lines.x[::-1])
+        return lines
+
+
+def lines_seen(upright: Upright, picture: Picture) -> FloorLines:
+    """The lines on which most strokes lie."""
     ends, weights = picture.ends, picture.strokes.length_px
     floor = np.stack([upright.floor(ends[:, 0]), upright.floor(ends[:, 1])], axis=1)
     seen = np.all(np.isfinite(floor), axis=(1, 2))
     floor, weights = floor[seen], weights[seen]
+    along = np.diff(floor, axis=1)[:, 0]
+    slope = np.abs(along / np.linalg.norm(along, axis=1, keepdims=True))
+    middle = floor.mean(axis=1)
+    x, y = (
+        _peaks(middle[rows, axis], weights[rows], float(weights.sum()))
+        for axis, rows in enumerate((slope[:, 0] < _PARALLEL, slope[:, 1] < _PARALLEL))
+    )
+    return FloorLines(x, y)
+
+
+def match(upright: Upright, picture: Picture, grid: Grid, lines: FloorLines) -> list[Match]:
+    """The best hypotheses for these lines, the best first."""
     few, many = (places_along(grid, count) for count in (_FEW, _MANY))
     found: list[tuple[float, Array, Array]] = []
-    for quarter in range(4 // gcd(4, grid.turns)):
-        cosine, sine = ((1, 0), (0, 1), (-1, 0), (0, -1))[quarter]
-        spin = np.array([[cosine, -sine], [sine, cosine]], dtype=float)
-        rotation = upright.rotation @ np.block([[spin, np.zeros((2, 1))], [np.zeros((1, 2)), np.ones((1, 1))]])
-        turned = Upright(upright.bend, upright.phi, rotation, upright.share)
-        hypotheses = _hypotheses(floor @ spin, weights, grid)
+    for quarters in range(4 // gcd(4, grid.turns)):
+        turned = replace(upright, rotation=upright.rotation @ _QUARTERS[quarters])
+        hypotheses = _hypotheses(lines.turned(quarters), grid)
         score = _scores(picture, turned, hypotheses, few)
         best = np.argsort(-score)[:_KEPT]
         score = _scores(picture, turned, hypotheses[best], many)
-        found += [(float(value), hypotheses[row], rotation) for value, row in zip(score, best, strict=True)]
+        found += [(float(value), hypotheses[row], turned.rotation) for value, row in zip(score, best, strict=True)]
     found.sort(key=lambda one: -one[0])
     return [_as_match(score, place, rotation, grid) for score, place, rotation in found[:_KEPT]]
 
@@ -90,15 +118,9 @@ def _as_match(score: float, place: Array, rotation: Array, grid: Grid) -> Match:
 # ---- hypotheses -----------------------------------------------------------------------------------------------------
 
 
-def _hypotheses(floor: Array, weights: Array, grid: Grid) -> Array:
+def _hypotheses(lines: FloorLines, grid: Grid) -> Array:
     """(K, 3) camera height and place x, y in the grid that put two lines one way and one across on lines of it."""
-    along = np.diff(floor, axis=1)[:, 0]
-    slope = np.abs(along / np.linalg.norm(along, axis=1, keepdims=True))
-    middle = floor.mean(axis=1)
-    x, y = (
-        _peaks(middle[rows, axis], weights[rows], float(weights.sum()))
-        for axis, rows in enumerate((slope[:, 0] < _PARALLEL, slope[:, 1] < _PARALLEL))
-    )
+    x, y = lines.x, lines.y
     height_y, place_y = _pairs(y, grid.along)
     height_x, place_x = _pairs(x, grid.across)
     parts = [

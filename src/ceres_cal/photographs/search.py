@@ -21,7 +21,7 @@ from ceres_cal.photographs.facing import (
     telling_feature,
 )
 from ceres_cal.photographs.follow import Followed, follow
-from ceres_cal.photographs.judgement import doubt, explained, same_labels, worth
+from ceres_cal.photographs.judgement import doubt, explained, same_labels, told, worth
 from ceres_cal.photographs.refit import Shown
 from ceres_cal.targets import Target
 
@@ -89,7 +89,7 @@ def search(grey: Grey, target: Target, curves: Collection[str], auto: Auto) -> S
     if not good:
         return Searched(None, reason)
     best = max(good, key=lambda one: worth(seen, one.camera))
-    others = [_followed(seen, _turned(seen, auto, camera)) for camera in alike(seen, best.camera)]
+    others = [_followed(seen, _turned(seen, auto, camera)) for camera in alike(seen, best.camera, told(seen, best))]
     found = [best]
     for other in (*good, *(one for one in others if not doubt(seen, one))):
         as_good = worth(seen, other.camera) >= _AS_GOOD * worth(seen, best.camera)
