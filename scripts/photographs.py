@@ -350,7 +350,7 @@ def draw(path: Path, found: FieldDetections, picture: Path) -> None:
     cv2.imwrite(str(picture), image)
 
 
-CASES = ("lines", "floor", "starts", "speed", "rings", "real", "straight")
+CASES = ("lines", "floor", "starts", "auto", "speed", "rings", "real", "straight")
 
 
 def rows_of(case: str, runs: int, real: Path | None, picture: Path | None) -> Iterator[Row]:
@@ -360,6 +360,12 @@ def rows_of(case: str, runs: int, real: Path | None, picture: Path | None) -> It
         yield from floor_rows(runs)
     elif case == "starts":
         yield from start_rows(runs)
+    elif case == "auto":
+        from photographs_auto import auto_rows, real_auto_rows  # which takes its photographs from here
+
+        yield from auto_rows(runs)
+        if real is not None:
+            yield from real_auto_rows(real)
     elif case == "speed":
         yield from speed_rows(min(runs, 20))
     elif case == "rings":

@@ -16,10 +16,11 @@ from ceres_cal.errors import InputError
 
 if TYPE_CHECKING:
     from ceres_cal.camera import Camera
-    from ceres_cal.photographs import Clicks, FieldDetections
+    from ceres_cal.photographs import Auto, Clicks, Facing, FieldDetections
     from ceres_cal.targets import Target
 
 _CORNER = "TopLeftCorner=102,88"
+_FACING = "LeftGoalLine=top"
 
 
 def _add_arguments(parser: ArgumentParser) -> None:
@@ -41,6 +42,20 @@ def _add_arguments(parser: ArgumentParser) -> None:
         metavar="NAME=X,Y",
         help=f"instead of --start: four points or more where they are seen, roughly, such as {_CORNER}; repeatable",
     )
+    add(
+        "--auto",
+        action="store_true",
+        help="without any start: find the field in the photograph; with --start CALIBRATION, however far it has moved",
+    )
+    add(
+        "--facing",
+        action="append",
+        default=[],
+        metavar="NAME=SIDE",
+        help="with --auto: which way round a field is that looks alike turned, by the side of the picture (left, "
+        f"right, top, bottom, top-left, ...) that a line or point lies towards, such as {_FACING}; it need not be in "
+        "the picture; repeatable",
+    )
     add("--not-painted", default="", metavar="NAME,...", help="lines of the target that this field does not have")
     add("--edges", action="store_true", help="both edges of each line instead of its middle")
     add("--lines-only", action="store_true", help="no corners and crossings")
@@ -54,8 +69,12 @@ def _run(args: Namespace) -> Answer:
     images = list(image_files(args.images))
     require_output(args.output, [*images, *([args.start] if args.start else [])])
     require_observations_file(args.output)
-    if (args.start is None) == (not args.corner):
-        raise InputError(f"say where to start: --start FILE, or --corner {_CORNER} four times")
+    if (args.start is not None) + bool(args.corner) != 1 and not (args.auto and not args.corner):
+        raise InputError(f"say where to start: --start FILE, or --corner {_CORNER} four times, or --auto")
+    if args.auto and args.corner:
+        raise InputError("--corner says where to start and --auto to do without: give one of them")
+    if args.facing and not args.auto:
+        raise InputError("--facing goes with --auto: a start says which way round the field is")
     os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")  # what it warns of in an image, we say ourselves
     from ceres_cal.photographs import detect_field
 
@@ -92,7 +111,7 @@ COMMANDS = (Command("detect field", "painted lines and crossings of a field in p
 
 @dataclass(frozen=True)
 class _Start:
-    start: Camera | Clicks
+    start: Camera | Clicks | Auto
     camera: str
     station: str
     target: Target | None
@@ -100,6 +119,8 @@ class _Start:
 
 def _start(args: Namespace) -> _Start:
     camera = args.camera or "camera"
+    if args.start is None and args.auto:
+        return _Start(_auto(args.facing, None), camera, args.station or camera, None)
     if args.start is None:
         return _Start(_corners(args.corner), camera, args.station or camera, None)
     from ceres_cal.calibration import FORMAT, Calibration
@@ -107,13 +128,31 @@ def _start(args: Namespace) -> _Start:
     from ceres_cal.photographs.known import is_painted
 
     if _json(args.start).get("format") != FORMAT:
+        if args.auto:
+            raise InputError(f"{args.start}: with --auto only a calibration is of use: leave out --auto, or the file")
         return _Start(load_clicks(args.start), camera, args.station or camera, None)
     calibration = Calibration.load(args.start)
     posed = calibration.station(args.station)
     station = args.station or next(iter(calibration.stations))
     fields = [target for target in calibration.targets.values() if is_painted(target)]
     name = args.camera or calibration.estimate.stations[station].camera
-    return _Start(posed, name, station, fields[0] if len(fields) == 1 else None)
+    start = _auto(args.facing, posed) if args.auto else posed
+    return _Start(start, name, station, fields[0] if len(fields) == 1 else None)
+
+
+def _auto(facing: list[str], before: Camera | None) -> Auto:
+    from ceres_cal.photographs import Auto
+
+    return Auto(tuple(_facing(spec) for spec in facing), before)
+
+
+def _facing(spec: str) -> Facing:
+    from ceres_cal.photographs import SIDES, Facing
+
+    name, equals, side = (part.strip() for part in spec.partition("="))
+    if not (name and equals and side in SIDES):
+        raise InputError(f"--facing {spec!r}: write NAME=SIDE, such as {_FACING}; a side is one of {', '.join(SIDES)}")
+    return Facing(name, side)
 
 
 def _corners(specs: list[str]) -> Clicks:
@@ -173,6 +212,9 @@ def _data(found: FieldDetections, output: Path) -> dict[str, Any]:
                 "width_factor": lines.stretch,
             }
         )
+        if path in found.searched:
+            ways, settled_by = found.searched[path].ways, found.searched[path].settled_by
+            images[-1]["searched"] = {"ways": ways, "settled_by": settled_by or None}
     return {
         "output": str(output),
         "points": len(found.observations.points),
@@ -193,5 +235,16 @@ def _text(data: dict[str, Any]) -> str:
         f"blur {one['blur_px']:.2f} px, lines {one['width_factor']:.2f} times as wide as the target says"
         for one in data["found"]
     ]
+    lines += [
+        f"{one['image']}: found without a start, {_ways(one['searched'])}" for one in data["found"] if "searched" in one
+    ]
     lines += [f"{one['image']}: {one['reason']}" for one in data["missed"]]
     return "\n".join([*lines, f"written to {data['output']}"])
+
+
+def _ways(searched: dict[str, Any]) -> str:
+    """In how many ways a photograph could be taken for the field, and what chose one."""
+    if searched["settled_by"] is None:
+        return "in the one way it can be seen"
+    by = {"facing": "--facing", "before": "the calibration of before"}[searched["settled_by"]]
+    return f"in one of the {searched['ways']} ways it can be seen: {by} says which"

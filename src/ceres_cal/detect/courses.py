@@ -15,6 +15,7 @@ from ceres_cal.transforms import Array
 Ints = NDArray[np.int32]
 Mask = NDArray[np.bool_]
 
+_WIDEST_PX = 100.0
 _PIECES = 240  # of a curve, to measure its length in the image
 
 
@@ -58,7 +59,10 @@ def predict(
     ]
     number = np.concatenate([np.empty(0, np.int32), *(np.full(len(s), i, np.int32) for i, s in parts)])
     s = np.concatenate([np.empty(0), *(s for _, s in parts)])
-    return course_at(target, camera, number, s)
+    course = course_at(target, camera, number, s)
+    # Where the lens folds over, paint may have one edge only; and what is wider no search is meant for.
+    whole = np.isfinite(course.curvature + np.sum(course.pixels + course.normals, axis=1))
+    return course.take(whole & (course.width_px < _WIDEST_PX))
 
 
 def _places(target: Target, camera: Camera, number: int, spacing_px: float, margin_px: float) -> tuple[int, Array]:

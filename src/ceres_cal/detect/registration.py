@@ -33,9 +33,10 @@ class Nearness:
 
     def score(self, pixels: Array) -> float:
         """Mean nearness of places (N, 2) px; those outside the image count as far off."""
-        return float(np.mean(self._at(pixels[:, 0], pixels[:, 1])))
+        return float(np.mean(self.at(pixels[:, 0], pixels[:, 1])))
 
-    def _at(self, x: Array, y: Array) -> Array:
+    def at(self, x: Array, y: Array) -> Array:
+        """Nearness of places x, y px of any shape; 0 outside the image."""
         column, row = (np.round((v + 0.5) / self.reduced - 0.5) for v in (x, y))
         height, width = self.plane.shape
         inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)  # False for NaN
@@ -54,12 +55,17 @@ def nearness(grey: Grey, width_px: float) -> Nearness:
     _, labels, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
     kept = stats[:, cv2.CC_STAT_AREA] >= _SPECK_PX
     kept[0] = False
-    if not np.any(kept):
-        return Nearness(np.zeros((mask.shape[0] // _REDUCED, mask.shape[1] // _REDUCED), np.float32))
-    away = cv2.distanceTransform(1 - kept[labels].astype(np.uint8), cv2.DIST_L2, 3)
+    return nearness_to(kept[labels])
+
+
+def nearness_to(mask: NDArray[np.bool_]) -> Nearness:
+    """How near each pixel is to those of a mask (height, width)."""
+    size = mask.shape[1] // _REDUCED, mask.shape[0] // _REDUCED
+    if not np.any(mask):
+        return Nearness(np.zeros(size[::-1], np.float32))
+    away = cv2.distanceTransform(1 - mask.astype(np.uint8), cv2.DIST_L2, 3)
     near = np.exp(-0.5 * (away / _NEAR_PX) ** 2).astype(np.float32)
-    reduced = cv2.resize(near, (mask.shape[1] // _REDUCED, mask.shape[0] // _REDUCED), interpolation=cv2.INTER_AREA)
-    return Nearness(np.asarray(reduced, dtype=np.float32))
+    return Nearness(np.asarray(cv2.resize(near, size, interpolation=cv2.INTER_AREA), dtype=np.float32))
 
 
 def shifted(course: Course, near: Nearness, image_size: tuple[int, int], reach_px: float, most: int) -> list[Array]:
@@ -74,7 +80,7 @@ def shifted(course: Course, near: Nearness, image_size: tuple[int, int], reach_p
         turned = middle + away @ np.array([[cosine, sine], [-sine, cosine]])
         score = np.empty((len(steps), len(steps)))
         for row, dy in enumerate(steps):
-            score[row] = near._at(turned[:, 0] + steps[:, None], turned[:, 1] + dy).mean(axis=1)
+            score[row] = near.at(turned[:, 0] + steps[:, None], turned[:, 1] + dy).mean(axis=1)
         best = int(np.argmax(score))
         shift = np.array([steps[best % len(steps)], steps[best // len(steps)]])
         found.append((float(score.flat[best]), turned + shift))

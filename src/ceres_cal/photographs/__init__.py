@@ -1,15 +1,21 @@
 """From photographs of a field to its observations: detection and refitting of the camera, in turn, until they agree."""
 
 from ceres_cal.photographs.clicks import Clicks, load_clicks
+from ceres_cal.photographs.facing import SIDES, Facing
 from ceres_cal.photographs.field import FieldDetections, detect_field
 from ceres_cal.photographs.follow import Followed, follow
 from ceres_cal.photographs.known import KnownDetections, check_photographs, detect_known
+from ceres_cal.photographs.search import Auto, Searched
 
 __all__ = [
+    "SIDES",
+    "Auto",
     "Clicks",
+    "Facing",
     "FieldDetections",
     "Followed",
     "KnownDetections",
+    "Searched",
     "check_photographs",
     "detect_field",
     "detect_known",

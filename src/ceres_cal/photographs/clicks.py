@@ -95,14 +95,17 @@ def starts_from_clicks(clicks: Clicks, target: Target, image_size: tuple[int, in
             raise InputError("the points to start from go round the wrong way, as if seen from below: check names")
         cameras.append(Camera(image_size, phi, (float(middle[0]), float(middle[1])), lens, 1.0, pose))
     phi = float(np.median([camera.phi for camera in cameras]))
+    return cameras, unknown_optics(image_size, phi, Shown(index, pixels, np.full(len(index), SIGMA_PX)))
+
+
+def unknown_optics(image_size: tuple[int, int], phi: float, shown: Shown) -> Freedom:
+    """What a photograph may tell of a camera of which nothing is known but, roughly, its phi and where points are."""
+    middle = 0.5 * (np.array(image_size) - 1.0)
     priors = (
         Prior("camera", CAMERA, "phi", (phi,), (0.5 * phi,)),
         Prior("camera", CAMERA, "principal_point", tuple(middle), (0.04 * image_size[0],) * 2),
     )
-    freedom = Freedom(
-        ("a3", "phi", "a2", "cx", "cy", "a4", "a5"), priors, Shown(index, pixels, np.full(len(index), SIGMA_PX))
-    )
-    return cameras, freedom
+    return Freedom(_FREED, priors, shown)
 
 
 def _phi(homography: Array, half_px: float) -> float:

@@ -13,10 +13,13 @@ from ceres_cal.camera import Camera
 from ceres_cal.detect.boards import read_grey
 from ceres_cal.detect.crossings import Crossings, find_crossings
 from ceres_cal.detect.lines import Lines
+from ceres_cal.detect.profiles import Grey
 from ceres_cal.errors import InputError, NothingShownError
 from ceres_cal.observations import Curves, Observations, Points, View, combine
 from ceres_cal.photographs.clicks import Clicks, starts_from_clicks
-from ceres_cal.photographs.follow import LEAST_SHARE, Followed, Freedom, follow
+from ceres_cal.photographs.follow import Followed, Freedom, follow
+from ceres_cal.photographs.judgement import why_missed
+from ceres_cal.photographs.search import Auto, Searched, search
 from ceres_cal.targets import Target
 
 TARGET_NAME = "field"
@@ -30,17 +33,19 @@ class FieldDetections:
         observations: one view per image that shows the field.
         found: path -> the camera that predicts its lines, and what was measured.
         missed: path and reason of every other image.
+        searched: what came of those images in which the field was found without a start.
     """
 
     observations: Observations
     found: dict[str, Followed]
     missed: tuple[tuple[str, str], ...]
+    searched: dict[str, Searched]
 
 
 def detect_field(
     images: Sequence[Path],
     target: Target,
-    start: Camera | Clicks,
+    start: Camera | Clicks | Auto,
     curves: Collection[str] | None = None,
     camera: str = "camera",
     station: str | None = None,
@@ -56,14 +61,15 @@ def detect_field(
 
     Args:
         images: files of any kind OpenCV reads, all of one size.
-        start: the station's camera before it was moved (by up to 130 px, or 5 degrees), or points that somebody showed.
+        start: the station's camera before it was moved (by up to 130 px, or 5 degrees), points that somebody showed, or
+            `Auto()`: the field is found without any (see `search`). Later images start from what the last one told.
         curves: names of those that are painted; None: all of the target with a width.
         with_points: else curve observations only. edges: both edges of the paint instead of its middle.
         progress: called after each image with (images done, images in all, file name).
 
     Raises:
-        InputError: an image cannot be read or has another size than the camera, or a name that the target does not
-            have.
+        InputError: an image cannot be read or has another size than the camera, a name that the target does not have,
+            or it cannot be told which way round the field is.
         NothingShownError: no image shows the field.
     """
     painted = _painted(target, curves)
@@ -71,17 +77,18 @@ def detect_field(
     found: dict[str, Followed] = {}
     crossings: dict[str, Crossings | None] = {}
     missed: list[tuple[str, str]] = []
+    searched: dict[str, Searched] = {}
     before: Followed | None = None
     for number, path in enumerate(paths, start=1):
         grey = read_grey(path).astype(np.float32)
-        size = (int(grey.shape[1]), int(grey.shape[0]))
-        starts, freedom = _starts(start, before, target, size, path)
-        followed = follow(grey, target, starts, painted, freedom)
-        if not followed.holds:
-            missed.append((str(path), _why_missed(followed, target)))
+        outcome = _looked_for(grey, target, painted, start, before, path)
+        if outcome.followed is None:
+            missed.append((str(path), outcome.reason))
         else:
-            found[str(path)] = before = followed
-            crossings[str(path)] = find_crossings(target, followed.camera, followed.lines) if with_points else None
+            found[str(path)] = before = outcome.followed
+            crossings[str(path)] = find_crossings(target, before.camera, before.lines) if with_points else None
+            if outcome.ways:
+                searched[str(path)] = outcome
         if progress is not None:
             progress(number, len(paths), path.name)
     if not found:
@@ -91,17 +98,7 @@ def detect_field(
         _observations(path, one, crossings[path], target, (camera, station or camera), edges)
         for path, one in found.items()
     ]
-    return FieldDetections(combine(parts), found, tuple(missed))
-
-
-def _why_missed(followed: Followed, target: Target) -> str:
-    if followed.share >= LEAST_SHARE:
-        names = ", ".join(target.curve_names[number] for number in followed.absent)
-        return f"there is no {names} where they should be: say which lines are not painted, or check the dimensions"
-    return (
-        f"its lines were not found (paint at {100.0 * followed.share:.0f} % of where this start, moved, puts them): "
-        "check the target's dimensions and which lines are painted, or start from other points"
-    )
+    return FieldDetections(combine(parts), found, tuple(missed), searched)
 
 
 def _painted(target: Target, curves: Collection[str] | None) -> tuple[str, ...]:
@@ -114,8 +111,28 @@ def _painted(target: Target, curves: Collection[str] | None) -> tuple[str, ...]:
     return painted
 
 
+def _looked_for(
+    grey: Grey,
+    target: Target,
+    painted: tuple[str, ...],
+    start: Camera | Clicks | Auto,
+    before: Followed | None,
+    path: Path,
+) -> Searched:
+    """The field from where the last image showed it, or from the start that was given, or from none."""
+    size = (int(grey.shape[1]), int(grey.shape[0]))
+    if before is None and isinstance(start, Auto):
+        try:
+            return search(grey, target, painted, start)
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from None
+    starts, freedom = _starts(start, before, target, size, path)
+    followed = follow(grey, target, starts, painted, freedom)
+    return Searched(followed) if followed.holds else Searched(None, why_missed(followed, target))
+
+
 def _starts(
-    start: Camera | Clicks, before: Followed | None, target: Target, size: tuple[int, int], path: Path
+    start: Camera | Clicks | Auto, before: Followed | None, target: Target, size: tuple[int, int], path: Path
 ) -> tuple[list[Camera], Freedom]:
     """The cameras to start from: the last image's, or the one given, or those that the clicks may belong to."""
     if isinstance(start, Camera) and start.image_size != size:
@@ -127,7 +144,10 @@ def _starts(
         if before.camera.image_size != size:
             raise InputError(f"{path}: {size[0]} x {size[1]} px, unlike the images before: give it on its own")
         return [before.camera], Freedom()
-    return ([start], Freedom()) if isinstance(start, Camera) else starts_from_clicks(start, target, size)
+    if isinstance(start, Clicks):
+        return starts_from_clicks(start, target, size)
+    assert isinstance(start, Camera)
+    return [start], Freedom()
 
 
 def _observations(

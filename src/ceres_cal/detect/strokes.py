@@ -1,0 +1,116 @@
+"""Short straight strokes of paint in a photograph, found without knowing where: thin, and brighter than both sides.
+
+Ridges are found as Steger does (An Unbiased Detector of Curvilinear Structures, 1998): where the second derivative
+across is most negative, at its sub-pixel top. What is connected and straight over a few dozen pixels is a stroke.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ceres_cal.detect.profiles import Grey
+from ceres_cal.transforms import Array
+
+_SCALES = (1, 2)  # a photograph is searched at full and at half size: for narrow paint and for wide
+_SIGMA_PX = 1.6
+_TILE_PX = 24  # a stroke's length at most
+_LEAST_PX = 9.0
+_STRAIGHT_PX = 0.6  # rms about the stroke
+_NOISE = 5.0  # times the usual response
+_OF_BRIGHTEST = 0.15
+
+
+@dataclass(frozen=True, eq=False)
+class Strokes:
+    """N strokes: their ends (N, 2, 2) px and how bright a ridge each is (N,), in grey levels per px squared."""
+
+    ends: Array
+    strength: Array
+
+    def __len__(self) -> int:
+        return len(self.ends)
+
+    @property
+    def length_px(self) -> Array:
+        """(N,)"""
+        return np.asarray(np.linalg.norm(self.ends[:, 1] - self.ends[:, 0], axis=1))
+
+
+def drawn(strokes: Strokes, image_size: tuple[int, int]) -> NDArray[np.bool_]:
+    """(height, width) where strokes are."""
+    mask = np.zeros(image_size[::-1], np.uint8)
+    cv2.polylines(mask, list(np.round(strokes.ends).astype(np.int32)), isClosed=False, color=1)
+    return mask > 0
+
+
+def find_strokes(grey: Grey) -> Strokes:
+    """Every stroke of a photograph, of paint up to some 12 px wide."""
+    found = []
+    for scale in _SCALES:
+        plane = (
+            grey if scale == 1 else cv2.resize(grey, None, fx=1.0 / scale, fy=1.0 / scale, interpolation=cv2.INTER_AREA)
+        )
+        strokes = _strokes(_ridge_points(np.asarray(plane, np.float32)))
+        found.append(Strokes((strokes.ends + 0.5) * scale - 0.5, strokes.strength))
+    return found[0] if np.sum(found[0].length_px) > 0.7 * np.sum(found[1].length_px) else found[1]
+
+
+@dataclass(frozen=True, eq=False)
+class _Ridge:
+    """Points on ridges: pixels (N, 2), strength (N,) and which connected piece each belongs to (N,)."""
+
+    pixels: Array
+    strength: Array
+    piece: NDArray[np.int64]
+
+
+def _ridge_points(grey: Grey) -> _Ridge:
+    soft = cv2.GaussianBlur(grey, (0, 0), _SIGMA_PX)
+    xx, yy = (np.asarray(cv2.Sobel(soft, cv2.CV_32F, *order, ksize=3)) / 4.0 for order in ((2, 0), (0, 2)))
+    xy = np.asarray(cv2.Sobel(soft, cv2.CV_32F, 1, 1, ksize=3)) / 4.0
+    bend = 0.5 * (xx + yy) - np.sqrt((0.5 * (xx - yy)) ** 2 + xy**2)  # the lower eigenvalue
+    strength = np.maximum(-bend, 0.0)
+    usual = float(np.median(strength[::3, ::3]))
+    bright = float(np.quantile(strength[::3, ::3], 0.995))
+    rows, columns = np.nonzero(strength > max(_NOISE * usual, _OF_BRIGHTEST * bright, 1e-3))
+    a, b, c = xx[rows, columns], xy[rows, columns], bend[rows, columns]
+    angle = 0.5 * np.arctan2(2.0 * b, a - yy[rows, columns]) + 0.5 * np.pi  # of the direction that bends most downwards
+    nx, ny = np.cos(angle), np.sin(angle)
+    gx = 0.5 * (soft[rows, np.minimum(columns + 1, soft.shape[1] - 1)] - soft[rows, np.maximum(columns - 1, 0)])
+    gy = 0.5 * (soft[np.minimum(rows + 1, soft.shape[0] - 1), columns] - soft[np.maximum(rows - 1, 0), columns])
+    step = -(gx * nx + gy * ny) / c
+    top = np.maximum(np.abs(step * nx), np.abs(step * ny)) <= 0.6
+    mask = np.zeros(grey.shape, np.uint8)
+    mask[rows[top], columns[top]] = 1
+    _, labels = cv2.connectedComponents(mask, connectivity=8)
+    pixels = np.column_stack([columns + step * nx, rows + step * ny])[top]
+    return _Ridge(pixels, -c[top], labels[rows[top], columns[top]].astype(np.int64))
+
+
+def _strokes(ridge: _Ridge) -> Strokes:
+    """The straight lines through the points of each piece in each tile of the image."""
+    if not len(ridge.pixels):
+        return Strokes(np.empty((0, 2, 2)), np.empty(0))
+    tile = np.floor(np.maximum(ridge.pixels, 0.0) / _TILE_PX).astype(np.int64)
+    key = (ridge.piece * 4096 + tile[:, 0]) * 4096 + tile[:, 1]
+    _, group, count = np.unique(key, return_inverse=True, return_counts=True)
+
+    def mean(values: Array) -> Array:
+        return np.asarray(np.bincount(group, values) / count)
+
+    x, y = ridge.pixels.T
+    cx, cy = mean(x), mean(y)
+    dx, dy = x - cx[group], y - cy[group]
+    xx, xy, yy = mean(dx * dx), mean(dx * dy), mean(dy * dy)
+    angle = 0.5 * np.arctan2(2.0 * xy, xx - yy)
+    along_x, along_y = np.cos(angle), np.sin(angle)
+    root = np.sqrt((0.5 * (xx - yy)) ** 2 + xy**2)
+    half = np.sqrt(3.0 * np.maximum(0.5 * (xx + yy) + root, 0.0))  # of an even line with that second moment
+    across = np.sqrt(np.maximum(0.5 * (xx + yy) - root, 0.0))
+    good = (2.0 * half >= _LEAST_PX) & (across < _STRAIGHT_PX) & (count > 1.2 * half)
+    centre, reach = np.column_stack([cx, cy]), np.column_stack([half * along_x, half * along_y])
+    return Strokes(np.stack([centre - reach, centre + reach], axis=1)[good], mean(ridge.strength)[good])

@@ -1,0 +1,144 @@
+"""Cameras that may have taken a photograph of a target, from nothing but its strokes of paint."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ceres_cal.camera import Camera
+from ceres_cal.detect.profiles import Grey
+from ceres_cal.detect.registration import nearness_to
+from ceres_cal.detect.strokes import drawn, find_strokes
+from ceres_cal.lens import Radial
+from ceres_cal.photographs.facing import turns_of
+from ceres_cal.photographs.grid import Grid, grid_of, offsets_of
+from ceres_cal.photographs.matching import FloorLines, Match, Picture, lines_seen, match
+from ceres_cal.photographs.upright import Upright, find_upright
+from ceres_cal.targets import Target
+from ceres_cal.transforms import Pose, rotation_log
+
+_UPRIGHTS = 4  # answers for lens and tilt, at most, that are matched
+_SURE = 0.88  # the score of a match after which no other lens and tilt is tried
+_POWERS = (2, 3, 4, 5)
+_WORTH_A_LOOK, _ALIKE = 0.75, 0.9  # of the best match's score: another's, and that of another way to take the picture
+_MOST, _MOST_ALIKE = 3, 5
+_SAME_PLACE, _SAME_TURN = 0.08, 0.1  # in heights, rad
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """A photograph and the target that it may show.
+
+    Attributes:
+        turns: of the target that put its painted curves onto themselves; the first is none.
+    """
+
+    grey: Grey
+    picture: Picture
+    grid: Grid
+    turns: tuple[Pose, ...]
+
+    @property
+    def target(self) -> Target:
+        return self.grid.target
+
+    @property
+    def curves(self) -> tuple[str, ...]:
+        """Names of those that are painted."""
+        return self.grid.curves
+
+
+def see(grey: Grey, target: Target, curves: Collection[str]) -> Seen:
+    """The strokes of a photograph, beside what they are to be taken for.
+
+    Raises:
+        InputError: the target has too few straight lines.
+    """
+    grid = grid_of(target, curves)
+    size = (int(grey.shape[1]), int(grey.shape[0]))
+    strokes = find_strokes(grey)
+    picture = Picture(strokes, nearness_to(drawn(strokes, size)), size, 0.5 * (np.array(size) - 1.0))
+    return Seen(grey, picture, grid, tuple(turns_of(target, curves)))
+
+
+def candidates(seen: Seen) -> list[Camera]:
+    """Cameras that may have taken it, the best first, each once for all turns of the target."""
+    found: list[tuple[float, Camera]] = []
+    for upright in find_upright(seen.picture.ends, seen.picture.strokes.length_px, _UPRIGHTS):
+        optics = _optics(upright, seen.picture)
+        matches = match(upright, seen.picture, seen.grid, lines_seen(upright, seen.picture))
+        found += [(one.score, _posed(optics, one)) for one in matches]
+        if found and max(score for score, _ in found) > _SURE:
+            break
+    return _distinct(sorted(found, key=lambda one: -one[0]), seen.turns, _WORTH_A_LOOK)[:_MOST]
+
+
+def alike(seen: Seen, camera: Camera, found: Collection[str]) -> list[Camera]:
+    """Other cameras with about these optics, turned by quarters, moved, higher or lower, that may have taken it too.
+
+    Args:
+        camera: that may have. found: names of the curves that were found from there.
+    """
+    picture, upright = replace(seen.picture, centre=np.array(camera.principal_point)), _upright_of(camera, seen)
+    x, y = camera.position[:2] @ seen.grid.turn
+    along, across = offsets_of(seen.target, found, seen.grid.turn)
+    lines = FloorLines((across - x) / camera.position[2], (along - y) / camera.position[2])
+    optics = _optics(upright, picture)
+    others = [(one.score, _posed(optics, one)) for one in match(upright, picture, seen.grid, lines)]
+    return _distinct(others, seen.turns, _ALIKE, camera)
+
+
+def _posed(optics: Camera, one: Match) -> Camera:
+    return optics.at(Pose.looking(one.position, one.rotation))
+
+
+# ---- one coefficient and lenses -------------------------------------------------------------------------------------
+
+
+def _optics(upright: Upright, picture: Picture) -> Camera:
+    """A camera with the polynomial that is nearest to the one coefficient, over the image."""
+    share = np.linspace(0.0, 1.02, 60)  # of half the image's diagonal
+    ideal = share / (1.0 + upright.bend * share**2)
+    values = np.linalg.lstsq(share[:, None] ** np.array(_POWERS), ideal - share, rcond=None)[0]
+    lens = Radial(tuple(values / picture.unit_px ** (np.array(_POWERS) - 1.0)), _POWERS)
+    x, y = picture.centre
+    return Camera(picture.image_size, upright.phi * picture.unit_px, (float(x), float(y)), lens)
+
+
+def _upright_of(camera: Camera, seen: Seen) -> Upright:
+    """A camera's turn, and the one coefficient that is nearest to its lens."""
+    share, unit = np.linspace(0.1, 1.0, 30), seen.picture.unit_px
+    rays = camera.lens.undistort(np.column_stack([share * unit, np.zeros(30)]), camera.phi)
+    ahead = np.isfinite(rays[:, 2]) & (rays[:, 2] > 0.0)
+    stretch = share[ahead] * unit * rays[ahead, 2] / (camera.phi * rays[ahead, 0]) - 1.0  # c p^2
+    bend = float(stretch @ share[ahead] ** 2 / np.sum(share[ahead] ** 4))
+    turn = np.eye(3)
+    turn[:2, :2] = seen.grid.turn
+    return Upright(bend, camera.phi / unit, camera.cam_from_world.rotation @ turn, 1.0)
+
+
+# ---- one and the same -----------------------------------------------------------------------------------------------
+
+
+def _distinct(
+    found: Sequence[tuple[float, Camera]], turns: Sequence[Pose], least: float, known: Camera | None = None
+) -> list[Camera]:
+    """The best of those that put the target elsewhere, whatever its turn, and not where it is known; best first."""
+    chosen: list[Camera] = [] if known is None else [known]
+    for score, camera in found:
+        if len(chosen) > _MOST_ALIKE or score < least * found[0][0]:
+            break
+        if not any(_same_place(camera, other, turns) for other in chosen):
+            chosen.append(camera)
+    return chosen if known is None else chosen[1:]
+
+
+def _same_place(one: Camera, other: Camera, turns: Sequence[Pose]) -> bool:
+    for turn in turns:
+        between = (one.cam_from_world @ turn) @ other.cam_from_world.inverse
+        near = np.linalg.norm(between.translation) < _SAME_PLACE * max(one.position[2], other.position[2])
+        if near and np.linalg.norm(rotation_log(between.rotation)) < _SAME_TURN:
+            return True
+    return False

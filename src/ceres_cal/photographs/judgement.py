@@ -1,0 +1,103 @@
+"""Whether what was followed is the field: what speaks against it, how good it is, and when two are one and the same."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ceres_cal.camera import Camera
+from ceres_cal.detect.courses import predict
+from ceres_cal.photographs.candidates import Seen
+from ceres_cal.photographs.follow import LEAST_SHARE, Followed
+from ceres_cal.targets import Target
+from ceres_cal.transforms import Array
+
+_COURSE_PX = 3.0
+_NEAR_PX = 6.0  # of the target: a stroke that lies on it
+_EXPLAINED = 0.8  # of the strokes inside the target's outline, the share that must lie on it
+_RIM = 0.02  # of its size
+_FEWEST_PLACES, _FEWEST_CURVES = 5, 3  # found on a curve, and curves of which so many were
+_LEAST_UPRIGHT = 0.42  # cosine of the tilt: 65 degrees
+_PHI = (0.4, 4.0)  # in half image diagonals: 136 to 28 degrees across
+_SAME_FLOOR = 0.1  # of the extent of what is seen
+
+
+def why_missed(followed: Followed, target: Target) -> str:
+    """Why lines that were followed are not the target's; for those that do not hold."""
+    if followed.share >= LEAST_SHARE:
+        names = ", ".join(target.curve_names[number] for number in followed.absent)
+        return f"there is no {names} where they should be: say which lines are not painted, or check the dimensions"
+    return (
+        f"its lines were not found (paint at {100.0 * followed.share:.0f} % of where this start, moved, puts them): "
+        "check the target's dimensions and which lines are painted, or start from other points"
+    )
+
+
+def doubt(seen: Seen, followed: Followed) -> str:
+    """What speaks against taking what was followed for the field, or nothing."""
+    if not followed.holds:
+        return why_missed(followed, seen.target)
+    names = told(seen, followed)
+    if len(names) < _FEWEST_CURVES or not _spread(seen, names):
+        return f"only {', '.join(names)} would be in the picture: too little to find a field by; start from corners"
+    phi = followed.camera.phi / seen.picture.unit_px
+    if -followed.camera.cam_from_world.rotation[2, 2] < _LEAST_UPRIGHT or not _PHI[0] < phi < _PHI[1]:
+        return "its lines were not found in any view from above: start from corners"
+    share = explained(seen, followed.camera)
+    if share < _EXPLAINED:
+        return (
+            f"of the bright lines where the field would be, only {100.0 * share:.0f} % are lines of it: "
+            "check the target's dimensions and which lines are painted, or start from corners"
+        )
+    return ""
+
+
+def worth(seen: Seen, camera: Camera) -> float:
+    """Twice what the target covers of the strokes, over strokes and target in view together, in px: about 1 at best."""
+    course = predict(seen.target, camera, seen.curves, _COURSE_PX)
+    shown = _COURSE_PX * len(course)
+    covered = seen.picture.near.score(course.pixels) * shown if len(course) else 0.0
+    return 2.0 * covered / (shown + float(np.sum(seen.picture.strokes.length_px)))
+
+
+def explained(seen: Seen, camera: Camera) -> float:
+    """Of the strokes inside the target's outline, the share (by length) that lies on its curves."""
+    strokes = seen.picture.strokes
+    middles = strokes.ends.mean(axis=1)
+    places = seen.grid.outline
+    margin = _RIM * np.ptp(places, axis=0)
+    floor = camera.locate(middles) @ seen.grid.turn
+    with np.errstate(invalid="ignore"):
+        inside = np.all((floor > places.min(axis=0) - margin) & (floor < places.max(axis=0) + margin), axis=1)
+    course = predict(seen.target, camera, seen.curves, _COURSE_PX)
+    if not np.any(inside) or not len(course):
+        return 0.0
+    away = np.min(np.linalg.norm(middles[inside, None] - course.pixels, axis=2), axis=1)
+    return float(np.average(away < _NEAR_PX, weights=strokes.length_px[inside]))
+
+
+def same_labels(seen: Seen, one: Followed, other: Followed) -> bool:
+    """Whether two put what is seen onto the same places of the target, whatever its turn."""
+    pixels = one.lines.pixels[one.lines.found]
+    here, there = (np.column_stack([c.locate(pixels), np.zeros(len(pixels))]) for c in (one.camera, other.camera))
+    extent = float(np.max(np.ptp(here, axis=0)))
+    away = [float(np.nanmedian(_distances(turn.inverse.transform(here), there))) for turn in seen.turns]
+    return min(away) < _SAME_FLOOR * extent
+
+
+def _distances(a: Array, b: Array) -> Array:
+    return np.asarray(np.nan_to_num(np.linalg.norm(a - b, axis=1), nan=np.inf))
+
+
+def told(seen: Seen, followed: Followed) -> list[str]:
+    """Names of the curves that were found."""
+    numbers, places = np.unique(followed.lines.course.curve[followed.lines.found], return_counts=True)
+    return [seen.target.curve_names[number] for number in numbers[places >= _FEWEST_PLACES]]
+
+
+def _spread(seen: Seen, names: list[str]) -> bool:
+    """Whether these curves run in more than one direction."""
+    numbers = [seen.target.curve_names.index(name) for name in names]
+    tracks, is_arc = seen.target.tracks[0, numbers], seen.target.is_arc[numbers]
+    ways = tracks[~is_arc, 1, :2]
+    parallel = np.abs(ways[:, 0] * ways[:1, 1] - ways[:, 1] * ways[:1, 0]) < 1e-6 * np.linalg.norm(ways, axis=1)
+    return bool(np.any(is_arc) or not np.all(parallel))

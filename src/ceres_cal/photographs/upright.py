@@ -1,0 +1,162 @@
+"""How a camera looks at a floor whose lines run in two directions at right angles: lens, focal length and turn.
+
+Nothing is known beforehand but the strokes of paint in one photograph. A stroke and the camera's centre span a plane;
+the direction of a line on the floor lies in the planes of all of its strokes. So the strokes vote for two directions at
+right angles, for a focal length, and for the one coefficient of a lens
+
+    ray = (p / phi, 1 + c |p|^2),    p in half image diagonals from the image's middle,
+
+that straightens them. Of a floor that is seen from straight above no line tells the focal length: a usual one is taken.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ceres_cal.transforms import Array, rotation_exp
+
+BENDS = (0.05, -0.05, -0.15, -0.25, -0.35, -0.45)
+PHIS = (0.8, 1.15, 1.6)
+_USUAL_PHI, _PHI_FACTOR = 1.1, 1.4
+_USUAL_BEND, _BEND_SIGMA = -0.15, 0.2
+_USUAL_TILT = 0.5  # rad
+_PRIOR_WEIGHT = 0.03  # of all strokes, at one standard deviation
+_RINGS_DEG = ((0.0, 1), (11.0, 6), (22.0, 12), (33.0, 16), (44.0, 20), (54.0, 24))  # tilt, directions of it
+_ROLL_DEG = 5.0
+_ROUGH, _FINE = 0.06, 0.015  # sine of the angle by which a stroke may be off
+_ROUNDS = 12
+_LEAST_SHARE = 0.06  # of the strokes, in the direction that has fewer
+_DOWN = np.diag([1.0, -1.0, -1.0])
+_FROM_EACH, _REFINED = 2, 14  # of each lens and focal length, and of all
+_APART = 0.1  # of two answers' uprights, rad
+
+
+@dataclass(frozen=True, eq=False)
+class Upright:
+    """One answer.
+
+    Attributes:
+        bend: c. phi: in half image diagonals.
+        rotation: (3, 3) camera from floor; the floor's x and y run along the lines, its z up.
+        share: of the strokes, those that run along x or y.
+    """
+
+    bend: float
+    phi: float
+    rotation: Array
+    share: float
+
+    def rays(self, offsets: Array) -> Array:
+        """(N, 3) of offsets (N, 2) from the image's middle in half image diagonals, in the camera's frame."""
+        return np.column_stack([offsets / self.phi, 1.0 + self.bend * np.sum(offsets**2, axis=1)])
+
+    def floor(self, offsets: Array) -> Array:
+        """(N, 2) where they meet the floor, in camera heights from below the camera; NaN above the horizon."""
+        d = self.rays(offsets) @ self.rotation
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.where(d[:, 2:] < -0.05, d[:, :2] / -d[:, 2:], np.nan)
+
+    def offsets(self, floor: Array) -> Array:
+        """(..., 2) of places (..., 2) on the floor: the other way; NaN behind the camera."""
+        x, y, z = self.rotation.T.astype(floor.dtype)
+        d = floor[..., :1] * x + floor[..., 1:] * y - z
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ideal = self.phi * np.where(d[..., 2:] > 0.0, d[..., :2] / d[..., 2:], np.nan)
+            # p = ideal (1 + c p^2): the root that is near ideal for small c.
+            root = np.sqrt(1.0 - 4.0 * self.bend * np.sum(ideal**2, axis=-1, keepdims=True))
+            return np.asarray(2.0 * ideal / (1.0 + root))
+
+
+def find_upright(ends: Array, weights: Array, most: int) -> list[Upright]:
+    """The best answers for strokes with these ends (N, 2, 2), in half image diagonals from the middle, best first."""
+    found: list[tuple[float, Upright]] = []
+    rotations = _rotations()
+    lean = _PRIOR_WEIGHT * (np.arccos(np.clip(-rotations[:, 2, 2], -1.0, 1.0)) / _USUAL_TILT) ** 2
+    for bend in BENDS:
+        for phi in PHIS:
+            optics = Upright(bend, phi, _DOWN, 0.0)
+            value = _score(_normals(optics, ends), weights, rotations, _ROUGH) - lean
+            for best in np.argsort(-value)[:_FROM_EACH]:
+                turned = replace(optics, rotation=rotations[best].astype(float))
+                found.append((float(value[best]) - _penalty(optics), turned))
+    found.sort(key=lambda one: -one[0])
+    refined = [_refined(one, ends, weights) for _, one in found[:_REFINED]]
+    refined.sort(key=lambda one: -(one.share - _penalty(one)))
+    chosen: list[Upright] = []
+    for one in refined:
+        if len(chosen) < most and all(_apart(one, other) for other in chosen):
+            chosen.append(one)
+    return chosen
+
+
+def _rotations() -> Array:
+    """(B, 3, 3) every way to look at the floor, but for quarter turns about the upright."""
+    rolls = np.deg2rad(np.arange(-45.0, 45.0, _ROLL_DEG))
+    found = []
+    for tilt, count in _RINGS_DEG:
+        for direction in 2.0 * np.pi * np.arange(count) / count:
+            lean = rotation_exp(np.deg2rad(tilt) * np.array([np.cos(direction), np.sin(direction), 0.0]))
+            found += [lean @ _DOWN @ rotation_exp([0.0, 0.0, roll]) for roll in rolls]
+    return np.array(found, dtype=np.float32)
+
+
+def _normals(optics: Upright, ends: Array) -> Array:
+    """(N, 3) unit normals of the planes through the camera and the strokes."""
+    normal = np.cross(optics.rays(ends[:, 0]), optics.rays(ends[:, 1]))
+    return np.asarray(normal / np.linalg.norm(normal, axis=1, keepdims=True))
+
+
+def _score(normals: Array, weights: Array, rotations: Array, tolerance: float) -> Array:
+    """(B,) share of the strokes that run along x or y, none where hardly any runs along one of them."""
+    single = np.float32  # twice as fast, and good enough for a share
+    off = np.matmul(normals.astype(single), rotations[:, :, :2].astype(single)) / single(tolerance)
+    along, weight = np.exp(-(off**2)), (weights / weights.sum()).astype(single)  # (B, N, 2), (N,)
+    shares = np.einsum("bnk,n->bk", along, weight)
+    both = np.einsum("bn,n->b", along.max(axis=2), weight)
+    return np.asarray(np.where(shares.min(axis=1) > _LEAST_SHARE, both, 0.0))
+
+
+def _penalty(optics: Upright) -> float:
+    phi = np.log(optics.phi / _USUAL_PHI) / np.log(_PHI_FACTOR)
+    tilt = np.arccos(np.clip(-optics.rotation[2, 2], -1.0, 1.0)) / _USUAL_TILT
+    return float(_PRIOR_WEIGHT * (phi**2 + ((optics.bend - _USUAL_BEND) / _BEND_SIGMA) ** 2 + tilt**2))
+
+
+def _moved(one: Upright, step: Array) -> Upright:
+    return replace(
+        one,
+        bend=one.bend + step[3],
+        phi=one.phi * float(np.exp(step[4])),
+        rotation=one.rotation @ rotation_exp(step[:3]),
+    )
+
+
+def _refined(one: Upright, ends: Array, weights: Array) -> Upright:
+    """Gauss-Newton on turn, bend and log phi, robust and ever finer."""
+    step_sizes = 1e-5 * np.eye(5)
+    for tolerance in np.geomspace(_ROUGH, _FINE, _ROUNDS):
+        base, which = _deviation(one, ends, None)
+        columns = np.array([(_deviation(_moved(one, step), ends, which)[0] - base) / 1e-5 for step in step_sizes])
+        weight = weights / weights.sum() * np.exp(-((base / tolerance) ** 2)) / tolerance**2
+        prior = _PRIOR_WEIGHT * np.diag([0.0, 0.0, 0.0, _BEND_SIGMA**-2, np.log(_PHI_FACTOR) ** -2])
+        off = np.array([0.0, 0.0, 0.0, one.bend - _USUAL_BEND, np.log(one.phi / _USUAL_PHI)])
+        normal = (columns * weight) @ columns.T + prior + 1e-9 * np.eye(5)
+        step = np.linalg.solve(normal, -(columns * weight) @ base - prior @ off)
+        one = _moved(one, np.clip(step, -0.1, 0.1))
+    normals = _normals(one, ends)
+    return replace(one, share=float(_score(normals, weights, one.rotation[None], 2.0 * _FINE)[0]))
+
+
+def _deviation(one: Upright, ends: Array, which: Array | None) -> tuple[Array, Array]:
+    """(N,) sine of the angle between each stroke and the nearer direction, or the one that was nearer."""
+    off = _normals(one, ends) @ one.rotation[:, :2]
+    which = np.argmin(np.abs(off), axis=1) if which is None else which
+    return off[np.arange(len(off)), which], which
+
+
+def _apart(one: Upright, other: Upright) -> bool:
+    """Whether two answers are two, but for quarter turns."""
+    away = np.linalg.norm(one.rotation[:, 2] - other.rotation[:, 2])
+    return bool(away > _APART or abs(one.bend - other.bend) > 0.05 or abs(np.log(one.phi / other.phi)) > 0.15)

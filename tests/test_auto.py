@@ -1,0 +1,254 @@
+"""The field without any start: strokes, how the camera looks, which way round, what is refused, and the command."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import photographs as script
+import photographs_auto as auto_script
+import pytest
+
+from ceres_cal.calibrate import calibrate
+from ceres_cal.camera import Camera
+from ceres_cal.cli import main
+from ceres_cal.detect.strokes import find_strokes
+from ceres_cal.errors import InputError
+from ceres_cal.lens import Radial
+from ceres_cal.observations import Observations
+from ceres_cal.photographs import Auto, Facing, detect_field
+from ceres_cal.photographs.candidates import candidates, see
+from ceres_cal.photographs.facing import settled_by_before, settled_by_facing, side_of, turns_of
+from ceres_cal.photographs.grid import grid_of
+from ceres_cal.photographs.search import search
+from ceres_cal.photographs.upright import find_upright
+from ceres_cal.simulate import Scene, Station, field_scene, overhead_pose
+from ceres_cal.simulate.photograph import photograph
+from ceres_cal.targets import Arc, Segment, Target, custom, ssl_field
+
+FIELD = ssl_field("B")
+NAMES = FIELD.curve_names
+TOP = Auto((Facing("LeftGoalLine", "top"),))
+
+
+@pytest.fixture(scope="module")
+def shot() -> script.Shot:
+    """A photograph in bad light: dark, blurred, worn, with a shadow."""
+    return script.take(1)
+
+
+@pytest.fixture(scope="module")
+def path(shot: script.Shot, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("auto") / "shot.png"
+    cv2.imwrite(str(path), shot.picture.image)
+    return path
+
+
+def lopsided() -> Target:
+    """A field with one goal area only, at the left, and a diagonal: alike in no turn."""
+    ends = {
+        "top": (-2.0, 1.5, 2.0, 1.5),
+        "bottom": (-2.0, -1.5, 2.0, -1.5),
+        "left": (-2.0, -1.5, -2.0, 1.5),
+        "right": (2.0, -1.5, 2.0, 1.5),
+        "area": (-1.3, -1.5, -1.3, 1.5),
+        "diagonal": (-1.3, -1.5, 0.5, 1.5),
+    }
+    curves = {name: Segment((a, b, 0.0), (c, d, 0.0), 0.02) for name, (a, b, c, d) in ends.items()}
+    return custom({"corner": (-2.0, -1.5, 0.0)}, curves)
+
+
+def small_scene() -> Scene:
+    """A small photograph of it."""
+    optics = Camera((640, 480), 420.0, (320.0, 240.0), Radial((0.0, 8e-7), (2, 3)))
+    stations = {"overhead": Station("overhead", overhead_pose(0.1, -0.1, 3.2, 6.0, -4.0, 200.0))}
+    return field_scene(lopsided(), {"overhead": optics}, stations)
+
+
+# ---- the parts ------------------------------------------------------------------------------------------------------
+
+
+def test_strokes_lie_on_paint(shot: script.Shot) -> None:
+    strokes = find_strokes(shot.grey)
+    middles = strokes.ends.mean(axis=1)
+    away = [script.distances_px(shot, np.full(len(middles), n, np.int32), middles) for n in range(len(NAMES))]
+    assert len(strokes) > 100  # 139
+    assert np.mean(np.min(np.abs(away), axis=0) < 1.0) > 0.97  # all of them
+    assert np.min(strokes.length_px) >= 9.0 and np.max(strokes.length_px) < 40.0  # a tile's diagonal
+    assert len(find_strokes(np.full((480, 640), 90.0, np.float32))) == 0
+
+
+def test_strokes_tell_how_the_camera_looks(shot: script.Shot) -> None:
+    seen = see(shot.grey, FIELD, NAMES)
+    upright = find_upright(seen.picture.ends, seen.picture.strokes.length_px, 3)[0]
+    rotation = shot.camera.cam_from_world.rotation
+    assert upright.rotation[:, 2] @ rotation[:, 2] > np.cos(np.deg2rad(1.5))  # 0.4 degrees
+    assert np.max(np.abs(upright.rotation[:, :2].T @ rotation[:, 0])) > 0.999
+    corner = shot.camera.corner_radius
+    stretch = float(np.asarray(shot.camera.lens.ideal_radius(corner))) / corner  # type: ignore[attr-defined]
+    assert 1.0 / (1.0 + upright.bend) == pytest.approx(stretch, rel=0.15)
+    places = np.array([[0.3, -0.2], [-0.5, 0.4]])
+    assert np.allclose(upright.floor(upright.offsets(places)), places)
+    best = candidates(seen)[0]
+    assert any(
+        np.linalg.norm((best.cam_from_world @ turn).position - shot.camera.position) < 0.4 for turn in seen.turns
+    )
+
+
+def test_turns_of_a_target() -> None:
+    assert len(turns_of(FIELD, NAMES)) == 2
+    assert np.allclose(turns_of(FIELD, NAMES)[1].transform([1.0, 2.0, 0.0]), [-1.0, -2.0, 0.0])
+    assert len(turns_of(FIELD, [name for name in NAMES if name != "LeftPenaltyStretch"])) == 1
+    assert len(turns_of(lopsided(), lopsided().curve_names)) == 1
+    corners = [(1.0, 0.0), (3.0, 0.0), (3.0, 2.0), (1.0, 2.0)]
+    sides = {
+        str(i): Segment((*corners[i], 0.0), (*corners[(i + 1) % 4], 0.0), 0.01) for i in range(4)
+    }  # whose middle is not the origin
+    turns = turns_of(custom({}, sides), tuple(sides))
+    assert len(turns) == 4 and np.allclose(turns[1].transform([3.0, 1.0, 0.0]), [2.0, 2.0, 0.0])
+
+
+def test_what_lies_towards_which_side() -> None:
+    optics = Camera((1280, 960), 800.0, (640.0, 480.0), Radial((0.0, 0.0), (2, 3)))
+    camera = optics.at(overhead_pose(-2.0, 0.3, 4.0, 5.0, 3.0, 90.0))
+    ways = [camera.at(camera.cam_from_world @ turn) for turn in turns_of(FIELD, NAMES)]
+    assert [side_of("LeftGoalLine", way, FIELD, NAMES) for way in ways] == ["top", "bottom"]
+    assert [side_of("TopTouchLine", way, FIELD, NAMES) for way in ways] == ["right", "left"]
+    for side, left in (("top", [0]), ("bottom", [1]), ("top-right", [0]), ("left", []), ("right", [])):
+        assert settled_by_facing(ways, [Facing("LeftGoalLine", side)], FIELD, NAMES) == left, side
+    both = [Facing("LeftGoalLine", "top"), Facing("TopTouchLine", "left")]
+    assert settled_by_facing(ways, both, FIELD, NAMES) == []
+    # Mirrored it is no way: no turn has the left goal at the top and the top touch line at the left.
+    with pytest.raises(InputError, match="a side of the picture is one of left, right"):
+        Facing("LeftGoalLine", "up")
+
+
+def test_an_old_calibration_settles_unless_it_lies_across() -> None:
+    camera = Camera((1280, 960), 800.0, (640.0, 480.0), Radial((0.0, 0.0), (2, 3)), 1.0, overhead_pose(yaw_deg=10.0))
+    ways = [camera.at(camera.cam_from_world @ turn) for turn in turns_of(FIELD, NAMES)]
+    for yaw, left in ((10.0, [0]), (-50.0, [0]), (170.0, [1]), (-130.0, [1]), (100.0, [0, 1]), (-75.0, [0, 1])):
+        before = camera.at(overhead_pose(1.0, 2.0, 3.0, 8.0, 0.0, yaw))
+        assert settled_by_before(ways, before) == left, yaw
+
+
+def test_targets_without_lines_at_right_angles() -> None:
+    circle = custom({}, {"circle": Arc((0.0, 0.0, 0.0), 1.0, width_m=0.01)})
+    cross = {name: FIELD.curves[name] for name in ("CenterLine", "HalfwayLine", "CenterCircle")}
+    for target in (circle, custom({}, cross)):
+        with pytest.raises(InputError, match="two one way and one across at least"):
+            grid_of(target, target.curve_names)
+
+
+# ---- the search -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("view", ["quarter", "tilted 20 to 45 degrees"])
+def test_views_of_any_kind(view: str) -> None:
+    shot = auto_script.take_view(view, auto_script.VIEWS[view], 1)
+    (found,) = auto_script.searched(iter([shot]))
+    assert found.what == "right", found
+
+
+def test_without_a_word_on_which_way_round(shot: script.Shot) -> None:
+    with pytest.raises(
+        InputError, match=r"in 2 ways: LeftGoalLine lies towards the (top|bottom) or the (top|bottom) of"
+    ):
+        search(shot.grey, FIELD, NAMES, Auto())
+    with pytest.raises(InputError, match="the target has no line, arc or point 'Nowhere'"):
+        search(shot.grey, FIELD, NAMES, Auto((Facing("Nowhere", "top"),)))
+    with pytest.raises(InputError, match="HalfwayLine lies in the middle of the field"):
+        search(shot.grey, FIELD, NAMES, Auto((Facing("HalfwayLine", "top"),)))
+
+
+def test_a_quarter_turn_that_looks_alike_too() -> None:
+    optics = Camera((640, 480), 350.0, (320.0, 240.0), Radial((0.0, 0.0), (2, 3)))
+    pose = overhead_pose(-0.1, 0.3, 1.6, 15.0, 4.0, 80.0)  # sees circle and cross only
+    stations = {"overhead": Station("overhead", pose)}
+    scene = replace(field_scene(FIELD, {"overhead": optics}, stations), photography=script.varied(0))
+    picture = photograph(scene, "overhead", "0001", seed=3)
+    near = script.Shot(scene, scene.camera_at("overhead"), FIELD, picture, True)
+    with pytest.raises(InputError, match="alike in 4 ways"):  # only two of them by what the strokes tell alone
+        search(near.grey, FIELD, NAMES, Auto())
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_a_field_that_looks_alike_in_no_turn(mirrored: bool) -> None:
+    target, scene = lopsided(), small_scene()
+    image = photograph(scene, "overhead", "0001", seed=1).image
+    grey = cv2.cvtColor(image[:, ::-1].copy() if mirrored else image, cv2.COLOR_BGR2GRAY).astype(np.float32)
+    found = search(grey, target, target.curve_names, Auto())
+    if mirrored:  # no camera that looks down sees it so
+        assert found.followed is None and found.reason
+    else:
+        assert found.followed is not None and (found.ways, found.settled_by) == (1, "")
+        truth = scene.camera_at("overhead")
+        corner = [target.points["corner"]]
+        assert np.allclose(found.followed.camera.project(corner), truth.project(corner), atol=0.5)
+
+
+def test_another_field_is_a_miss_that_says_why(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "small.png"), photograph(small_scene(), "overhead", "0001", seed=1).image)
+    with pytest.raises(InputError, match=r"no field in any of 1 images; .*small\.png: ") as raised:
+        detect_field([tmp_path / "small.png"], FIELD, TOP)
+    assert "corners" in str(raised.value) or "dimensions" in str(raised.value)
+
+
+@pytest.mark.parametrize("kind", ["flat", "noise", "board"])
+def test_pictures_without_a_field_are_misses(kind: str) -> None:
+    rng = np.random.default_rng(2)
+    image = {
+        "flat": np.full((240, 320), 90),
+        "noise": rng.integers(0, 255, (240, 320)),
+        "board": np.kron(np.indices((12, 16)).sum(axis=0) % 2 * 200 + 20, np.ones((20, 20))),
+    }[kind]
+    found = search(image.astype(np.float32), FIELD, NAMES, TOP)
+    assert found.followed is None and found.reason
+
+
+def test_the_real_photograph_without_its_clicks(real_data: Path) -> None:
+    figures = {row.what: row for row in auto_script.real_auto_rows(real_data)}
+    assert figures["found"].value == 1.0
+    assert figures["BottomLeftCorner off its published click, px"].value < 15.0  # 3.8 px
+
+
+# ---- the whole way --------------------------------------------------------------------------------------------------
+
+
+def test_from_a_photograph_alone_to_a_calibration(tmp_path: Path, shot: script.Shot, path: Path) -> None:
+    again = tmp_path / "again.png"
+    cv2.imwrite(str(again), photograph(shot.scene, "overhead", "0001", seed=77).image)
+    found = detect_field([path, again], FIELD, TOP)
+    assert list(found.found) == [str(path), str(again)]
+    assert {name: (one.ways, one.settled_by) for name, one in found.searched.items()} == {str(path): (2, "facing")}
+    calibration = calibrate(found.observations, script.OPTIONS[shot.camera.lens.kind])
+    assert np.mean(script.floor_error_mm(shot, calibration.station())) < 1.0  # 0.2 mm
+
+
+def test_command(tmp_path: Path, path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out, calibration = str(tmp_path / "obs.json"), str(tmp_path / "calibration.json")
+    detect = ["detect", "field", str(path), "-o", out, "--auto"]
+    assert main([*detect, "--target", "ssl-b", "--facing", "LeftGoalLine=top"]) == 0
+    assert "in one of the 2 ways it can be seen: --facing says which" in capsys.readouterr().out
+    assert main(["calibrate", out, "-o", calibration, "--quiet"]) == 0
+    capsys.readouterr()
+    assert main([*detect, "--start", calibration, "--json"]) == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["found"][0]["searched"] == {"ways": 2, "settled_by": "before"}
+    assert len(Observations.load(out).curves) == answer["curves"]
+    corners = tmp_path / "corners.json"
+    corners.write_text(json.dumps({"format": "ceres-cal/corners", "version": 1, "points": {}}))
+    for arguments, message in (
+        (("--facing", "LeftGoalLine=up"), "write NAME=SIDE"),
+        (("--facing", "LeftGoalLine"), "write NAME=SIDE"),
+        (("--corner", "TopLeftCorner=1,2"), "give one of them"),
+        (("--start", str(corners)), "only a calibration is of use"),
+        (("--facing", "Nowhere=left"), "has no line, arc or point 'Nowhere'"),
+    ):
+        assert main([*detect, "--target", "ssl-b", *arguments]) == 2
+        assert message in capsys.readouterr().err
+    without = [argument for argument in detect if argument != "--auto"]
+    assert main([*without, "--start", calibration, "--facing", "LeftGoalLine=top"]) == 2
+    assert "--facing goes with --auto" in capsys.readouterr().err
+    assert main([*without, "--target", "ssl-b"]) == 2
+    assert "or --auto" in capsys.readouterr().err
