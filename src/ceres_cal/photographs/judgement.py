@@ -34,6 +34,8 @@ def why_missed(followed: Followed, target: Target) -> str:
 
 def doubt(seen: Seen, followed: Followed) -> str:
     """What speaks against taking what was followed for the field, or nothing."""
+    if followed.share < LEAST_SHARE:
+        return "its lines were not found: check the target's dimensions and which lines are painted, or give a start"
     if not followed.holds:
         return why_missed(followed, seen.target)
     names = told(seen, followed)
