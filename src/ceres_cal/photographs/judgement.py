@@ -6,6 +6,7 @@ import numpy as np
 
 from ceres_cal.camera import Camera
 from ceres_cal.detect.courses import predict
+from ceres_cal.initialise import PHI_RANGE
 from ceres_cal.photographs.candidates import Seen
 from ceres_cal.photographs.follow import LEAST_SHARE, Followed
 from ceres_cal.targets import Target
@@ -17,7 +18,6 @@ _EXPLAINED = 0.8  # of the strokes inside the target's outline, the share that m
 _RIM = 0.02  # of its size
 _FEWEST_PLACES, _FEWEST_CURVES = 5, 3  # found on a curve, and curves of which so many were
 _LEAST_UPRIGHT = 0.42  # cosine of the tilt: 65 degrees
-_PHI = (0.4, 4.0)  # in half image diagonals: 136 to 28 degrees across
 _SAME_FLOOR = 0.1  # of the extent of what is seen
 
 
@@ -42,7 +42,7 @@ def doubt(seen: Seen, followed: Followed) -> str:
     if len(names) < _FEWEST_CURVES or not _spread(seen, names):
         return f"only {', '.join(names)} would be in the picture: too little to find a field by; start from corners"
     phi = followed.camera.phi / seen.picture.unit_px
-    if -followed.camera.cam_from_world.rotation[2, 2] < _LEAST_UPRIGHT or not _PHI[0] < phi < _PHI[1]:
+    if -followed.camera.cam_from_world.rotation[2, 2] < _LEAST_UPRIGHT or not PHI_RANGE[0] < phi < PHI_RANGE[1]:
         return "its lines were not found in any view from above: start from corners"
     share = explained(seen, followed.camera)
     if share < _EXPLAINED:
