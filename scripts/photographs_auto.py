@@ -153,13 +153,11 @@ def auto_rows(runs: int) -> Iterator[Row]:
         outcomes = searched(take_view(name, view, seed) for seed in range(few))
         yield from rows_for(f"auto, {name}", outcomes, 0.95)
     outcomes = searched(take_view("near", near, seed) for seed in range(2 * few))
-    yield from rows_for("auto, so near that much is missing", outcomes)
+    yield from rows_for("auto, very near", outcomes)
     silent = [outcome(take(seed), Auto()).what for seed in range(few)]
     yield Row("auto, no --facing", "refused, both ways named", silent.count("several ways") / few, least=1.0)
     other = [outcome(take(seed), FACING, "A").what for seed in range(few)]
-    yield Row(
-        "auto, searched for a division A field", "found", other.count("wrong"), most=0.0, note=f"{few} photographs"
-    )
+    yield Row("auto, for a division A field", "found", other.count("wrong"), most=0.0, note=f"{few} photographs")
 
 
 def process_seconds(runs: int) -> float:
