@@ -14,7 +14,9 @@ from __future__ import annotations
 
 import argparse
 import json
+import signal
 import sys
+import threading
 import time
 from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
@@ -96,19 +98,19 @@ def keep(place: Path) -> Path:
     return copy
 
 
-def appearing(folder: Path, every_s: float) -> Iterator[Path]:
-    """Files that appear in a folder, in the order of their times; one that changes comes again."""
+def appearing(folder: Path, every_s: float, stopped: threading.Event) -> Iterator[Path]:
+    """Files that appear in a folder, in the order of their times, until stopped; one that changes comes again."""
     done = {path: stamp(path) for path in files_in(folder)}
     before = dict(done)
-    while True:
-        time.sleep(every_s)
+    while not stopped.wait(every_s):
         now = {path: stamp(path) for path in files_in(folder)}
         # A file that is still being written has grown since the last look.
         ready = [path for path in now if now[path] != done.get(path) and now[path] == before.get(path)]
         before = now
         for path in sorted(ready, key=lambda p: now[p]):
-            done[path] = now[path]
-            yield path
+            if not stopped.is_set():
+                done[path] = now[path]
+                yield path
 
 
 def files_in(folder: Path) -> list[Path]:
@@ -132,13 +134,15 @@ def events(given: argparse.Namespace) -> Iterator[dict[str, Any]]:
     yield from map(answer, given.files)
     if given.watch is None:
         return
-    for source in appearing(given.watch, given.every_s):
+    stopped = threading.Event()
+    signal.signal(signal.SIGINT, lambda *_: stopped.set())  # Ctrl-C ends the watch when the file in hand is done
+    for source in appearing(given.watch, given.every_s, stopped):
         for attempt in range(PATIENCE):
             event = answer(source)
             if event["event"] != "unreadable" or attempt == PATIENCE - 1:
                 yield event
                 break
-            time.sleep(given.every_s)
+            stopped.wait(given.every_s)
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -170,8 +174,8 @@ def main(arguments: Sequence[str]) -> int:
                 with given.log.open("a", encoding="utf-8") as log:
                     log.write(line + "\n")
     except KeyboardInterrupt:
-        return 0  # a watch ends so
-    return last
+        return 130
+    return last if given.watch is None else 0
 
 
 if __name__ == "__main__":
