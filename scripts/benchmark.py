@@ -25,13 +25,26 @@ from typing import Any
 
 import numpy as np
 from benchmark_peers import PEERS, Answer, Corners, peak_mib
-from benchmark_problems import OVERHEAD, WIDE, Problem, corner_observations, field_observations, wide_lens
+from benchmark_problems import (
+    HEIGHT_M,
+    OVERHEAD,
+    TILT_DEG,
+    WIDE,
+    Problem,
+    corner_observations,
+    field_observations,
+    wide_lens,
+)
+
+from ceres_cal.lens import KannalaBrandt
+from ceres_cal.simulate import overhead_pose
 
 OURS = "ceres-cal"
 MODULES = {OURS: "ceres_cal.calibrate", "opencv": "cv2", "pycolmap": "pycolmap", "mrcal": "mrcal"}
 MRCAL_PYTHON = "/usr/bin/python3"  # Debian's mrcal belongs to the system's Python
 MIRRORED_DEG = 5.0  # that far off the truth, a pose is the other one of the two that a plane's picture allows
 WARM_UP_FRAMES, WARM_UP_LINE_POINTS = 10, 1000
+PIXELS, ROBOT_M = 1_000_000, 0.15
 LAST_DECADES = 2.0  # over which growth is told
 
 Solver = Callable[[Corners], Answer]
@@ -285,6 +298,9 @@ GROWTH = {
 }
 
 
+PIXELS_TOLD = {"lens": ("lens", ""), "locate": ("locate s", ".3f"), "project": ("project s", ".3f")}
+
+
 def print_table(title: str, columns: Mapping[str, tuple[str, str]], rows: Iterable[Mapping[str, Any]]) -> None:
     """Rows by key; columns: key -> head and format. What a row does not have is a dash."""
     lines = [[head for head, _ in columns.values()]]
@@ -296,6 +312,24 @@ def print_table(title: str, columns: Mapping[str, tuple[str, str]], rows: Iterab
     for first, *others in lines:
         cells = [cell.rjust(width) for cell, width in zip(others, widths[1:], strict=True)]
         print("  ".join(["", first.ljust(widths[0]), *cells]), flush=True)
+
+
+def pixel_rows(repeat: int) -> list[dict[str, Any]]:
+    """Seconds that a million pixels take to the floor at robot height and back, for a lens of each kind."""
+    camera = replace(OVERHEAD, phi=600.0).at(overhead_pose(0.0, 0.0, HEIGHT_M, tilt_x_deg=TILT_DEG))
+    pixels = np.random.default_rng(0).uniform((0.0, 0.0), camera.image_size, (PIXELS, 2))
+    rows = []
+    for lens in (OVERHEAD.lens, WIDE.lens, KannalaBrandt((-0.02, 0.004, -0.001, 0.0))):
+        one, there, back = replace(camera, lens=lens), [], []
+        for _ in range(repeat):
+            start = time.perf_counter()
+            places = one.locate(pixels, ROBOT_M)
+            middle = time.perf_counter()
+            one.project(np.column_stack([places, np.full(len(places), ROBOT_M)]))
+            there.append(middle - start)
+            back.append(time.perf_counter() - middle)
+        rows.append({"lens": lens.kind, "locate": median(there), "project": median(back)})
+    return rows
 
 
 def print_comparison(found: Mapping[str, Any], repeat: int) -> None:
@@ -346,6 +380,10 @@ def measure(chosen: argparse.Namespace) -> dict[str, Any]:
     if chosen.points:
         report["field"] = [alone("field", count, chosen.repeat) for count in chosen.points]
         print_growth("growth with the line points of a static camera over a field, ours", report["field"])
+    report["pixels"] = pixel_rows(chosen.repeat)
+    print_table(
+        f"{PIXELS:,} pixels located at {1e3 * ROBOT_M:.0f} mm, and projected back", PIXELS_TOLD, report["pixels"]
+    )
     report["environment"]["load after"] = round(os.getloadavg()[0], 2)
     print(f"\nload after {report['environment']['load after']}")
     return report

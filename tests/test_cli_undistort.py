@@ -13,6 +13,7 @@ from test_cli import Say, refused, say
 
 from ceres_cal.calibrate import calibrate
 from ceres_cal.calibration import Calibration
+from ceres_cal.cli.progress import ProgressBar
 from ceres_cal.parameters import Station
 from ceres_cal.photographs import detect_field
 
@@ -101,6 +102,17 @@ def test_overlays(say: Say, folder: Path) -> None:
     assert drawn is not None and plain is not None and drawn.shape == plain.shape
     assert 0.005 < np.mean(np.any(drawn != plain, axis=2)) < 0.2
     assert say("undistort", folder / "c.json", folder / "in", "-o", out, "--overlay").code == 0
+
+
+def test_ctrl_c_says_what_is_written(say: Say, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(ProgressBar, "update", interrupt)
+    out = folder / "interrupted"
+    line = refused(say("undistort", folder / "c.json", folder / "in", "-o", out), code=130)
+    assert line == "ceres-cal: interrupted: 1 of 1 pictures are written, straight.json is not\n"
+    assert [path.name for path in out.iterdir()] == ["shot-straight.png"]
 
 
 def test_several_stations(say: Say, folder: Path) -> None:

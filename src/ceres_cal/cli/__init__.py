@@ -53,8 +53,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _fail(str(error), error.exit_code)
     except SystemExit as done:  # argparse has printed its help
         return int(done.code or 0)
-    except KeyboardInterrupt:
-        return _fail("interrupted: nothing was written", _INTERRUPTED)
+    except KeyboardInterrupt as error:
+        return _fail(f"interrupted: {str(error) or 'nothing was written'}", _INTERRUPTED)
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or Python complains when it closes the stream
         return _PIPE_CLOSED

@@ -71,13 +71,17 @@ def _run(args: Namespace) -> Answer:
     args.output.mkdir(parents=True, exist_ok=True)
     told: dict[str, str] = {}
     written: list[dict[str, Any]] = []
-    with ProgressBar(silent=args.quiet or args.json) as bar:
-        for number, (path, output) in enumerate(outputs.items(), start=1):
-            picture, facts, told[str(output)] = make.picture(path)
-            _write(output, picture)
-            written.append({"image": str(path), "output": str(output), **facts})
-            bar.update(number, len(outputs), path.name)
     about = args.output / f"{kind}.json"
+    try:
+        with ProgressBar(silent=args.quiet or args.json) as bar:
+            for number, (path, output) in enumerate(outputs.items(), start=1):
+                picture, facts, told[str(output)] = make.picture(path)
+                _write(output, picture)
+                written.append({"image": str(path), "output": str(output), **facts})
+                bar.update(number, len(outputs), path.name)
+    except KeyboardInterrupt:
+        done = f"{len(written)} of {len(outputs)} pictures are written, {about.name} is not"
+        raise KeyboardInterrupt(done if written else "") from None
     data = {"format": _FORMAT, "version": _VERSION, "calibration": str(args.calibration), "kind": kind, **make.facts}
     with finishing():
         write_json(about, {**data, "pictures": written})

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ceres_cal.kernels.block import cholesky
+from ceres_cal.kernels.block import cholesky, substitute
 from ceres_cal.kernels.jit import jit
 from ceres_cal.kernels.planes import least_direction, normalise
 
@@ -67,15 +67,8 @@ def _depths(x: Any, p: Any, weights: Any, h: Any, share: Any, reduced: Any) -> N
     cholesky(products[:3, :3], upper)
     for column in range(len(reduced)):
         for k in range(3):
-            total = products[3 + column, k]
-            for j in range(k):
-                total -= upper[j, k] * share[j, column]
-            share[k, column] = total / upper[k, k]
-        for k in range(2, -1, -1):
-            total = share[k, column]
-            for j in range(k + 1, 3):
-                total -= upper[k, j] * share[j, column]
-            share[k, column] = total / upper[k, k]
+            share[k, column] = products[3 + column, k]
+        substitute(upper, share[:, column])
     for k in range(len(reduced)):
         for j in range(len(reduced)):
             value = products[3 + max(k, j), 3 + min(k, j)]

@@ -38,6 +38,19 @@ def cholesky(normal: Any, upper: Any) -> None:
 
 
 @jit
+def substitute(upper: Any, x: Any) -> None:
+    """x <- (U^T U)^-1 x by forward and back substitution, in place; U of full rank."""
+    for k in range(len(x)):
+        for j in range(k):
+            x[k] -= upper[j, k] * x[j]
+        x[k] /= upper[k, k]
+    for k in range(len(x) - 1, -1, -1):
+        for j in range(k + 1, len(x)):
+            x[k] -= upper[k, j] * x[j]
+        x[k] /= upper[k, k]
+
+
+@jit
 def _sine_series(w: Any) -> tuple[float, float, float, float]:
     """Squared angle of a rotation vector, and sin a / a, (1 - cos a) / a^2, (a - sin a) / a^3, also where a is tiny."""
     angle2 = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]

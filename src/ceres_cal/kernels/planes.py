@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ceres_cal.kernels.block import cholesky
+from ceres_cal.kernels.block import cholesky, substitute
 from ceres_cal.kernels.jit import jit
 
 _PATIENCE = 8  # rounds of reweighting where some points do not fit
@@ -75,14 +75,7 @@ def least_direction(normal: Any, upper: Any, h: Any) -> None:
         normal[i, i] += 1e-13 * trace
     cholesky(normal, upper)
     for _ in range(4):
-        for k in range(size):
-            for j in range(k):
-                h[k] -= upper[j, k] * h[j]
-            h[k] /= upper[k, k]
-        for k in range(size - 1, -1, -1):
-            for j in range(k + 1, size):
-                h[k] -= upper[k, j] * h[j]
-            h[k] /= upper[k, k]
+        substitute(upper, h)
         h /= np.sqrt(np.sum(h * h))
 
 

@@ -128,7 +128,7 @@ def _looked_for(
             raise InputError(f"{path}: {error}") from None
     starts, freedom = _starts(start, before, target, size, path)
     followed = follow(grey, target, starts, painted, freedom)
-    return Searched(followed) if followed.holds else Searched(None, why_missed(followed, target))
+    return Searched(followed) if followed.holds else Searched(None, why_missed(followed, target, started=True))
 
 
 def _starts(

@@ -21,23 +21,24 @@ _LEAST_UPRIGHT = 0.42  # cosine of the tilt: 65 degrees
 _SAME_FLOOR = 0.1  # of the extent of what is seen
 
 
-def why_missed(followed: Followed, target: Target) -> str:
-    """Why lines that were followed are not the target's; for those that do not hold."""
+def why_missed(followed: Followed, target: Target, *, started: bool) -> str:
+    """Why lines that were followed are not the target's; for those that do not hold.
+
+    Args:
+        started: whether somebody said where to start.
+    """
     if followed.share >= LEAST_SHARE:
         names = ", ".join(target.curve_names[number] for number in followed.absent)
         return f"there is no {names} where they should be: say which lines are not painted, or check the dimensions"
-    return (
-        f"its lines were not found (paint at {100.0 * followed.share:.0f} % of where this start, moved, puts them): "
-        "check the target's dimensions and which lines are painted, or start from other points"
-    )
+    share = f" (paint at {100.0 * followed.share:.0f} % of where this start, moved, puts them)" if started else ""
+    elsewhere = "start from other points" if started else "start from corners"
+    return f"its lines were not found{share}: check the target's dimensions and which lines are painted, or {elsewhere}"
 
 
 def doubt(seen: Seen, followed: Followed) -> str:
     """What speaks against taking what was followed for the field, or nothing."""
-    if followed.share < LEAST_SHARE:
-        return "its lines were not found: check the target's dimensions and which lines are painted, or give a start"
     if not followed.holds:
-        return why_missed(followed, seen.target)
+        return why_missed(followed, seen.target, started=False)
     names = told(seen, followed)
     if len(names) < _FEWEST_CURVES or not _spread(seen, names):
         return f"only {', '.join(names)} would be in the picture: too little to find a field by; start from corners"

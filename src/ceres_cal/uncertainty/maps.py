@@ -143,8 +143,9 @@ def _by_profile(
     circles = np.array([radius_95(part) for part in known]) / 1.96
     weights, widths = profile.reaches(width)
     away = np.linalg.norm(np.einsum("mn,npk->mpk", weights, values), axis=2)
-    radius = np.max(away + widths[:, None] * (weights @ circles), axis=0)
-    radius = np.where(np.isinf(low).any(axis=1) | np.isinf(high).any(axis=1), np.inf, radius)
+    unknown = ~np.isfinite(circles).all(axis=0)  # from some place of the valley
+    radius = np.max(away + widths[:, None] * (weights @ np.where(unknown, 0.0, circles)), axis=0)
+    radius = np.where(unknown | np.isinf(low).any(axis=1) | np.isinf(high).any(axis=1), np.inf, radius)
     return PointSpread(located, located + low, located + high, radius, radius / 1.96)
 
 
