@@ -153,7 +153,13 @@ def normal_equations(
 def point_residuals(camera: Camera, seen: Seen) -> Array:
     found, bounds = np.empty((len(seen.points), 2)), np.array([0, len(seen.points)])
     kernels.point_residuals(
-        *optics(camera), matrix(camera.cam_from_world)[None], bounds, seen.points, seen.pixels, found
+        *optics(camera),
+        matrix(camera.cam_from_world)[None],
+        bounds,
+        seen.points,
+        seen.pixels,
+        np.arange(len(found)),
+        found,
     )
     return found
 

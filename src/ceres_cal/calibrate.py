@@ -26,7 +26,7 @@ from ceres_cal.uncertainty import Posterior, Setting, Uncertainty, assess, bound
 
 _MOST_ROUNDS = 15
 _SETTLED_SCALE, _SETTLED_AGAIN = 1e-2, 1e-5  # relative change of a noise scale that is no change
-_ENOUGH_PLACEMENTS = 32  # of a camera: with them it is known well enough to place all others
+_ENOUGH_PLACEMENTS = 20  # of a camera: with them it is known well enough to place all others
 _NO_FIT = 0.015  # of the image diagonal: a median residual beyond it is no calibration
 _UNKNOWN = (
     "camera {!r}: its views are too frontal to tell phi, which is {} at 95 %, and its heights go with phi: the floor "

@@ -20,6 +20,7 @@ from ceres_cal.threads import parts_of, run_parts
 from ceres_cal.transforms import Array, Pose, nearest_rotation
 
 Ints = NDArray[np.int64]
+_POINT_NS = 100.0  # that a point's share of a homography takes
 
 
 @dataclass(frozen=True)
@@ -224,7 +225,7 @@ def homographies_of_sights(data: PlaneData, profile: Profile) -> tuple[Array, Ar
         bounds, found = data.bounds[first : last + 1], homographies[first:last]
         plane_homographies(bounds, data.plane, data.offsets, coefficients, profile.unit_px, found, errors)
 
-    run_parts(part, parts_of(len(homographies), len(errors)))
+    run_parts(part, parts_of(len(homographies), len(errors), _POINT_NS))
     return np.array([[profile.unit_px], [profile.unit_px], [1.0]]) * homographies, errors * profile.unit_px
 
 
@@ -276,4 +277,4 @@ def orthogonality_error(homographies: Array, phi: ArrayLike) -> Array:
     dot = a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1] + phi**2 * a[:, 2] * b[:, 2]
     aa = a[:, 0] ** 2 + a[:, 1] ** 2 + phi**2 * a[:, 2] ** 2
     bb = b[:, 0] ** 2 + b[:, 1] ** 2 + phi**2 * b[:, 2] ** 2
-    return np.asarray(np.hypot(2.0 * dot, aa - bb) / (aa + bb))
+    return np.asarray(np.sqrt(4.0 * dot**2 + (aa - bb) ** 2) / (aa + bb))

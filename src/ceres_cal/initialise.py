@@ -27,6 +27,8 @@ PHI_RANGE = (0.15, 15.0)
 USUAL_PHI = 1.4
 """In half image diagonals: 71 degrees across the diagonal, a usual lens."""
 _ENOUGH_VIEWS = 50  # for phi
+_GRID = np.geomspace(*PHI_RANGE, 120)
+_NEAR = np.geomspace(1.0 / 1.04, 1.04, 13)  # a grid step to either side
 
 
 @dataclass(frozen=True)
@@ -138,14 +140,16 @@ def _choose_phi(
         total = np.sum(np.log1p((error / 0.5) ** 2), axis=1)
         return np.asarray(total + sum(_prior_cost(prior, phi, sights, homographies) for prior in known))
 
-    grid = unit * np.geomspace(*PHI_RANGE, 120)
+    grid = unit * _GRID
     values = cost(grid)
     acceptable = grid[values <= values.min() + 1.0]
     flat = acceptable[-1] > 1.6 * acceptable[0]
     middle = min(acceptable, key=lambda phi: abs(np.log(phi / (USUAL_PHI * unit)))) if flat else grid[np.argmin(values)]
     for _ in range(0 if flat else 6):
-        near = middle * np.geomspace(1.0 / 1.04, 1.04, 13)
-        middle = near[np.argmin(cost(near))]
+        place = int(np.argmin(cost(middle * _NEAR)))
+        middle *= _NEAR[place]
+        if 0 < place < len(_NEAR) - 1:
+            break
     source = "guess" if flat else ("prior" if known else "views")
     return float(middle), source
 

@@ -17,7 +17,7 @@ from ceres_cal.camera import Camera
 from ceres_cal.errors import InputError
 from ceres_cal.joint import JointPrior
 from ceres_cal.lens import LENS_KINDS, Lens, make_lens
-from ceres_cal.observations import Observations, Prior, View
+from ceres_cal.observations import Observations, Prior
 from ceres_cal.sights import SightKey
 from ceres_cal.structure import Structure, Tolerance
 from ceres_cal.transforms import Array, Pose, Poses, chained, inverted
@@ -157,8 +157,10 @@ class Estimate:
     def _station_stack(self, keys: Sequence[SightKey]) -> Array:
         """cam_from_world of each sight, (S, 3, 4); (3, 4) where one station has them all."""
         names = [key.station for key in keys]
-        poses = Poses.of({name: self.stations[name].cam_from_world for name in dict.fromkeys(names)})
-        return poses.stack[0] if len(poses) == 1 else poses.of_names(names)
+        poses = {name: self.stations[name].cam_from_world for name in dict.fromkeys(names)}
+        if len(poses) == 1:
+            return poses[names[0]].matrix
+        return Poses.of(poses).of_names(names)
 
 
 @dataclass(frozen=True)
@@ -210,7 +212,7 @@ def make_layout(observations: Observations, options: Options) -> Layout:
         observations.require_owner(prior)
         if prior.owner == "camera" and prior.quantity not in (*names, "principal_point"):
             raise InputError(f"prior on camera {prior.name!r}: it has no {prior.quantity!r}, only {', '.join(names)}")
-    shown = _shown_views(observations)
+    shown = observations.shown_views
     return Layout(
         dict.fromkeys(observations.cameras, free),
         frozenset(view.station for view in shown) - anchored_stations(observations),
@@ -219,19 +221,12 @@ def make_layout(observations: Observations, options: Options) -> Layout:
     )
 
 
-def _shown_views(observations: Observations) -> list[View]:
-    """The views with observations; what the others name is not there for the solve."""
-    count = len(observations.views)
-    shown = sum(np.bincount(column.view, minlength=count) for column in (observations.points, observations.curves))
-    return [observations.views[number] for number in np.flatnonzero(shown)]
-
-
 def anchored_stations(observations: Observations) -> frozenset[str]:
     """One station of each group that no view ties to the world: its camera frame serves as the world.
 
     Boards alone tell poses among themselves only; holding one station removes that freedom.
     """
-    shown = _shown_views(observations)
+    shown = observations.shown_views
     times = Counter([view.placement for view in shown])
     group = {view.station: view.station for view in shown}
     first_seen: dict[str, str] = {}

@@ -26,7 +26,7 @@ from ceres_cal.closed_forms import (
 )
 from ceres_cal.errors import DegenerateError
 from ceres_cal.kernels import grouped_scatter
-from ceres_cal.sights import Mask, Rows, Sights
+from ceres_cal.sights import Mask, Rows, Sights, bounds_of, ranges
 from ceres_cal.transforms import Array
 
 _MOST = 1500  # observations of one kind in a sight beyond which a start learns nothing more
@@ -106,13 +106,14 @@ class Homographies:
 def profile_and_homographies(sights: Sights, camera: Camera, unit: float) -> tuple[Profile, Homographies]:
     """The camera's radial profile and the homography of each of its sights that can tell one."""
     pure = _flat_sights_of_points(sights)
-    rest = np.setdiff1d(np.arange(len(sights)), pure)
+    rest = np.delete(np.arange(len(sights)), pure)
     planes = {int(i): _on_plane(sights[int(i)], camera) for i in rest}
     found: dict[int, Array] = {}
     profile: Profile | None = None
     board = sights.take(pure)
     if len(pure):
-        profile = _profile_of_boards(board, camera, unit)
+        data = _plane_data(board, _spread_rows(board.point_bounds), camera)
+        profile = _profile_of_boards(board, data, camera, unit)
     for i, plane in planes.items():
         if plane.equations == 0 and len(sights[i].track) and sights[i].is_arc[sights[i].track].all():
             ring, found[i] = _from_rings(sights[i], camera, unit)
@@ -124,9 +125,9 @@ def profile_and_homographies(sights: Sights, camera: Camera, unit: float) -> tup
     found |= {i: _homography_of(planes[i], profile) for i in mixed}
     parts = [Homographies(np.array([i]), h[None], *_extent(planes[i])) for i, h in found.items()]
     if len(pure):
-        sizes = np.sqrt(np.trace(grouped_scatter(board.pixels, board.point_bounds), axis1=1, axis2=2))
+        sizes = np.sqrt(np.trace(grouped_scatter(data.offsets, data.bounds), axis1=1, axis2=2))
         heights = board.points[board.point_bounds[:-1], 2]
-        matrices = _homographies_of_boards(board, camera, profile)
+        matrices = _homographies_of_boards(board, data, camera, profile)
         told = _spans(matrices)
         parts.append(Homographies(pure[told], matrices[told], heights[told], sizes[told]))
     names = ("sights", "matrices", "heights_m", "sizes_px")
@@ -157,28 +158,43 @@ def _flat_sights_of_points(sights: Sights) -> Rows:
     return np.asarray(candidates[flat & (xx * yy - xy**2 > 1e-12 * (xx + yy) ** 2)])
 
 
-def _profile_of_boards(board: Sights, camera: Camera, unit: float) -> Profile:
+def _profile_of_boards(board: Sights, data: PlaneData, camera: Camera, unit: float) -> Profile:
     """By radial alignment on some points of some sights; on all points of these, with more patience, where not all fit.
 
     A profile needs no more: every other homography follows from it.
     """
-    some = board.take(np.unique(np.linspace(0, len(board) - 1, _ENOUGH_BOARDS).round().astype(np.int64)))
-    data = _plane_data(some, camera)
-    terms = int(np.clip((len(some.points) - 3 * len(some)) // 8, 1, 3))
-    sizes = np.diff(some.point_bounds)
-    place = np.arange(len(some.points)) - np.repeat(some.point_bounds[:-1], sizes)
-    # Steps of the golden ratio spread the chosen points evenly and never along one row of a board.
-    chosen = np.flatnonzero((place * _GOLDEN) % 1.0 < np.repeat(_ENOUGH_POINTS / sizes, sizes))
-    few = PlaneData(np.searchsorted(chosen, data.bounds), data.plane[chosen], data.offsets[chosen])
+    numbers = np.unique(np.linspace(0, len(board) - 1, _ENOUGH_BOARDS).round().astype(np.int64))
+    rows, sizes = ranges(data.bounds, numbers), np.diff(board.point_bounds)[numbers]
+    few = PlaneData(
+        bounds_of(np.diff(data.bounds)[numbers]), data.plane.take(rows, axis=0), data.offsets.take(rows, axis=0)
+    )
+    terms = int(np.clip((sizes.sum() - 3 * len(numbers)) // 8, 1, 3))
     first = radial_alignment(few, unit, terms, rounds=2)
     wrong = (first.relative_error > _SUSPICIOUS) & (first.error_px > 1.0)
     if np.mean(wrong) < 0.02 and np.median(first.error_px) < _ROUGH_PX:
         return first.profile
-    return radial_alignment(data, unit, terms, rounds=8).profile
+    some = board.take(numbers)
+    return radial_alignment(_plane_data(some, np.arange(len(some.points)), camera), unit, terms, rounds=8).profile
 
 
-def _plane_data(board: Sights, camera: Camera) -> PlaneData:
-    return PlaneData(board.point_bounds, np.ascontiguousarray(board.points[:, :2]), camera.offsets(board.pixels))
+def _spread_rows(bounds: Rows) -> Rows:
+    """Rows of no more than about enough points of each sight.
+
+    Steps of the golden ratio spread them evenly and never along one row of a board.
+    """
+    sizes = np.diff(bounds)
+    order = (np.arange(sizes.max()) * _GOLDEN) % 1.0
+    place = np.arange(bounds[-1]) - np.repeat(bounds[:-1], sizes)
+    return np.flatnonzero(order[place] < np.repeat(_ENOUGH_POINTS / sizes, sizes))
+
+
+def _plane_data(board: Sights, rows: Rows, camera: Camera) -> PlaneData:
+    """Of some points of the sights, given by their rows there."""
+    return PlaneData(
+        np.searchsorted(rows, board.point_bounds),
+        np.ascontiguousarray(board.points.take(rows, axis=0)[:, :2]),
+        camera.offsets(board.pixels.take(rows, axis=0)),
+    )
 
 
 def _as_lines(plane: PlaneSight, scale: float) -> tuple[Array, Array]:
@@ -295,13 +311,12 @@ def _from_rings(sight: Sights, camera: Camera, unit: float) -> tuple[Profile, Ar
     return profile, np.array([[kappa, 0.0, cx], [0.0, kappa, cy], [0.0, 0.0, 1.0]])
 
 
-def _homographies_of_boards(board: Sights, camera: Camera, profile: Profile) -> Array:
+def _homographies_of_boards(board: Sights, data: PlaneData, camera: Camera, profile: Profile) -> Array:
     """The homographies, by LO-RANSAC (pycolmap) where some points of a sight lie far off while most fit."""
-    data = _plane_data(board, camera)
     homographies, error_px = homographies_of_sights(data, profile)
     limit = max(_SUSPICIOUS * float(np.median(error_px)), 2.0)
-    far = np.add.reduceat(error_px > limit, board.point_bounds[:-1], dtype=np.int64)
-    sizes = np.diff(board.point_bounds)
+    far = np.add.reduceat(error_px > limit, data.bounds[:-1], dtype=np.int64)
+    sizes = np.diff(data.bounds)
     for number in np.flatnonzero((far > 0.1 * sizes) & (sizes >= 8)):
         sight = board[int(number)]
         found = consensus_homography(sight.points[:, :2], profile.lift(camera.offsets(sight.pixels)), limit)

@@ -15,6 +15,8 @@ from ceres_cal.sights import Sights, nearest_places
 from ceres_cal.threads import parts_of, run_parts
 from ceres_cal.transforms import Array
 
+_POINT_NS = 10.0
+
 
 @dataclass(frozen=True, eq=False)
 class Residuals:
@@ -32,7 +34,8 @@ class Residuals:
     @cached_property
     def lengths(self) -> tuple[Array, Array]:
         """Lengths of the residuals of points (N,) and of curves (M,), px."""
-        return np.sqrt(np.einsum("ij,ij->i", self.points, self.points)), np.abs(self.curves)
+        x, y = self.points.T
+        return np.sqrt(x * x + y * y), np.abs(self.curves)
 
 
 def lens_arguments(camera: Camera) -> tuple[int, Array, Array, float]:
@@ -59,8 +62,7 @@ def residuals(observations: Observations, sights: Sights, estimate: Estimate, pl
         numbers = np.array([number for number, key in enumerate(sights.keys) if key.camera == name], dtype=np.int64)
         own = sights.take(numbers)
         optics = lens_arguments(estimate.cameras[name])
-        offsets = _point_residuals(optics, poses[numbers], own, estimate.structure.points(own))
-        points[own.point_rows] = offsets
+        _point_residuals(optics, poses[numbers], own, estimate.structure.points(own), points)
         if len(own.curve_rows):
             distances = np.empty(len(own.curve_rows))
             starts = starting_places(own, estimate, places)
@@ -72,23 +74,24 @@ def residuals(observations: Observations, sights: Sights, estimate: Estimate, pl
     return Residuals(points, curves, feet)
 
 
-def _point_residuals(optics: tuple[int, Array, Array, float], poses: Array, sights: Sights, points: Array) -> Array:
-    found = np.empty((len(points), 2))
-
+def _point_residuals(
+    optics: tuple[int, Array, Array, float], poses: Array, sights: Sights, points: Array, found: Array
+) -> None:
     def part(first: int, last: int) -> None:
         bounds = sights.point_bounds[first : last + 1]
-        kernels.point_residuals(*optics, poses[first:last], bounds, points, sights.pixels, found)
+        kernels.point_residuals(*optics, poses[first:last], bounds, points, sights.pixels, sights.point_rows, found)
 
-    run_parts(part, parts_of(len(sights), len(points)))
-    return found
+    run_parts(part, parts_of(len(sights), len(points), _POINT_NS))
 
 
 def starting_places(sights: Sights, estimate: Estimate, places: Array | None) -> Array:
     """(M of the sights,) a copy of the places of their rows, or where the rays pass nearest."""
+    if not len(sights.curve_rows):
+        return np.empty(0)
     if places is not None:
         known = places[sights.curve_rows]
         if np.all(np.isfinite(known)):
             return known
     seen = [sights[int(number)] for number in np.flatnonzero(np.diff(sights.curve_bounds))]
     nearest = [nearest_places(s, estimate.camera_at(s.key.station, s.key.placement)) for s in seen]
-    return np.concatenate([np.empty(0), *nearest])
+    return np.concatenate(nearest)

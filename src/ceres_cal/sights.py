@@ -8,10 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ceres_cal.camera import Camera
 from ceres_cal.observations import Columns, Observations
@@ -96,13 +96,13 @@ class Sights(Sequence["Sights"]):
         """The sights with these numbers, in this order."""
         if len(numbers) == len(self) and np.array_equal(numbers, np.arange(len(self))):
             return self
-        p, c = _ranges(self.point_bounds, numbers), _ranges(self.curve_bounds, numbers)
+        p, c = ranges(self.point_bounds, numbers), ranges(self.curve_bounds, numbers)
         return self._rows(numbers, p, c, np.diff(self.point_bounds)[numbers], np.diff(self.curve_bounds)[numbers])
 
     def used_share(self, points: Mask, curves: Mask) -> Array:
         """(S,) the share of each sight's observations that is used."""
-        p = np.concatenate([[0], np.cumsum(points[self.point_rows])])[self.point_bounds]
-        c = np.concatenate([[0], np.cumsum(curves[self.curve_rows])])[self.curve_bounds]
+        p = bounds_of(points[self.point_rows])[self.point_bounds]
+        c = bounds_of(curves[self.curve_rows])[self.curve_bounds]
         return np.asarray((np.diff(p) + np.diff(c)) / (np.diff(self.point_bounds) + np.diff(self.curve_bounds)))
 
     def reach_px(self, camera: Camera) -> float:
@@ -111,8 +111,8 @@ class Sights(Sequence["Sights"]):
         for pixels in (self.pixels, self.curve_pixels):
             for at in range(0, len(pixels), _BLOCK):
                 offsets = camera.offsets(pixels[at : at + _BLOCK])
-                farthest = max(farthest, float(np.max(np.linalg.norm(offsets, axis=1))))
-        return farthest
+                farthest = max(farthest, float(np.max(np.einsum("ij,ij->i", offsets, offsets))))
+        return float(np.sqrt(farthest))
 
     def part(self, number: int, count: int) -> Sights:
         """The number-th of `count` about equal parts of the observations of a single sight."""
@@ -137,26 +137,36 @@ class Sights(Sequence["Sights"]):
         return Sights(
             tuple(self.keys[i] for i in numbers),
             tuple(self.views[i] for i in numbers),
-            np.concatenate([[0], np.cumsum(point_sizes)]),
-            self.point_rows[p],
-            self.feature[p],
-            self.points[p],
-            self.pixels[p],
-            self.sigma_px[p],
-            np.concatenate([[0], np.cumsum(curve_sizes)]),
-            self.curve_rows[c],
-            self.track[c],
-            self.curve_pixels[c],
-            self.curve_sigma_px[c],
+            bounds_of(point_sizes),
+            _at(self.point_rows, p),
+            _at(self.feature, p),
+            _at(self.points, p),
+            _at(self.pixels, p),
+            _at(self.sigma_px, p),
+            bounds_of(curve_sizes),
+            _at(self.curve_rows, c),
+            _at(self.track, c),
+            _at(self.curve_pixels, c),
+            _at(self.curve_sigma_px, c),
             self.tracks,
             self.is_arc,
         )
 
 
-def _ranges(bounds: Rows, numbers: Rows) -> Rows:
+def _at(values: NDArray[Any], rows: Rows | slice) -> NDArray[Any]:
+    """values[rows]; `take` is several times as fast where a row holds more than one number."""
+    return values[rows] if isinstance(rows, slice) else values.take(rows, axis=0)
+
+
+def bounds_of(sizes: ArrayLike) -> Rows:
+    """(S + 1,) where each of so many rows begins, one after the other, and where the last one ends."""
+    return np.concatenate([[0], np.cumsum(sizes)])
+
+
+def ranges(bounds: Rows, numbers: Rows) -> Rows:
     """All row numbers from bounds[i] to bounds[i + 1], for each i of numbers in turn."""
     sizes = np.diff(bounds)[numbers]
-    starts = np.repeat(bounds[numbers] - np.concatenate([[0], np.cumsum(sizes)[:-1]]), sizes)
+    starts = np.repeat(bounds[numbers] - bounds_of(sizes)[:-1], sizes)
     return np.asarray(starts + np.arange(sizes.sum()))
 
 
@@ -172,32 +182,30 @@ def gather_sights(observations: Observations) -> Sights:
     names = {name: number for number, name in enumerate(observations.targets)}
     targets = list(observations.targets.values())
     target_of_view = np.array([names[view.target] for view in observations.views], dtype=np.int64)
-    first_point = np.cumsum([0, *(len(t.points) for t in targets)])
-    first_track = np.cumsum([0, *(3 * len(t.curves) for t in targets)])
-    curve_count = np.array([len(t.curves) for t in targets], dtype=np.int64)
+    first_point = bounds_of([len(t.points) for t in targets])[target_of_view]
+    first_track = bounds_of([3 * len(t.curves) for t in targets])[target_of_view]
+    curve_count = np.array([len(t.curves) for t in targets], dtype=np.int64)[target_of_view]
 
     points, curves = observations.points, observations.curves
     p, point_bounds = _grouped(points, sight_of_view, len(order))
     c, curve_bounds = _grouped(curves, sight_of_view, len(order))
-    of_point = target_of_view[points.view[p]]
-    of_curve = target_of_view[curves.view[c]]
-    feature = (first_point[of_point] + points.feature[p]).astype(np.int64)
+    feature = first_point[points.view[p]] + points.feature[p]
     side = curves.side[c] % 3  # -1 is the last of a target's three sets of tracks
-    track = first_track[of_curve] + side * curve_count[of_curve] + curves.feature[c]
+    track = first_track[curves.view[c]] + side * curve_count[curves.view[c]] + curves.feature[c]
     every = Sights(
         tuple(order),
         tuple(tuple(views) for views in views_of),
         point_bounds,
         np.arange(len(points))[p],
         feature,
-        np.concatenate([t.point_array for t in targets])[feature],
-        points.pixels[p],
-        points.sigma_px[p],
+        np.concatenate([t.point_array for t in targets]).take(feature, axis=0),
+        _at(points.pixels, p),
+        _at(points.sigma_px, p),
         curve_bounds,
         np.arange(len(curves))[c],
         track.astype(np.int32),
-        curves.pixels[c],
-        curves.sigma_px[c],
+        _at(curves.pixels, c),
+        _at(curves.sigma_px, c),
         np.concatenate([t.tracks.reshape(-1, 3, 3) for t in targets]),
         np.concatenate([np.tile(t.is_arc, 3) for t in targets]),
     )

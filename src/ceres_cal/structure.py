@@ -60,6 +60,7 @@ class Structure:
         point_slots: (P, 4) which numbers move each point of all targets: x, y, first and second bow; -1 for none.
         bends: (P, 2) how much of each bow a point gets, along +z.
         track_slots: (T, 3) which numbers move each track: of a segment the offset, of an arc x, y and radius.
+            These three are empty where nothing moves at all.
     """
 
     names: tuple[str, ...]
@@ -71,7 +72,7 @@ class Structure:
 
     def with_values(self, values: Array) -> Structure:
         """The same corrections with other numbers."""
-        return replace(self, values=np.array(values, dtype=float))
+        return replace(self, values=np.array(values, dtype=float)) if len(self.values) else self
 
     def points(self, sights: Sights) -> Array:
         """(N, 3) where the observed points of the sights lie, m."""
@@ -116,6 +117,17 @@ class Structure:
         return tracks
 
 
+EXACT = Structure(
+    (),
+    np.empty(0),
+    np.empty(0),
+    np.empty((0, 4), dtype=np.int32),
+    np.empty((0, 2)),
+    np.empty((0, 3), dtype=np.int32),
+)
+"""All targets as drawn."""
+
+
 def make_structure(targets: Mapping[str, Target], tolerances: Mapping[str, Tolerance]) -> Structure:
     """The corrections that the tolerances free, all 0.
 
@@ -125,6 +137,8 @@ def make_structure(targets: Mapping[str, Target], tolerances: Mapping[str, Toler
     for name in tolerances:
         if name not in targets:
             raise InputError(f"a tolerance names target {name!r}: there are {', '.join(map(repr, targets))}")
+    if all(tolerance == Tolerance() for tolerance in tolerances.values()):
+        return EXACT
     names: list[str] = []
     sigmas: list[float] = []
 

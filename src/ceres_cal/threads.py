@@ -13,7 +13,8 @@ from typing import TypeVar
 import numpy as np  # noqa: F401 its BLAS is what the controller looks for
 from threadpoolctl import ThreadpoolController
 
-_ROWS_OF_A_PART = 3_000  # observations; below it a thread costs more than it brings
+_WORTH_US = 180.0  # of work in a part; below it a thread costs more than it brings
+_LATER_US = 60.0  # that another thread begins after this one
 _MOST = 8
 _allowed: ContextVar[int] = ContextVar("allowed", default=0)
 _T = TypeVar("_T")
@@ -61,10 +62,16 @@ def available() -> int:
     return _allowed.get() or _cores()
 
 
-def parts_of(items: int, rows: int) -> list[int]:
-    """Where each part of so many items begins, and where the last one ends, when they hold so many rows in all."""
-    count = max(1, min(available(), rows // _ROWS_OF_A_PART))
-    return [items * number // count for number in range(count + 1)]
+def parts_of(items: int, rows: int, row_ns: float) -> list[int]:
+    """Where each part of so many items begins, and where the last one ends.
+
+    Args:
+        rows: how many they hold in all. row_ns: about how long one of them takes.
+    """
+    work_us = 1e-3 * row_ns * rows
+    count = max(1, min(available(), int(work_us / _WORTH_US)))
+    ahead = _LATER_US / work_us if count > 1 else 0.0
+    return [0, *(int(items * (ahead + (1.0 - ahead) * number / count)) for number in range(1, count + 1))]
 
 
 def run_parts(function: Callable[[int, int], _T], parts: Sequence[int]) -> list[_T]:

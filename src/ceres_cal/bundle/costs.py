@@ -19,6 +19,8 @@ from ceres_cal.threads import parts_of, run_parts
 from ceres_cal.transforms import Array, left_jacobian, rotation_exp, skew
 
 ROWS_WORTH_A_THREAD = 20_000
+NORMAL_NS = 60.0
+"""That an observation's share of the normal equations takes."""
 _NOTHING = np.empty(0)
 
 
@@ -71,7 +73,7 @@ class SightCost(pyceres.CostFunction):
         self._static = (
             code, vector, free, powers, unit, *kernel_columns(sight, estimate.structure, weighting),
             starting_places(sight, estimate, places),
-            *kernel_track_slots(estimate.structure), kernels.LOSS_CODES[weighting.loss], weighting.loss_scale,
+            estimate.structure.track_slots, kernels.LOSS_CODES[weighting.loss], weighting.loss_scale,
         )  # fmt: skip
         self._poses = [estimate.stations[key.station].cam_from_world.log(), np.zeros(6)]
         if key.placement is not None:
@@ -131,11 +133,6 @@ def kernel_columns(sights: Sights, structure: Structure, weighting: Weighting) -
     )
 
 
-def kernel_track_slots(structure: Structure) -> tuple[NDArray[np.int32]]:
-    """Which structure numbers move the tracks, as the kernels take it: nothing where nothing moves."""
-    return (structure.track_slots if len(structure.values) else structure.track_slots[:0],)
-
-
 class _Sweep(NamedTuple):
     """Placements at their best for given shared numbers.
 
@@ -183,7 +180,7 @@ class EliminatedCost(pyceres.CostFunction):
         )
         self._observations = (
             sights.point_bounds, pixels, weights, slots, bends, is_arc, sights.curve_bounds, track, curve_pixels,
-            curve_weights, starting_places(sights, estimate, places), *kernel_track_slots(estimate.structure),
+            curve_weights, starting_places(sights, estimate, places), estimate.structure.track_slots,
         )  # fmt: skip
         self._loss = (kernels.LOSS_CODES[weighting.loss], weighting.loss_scale)
         self._tolerance = 1e-2 if weighting.rough else 1e-3
@@ -194,7 +191,7 @@ class EliminatedCost(pyceres.CostFunction):
         # Every step starts from the poses of the last accepted one: a rejected step may have led them astray.
         self._accepted = _Evaluation(start, _NOTHING, _NOTHING, poses, gains)
         self._known: _Evaluation | None = None
-        self._parts = parts_of(len(sights), len(sights.points) + len(sights.curve_pixels))
+        self._parts = parts_of(len(sights), len(sights.points) + len(sights.curve_pixels), NORMAL_NS)
         self.slots = [slot for slot, size in zip((0, 3), sizes, strict=True) if size]
         self.set_num_residuals(self._size + 1)
         self.set_parameter_block_sizes([size for size in sizes if size])

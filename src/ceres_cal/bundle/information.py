@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ceres_cal import kernels
-from ceres_cal.bundle.costs import Weighting, kernel_columns, kernel_track_slots
+from ceres_cal.bundle.costs import NORMAL_NS, Weighting, kernel_columns
 from ceres_cal.bundle.problem import own_structure, private_placements
 from ceres_cal.errors import SolutionError
 from ceres_cal.parameters import Estimate, Layout, intrinsics_scales
@@ -122,7 +122,7 @@ def _normals(
         normals = np.empty((last - first, size, size))
         if not kernels.sight_normals(
             first, last, code, vector, free, powers, unit, sights.point_bounds, pixels, weights, slots, bends, is_arc,
-            sights.curve_bounds, track, curve_pixels, curve_weights, starts, *kernel_track_slots(structure),
+            sights.curve_bounds, track, curve_pixels, curve_weights, starts, structure.track_slots,
             kernels.LOSS_CODES[weighting.loss], weighting.loss_scale, False, points, tracks, len(structure.values),
             poses, normals,
         ):  # fmt: skip
@@ -132,7 +132,7 @@ def _normals(
     batch = max(1, _BATCH // size**2)
     for first in range(0, len(sights), batch):
         last = min(first + batch, len(sights))
-        parts = [first + place for place in parts_of(last - first, len(points) + len(curve_pixels))]
+        parts = [first + place for place in parts_of(last - first, len(points) + len(curve_pixels), NORMAL_NS)]
         normals = np.concatenate(run_parts(told, parts))
         yield poses[first:last], normals * units[:, None] * units
 

@@ -86,7 +86,7 @@ class _Blocks:
         kept = layout.placements - eliminated
         return cls(
             {name: intrinsics_vector(camera)[layout.free[name]] for name, camera in estimate.cameras.items()},
-            {name: station.cam_from_world.log() for name, station in estimate.stations.items()},
+            {n: estimate.stations[n].cam_from_world.log() for n in estimate.stations if n in layout.stations},
             {n: estimate.placements[n].log() for n in estimate.placements if n in kept},
             estimate.structure.values.copy(),
         )

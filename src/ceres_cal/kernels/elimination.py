@@ -34,7 +34,8 @@ def _move(pose: Any, step: Any, turned: Any, moved: Any) -> None:
 def _solve_pose(normal: Any, count: int, damping: float, lower: Any, gain: Any) -> None:
     """gain (6, count + 1) = A_pp^-1 [A_pc A_pe] by Cholesky; a direction that nothing fixes is left where it is.
 
-    `normal` has its lower triangle filled, in the order [count intrinsics | 6 pose | residual].
+    `normal` has its lower triangle filled, in the order [count intrinsics | 6 pose | residual]. `lower` is Cholesky's
+    factor with its diagonal inverted: a product is cheaper than a quotient.
     """
     for k in range(6):
         for i in range(k, 6):
@@ -43,20 +44,20 @@ def _solve_pose(normal: Any, count: int, damping: float, lower: Any, gain: Any) 
                 total -= lower[i, j] * lower[k, j]
             if i == k:
                 held = not total > 1e-13 * normal[count + k, count + k]
-                lower[k, k] = np.inf if held else np.sqrt(total)
+                lower[k, k] = 0.0 if held else 1.0 / np.sqrt(total)
             else:
-                lower[i, k] = total / lower[k, k]
+                lower[i, k] = total * lower[k, k]
     for column in range(count + 1):
         for k in range(6):
             total = normal[count + k, column] if column < count else normal[count + 6, count + k]
             for j in range(k):
                 total -= lower[k, j] * gain[j, column]
-            gain[k, column] = total / lower[k, k]
+            gain[k, column] = total * lower[k, k]
         for k in range(5, -1, -1):
             total = gain[k, column]
             for j in range(k + 1, 6):
                 total -= lower[j, k] * gain[j, column]
-            gain[k, column] = total / lower[k, k]
+            gain[k, column] = total * lower[k, k]
 
 
 @jit

@@ -19,9 +19,14 @@ def grouped_scatter(values: Any, bounds: Any) -> Any:
         mean[:] = 0.0
         for n in range(bounds[g], bounds[g + 1]):
             for i in range(size):
-                mean[i] += values[n, i] / count
+                mean[i] += values[n, i]
+        mean /= count
         for n in range(bounds[g], bounds[g + 1]):
             for i in range(size):
-                for j in range(size):
-                    scatter[g, i, j] += (values[n, i] - mean[i]) * (values[n, j] - mean[j]) / count
+                for j in range(i + 1):
+                    scatter[g, i, j] += (values[n, i] - mean[i]) * (values[n, j] - mean[j])
+        for i in range(size):
+            for j in range(i + 1):
+                scatter[g, i, j] /= count
+                scatter[g, j, i] = scatter[g, i, j]
     return scatter

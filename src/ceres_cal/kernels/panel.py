@@ -15,35 +15,49 @@ _FLAT, _MOSTLY_FLAT = 0.7, 0.5  # a bend; share of a chunk beyond which it says 
 
 @jit
 def add_products(n: int, count: int, panel: Any, products: Any) -> None:
-    """products += P P^T over the panel's first n columns, lower triangle; three rows by three, to read each one less.
+    """products += P P^T over the panel's first n columns, lower triangle; four rows by four, to read each one less.
 
-    Both have room for a multiple of three rows.
+    Both have room for a multiple of four rows.
     """
-    for k in range(0, count, 3):
-        a, b, c = panel[k], panel[k + 1], panel[k + 2]
-        for j in range(0, k + 1, 3):
-            x, y, z = panel[j], panel[j + 1], panel[j + 2]
-            s00, s01, s02, s10, s11, s12, s20, s21, s22 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for k in range(0, count, 4):
+        for j in range(0, k + 1, 4):
+            s00, s01, s02, s03, s10, s11, s12, s13 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+            s20, s21, s22, s23, s30, s31, s32, s33 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
             for i in range(n):
-                s00 += a[i] * x[i]
-                s01 += a[i] * y[i]
-                s02 += a[i] * z[i]
-                s10 += b[i] * x[i]
-                s11 += b[i] * y[i]
-                s12 += b[i] * z[i]
-                s20 += c[i] * x[i]
-                s21 += c[i] * y[i]
-                s22 += c[i] * z[i]
-            upper, middle, lower = products[k], products[k + 1], products[k + 2]
-            upper[j] += s00
-            upper[j + 1] += s01
-            upper[j + 2] += s02
-            middle[j] += s10
-            middle[j + 1] += s11
-            middle[j + 2] += s12
-            lower[j] += s20
-            lower[j + 1] += s21
-            lower[j + 2] += s22
+                a, b, c, d = panel[k, i], panel[k + 1, i], panel[k + 2, i], panel[k + 3, i]
+                x, y, z, w = panel[j, i], panel[j + 1, i], panel[j + 2, i], panel[j + 3, i]
+                s00 += a * x
+                s01 += a * y
+                s02 += a * z
+                s03 += a * w
+                s10 += b * x
+                s11 += b * y
+                s12 += b * z
+                s13 += b * w
+                s20 += c * x
+                s21 += c * y
+                s22 += c * z
+                s23 += c * w
+                s30 += d * x
+                s31 += d * y
+                s32 += d * z
+                s33 += d * w
+            products[k, j] += s00
+            products[k, j + 1] += s01
+            products[k, j + 2] += s02
+            products[k, j + 3] += s03
+            products[k + 1, j] += s10
+            products[k + 1, j + 1] += s11
+            products[k + 1, j + 2] += s12
+            products[k + 1, j + 3] += s13
+            products[k + 2, j] += s20
+            products[k + 2, j + 1] += s21
+            products[k + 2, j + 2] += s22
+            products[k + 2, j + 3] += s23
+            products[k + 3, j] += s30
+            products[k + 3, j + 1] += s31
+            products[k + 3, j + 2] += s32
+            products[k + 3, j + 3] += s33
 
 
 @jit

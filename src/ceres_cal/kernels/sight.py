@@ -235,8 +235,8 @@ def working_space(intrinsics: int, rows: int) -> tuple[Any, Any, Any, Any]:
     """Where `normal_equations` works: the chunk's Jacobian, its weighted rows, their products, and what leads there."""
     return (
         np.empty((intrinsics + 6, 2, CHUNK)),
-        np.zeros((rows + 2, 2 * CHUNK)),
-        np.empty((rows + 2, rows + 2)),
+        np.zeros((rows + 3, 2 * CHUNK)),
+        np.empty((rows + 3, rows + 3)),
         np.empty((32, CHUNK)),
     )
 
@@ -288,9 +288,9 @@ def normal_equations(
 @jit
 def point_residuals(
     lens: int, intrinsics: Any, powers: Any, unit: float, poses: Any, bounds: Any, points: Any, pixels: Any,
-    residuals: Any,
+    rows: Any, residuals: Any,
 ) -> None:  # fmt: skip
-    """project(X) - p in px, (N, 2), of the sights at poses (S, 3, 4); NaN where a point cannot be projected."""
+    """project(X) - p in px of the sights at poses (S, 3, 4), to `rows` of `residuals`; NaN where there is none."""
     scratch = np.empty((21, CHUNK))
     dense = one_dimensional(lens, intrinsics, powers)
     limit = answer_limit(lens, dense)
@@ -298,19 +298,20 @@ def point_residuals(
         for start in range(bounds[v], bounds[v + 1], CHUNK):
             stop = min(start + CHUNK, bounds[v + 1])
             if not _chunk_residuals(
-                start, stop, lens, intrinsics, dense, unit, limit, poses[v], points, pixels, scratch, residuals
+                start, stop, lens, intrinsics, dense, unit, limit, poses[v], points, pixels, scratch, rows, residuals
             ):
                 for k in range(start, stop):
                     if not _chunk_residuals(
-                        k, k + 1, lens, intrinsics, dense, unit, limit, poses[v], points, pixels, scratch, residuals
-                    ):
-                        residuals[k] = np.nan
+                        k, k + 1, lens, intrinsics, dense, unit, limit, poses[v], points, pixels, scratch, rows,
+                        residuals,
+                    ):  # fmt: skip
+                        residuals[rows[k]] = np.nan
 
 
 @jit
 def _chunk_residuals(
     start: int, stop: int, lens: int, intrinsics: Any, dense: Any, unit: float, limit: float, pose: Any, points: Any,
-    pixels: Any, scratch: Any, residuals: Any,
+    pixels: Any, scratch: Any, rows: Any, residuals: Any,
 ) -> bool:  # fmt: skip
     """The same for some points of one sight; False where any of them cannot be projected."""
     n, image = stop - start, scratch[9:16]
@@ -321,8 +322,9 @@ def _chunk_residuals(
     if not distort(lens, n, intrinsics, dense, unit, limit, scratch[6:9], image, scratch[16:]):
         return False
     for i in range(n):
-        residuals[start + i, 0] = intrinsics[2] + image[0, i] - pixels[start + i, 0]
-        residuals[start + i, 1] = intrinsics[3] + intrinsics[1] * image[1, i] - pixels[start + i, 1]
+        row = rows[start + i]
+        residuals[row, 0] = intrinsics[2] + image[0, i] - pixels[start + i, 0]
+        residuals[row, 1] = intrinsics[3] + intrinsics[1] * image[1, i] - pixels[start + i, 1]
     return True
 
 
