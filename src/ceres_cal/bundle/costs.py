@@ -22,6 +22,7 @@ ROWS_WORTH_A_THREAD = 20_000
 NORMAL_NS = 60.0
 """That an observation's share of the normal equations takes."""
 _NOTHING = np.empty(0)
+_LEFT_TO_THE_COMPLEMENT = 1e-2  # of a sight's cost, by the step its pose would take
 
 
 @dataclass(frozen=True)
@@ -183,7 +184,6 @@ class EliminatedCost(pyceres.CostFunction):
             curve_weights, starting_places(sights, estimate, places), estimate.structure.track_slots,
         )  # fmt: skip
         self._loss = (kernels.LOSS_CODES[weighting.loss], weighting.loss_scale)
-        self._tolerance = 1e-2 if weighting.rough else 1e-3
         sizes = (len(self._free), len(estimate.structure.values))
         self._size = sum(sizes)
         start = np.concatenate([self._optics[1][self._free], estimate.structure.values])
@@ -201,7 +201,7 @@ class EliminatedCost(pyceres.CostFunction):
             at = np.concatenate(parameters)
             # Ceres asks for the cost of a step first, then for the Jacobian in the same place: once is enough.
             if self._known is None or not np.array_equal(self._known.at, at):
-                self._known = self._evaluated(at, self._tolerance)
+                self._known = self._evaluated(at, _LEFT_TO_THE_COMPLEMENT)
         except BaseException as error:  # an exception must not travel through C++: the solve ends, then it is raised
             self._run.failure = self._run.failure or error
             return False

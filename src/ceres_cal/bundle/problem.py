@@ -230,8 +230,7 @@ def solve(
     run = Run()
     with at_most(options.threads):
         assembly = _assemble(run, sights, estimate, layout, weighting, places)
-    # Far from the end gains come and go: there it is for Ceres to say that they are small.
-    watcher = _Watcher(run, progress, 0.0 if weighting.rough else weighting.precision)
+    watcher = _Watcher(run, progress, weighting.precision)
     problem = pyceres.Problem()
     for cost, arrays in assembly.costs:
         if arrays:
