@@ -18,13 +18,14 @@ import tempfile
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from statistics import median
 from typing import Any
 
 import numpy as np
-from benchmark_peers import PEERS, Answer, Corners, peak_mib
+from benchmark_peers import PEERS, Answer, Corners, peak_mib, solve_warm
 from benchmark_problems import (
     HEIGHT_M,
     OVERHEAD,
@@ -137,8 +138,6 @@ def judge(problem: Problem, answer: Answer) -> dict[str, Any]:
 def compare(frames: int, solvers: Mapping[str, Solver], repeat: int) -> dict[str, Any]:
     """All solvers on one problem, taking turns: medians, and ratios within each turn."""
     problem = wide_lens(frames)
-    for solve in solvers.values():
-        solve(problem.corners.first(WARM_UP_FRAMES))
     turns = [{name: solve(problem.corners) for name, solve in solvers.items()} for _ in range(repeat)]
     rows: dict[str, dict[str, Any]] = {}
     for name, answer in turns[-1].items():
@@ -391,9 +390,11 @@ def measure(chosen: argparse.Namespace) -> dict[str, Any]:
 
 def compare_all(chosen: argparse.Namespace, imports: Mapping[str, float | None]) -> list[dict[str, Any]]:
     """Every size of the comparison, by the solvers that are there."""
-    solvers: dict[str, Solver] = {OURS: solve_ours}
+    solvers: dict[str, Solver] = {OURS: partial(solve_warm, solve_ours)}
     for name in (name for name in chosen.peers if imports[name] is not None):
-        solvers[name] = PEERS[name] if name != "mrcal" else lambda corners: solve_apart("mrcal", corners)[0]
+        solvers[name] = partial(solve_warm, PEERS[name])
+    if "mrcal" in solvers:
+        solvers["mrcal"] = lambda corners: solve_apart("mrcal", corners)[0]
     comparison = []
     for frames in chosen.frames:
         found = compare(frames, solvers, chosen.repeat)

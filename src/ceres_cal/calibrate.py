@@ -20,7 +20,7 @@ from ceres_cal.observations import Observations
 from ceres_cal.parameters import Estimate, Layout, Options, make_layout
 from ceres_cal.residuals import Residuals, residuals
 from ceres_cal.sights import Rows, SightKey, Sights, gather_sights
-from ceres_cal.threads import at_most, single_threaded_blas
+from ceres_cal.threads import at_most, meanwhile, single_threaded_blas
 from ceres_cal.transforms import Array
 from ceres_cal.uncertainty import Posterior, Setting, Uncertainty, assess, bounds_text
 
@@ -88,6 +88,7 @@ def solved_from(
     """
     warnings: tuple[str, ...] = ()
     posterior = None
+    digest = meanwhile(lambda: observations.digest)
     if options.closed_form_only:
         settled = _unsolved(observations, sights, four_point_baseline(sights, start.estimate))
     else:
@@ -109,7 +110,7 @@ def solved_from(
         start.phi_from,
         warnings,
         options,
-        observations.digest,
+        digest.result(),
         posterior,
     )
 

@@ -61,6 +61,8 @@ def _with_better_poses(
     two = np.max(np.abs(turned - found), axis=(1, 2)) > _SAME  # else the search came back from the mirrored pose
     close = np.flatnonzero(two & (np.abs(other - as_is) < _MUCH_WORSE))
     undecided = frozenset(few.keys[i] for i in close)
+    if not len(better):
+        return estimate, 0, undecided
     return estimate.with_placements([few.keys[i] for i in better], turned[better]), len(better), undecided
 
 

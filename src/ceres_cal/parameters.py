@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,7 +81,7 @@ class Options:
         if self.threads < 0:
             raise InputError(f"threads must be 0 (to choose) or above, not {self.threads}")
 
-    @property
+    @cached_property
     def blank_lens(self) -> Lens:
         """The chosen lens with its fixed coefficients; the others are 0."""
         names = make_lens(self.lens, self.powers).names

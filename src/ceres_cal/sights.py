@@ -6,8 +6,10 @@ of its own. Rows are kept so that residuals find their way back to the observati
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -87,6 +89,12 @@ class Sights(Sequence["Sights"]):
         (key,) = self.keys
         return key
 
+    @cached_property
+    def seen_once(self) -> frozenset[str | None]:
+        """Placements that a single one of the sights shows."""
+        times = Counter([key.placement for key in self.keys])
+        return frozenset(name for name, count in times.items() if count == 1)
+
     @property
     def equations(self) -> int:
         """Measured numbers: two of each point, one of each curve observation."""
@@ -101,6 +109,8 @@ class Sights(Sequence["Sights"]):
 
     def used_share(self, points: Mask, curves: Mask) -> Array:
         """(S,) the share of each sight's observations that is used."""
+        if points.all() and curves.all():
+            return np.ones(len(self))
         p = bounds_of(points[self.point_rows])[self.point_bounds]
         c = bounds_of(curves[self.curve_rows])[self.curve_bounds]
         return np.asarray((np.diff(p) + np.diff(c)) / (np.diff(self.point_bounds) + np.diff(self.curve_bounds)))

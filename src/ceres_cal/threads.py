@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import cache
@@ -14,7 +14,7 @@ import numpy as np  # noqa: F401 its BLAS is what the controller looks for
 from threadpoolctl import ThreadpoolController
 
 _WORTH_US = 180.0  # of work in a part; below it a thread costs more than it brings
-_LATER_US = 60.0  # that another thread begins after this one
+_LATER_US = 100.0  # that another thread begins after this one
 _MOST = 8
 _allowed: ContextVar[int] = ContextVar("allowed", default=0)
 _T = TypeVar("_T")
@@ -72,6 +72,11 @@ def parts_of(items: int, rows: int, row_ns: float) -> list[int]:
     count = max(1, min(available(), int(work_us / _WORTH_US)))
     ahead = _LATER_US / work_us if count > 1 else 0.0
     return [0, *(int(items * (ahead + (1.0 - ahead) * number / count)) for number in range(1, count + 1))]
+
+
+def meanwhile(function: Callable[[], _T]) -> Future[_T]:
+    """What a function returns that another thread calls from now on."""
+    return _pool().submit(function)
 
 
 def run_parts(function: Callable[[int, int], _T], parts: Sequence[int]) -> list[_T]:

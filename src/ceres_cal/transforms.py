@@ -138,7 +138,9 @@ class Pose:
     @property
     def matrix(self) -> Array:
         """(3, 4), [R t]."""
-        return np.column_stack([self.rotation, self.translation])
+        matrix = np.empty((3, 4))
+        matrix[:, :3], matrix[:, 3] = self.rotation, self.translation
+        return matrix
 
     def log(self) -> Array:
         """The 6-vector (rotation vector, translation) of this pose: the inverse of `exp`."""

@@ -124,7 +124,7 @@ def _normals(
             first, last, code, vector, free, powers, unit, sights.point_bounds, pixels, weights, slots, bends, is_arc,
             sights.curve_bounds, track, curve_pixels, curve_weights, starts, structure.track_slots,
             kernels.LOSS_CODES[weighting.loss], weighting.loss_scale, False, points, tracks, len(structure.values),
-            poses, normals,
+            poses, units, normals,
         ):  # fmt: skip
             raise SolutionError("an observation cannot be projected where the solve ended: no uncertainty can be given")
         return normals
@@ -133,8 +133,7 @@ def _normals(
     for first in range(0, len(sights), batch):
         last = min(first + batch, len(sights))
         parts = [first + place for place in parts_of(last - first, len(points) + len(curve_pixels), NORMAL_NS)]
-        normals = np.concatenate(run_parts(told, parts))
-        yield poses[first:last], normals * units[:, None] * units
+        yield poses[first:last], np.concatenate(run_parts(told, parts))
 
 
 def _eliminate(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -303,9 +302,7 @@ def _rests(history: Sequence[float]) -> bool:
 
 def private_placements(sights: Sights, layout: Layout) -> frozenset[str | None]:
     """Free placements that a single sight shows."""
-    seen = Counter([key.placement for key in sights.keys])
-    several = {name for name, times in seen.items() if times > 1}
-    return layout.placements & (seen.keys() - several)
+    return layout.placements & sights.seen_once
 
 
 def _require_enough(sights: Sights, layout: Layout) -> None:

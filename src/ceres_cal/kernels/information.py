@@ -16,13 +16,15 @@ def sight_normals(
     first: int, last: int, lens: int, intrinsics: Any, free: Any, powers: Any, unit: float,
     bounds: Any, pixels: Any, weights: Any, slots: Any, bends: Any,
     is_arc: Any, curve_bounds: Any, track: Any, curve_pixels: Any, curve_weights: Any, s: Any, track_slots: Any,
-    loss: int, scale: float, newton: bool, points: Any, tracks: Any, structure: int, poses: Any, normals: Any,
+    loss: int, scale: float, newton: bool, points: Any, tracks: Any, structure: int, poses: Any, units: Any,
+    normals: Any,
 ) -> bool:  # fmt: skip
     """False where an observation cannot be projected; else J^T W J of the sights first to last, each by itself.
 
     Args:
         normals: (last - first, n, n) with n = free + structure + 6: free intrinsics, structure, left perturbation of
-            the pose. Everything else as in `elimination.eliminate_placements`.
+            the pose, each multiplied with its one of `units` (n,). Everything else as in
+            `elimination.eliminate_placements`.
     """
     size = len(free) + structure + 6
     rows, places = layout_of_rows(free, len(intrinsics), structure)
@@ -41,6 +43,6 @@ def sight_normals(
             return False
         for i in range(size):
             for j in range(i + 1):
-                normals[v - first, i, j] = normal[i, j]
-                normals[v - first, j, i] = normal[i, j]
+                normals[v - first, i, j] = units[i] * units[j] * normal[i, j]
+                normals[v - first, j, i] = normals[v - first, i, j]
     return True
