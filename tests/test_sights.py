@@ -191,3 +191,8 @@ def test_a_pixel_without_a_ray_has_a_place_all_the_same() -> None:
     assert np.all(
         np.isfinite(nearest_places(replace(sight, curve_pixels=np.full_like(far.curve_pixels, 480.0)), level))
     )
+
+
+def test_placements_seen_once() -> None:
+    """"near" is a board that two stations show; the court is no placement but seen by two as well."""
+    assert gather_sights(seen()).seen_once == {"far"}

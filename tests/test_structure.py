@@ -16,7 +16,7 @@ from ceres_cal.observations import Observations
 from ceres_cal.parameters import Options
 from ceres_cal.sights import gather_sights
 from ceres_cal.simulate import Disturbance, Station, board_scene, field_scene, join, overhead_pose, simulate
-from ceres_cal.structure import Tolerance, make_structure
+from ceres_cal.structure import EXACT, Tolerance, make_structure
 from ceres_cal.targets import Arc, Curve, Segment, Target, checkerboard, custom, ssl_field
 from ceres_cal.transforms import Array
 
@@ -151,3 +151,10 @@ def test_tolerances_that_do_not_fit(tolerances: dict[str, Tolerance], message: s
 def test_sigmas_that_are_none(sigma: float) -> None:
     with pytest.raises(InputError, match="tolerance lines_m"):
         Tolerance(lines_m=sigma)
+
+
+def test_nothing_moves_without_a_tolerance() -> None:
+    assert make_structure({"field": FIELD}, {"field": Tolerance()}) is EXACT
+    built = EXACT.built({"field": FIELD})["field"]
+    assert np.array_equal(built.points, FIELD.point_array)
+    assert np.array_equal(built.tracks, FIELD.tracks)

@@ -70,8 +70,8 @@ def parts_of(items: int, rows: int, row_ns: float) -> list[int]:
     """
     work_us = 1e-3 * row_ns * rows
     count = max(1, min(available(), int(work_us / _WORTH_US)))
-    ahead = _LATER_US / work_us if count > 1 else 0.0
-    return [0, *(int(items * (ahead + (1.0 - ahead) * number / count)) for number in range(1, count + 1))]
+    ahead = items * _LATER_US / work_us if count > 1 else 0.0
+    return [0, *(int(ahead + (items - ahead) * number / count) for number in range(1, count)), items]
 
 
 def meanwhile(function: Callable[[], _T]) -> Future[_T]:

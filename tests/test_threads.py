@@ -1,0 +1,46 @@
+"""Work in parts: every item once, whatever the number of threads."""
+
+from __future__ import annotations
+
+import threading
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ceres_cal.threads import at_most, meanwhile, parts_of, run_parts
+
+
+@given(
+    items=st.integers(0, 2000),
+    rows=st.integers(0, 10**7),
+    row_ns=st.floats(1.0, 1000.0),
+    threads=st.integers(1, 8),
+)
+def test_parts_hold_every_item_once(items: int, rows: int, row_ns: float, threads: int) -> None:
+    with at_most(threads):
+        parts = parts_of(items, rows, row_ns)
+    assert parts[0] == 0
+    assert parts[-1] == items
+    assert parts == sorted(parts)
+    assert 1 <= len(parts) - 1 <= threads
+    assert [item for part in run_parts(lambda a, b: list(range(a, b)), parts) for item in part] == list(range(items))
+
+
+def test_little_work_stays_in_one_part() -> None:
+    with at_most(8):
+        assert parts_of(100, 10_000, 10.0) == [0, 100]
+
+
+def test_the_part_of_the_caller_is_the_largest() -> None:
+    """Another thread begins later; with very much work that no longer tells."""
+    with at_most(2):
+        few, many = parts_of(1000, 10_000, 60.0), parts_of(1000, 10**7, 60.0)
+    assert few[1] > 550
+    assert 500 <= many[1] <= 501
+
+
+def test_meanwhile_is_another_thread_and_brings_what_it_raises() -> None:
+    assert meanwhile(threading.get_ident).result() != threading.get_ident()
+    with pytest.raises(ZeroDivisionError):
+        meanwhile(lambda: 1 // 0).result()
