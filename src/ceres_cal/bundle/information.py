@@ -33,12 +33,14 @@ class Eliminated:
     """Private placements of one station: their own information, and how they follow the shared numbers.
 
     Attributes:
-        names: (S). own: (S, 6, 6) information about each with everything shared held.
+        names: (S). own: (S, 6, 6) information about each with everything shared held; inverses: (S, 6, 6) of that,
+            over what it tells.
         gains: (S, 6, K); a step d of the shared numbers at `places` (K,) takes each placement along by -gains d.
     """
 
     names: tuple[str, ...]
     own: Array
+    inverses: Array
     gains: Array
     places: Places
 
@@ -144,20 +146,21 @@ def _eliminate(
     world = estimate.stations[key.station].cam_from_world
     lead = np.concatenate([owned("camera", key.camera), owned("structure", "")])
     station = owned("station", key.station)
-    owns, gains, limits = [], [], sigma_limits(pose_keys("placement", ""))
+    eliminated, limits = [], sigma_limits(pose_keys("placement", ""))
     for poses, normals in parts:
         chain = from_placement(poses, world)
         own = np.swapaxes(chain, 1, 2) @ normals[:, -6:, -6:] @ chain
         coupling = np.swapaxes(chain, 1, 2) @ normals[:, -6:, :-6]
-        gain = known_inverses(own, limits) @ coupling
+        inverse = known_inverses(own, limits)
+        gain = inverse @ coupling
         matrix[np.ix_(lead, lead)] += np.sum(normals[:, :-6, :-6] - np.swapaxes(coupling, 1, 2) @ gain, axis=0)
         if len(station):  # the placement makes up for whatever its station does: the chain is orthogonal
             moved = np.swapaxes(chain, 1, 2) @ from_station(poses, world)
             gain = np.concatenate([gain, moved], axis=2)
-        owns.append(own)
-        gains.append(gain)
+        eliminated.append((own, inverse, gain))
+    own, inverse, gain = (np.concatenate(stacks) for stacks in zip(*eliminated, strict=True))
     names = tuple(str(key.placement) for key in sights.keys)
-    return Eliminated(names, np.concatenate(owns), np.concatenate(gains), np.concatenate([lead, station]))
+    return Eliminated(names, own, inverse, gain, np.concatenate([lead, station]))
 
 
 def _add(key: SightKey, pose: Array, normal: Array, estimate: Estimate, owned: Owned, matrix: Array) -> None:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ceres_cal.bundle import Eliminated, Information
 from ceres_cal.errors import InputError
 from ceres_cal.quantities import Key, pose_keys, sigma_limits
-from ceres_cal.spread import Spread, known_inverses, without
+from ceres_cal.spread import Spread, without
 from ceres_cal.transforms import Array
 from ceres_cal.uncertainty.profile import Profile
 
@@ -160,12 +160,11 @@ def _placement_information(part: Eliminated, shared: Posterior) -> Array:
     A placement follows the shared numbers by -G, and deviates from that by what its own observations leave open:
     covariance own^-1 + G C G^T where both exist, else the Schur complement of the two together.
     """
-    inverse = known_inverses(part.own, sigma_limits(pose_keys("placement", "")))
-    regular = np.einsum("sij,sji->s", part.own, inverse) > 5.5  # the rank of own
+    regular = np.einsum("sij,sji->s", part.own, part.inverses) > 5.5  # the rank of own
     regular &= not shared.spread.unknown.shape[1]
     found, gains = np.empty_like(part.own), part.gains[regular]
     covariance = shared.spread.covariance[np.ix_(part.places, part.places)]
-    found[regular] = np.linalg.inv(inverse[regular] + gains @ covariance @ np.swapaxes(gains, 1, 2))
+    found[regular] = np.linalg.inv(part.inverses[regular] + gains @ covariance @ np.swapaxes(gains, 1, 2))
     marginal = shared.marginal(part.places)
     limits = sigma_limits([shared.keys[place] for place in part.places])
     for s in np.flatnonzero(~regular):
