@@ -153,7 +153,8 @@ def _eliminate(
         coupling = np.swapaxes(chain, 1, 2) @ normals[:, -6:, :-6]
         inverse = known_inverses(own, limits)
         gain = inverse @ coupling
-        matrix[np.ix_(lead, lead)] += np.sum(normals[:, :-6, :-6] - np.swapaxes(coupling, 1, 2) @ gain, axis=0)
+        taken = coupling.reshape(-1, len(lead)).T @ gain.reshape(-1, len(lead))  # summed over the sights
+        matrix[np.ix_(lead, lead)] += np.sum(normals[:, :-6, :-6], axis=0) - taken
         if len(station):  # the placement makes up for whatever its station does: the chain is orthogonal
             moved = np.swapaxes(chain, 1, 2) @ from_station(poses, world)
             gain = np.concatenate([gain, moved], axis=2)
