@@ -40,7 +40,7 @@ from ceres_cal.transforms import Array, Pose, Poses
 _AT_REST = 10  # iterations
 _NOTHING_LEFT = "Nothing left to gain."
 _SUCCESS = (pyceres.TerminationType.CONVERGENCE, pyceres.TerminationType.USER_SUCCESS)
-_POSED = 1e-3  # relative change of a placement's cost that a start may leave
+_POSED = 1e-2  # relative change of a placement's cost that a start may leave
 _DENSE_LIMIT = 600  # numbers that stay after the Schur complement; above it a sparse factorisation is faster
 
 
