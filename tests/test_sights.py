@@ -194,5 +194,5 @@ def test_a_pixel_without_a_ray_has_a_place_all_the_same() -> None:
 
 
 def test_placements_seen_once() -> None:
-    """"near" is a board that two stations show; the court is no placement but seen by two as well."""
+    """ "near" is a board that two stations show; the court is no placement but seen by two as well."""
     assert gather_sights(seen()).seen_once == {"far"}
