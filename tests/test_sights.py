@@ -194,5 +194,5 @@ def test_a_pixel_without_a_ray_has_a_place_all_the_same() -> None:
 
 
 def test_placements_seen_once() -> None:
-    """ "near" is a board that two stations show; the court is no placement but seen by two as well."""
+    """Two stations show the board at "near"; the court, which two see as well, is no placement."""
     assert gather_sights(seen()).seen_once == {"far"}
