@@ -75,14 +75,13 @@ def information(
     private = private_placements(sights, layout)
     keys = shared_keys(estimate, layout, private)
     matrix, owned = np.zeros((len(keys), len(keys))), _owned(keys)
-    alone = np.array([key.placement in private for key in sights.keys], dtype=bool)
-    stations = np.array([key.station for key in sights.keys])
+    alone = [number for number, key in enumerate(sights.keys) if key.placement in private]
     eliminated = []
-    for name in dict.fromkeys(stations[alone].tolist()):
-        own = sights.take(np.flatnonzero(alone & (stations == name)))
+    for name in dict.fromkeys(sights.keys[number].station for number in alone):
+        own = sights.take(np.array([number for number in alone if sights.keys[number].station == name]))
         parts = list(_normals(own, estimate, layout, weighting, places))
         eliminated.append(_eliminate(own, parts, estimate, owned, matrix))
-    for number in np.flatnonzero(~alone):
+    for number in np.delete(np.arange(len(sights)), alone):
         sight = sights[int(number)]
         for pose, normal in _normals(sight, estimate, layout, weighting, places):
             _add(sight.key, pose[0], normal[0], estimate, owned, matrix)
