@@ -25,7 +25,7 @@ from statistics import median
 from typing import Any
 
 import numpy as np
-from benchmark_peers import PEERS, Answer, Corners, peak_mib, solve_warm
+from benchmark_peers import PEERS, WARM_UP_FRAMES, Answer, Corners, peak_mib, solve_warm
 from benchmark_problems import (
     HEIGHT_M,
     OVERHEAD,
@@ -44,7 +44,7 @@ OURS = "ceres-cal"
 MODULES = {OURS: "ceres_cal.calibrate", "opencv": "cv2", "pycolmap": "pycolmap", "mrcal": "mrcal"}
 MRCAL_PYTHON = "/usr/bin/python3"  # Debian's mrcal belongs to the system's Python
 MIRRORED_DEG = 5.0  # that far off the truth, a pose is the other one of the two that a plane's picture allows
-WARM_UP_FRAMES, WARM_UP_LINE_POINTS = 10, 1000
+WARM_UP_LINE_POINTS, WARM_UP_S = 1000, 0.3
 PIXELS, ROBOT_M = 1_000_000, 0.15
 LAST_DECADES = 2.0  # over which growth is told
 
@@ -80,14 +80,20 @@ def solve_ours(corners: Corners) -> Answer:
     )
 
 
-def solve_apart(name: str, corners: Corners) -> tuple[Answer, float]:
+def solve_apart(name: str, warm_up_s: float, corners: Corners) -> tuple[Answer, float]:
     """A peer's answer from a process of its own, and that process' peak memory in MiB."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "corners.npz"
         corners.save(path)
-        found = json.loads(run(name, str(Path(__file__).with_name("benchmark_peers.py")), name, str(path)))
+        script = Path(__file__).with_name("benchmark_peers.py")
+        found = json.loads(run(name, str(script), name, str(path), str(warm_up_s)))
     answer = Answer(found["seconds"], np.array(found["intrinsics"]), np.array(found["cam_from_board"]))
     return answer, found["peak_mib"]
+
+
+def answer_apart(name: str, warm_up_s: float, corners: Corners) -> Answer:
+    """The answer alone."""
+    return solve_apart(name, warm_up_s, corners)[0]
 
 
 def run(name: str, *arguments: str) -> str:
@@ -165,7 +171,7 @@ def add_memory(found: dict[str, Any]) -> None:
     """Peak memory of each solver, each in a process of its own."""
     corners = wide_lens(found["frames"]).corners
     for name, row in found["solvers"].items():
-        row["peak_mib"] = alone("corners", found["frames"]) if name == OURS else solve_apart(name, corners)[1]
+        row["peak_mib"] = alone("corners", found["frames"]) if name == OURS else solve_apart(name, 0.0, corners)[1]
 
 
 # ---- alone in a fresh process ---------------------------------------------------------------------------------------
@@ -258,8 +264,7 @@ def uncertainty_share(frames: int, repeat: int) -> float:
 def frames_growth(frames: int, repeat: int) -> dict[str, Any]:
     """Our seconds on the wide lens."""
     problem = wide_lens(frames)
-    solve_ours(problem.corners.first(WARM_UP_FRAMES))
-    answers = [solve_ours(problem.corners) for _ in range(repeat)]
+    answers = [solve_warm(solve_ours, WARM_UP_S, problem.corners) for _ in range(repeat)]
     seconds = median(answer.seconds for answer in answers)
     return {"size": frames, "frames": frames, "seconds": seconds, **judge(problem, answers[-1])}
 
@@ -390,11 +395,13 @@ def measure(chosen: argparse.Namespace) -> dict[str, Any]:
 
 def compare_all(chosen: argparse.Namespace, imports: Mapping[str, float | None]) -> list[dict[str, Any]]:
     """Every size of the comparison, by the solvers that are there."""
-    solvers: dict[str, Solver] = {OURS: partial(solve_warm, solve_ours)}
+    warm_up_s = chosen.warm_up
+    solvers: dict[str, Solver] = {OURS: partial(solve_warm, solve_ours, warm_up_s)}
     for name in (name for name in chosen.peers if imports[name] is not None):
-        solvers[name] = partial(solve_warm, PEERS[name])
-    if "mrcal" in solvers:
-        solvers["mrcal"] = lambda corners: solve_apart("mrcal", corners)[0]
+        if python_of(name) == sys.executable:
+            solvers[name] = partial(solve_warm, PEERS[name], warm_up_s)
+        else:
+            solvers[name] = partial(answer_apart, name, warm_up_s)
     comparison = []
     for frames in chosen.frames:
         found = compare(frames, solvers, chosen.repeat)
@@ -427,6 +434,9 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--points", type=numbers, default=sizes["points"], help="line points for us alone: %(default)s")
     parser.add_argument("--peers", type=peer_names, default=",".join(PEERS), help="of the comparison: %(default)s")
     parser.add_argument("--repeat", type=int, default=3, help="turns of everything: %(default)s")
+    parser.add_argument(
+        "--warm-up", type=float, default=WARM_UP_S, help="seconds of work before each is timed: %(default)s"
+    )
     parser.add_argument("--memory", action="store_true", help="peak memory of each solver at the most frames, too")
     parser.add_argument("--json", type=Path, help="write everything measured to this file")
     parser.add_argument("--quick", action="store_true", help="smallest sizes, one turn: does it run?")

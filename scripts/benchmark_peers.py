@@ -1,7 +1,8 @@
 """The other solvers of the benchmark, each on the same corners: OpenCV, pycolmap and mrcal.
 
 Needs NumPy and the library of the peer that is asked for, nothing of this package: so mrcal runs under the system's
-Python, and each peer in a process of its own. python scripts/benchmark_peers.py NAME CORNERS.npz prints its answer.
+Python, and each peer in a process of its own. python scripts/benchmark_peers.py NAME CORNERS.npz WARM_UP_SECONDS prints
+its answer.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-_WARM_UP_FRAMES, _WARM_UP_S = 10, 0.3
+WARM_UP_FRAMES = 10
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,20 +210,20 @@ PEERS: dict[str, Callable[[Corners], Answer]] = {
 }
 
 
-def solve_warm(solve: Callable[[Corners], Answer], corners: Corners) -> Answer:
-    """The answer of a solver that has been at work on ten of the frames.
+def solve_warm(solve: Callable[[Corners], Answer], warm_up_s: float, corners: Corners) -> Answer:
+    """The answer of a solver that has been at work on ten of the frames for so long.
 
-    A core that has idled, such as while another's process ran, is slower by a third for a tenth of a second.
+    A core that has idled, such as while another's process ran, is slower for a while.
     """
-    few, start = corners.first(_WARM_UP_FRAMES), time.perf_counter()
-    while time.perf_counter() - start < _WARM_UP_S:
+    few, start = corners.first(WARM_UP_FRAMES), time.perf_counter()
+    while time.perf_counter() - start < warm_up_s:
         solve(few)
     return solve(corners)
 
 
-def main(name: str, path: str) -> None:
+def main(name: str, path: str, warm_up_s: str) -> None:
     """Print a peer's answer with the process' peak memory."""
-    answer = solve_warm(PEERS[name], Corners.load(Path(path)))
+    answer = solve_warm(PEERS[name], float(warm_up_s), Corners.load(Path(path)))
     print(
         json.dumps(
             {

@@ -396,3 +396,8 @@ def test_orthogonality_tells_phi_from_tilted_views_only() -> None:
     assert np.all(error[[0, 2]] > 0.02)  # 0.025 to 0.052 measured
     assert np.all(error[1] < 1e-12)
     assert np.all(orthogonality_error(frontal, phi) < 1e-12)
+
+
+def test_a_plane_seen_as_a_line_has_no_polar_pose() -> None:
+    edge_on = np.array([[[1.0, 2.0, 0.0], [2.0, 4.0, 0.0], [0.0, 0.0, 1.0]]])
+    assert not np.any(np.isfinite(polar_poses(edge_on)[:, :, :3]))

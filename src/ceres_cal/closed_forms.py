@@ -118,7 +118,8 @@ def polar_poses(homographies: Array) -> Array:
     """[R t] (S, 3, 4) minimising the paper's E = |h1 / lambda - r1|^2 + |h2 / lambda - r2|^2 (section 3.6) for each H.
 
     With [h1 h2] = U S V^T: [r1 r2] = U V^T and 1 / lambda = tr(S) / tr(S^2). U V^T is B (B^T B)^-1/2, and the root of a
-    2 x 2 matrix M is (M + d) / s with d = (det M)^1/2 and s = (tr M + 2 d)^1/2; its inverse is (s - root) / d.
+    2 x 2 matrix M is (M + d) / s with d = (det M)^1/2 and s = (tr M + 2 d)^1/2; its inverse is (s - root) / d. Where H
+    sends the plane to a line there is none: NaN.
     """
     b = homographies[:, :, :2]
     m = np.swapaxes(b, 1, 2) @ b
@@ -126,7 +127,8 @@ def polar_poses(homographies: Array) -> Array:
     d = np.sqrt(np.maximum(m[:, 0, 0] * m[:, 1, 1] - m[:, 0, 1] ** 2, 0.0))
     sum_s = np.sqrt(trace + 2.0 * d)
     root = (m + d[:, None, None] * np.eye(2)) / sum_s[:, None, None]
-    r = b @ ((sum_s[:, None, None] * np.eye(2) - root) / d[:, None, None])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        r = b @ ((sum_s[:, None, None] * np.eye(2) - root) / d[:, None, None])
     first, second = r[:, :, 0].T, r[:, :, 1].T
     third = np.stack([first[i - 2] * second[i - 1] - first[i - 1] * second[i - 2] for i in range(3)], axis=1)
     translation = homographies[:, :, 2] * (sum_s / trace)[:, None]

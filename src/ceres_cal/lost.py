@@ -29,8 +29,6 @@ def with_lost_boards_found(
     Args:
         sights: with all their observations, those rejected too. weighting: with a loss that bears outliers.
     """
-    if inliers.points.all() and inliers.curves.all():
-        return estimate, 0
     private = private_placements(sights, layout)
     count = 0
     for number in np.flatnonzero(sights.used_share(inliers.points, inliers.curves) < _LOST):

@@ -178,7 +178,7 @@ def _profile_of_boards(board: Sights, data: PlaneData, camera: Camera, unit: flo
 
 
 def _spread_rows(bounds: Rows) -> Rows:
-    """Rows of no more than about enough points of each sight.
+    """Rows of about as many points of each sight as are enough.
 
     Steps of the golden ratio spread them evenly and never along one row of a board.
     """

@@ -120,8 +120,8 @@ class Sights(Sequence["Sights"]):
         farthest = 0.0
         for pixels in (self.pixels, self.curve_pixels):
             for at in range(0, len(pixels), _BLOCK):
-                offsets = camera.offsets(pixels[at : at + _BLOCK])
-                farthest = max(farthest, float(np.max(np.einsum("ij,ij->i", offsets, offsets))))
+                x, y = camera.offsets(pixels[at : at + _BLOCK]).T
+                farthest = max(farthest, float(np.max(x * x + y * y)))
         return float(np.sqrt(farthest))
 
     def part(self, number: int, count: int) -> Sights:

@@ -79,12 +79,6 @@ class Observations:
         write_content(self._content, Path(path))
 
     @cached_property
-    def shown_views(self) -> tuple[View, ...]:
-        """The views with observations; what the others name is not there for the solve."""
-        shown = sum(np.bincount(column.view, minlength=len(self.views)) for column in (self.points, self.curves))
-        return tuple(self.views[number] for number in np.flatnonzero(shown))
-
-    @cached_property
     def digest(self) -> str:
         """SHA-256 of the content, the same for the JSON and the NPZ file: where a calibration came from."""
         content = hashlib.sha256(msgspec.json.encode(header_of(self._content)))
@@ -98,6 +92,12 @@ class Observations:
         return Content(self.targets, self.cameras, self.views, self.points, self.curves, self.priors)
 
     # ---- reading ------------------------------------------------------------------------------------------------
+
+    @cached_property
+    def shown_views(self) -> tuple[View, ...]:
+        """The views with observations; what the others name is not there for the solve."""
+        shown = sum(np.bincount(column.view, minlength=len(self.views)) for column in (self.points, self.curves))
+        return tuple(self.views[number] for number in np.flatnonzero(shown))
 
     @property
     def stations(self) -> dict[str, str]:
