@@ -29,18 +29,18 @@ from accuracy_scenes import (
 from benchmark_problems import corner_observations, wide_lens
 from cases import Row, run
 
-from ceres_cal.bundle import Weighting, placement_costs
-from ceres_cal.calibrate import calibrate
+from ceres_cal.base.transforms import Array
+from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
-from ceres_cal.camera import Camera
+from ceres_cal.model.parameters import Options
+from ceres_cal.model.quantities import moved
+from ceres_cal.model.structure import Tolerance
 from ceres_cal.observations import Observations
-from ceres_cal.parameters import Options
-from ceres_cal.quantities import moved
-from ceres_cal.sights import gather_sights
+from ceres_cal.observations.sights import gather_sights
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.targets import Arc, Target
 from ceres_cal.simulate import Disturbance, simulate
-from ceres_cal.structure import Tolerance
-from ceres_cal.targets import Arc, Target
-from ceres_cal.transforms import Array
+from ceres_cal.solve import Weighting, placement_costs
 
 MOST_SIGMA = 4.0  # a mean farther from 0 than so many of its own standard errors is a bias
 HEIGHTS_M = (0.0, 0.15)  # the floor, and the top of a robot

@@ -9,13 +9,13 @@ from math import hypot
 
 import numpy as np
 
-from ceres_cal.camera import Camera
-from ceres_cal.lens import Brown, Lens, Radial
+from ceres_cal.base.transforms import Array, Pose
+from ceres_cal.model.parameters import Options
 from ceres_cal.observations import Observations, Prior
-from ceres_cal.parameters import Options
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.lens import Brown, Lens, Radial
+from ceres_cal.scene.targets import Arc, Curve, Segment, checkerboard, custom, ssl_field
 from ceres_cal.simulate import Disturbance, Scene, Station, board_scene, field_scene, join, overhead_pose, simulate
-from ceres_cal.targets import Arc, Curve, Segment, checkerboard, custom, ssl_field
-from ceres_cal.transforms import Array, Pose
 
 FIELD = ssl_field("B")
 CLEAN_NOISE = Disturbance(points_sigma_px=0.3, curves_sigma_px=0.3)

@@ -21,14 +21,14 @@ from accuracy_scenes import CLEAN_NOISE, FIELD, Problem, tilted
 from cases import Row, run
 
 from ceres_cal.advice import Measurement, Promise, advise, promised
-from ceres_cal.calibrate import calibrate
+from ceres_cal.base.errors import CalibrationError
+from ceres_cal.base.transforms import Array
+from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
-from ceres_cal.errors import CalibrationError
+from ceres_cal.model.parameters import Options, Station
 from ceres_cal.observations import Observations, combine
-from ceres_cal.parameters import Options, Station
+from ceres_cal.scene.targets import custom
 from ceres_cal.simulate import Scene, field_scene, overhead_pose, simulate
-from ceres_cal.targets import custom
-from ceres_cal.transforms import Array
 
 HEIGHT_M = 0.15
 WITHIN = 0.1

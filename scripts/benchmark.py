@@ -37,11 +37,11 @@ from benchmark_problems import (
     wide_lens,
 )
 
-from ceres_cal.lens import KannalaBrandt
+from ceres_cal.scene.lens import KannalaBrandt
 from ceres_cal.simulate import overhead_pose
 
 OURS = "ceres-cal"
-MODULES = {OURS: "ceres_cal.calibrate", "opencv": "cv2", "pycolmap": "pycolmap", "mrcal": "mrcal"}
+MODULES = {OURS: "ceres_cal.calibrating", "opencv": "cv2", "pycolmap": "pycolmap", "mrcal": "mrcal"}
 MRCAL_PYTHON = "/usr/bin/python3"  # Debian's mrcal belongs to the system's Python
 MIRRORED_DEG = 5.0  # that far off the truth, a pose is the other one of the two that a plane's picture allows
 WARM_UP_LINE_POINTS, WARM_UP_S = 1000, 0.3
@@ -56,10 +56,10 @@ Solver = Callable[[Corners], Answer]
 
 def solve_ours(corners: Corners) -> Answer:
     """From Observations to Calibration, with the nine intrinsics that OpenCV and mrcal solve for."""
-    from ceres_cal.calibrate import calibrate
-    from ceres_cal.initialise import initialise
-    from ceres_cal.parameters import Options
-    from ceres_cal.sights import gather_sights
+    from ceres_cal.calibrating import calibrate
+    from ceres_cal.model.parameters import Options
+    from ceres_cal.observations.sights import gather_sights
+    from ceres_cal.start.initialise import initialise
 
     options = Options(lens="brown", free_aspect=True)
     observations = corner_observations(corners)  # new ones each time: they remember what was derived from them
@@ -198,7 +198,7 @@ def corners_memory(frames: int, repeat: int) -> float:
 
 def field_growth(line_points: int, repeat: int) -> dict[str, Any]:
     """Seconds of calibrate (median) and the memory that the process holds at most meanwhile, observations included."""
-    from ceres_cal.calibrate import calibrate
+    from ceres_cal.calibrating import calibrate
 
     calibrate(field_observations(WARM_UP_LINE_POINTS))
     observations = field_observations(line_points)
@@ -238,10 +238,10 @@ TASKS: dict[str, Callable[[int, int], Any]] = {
 
 def uncertainty_share(frames: int, repeat: int) -> float:
     """What the standard deviations of everything, placements too, add to a calibration's seconds (median of turns)."""
-    from ceres_cal.bundle import Weighting
-    from ceres_cal.calibrate import calibrate
-    from ceres_cal.parameters import Options, make_layout
-    from ceres_cal.sights import gather_sights
+    from ceres_cal.calibrating import calibrate
+    from ceres_cal.model.parameters import Options, make_layout
+    from ceres_cal.observations.sights import gather_sights
+    from ceres_cal.solve import Weighting
     from ceres_cal.uncertainty import Setting, assess
 
     observations, options = corner_observations(wide_lens(frames).corners), Options(lens="brown", free_aspect=True)

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 from benchmark_peers import Corners
 
-from ceres_cal.camera import Camera
-from ceres_cal.lens import Brown, Radial
+from ceres_cal.base.transforms import Array, rotation_exp
 from ceres_cal.observations import Columns, Curves, Observations, Points, Prior, View
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.lens import Brown, Radial
+from ceres_cal.scene.targets import checkerboard, ssl_field
 from ceres_cal.simulate import Scene, Station, field_scene, overhead_pose, simulate
-from ceres_cal.targets import checkerboard, ssl_field
-from ceres_cal.transforms import Array, rotation_exp
 
 WIDE = Camera((1280, 960), 600.0, (645.0, 470.0), Brown((-0.28, 0.07, 0.0, 0.0, 0.0)))
 COLUMNS, ROWS, SQUARE_M = 10, 10, 0.1

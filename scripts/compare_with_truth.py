@@ -12,15 +12,15 @@ from typing import Any
 
 import numpy as np
 
+from ceres_cal.base.errors import CalibrationError, InputError
+from ceres_cal.base.files import read_json
+from ceres_cal.base.transforms import Array, Pose, euler_from_rotation
 from ceres_cal.calibration import Calibration
-from ceres_cal.camera import Camera
-from ceres_cal.errors import CalibrationError, InputError
-from ceres_cal.files import read_json
-from ceres_cal.lens import make_lens
 from ceres_cal.observations import Observations
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.lens import make_lens
+from ceres_cal.scene.targets import Arc, Target, along_track
 from ceres_cal.simulate.files import TRUTH_FORMAT, TRUTH_VERSION
-from ceres_cal.targets import Arc, Target, along_track
-from ceres_cal.transforms import Array, Pose, euler_from_rotation
 
 HEIGHTS_M = (0.0, 0.15)  # the floor, and the top of a robot
 STEP_M = 0.1

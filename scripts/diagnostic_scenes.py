@@ -7,10 +7,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ceres_cal.camera import Camera
-from ceres_cal.lens import Brown, KannalaBrandt, Lens, Radial
+from ceres_cal.base.transforms import Pose
+from ceres_cal.model.parameters import Options
+from ceres_cal.model.structure import Tolerance
 from ceres_cal.observations import Observations, Prior
-from ceres_cal.parameters import Options
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.lens import Brown, KannalaBrandt, Lens, Radial
+from ceres_cal.scene.targets import Segment, checkerboard, custom, ssl_field
 from ceres_cal.simulate import (
     Disturbance,
     Scene,
@@ -22,9 +25,6 @@ from ceres_cal.simulate import (
     overhead_pose,
     simulate,
 )
-from ceres_cal.structure import Tolerance
-from ceres_cal.targets import Segment, checkerboard, custom, ssl_field
-from ceres_cal.transforms import Pose
 
 NOISE = Disturbance(points_sigma_px=0.3, curves_sigma_px=0.3)
 OUTLIERS = replace(NOISE, outliers=0.1, hidden_stretches=4, hidden_points=0.1)

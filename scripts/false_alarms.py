@@ -21,11 +21,11 @@ from pathlib import Path
 import numpy as np
 from diagnostic_scenes import CLEAN, FAULTS, NOISE, USUAL, Problem, held_boards
 
-from ceres_cal.calibrate import calibrate
+from ceres_cal.base.tails import log_binomial_tail
+from ceres_cal.calibrating import calibrate
 from ceres_cal.diagnostics import FALSE_ALARM_RATE, Diagnosis, diagnose
-from ceres_cal.parameters import Options
+from ceres_cal.model.parameters import Options
 from ceres_cal.simulate import simulate
-from ceres_cal.tails import log_binomial_tail
 
 MOST_SECONDS = 5.0
 SURE = 0.001  # a count of false alarms less probable than this exceeds the rate

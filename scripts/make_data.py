@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from ceres_cal.files import write_bytes, write_json
-from ceres_cal.parameters import Station
+from ceres_cal.base.files import write_bytes, write_json
+from ceres_cal.model.parameters import Station
 from ceres_cal.simulate import (
     Disturbance,
     Scene,

@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 
 from ceres_cal import Calibration, Camera, Observations, calibrate
-from ceres_cal.residuals import residuals
-from ceres_cal.sights import gather_sights
-from ceres_cal.targets import along_track
-from ceres_cal.transforms import Array
+from ceres_cal.base.transforms import Array
+from ceres_cal.model.residuals import residuals
+from ceres_cal.observations.sights import gather_sights
+from ceres_cal.scene.targets import along_track
 
 ROOT = Path(__file__).parents[1]
 ENLARGED = 25.0

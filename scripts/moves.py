@@ -23,20 +23,22 @@ from accuracy_scenes import FIELD, field_places
 from cases import Row, run
 from photographs import varied
 
-from ceres_cal.bundle import Weighting, information
-from ceres_cal.calibrate import calibrate
+from ceres_cal.base.errors import CalibrationError
+from ceres_cal.base.transforms import Array, Pose, rotation_exp
+from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
-from ceres_cal.camera import Camera
 from ceres_cal.detect.boards import detect_boards
-from ceres_cal.errors import CalibrationError
-from ceres_cal.lens import Radial
+from ceres_cal.model.parameters import Estimate
+from ceres_cal.model.quantities import Key, difference
+from ceres_cal.model.structure import make_structure
 from ceres_cal.moves import check, refit
 from ceres_cal.moves.carried import layouts, make_plan
 from ceres_cal.observations import Observations, combine, taken
-from ceres_cal.parameters import Estimate
+from ceres_cal.observations.sights import gather_sights
 from ceres_cal.photographs import check_photographs, detect_field
-from ceres_cal.quantities import Key, difference
-from ceres_cal.sights import gather_sights
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.lens import Radial
+from ceres_cal.scene.targets import checkerboard
 from ceres_cal.simulate import (
     Disturbance,
     Scene,
@@ -49,9 +51,7 @@ from ceres_cal.simulate import (
     simulate,
 )
 from ceres_cal.simulate.photograph import frames, photograph
-from ceres_cal.structure import make_structure
-from ceres_cal.targets import checkerboard
-from ceres_cal.transforms import Array, Pose, rotation_exp
+from ceres_cal.solve import Weighting, information
 from ceres_cal.uncertainty.maps import locate_slopes, shown_pixels
 
 CAMERA = Camera((1280, 960), 868.0, (646.5, 473.8), Radial((-5.2e-5, 6.1e-7)))

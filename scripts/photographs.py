@@ -21,19 +21,19 @@ from cases import Row, exit_code, json_text, printed
 from numpy.typing import NDArray
 from straightness import observed_boards, straight_rows
 
-from ceres_cal.calibrate import calibrate
-from ceres_cal.camera import Camera
+from ceres_cal.base.errors import CalibrationError
+from ceres_cal.base.transforms import Array, Pose, rotation_exp
+from ceres_cal.calibrating import calibrate
 from ceres_cal.detect.profiles import Grey
 from ceres_cal.detect.rings import detect_rings
-from ceres_cal.errors import CalibrationError
-from ceres_cal.lens import Brown, KannalaBrandt, Lens, Radial
-from ceres_cal.parameters import Options
+from ceres_cal.model.parameters import Options
+from ceres_cal.model.structure import Tolerance
 from ceres_cal.photographs import Clicks, FieldDetections, detect_field, follow
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.lens import Brown, KannalaBrandt, Lens, Radial
+from ceres_cal.scene.targets import Target, nearest_on_track, ssl_field
 from ceres_cal.simulate import Photography, Scene, Station, built_in_scene, field_scene, overhead_pose
 from ceres_cal.simulate.photograph import Photograph, photograph
-from ceres_cal.structure import Tolerance
-from ceres_cal.targets import Target, nearest_on_track, ssl_field
-from ceres_cal.transforms import Array, Pose, rotation_exp
 
 LENSES: tuple[tuple[float, Lens], ...] = (
     (868.0, Radial((-5.2e-5, 6.1e-7), (2, 3))),

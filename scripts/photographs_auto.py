@@ -15,16 +15,16 @@ import numpy as np
 from cases import Row
 from photographs import LENSES, NOT_PAINTED, Shot, distances_px, real_target, take, varied
 
-from ceres_cal.camera import Camera
+from ceres_cal.base.errors import InputError
 from ceres_cal.detect.boards import read_grey
 from ceres_cal.detect.profiles import Grey
-from ceres_cal.errors import InputError
-from ceres_cal.lens import KannalaBrandt, Radial
 from ceres_cal.photographs import Auto, Facing
 from ceres_cal.photographs.search import search
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.lens import KannalaBrandt, Radial
+from ceres_cal.scene.targets import ssl_field
 from ceres_cal.simulate import Station, field_scene, overhead_pose
 from ceres_cal.simulate.photograph import photograph
-from ceres_cal.targets import ssl_field
 
 FACING = Auto((Facing("LeftGoalLine", "top"),))  # as the cameras of `take` are mounted
 WIDE = (

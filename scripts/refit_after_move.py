@@ -24,9 +24,9 @@ from pathlib import Path
 from typing import Any
 
 import ceres_cal as cc
+from ceres_cal.base.files import read_bytes, write_bytes
 from ceres_cal.cli.detect import IMAGE_ENDINGS
 from ceres_cal.detect.boards import read_grey
-from ceres_cal.files import read_bytes, write_bytes
 from ceres_cal.moves import FALSE_ALARMS, Check, movements
 from ceres_cal.photographs import check_photographs
 

@@ -19,15 +19,15 @@ import numpy as np
 from cases import Row
 from numpy.typing import NDArray
 
-from ceres_cal.calibrate import calibrate
-from ceres_cal.camera import Camera
-from ceres_cal.closed_forms import homography_from_points
+from ceres_cal.base.transforms import Array, Pose
+from ceres_cal.calibrating import calibrate
 from ceres_cal.detect.boards import BoardDetections, detect_boards, read_colour
-from ceres_cal.parameters import Options
+from ceres_cal.model.parameters import Options
 from ceres_cal.pictures.straight import Straight, straighten
 from ceres_cal.pictures.warp import Image
-from ceres_cal.targets import checkerboard
-from ceres_cal.transforms import Array, Pose
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.targets import checkerboard
+from ceres_cal.start.closed_forms import homography_from_points
 
 FOLDER = "udacity_gopro_wide"
 COLUMNS, ROWS = 8, 6

@@ -9,7 +9,7 @@ from moves import DAY, HOME, MOVED, calibrated, seen
 
 from ceres_cal.detect.boards import BoardDetections, detect_boards
 from ceres_cal.moves.labels import MIRRORED, relabelled
-from ceres_cal.targets import checkerboard
+from ceres_cal.scene.targets import checkerboard
 
 # A shell's background jobs get SIGINT ignored, and hand it on; the tests of Ctrl-C want it as it comes at a terminal.
 signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -6,11 +6,11 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
-from ceres_cal.camera import Camera
-from ceres_cal.lens import Brown, KannalaBrandt, Lens, Radial
+from ceres_cal.base.transforms import Pose
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.lens import Brown, KannalaBrandt, Lens, Radial
+from ceres_cal.scene.targets import Segment, Target, checkerboard, custom, rings, ssl_field
 from ceres_cal.simulate import Scene, Station, board_scene, field_scene, join, overhead_pose, rings_scene
-from ceres_cal.targets import Segment, Target, checkerboard, custom, rings, ssl_field
-from ceres_cal.transforms import Pose
 
 # phi, lens, and the height (m) from which the image just holds a division B field.
 _LENSES: dict[str, tuple[float, Lens, float]] = {

@@ -19,15 +19,15 @@ import numpy as np
 import pytest
 from benchmark_problems import corner_observations, wide_lens
 
-from ceres_cal.calibrate import calibrate
-from ceres_cal.mirrored import mirrored
-from ceres_cal.parameters import Options
-from ceres_cal.quantities import moved
-from ceres_cal.residuals import residuals
-from ceres_cal.sights import gather_sights
+from ceres_cal.base.transforms import Array, Pose
+from ceres_cal.calibrating import calibrate
+from ceres_cal.model.parameters import Options
+from ceres_cal.model.quantities import moved
+from ceres_cal.model.residuals import residuals
+from ceres_cal.model.structure import Tolerance
+from ceres_cal.observations.sights import gather_sights
 from ceres_cal.simulate import simulate
-from ceres_cal.structure import Tolerance
-from ceres_cal.transforms import Array, Pose
+from ceres_cal.solve.mirrored import mirrored
 
 RUNS = 60
 PROBLEMS = tuple(scenes.PROBLEMS)

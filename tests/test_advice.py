@@ -21,18 +21,18 @@ from advice import CASES, Kept, followed, promised_for
 from ceres_cal.advice import Advice, Errors, Measurement, Promise, advise, promised
 from ceres_cal.advice.measurements import Ground, _observed, together
 from ceres_cal.advice.ranking import _chosen, _prepared, _weighting
-from ceres_cal.bundle import Weighting, information
-from ceres_cal.calibrate import calibrate
+from ceres_cal.base.errors import InputError
+from ceres_cal.base.transforms import Array
+from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
 from ceres_cal.cli import main
-from ceres_cal.errors import InputError
+from ceres_cal.model.parameters import Layout, Options, make_layout
+from ceres_cal.model.structure import Tolerance, make_structure
 from ceres_cal.observations import Observations, combine
-from ceres_cal.parameters import Layout, Options, make_layout
-from ceres_cal.sights import gather_sights
+from ceres_cal.observations.sights import gather_sights
+from ceres_cal.scene.targets import checkerboard, rings
 from ceres_cal.simulate import Disturbance, board_scene, simulate
-from ceres_cal.structure import Tolerance, make_structure
-from ceres_cal.targets import checkerboard, rings
-from ceres_cal.transforms import Array
+from ceres_cal.solve import Weighting, information
 from ceres_cal.uncertainty import Uncertainty
 
 PROBLEMS: dict[str, Callable[[], Problem]] = {**CASES, "two cameras": two_cameras, "as built": partial(tilted, 8.0)}

@@ -10,12 +10,10 @@ import photographs as script
 import photographs_auto as auto_script
 import pytest
 
-from ceres_cal.calibrate import calibrate
-from ceres_cal.camera import Camera
+from ceres_cal.base.errors import InputError
+from ceres_cal.calibrating import calibrate
 from ceres_cal.cli import main
 from ceres_cal.detect.strokes import find_strokes
-from ceres_cal.errors import InputError
-from ceres_cal.lens import Radial
 from ceres_cal.observations import Observations
 from ceres_cal.photographs import Auto, Facing, detect_field
 from ceres_cal.photographs.candidates import candidates, see
@@ -23,9 +21,11 @@ from ceres_cal.photographs.facing import settled_by_before, settled_by_facing, s
 from ceres_cal.photographs.grid import grid_of
 from ceres_cal.photographs.search import search
 from ceres_cal.photographs.upright import find_upright
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.lens import Radial
+from ceres_cal.scene.targets import Arc, Segment, Target, custom, ssl_field
 from ceres_cal.simulate import Scene, Station, field_scene, overhead_pose
 from ceres_cal.simulate.photograph import photograph
-from ceres_cal.targets import Arc, Segment, Target, custom, ssl_field
 
 FIELD = ssl_field("B")
 NAMES = FIELD.curve_names

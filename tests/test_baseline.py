@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from scenes import SCENES
 
-from ceres_cal.calibrate import calibrate
-from ceres_cal.errors import DegenerateError
+from ceres_cal.base.errors import DegenerateError
+from ceres_cal.base.transforms import Array
+from ceres_cal.calibrating import calibrate
+from ceres_cal.model.parameters import Options
 from ceres_cal.observations import Observations, Prior, combine
-from ceres_cal.parameters import Options
 from ceres_cal.simulate import built_in_scene, simulate
-from ceres_cal.transforms import Array
 
 DATA = Path(__file__).parents[1] / "data" / "field_2004"
 

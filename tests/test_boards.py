@@ -11,14 +11,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from ceres_cal.camera import Camera
+from ceres_cal.base.errors import InputError
+from ceres_cal.base.transforms import Array, Pose
 from ceres_cal.detect.boards import BoardDetections, CharucoSpec, detect_boards, read_grey, right_handed
 from ceres_cal.detect.saddles import measure_saddles
-from ceres_cal.errors import InputError
-from ceres_cal.lens import Radial
 from ceres_cal.observations import Observations
-from ceres_cal.targets import Target, checkerboard, rings
-from ceres_cal.transforms import Array, Pose
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.lens import Radial
+from ceres_cal.scene.targets import Target, checkerboard, rings
 
 BOARD = checkerboard(7, 6, 0.03)
 CAMERA = Camera((480, 360), 450.0, (243.3, 177.8), Radial((1e-4, 7e-7)))

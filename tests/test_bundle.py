@@ -12,11 +12,9 @@ from numpy.typing import NDArray
 from scenes import SCENES
 from scipy.optimize import least_squares
 
-from ceres_cal.bundle import Progress, Weighting, solve
-from ceres_cal.errors import DegenerateError
-from ceres_cal.initialise import initialise
-from ceres_cal.observations import Observations, Prior, taken
-from ceres_cal.parameters import (
+from ceres_cal.base.errors import DegenerateError
+from ceres_cal.base.transforms import Array, Pose, rotation_exp, rotation_log
+from ceres_cal.model.parameters import (
     Estimate,
     Layout,
     Options,
@@ -25,10 +23,12 @@ from ceres_cal.parameters import (
     make_layout,
     with_intrinsics,
 )
-from ceres_cal.residuals import residuals
-from ceres_cal.sights import gather_sights
+from ceres_cal.model.residuals import residuals
+from ceres_cal.observations import Observations, Prior, taken
+from ceres_cal.observations.sights import gather_sights
 from ceres_cal.simulate import Disturbance, simulate
-from ceres_cal.transforms import Array, Pose, rotation_exp, rotation_log
+from ceres_cal.solve import Progress, Weighting, solve
+from ceres_cal.start.initialise import initialise
 
 NOISE = Disturbance(points_sigma_px=0.3, curves_sigma_px=0.3, outliers=0.03, outlier_spread_px=5.0)
 LOSSES = ["trivial", "huber", "soft_l1", "cauchy", "tukey"]

@@ -15,13 +15,14 @@ from numpy.typing import NDArray
 from scenes import SCENES
 from scipy.optimize import least_squares
 
-from ceres_cal.bundle import Progress
-from ceres_cal.calibrate import calibrate
-from ceres_cal.camera import Camera
-from ceres_cal.errors import DegenerateError, InputError, SolutionError
-from ceres_cal.lens import Brown, Radial
+from ceres_cal.base.errors import DegenerateError, InputError, SolutionError
+from ceres_cal.base.transforms import Array, Pose, rotation_exp, rotation_log
+from ceres_cal.calibrating import calibrate
+from ceres_cal.model.parameters import Options, intrinsic_names, intrinsics_scales, intrinsics_vector, with_intrinsics
 from ceres_cal.observations import Curves, Observations, Points, Prior, View, combine
-from ceres_cal.parameters import Options, intrinsic_names, intrinsics_scales, intrinsics_vector, with_intrinsics
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.lens import Brown, Radial
+from ceres_cal.scene.targets import Arc, Segment, Target, along_track, checkerboard, custom, ssl_field
 from ceres_cal.simulate import (
     CLEAN,
     Disturbance,
@@ -34,8 +35,7 @@ from ceres_cal.simulate import (
     overhead_pose,
     simulate,
 )
-from ceres_cal.targets import Arc, Segment, Target, along_track, checkerboard, custom, ssl_field
-from ceres_cal.transforms import Array, Pose, rotation_exp, rotation_log
+from ceres_cal.solve import Progress
 
 ROOT = Path(__file__).resolve().parents[1]
 NOISE = Disturbance(points_sigma_px=0.3, curves_sigma_px=0.3)

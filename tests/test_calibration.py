@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 from scenes import SCENES
 
-from ceres_cal.calibrate import calibrate
+from ceres_cal.base.errors import InputError
+from ceres_cal.base.transforms import rotation_from_euler
+from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration, Fit
-from ceres_cal.errors import InputError
+from ceres_cal.model.parameters import Options
 from ceres_cal.observations import Prior
-from ceres_cal.parameters import Options
 from ceres_cal.simulate import Disturbance, simulate
-from ceres_cal.transforms import rotation_from_euler
 
 WORKDAY = Disturbance(points_sigma_px=0.3, curves_sigma_px=0.3, outliers=0.04)
 NAMES = ["radial-2-3/field-boards", "radial-3-5/corners", "brown/two-cameras", "kannala-brandt/several-stations"]

@@ -8,10 +8,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ceres_cal.camera import Camera
-from ceres_cal.errors import CalibrationError, DegenerateError, InputError
-from ceres_cal.lens import Brown, KannalaBrandt, Lens, Radial
-from ceres_cal.transforms import Array, Pose, rotation_exp, rotation_from_euler
+from ceres_cal.base.errors import CalibrationError, DegenerateError, InputError
+from ceres_cal.base.transforms import Array, Pose, rotation_exp, rotation_from_euler
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.lens import Brown, KannalaBrandt, Lens, Radial
 
 quick = settings(deadline=None, max_examples=100)
 

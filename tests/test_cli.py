@@ -18,17 +18,17 @@ import pytest
 from accuracy_bound import make_trial
 from accuracy_scenes import CLEAN_NOISE, tilted
 
-import ceres_cal.calibrate
+import ceres_cal.calibrating
 from ceres_cal.calibration import Calibration
 from ceres_cal.cli import COMMANDS, main
 from ceres_cal.cli.progress import ProgressBar
 from ceres_cal.cli.targets import KINDS
 from ceres_cal.detect.boards import CORNER_FITS
-from ceres_cal.lens import LENS_KINDS
+from ceres_cal.model.parameters import LOSSES, Options
 from ceres_cal.observations import Observations
-from ceres_cal.parameters import LOSSES, Options
+from ceres_cal.scene.lens import LENS_KINDS
+from ceres_cal.scene.targets import TARGET_KINDS, ssl_field
 from ceres_cal.simulate import scene_names
-from ceres_cal.targets import TARGET_KINDS, ssl_field
 
 ROOT = Path(__file__).resolve().parents[1]
 SAMPLE = ROOT / "data" / "ssl_field" / "observations.json"
@@ -525,7 +525,7 @@ def test_no_failure_is_a_traceback(
     def fail(*_: object) -> None:
         raise failure
 
-    monkeypatch.setattr(sys.modules["ceres_cal.calibrate"], "calibrate", fail)
+    monkeypatch.setattr(sys.modules["ceres_cal.calibrating"], "calibrate", fail)
     assert refused(say("calibrate", SAMPLE), code) == f"ceres-cal: {line}\n"
     if code == 3:
         monkeypatch.setenv("CERES_CAL_DEBUG", "1")
@@ -537,7 +537,7 @@ def test_no_usable_solution_is_3(say: Say, tmp_path: Path, monkeypatch: pytest.M
     def fail(*_: object) -> None:
         raise ceres_cal.SolutionError("no camera\ncame out")
 
-    monkeypatch.setattr(sys.modules["ceres_cal.calibrate"], "calibrate", fail)
+    monkeypatch.setattr(sys.modules["ceres_cal.calibrating"], "calibrate", fail)
     said = say("calibrate", SAMPLE, "-o", tmp_path / "calibration.json")
     assert refused(said, 3) == "ceres-cal: no camera came out\n"
     assert list(tmp_path.iterdir()) == []

@@ -11,10 +11,10 @@ import photographs as script
 import pytest
 from test_cli import Say, refused, say
 
-from ceres_cal.calibrate import calibrate
+from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
 from ceres_cal.cli.progress import ProgressBar
-from ceres_cal.parameters import Station
+from ceres_cal.model.parameters import Station
 from ceres_cal.photographs import detect_field
 
 __all__ = ["say"]

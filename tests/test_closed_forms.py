@@ -11,7 +11,11 @@ from hypothesis import strategies as st
 from numpy.typing import ArrayLike
 from scipy.optimize import minimize
 
-from ceres_cal.closed_forms import (
+from ceres_cal.base.errors import DegenerateError
+from ceres_cal.base.transforms import Array, Pose, euler_from_rotation, nearest_rotation, rotation_from_euler
+from ceres_cal.observations import Observations
+from ceres_cal.simulate import overhead_pose
+from ceres_cal.start.closed_forms import (
     PlaneData,
     Profile,
     facing,
@@ -28,10 +32,6 @@ from ceres_cal.closed_forms import (
     require_spread,
     ring_profile,
 )
-from ceres_cal.errors import DegenerateError
-from ceres_cal.observations import Observations
-from ceres_cal.simulate import overhead_pose
-from ceres_cal.transforms import Array, Pose, euler_from_rotation, nearest_rotation, rotation_from_euler
 
 ROOT = Path(__file__).resolve().parents[1]
 A1, A2, A3 = 1.07761103142178, -0.00096240306505, 0.00000401304361  # the paper's section 2

@@ -8,8 +8,8 @@ import pytest
 from moves import CAMERA, DAY, HOME, MOVED, seen
 from moves import calibrated as calibrated_at_home
 
+from ceres_cal.base.errors import InputError
 from ceres_cal.calibration import Calibration
-from ceres_cal.errors import InputError
 from ceres_cal.moves import compare, picture, refit
 
 

@@ -12,20 +12,20 @@ import numpy as np
 import pytest
 import scenes as usual
 
-from ceres_cal.calibrate import calibrate
+from ceres_cal.base.errors import InputError
+from ceres_cal.base.transforms import Array, Pose
+from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
 from ceres_cal.cli import main
 from ceres_cal.detect.boards import BoardDetections
 from ceres_cal.diagnostics import Diagnosis, choose, cross_validate, diagnose
 from ceres_cal.diagnostics.equations import Equations, write_equations
 from ceres_cal.diagnostics.freedom import _shared_columns, make_freedom
-from ceres_cal.errors import InputError
+from ceres_cal.model.parameters import Options, intrinsics_vector, make_layout, with_intrinsics
+from ceres_cal.model.residuals import residuals
 from ceres_cal.observations import Observations, Prior
-from ceres_cal.parameters import Options, intrinsics_vector, make_layout, with_intrinsics
-from ceres_cal.residuals import residuals
-from ceres_cal.sights import gather_sights
+from ceres_cal.observations.sights import gather_sights
 from ceres_cal.simulate import Disturbance, simulate
-from ceres_cal.transforms import Array, Pose
 
 PLAIN = Options(loss="trivial")
 

@@ -9,17 +9,17 @@ import numpy as np
 import photographs as script
 import pytest
 
-from ceres_cal.calibrate import calibrate
+from ceres_cal.base.errors import InputError
+from ceres_cal.calibrating import calibrate
 from ceres_cal.cli import main
 from ceres_cal.detect.courses import clear_px, predict
 from ceres_cal.detect.crossings import find_crossings
 from ceres_cal.detect.lines import SPACING_PX, measure, window_px
-from ceres_cal.errors import InputError
 from ceres_cal.observations import Observations
 from ceres_cal.photographs import Clicks, detect_field, follow, load_clicks
 from ceres_cal.photographs.clicks import FORMAT, clicks_from_json
+from ceres_cal.scene.targets import ssl_field
 from ceres_cal.simulate.photograph import photograph
-from ceres_cal.targets import ssl_field
 
 FIELD = ssl_field("B")
 

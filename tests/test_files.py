@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ceres_cal.errors import InputError
-from ceres_cal.files import check_header, convert, parse_json, read_bytes, read_json, write_bytes, write_json
+from ceres_cal.base.errors import InputError
+from ceres_cal.base.files import check_header, convert, parse_json, read_bytes, read_json, write_bytes, write_json
 
 quick = settings(deadline=None, max_examples=100)
 

@@ -9,14 +9,15 @@ import numpy as np
 import pytest
 from scenes import SCENES
 
-from ceres_cal.camera import Camera
-from ceres_cal.errors import DegenerateError
-from ceres_cal.initialise import Start, initialise
-from ceres_cal.lens import Radial
+from ceres_cal.base.errors import DegenerateError
+from ceres_cal.base.transforms import Pose, rotation_log
+from ceres_cal.model.parameters import Options
+from ceres_cal.model.residuals import residuals
 from ceres_cal.observations import Observations, Prior
-from ceres_cal.parameters import Options
-from ceres_cal.residuals import residuals
-from ceres_cal.sights import gather_sights
+from ceres_cal.observations.sights import gather_sights
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.lens import Radial
+from ceres_cal.scene.targets import checkerboard, ssl_field
 from ceres_cal.simulate import (
     Disturbance,
     Scene,
@@ -28,8 +29,7 @@ from ceres_cal.simulate import (
     overhead_pose,
     simulate,
 )
-from ceres_cal.targets import checkerboard, ssl_field
-from ceres_cal.transforms import Pose, rotation_log
+from ceres_cal.start.initialise import Start, initialise
 
 NOISE = Disturbance(points_sigma_px=0.3, curves_sigma_px=0.3)
 CAMERA = Camera((1280, 960), 868.0, (651.3, 468.9), Radial((-5.2e-5, 6.1e-7)))

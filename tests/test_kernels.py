@@ -17,14 +17,14 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
 from ceres_cal import kernels
-from ceres_cal.camera import Camera
+from ceres_cal.base.transforms import Array, Pose, rotation_exp
 from ceres_cal.kernels.lenses import answer_limit, one_dimensional
 from ceres_cal.kernels.sight import working_space
-from ceres_cal.lens import Brown, KannalaBrandt, Radial
-from ceres_cal.parameters import intrinsics_vector, unit_px, with_intrinsics
+from ceres_cal.model.parameters import intrinsics_vector, unit_px, with_intrinsics
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.lens import Brown, KannalaBrandt, Radial
+from ceres_cal.scene.targets import Arc, Segment, along_track, custom
 from ceres_cal.simulate import overhead_pose
-from ceres_cal.targets import Arc, Segment, along_track, custom
-from ceres_cal.transforms import Array, Pose, rotation_exp
 
 LOSSES = {
     "trivial": pyceres.TrivialLoss,

@@ -7,17 +7,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ceres_cal.bundle import Weighting
-from ceres_cal.calibrate import calibrate
-from ceres_cal.camera import Camera
-from ceres_cal.lens import Brown
-from ceres_cal.mirrored import mirrored, without_mirrored_poses
+from ceres_cal.base.transforms import Pose, rotation_log
+from ceres_cal.calibrating import calibrate
+from ceres_cal.model.parameters import Estimate, Options, make_layout
 from ceres_cal.observations import Observations
-from ceres_cal.parameters import Estimate, Options, make_layout
-from ceres_cal.sights import gather_sights
+from ceres_cal.observations.sights import gather_sights
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.lens import Brown
+from ceres_cal.scene.targets import checkerboard
 from ceres_cal.simulate import Disturbance, Scene, Station, board_scene, simulate
-from ceres_cal.targets import checkerboard
-from ceres_cal.transforms import Pose, rotation_log
+from ceres_cal.solve import Weighting
+from ceres_cal.solve.mirrored import mirrored, without_mirrored_poses
 
 OPTIONS = Options(lens="brown")
 

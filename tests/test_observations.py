@@ -15,9 +15,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ceres_cal.errors import InputError
+from ceres_cal.base.errors import InputError
 from ceres_cal.observations import Curves, Observations, Points, Prior, View, combine
-from ceres_cal.targets import Segment, checkerboard, custom, rings, ssl_field
+from ceres_cal.scene.targets import Segment, checkerboard, custom, rings, ssl_field
 
 quick = settings(deadline=None, max_examples=60)
 

@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ceres_cal.camera import Camera
-from ceres_cal.lens import Radial
-from ceres_cal.transforms import Array, Pose, rotation_from_euler
+from ceres_cal.base.transforms import Array, Pose, rotation_from_euler
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.lens import Radial
 
 A1, A2, A3 = 1.07761103142178, -0.00096240306505, 0.00000401304361  # section 2, to the last digit printed
 

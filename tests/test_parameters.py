@@ -11,11 +11,9 @@ import scenes
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ceres_cal.camera import Camera
-from ceres_cal.errors import InputError
-from ceres_cal.lens import Brown, KannalaBrandt, Radial, make_lens
-from ceres_cal.observations import Curves, Observations, Points, Prior, View
-from ceres_cal.parameters import (
+from ceres_cal.base.errors import InputError
+from ceres_cal.base.transforms import Pose
+from ceres_cal.model.parameters import (
     LOSSES,
     Estimate,
     Layout,
@@ -29,10 +27,12 @@ from ceres_cal.parameters import (
     unit_px,
     with_intrinsics,
 )
-from ceres_cal.sights import SightKey
-from ceres_cal.structure import make_structure
-from ceres_cal.targets import checkerboard
-from ceres_cal.transforms import Pose
+from ceres_cal.model.structure import make_structure
+from ceres_cal.observations import Curves, Observations, Points, Prior, View
+from ceres_cal.observations.sights import SightKey
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.lens import Brown, KannalaBrandt, Radial, make_lens
+from ceres_cal.scene.targets import checkerboard
 
 BOARD = checkerboard(3, 2, 0.1)
 

@@ -18,16 +18,16 @@ import pycolmap
 import pycolmap.cost_functions
 import pytest
 
-from ceres_cal.calibrate import calibrate
+from ceres_cal.base.transforms import Array, Pose, rotation_exp, rotation_log
+from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
-from ceres_cal.camera import Camera
 from ceres_cal.detect.boards import BoardDetections
-from ceres_cal.lens import Brown, KannalaBrandt, Lens
+from ceres_cal.model.parameters import Options
 from ceres_cal.observations import Observations
-from ceres_cal.parameters import Options
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.lens import Brown, KannalaBrandt, Lens
+from ceres_cal.scene.targets import checkerboard
 from ceres_cal.simulate import Disturbance, Station, board_scene, simulate
-from ceres_cal.targets import checkerboard
-from ceres_cal.transforms import Array, Pose, rotation_exp, rotation_log
 
 BOARD = checkerboard(9, 6, 0.125)  # its corners are the same numbers in single precision, which OpenCV asks for
 SIZE = (1280, 960)

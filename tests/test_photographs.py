@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 from scenes import LENSES, camera, lines
 
+from ceres_cal.base.errors import InputError
+from ceres_cal.base.transforms import Array, Pose
 from ceres_cal.cli import main
 from ceres_cal.detect.boards import read_grey
 from ceres_cal.detect.saddles import measure_saddles
-from ceres_cal.errors import InputError
+from ceres_cal.scene.targets import checkerboard, custom, rings, ssl_field
 from ceres_cal.simulate import (
     Photography,
     Scene,
@@ -29,8 +31,6 @@ from ceres_cal.simulate.album import take_album
 from ceres_cal.simulate.photograph import frames, photograph
 from ceres_cal.simulate.render import SUBPIXELS, averaged, blank_canvas, curve_points, fill, paint_curves, print_sheet
 from ceres_cal.simulate.things import BALL_RADIUS_M, ROBOT_HEIGHT_M, Ball, Robot, outline
-from ceres_cal.targets import checkerboard, custom, rings, ssl_field
-from ceres_cal.transforms import Array, Pose
 
 PLAIN = Photography(
     blur_px=0.0, vignetting=0.0, unevenness=0.0, carpet_texture=0.0, read_noise=0.0, shot_noise=0.0, carpet=0.2

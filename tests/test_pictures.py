@@ -15,22 +15,22 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scenes import LENSES, camera
 
-from ceres_cal.calibrate import calibrate
-from ceres_cal.camera import Camera
+from ceres_cal.base.errors import InputError
+from ceres_cal.base.transforms import Array, Pose
+from ceres_cal.calibrating import calibrate
 from ceres_cal.detect.boards import BoardDetections, read_grey
-from ceres_cal.errors import InputError
-from ceres_cal.lens import Brown, KannalaBrandt, Lens, Radial
-from ceres_cal.parameters import Estimate, Options
-from ceres_cal.parameters import Station as Posed
+from ceres_cal.model.parameters import Estimate, Options
+from ceres_cal.model.parameters import Station as Posed
+from ceres_cal.model.structure import Tolerance, make_structure
 from ceres_cal.pictures.files import encoded, jpeg_of_at_most
 from ceres_cal.pictures.frames import Frame, frame_by_name, frames_of, marks_of, model_of, photographs_by_frame
 from ceres_cal.pictures.model import model_seen
 from ceres_cal.pictures.overlay import AFTER, BEFORE, Layer, Marks, draw_overlay
 from ceres_cal.pictures.straight import Straight, straighten
 from ceres_cal.pictures.top_view import Plan, make_plan, top_view
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.lens import Brown, KannalaBrandt, Lens, Radial
 from ceres_cal.simulate import overhead_pose
-from ceres_cal.structure import Tolerance, make_structure
-from ceres_cal.transforms import Array, Pose
 
 POSE = overhead_pose(-2.27, -0.12, 4.02, 3.0, -2.0, 90.0)
 FISHEYE = Camera(

@@ -11,19 +11,19 @@ import pytest
 from scenes import SCENES
 from scipy.stats import t as student
 
-from ceres_cal.bundle import Weighting, information, private_placements, solve
-from ceres_cal.bundle.costs import Run, SightCost
-from ceres_cal.bundle.problem import _Blocks, _prior_blocks
-from ceres_cal.calibrate import calibrate
-from ceres_cal.errors import InputError
+from ceres_cal.base.errors import InputError
+from ceres_cal.base.spread import Spread
+from ceres_cal.base.transforms import Array, Pose, left_jacobian, skew
+from ceres_cal.calibrating import calibrate
+from ceres_cal.model.parameters import Estimate, Layout, Options, intrinsics_scales, make_layout
+from ceres_cal.model.quantities import Key, difference, moved, pose_keys, shared_keys
+from ceres_cal.model.structure import Tolerance
 from ceres_cal.observations import Prior
-from ceres_cal.parameters import Estimate, Layout, Options, intrinsics_scales, make_layout
-from ceres_cal.quantities import Key, difference, moved, pose_keys, shared_keys
-from ceres_cal.sights import Sights, gather_sights
+from ceres_cal.observations.sights import Sights, gather_sights
 from ceres_cal.simulate import Disturbance, simulate
-from ceres_cal.spread import Spread
-from ceres_cal.structure import Tolerance
-from ceres_cal.transforms import Array, Pose, left_jacobian, skew
+from ceres_cal.solve import Weighting, information, private_placements, solve
+from ceres_cal.solve.bundle import _Blocks, _prior_blocks
+from ceres_cal.solve.costs import Run, SightCost
 from ceres_cal.uncertainty import make_posterior
 from ceres_cal.uncertainty.posterior import student_95
 

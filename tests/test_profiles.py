@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from ceres_cal.base.transforms import Array
 from ceres_cal.detect.profiles import Grey, cut_windows, fit_profiles, fit_shape, normal_step
-from ceres_cal.transforms import Array
 
 WIDTH_PX = 2.4
 COUNT = 200

@@ -26,24 +26,24 @@ from moves import (
 from moves import calibrated as calibrated_at_home
 from scenes import side_by_side
 
-from ceres_cal.bundle.costs import Run
-from ceres_cal.bundle.joint import JointPriorCost, offsets
-from ceres_cal.calibrate import calibrate
+from ceres_cal.base.errors import DegenerateError, InputError, SolutionError
+from ceres_cal.base.transforms import Pose, rotation_exp
+from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
-from ceres_cal.errors import DegenerateError, InputError, SolutionError
-from ceres_cal.joint import JointPrior
-from ceres_cal.lens import Radial
+from ceres_cal.model.joint import JointPrior
+from ceres_cal.model.parameters import Layout, Options, Station
+from ceres_cal.model.quantities import difference, moved
+from ceres_cal.model.structure import Tolerance
 from ceres_cal.moves import refit
 from ceres_cal.moves.carried import make_plan, prior_for, without_keys
 from ceres_cal.moves.labels import MIRRORED, TURNED, relabelled
 from ceres_cal.moves.poses import movement
 from ceres_cal.observations import Observations, taken
-from ceres_cal.parameters import Layout, Options, Station
-from ceres_cal.quantities import difference, moved
+from ceres_cal.scene.lens import Radial
+from ceres_cal.scene.targets import ssl_field
 from ceres_cal.simulate import field_scene, overhead_pose, simulate
-from ceres_cal.structure import Tolerance
-from ceres_cal.targets import ssl_field
-from ceres_cal.transforms import Pose, rotation_exp
+from ceres_cal.solve.costs import Run
+from ceres_cal.solve.joint import JointPriorCost, offsets
 
 FAR = overhead_pose(-2.3, -1.9, 3.9, tilt_y_deg=-25.0, yaw_deg=90.0)
 
@@ -95,7 +95,7 @@ def test_the_joint_prior_says_what_its_matrix_says(two_cameras: tuple[Calibratio
     away = moved(estimate, posterior.keys, step)
     np.testing.assert_allclose(offsets(joint, away), step, rtol=1e-6, atol=1e-12)
     cost = JointPriorCost(Run(), joint, away, layout)
-    from ceres_cal.bundle.problem import _Blocks
+    from ceres_cal.solve.bundle import _Blocks
 
     blocks = _Blocks.pack(away, layout, frozenset())
     of = {"camera": blocks.cameras, "station": blocks.stations}

@@ -17,10 +17,10 @@ from chromium import Browser, browser
 from scenes import SCENES, camera
 
 from ceres_cal import Calibration, Observations, Options, Pose, calibrate, write_report
+from ceres_cal.base.errors import InputError
+from ceres_cal.base.transforms import rotation_exp
 from ceres_cal.cli import main
 from ceres_cal.diagnostics import diagnose
-from ceres_cal.errors import InputError
-from ceres_cal.lens import Radial
 from ceres_cal.report import make_report
 from ceres_cal.report.grounds import level_of, worst
 from ceres_cal.report.lens_picture import ideal_radii
@@ -29,9 +29,9 @@ from ceres_cal.report.material import Material
 from ceres_cal.report.residual_pictures import telling_means
 from ceres_cal.report.verdict import verdict
 from ceres_cal.report.words import at_precision, short
+from ceres_cal.scene.lens import Radial
+from ceres_cal.scene.targets import ssl_field
 from ceres_cal.simulate import Disturbance, Scene, Station, built_in_scene, field_scene, overhead_pose, simulate
-from ceres_cal.targets import ssl_field
-from ceres_cal.transforms import rotation_exp
 
 ROOT = Path(__file__).parents[1]
 SAMPLE = ROOT / "data" / "ssl_field" / "observations.json"

@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 from scenes import camera, rings_and_field
 
-from ceres_cal.calibrate import calibrate
-from ceres_cal.camera import Camera
+from ceres_cal.base.errors import InputError
+from ceres_cal.base.transforms import Array
+from ceres_cal.calibrating import calibrate
 from ceres_cal.cli import main
 from ceres_cal.detect.rings import RingsDetection, detect_rings
-from ceres_cal.errors import InputError
 from ceres_cal.observations import Observations, combine
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.targets import Target, rings
 from ceres_cal.simulate import Photography, Scene, built_in_scene, simulate
 from ceres_cal.simulate.photograph import photograph
-from ceres_cal.targets import Target, rings
-from ceres_cal.transforms import Array
 
 RADII = tuple(i / 100 for i in range(1, 37))
 HARSH = Photography(blur_px=1.1, vignetting=0.4, unevenness=0.4, read_noise=4.0, jpeg_quality=80)

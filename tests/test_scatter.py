@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from ceres_cal.camera import Camera
+from ceres_cal.base.transforms import Array
 from ceres_cal.detect.scatter import USUAL_PX, scatter_px
-from ceres_cal.lens import Brown
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.lens import Brown
+from ceres_cal.scene.targets import checkerboard
 from ceres_cal.simulate import board_pose
-from ceres_cal.targets import checkerboard
-from ceres_cal.transforms import Array
 
 WIDE = Camera((1280, 960), 700.0, (640.0, 480.0), Brown((-0.25, 0.06, 0.0, 0.0, 0.0)))
 

@@ -18,10 +18,12 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scenes import SCENES
 
-from ceres_cal.camera import Camera
-from ceres_cal.errors import InputError
-from ceres_cal.lens import Radial
+from ceres_cal.base.errors import InputError
+from ceres_cal.base.transforms import Pose
 from ceres_cal.observations import Observations
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.lens import Radial
+from ceres_cal.scene.targets import Arc, Curve, Segment, checkerboard, custom, rings, ssl_field
 from ceres_cal.simulate import (
     CLEAN,
     OUTLIER,
@@ -44,8 +46,6 @@ from ceres_cal.simulate import (
     truth_to_json,
     write_simulation,
 )
-from ceres_cal.targets import Arc, Curve, Segment, checkerboard, custom, rings, ssl_field
-from ceres_cal.transforms import Pose
 
 ROOT = Path(__file__).resolve().parents[1]
 CAMERA = Camera((1280, 960), 868.0, (646.5, 473.8), Radial((-5.2e-5, 6.1e-7)))

@@ -7,18 +7,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ceres_cal.calibrate import calibrate
+from ceres_cal.base.errors import InputError
+from ceres_cal.base.transforms import Array
+from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
-from ceres_cal.camera import Camera
-from ceres_cal.errors import InputError
-from ceres_cal.lens import Radial
+from ceres_cal.model.parameters import Options
+from ceres_cal.model.structure import EXACT, Tolerance, make_structure
 from ceres_cal.observations import Observations
-from ceres_cal.parameters import Options
-from ceres_cal.sights import gather_sights
+from ceres_cal.observations.sights import gather_sights
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.lens import Radial
+from ceres_cal.scene.targets import Arc, Curve, Segment, Target, checkerboard, custom, ssl_field
 from ceres_cal.simulate import Disturbance, Station, board_scene, field_scene, join, overhead_pose, simulate
-from ceres_cal.structure import EXACT, Tolerance, make_structure
-from ceres_cal.targets import Arc, Curve, Segment, Target, checkerboard, custom, ssl_field
-from ceres_cal.transforms import Array
 
 CAMERA = Camera((1280, 960), 868.0, (651.3, 468.9), Radial((-5.2e-5, 6.1e-7)))
 NOISE = Disturbance(0.3, 0.3)

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from ceres_cal.tails import log_binomial_tail, log_chi2_tail, log_f_tail, upper_tail
+from ceres_cal.base.tails import log_binomial_tail, log_chi2_tail, log_f_tail, upper_tail
 
 
 @pytest.mark.parametrize("degrees", [1, 2, 6, 7, 14])

@@ -11,8 +11,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ceres_cal.errors import InputError
-from ceres_cal.targets import (
+from ceres_cal.base.errors import InputError
+from ceres_cal.base.transforms import Array
+from ceres_cal.scene.targets import (
     SIDES,
     TARGET_KINDS,
     Arc,
@@ -27,7 +28,6 @@ from ceres_cal.targets import (
     ssl_field,
     target_from_spec,
 )
-from ceres_cal.transforms import Array
 
 quick = settings(deadline=None, max_examples=100)
 

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ceres_cal.threads import at_most, meanwhile, parts_of, run_parts
+from ceres_cal.base.threads import at_most, meanwhile, parts_of, run_parts
 
 
 @given(

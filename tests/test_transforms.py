@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from ceres_cal.transforms import (
+from ceres_cal.base.transforms import (
     Array,
     Pose,
     euler_from_rotation,

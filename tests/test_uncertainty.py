@@ -17,18 +17,18 @@ from accuracy_scenes import CLEAN_NOISE, FIELD, painted_by_two_cameras, tilted, 
 from coverage import CASES, cover, share
 from scenes import SCENES
 
-from ceres_cal.bundle import Weighting, solve
-from ceres_cal.calibrate import calibrate
+from ceres_cal.base.errors import InputError
+from ceres_cal.base.transforms import Array, Pose
+from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
-from ceres_cal.errors import InputError
-from ceres_cal.initialise import PHI_RANGE
+from ceres_cal.model.parameters import Estimate, Options, make_layout, unit_px
+from ceres_cal.model.quantities import Key, camera_keys, moved, natural_sizes, pose_keys
+from ceres_cal.model.structure import make_structure
 from ceres_cal.observations import Observations, Prior, combine
-from ceres_cal.parameters import Estimate, Options, make_layout, unit_px
-from ceres_cal.quantities import Key, camera_keys, moved, natural_sizes, pose_keys
-from ceres_cal.sights import gather_sights
-from ceres_cal.structure import make_structure
-from ceres_cal.targets import Segment
-from ceres_cal.transforms import Array, Pose
+from ceres_cal.observations.sights import gather_sights
+from ceres_cal.scene.targets import Segment
+from ceres_cal.solve import Weighting, solve
+from ceres_cal.start.initialise import PHI_RANGE
 from ceres_cal.uncertainty import Posterior, Uncertainty, Verdict, bounds_text
 from ceres_cal.uncertainty.maps import locate_slopes, radius_95, shown_pixels
 from ceres_cal.uncertainty.seam import predicted

@@ -12,16 +12,16 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from ceres_cal.camera import Camera
-from ceres_cal.errors import InputError
-from ceres_cal.files import convert, read_json, write_json
-from ceres_cal.joint import JointPrior
-from ceres_cal.lens import make_lens
+from ceres_cal.base.errors import InputError
+from ceres_cal.base.files import convert, read_json, write_json
+from ceres_cal.base.transforms import Pose, euler_from_rotation
+from ceres_cal.model.joint import JointPrior
+from ceres_cal.model.parameters import Estimate, Options, Station
+from ceres_cal.model.structure import make_structure
 from ceres_cal.observations import Observations, prior_from_json, prior_to_json
-from ceres_cal.parameters import Estimate, Options, Station
-from ceres_cal.structure import make_structure
-from ceres_cal.targets import Target, target_from_spec
-from ceres_cal.transforms import Pose, euler_from_rotation
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.lens import make_lens
+from ceres_cal.scene.targets import Target, target_from_spec
 from ceres_cal.uncertainty import (
     Disagreement,
     Posterior,

@@ -9,12 +9,12 @@ import numpy as np
 
 from ceres_cal.advice.measurements import Ground, Measurement, together
 from ceres_cal.advice.outlook import Outlook
-from ceres_cal.camera import Camera
+from ceres_cal.base.transforms import Array
+from ceres_cal.model.structure import Tolerance
 from ceres_cal.observations import Prior
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.targets import MOVABLE, Arc, Target, along_track, checkerboard, custom
 from ceres_cal.simulate import ViewPlan, board_pose, well_inside
-from ceres_cal.structure import Tolerance
-from ceres_cal.targets import MOVABLE, Arc, Target, along_track, checkerboard, custom
-from ceres_cal.transforms import Array
 
 HEIGHT_SIGMAS_M = (0.02, 0.01, 0.005)
 POSITION_SIGMA_M = 0.01

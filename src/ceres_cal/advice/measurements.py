@@ -7,17 +7,17 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from ceres_cal.bundle import Weighting, information
-from ceres_cal.errors import InputError
+from ceres_cal.base.errors import InputError
+from ceres_cal.base.spread import without
+from ceres_cal.base.transforms import Array, Pose
+from ceres_cal.model.parameters import Estimate, Layout, intrinsic_names
+from ceres_cal.model.quantities import Key, sigma_limits
+from ceres_cal.model.structure import Tolerance, make_structure
 from ceres_cal.observations import Curves, Observations, Points, Prior
-from ceres_cal.parameters import Estimate, Layout, intrinsic_names
-from ceres_cal.quantities import Key, sigma_limits
-from ceres_cal.sights import gather_sights
+from ceres_cal.observations.sights import gather_sights
+from ceres_cal.scene.targets import Target
 from ceres_cal.simulate import Scene, ViewPlan, simulate
-from ceres_cal.spread import without
-from ceres_cal.structure import Tolerance, make_structure
-from ceres_cal.targets import Target
-from ceres_cal.transforms import Array, Pose
+from ceres_cal.solve import Weighting, information
 
 
 @dataclass(frozen=True, eq=False)

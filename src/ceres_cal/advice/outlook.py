@@ -9,10 +9,10 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from ceres_cal.parameters import Estimate
-from ceres_cal.quantities import Key, moved, sigma_limits
-from ceres_cal.spread import Spread
-from ceres_cal.transforms import Array
+from ceres_cal.base.spread import Spread
+from ceres_cal.base.transforms import Array
+from ceres_cal.model.parameters import Estimate
+from ceres_cal.model.quantities import Key, moved, sigma_limits
 from ceres_cal.uncertainty import FieldMap, Posterior, Profile
 from ceres_cal.uncertainty.maps import locate_slopes, shown_pixels, station_keys
 

@@ -10,12 +10,12 @@ import numpy as np
 from ceres_cal.advice.candidates import BOARD, Search, still
 from ceres_cal.advice.measurements import Ground, Measurement
 from ceres_cal.advice.outlook import BENT, Errors, Outlook
-from ceres_cal.bundle import Weighting
+from ceres_cal.base.errors import InputError
+from ceres_cal.base.transforms import Array
 from ceres_cal.calibration import Calibration, Fit
-from ceres_cal.errors import InputError
-from ceres_cal.parameters import Estimate
-from ceres_cal.targets import Target
-from ceres_cal.transforms import Array
+from ceres_cal.model.parameters import Estimate
+from ceres_cal.scene.targets import Target
+from ceres_cal.solve import Weighting
 from ceres_cal.uncertainty import Posterior
 
 _LARGER, _LESS = 0.5, 0.2

@@ -9,6 +9,7 @@ import os
 import sys
 from collections.abc import Sequence
 
+from ceres_cal.base.errors import CalibrationError, InputError, SolutionError
 from ceres_cal.cli.advise import COMMANDS as ADVISE
 from ceres_cal.cli.calibrate import COMMANDS as CALIBRATE
 from ceres_cal.cli.check import COMMANDS as CHECK
@@ -24,7 +25,6 @@ from ceres_cal.cli.simulate import COMMANDS as SIMULATE
 from ceres_cal.cli.table import COMMANDS as TABLE
 from ceres_cal.cli.targets import COMMANDS as TARGETS
 from ceres_cal.cli.undistort import COMMANDS as UNDISTORT
-from ceres_cal.errors import CalibrationError, InputError, SolutionError
 
 _GROUPS = (
     *(DETECT_BOARD, DETECT_RINGS, DETECT_FIELD),

@@ -8,12 +8,12 @@ from pathlib import Path
 from textwrap import wrap
 from typing import TYPE_CHECKING, Any
 
+from ceres_cal.base.errors import InputError
 from ceres_cal.cli.command import Answer, Command, parse_number
-from ceres_cal.errors import InputError
 
 if TYPE_CHECKING:
     from ceres_cal.advice import Advice, Errors, Measurement, Promise
-    from ceres_cal.targets import Target
+    from ceres_cal.scene.targets import Target
 
 _WIDTH = 100
 
@@ -58,7 +58,7 @@ COMMANDS = (Command("advise", "what to measure next, and what it would bring in 
 
 
 def _board(text: str) -> Target:
-    from ceres_cal.targets import checkerboard
+    from ceres_cal.scene.targets import checkerboard
 
     parts = text.split("x")
     if len(parts) != 3 or not (parts[0].isdecimal() and parts[1].isdecimal()):

@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ceres_cal.base.errors import InputError
 from ceres_cal.cli.detect import image_files
-from ceres_cal.errors import InputError
 
 if TYPE_CHECKING:
     from ceres_cal.calibration import Calibration

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ceres_cal.base.errors import InputError
 from ceres_cal.cli.album import album_of
 from ceres_cal.cli.command import (
     Answer,
@@ -19,15 +20,14 @@ from ceres_cal.cli.command import (
     require_outputs,
 )
 from ceres_cal.cli.progress import ProgressBar
-from ceres_cal.errors import InputError
 
 if TYPE_CHECKING:
-    from ceres_cal.bundle import Progress
     from ceres_cal.calibration import Calibration
+    from ceres_cal.model.parameters import Options
+    from ceres_cal.model.structure import Tolerance
     from ceres_cal.observations import Observations, Prior
-    from ceres_cal.parameters import Options
     from ceres_cal.report import Album
-    from ceres_cal.structure import Tolerance
+    from ceres_cal.solve import Progress
 
 _STATION_QUANTITIES = ("height_m", "position_m")
 _PRIOR_EXAMPLE = "overhead.height_m=4.02:0.01"
@@ -99,8 +99,8 @@ def _run(args: Namespace) -> Answer:
     require_outputs(args.output, args.report, args.observations)
     require_different(args.observations)
     fixed, powers = _fixed(args.fix), _powers(args)
+    from ceres_cal.base.files import write_bytes
     from ceres_cal.cli.summary import calibration_data, calibration_text
-    from ceres_cal.files import write_bytes
     from ceres_cal.observations import Observations, combine
 
     observations = combine([Observations.load(path) for path in args.observations])
@@ -111,7 +111,7 @@ def _run(args: Namespace) -> Answer:
 
         if next(CACHE_FOLDER.rglob("*.nbi"), None) is None:
             bar.say("compiling the kernels (first run only)")
-        from ceres_cal.calibrate import calibrate
+        from ceres_cal.calibrating import calibrate
 
         calibration = calibrate(observations, options, _shown_on(bar, options.max_iterations))
         page = _page(calibration, observations, album, bar) if args.report is not None else ""
@@ -186,7 +186,7 @@ def _fixed(specs: list[str]) -> dict[str, float]:
 def _options(
     args: Namespace, fixed: Mapping[str, float], powers: tuple[int, ...], observations: Observations
 ) -> Options:
-    from ceres_cal.parameters import Options, intrinsic_names
+    from ceres_cal.model.parameters import Options, intrinsic_names
 
     options = Options(lens=args.lens, powers=powers, fixed=fixed)
     quantities = (*intrinsic_names(options.blank_lens), "principal_point")
@@ -210,7 +210,7 @@ def _options(
 
 def _tolerances(specs: list[str]) -> dict[str, Tolerance]:
     """The tolerances of `--tolerance` arguments: TARGET.lines_m|points_m|warp_m=SIGMA."""
-    from ceres_cal.structure import Tolerance
+    from ceres_cal.model.structure import Tolerance
 
     given: dict[str, dict[str, float]] = {}
     for spec in specs:

@@ -7,6 +7,7 @@ from argparse import ArgumentParser, Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ceres_cal.base.errors import InputError
 from ceres_cal.cli.command import Answer, Command, parse_number
 from ceres_cal.cli.moved import (
     add_inputs,
@@ -18,7 +19,6 @@ from ceres_cal.cli.moved import (
     read_calibration,
     read_observations,
 )
-from ceres_cal.errors import InputError
 
 if TYPE_CHECKING:
     from ceres_cal.moves import Check, StationCheck

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn
 
-from ceres_cal.errors import InputError
+from ceres_cal.base.errors import InputError
 
 
 class Parser(argparse.ArgumentParser):

@@ -6,8 +6,8 @@ from argparse import ArgumentParser, Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ceres_cal.base.errors import InputError
 from ceres_cal.cli.command import Answer, Command, finishing, parse_number, require_output
-from ceres_cal.errors import InputError
 
 if TYPE_CHECKING:
     from ceres_cal.moves import StationComparison
@@ -27,8 +27,8 @@ def _add_arguments(parser: ArgumentParser) -> None:
 def _run(args: Namespace) -> Answer:
     require_output(args.picture, [args.a, args.b])
     height_m = parse_number(args.height_mm, "--height-mm") / 1000.0
+    from ceres_cal.base.files import write_bytes
     from ceres_cal.calibration import Calibration
-    from ceres_cal.files import write_bytes
     from ceres_cal.moves import compare, picture
 
     first = Calibration.load(args.a)

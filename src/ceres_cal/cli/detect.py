@@ -9,9 +9,9 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ceres_cal.base.errors import InputError
 from ceres_cal.cli.command import Answer, Command, add_output, finishing, require_output
 from ceres_cal.cli.progress import ProgressBar
-from ceres_cal.errors import InputError
 
 if TYPE_CHECKING:
     from ceres_cal.detect.boards import BoardDetections
@@ -47,7 +47,7 @@ def _run_board(args: Namespace) -> Answer:
         raise InputError("--charuco DICT and --marker M go together: give both or neither")
     os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")  # what it warns of in an image, we say ourselves
     from ceres_cal.detect.boards import CharucoSpec, detect_boards
-    from ceres_cal.targets import checkerboard
+    from ceres_cal.scene.targets import checkerboard
 
     board = checkerboard(args.columns, args.rows, args.square)
     charuco = None if args.charuco is None else CharucoSpec(args.charuco, args.marker)

@@ -9,15 +9,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ceres_cal.base.errors import InputError
 from ceres_cal.cli.command import Answer, Command, add_output, finishing, parse_numbers, plural, require_output
 from ceres_cal.cli.detect import image_files, parse_names, require_observations_file
 from ceres_cal.cli.progress import ProgressBar
-from ceres_cal.errors import InputError
 
 if TYPE_CHECKING:
-    from ceres_cal.camera import Camera
     from ceres_cal.photographs import Auto, Clicks, Facing, FieldDetections
-    from ceres_cal.targets import Target
+    from ceres_cal.scene.camera import Camera
+    from ceres_cal.scene.targets import Target
 
 _CORNER = "TopLeftCorner=102,88"
 _FACING = "LeftGoalLine=top"
@@ -172,7 +172,7 @@ def _corners(specs: list[str]) -> Clicks:
 
 
 def _target(text: str) -> Target:
-    from ceres_cal.targets import ssl_field, target_from_spec
+    from ceres_cal.scene.targets import ssl_field, target_from_spec
 
     if text in ("ssl-a", "ssl-b"):
         return ssl_field(text[-1].upper())
@@ -187,7 +187,7 @@ def _target(text: str) -> Target:
 
 
 def _json(path: Path) -> Mapping[str, Any]:
-    from ceres_cal.files import parse_json, read_bytes
+    from ceres_cal.base.files import parse_json, read_bytes
 
     content = parse_json(read_bytes(path), str(path))
     if not isinstance(content, dict):

@@ -6,9 +6,9 @@ import os
 from argparse import ArgumentParser, Namespace
 from typing import TYPE_CHECKING, Any
 
+from ceres_cal.base.errors import InputError
 from ceres_cal.cli.command import Answer, Command, add_output, finishing, parse_number, parse_numbers, require_output
 from ceres_cal.cli.detect import require_observations_file
-from ceres_cal.errors import InputError
 
 if TYPE_CHECKING:
     from ceres_cal.detect.rings import RingsDetection

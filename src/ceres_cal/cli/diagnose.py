@@ -5,9 +5,9 @@ from __future__ import annotations
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
 
+from ceres_cal.base.errors import InputError
 from ceres_cal.cli.album import album_of
 from ceres_cal.cli.command import Answer, Command, add_output, add_report, finishing, parse_number, require_outputs
-from ceres_cal.errors import InputError
 
 
 def _add_arguments(parser: ArgumentParser) -> None:
@@ -43,10 +43,10 @@ def _run(args: Namespace) -> Answer:
         raise InputError(f"--folds must be at least 2, not {args.folds}")
     if args.held_out and args.new_data:
         raise InputError("--held-out calibrates the observations anew: leave out --new-data")
+    from ceres_cal.base.files import write_bytes
     from ceres_cal.calibration import Calibration
     from ceres_cal.cli.diagnosis import diagnosis_data, diagnosis_text
     from ceres_cal.diagnostics import choose, diagnose
-    from ceres_cal.files import write_bytes
     from ceres_cal.observations import Observations, combine
 
     calibration = Calibration.load(args.calibration)

@@ -8,12 +8,12 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ceres_cal.base.errors import InputError
 from ceres_cal.cli.command import Answer, Command, parse_number
-from ceres_cal.errors import InputError
 
 if TYPE_CHECKING:
-    from ceres_cal.camera import Camera
-    from ceres_cal.transforms import Array
+    from ceres_cal.base.transforms import Array
+    from ceres_cal.scene.camera import Camera
 
 
 def _add_common(parser: ArgumentParser, rows: str, example: str) -> None:
@@ -99,7 +99,7 @@ def _texts(args: Namespace) -> Iterator[tuple[str, str]]:
     if args.file == "-" or args.rows == ["-"]:
         yield from _lines(sys.stdin, "standard input")
     elif args.file is not None:
-        from ceres_cal.files import read_bytes
+        from ceres_cal.base.files import read_bytes
 
         yield from _lines(read_bytes(args.file).decode("utf-8-sig", errors="replace").splitlines(), args.file)
     else:

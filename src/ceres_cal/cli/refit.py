@@ -6,6 +6,7 @@ from argparse import ArgumentParser, Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ceres_cal.base.errors import InputError
 from ceres_cal.cli.album import album_of
 from ceres_cal.cli.command import Answer, Command, add_output, add_report, finishing, parse_numbers, require_outputs
 from ceres_cal.cli.moved import (
@@ -18,7 +19,6 @@ from ceres_cal.cli.moved import (
     read_calibration,
     read_observations,
 )
-from ceres_cal.errors import InputError
 
 if TYPE_CHECKING:
     from ceres_cal.calibration import Calibration
@@ -65,7 +65,7 @@ def _run(args: Namespace) -> Answer:
     calibration = read_calibration(args)
     found = _photographed(args, calibration, images) if images else None
     observations = read_observations(args) if found is None else found.require()
-    from ceres_cal.files import write_bytes
+    from ceres_cal.base.files import write_bytes
     from ceres_cal.moves import refit
 
     album = album_of(args, observations, calibration, images)

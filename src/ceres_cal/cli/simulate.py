@@ -6,9 +6,9 @@ from argparse import ArgumentParser, Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ceres_cal.base.errors import InputError
 from ceres_cal.cli.command import Answer, Command, finishing, plural
 from ceres_cal.cli.progress import ProgressBar
-from ceres_cal.errors import InputError
 
 if TYPE_CHECKING:
     from ceres_cal.simulate import Simulation

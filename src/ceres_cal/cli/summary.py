@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
+from ceres_cal.base.transforms import Pose, euler_from_rotation
 from ceres_cal.calibration import Calibration, calibration_to_json
-from ceres_cal.camera import Camera
 from ceres_cal.cli.command import plural, written
 from ceres_cal.cli.trust import Trust, with_sd
+from ceres_cal.model.parameters import Options, anchored_stations
 from ceres_cal.observations import Observations
-from ceres_cal.parameters import Options, anchored_stations
-from ceres_cal.transforms import Pose, euler_from_rotation
+from ceres_cal.scene.camera import Camera
 
 _MOST_FEATURES = 6
 _MANY_OUTLIERS, _LARGE_SCALE = 0.3, 4.0  # from where on a warning is due

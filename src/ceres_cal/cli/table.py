@@ -5,8 +5,8 @@ from __future__ import annotations
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
 
+from ceres_cal.base.errors import InputError
 from ceres_cal.cli.command import Answer, Command, add_output, finishing, parse_number, require_output
-from ceres_cal.errors import InputError
 
 
 def _add_arguments(parser: ArgumentParser) -> None:
@@ -24,7 +24,7 @@ def _run(args: Namespace) -> Answer:
     if error_mm <= 0.0:
         raise InputError(f"--error-mm must be above 0, not {error_mm:g}")
     from ceres_cal.calibration import Calibration
-    from ceres_cal.table import make_table
+    from ceres_cal.scene.lookup import make_table
     from ceres_cal.uncertainty.uncertainty import field_grid
 
     calibration = Calibration.load(args.calibration)

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ceres_cal.base.errors import InputError
 from ceres_cal.cli.command import Answer, Command
-from ceres_cal.errors import InputError
 
 if TYPE_CHECKING:
-    from ceres_cal.targets import Curve, Target
+    from ceres_cal.scene.targets import Curve, Target
 
 
 @dataclass(frozen=True)
@@ -26,25 +26,25 @@ class Kind:
 
 
 def _ssl_fields() -> dict[str, Target]:
-    from ceres_cal.targets import ssl_field
+    from ceres_cal.scene.targets import ssl_field
 
     return {"ssl-a": ssl_field("A"), "ssl-b": ssl_field("B")}
 
 
 def _checkerboard() -> dict[str, Target]:
-    from ceres_cal.targets import checkerboard
+    from ceres_cal.scene.targets import checkerboard
 
     return {"checkerboard": checkerboard(9, 6, 0.025)}
 
 
 def _rings() -> dict[str, Target]:
-    from ceres_cal.targets import rings
+    from ceres_cal.scene.targets import rings
 
     return {"rings": rings((0.05, 0.1, 0.15))}
 
 
 def _custom() -> dict[str, Target]:
-    from ceres_cal.targets import Arc, Segment, custom
+    from ceres_cal.scene.targets import Arc, Segment, custom
 
     curves: dict[str, Curve] = {
         "edge": Segment((0, 0, 0), (4, 0, 0), 0.01),
@@ -121,9 +121,9 @@ def _targets(wanted: str) -> dict[str, Target]:
 
 def _targets_in(path: Path) -> dict[str, Target]:
     """The targets of a file of observations, even where its observations are at fault."""
-    from ceres_cal.files import read_json
+    from ceres_cal.base.files import read_json
     from ceres_cal.observations import FORMAT, VERSION, Observations
-    from ceres_cal.targets import target_from_spec
+    from ceres_cal.scene.targets import target_from_spec
 
     if path.suffix == ".npz":
         return dict(Observations.load(path).targets)
@@ -175,7 +175,7 @@ def _place(place: tuple[float, float, float]) -> str:
 
 
 def _curve_text(curve: Curve) -> str:
-    from ceres_cal.targets import Segment
+    from ceres_cal.scene.targets import Segment
 
     if isinstance(curve, Segment):
         shape = f"segment  from {_place(curve.start)}  to {_place(curve.end)}"
@@ -195,7 +195,7 @@ def _kind_data(kind: Kind) -> dict[str, Any]:
 
 def _target_data(target: Target) -> dict[str, Any]:
     """Its description, and all its features as a custom target's file has them."""
-    from ceres_cal.targets import custom
+    from ceres_cal.scene.targets import custom
 
     features = {**custom(target.points, target.curves).spec}
     del features["kind"]

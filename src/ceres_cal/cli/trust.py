@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ceres_cal.digits import two_digits
+from ceres_cal.base.digits import two_digits
 from ceres_cal.uncertainty import bounds_text
 
 if TYPE_CHECKING:

@@ -9,15 +9,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ceres_cal.base.errors import InputError
 from ceres_cal.cli.command import Answer, Command, finishing, parse_number, parse_numbers
 from ceres_cal.cli.detect import image_files
 from ceres_cal.cli.progress import ProgressBar
-from ceres_cal.errors import InputError
 
 if TYPE_CHECKING:
     from ceres_cal.calibration import Calibration
-    from ceres_cal.camera import Camera
     from ceres_cal.pictures.warp import Image
+    from ceres_cal.scene.camera import Camera
 
 _MARGIN_M = 0.3  # around the field in a top view
 _JPEG_QUALITY = 95
@@ -63,8 +63,8 @@ def _run(args: Namespace) -> Answer:
     kind = "top" if args.top_view else "overlay" if args.overlay else "straight"
     outputs = _outputs(images, args.output, f"-{kind}.{args.format}", f"{kind}.json")
     os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")  # what it warns of in an image, we say ourselves
+    from ceres_cal.base.files import write_json
     from ceres_cal.calibration import Calibration
-    from ceres_cal.files import write_json
 
     calibration = Calibration.load(args.calibration)
     make = {"top": _top_view, "overlay": _overlay, "straight": _straight}[kind](args, calibration)
@@ -196,7 +196,7 @@ def _read(path: Path, camera: Camera, name: str) -> Image:
 
 
 def _write(path: Path, picture: Image) -> None:
-    from ceres_cal.files import write_bytes
+    from ceres_cal.base.files import write_bytes
     from ceres_cal.pictures.files import encoded
 
     with finishing():

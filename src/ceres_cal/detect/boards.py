@@ -14,13 +14,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ceres_cal.base.errors import InputError, NothingShownError
+from ceres_cal.base.files import read_bytes
+from ceres_cal.base.transforms import Array
 from ceres_cal.detect.saddles import REACH, measure_saddles
 from ceres_cal.detect.scatter import scatter_px
-from ceres_cal.errors import InputError, NothingShownError
-from ceres_cal.files import read_bytes
 from ceres_cal.observations import Curves, Observations, Points, View
-from ceres_cal.targets import Target
-from ceres_cal.transforms import Array
+from ceres_cal.scene.targets import Target
 
 Image = NDArray[Any]
 Progress = Callable[[int, int, str], None]

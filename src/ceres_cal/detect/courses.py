@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ceres_cal.camera import Camera
-from ceres_cal.targets import Arc, Target, along_track, nearest_on_track
-from ceres_cal.transforms import Array
+from ceres_cal.base.transforms import Array
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.targets import Arc, Target, along_track, nearest_on_track
 
 Ints = NDArray[np.int32]
 Mask = NDArray[np.bool_]

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ceres_cal.camera import Camera
+from ceres_cal.base.transforms import Array
 from ceres_cal.detect.courses import Ints, Mask, course_at
 from ceres_cal.detect.lines import Lines
-from ceres_cal.targets import Arc, Target, along_track, nearest_on_track
-from ceres_cal.transforms import Array
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.targets import Arc, Target, along_track, nearest_on_track
 
 _ON_CURVE_M = 1e-6
 _EACH_WAY, _ONE_WAY, _FEWEST = 3, 8, 3  # places of a branch that goes on, of one that ends, and at least

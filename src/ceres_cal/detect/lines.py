@@ -12,9 +12,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ceres_cal.base.transforms import Array
 from ceres_cal.detect.courses import Course, Mask
 from ceres_cal.detect.profiles import Grey, Profiles, Windows, cut_windows, fit_profiles, fit_shape
-from ceres_cal.transforms import Array
 
 HALF_WIDTH_PX = 3  # of a window, along the line
 SPACING_PX = 2.0 * HALF_WIDTH_PX + 2.0  # neighbouring windows share no pixels

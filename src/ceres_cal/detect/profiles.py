@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ceres_cal.transforms import Array
+from ceres_cal.base.transforms import Array
 
 Grey = NDArray[np.float32]
 """(height, width) grey levels."""

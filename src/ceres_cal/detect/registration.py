@@ -12,9 +12,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ceres_cal.base.transforms import Array
 from ceres_cal.detect.courses import Course
 from ceres_cal.detect.profiles import Grey
-from ceres_cal.transforms import Array
 
 _REDUCED = 4
 _NEAR_PX = 8.0

@@ -15,12 +15,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ceres_cal.base.errors import InputError
+from ceres_cal.base.transforms import Array
 from ceres_cal.detect.boards import read_grey
 from ceres_cal.detect.profiles import Grey, Windows, cut_windows, fit_profiles, fit_shape
-from ceres_cal.errors import InputError
 from ceres_cal.observations import Curves, Observations, Points, View
-from ceres_cal.targets import Target, rings
-from ceres_cal.transforms import Array
+from ceres_cal.scene.targets import Target, rings
 
 TARGET_NAME = "rings"
 RAYS = 360

@@ -29,7 +29,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ceres_cal.transforms import Array
+from ceres_cal.base.transforms import Array
 
 REACH = 0.6
 """Radius of the disc around a corner as a part of the distance to the next edges: further, they would be in it."""

@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ceres_cal.base.transforms import Array
 from ceres_cal.detect.profiles import Grey
-from ceres_cal.transforms import Array
 
 _SCALES = (1, 2)  # a photograph is searched at full and at half size: for narrow paint and for wide
 _SIGMA_PX = 1.6

@@ -6,16 +6,16 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
-from ceres_cal.bundle import private_placements
+from ceres_cal.base.transforms import Array, skew
 from ceres_cal.diagnostics.equations import Equations, Ints
 from ceres_cal.diagnostics.freedom import structure_columns
 from ceres_cal.diagnostics.scores import Family
+from ceres_cal.model.parameters import Estimate, Layout, unit_px
+from ceres_cal.model.structure import Tolerance, make_structure
 from ceres_cal.observations import Observations
-from ceres_cal.parameters import Estimate, Layout, unit_px
-from ceres_cal.sights import Mask
-from ceres_cal.structure import Tolerance, make_structure
-from ceres_cal.targets import Target
-from ceres_cal.transforms import Array, skew
+from ceres_cal.observations.sights import Mask
+from ceres_cal.scene.targets import Target
+from ceres_cal.solve import private_placements
 
 _RADIAL_BASIS = 3  # powers of the radius past those of the lens: enough for any smooth trend that one more power mends
 _POWERS = {"radial": (2, 3, 4, 5, 6, 7)}  # of the others' polynomials: odd ones

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ceres_cal import kernels
+from ceres_cal.base.errors import InputError
+from ceres_cal.base.transforms import Array
 from ceres_cal.calibration import Calibration
 from ceres_cal.diagnostics.alternatives import all_families, target_families
 from ceres_cal.diagnostics.equations import Equations, write_equations
@@ -20,13 +22,11 @@ from ceres_cal.diagnostics.patterns import heard_again, select
 from ceres_cal.diagnostics.summaries import Summaries, summarise
 from ceres_cal.diagnostics.table import ResidualTable, make_table
 from ceres_cal.diagnostics.words import Context, label_findings, noise_findings, pattern_finding
-from ceres_cal.errors import InputError
-from ceres_cal.noise import Inliers, judge, relative_lengths
+from ceres_cal.model.parameters import Estimate, Layout, make_layout
+from ceres_cal.model.residuals import Residuals, residuals
 from ceres_cal.observations import Observations
-from ceres_cal.parameters import Estimate, Layout, make_layout
-from ceres_cal.residuals import Residuals, residuals
-from ceres_cal.sights import Mask, gather_sights
-from ceres_cal.transforms import Array
+from ceres_cal.observations.sights import Mask, gather_sights
+from ceres_cal.solve.noise import Inliers, judge, relative_lengths
 
 FALSE_ALARM_RATE = 0.01
 """Probability that a calibration of sound data gets any finding at all."""

@@ -15,13 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ceres_cal import kernels
-from ceres_cal.errors import SolutionError
+from ceres_cal.base.errors import SolutionError
+from ceres_cal.base.transforms import Array
+from ceres_cal.model.parameters import Estimate
+from ceres_cal.model.residuals import Residuals, lens_arguments
 from ceres_cal.observations import Observations
-from ceres_cal.parameters import Estimate
-from ceres_cal.residuals import Residuals, lens_arguments
-from ceres_cal.sights import Mask, Sights
-from ceres_cal.targets import along_track
-from ceres_cal.transforms import Array
+from ceres_cal.observations.sights import Mask, Sights
+from ceres_cal.scene.targets import along_track
 
 Ints = NDArray[np.int64]
 

@@ -14,12 +14,12 @@ from functools import cached_property
 
 import numpy as np
 
-from ceres_cal.bundle import prior_on_intrinsics, private_placements
+from ceres_cal.base.transforms import Array, skew
 from ceres_cal.diagnostics.equations import Equations, Ints
-from ceres_cal.parameters import Estimate, Layout, Station, intrinsics_vector
-from ceres_cal.sights import Mask
-from ceres_cal.structure import Structure
-from ceres_cal.transforms import Array, skew
+from ceres_cal.model.parameters import Estimate, Layout, Station, intrinsics_vector
+from ceres_cal.model.structure import Structure
+from ceres_cal.observations.sights import Mask
+from ceres_cal.solve import prior_on_intrinsics, private_placements
 
 _SINGULAR = 1e-12  # share of its own information that a number must keep beside the others
 

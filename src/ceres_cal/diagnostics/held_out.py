@@ -13,18 +13,18 @@ from typing import Any
 
 import numpy as np
 
-from ceres_cal.bundle import Weighting, solve
-from ceres_cal.calibrate import calibrate
+from ceres_cal.base.errors import CalibrationError, DegenerateError, InputError
+from ceres_cal.base.transforms import Array, Pose
+from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
 from ceres_cal.diagnostics.equations import write_equations
 from ceres_cal.diagnostics.table import error_mm
-from ceres_cal.errors import CalibrationError, DegenerateError, InputError
+from ceres_cal.model.parameters import Estimate, Layout, Options
+from ceres_cal.model.residuals import residuals
+from ceres_cal.model.structure import make_structure
 from ceres_cal.observations import Columns, Observations
-from ceres_cal.parameters import Estimate, Layout, Options
-from ceres_cal.residuals import residuals
-from ceres_cal.sights import Mask, Sights, gather_sights
-from ceres_cal.structure import make_structure
-from ceres_cal.transforms import Array, Pose
+from ceres_cal.observations.sights import Mask, Sights, gather_sights
+from ceres_cal.solve import Weighting, solve
 
 FOLDS = 5
 MOST_OBSERVATIONS = 10_000

@@ -12,14 +12,14 @@ from functools import cache, cached_property
 import numpy as np
 
 from ceres_cal import kernels
-from ceres_cal.camera import Camera
+from ceres_cal.base.tails import log_binomial_tail
+from ceres_cal.base.transforms import Array
 from ceres_cal.diagnostics.equations import Ints
+from ceres_cal.model.parameters import Estimate
+from ceres_cal.model.residuals import lens_arguments
 from ceres_cal.observations import Curves, Observations, Points
-from ceres_cal.parameters import Estimate
-from ceres_cal.residuals import lens_arguments
-from ceres_cal.tails import log_binomial_tail
-from ceres_cal.targets import SIDES, Target, along_track, nearest_on_track
-from ceres_cal.transforms import Array
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.targets import SIDES, Target, along_track, nearest_on_track
 
 _MOST = 20_000  # rejected observations looked at: of more, evenly spread ones
 

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ceres_cal.base.tails import log_chi2_tail
+from ceres_cal.base.transforms import Array
 from ceres_cal.diagnostics.equations import Ints
 from ceres_cal.diagnostics.freedom import Freedom
 from ceres_cal.observations import Observations
-from ceres_cal.sights import Mask
-from ceres_cal.tails import log_chi2_tail
-from ceres_cal.transforms import Array
+from ceres_cal.observations.sights import Mask
 
 LARGER = 1.15  # noise within so much of what was stated is as stated
 _FEWEST_PAIRS = 20

@@ -6,19 +6,19 @@ from dataclasses import replace
 
 import numpy as np
 
-from ceres_cal.bundle import Weighting
+from ceres_cal.base.errors import DegenerateError
+from ceres_cal.base.tails import log_f_tail
+from ceres_cal.base.transforms import Pose
 from ceres_cal.calibration import Calibration
 from ceres_cal.diagnostics.findings import Finding
 from ceres_cal.diagnostics.freedom import Freedom
 from ceres_cal.diagnostics.words import Context
-from ceres_cal.errors import DegenerateError
-from ceres_cal.lost import with_lost_boards_found
-from ceres_cal.noise import Inliers
+from ceres_cal.model.parameters import Estimate, Layout
 from ceres_cal.observations import Observations
-from ceres_cal.parameters import Estimate, Layout
-from ceres_cal.sights import Sights
-from ceres_cal.tails import log_f_tail
-from ceres_cal.transforms import Pose
+from ceres_cal.observations.sights import Sights
+from ceres_cal.solve import Weighting
+from ceres_cal.solve.lost import with_lost_boards_found
+from ceres_cal.solve.noise import Inliers
 
 
 def with_newcomers_placed(observations: Observations, sights: Sights, calibration: Calibration) -> Estimate:

@@ -7,12 +7,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ceres_cal.base.transforms import Array
 from ceres_cal.diagnostics.equations import Equations, Ints
 from ceres_cal.diagnostics.findings import OF_LENS
 from ceres_cal.diagnostics.freedom import Freedom, inverse_root
 from ceres_cal.diagnostics.scores import LEAST_LEFT, Family, Score, score_all
-from ceres_cal.sights import Mask
-from ceres_cal.transforms import Array
+from ceres_cal.observations.sights import Mask
 
 _MOST = 12  # causes that are named; more than that is not a calibration with faults but none
 _LEAST_SHARE = 0.02  # of the first cause's statistic: below it the error of its linear picture speaks

@@ -13,10 +13,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ceres_cal.base.tails import log_f_tail
+from ceres_cal.base.transforms import Array
 from ceres_cal.diagnostics.equations import Ints
 from ceres_cal.diagnostics.freedom import Freedom, inverse_root
-from ceres_cal.tails import log_f_tail
-from ceres_cal.transforms import Array
 
 LEAST_LEFT = 1e-7
 """Share of an alternative's squared length that the free numbers must leave for it to be testable."""

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ceres_cal.camera import Camera
+from ceres_cal.base.transforms import Array
 from ceres_cal.diagnostics.equations import Ints
 from ceres_cal.diagnostics.freedom import Freedom
 from ceres_cal.diagnostics.table import ResidualTable
 from ceres_cal.observations import Observations
-from ceres_cal.sights import Mask
-from ceres_cal.transforms import Array
+from ceres_cal.observations.sights import Mask
+from ceres_cal.scene.camera import Camera
 
 REGIONS = (6, 4)
 """Columns and rows of equal parts into which an image is divided."""

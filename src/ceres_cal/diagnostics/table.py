@@ -11,15 +11,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ceres_cal.camera import Camera
+from ceres_cal.base.errors import InputError
+from ceres_cal.base.files import write_bytes, write_json
+from ceres_cal.base.transforms import Array
 from ceres_cal.diagnostics.equations import Equations, Ints
 from ceres_cal.diagnostics.freedom import Freedom
-from ceres_cal.errors import InputError
-from ceres_cal.files import write_bytes, write_json
-from ceres_cal.noise import Inliers
 from ceres_cal.observations import Observations
-from ceres_cal.sights import Mask
-from ceres_cal.transforms import Array
+from ceres_cal.observations.sights import Mask
+from ceres_cal.scene.camera import Camera
+from ceres_cal.solve.noise import Inliers
 
 FORMAT, VERSION = "ceres-cal/residuals", 1
 INLIER, TOO_FAR, NOT_SEEN = 0, 1, 2

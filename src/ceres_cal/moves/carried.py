@@ -7,15 +7,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ceres_cal.calibrate import Again
+from ceres_cal.base.errors import InputError, SolutionError
+from ceres_cal.base.transforms import Pose
+from ceres_cal.calibrating import Again
 from ceres_cal.calibration import Calibration
-from ceres_cal.errors import InputError, SolutionError
-from ceres_cal.joint import JointPrior
+from ceres_cal.model.joint import JointPrior
+from ceres_cal.model.parameters import Estimate, Layout, Options, Station, intrinsic_names
+from ceres_cal.model.quantities import Key, camera_keys, pose_keys
+from ceres_cal.model.structure import Structure, make_structure
 from ceres_cal.observations import Observations, Prior
-from ceres_cal.parameters import Estimate, Layout, Options, Station, intrinsic_names
-from ceres_cal.quantities import Key, camera_keys, pose_keys
-from ceres_cal.structure import Structure, make_structure
-from ceres_cal.transforms import Pose
 
 WHAT = ("pose", "pose-only", "zoom", "iris", "everything")
 

@@ -11,20 +11,20 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ceres_cal.bundle import Weighting, information, solve
+from ceres_cal.base.errors import CalibrationError, InputError
+from ceres_cal.base.spread import Spread
+from ceres_cal.base.tails import upper_tail
+from ceres_cal.base.transforms import Array, Pose
 from ceres_cal.calibration import Calibration
-from ceres_cal.camera import Camera
-from ceres_cal.errors import CalibrationError, InputError
-from ceres_cal.joint import JointPrior
+from ceres_cal.model.joint import JointPrior
+from ceres_cal.model.parameters import Estimate, Layout, intrinsic_names
+from ceres_cal.model.quantities import Key, sigma_limits
 from ceres_cal.moves.carried import kept_prior, require_same_things, with_structure, without_keys
 from ceres_cal.moves.poses import Place, Scene, movement, places
 from ceres_cal.observations import Observations
-from ceres_cal.parameters import Estimate, Layout, intrinsic_names
-from ceres_cal.quantities import Key, sigma_limits
-from ceres_cal.sights import Mask, Sights, gather_sights
-from ceres_cal.spread import Spread
-from ceres_cal.tails import upper_tail
-from ceres_cal.transforms import Array, Pose
+from ceres_cal.observations.sights import Mask, Sights, gather_sights
+from ceres_cal.scene.camera import Camera
+from ceres_cal.solve import Weighting, information, solve
 from ceres_cal.uncertainty import Posterior
 from ceres_cal.uncertainty.maps import shown_pixels
 from ceres_cal.uncertainty.uncertainty import field_grid

@@ -10,18 +10,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ceres_cal.bundle.joint import offsets
+from ceres_cal.base.errors import CalibrationError, SolutionError
+from ceres_cal.base.tails import upper_tail
+from ceres_cal.base.transforms import Pose
 from ceres_cal.calibration import Calibration
-from ceres_cal.errors import CalibrationError, SolutionError
+from ceres_cal.model.parameters import Estimate
+from ceres_cal.model.residuals import residuals
 from ceres_cal.moves.carried import Plan, without_keys
 from ceres_cal.moves.labels import MIRRORED, TURNED, other_divisions, relabelled
 from ceres_cal.moves.poses import Place, Scene, misfit, movement, places
 from ceres_cal.observations import Observations, taken
-from ceres_cal.parameters import Estimate
-from ceres_cal.residuals import residuals
-from ceres_cal.sights import gather_sights
-from ceres_cal.tails import upper_tail
-from ceres_cal.transforms import Pose
+from ceres_cal.observations.sights import gather_sights
+from ceres_cal.solve.joint import offsets
 
 _ZOOMS = 15
 _HALF = 0.5
@@ -108,7 +108,7 @@ def _others(plan: Plan, scene: Scene) -> Iterator[str]:
         phi = zoomed[0].camera.phi
         before = scene.camera.phi
         yield f"with phi {phi:.0f} px in place of {before:.0f} they do: {WORDS['zoom']}: refit with --what zoom"
-    from ceres_cal.calibrate import calibrate
+    from ceres_cal.calibrating import calibrate
 
     try:
         fresh = calibrate(_of_camera(scene), replace(plan.options, priors=()))
@@ -131,7 +131,7 @@ def _good(place: Place) -> bool:
 
 def _seen_as(scene: Scene, observations: Observations) -> Scene:
     """The scene with its observations renamed or its targets exchanged; structure is left out of it."""
-    from ceres_cal.structure import make_structure
+    from ceres_cal.model.structure import make_structure
 
     sights = gather_sights(observations)
     number = sights.keys.index(scene.sight.key)

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ceres_cal.base.transforms import Array
 from ceres_cal.observations import Observations
-from ceres_cal.targets import Arc, Segment, Target, ssl_field
-from ceres_cal.transforms import Array
+from ceres_cal.scene.targets import Arc, Segment, Target, ssl_field
 
 TURNED, MIRRORED = np.array([-1.0, -1.0, 1.0]), np.array([-1.0, 1.0, 1.0])
 _SAME_M = 1e-6

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 
 from ceres_cal.moves.comparison import StationComparison
-from ceres_cal.targets import MOVABLE, Arc, Target, along_track
+from ceres_cal.scene.targets import MOVABLE, Arc, Target, along_track
 
 _SCALE = 80.0  # px per metre
 _MARGIN_M = 0.6

@@ -12,14 +12,14 @@ from itertools import product
 
 import numpy as np
 
-from ceres_cal.bundle import Weighting, placement_costs
-from ceres_cal.camera import Camera
-from ceres_cal.closed_forms import null_vector, polar_pose
+from ceres_cal.base.transforms import Array, Pose, rotation_exp
+from ceres_cal.model.parameters import Estimate
+from ceres_cal.model.residuals import Residuals, residuals
 from ceres_cal.observations import Observations
-from ceres_cal.parameters import Estimate
-from ceres_cal.residuals import Residuals, residuals
-from ceres_cal.sights import SightKey, Sights
-from ceres_cal.transforms import Array, Pose, rotation_exp
+from ceres_cal.observations.sights import SightKey, Sights
+from ceres_cal.scene.camera import Camera
+from ceres_cal.solve import Weighting, placement_costs
+from ceres_cal.start.closed_forms import null_vector, polar_pose
 
 _WIDE = (60.0, 12.0)  # standard deviations: scale of the loss while a candidate is far off
 _FARTHEST_M = 1e3

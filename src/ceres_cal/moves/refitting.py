@@ -11,19 +11,19 @@ from dataclasses import replace
 
 import numpy as np
 
-from ceres_cal.bundle import Progress
-from ceres_cal.calibrate import solved_from
+from ceres_cal.base.errors import DegenerateError, InputError, SolutionError
+from ceres_cal.base.transforms import Pose
+from ceres_cal.calibrating import solved_from
 from ceres_cal.calibration import Calibration, Refitted
-from ceres_cal.errors import DegenerateError, InputError, SolutionError
-from ceres_cal.initialise import Start
+from ceres_cal.model.parameters import Estimate
 from ceres_cal.moves.carried import Plan, again, first_estimate, layouts, make_plan
 from ceres_cal.moves.explain import judged, old_poses, require_labels, require_supported, why_nothing_fits, zoomed_place
 from ceres_cal.moves.labels import TURNED, relabelled
 from ceres_cal.moves.poses import Scene, equations, movement, places
 from ceres_cal.observations import Observations, Prior
-from ceres_cal.parameters import Estimate
-from ceres_cal.sights import Sights, gather_sights
-from ceres_cal.transforms import Pose
+from ceres_cal.observations.sights import Sights, gather_sights
+from ceres_cal.solve import Progress
+from ceres_cal.start.initialise import Start
 
 LABELS = ("check", "as-given", "turned")
 _NATS_ALIKE = 10.0

@@ -9,8 +9,8 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ceres_cal.errors import InputError
-from ceres_cal.transforms import Array
+from ceres_cal.base.errors import InputError
+from ceres_cal.base.transforms import Array
 
 Ints = NDArray[np.int32]
 Rows = NDArray[np.int64] | NDArray[np.int32] | NDArray[np.bool_]

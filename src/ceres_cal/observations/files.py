@@ -12,10 +12,10 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from ceres_cal.errors import InputError
-from ceres_cal.files import check_header, convert, parse_json, read_bytes, write_bytes
+from ceres_cal.base.errors import InputError
+from ceres_cal.base.files import check_header, convert, parse_json, read_bytes, write_bytes
 from ceres_cal.observations.columns import TYPES, Curves, Points, Prior, View, listed, place_of
-from ceres_cal.targets import SIDES, Target, target_from_spec
+from ceres_cal.scene.targets import SIDES, Target, target_from_spec
 
 FORMAT, VERSION = "ceres-cal/observations", 1
 _SIDE_NAMES = {value: name for name, value in SIDES.items()}

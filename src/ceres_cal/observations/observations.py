@@ -15,10 +15,10 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from ceres_cal.errors import InputError
+from ceres_cal.base.errors import InputError
 from ceres_cal.observations.columns import Columns, Curves, Points, Prior, View, listed, place_of
 from ceres_cal.observations.files import Content, header_of, read_content, write_content
-from ceres_cal.targets import Target
+from ceres_cal.scene.targets import Target
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,16 +10,16 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from ceres_cal.camera import Camera
-from ceres_cal.closed_forms import homography_from_points, orthogonality_error, polar_pose
-from ceres_cal.errors import DegenerateError, InputError
-from ceres_cal.files import check_header, convert, read_json
-from ceres_cal.lens import Radial
+from ceres_cal.base.errors import DegenerateError, InputError
+from ceres_cal.base.files import check_header, convert, read_json
+from ceres_cal.base.transforms import Array
 from ceres_cal.observations import Prior
 from ceres_cal.photographs.follow import Freedom
 from ceres_cal.photographs.refit import CAMERA, Shown
-from ceres_cal.targets import Target
-from ceres_cal.transforms import Array
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.lens import Radial
+from ceres_cal.scene.targets import Target
+from ceres_cal.start.closed_forms import homography_from_points, orthogonality_error, polar_pose
 
 FORMAT, VERSION = "ceres-cal/corners", 1
 SIGMA_PX = 15.0

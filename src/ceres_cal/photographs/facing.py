@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ceres_cal.camera import Camera
-from ceres_cal.errors import InputError
-from ceres_cal.targets import Arc, Target, along_track, nearest_on_track
-from ceres_cal.transforms import Array, Pose, rotation_exp, rotation_log
+from ceres_cal.base.errors import InputError
+from ceres_cal.base.transforms import Array, Pose, rotation_exp, rotation_log
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.targets import Arc, Target, along_track, nearest_on_track
 
 SIDES = {
     "left": (-1.0, 0.0),

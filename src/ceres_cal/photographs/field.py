@@ -9,18 +9,18 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ceres_cal.camera import Camera
+from ceres_cal.base.errors import InputError, NothingShownError
 from ceres_cal.detect.boards import read_grey
 from ceres_cal.detect.crossings import Crossings, find_crossings
 from ceres_cal.detect.lines import Lines
 from ceres_cal.detect.profiles import Grey
-from ceres_cal.errors import InputError, NothingShownError
 from ceres_cal.observations import Curves, Observations, Points, View, combine
 from ceres_cal.photographs.clicks import Clicks, starts_from_clicks
 from ceres_cal.photographs.follow import Followed, Freedom, follow
 from ceres_cal.photographs.judgement import why_missed
 from ceres_cal.photographs.search import Auto, Searched, search
-from ceres_cal.targets import Target
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.targets import Target
 
 TARGET_NAME = "field"
 

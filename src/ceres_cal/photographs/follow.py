@@ -7,18 +7,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ceres_cal.calibrate import calibrate
-from ceres_cal.camera import Camera
+from ceres_cal.base.errors import CalibrationError
+from ceres_cal.base.transforms import Array
+from ceres_cal.calibrating import calibrate
 from ceres_cal.detect.courses import clear_px, predict
 from ceres_cal.detect.lines import SPACING_PX, Lines, measure, search, window_px
 from ceres_cal.detect.profiles import Grey
 from ceres_cal.detect.registration import nearness, shifted
-from ceres_cal.errors import CalibrationError
+from ceres_cal.model.parameters import Options
 from ceres_cal.observations import Prior
-from ceres_cal.parameters import Options
 from ceres_cal.photographs.refit import Shown, observations_of, refit_camera
-from ceres_cal.targets import Target
-from ceres_cal.transforms import Array
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.targets import Target
 
 FAR_PX = 130.0  # how far off the start may be
 LEAST_SHARE = 0.5  # of the places in view where paint must be found

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ceres_cal.errors import InputError
+from ceres_cal.base.errors import InputError
+from ceres_cal.base.transforms import Array
 from ceres_cal.photographs.facing import turns_of
-from ceres_cal.targets import Arc, Segment, Target, along_track
-from ceres_cal.transforms import Array
+from ceres_cal.scene.targets import Arc, Segment, Target, along_track
 
 _AXIS = 1e-6  # sine of the angle to the main direction of a line that is parallel to it
 _DIGITS = 6  # of metres, after which two offsets are one

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from ceres_cal.camera import Camera
+from ceres_cal.base.transforms import Array
 from ceres_cal.detect.courses import predict
-from ceres_cal.initialise import PHI_RANGE
 from ceres_cal.photographs.candidates import Seen
 from ceres_cal.photographs.follow import LEAST_SHARE, Followed
-from ceres_cal.targets import Target
-from ceres_cal.transforms import Array
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.targets import Target
+from ceres_cal.start.initialise import PHI_RANGE
 
 _COURSE_PX = 3.0
 _NEAR_PX = 6.0  # of the target: a stroke that lies on it

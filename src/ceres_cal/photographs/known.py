@@ -6,15 +6,15 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from ceres_cal.base.errors import InputError, NothingShownError
 from ceres_cal.calibration import Calibration
-from ceres_cal.camera import Camera
 from ceres_cal.detect.boards import detect_boards
-from ceres_cal.errors import InputError, NothingShownError
 from ceres_cal.moves import FALSE_ALARMS, Check, StationCheck, check
 from ceres_cal.observations import Observations, combine
 from ceres_cal.photographs.field import detect_field
 from ceres_cal.photographs.follow import FAR_PX
-from ceres_cal.targets import Target
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.targets import Target
 
 Progress = Callable[[int, int, str], None]
 

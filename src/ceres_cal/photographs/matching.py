@@ -13,11 +13,11 @@ from math import gcd
 
 import numpy as np
 
+from ceres_cal.base.transforms import Array
 from ceres_cal.detect.registration import Nearness
 from ceres_cal.detect.strokes import Strokes
 from ceres_cal.photographs.grid import Grid, Places, places_along
 from ceres_cal.photographs.upright import Upright
-from ceres_cal.transforms import Array
 
 _PEAK = 0.012  # of lines on the floor, in camera heights
 _MOST_PEAKS, _LEAST_PEAK = 9, 0.015  # of lines in one direction; of all strokes, in one line

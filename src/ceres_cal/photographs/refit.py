@@ -7,15 +7,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ceres_cal.bundle import Weighting, solve
-from ceres_cal.camera import Camera
-from ceres_cal.errors import CalibrationError
+from ceres_cal.base.errors import CalibrationError
+from ceres_cal.base.transforms import Array
+from ceres_cal.model.parameters import Estimate, Layout, Options, Station, intrinsic_names
+from ceres_cal.model.structure import make_structure
 from ceres_cal.observations import Curves, Observations, Points, Prior, View
-from ceres_cal.parameters import Estimate, Layout, Options, Station, intrinsic_names
-from ceres_cal.sights import gather_sights
-from ceres_cal.structure import make_structure
-from ceres_cal.targets import Target
-from ceres_cal.transforms import Array
+from ceres_cal.observations.sights import gather_sights
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.targets import Target
+from ceres_cal.solve import Weighting, solve
 
 CAMERA, STATION, TARGET = "camera", "station", "field"
 _QUICK = Options(max_iterations=30, threads=1)

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ceres_cal.camera import Camera
+from ceres_cal.base.errors import InputError
 from ceres_cal.detect.profiles import Grey
-from ceres_cal.errors import InputError
 from ceres_cal.photographs.candidates import Seen, alike, candidates, see
 from ceres_cal.photographs.clicks import SIGMA_PX, unknown_optics
 from ceres_cal.photographs.facing import (
@@ -23,7 +22,8 @@ from ceres_cal.photographs.facing import (
 from ceres_cal.photographs.follow import Followed, follow
 from ceres_cal.photographs.judgement import doubt, explained, same_labels, told, worth
 from ceres_cal.photographs.refit import Shown
-from ceres_cal.targets import Target
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.targets import Target
 
 _SURE = 0.9  # of the strokes explained, by the first that is not doubted: no other is followed
 _AS_GOOD = 0.92  # of the best one's worth

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import cv2
 
+from ceres_cal.base.errors import InputError
 from ceres_cal.detect.boards import read_colour
-from ceres_cal.errors import InputError
 from ceres_cal.pictures.overlay import in_8_bit_colour
 from ceres_cal.pictures.warp import Image
 

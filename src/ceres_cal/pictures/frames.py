@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ceres_cal.base.errors import InputError
 from ceres_cal.calibration import Calibration
-from ceres_cal.errors import InputError
 from ceres_cal.observations import Observations
 from ceres_cal.pictures.model import Model, model_seen
 from ceres_cal.pictures.overlay import TAKEN_OUT, USED, Marks
-from ceres_cal.targets import MOVABLE
+from ceres_cal.scene.targets import MOVABLE
 
 Shown = tuple[tuple[str, str | None], ...]
 """Target and placement of each thing that a frame shows."""

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ceres_cal.camera import Camera
-from ceres_cal.parameters import Estimate
-from ceres_cal.structure import Built
-from ceres_cal.targets import Target, along_track
-from ceres_cal.transforms import Array, Pose
+from ceres_cal.base.transforms import Array, Pose
+from ceres_cal.model.parameters import Estimate
+from ceres_cal.model.structure import Built
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.targets import Target, along_track
 
 _STEPS = 240  # along a curve
 _BETWEEN = 12  # steps from one corner of a board to the next

@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ceres_cal.base.transforms import Array
 from ceres_cal.pictures.model import Line, Model
 from ceres_cal.pictures.warp import Image
-from ceres_cal.transforms import Array
 
 Colour = tuple[int, int, int]
 """Blue, green, red."""

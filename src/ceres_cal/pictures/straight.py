@@ -11,11 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ceres_cal.camera import Camera
-from ceres_cal.errors import InputError
-from ceres_cal.lens import Brown
+from ceres_cal.base.errors import InputError
+from ceres_cal.base.transforms import Array, Pose
 from ceres_cal.pictures.warp import Warp, make_warp, require_size
-from ceres_cal.transforms import Array, Pose
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.lens import Brown
 
 WIDEST_DEG = 150.0
 MOST_STRETCH = 4.0

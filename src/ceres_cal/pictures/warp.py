@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ceres_cal.errors import InputError
-from ceres_cal.transforms import Array
+from ceres_cal.base.errors import InputError
+from ceres_cal.base.transforms import Array
 
 Image = NDArray[Any]
 Plane = NDArray[np.float32]

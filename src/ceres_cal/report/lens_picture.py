@@ -6,13 +6,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ceres_cal.camera import Camera
+from ceres_cal.base.transforms import Array
 from ceres_cal.report import canvas
 from ceres_cal.report.canvas import POINT, QUIET, Drawing
 from ceres_cal.report.material import Material
 from ceres_cal.report.page import Picture, Table
 from ceres_cal.report.words import powered
-from ceres_cal.transforms import Array
+from ceres_cal.scene.camera import Camera
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ceres_cal.base.transforms import Array
 from ceres_cal.report import canvas
 from ceres_cal.report.canvas import INK, OUTLIER, QUIET, RAMP, Drawing
 from ceres_cal.report.material import Material
 from ceres_cal.report.page import Picture, Table
 from ceres_cal.report.words import metres, mm, short
-from ceres_cal.transforms import Array
 from ceres_cal.uncertainty import FieldMap
 
 if TYPE_CHECKING:

@@ -6,12 +6,12 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from ceres_cal.camera import Camera
-from ceres_cal.parameters import anchored_stations
+from ceres_cal.base.transforms import euler_from_rotation
+from ceres_cal.model.parameters import anchored_stations
 from ceres_cal.report.material import Material, Seam
 from ceres_cal.report.page import Chapter, Piece, Points, Table, Text
 from ceres_cal.report.words import DASH, at_precision, bounds, fixed, grouped, mm, powered, short
-from ceres_cal.transforms import euler_from_rotation
+from ceres_cal.scene.camera import Camera
 from ceres_cal.uncertainty import Verdict
 
 _HEAD = ("", "value", "± sd", "95 % bounds", "verdict")

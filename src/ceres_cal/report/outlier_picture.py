@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ceres_cal.base.transforms import Array
+from ceres_cal.observations.sights import Rows
 from ceres_cal.report.canvas import INK, OUTLIER, QUIET, Drawing
 from ceres_cal.report.material import Material
 from ceres_cal.report.page import Picture, Table
 from ceres_cal.report.words import fixed, grouped, short
-from ceres_cal.sights import Rows
-from ceres_cal.transforms import Array
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
+from ceres_cal.base.files import write_bytes
 from ceres_cal.calibration import Calibration
 from ceres_cal.diagnostics import Choice, Diagnosis, diagnose
-from ceres_cal.files import write_bytes
 from ceres_cal.observations import Observations
 from ceres_cal.report.findings import findings
 from ceres_cal.report.in_photographs import Album, in_photographs

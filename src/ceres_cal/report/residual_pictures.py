@@ -7,15 +7,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ceres_cal.camera import Camera
+from ceres_cal.base.transforms import Array
 from ceres_cal.diagnostics import ResidualTable, Summary
+from ceres_cal.observations.sights import Rows
 from ceres_cal.report import canvas
 from ceres_cal.report.canvas import CURVE, INK, OUTLIER, PAINT, POINT, QUIET, Drawing
 from ceres_cal.report.material import Material
 from ceres_cal.report.page import Picture, Table
 from ceres_cal.report.words import fixed, grouped, short, signed
-from ceres_cal.sights import Rows
-from ceres_cal.transforms import Array
+from ceres_cal.scene.camera import Camera
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

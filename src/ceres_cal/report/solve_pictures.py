@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ceres_cal.base.transforms import Array
 from ceres_cal.calibration import Calibration
-from ceres_cal.quantities import Key
+from ceres_cal.model.quantities import Key
 from ceres_cal.report import canvas
 from ceres_cal.report.canvas import DIVERGING, OUTLIER, PAINT, POINT, Drawing
 from ceres_cal.report.material import ClosedForm, Material
 from ceres_cal.report.page import Picture, Table
 from ceres_cal.report.words import count, fixed, short, signed
-from ceres_cal.transforms import Array
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

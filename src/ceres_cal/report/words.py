@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ceres_cal.digits import two_digits
+from ceres_cal.base.digits import two_digits
 from ceres_cal.uncertainty import Verdict
 
 DASH = "\N{EN DASH}"

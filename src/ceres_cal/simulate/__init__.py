@@ -3,7 +3,7 @@
 What draws (`photograph`, `album`) needs OpenCV and is imported where it is used, by its own name.
 """
 
-from ceres_cal.parameters import Station
+from ceres_cal.model.parameters import Station
 from ceres_cal.simulate.built_in import built_in_scene, scene_names
 from ceres_cal.simulate.compose import (
     board_placements,

@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ceres_cal.errors import InputError
-from ceres_cal.files import write_bytes
+from ceres_cal.base.errors import InputError
+from ceres_cal.base.files import write_bytes
 from ceres_cal.observations import taken
 from ceres_cal.simulate.files import make_folder, write_simulation
 from ceres_cal.simulate.photograph import Photograph, frames, photograph

@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
-from ceres_cal.camera import Camera
-from ceres_cal.errors import InputError
-from ceres_cal.lens import KannalaBrandt, Radial
-from ceres_cal.parameters import Station
+from ceres_cal.base.errors import InputError
+from ceres_cal.base.transforms import Pose
+from ceres_cal.model.parameters import Station
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.lens import KannalaBrandt, Radial
+from ceres_cal.scene.targets import Target, checkerboard, custom, rings, ssl_field
 from ceres_cal.simulate.compose import board_scene, field_scene, join, overhead_pose, rings_scene
 from ceres_cal.simulate.photography import Photography
 from ceres_cal.simulate.scene import Disturbance, Scene
-from ceres_cal.targets import Target, checkerboard, custom, rings, ssl_field
-from ceres_cal.transforms import Pose
 
 _WORKDAY = Disturbance(
     points_sigma_px=0.5,

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ceres_cal.camera import Camera
-from ceres_cal.errors import InputError
-from ceres_cal.parameters import Station
+from ceres_cal.base.errors import InputError
+from ceres_cal.base.transforms import Array, Pose, rotation_exp
+from ceres_cal.model.parameters import Station
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.targets import Target
 from ceres_cal.simulate.scene import Scene, ViewPlan
-from ceres_cal.targets import Target
-from ceres_cal.transforms import Array, Pose, rotation_exp
 
 _MARGIN_PX = 5.0  # a board stays this far inside the image, so that noise moves no corner out
 _TRIES = 5_000

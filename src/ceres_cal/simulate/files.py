@@ -12,16 +12,16 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ceres_cal.camera import Camera
-from ceres_cal.errors import InputError
-from ceres_cal.files import check_header, convert, read_json, write_json
-from ceres_cal.lens import Radial, make_lens
-from ceres_cal.parameters import Station
+from ceres_cal.base.errors import InputError
+from ceres_cal.base.files import check_header, convert, read_json, write_json
+from ceres_cal.base.transforms import Array, Pose, euler_from_rotation, rotation_exp, rotation_from_euler, rotation_log
+from ceres_cal.model.parameters import Station
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.lens import Radial, make_lens
+from ceres_cal.scene.targets import target_from_spec
 from ceres_cal.simulate.photography import Photography
 from ceres_cal.simulate.scene import Disturbance, Scene, ViewPlan
 from ceres_cal.simulate.simulation import OUTLIER, WRONG_LABEL, Simulation, Truth
-from ceres_cal.targets import target_from_spec
-from ceres_cal.transforms import Array, Pose, euler_from_rotation, rotation_exp, rotation_from_euler, rotation_log
 
 SCENE_FORMAT, SCENE_VERSION = "ceres-cal/scene", 1
 TRUTH_FORMAT, TRUTH_VERSION = "ceres-cal/truth", 1

@@ -9,13 +9,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ceres_cal.camera import Camera
+from ceres_cal.base.transforms import Array
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.targets import Target, along_track
 from ceres_cal.simulate import render
 from ceres_cal.simulate.photography import Photography
 from ceres_cal.simulate.scene import Scene
 from ceres_cal.simulate.things import Ball, Robot, Shadow, Thing, outline, patches, shadow_outline
-from ceres_cal.targets import Target, along_track
-from ceres_cal.transforms import Array
 
 Image = NDArray[np.uint8]
 Plane = NDArray[np.float32]

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ceres_cal.errors import InputError
+from ceres_cal.base.errors import InputError
 
 MOST_THINGS = 100
 

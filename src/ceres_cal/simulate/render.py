@@ -14,9 +14,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ceres_cal.camera import Camera
-from ceres_cal.targets import Arc, Curve, Segment, Target, along_track
-from ceres_cal.transforms import Array
+from ceres_cal.base.transforms import Array
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.targets import Arc, Curve, Segment, Target, along_track
 
 Canvas = NDArray[np.float32]
 """(height, width) times SUBPIXELS: the share of each small square that is paint, or the brightness of paper there."""

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ceres_cal.camera import Camera
-from ceres_cal.errors import InputError
-from ceres_cal.parameters import Station
+from ceres_cal.base.errors import InputError
+from ceres_cal.base.transforms import Pose
+from ceres_cal.model.parameters import Station
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.targets import SIDES, Target
 from ceres_cal.simulate.photography import Photography
-from ceres_cal.targets import SIDES, Target
-from ceres_cal.transforms import Pose
 
 
 @dataclass(frozen=True)

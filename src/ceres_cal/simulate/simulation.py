@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ceres_cal.camera import Camera
+from ceres_cal.base.transforms import Array
 from ceres_cal.observations import Curves, Observations, Points, View
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.targets import SIDES, Arc, Target, along_track, nearest_on_track
 from ceres_cal.simulate.scene import Disturbance, Scene, ViewPlan
-from ceres_cal.targets import SIDES, Arc, Target, along_track, nearest_on_track
-from ceres_cal.transforms import Array
 
 CLEAN, OUTLIER, WRONG_LABEL = 0, 1, 2
 

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ceres_cal.camera import Camera
-from ceres_cal.transforms import Array
+from ceres_cal.base.transforms import Array
+from ceres_cal.scene.camera import Camera
 
 Colour = tuple[float, float, float]
 """Blue, green and red, as shares of white."""

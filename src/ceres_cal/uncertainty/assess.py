@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from ceres_cal.camera import Camera
-from ceres_cal.initialise import PHI_RANGE, USUAL_PHI
-from ceres_cal.parameters import Estimate, unit_px
+from ceres_cal.model.parameters import Estimate, unit_px
+from ceres_cal.scene.camera import Camera
+from ceres_cal.start.initialise import PHI_RANGE, USUAL_PHI
 from ceres_cal.uncertainty.posterior import Posterior, make_posterior, student_95
 from ceres_cal.uncertainty.profile import Node, Setting, profile, valley
 

@@ -9,11 +9,11 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from ceres_cal.bundle import Eliminated, Information
-from ceres_cal.errors import InputError
-from ceres_cal.quantities import Key, pose_keys, sigma_limits
-from ceres_cal.spread import Spread, without
-from ceres_cal.transforms import Array
+from ceres_cal.base.errors import InputError
+from ceres_cal.base.spread import Spread, without
+from ceres_cal.base.transforms import Array
+from ceres_cal.model.quantities import Key, pose_keys, sigma_limits
+from ceres_cal.solve import Eliminated, Information
 from ceres_cal.uncertainty.profile import Profile
 
 _NORMAL_95 = 1.959963984540054  # half width of the 95 % interval of a standard normal

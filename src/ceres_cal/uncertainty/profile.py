@@ -14,14 +14,14 @@ from itertools import pairwise
 
 import numpy as np
 
-from ceres_cal.bundle import Information, Weighting, information, solve
-from ceres_cal.errors import CalibrationError, SolutionError
-from ceres_cal.initialise import PHI_RANGE
-from ceres_cal.parameters import Estimate, Layout, Options, unit_px
-from ceres_cal.quantities import Key, difference, moved, sigma_limits
-from ceres_cal.sights import Sights
-from ceres_cal.spread import known_inverses, without
-from ceres_cal.transforms import Array
+from ceres_cal.base.errors import CalibrationError, SolutionError
+from ceres_cal.base.spread import known_inverses, without
+from ceres_cal.base.transforms import Array
+from ceres_cal.model.parameters import Estimate, Layout, Options, unit_px
+from ceres_cal.model.quantities import Key, difference, moved, sigma_limits
+from ceres_cal.observations.sights import Sights
+from ceres_cal.solve import Information, Weighting, information, solve
+from ceres_cal.start.initialise import PHI_RANGE
 
 _FAR = 9.0  # rise of twice the cost at which the valley is followed no further: three sigma
 _STEPS = (0.02, 0.35)  # of log phi

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ceres_cal.digits import two_digits
-from ceres_cal.parameters import Estimate, intrinsic_names, intrinsics_scales, intrinsics_vector
-from ceres_cal.quantities import PLACEMENT_QUANTITIES, Key, natural_sizes
-from ceres_cal.transforms import Array
+from ceres_cal.base.digits import two_digits
+from ceres_cal.base.transforms import Array
+from ceres_cal.model.parameters import Estimate, intrinsic_names, intrinsics_scales, intrinsics_vector
+from ceres_cal.model.quantities import PLACEMENT_QUANTITIES, Key, natural_sizes
 from ceres_cal.uncertainty.posterior import Posterior
 
 KNOWN, WEAK = 0.01, 0.3

@@ -1,0 +1,134 @@
+"""Covariances where some directions may be unknown: what an information matrix says, and what it does not.
+
+A covariance does not exist where nothing is known. Here the finite part and the unknown directions are kept apart, so
+that a number which does not depend on an unknown direction keeps its honest, finite sigma and one which does gets
+infinity: never 0, never a large number that is rounding alone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ceres_cal.base.transforms import Array
+
+NOTHING = 2e-14
+"""Eigenvalue of an information matrix with unit diagonal below which a direction counts as unknown: rounding reaches
+1e-15 for each ten numbers, and a sigma millions of times larger than what each number would have alone is infinite."""
+_REGULAR = 1e6  # the inverse of such an eigenvalue; plain inverses are good to 1e-9 there
+_RESIDUE = 1e-11  # what a Schur complement leaves of a direction that is not told, relative to what went in
+
+
+def _nothing(count: int) -> float:
+    return NOTHING * max(1.0, count / 10.0)
+
+
+def _scaled(information: Array, limits: Array) -> tuple[Array, Array]:
+    """Scale (..., n) that makes the diagonal one, and the information (..., n, n) in it."""
+    diagonal = np.diagonal(information, axis1=-2, axis2=-1)
+    told = diagonal > limits**-2.0
+    scale = np.where(told, 1.0 / np.sqrt(np.where(told, diagonal, 1.0)), 1.0)
+    # What is not told at all has rounding on its diagonal, which must not be scaled up.
+    information = np.where(told[..., :, None] & told[..., None, :], information, 0.0)
+    return scale, information * scale[..., :, None] * scale[..., None, :]
+
+
+def known_inverses(information: Array, limits: Array) -> Array:
+    """Inverses (..., n, n) of information matrices over what they tell; unknown directions are left out.
+
+    Args:
+        limits: (n,) see `Spread.of`.
+    """
+    scale, scaled = _scaled(information, limits)
+    inverse = _regular_inverses(scaled)
+    if inverse is not None:
+        return np.asarray(inverse * scale[..., :, None] * scale[..., None, :])
+    values, vectors = np.linalg.eigh(scaled)
+    told = values > _nothing(values.shape[-1])
+    kept = np.where(told, 1.0 / np.where(told, values, 1.0), 0.0)
+    half = vectors * np.sqrt(kept)[..., None, :] * scale[..., :, None]
+    return np.asarray(half @ np.swapaxes(half, -1, -2))
+
+
+def _regular_inverses(scaled: Array) -> Array | None:
+    """Their plain inverses, ten times as fast, where no direction of any of them comes near to being unknown."""
+    try:
+        inverse = np.linalg.inv(scaled)
+    except np.linalg.LinAlgError:
+        return None
+    sizes = np.trace(inverse, axis1=-2, axis2=-1)  # not less than one by the least eigenvalue
+    regular = np.all((sizes > 0.0) & (sizes < _REGULAR))
+    return np.asarray(0.5 * (inverse + np.swapaxes(inverse, -1, -2))) if regular else None
+
+
+def without(here: Array, coupling: Array, others: Array, limits: Array) -> Array:
+    """(n, n) information about some numbers, the others integrated out: the Schur complement of the whole.
+
+    Args:
+        here: (n, n). coupling: (m, n). others: (m, m), their limits (m,) see `Spread.of`.
+    """
+    left = here - coupling.T @ known_inverses(others, limits) @ coupling
+    diagonal = np.diagonal(here)
+    scale = np.where(diagonal > 0.0, 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0)), 1.0)
+    values, vectors = np.linalg.eigh(0.5 * (left + left.T) * scale[:, None] * scale)
+    root = vectors * np.sqrt(np.where(values > _RESIDUE, values, 0.0)) / scale[:, None]  # the rest is rounding
+    return np.asarray(root @ root.T)
+
+
+@dataclass(frozen=True, eq=False)
+class Spread:
+    """What is known of n numbers.
+
+    Attributes:
+        covariance: (n, n) finite; of the numbers with their unknown directions held.
+        unknown: (n, k) directions about which nothing is known, in units of `scale`.
+        scale: (n,) sigma of each number if all the others were known.
+    """
+
+    covariance: Array
+    unknown: Array
+    scale: Array
+
+    @classmethod
+    def of(cls, information: Array, limits: Array) -> Spread:
+        """Of an information matrix (n, n), symmetric, not necessarily of full rank.
+
+        Args:
+            limits: (n,) a number whose sigma would be larger even if all others were known is not known at all.
+        """
+        scale, scaled = _scaled(np.asarray(information, dtype=float), limits)
+        values, vectors = np.linalg.eigh(scaled)
+        lost = values <= _nothing(len(values))
+        half = vectors[:, ~lost] / np.sqrt(values[~lost]) * scale[:, None]
+        return cls(half @ half.T, vectors[:, lost] * scale[:, None], scale)
+
+    def depends(self, jacobian: Array) -> Array:
+        """(..., m) whether functions with derivatives (..., m, n) depend on an unknown direction."""
+        if not self.unknown.shape[1]:
+            return np.zeros(jacobian.shape[:-1], dtype=bool)
+        size = np.linalg.norm(jacobian * self.scale, axis=-1)
+        # What leaks through below the root adds no more than the sigma that the function has with all else known.
+        return np.asarray(np.linalg.norm(jacobian @ self.unknown, axis=-1) > np.sqrt(_nothing(len(self.scale))) * size)
+
+    def through(self, jacobian: Array) -> Array:
+        """Covariances (..., m, m) of functions with derivatives (..., m, n); infinite variance where they depend on an
+        unknown direction, NaN as their covariance with others.
+        """
+        found = jacobian @ self.covariance @ np.swapaxes(jacobian, -1, -2)
+        lost = self.depends(jacobian)
+        if np.any(lost):
+            found = np.where(np.logical_or(lost[..., :, None], lost[..., None, :]), np.nan, found)
+            places = np.arange(found.shape[-1])
+            found[..., places, places] = np.where(lost, np.inf, found[..., places, places])
+        return np.asarray(found)
+
+    @property
+    def matrix(self) -> Array:
+        """(n, n) covariance of the numbers themselves, with infinity and NaN as `through` gives them."""
+        return self.through(np.eye(len(self.scale)))
+
+    @property
+    def sd(self) -> Array:
+        """(n,) standard deviations, infinite where a number depends on an unknown direction."""
+        return np.asarray(np.sqrt(np.diagonal(self.matrix)))

@@ -1,0 +1,251 @@
+"""Which numbers are free, fixed, shared or under a prior: the one owner of the solver's layout.
+
+The solver sees one block per camera with its free intrinsics (in the order of `intrinsic_names`, coefficients scaled to
+be of order one) and one 6-vector (rotation vector, translation) per free station and per placement.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ceres_cal.base.errors import InputError
+from ceres_cal.base.transforms import Array, Pose, Poses, chained, inverted
+from ceres_cal.model.joint import JointPrior
+from ceres_cal.model.structure import Structure, Tolerance
+from ceres_cal.observations import Observations, Prior
+from ceres_cal.observations.sights import SightKey
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.lens import LENS_KINDS, Lens, make_lens
+
+LOSSES = ("trivial", "huber", "soft_l1", "cauchy", "tukey")
+
+
+@dataclass(frozen=True)
+class Options:
+    """What to solve for and how.
+
+    Attributes:
+        lens: "radial", "brown" or "kannala-brandt"; powers: those of the radial lens.
+        free_principal_point: else it is held at the image centre, or where `fixed` says.
+        free_aspect: whether fy / fx is free; else 1, or what `fixed` says.
+        fixed: numbers held, by name: phi, aspect, cx, cy (px) and the lens's coefficients in the units of the files.
+            They hold for every camera.
+        priors: what is known beforehand, besides the observations' own.
+        tolerances: target -> how far it may have been built from its drawing; none of it where a target is not named.
+        loss: robust loss of each observation: one of LOSSES. loss_scale: where it starts to bend, in standard
+            deviations.
+        reject_sigma: observations farther off than this many standard deviations are taken out and listed.
+        noise_scale: "estimate" the factor on the stated sigmas of points and curves from the residuals, or "stated".
+        closed_form_only: stop at the paper's own method (radial fit, four points, max-norm lambda): a baseline to
+            compare with, not a calibration.
+        max_iterations: of each solve. threads: of the solver; 0 chooses.
+    """
+
+    lens: str = "radial"
+    powers: tuple[int, ...] = (2, 3)
+    free_principal_point: bool = True
+    free_aspect: bool = False
+    fixed: Mapping[str, float] = field(default_factory=dict)
+    priors: tuple[Prior, ...] = ()
+    tolerances: Mapping[str, Tolerance] = field(default_factory=dict)
+    loss: str = "huber"
+    loss_scale: float = 2.5
+    reject_sigma: float = 5.0
+    noise_scale: str = "estimate"
+    closed_form_only: bool = False
+    max_iterations: int = 100
+    threads: int = 0
+
+    def __post_init__(self) -> None:
+        if self.lens not in LENS_KINDS:
+            raise InputError(f"unknown lens {self.lens!r}: choose one of {', '.join(LENS_KINDS)}")
+        if self.loss not in LOSSES:
+            raise InputError(f"unknown loss {self.loss!r}: choose one of {', '.join(LOSSES)}")
+        if self.noise_scale not in ("estimate", "stated"):
+            raise InputError(f"noise_scale must be 'estimate' or 'stated', not {self.noise_scale!r}")
+        names = intrinsic_names(self.blank_lens)
+        for name, value in self.fixed.items():
+            if name not in names:
+                raise InputError(f"cannot fix {name!r}: the {self.lens} lens has {', '.join(names)}")
+            if not np.isfinite(value):
+                raise InputError(f"cannot fix {name} at {value}: give a finite number")
+        for name in ("loss_scale", "reject_sigma", "max_iterations"):
+            if not getattr(self, name) > 0:
+                raise InputError(f"{name} must be above 0, not {getattr(self, name)}")
+        if self.threads < 0:
+            raise InputError(f"threads must be 0 (to choose) or above, not {self.threads}")
+
+    @cached_property
+    def blank_lens(self) -> Lens:
+        """The chosen lens with its fixed coefficients; the others are 0."""
+        names = make_lens(self.lens, self.powers).names
+        return make_lens(self.lens, self.powers, {k: v for k, v in self.fixed.items() if k in names})
+
+
+def intrinsic_names(lens: Lens) -> tuple[str, ...]:
+    """Names of a camera's intrinsics in the order of the solver's vector."""
+    return ("phi", "aspect", "cx", "cy", *lens.names)
+
+
+def unit_px(camera: Camera) -> float:
+    """Half the image diagonal: the unit of radius in which the solver's coefficients are of order one."""
+    return 0.5 * float(np.hypot(*camera.image_size))
+
+
+def intrinsics_vector(camera: Camera) -> Array:
+    """The solver's numbers of a camera, (4 + coefficients,)."""
+    scaled = np.asarray(camera.lens.values) * camera.lens.scales(unit_px(camera))
+    return np.array([camera.phi, camera.aspect, *camera.principal_point, *scaled])
+
+
+def intrinsics_scales(camera: Camera) -> Array:
+    """What a camera's numbers in the files' units are multiplied with to become the solver's."""
+    return np.concatenate([np.ones(4), camera.lens.scales(unit_px(camera))])
+
+
+def with_intrinsics(camera: Camera, vector: Array) -> Camera:
+    """The camera with the solver's numbers put in."""
+    phi, aspect, cx, cy = (float(v) for v in vector[:4])
+    lens = camera.lens.with_values(vector[4:] / camera.lens.scales(unit_px(camera)))
+    return replace(camera, phi=phi, aspect=aspect, principal_point=(cx, cy), lens=lens)
+
+
+@dataclass(frozen=True)
+class Station:
+    """One fixed pose of a camera over the field."""
+
+    camera: str
+    cam_from_world: Pose
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A value for everything the solve is about: cameras (at no particular pose), stations, placements, by name."""
+
+    cameras: Mapping[str, Camera]
+    stations: Mapping[str, Station]
+    placements: Mapping[str, Pose]
+    """world_from_target of each placement."""
+    structure: Structure
+    """The targets as built."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "placements", Poses.of(self.placements))  # which costs nothing from then on
+
+    def camera_at(self, station: str, placement: str | None = None) -> Camera:
+        """The station's camera in the world, or in the frame of a placement (its cam_from_world is cam_from_target)."""
+        pose = self.stations[station].cam_from_world
+        if placement is not None:
+            pose = pose @ self.placements[placement]
+        return self.cameras[self.stations[station].camera].at(pose)
+
+    def pose_stack(self, keys: Sequence[SightKey]) -> Array:
+        """cam_from_frame of each sight as [R t], (S, 3, 4)."""
+        return chained(self._station_stack(keys), Poses.of(self.placements).of_names([key.placement for key in keys]))
+
+    def with_placements(self, keys: Sequence[SightKey], cam_from_target: Array) -> Estimate:
+        """The estimate with the placement of each key where its station sees it, cam_from_target (S, 3, 4)."""
+        names = [key.placement for key in keys if key.placement is not None]
+        moved = chained(inverted(self._station_stack(keys)), cam_from_target)
+        return replace(self, placements=Poses.of(self.placements).updated(names, moved))
+
+    def _station_stack(self, keys: Sequence[SightKey]) -> Array:
+        """cam_from_world of each sight, (S, 3, 4); (3, 4) where one station has them all."""
+        names = [key.station for key in keys]
+        poses = {name: self.stations[name].cam_from_world for name in dict.fromkeys(names)}
+        if len(poses) == 1:
+            return poses[names[0]].matrix
+        return Poses.of(poses).of_names(names)
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Which numbers the solver may move.
+
+    Attributes:
+        free: camera -> indices into its intrinsics vector.
+        stations, placements: names of the poses that are free.
+        priors: on free numbers. joint: what an earlier calibration knew of many numbers together.
+    """
+
+    free: Mapping[str, NDArray[np.int64]]
+    stations: frozenset[str]
+    placements: frozenset[str]
+    priors: tuple[Prior, ...] = ()
+    joint: JointPrior | None = None
+
+    @property
+    def size(self) -> int:
+        """Number of free numbers."""
+        return sum(len(f) for f in self.free.values()) + 6 * (len(self.stations) + len(self.placements))
+
+    @property
+    def unknowns(self) -> int:
+        """Number of free numbers that use up observations: what is known beforehand does not."""
+        return self.size if self.joint is None else max(self.size - self.joint.rank, 0)
+
+    def of(self, keys: Iterable[SightKey]) -> Layout:
+        """The layout of a problem with these sights alone: no placement that they do not show is free."""
+        return replace(self, placements=self.placements & {key.placement for key in keys})
+
+
+def make_layout(observations: Observations, options: Options) -> Layout:
+    """The layout of a calibration: everything free but what the options fix and what nothing can tell.
+
+    Raises:
+        InputError: a prior names a camera, a station or a quantity that is not there.
+    """
+    names = intrinsic_names(options.blank_lens)
+    held = set(options.fixed)
+    if not options.free_principal_point:
+        held |= {"cx", "cy"}
+    if not options.free_aspect:
+        held |= {"aspect"}
+    free = np.array([i for i, name in enumerate(names) if name not in held], dtype=np.int64)
+    priors = (*observations.priors, *options.priors)
+    for prior in priors:
+        observations.require_owner(prior)
+        if prior.owner == "camera" and prior.quantity not in (*names, "principal_point"):
+            raise InputError(f"prior on camera {prior.name!r}: it has no {prior.quantity!r}, only {', '.join(names)}")
+    shown = observations.shown_views
+    return Layout(
+        dict.fromkeys(observations.cameras, free),
+        frozenset(view.station for view in shown) - anchored_stations(observations),
+        frozenset(view.placement for view in shown if view.placement is not None),
+        priors,
+    )
+
+
+def anchored_stations(observations: Observations) -> frozenset[str]:
+    """One station of each group that no view ties to the world: its camera frame serves as the world.
+
+    Boards alone tell poses among themselves only; holding one station removes that freedom.
+    """
+    shown = observations.shown_views
+    times = Counter([view.placement for view in shown])
+    group = {view.station: view.station for view in shown}
+    first_seen: dict[str, str] = {}
+    tied: set[str] = set()
+
+    def root(name: str) -> str:
+        while group[name] != name:
+            name = group[name]
+        return name
+
+    for view in shown:
+        if view.placement is None:
+            tied.add(view.station)
+        elif times[view.placement] > 1:
+            group[root(view.station)] = root(first_seen.setdefault(view.placement, view.station))
+    tied_groups = {root(name) for name in tied}
+    anchors: dict[str, str] = {}
+    for name in group:
+        if root(name) not in tied_groups:
+            anchors.setdefault(root(name), name)
+    return frozenset(anchors.values())

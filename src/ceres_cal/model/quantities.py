@@ -1,0 +1,218 @@
+"""The numbers that a calibration is uncertain about, each with an owner, a name and a unit; steps along them.
+
+Intrinsics are in the units of the files. A pose has a position in the world (m) and three turns (rad): of a station
+about the camera's own axes (x right, y down, z forward), of a placement about the target's own. Turns are small angles
+from where the pose is, so no pose is special, not even one turned by half a turn.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from ceres_cal.base.transforms import Array, Pose, rotation_exp, rotation_log, skew
+from ceres_cal.model.parameters import (
+    Estimate,
+    Layout,
+    Station,
+    intrinsic_names,
+    intrinsics_scales,
+    intrinsics_vector,
+    unit_px,
+    with_intrinsics,
+)
+from ceres_cal.scene.camera import Camera
+
+_TURNS = ("turn_x", "turn_y", "turn_z")
+STATION_QUANTITIES = ("x", "y", "height", *_TURNS)
+PLACEMENT_QUANTITIES = ("x", "y", "z", *_TURNS)
+_POSE_UNITS = ("m", "m", "m", "rad", "rad", "rad")
+
+
+class Key(NamedTuple):
+    """One number: whose it is (a "camera", "station", "placement" or "structure" by name), what, and in which unit.
+
+    A camera, a station and a placement may carry the same name. Of a structure number the owner is the target, the
+    quantity the feature ("HalfwayLine", "CenterCircle.radius", "0,0.x", "bow.x").
+    """
+
+    kind: str
+    owner: str
+    quantity: str
+    unit: str
+
+
+_LIMITS = {"rad": 1e2, "m": 1e6, "px": 1e7}
+
+
+def sigma_limits(keys: Sequence[Key]) -> Array:
+    """(P,) sigmas beyond which a number means nothing: turns of many turns, a camera in orbit."""
+    return np.array([_LIMITS.get(key.unit, 1e12) for key in keys])
+
+
+def natural_sizes(estimate: Estimate, keys: Sequence[Key]) -> Array:
+    """(P,) what each number is compared with: an error of a hundredth of it moves a picture by about a hundredth.
+
+    phi and the principal point go with phi, positions with the distance to what is seen, turns with 1 rad, coefficients
+    with the one that moves a pixel half an image diagonal from the middle by as much; structure with its tolerance.
+    """
+    sizes = np.ones(len(keys))
+    for (kind, owner), places in places_of(keys).items():
+        if kind == "camera":
+            camera = estimate.cameras[owner]
+            radius = unit_px(camera) if camera.lens.kind == "radial" else unit_px(camera) / camera.phi
+            powers = {"p1": 2, "p2": 2} | dict(
+                zip([n for n in camera.lens.names if n[0] != "p"], camera.lens.radius_powers, strict=True)
+            )
+            known = {"phi": camera.phi, "cx": camera.phi, "cy": camera.phi, "aspect": 1.0}
+            known |= {name: radius ** (1 - power) for name, power in powers.items()}
+            sizes[places] = [known[keys[place].quantity] for place in places]
+        elif kind == "structure":
+            names = [f"{owner}/{keys[place].quantity}" for place in places]
+            sizes[places] = estimate.structure.sigma_m[[estimate.structure.names.index(name) for name in names]]
+        else:
+            distance = _distance_m(estimate, kind, owner)
+            sizes[places] = [distance if keys[place].unit == "m" else 1.0 for place in places]
+    return sizes
+
+
+def _distance_m(estimate: Estimate, kind: str, owner: str) -> float:
+    """From a station to the floor, or from a placement to the nearest station."""
+    if kind == "station":
+        return max(abs(float(estimate.stations[owner].cam_from_world.position[2])), 1e-3)
+    where = estimate.placements[owner].translation
+    away = [np.linalg.norm(where - station.cam_from_world.position) for station in estimate.stations.values()]
+    return max(float(min(away)), 1e-3)
+
+
+def camera_keys(name: str, camera: Camera, free: Iterable[int]) -> list[Key]:
+    """Keys of the intrinsics with these places in the solver's vector."""
+    powers = camera.lens.radius_powers if camera.lens.kind == "radial" else (1,) * len(camera.lens.names)
+    units = ("px", "1", "px", "px", *("1" if power == 1 else f"px^{1 - power}" for power in powers))
+    names = intrinsic_names(camera.lens)
+    return [Key("camera", name, names[int(i)], units[int(i)]) for i in free]
+
+
+def pose_keys(kind: str, name: str) -> list[Key]:
+    """The six keys of a station or a placement."""
+    quantities = STATION_QUANTITIES if kind == "station" else PLACEMENT_QUANTITIES
+    return [Key(kind, name, q, unit) for q, unit in zip(quantities, _POSE_UNITS, strict=True)]
+
+
+def shared_keys(estimate: Estimate, layout: Layout, private: frozenset[str | None]) -> tuple[Key, ...]:
+    """Keys of everything free but the private placements: cameras, stations, placements, structure."""
+    keys: list[Key] = []
+    for name, camera in estimate.cameras.items():
+        keys += camera_keys(name, camera, layout.free[name])
+    for name in estimate.stations:
+        keys += pose_keys("station", name) if name in layout.stations else []
+    for name in estimate.placements:
+        keys += pose_keys("placement", name) if name in layout.placements and name not in private else []
+    for name in estimate.structure.names:
+        target, _, feature = name.partition("/")
+        keys.append(Key("structure", target, feature, "m"))
+    return tuple(keys)
+
+
+def places_of(keys: Sequence[Key]) -> dict[tuple[str, str], list[int]]:
+    """(kind, owner) -> where its keys are."""
+    places: dict[tuple[str, str], list[int]] = {}
+    for place, key in enumerate(keys):
+        places.setdefault((key.kind, key.owner), []).append(place)
+    return places
+
+
+def from_station(cam_from_frame: Array, cam_from_world: Pose) -> Array:
+    """(S, 6, 6) left perturbation (turn, shift) of each cam_from_frame (S, 3, 4) by a step of the station's six."""
+    chain = np.zeros((len(cam_from_frame), 6, 6))
+    chain[:, :3, 3:] = np.eye(3)
+    chain[:, 3:, :3] = -cam_from_world.rotation
+    chain[:, 3:, 3:] = [-skew(shift) for shift in cam_from_frame[:, :, 3]]
+    return chain
+
+
+def from_placement(cam_from_target: Array, cam_from_world: Pose) -> Array:
+    """(S, 6, 6) left perturbation (turn, shift) of each cam_from_target (S, 3, 4) by a step of its placement's six: an
+    orthogonal matrix.
+    """
+    chain = np.zeros((len(cam_from_target), 6, 6))
+    chain[:, :3, 3:] = cam_from_target[:, :, :3]
+    chain[:, 3:, :3] = cam_from_world.rotation
+    return chain
+
+
+def camera_moved(camera: Camera, quantities: Sequence[str], step: Array) -> Camera:
+    """A camera after a step along some of its intrinsics, in the units of the files.
+
+    Raises:
+        InputError: phi or aspect is no longer above 0.
+    """
+    vector, known = intrinsics_vector(camera), intrinsic_names(camera.lens)
+    at = [known.index(name) for name in quantities]
+    vector[at] += step * intrinsics_scales(camera)[at]
+    return with_intrinsics(camera, vector)
+
+
+def moved(estimate: Estimate, keys: Sequence[Key], step: Array) -> Estimate:
+    """The estimate after a step (P,) along the keys.
+
+    Raises:
+        InputError: the step leads to no camera (phi or aspect below 0).
+    """
+    cameras, stations, placements = dict(estimate.cameras), dict(estimate.stations), dict(estimate.placements)
+    values = estimate.structure.values.copy()
+    for (kind, owner), places in places_of(keys).items():
+        names = [keys[place].quantity for place in places]
+        if kind == "camera":
+            cameras[owner] = camera_moved(cameras[owner], names, step[places])
+        elif kind == "structure":
+            values[[estimate.structure.names.index(f"{owner}/{name}") for name in names]] += step[places]
+        else:
+            change = np.zeros(6)
+            quantities = STATION_QUANTITIES if kind == "station" else PLACEMENT_QUANTITIES
+            change[[quantities.index(name) for name in names]] = step[places]
+            if kind == "station":
+                old = stations[owner].cam_from_world
+                pose = Pose.looking(old.position + change[:3], rotation_exp(change[3:]) @ old.rotation)
+                stations[owner] = Station(stations[owner].camera, pose)
+            else:
+                held = placements[owner]
+                placements[owner] = Pose(held.rotation @ rotation_exp(change[3:]), held.translation + change[:3])
+    return replace(
+        estimate,
+        cameras=cameras,
+        stations=stations,
+        placements=placements,
+        structure=estimate.structure.with_values(values),
+    )
+
+
+def difference(estimate: Estimate, reference: Estimate, keys: Sequence[Key]) -> Array:
+    """The step (P,) along the keys that leads from the reference to the estimate."""
+    found = np.empty(len(keys))
+    for (kind, owner), places in places_of(keys).items():
+        values = _differences(kind, owner, estimate, reference)
+        found[places] = [values[keys[place].quantity] for place in places]
+    return found
+
+
+def _differences(kind: str, owner: str, estimate: Estimate, reference: Estimate) -> dict[str, float]:
+    if kind == "camera":
+        here, there = estimate.cameras[owner], reference.cameras[owner]
+        change = (intrinsics_vector(here) - intrinsics_vector(there)) / intrinsics_scales(there)
+        return dict(zip(intrinsic_names(there.lens), change.tolist(), strict=True))
+    if kind == "structure":
+        change = estimate.structure.values - reference.structure.values
+        names = [name.partition("/")[2] for name in reference.structure.names if name.partition("/")[0] == owner]
+        mine = [name.partition("/")[0] == owner for name in reference.structure.names]
+        return dict(zip(names, change[mine].tolist(), strict=True))
+    if kind == "station":
+        a, b = estimate.stations[owner].cam_from_world, reference.stations[owner].cam_from_world
+        step = np.concatenate([a.position - b.position, rotation_log(a.rotation @ b.rotation.T)])
+        return dict(zip(STATION_QUANTITIES, step.tolist(), strict=True))
+    c, d = estimate.placements[owner], reference.placements[owner]
+    step = np.concatenate([c.translation - d.translation, rotation_log(d.rotation.T @ c.rotation)])
+    return dict(zip(PLACEMENT_QUANTITIES, step.tolist(), strict=True))

@@ -1,0 +1,184 @@
+"""The target as built: how far painted lines, points and boards lie from where they should, as numbers under a sigma.
+
+One vector for everything observed, shared by all frames and cameras: for each segment its offset to the left, for each
+arc its centre's x and y and its radius, for each point its x and y, for each board two bows of a parabolic warp. All
+metres; 0 is the nominal target.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ceres_cal.base.errors import InputError
+from ceres_cal.base.transforms import Array
+from ceres_cal.observations.sights import Sights
+from ceres_cal.scene.targets import Arc, Target
+
+Slots = NDArray[np.int32]
+_NONE = -1
+
+
+@dataclass(frozen=True)
+class Tolerance:
+    """Standard deviations of a target as built; 0 means exactly as drawn.
+
+    Attributes:
+        lines_m: of the offset of each segment, and of each arc's centre and radius.
+        points_m: of each point's x and y.
+        warp_m: of a board's bow along each side, at its middle.
+    """
+
+    lines_m: float = 0.0
+    points_m: float = 0.0
+    warp_m: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not (np.isfinite(value) and value >= 0.0):
+                raise InputError(f"tolerance {name} must be a number of metres from 0 on, not {value}")
+
+
+@dataclass(frozen=True, eq=False)
+class Built:
+    """A target as built: where its points (P, 3) lie, m, and its tracks (3, C, 3, 3) as `Target.tracks` has them."""
+
+    target: Target
+    points: Array
+    tracks: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Structure:
+    """The corrections of all targets.
+
+    Attributes:
+        names: (Q) "target/feature" or "target/feature.x": what each number moves. values, sigma_m: (Q,).
+        point_slots: (P, 4) which numbers move each point of all targets: x, y, first and second bow; -1 for none.
+        bends: (P, 2) how much of each bow a point gets, along +z.
+        track_slots: (T, 3) which numbers move each track: of a segment the offset, of an arc x, y and radius.
+            These three are empty where nothing moves at all.
+    """
+
+    names: tuple[str, ...]
+    values: Array
+    sigma_m: Array
+    point_slots: Slots
+    bends: Array
+    track_slots: Slots
+
+    def with_values(self, values: Array) -> Structure:
+        """The same corrections with other numbers."""
+        return replace(self, values=np.array(values, dtype=float)) if len(self.values) else self
+
+    def points(self, sights: Sights) -> Array:
+        """(N, 3) where the observed points of the sights lie, m."""
+        return self._points(sights.points, sights.feature)
+
+    def tracks(self, sights: Sights) -> Array:
+        """(T, 3, 3) the tracks of all targets as built."""
+        return self._tracks(sights.tracks, sights.is_arc)
+
+    def built(self, targets: Mapping[str, Target]) -> dict[str, Built]:
+        """Every target as built; `targets` are those that the corrections were made for, in that order."""
+        points = np.concatenate([target.point_array for target in targets.values()])
+        tracks = np.concatenate([target.tracks.reshape(-1, 3, 3) for target in targets.values()])
+        is_arc = np.concatenate([np.tile(target.is_arc, 3) for target in targets.values()])
+        points, tracks = self._points(points, np.arange(len(points))), self._tracks(tracks, is_arc)
+        found = {}
+        for name, target in targets.items():
+            own, points = np.split(points, [len(target.points)])
+            curves, tracks = np.split(tracks, [3 * len(target.curves)])
+            found[name] = Built(target, own, curves.reshape(3, -1, 3, 3))
+        return found
+
+    def _points(self, points: Array, feature: NDArray[np.int64]) -> Array:
+        if not len(self.values):
+            return points
+        moved = np.append(self.values, 0.0)[self.point_slots[feature]]  # slot -1 is the 0 at the end
+        bow = np.sum(moved[:, 2:] * self.bends[feature], axis=1)
+        return np.asarray(points + np.column_stack([moved[:, :2], bow]))
+
+    def _tracks(self, given: Array, is_arc: NDArray[np.bool_]) -> Array:
+        if not len(self.values):
+            return given
+        moved = np.append(self.values, 0.0)[self.track_slots]
+        tracks = given.copy()
+        straight = ~is_arc
+        along = tracks[straight, 1, :2]
+        length = np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-300)
+        tracks[straight, 0, :2] += moved[straight, :1] * np.column_stack([-along[:, 1], along[:, 0]]) / length
+        tracks[is_arc, 0, :2] += moved[is_arc, :2]
+        tracks[is_arc, 1, 0] += moved[is_arc, 2]
+        tracks[is_arc, 2, 1] += moved[is_arc, 2]
+        return tracks
+
+
+EXACT = Structure(
+    (),
+    np.empty(0),
+    np.empty(0),
+    np.empty((0, 4), dtype=np.int32),
+    np.empty((0, 2)),
+    np.empty((0, 3), dtype=np.int32),
+)
+"""All targets as drawn."""
+
+
+def make_structure(targets: Mapping[str, Target], tolerances: Mapping[str, Tolerance]) -> Structure:
+    """The corrections that the tolerances free, all 0.
+
+    Raises:
+        InputError: a tolerance names a target that is not there, or a warp of a target that is no checkerboard.
+    """
+    for name in tolerances:
+        if name not in targets:
+            raise InputError(f"a tolerance names target {name!r}: there are {', '.join(map(repr, targets))}")
+    if all(tolerance == Tolerance() for tolerance in tolerances.values()):
+        return EXACT
+    names: list[str] = []
+    sigmas: list[float] = []
+
+    def free(name: str, sigma_m: float) -> int:
+        if sigma_m <= 0.0:
+            return _NONE
+        names.append(name)
+        sigmas.append(sigma_m)
+        return len(names) - 1
+
+    point_slots, bends, track_slots = [], [], []
+    for name, target in targets.items():
+        tolerance = tolerances.get(name, Tolerance())
+        curves = []
+        for curve_name, curve in target.curves.items():
+            parts = (".x", ".y", ".radius") if isinstance(curve, Arc) else ("",)
+            slots = [free(f"{name}/{curve_name}{part}", tolerance.lines_m) for part in parts]
+            curves.append(slots + [_NONE] * (3 - len(slots)))
+        track_slots += curves * 3  # the paint's centre and both edges move together
+        bows = [free(f"{name}/bow.{side}", tolerance.warp_m) for side in "xy"]
+        for point_name in target.points:
+            own = [free(f"{name}/{point_name}.{axis}", tolerance.points_m) for axis in "xy"]
+            point_slots.append(own + bows)
+        bends.append(_bends(target, name, tolerance))
+    return Structure(
+        tuple(names),
+        np.zeros(len(names)),
+        np.array(sigmas),
+        np.array(point_slots, dtype=np.int32).reshape(-1, 4),
+        np.concatenate(bends),
+        np.array(track_slots, dtype=np.int32).reshape(-1, 3),
+    )
+
+
+def _bends(target: Target, name: str, tolerance: Tolerance) -> Array:
+    """1 - x^2 and 1 - y^2 over the board, x and y from -1 to 1 between its edges."""
+    if tolerance.warp_m > 0.0 and target.kind != "checkerboard":
+        raise InputError(f"a warp is for checkerboards: target {name!r} is of kind {target.kind!r}")
+    if not len(target.points) or target.kind != "checkerboard":
+        return np.zeros((len(target.points), 2))
+    flat = target.point_array[:, :2]
+    half = 0.5 * np.ptp(flat, axis=0)
+    return np.asarray(1.0 - ((flat - flat.min(axis=0) - half) / half) ** 2)

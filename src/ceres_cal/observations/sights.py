@@ -1,0 +1,257 @@
+"""Sights: what one camera at one station sees of one rigid frame, gathered over all its views.
+
+The frame is the world or a placement. A static camera's many frames of a field are one sight; each board frame is one
+of its own. Rows are kept so that residuals find their way back to the observations' permanent ids.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ceres_cal.base.transforms import Array
+from ceres_cal.observations import Columns, Observations
+from ceres_cal.scene.camera import Camera
+
+Rows = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+_BLOCK = 1 << 16  # rows worked on at once: memory stays small beside the observations
+
+
+class SightKey(NamedTuple):
+    """Camera, station and frame of a sight; `placement` None is the world."""
+
+    camera: str
+    station: str
+    placement: str | None
+
+    def __str__(self) -> str:
+        return f"station {self.station!r}" + (f", placement {self.placement!r}" if self.placement is not None else "")
+
+
+@dataclass(frozen=True, eq=False)
+class Sights(Sequence["Sights"]):
+    """Some sights, their observations one after the other; one sight is a `Sights` of length one.
+
+    Attributes:
+        keys: of each of the S sights. views: numbers of the views that each sight gathers.
+        point_bounds: (S + 1,) where each sight's points begin. point_rows: (N,) rows of the observations' columns.
+        feature: (N,) number of each point among those of all targets. points: (N, 3) m in the sight's frame.
+        pixels: (N, 2). sigma_px: (N,).
+        curve_bounds, curve_rows, curve_pixels, curve_sigma_px: the same of the M curve observations.
+        track: (M,) index into tracks (T, 3, 3) and is_arc (T,): every curve and side of every target (see
+            `targets.along_track`).
+    """
+
+    keys: tuple[SightKey, ...]
+    views: tuple[tuple[int, ...], ...]
+    point_bounds: Rows
+    point_rows: Rows
+    feature: Rows
+    points: Array
+    pixels: Array
+    sigma_px: Array
+    curve_bounds: Rows
+    curve_rows: Rows
+    track: NDArray[np.int32]
+    curve_pixels: Array
+    curve_sigma_px: Array
+    tracks: Array
+    is_arc: Mask
+
+    def __post_init__(self) -> None:
+        # Kernels are compiled once for arrays that may be written and once for others: these are always the others.
+        for pixels in (self.pixels, self.curve_pixels):
+            pixels.setflags(write=False)
+
+    def __len__(self) -> int:
+        return len(self.keys)
+
+    def __getitem__(self, number: int | slice) -> Sights:
+        if isinstance(number, slice):
+            return self.take(np.arange(len(self))[number])
+        if not -len(self) <= number < len(self):
+            raise IndexError(number)
+        number %= len(self)
+        p = slice(self.point_bounds[number], self.point_bounds[number + 1])
+        c = slice(self.curve_bounds[number], self.curve_bounds[number + 1])
+        return self._rows(np.array([number]), p, c, np.array([p.stop - p.start]), np.array([c.stop - c.start]))
+
+    @property
+    def key(self) -> SightKey:
+        """The key of a single sight."""
+        (key,) = self.keys
+        return key
+
+    @cached_property
+    def seen_once(self) -> frozenset[str | None]:
+        """Placements that a single one of the sights shows."""
+        times = Counter([key.placement for key in self.keys])
+        return frozenset(name for name, count in times.items() if count == 1)
+
+    @property
+    def equations(self) -> int:
+        """Measured numbers: two of each point, one of each curve observation."""
+        return 2 * len(self.point_rows) + len(self.curve_rows)
+
+    def take(self, numbers: Rows) -> Sights:
+        """The sights with these numbers, in this order."""
+        if len(numbers) == len(self) and np.array_equal(numbers, np.arange(len(self))):
+            return self
+        p, c = ranges(self.point_bounds, numbers), ranges(self.curve_bounds, numbers)
+        return self._rows(numbers, p, c, np.diff(self.point_bounds)[numbers], np.diff(self.curve_bounds)[numbers])
+
+    def used_share(self, points: Mask, curves: Mask) -> Array:
+        """(S,) the share of each sight's observations that is used."""
+        if points.all() and curves.all():
+            return np.ones(len(self))
+        p = bounds_of(points[self.point_rows])[self.point_bounds]
+        c = bounds_of(curves[self.curve_rows])[self.curve_bounds]
+        return np.asarray((np.diff(p) + np.diff(c)) / (np.diff(self.point_bounds) + np.diff(self.curve_bounds)))
+
+    def reach_px(self, camera: Camera) -> float:
+        """Distance from the principal point to the farthest observation of the sights, which are the camera's."""
+        farthest = 0.0
+        for pixels in (self.pixels, self.curve_pixels):
+            for at in range(0, len(pixels), _BLOCK):
+                x, y = camera.offsets(pixels[at : at + _BLOCK]).T
+                farthest = max(farthest, float(np.max(x * x + y * y)))
+        return float(np.sqrt(farthest))
+
+    def part(self, number: int, count: int) -> Sights:
+        """The number-th of `count` about equal parts of the observations of a single sight."""
+        first, last = (int(self.point_bounds[-1]) * n // count for n in (number, number + 1))
+        start, stop = (int(self.curve_bounds[-1]) * n // count for n in (number, number + 1))
+        here = np.zeros(1, dtype=np.int64)
+        return self._rows(
+            here, slice(first, last), slice(start, stop), np.array([last - first]), np.array([stop - start])
+        )
+
+    def used(self, points: Mask, curves: Mask) -> Sights:
+        """What is left of every sight when only these rows of the observations count; empty sights are left out."""
+        if points.all() and curves.all():
+            return self
+        p, c = np.flatnonzero(points[self.point_rows]), np.flatnonzero(curves[self.curve_rows])
+        point_sizes = np.diff(np.searchsorted(p, self.point_bounds))
+        curve_sizes = np.diff(np.searchsorted(c, self.curve_bounds))
+        numbers = np.flatnonzero(point_sizes + curve_sizes)
+        return self._rows(numbers, p, c, point_sizes[numbers], curve_sizes[numbers])
+
+    def _rows(self, numbers: Rows, p: Rows | slice, c: Rows | slice, point_sizes: Rows, curve_sizes: Rows) -> Sights:
+        return Sights(
+            tuple(self.keys[i] for i in numbers),
+            tuple(self.views[i] for i in numbers),
+            bounds_of(point_sizes),
+            _at(self.point_rows, p),
+            _at(self.feature, p),
+            _at(self.points, p),
+            _at(self.pixels, p),
+            _at(self.sigma_px, p),
+            bounds_of(curve_sizes),
+            _at(self.curve_rows, c),
+            _at(self.track, c),
+            _at(self.curve_pixels, c),
+            _at(self.curve_sigma_px, c),
+            self.tracks,
+            self.is_arc,
+        )
+
+
+def _at(values: NDArray[Any], rows: Rows | slice) -> NDArray[Any]:
+    """values[rows]; `take` is several times as fast where a row holds more than one number."""
+    return values[rows] if isinstance(rows, slice) else values.take(rows, axis=0)
+
+
+def bounds_of(sizes: ArrayLike) -> Rows:
+    """(S + 1,) where each of so many rows begins, one after the other, and where the last one ends."""
+    return np.concatenate([[0], np.cumsum(sizes)])
+
+
+def ranges(bounds: Rows, numbers: Rows) -> Rows:
+    """All row numbers from bounds[i] to bounds[i + 1], for each i of numbers in turn."""
+    sizes = np.diff(bounds)[numbers]
+    starts = np.repeat(bounds[numbers] - bounds_of(sizes)[:-1], sizes)
+    return np.asarray(starts + np.arange(sizes.sum()))
+
+
+def gather_sights(observations: Observations) -> Sights:
+    """The sights of all observations; a sight without any observation is left out."""
+    keys = [SightKey(view.camera, view.station, view.placement) for view in observations.views]
+    order = {key: number for number, key in enumerate(dict.fromkeys(keys))}
+    sight_of_view = np.array([order[key] for key in keys], dtype=np.int64)
+    views_of: list[list[int]] = [[] for _ in order]
+    for number, sight in enumerate(sight_of_view):
+        views_of[sight].append(number)
+
+    names = {name: number for number, name in enumerate(observations.targets)}
+    targets = list(observations.targets.values())
+    target_of_view = np.array([names[view.target] for view in observations.views], dtype=np.int64)
+    first_point = bounds_of([len(t.points) for t in targets])[target_of_view]
+    first_track = bounds_of([3 * len(t.curves) for t in targets])[target_of_view]
+    curve_count = np.array([len(t.curves) for t in targets], dtype=np.int64)[target_of_view]
+
+    points, curves = observations.points, observations.curves
+    p, point_bounds = _grouped(points, sight_of_view, len(order))
+    c, curve_bounds = _grouped(curves, sight_of_view, len(order))
+    feature = first_point[points.view[p]] + points.feature[p]
+    side = curves.side[c] % 3  # -1 is the last of a target's three sets of tracks
+    track = first_track[curves.view[c]] + side * curve_count[curves.view[c]] + curves.feature[c]
+    every = Sights(
+        tuple(order),
+        tuple(tuple(views) for views in views_of),
+        point_bounds,
+        np.arange(len(points))[p],
+        feature,
+        np.concatenate([t.point_array for t in targets]).take(feature, axis=0),
+        _at(points.pixels, p),
+        _at(points.sigma_px, p),
+        curve_bounds,
+        np.arange(len(curves))[c],
+        track.astype(np.int32),
+        _at(curves.pixels, c),
+        _at(curves.sigma_px, c),
+        np.concatenate([t.tracks.reshape(-1, 3, 3) for t in targets]),
+        np.concatenate([np.tile(t.is_arc, 3) for t in targets]),
+    )
+    filled = np.flatnonzero(np.diff(point_bounds) + np.diff(curve_bounds))
+    return every if len(filled) == len(every) else every.take(filled)
+
+
+def _grouped(columns: Columns, sight_of_view: Rows, count: int) -> tuple[Rows | slice, Rows]:
+    """Rows in the order of their sights, all of them as they are where that is their order; where each sight begins."""
+    sight = sight_of_view[columns.view]
+    if np.all(sight[1:] >= sight[:-1]):
+        return slice(None), np.searchsorted(sight, np.arange(count + 1))
+    order = np.argsort(sight, kind="stable")
+    return order, np.searchsorted(sight[order], np.arange(count + 1))
+
+
+def nearest_places(sight: Sights, camera: Camera) -> Array:
+    """Where on its track each curve observation's ray passes nearest, (M,): the start of the search for the foot.
+
+    `camera` stands in the frame of the single sight (cam_from_frame). Where the lens has no ray the track's origin is
+    taken.
+    """
+    blocks = range(0, len(sight.curve_pixels), _BLOCK)
+    return np.concatenate([np.empty(0), *(_nearest(sight, camera, slice(at, at + _BLOCK)) for at in blocks)])
+
+
+def _nearest(sight: Sights, camera: Camera, rows: slice) -> Array:
+    rays = np.nan_to_num(camera.rays(sight.curve_pixels[rows]) @ camera.cam_from_world.rotation)
+    track = sight.track[rows]
+    tracks, is_arc = sight.tracks[track], sight.is_arc[track]
+    c, a = tracks[:, 0], tracks[:, 1]
+    away = camera.position - c
+    # Arc: where the ray meets the arc's plane. Segment: the common perpendicular of ray and line.
+    with np.errstate(divide="ignore", invalid="ignore"):
+        on_plane = away - (away[:, 2] / rays[:, 2])[:, None] * rays
+        turned = np.arctan2(on_plane[:, 1], on_plane[:, 0])
+        aa, ar, rr = np.sum(a * a, 1), np.sum(a * rays, 1), np.sum(rays * rays, 1)
+        straight = (np.sum(a * away, 1) * rr - np.sum(rays * away, 1) * ar) / (aa * rr - ar * ar)
+    return np.nan_to_num(np.where(is_arc, turned, straight), posinf=0.0, neginf=0.0)

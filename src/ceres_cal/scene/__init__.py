@@ -1,0 +1,1 @@
+"""What stands in the room: lenses, cameras, targets of known geometry."""

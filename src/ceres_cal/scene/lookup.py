@@ -1,0 +1,176 @@
+"""A look-up table from pixels to the field, for those who track at many frames a second without this package.
+
+A ray meets the plane z = l where it meets the floor plus l times a constant of the pixel: the change with height that
+the third column of the paper's H makes (section 4), exact for every height. So four numbers per node are enough.
+"""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ceres_cal.base.errors import InputError
+from ceres_cal.base.files import read_bytes, write_bytes
+from ceres_cal.base.transforms import Array
+from ceres_cal.scene.camera import Camera
+
+FORMAT, VERSION = "ceres-cal/table", 1
+HEIGHTS_M = (0.0, 0.15)  # at which the error is stated
+_STEPS_PX = (64, 32, 16, 8, 4, 2, 1)
+
+
+@dataclass(frozen=True, eq=False)
+class LookupTable:
+    """Where on the field the nodes of a grid over the image look.
+
+    Attributes:
+        x_px (X,), y_px (Y,): the nodes, evenly spaced by step_px, from outside the image to outside of it.
+        floor_m: (Y, X, 2) x and y on the floor; NaN where a node sees none. per_height: (Y, X, 2) what to add for each
+            metre of height.
+        error_mm: height_m -> root mean square and largest error of bilinear interpolation, half way between nodes,
+            over the given box of the field.
+        homography: (3, 3) the paper's H of the floor. third_column: (3,) what its third column gains per metre.
+    """
+
+    station: str
+    image_size: tuple[int, int]
+    step_px: int
+    x_px: Array
+    y_px: Array
+    floor_m: Array
+    per_height: Array
+    error_mm: dict[float, tuple[float, float]]
+    homography: Array
+    third_column: Array
+
+    def locate(self, pixels: ArrayLike, height_m: float = 0.0) -> Array:
+        """Pixels (N, 2) -> places (N, 2) m at a height, interpolated; NaN outside of the table."""
+        at = (np.asarray(pixels, dtype=float) - (self.x_px[0], self.y_px[0])) / self.step_px
+        inside = np.all((at >= 0.0) & (at <= (len(self.x_px) - 1, len(self.y_px) - 1)), axis=1)
+        at = np.where(inside[:, None], at, 0.0)
+        column, row = np.minimum(at.astype(int), (len(self.x_px) - 2, len(self.y_px) - 2)).T
+        u, v = (at - np.column_stack([column, row])).T[:, :, None]
+        nodes = self.floor_m + height_m * self.per_height
+        upper = (1.0 - u) * nodes[row, column] + u * nodes[row, column + 1]
+        lower = (1.0 - u) * nodes[row + 1, column] + u * nodes[row + 1, column + 1]
+        return np.where(inside[:, None], (1.0 - v) * upper + v * lower, np.nan)
+
+    def save(self, path: str | Path) -> None:
+        """Write it as NPZ."""
+        stream = io.BytesIO()
+        errors = [(height_m, *error) for height_m, error in self.error_mm.items()]
+        np.savez_compressed(
+            stream,
+            format=np.array(FORMAT),
+            version=np.array(VERSION),
+            station=np.array(self.station),
+            image_size=np.array(self.image_size),
+            step_px=np.array(self.step_px),
+            x_px=self.x_px,
+            y_px=self.y_px,
+            floor_m=self.floor_m,
+            per_height=self.per_height,
+            error_mm=np.array(errors),
+            homography=self.homography,
+            third_column=self.third_column,
+        )
+        write_bytes(path, stream.getvalue())
+
+    @classmethod
+    def load(cls, path: str | Path) -> LookupTable:
+        """Read a table.
+
+        Raises:
+            InputError: it is none.
+        """
+        try:
+            with np.load(io.BytesIO(read_bytes(path)), allow_pickle=False) as data:
+                if str(data["format"]) != FORMAT or int(data["version"]) != VERSION:
+                    raise InputError(f"{path}: is no table of version {VERSION}: export it again")
+                width, height = (int(size) for size in data["image_size"])
+                return cls(
+                    str(data["station"]),
+                    (width, height),
+                    int(data["step_px"]),
+                    np.array(data["x_px"]),
+                    np.array(data["y_px"]),
+                    np.array(data["floor_m"]),
+                    np.array(data["per_height"]),
+                    {float(row[0]): (float(row[1]), float(row[2])) for row in data["error_mm"]},
+                    np.array(data["homography"]),
+                    np.array(data["third_column"]),
+                )
+        except (ValueError, KeyError, OSError) as error:
+            raise InputError(f"{path}: is no table ({error}): export it again") from None
+
+
+def make_table(
+    camera: Camera, station: str, x_m: Array, y_m: Array, error_mm: float = 0.1, step_px: int | None = None
+) -> LookupTable:
+    """The table of a camera; without a step, the widest grid whose largest error keeps to `error_mm`.
+
+    Args:
+        x_m, y_m: the box of the field over which errors count is the one around these.
+
+    Raises:
+        InputError: a step below 1, or no step of 1 px or more keeps to the error.
+    """
+    if step_px is not None and step_px < 1:
+        raise InputError(f"step_px must be 1 or more, not {step_px}")
+    table = None
+    for step in _STEPS_PX if step_px is None else (step_px,):
+        table = _table(camera, station, step, x_m, y_m)
+        if max(worst for _, worst in table.error_mm.values()) <= error_mm:
+            return table
+    if step_px is None or table is None:
+        raise InputError(f"no table with a step of 1 px or more keeps to {error_mm:g} mm: allow for more")
+    return table
+
+
+def _table(camera: Camera, station: str, step: int, x_m: Array, y_m: Array) -> LookupTable:
+    x, y = (step * np.arange(-1, int(np.ceil((size - 0.5) / step)) + 1, dtype=float) for size in camera.image_size)
+    floor, slope = _rays(camera, x, y)
+    plain = LookupTable(
+        station,
+        camera.image_size,
+        step,
+        x,
+        y,
+        floor,
+        slope,
+        {},
+        camera.homography(),
+        np.array(camera.cam_from_world.rotation[:, 2]),
+    )
+    pixels = np.column_stack([part.ravel() for part in np.meshgrid(x[:-1] + 0.5 * step, y[:-1] + 0.5 * step)])
+    inside = np.all((pixels >= -0.5) & (pixels <= np.array(camera.image_size) - 0.5), axis=1)
+    errors = {height_m: _error_mm(camera, plain, pixels[inside], x_m, y_m, height_m) for height_m in HEIGHTS_M}
+    return replace(plain, error_mm=errors)
+
+
+def _rays(camera: Camera, x: Array, y: Array) -> tuple[Array, Array]:
+    """Where the nodes' rays meet the floor, and how that changes with height, (Y, X, 2) each."""
+    nodes = np.column_stack([part.ravel() for part in np.meshgrid(x, y)])
+    floor = camera.locate(nodes)
+    slope = (camera.position[:2] - floor) / camera.position[2]
+    shape = (len(y), len(x), 2)
+    return floor.reshape(shape), slope.reshape(shape)
+
+
+def _error_mm(
+    camera: Camera, table: LookupTable, pixels: Array, x_m: Array, y_m: Array, height_m: float
+) -> tuple[float, float]:
+    """Root mean square and largest error where it is largest, half way between nodes, over the box."""
+    true = camera.locate(pixels, height_m)
+    low, high = (np.array([end(x_m), end(y_m)]) for end in (np.min, np.max))
+    with np.errstate(invalid="ignore"):
+        on_field = np.all((true >= low) & (true <= high), axis=1)
+    if not on_field.any():
+        return np.inf, np.inf
+    off = 1e3 * np.linalg.norm(table.locate(pixels[on_field], height_m) - true[on_field], axis=1)
+    off = np.where(np.isfinite(off), off, np.inf)
+    return float(np.sqrt(np.mean(off**2))), float(np.max(off))

@@ -1,0 +1,32 @@
+"""The one nonlinear least-squares problem, in Ceres: blocks, losses, priors, solve (design, sections 5 and 6).
+
+The only package that imports pyceres. Placements that a single station sees are eliminated inside one block per camera,
+over its free intrinsics alone; every other sight is one compressed block over its camera's free intrinsics, its station
+and its placement; each prior is one small block. What Ceres minimises is the same function either way.
+"""
+
+from ceres_cal.solve.bundle import (
+    Progress,
+    Solution,
+    placement_costs,
+    prior_on_intrinsics,
+    private_placements,
+    settle_placements,
+    solve,
+)
+from ceres_cal.solve.costs import Weighting
+from ceres_cal.solve.information import Eliminated, Information, information
+
+__all__ = [
+    "Eliminated",
+    "Information",
+    "Progress",
+    "Solution",
+    "Weighting",
+    "information",
+    "placement_costs",
+    "prior_on_intrinsics",
+    "private_placements",
+    "settle_placements",
+    "solve",
+]

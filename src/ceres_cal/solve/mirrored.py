@@ -1,0 +1,105 @@
+"""The two mirrored poses of a plane: a small or distant board looks almost the same tilted either way.
+
+Each has its own minimum of the cost. Which is the lower one can only be told by trying both; they are tried where they
+compete, that is, where perspective is too weak to have decided at the start.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ceres_cal.base.transforms import Array
+from ceres_cal.model.parameters import Estimate, Layout
+from ceres_cal.observations.sights import Rows, SightKey, Sights
+from ceres_cal.solve import Weighting, placement_costs, private_placements
+
+_DECIDED_SIGMA = 100.0  # perspective that bends a view by so many standard deviations leaves no doubt
+_SAME = 1e-3  # of rotations and metres
+_MUCH_WORSE = 100.0  # squared standard deviations: ten of them decide, whatever the lens still does
+
+
+def without_mirrored_poses(
+    sights: Sights, estimate: Estimate, layout: Layout, weighting: Weighting, among: frozenset[SightKey]
+) -> tuple[Estimate, int, frozenset[SightKey]]:
+    """The estimate with private placements in the better one of their two poses.
+
+    Args:
+        among: keys of the sights that are tried.
+
+    Returns:
+        The estimate, how many placements were changed, and the keys of those whose other pose is not much worse.
+    """
+    private = private_placements(sights, layout)
+    changed, undecided = 0, frozenset[SightKey]()
+    for camera in estimate.cameras:
+        own = np.array(
+            [
+                number
+                for number, key in enumerate(sights.keys)
+                if key.camera == camera and key.placement in private and key in among
+            ],
+            dtype=np.int64,
+        )
+        if len(own):
+            estimate, count, open_ones = _with_better_poses(sights.take(own), estimate, weighting)
+            changed, undecided = changed + count, undecided | open_ones
+    return estimate, changed, undecided
+
+
+def _with_better_poses(
+    sights: Sights, estimate: Estimate, weighting: Weighting
+) -> tuple[Estimate, int, frozenset[SightKey]]:
+    poses = estimate.pose_stack(sights.keys)
+    doubtful = _doubtful(sights, poses, estimate, weighting)
+    if not len(doubtful):
+        return estimate, 0, frozenset()
+    few = sights.take(doubtful)
+    twice = np.concatenate([poses[doubtful], mirrored(few, poses[doubtful])])
+    costs, found = placement_costs(sights.take(np.tile(doubtful, 2)), estimate, weighting, twice)
+    (as_is, other), (found, turned) = np.split(costs, 2), np.split(found, 2)
+    better = np.flatnonzero(other < as_is * (1.0 - 1e-6))
+    two = np.max(np.abs(turned - found), axis=(1, 2)) > _SAME  # else the search came back from the mirrored pose
+    close = np.flatnonzero(two & (np.abs(other - as_is) < _MUCH_WORSE))
+    undecided = frozenset(few.keys[i] for i in close)
+    if not len(better):
+        return estimate, 0, undecided
+    return estimate.with_placements([few.keys[i] for i in better], turned[better]), len(better), undecided
+
+
+def _boxes(sights: Sights) -> tuple[Array, Array]:
+    """Middle (S, 3) and half diagonal (S,) of the box around each sight's points; every sight has some."""
+    starts = sights.point_bounds[:-1]
+    low, high = np.minimum.reduceat(sights.points, starts), np.maximum.reduceat(sights.points, starts)
+    return 0.5 * (low + high), 0.5 * np.linalg.norm(high - low, axis=1)
+
+
+def _doubtful(sights: Sights, poses: Array, estimate: Estimate, weighting: Weighting) -> Rows:
+    """Sights of points whose two poses differ by little: the bend that perspective adds, phi (size / depth)^2 sin(tilt)
+    cos(tilt), against the noise.
+    """
+    seen = np.flatnonzero(np.diff(sights.point_bounds) >= 4)
+    if not len(seen):
+        return seen
+    few, pose = sights.take(seen), poses[seen]
+    centres, reach = _boxes(few)
+    middle = np.einsum("sij,sj->si", pose[:, :, :3], centres) + pose[:, :, 3]
+    distance = np.linalg.norm(middle, axis=1)
+    cosine = np.abs(np.sum(pose[:, :, 2] * middle, axis=1)) / distance
+    sine = np.sqrt(np.maximum(1.0 - cosine**2, 0.0))
+    phi = estimate.cameras[sights.keys[0].camera].phi
+    bend_px = phi * (reach / distance) ** 2 * sine * cosine
+    sigma_px = weighting.point_scale * np.minimum.reduceat(few.sigma_px, few.point_bounds[:-1])
+    return np.asarray(seen[bend_px < _DECIDED_SIGMA * sigma_px])
+
+
+def mirrored(sights: Sights, poses: Array) -> Array:
+    """cam_from_target (S, 3, 4) with the depth of each target's points reversed about its middle, along the line of
+    sight: R' = (1 - 2 d d^T) R diag(1, 1, -1), a rotation again.
+    """
+    centres, _ = _boxes(sights)
+    middle = np.einsum("sij,sj->si", poses[:, :, :3], centres) + poses[:, :, 3]
+    d = middle / np.linalg.norm(middle, axis=1, keepdims=True)
+    reflect = np.eye(3) - 2.0 * d[:, :, None] * d[:, None, :]
+    rotations = reflect @ poses[:, :, :3] @ np.diag([1.0, 1.0, -1.0])
+    translations = middle - np.einsum("sij,sj->si", rotations, centres)
+    return np.concatenate([rotations, translations[:, :, None]], axis=2)

@@ -1,0 +1,142 @@
+"""Reading the residuals: how large the noise is, and which observations do not belong.
+
+Residuals are taken in units of their stated sigma; the noise scale is the factor by which the stated sigmas of a kind
+(points, curves) must be multiplied to describe what is seen.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ceres_cal.base.transforms import Array
+from ceres_cal.model.residuals import Residuals
+from ceres_cal.observations import Observations
+from ceres_cal.observations.sights import Mask
+
+_LEAST_FREEDOM = 8.0  # spare equations below which a spread says nothing
+_USUAL_FREEDOM = 10.0  # spare equations that a scale seen before stands for
+_ENOUGH = 5_000
+_LEAST_SCALE_PX = 1e-4  # no image is measured better than that
+_RAYLEIGH_MEDIAN = 1.177410022515474  # of the length of a two-dimensional standard normal
+_NORMAL_MEDIAN = 0.674489750196082  # of the absolute value of a standard normal
+
+
+@dataclass(frozen=True, eq=False)
+class Inliers:
+    """Which observations take part, and the noise scales they were judged by.
+
+    Attributes:
+        points: (N,), curves: (M,) bool. point_scale, curve_scale: factors on the stated sigmas.
+        point_sigmas, curve_sigmas: how many standard deviations each residual is long; infinite where the estimate
+            cannot show the observation.
+        freedom: spare equations that the scales rest on; infinite where they are the stated ones.
+    """
+
+    points: Mask
+    curves: Mask
+    point_scale: float
+    curve_scale: float
+    point_sigmas: Array
+    curve_sigmas: Array
+    freedom: float = np.inf
+
+    def same_as(self, other: Inliers, relative: float = 1e-2) -> bool:
+        """Whether nothing worth another solve changed: the same rows, and scales by no more than `relative`."""
+        return (
+            np.array_equal(self.points, other.points)
+            and np.array_equal(self.curves, other.curves)
+            and abs(self.point_scale - other.point_scale) <= relative * other.point_scale
+            and abs(self.curve_scale - other.curve_scale) <= relative * other.curve_scale
+        )
+
+
+def relative_lengths(observations: Observations, residuals: Residuals) -> tuple[Array, Array]:
+    """Lengths of the residuals of points and of curves in their stated sigmas; infinite where there is none."""
+    points, curves = residuals.lengths
+    points, curves = points / observations.points.sigma_px, curves / observations.curves.sigma_px
+    return np.where(np.isfinite(points), points, np.inf), np.where(np.isfinite(curves), curves, np.inf)
+
+
+def start_weights(observations: Observations, residuals: Residuals) -> Inliers:
+    """Everything that a start can show, at the scale of its median residual: what the first solve works with."""
+    points, curves = relative_lengths(observations, residuals)
+    shown_points, shown_curves = np.isfinite(points), np.isfinite(curves)
+    p = _median_scale(points[shown_points], _RAYLEIGH_MEDIAN)
+    c = _median_scale(curves[shown_curves], _NORMAL_MEDIAN)
+    return Inliers(shown_points, shown_curves, p, c, points / p, curves / c)
+
+
+def _median_scale(lengths: Array, median_of_one: float) -> float:
+    if not len(lengths):
+        return 1.0
+    some = lengths[:: max(1, len(lengths) // _ENOUGH)]  # its median is that of all within two hundredths
+    middle = len(some) // 2
+    return max(float(np.partition(some, middle)[middle]) / median_of_one, _LEAST_SCALE_PX)
+
+
+def judge(
+    observations: Observations,
+    residuals: Residuals,
+    unknowns: int,
+    reject_sigma: float,
+    *,
+    estimate_noise: bool,
+    usual: tuple[float, float] | None = None,
+) -> Inliers:
+    """Noise scales and inliers at one estimate.
+
+    The median gives a first scale that half the data may not spoil, the inliers' own spread the final one.
+
+    Args:
+        unknowns: free numbers; they use up equations in proportion.
+        reject_sigma: longer residuals are outliers. estimate_noise: else the stated sigmas hold (scale 1).
+        usual: scales of points and curves seen before; they count as much as a few spare equations do.
+    """
+    points, curves = relative_lengths(observations, residuals)
+    if not estimate_noise:
+        return Inliers(points <= reject_sigma, curves <= reject_sigma, 1.0, 1.0, points, curves)
+    floor = usual or (0.0, 0.0)
+    point_spread = _spread(points, _RAYLEIGH_MEDIAN, reject_sigma, floor[0])
+    curve_spread = _spread(curves, _NORMAL_MEDIAN, reject_sigma, floor[1])
+    spare = 1.0 - unknowns / max(2.0 * point_spread.count + curve_spread.count, 1.0)
+    freedom = spare * (2.0 * point_spread.count + curve_spread.count)
+    if usual is not None:
+        p, c = point_spread.scale_from(usual[0], 2.0 * spare), curve_spread.scale_from(usual[1], spare)
+        freedom = max(freedom, 0.0) + _USUAL_FREEDOM
+    else:
+        point_scale, curve_scale = point_spread.scale(2.0 * spare), curve_spread.scale(spare)
+        # A kind with too few spare equations borrows the other's scale; if both have, the stated sigmas hold.
+        known = [scale for scale in (point_scale, curve_scale) if scale is not None]
+        fallback = known[0] if known else 1.0
+        p = fallback if point_scale is None else point_scale
+        c = fallback if curve_scale is None else curve_scale
+        freedom = freedom if known else np.inf
+    return Inliers(points <= reject_sigma * p, curves <= reject_sigma * c, p, c, points / p, curves / c, freedom)
+
+
+@dataclass(frozen=True)
+class _Spread:
+    """Number and sum of squares of the lengths within the rejection bound."""
+
+    count: int
+    squares: float
+
+    def scale(self, freedom: float) -> float | None:
+        """Their scale, when each brings `freedom` spare equations; None where those are too few to tell."""
+        if self.count * freedom < _LEAST_FREEDOM:
+            return None
+        return max(float(np.sqrt(self.squares / (self.count * freedom))), _LEAST_SCALE_PX)
+
+    def scale_from(self, usual: float, freedom: float) -> float:
+        """Their scale, when the usual one counts as much as a few spare equations: few exact ones do not make it 0."""
+        equations = self.count * max(freedom, 0.0)
+        return float(np.sqrt((self.squares + _USUAL_FREEDOM * usual**2) / (equations + _USUAL_FREEDOM)))
+
+
+def _spread(lengths: Array, median_of_one: float, reject_sigma: float, least: float) -> _Spread:
+    finite = np.isfinite(lengths)
+    seen = lengths if finite.all() else lengths[finite]
+    inside = seen <= reject_sigma * max(_median_scale(seen, median_of_one), least)
+    return _Spread(int(np.count_nonzero(inside)), float(np.sum(seen**2, where=inside)))

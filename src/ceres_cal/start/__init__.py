@@ -1,0 +1,1 @@
+"""The paper's closed forms, which only initialise."""

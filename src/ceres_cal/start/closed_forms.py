@@ -1,0 +1,283 @@
+"""The closed forms: what the paper computes by hand, corrected where it errs (design, section 2), and what it lacks.
+
+Plane points are (x, y) of a plane of constant z; image points are offsets from the principal point in pixels. A radial
+profile w(r) = 1 + c_1 r^2 + c_2 r^4 with r in units of `unit_px` turns a measured offset p into the direction
+(p, phi w(r)): the same for every lens, and still finite where a fisheye looks beyond 90 degrees. With a profile a
+homography maps a plane point to (p, w(r)), up to scale.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ceres_cal.base.errors import DegenerateError
+from ceres_cal.base.threads import parts_of, run_parts
+from ceres_cal.base.transforms import Array, Pose, nearest_rotation
+from ceres_cal.kernels import align_sights, alignment_errors, normalised_planes, plane_homographies, usual_by_radius
+
+Ints = NDArray[np.int64]
+_POINT_NS = 100.0  # that a point's share of a homography takes
+
+
+@dataclass(frozen=True)
+class Profile:
+    """w(r) = 1 + sum c_k r^(2k), r in units of `unit_px`."""
+
+    coefficients: tuple[float, ...]
+    unit_px: float
+
+    def lift(self, offsets: Array) -> Array:
+        """Offsets (N, 2) -> (N, 3): (p, w(r)), homogeneous undistorted image points."""
+        squared = np.sum(offsets * offsets, axis=1) / self.unit_px**2
+        w = np.ones(len(offsets))
+        for k, c in enumerate(self.coefficients, start=1):
+            w += c * squared**k
+        return np.column_stack([offsets, w])
+
+
+def null_vector(matrix: ArrayLike) -> Array:
+    """Unit vector that a symmetric positive semidefinite matrix shrinks most."""
+    return np.asarray(np.linalg.eigh(np.asarray(matrix, dtype=float))[1][:, 0])
+
+
+def _normaliser(points: Array) -> Array:
+    """(3, 3) T that moves 2D points to their centroid and scales them to a mean distance of sqrt 2."""
+    centre = points.mean(axis=0)
+    scale = np.sqrt(2.0) / max(float(np.mean(np.linalg.norm(points - centre, axis=1))), 1e-12)
+    return np.array([[scale, 0.0, -scale * centre[0]], [0.0, scale, -scale * centre[1]], [0.0, 0.0, 1.0]])
+
+
+def homography_from_points(plane_points: ArrayLike, image_points: ArrayLike) -> Array:
+    """H (3, 3) with image ~ H (x, y, 1), from at least four points (paper, section 3.2).
+
+    The rows are (x y 1 0 0 0 -x''x -x''y -x'') and (0 0 0 x y 1 -y''x -y''y -y''); H is their null vector in normalised
+    coordinates, so no entry of H is assumed to be other than 0. Its sign gives the points positive depth.
+
+    Args:
+        image_points: (N, 2), or (N, 3) homogeneous.
+
+    Raises:
+        DegenerateError: fewer than four points, or no four of which no three lie on one line.
+    """
+    plane = np.asarray(plane_points, dtype=float)
+    image = np.asarray(image_points, dtype=float)
+    if image.shape[1] == 2:
+        image = np.column_stack([image, np.ones(len(image))])
+    require_spread(plane)
+    t = _normaliser(plane)
+    x = np.column_stack([plane, np.ones(len(plane))]) @ t.T
+    scale = np.diag([1.0, 1.0, max(float(np.mean(np.linalg.norm(image[:, :2], axis=1))), 1e-12)])
+    u = image @ scale
+    zero = np.zeros_like(x)
+    rows = np.vstack(
+        [
+            np.hstack([u[:, 2:] * x, zero, -u[:, :1] * x]),
+            np.hstack([zero, u[:, 2:] * x, -u[:, 1:2] * x]),
+        ]
+    )
+    _, s, vt = np.linalg.svd(rows)
+    if s[7] <= 1e-9 * s[0]:
+        raise DegenerateError(f"of any four of the {len(plane)} points three lie on one line: add points beside it")
+    h = np.linalg.inv(scale) @ vt[-1].reshape(3, 3) @ t
+    return facing(h, plane, image)
+
+
+def require_spread(plane_points: Array) -> None:
+    """Raise DegenerateError unless the points number four at least and do not lie on one line."""
+    if len(plane_points) < 4:
+        raise DegenerateError(f"{len(plane_points)} points cannot fix a plane's pose: give at least four")
+    spread = np.linalg.svd(plane_points - plane_points.mean(axis=0), compute_uv=False)
+    if spread[-1] <= 1e-7 * spread[0]:
+        raise DegenerateError(f"all {len(plane_points)} points lie on one line: add points beside it")
+
+
+def facing(homography: Array, plane_points: Array, image_points: Array) -> Array:
+    """The homography with the sign that sends the plane points to their image points, not to their opposites."""
+    sent = np.column_stack([plane_points, np.ones(len(plane_points))]) @ homography.T
+    agree = np.sum(sent * image_points, axis=1)
+    return homography if np.median(agree) >= 0.0 else -homography
+
+
+def max_norm_pose(homography: Array) -> Pose:
+    """The paper's pose from H in normalised coordinates: lambda is the larger norm of h1 and h2 (section 3.5).
+
+    R's columns are h1 / lambda, h2 / lambda and their cross product: not orthonormal where the norms differ, which is
+    the paper's own error and what `polar_pose` mends. The translation is h3 / lambda = -R t.
+    """
+    h1, h2, h3 = homography.T
+    scale = max(np.linalg.norm(h1), np.linalg.norm(h2))
+    rotation = np.column_stack([h1 / scale, h2 / scale, np.cross(h1 / scale, h2 / scale)])
+    return Pose(nearest_rotation(rotation), h3 / scale)
+
+
+def polar_poses(homographies: Array) -> Array:
+    """[R t] (S, 3, 4) minimising the paper's E = |h1 / lambda - r1|^2 + |h2 / lambda - r2|^2 (section 3.6) for each H.
+
+    With [h1 h2] = U S V^T: [r1 r2] = U V^T and 1 / lambda = tr(S) / tr(S^2). U V^T is B (B^T B)^-1/2, and the root of a
+    2 x 2 matrix M is (M + d) / s with d = (det M)^1/2 and s = (tr M + 2 d)^1/2; its inverse is (s - root) / d. Where H
+    sends the plane to a line there is none: NaN.
+    """
+    b = homographies[:, :, :2]
+    m = np.swapaxes(b, 1, 2) @ b
+    trace = m[:, 0, 0] + m[:, 1, 1]
+    d = np.sqrt(np.maximum(m[:, 0, 0] * m[:, 1, 1] - m[:, 0, 1] ** 2, 0.0))
+    sum_s = np.sqrt(trace + 2.0 * d)
+    root = (m + d[:, None, None] * np.eye(2)) / sum_s[:, None, None]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        r = b @ ((sum_s[:, None, None] * np.eye(2) - root) / d[:, None, None])
+    first, second = r[:, :, 0].T, r[:, :, 1].T
+    third = np.stack([first[i - 2] * second[i - 1] - first[i - 1] * second[i - 2] for i in range(3)], axis=1)
+    translation = homographies[:, :, 2] * (sum_s / trace)[:, None]
+    return np.concatenate([r, third[:, :, None], translation[:, :, None]], axis=2)
+
+
+def polar_pose(homography: Array) -> Pose:
+    """The pose of one homography in normalised coordinates: see `polar_poses`."""
+    (matrix,) = polar_poses(homography[None])
+    return Pose(matrix[:, :3], matrix[:, 3])
+
+
+def fit_rings(measured_radius: ArrayLike, ring_radius: ArrayLike, powers: Sequence[int] = (1, 2, 3)) -> Array:
+    """The paper's fit of r' = a1 r + a2 r^2 + a3 r^3 to rings (section 2): coefficients in the order of `powers`.
+
+    Args:
+        measured_radius: (N,) px. ring_radius: (N,) what r' would be without distortion, px; a common factor on it goes
+            into every coefficient (and into phi), which is the gauge freedom of the paper's triple.
+    """
+    r = np.asarray(measured_radius, dtype=float)
+    unit = float(np.max(r))
+    basis = (r / unit)[:, None] ** np.asarray(powers, dtype=float)
+    solution = np.linalg.lstsq(basis, np.asarray(ring_radius, dtype=float), rcond=None)[0]
+    return np.asarray(solution / unit ** np.asarray(powers, dtype=float))
+
+
+def ring_profile(measured_radius: Array, ring_radius: Array, unit_px: float) -> tuple[Profile, float]:
+    """Profile and magnification (px per metre at the centre) from rings: r = kappa R w(r), linear in kappa, kappa c."""
+    squared = (measured_radius / unit_px) ** 2
+    basis = np.column_stack([ring_radius, ring_radius * squared, ring_radius * squared**2])
+    kappa, *rest = np.linalg.lstsq(basis, measured_radius, rcond=None)[0]
+    return Profile(tuple(float(c / kappa) for c in rest), unit_px), float(kappa)
+
+
+@dataclass(frozen=True, eq=False)
+class PlaneData:
+    """Points of several sights of one camera, one sight after the other.
+
+    Attributes:
+        bounds: (S + 1,) where each sight begins. plane: (N, 2) m. offsets: (N, 2) px.
+    """
+
+    bounds: Ints
+    plane: Array
+    offsets: Array
+
+
+@dataclass(frozen=True, eq=False)
+class RadialAlignment:
+    """What `radial_alignment` found: the profile, H (S, 3, 3) of every sight, and each point's error.
+
+    Attributes:
+        error_px: (N,). relative_error: (N,) the same in units of what is usual at that distance from the centre.
+    """
+
+    profile: Profile
+    homographies: Array
+    error_px: Array
+    relative_error: Array
+
+
+def radial_alignment(data: PlaneData, unit_px: float, terms: int, rounds: int) -> RadialAlignment:
+    """Profile and homographies of sights of points, whatever the radial distortion (design, section 7).
+
+    p_x (h2 . X) - p_y (h1 . X) = 0 holds for any radial lens: it gives h1 and h2 of each sight. Along p, then,
+    r (h3 . X) - q sum c_k r^2k = q with q = (h1 . X, h2 . X) . p / r is linear in h3 of each sight and in the shared c.
+    Rounds of reweighting keep wrong labels from deciding. Fewer than six points in a sight leave its answer to chance.
+    """
+    p = data.offsets / unit_px
+    radius = np.linalg.norm(p, axis=1)
+    sights = len(data.bounds) - 1
+    x, lifts = np.empty((2, len(p))), np.empty((sights, 3))
+    normalised_planes(data.bounds, data.plane, x, lifts)
+    h12, shares, errors = np.empty((sights, 6)), np.empty((sights, 3, terms + 1)), np.empty(len(p))
+    weights = np.ones(len(p))
+    for _ in range(rounds):
+        reduced = np.zeros((terms + 1, terms + 1))
+        align_sights(data.bounds, x, p, weights, h12, shares, reduced)
+        c = np.linalg.lstsq(reduced[:terms, :terms], reduced[:terms, terms], rcond=1e-10)[0]
+        h3 = shares[:, :, terms] - shares[:, :, :terms] @ c
+        alignment_errors(data.bounds, x, p, h12, h3, c, errors)
+        usual = usual_by_radius(errors, radius)
+        weights = 1.0 / (1.0 + (errors / (1.5 * usual)) ** 2)
+    homographies = np.concatenate([h12.reshape(-1, 2, 3) * unit_px, h3[:, None, :]], axis=1) @ _restored(lifts)
+    return RadialAlignment(Profile(tuple(float(v) for v in c), unit_px), homographies, errors * unit_px, errors / usual)
+
+
+def homographies_of_sights(data: PlaneData, profile: Profile) -> tuple[Array, Array]:
+    """H (S, 3, 3) of every sight under a known profile, and each point's error (N,) px.
+
+    The normalised DLT, reweighted to distances in the image, and against wrong labels where some points do not fit.
+    """
+    homographies, errors = np.empty((len(data.bounds) - 1, 3, 3)), np.empty(len(data.plane))
+    coefficients = np.array(profile.coefficients)
+
+    def part(first: int, last: int) -> None:
+        bounds, found = data.bounds[first : last + 1], homographies[first:last]
+        plane_homographies(bounds, data.plane, data.offsets, coefficients, profile.unit_px, found, errors)
+
+    run_parts(part, parts_of(len(homographies), len(errors), _POINT_NS))
+    return np.array([[profile.unit_px], [profile.unit_px], [1.0]]) * homographies, errors * profile.unit_px
+
+
+def _restored(lifts: Array) -> Array:
+    """(S, 3, 3) from plane points (x, y, 1) to those of `normalised_planes`."""
+    restore = np.zeros((len(lifts), 3, 3))
+    restore[:, 0, 0] = restore[:, 1, 1] = lifts[:, 2]
+    restore[:, :2, 2] = -lifts[:, :2] * lifts[:, 2:]
+    restore[:, 2, 2] = 1.0
+    return restore
+
+
+def line_moments(lines: Array, offsets: Array, weights: Array, unit_px: float, terms: int) -> Array:
+    """(2 + terms + 1 groups of 3)^2 moment matrix of l . (g1 p_x + g2 p_y + g3 (1 + sum c_k r^2k)) = 0.
+
+    Args:
+        lines: (N, 3) homogeneous lines of the (normalised) plane. offsets: (N, 2) px, seen on those lines. A point is
+            two lines that cross in it.
+    """
+    p = offsets / unit_px
+    squared = np.sum(p * p, axis=1)
+    factors = np.column_stack([p, *(squared**k for k in range(terms + 1))])
+    rows = (factors[:, :, None] * lines[:, None, :]).reshape(len(lines), -1) * np.sqrt(weights)[:, None]
+    return np.asarray(rows.T @ rows)
+
+
+def inverse_homography_from_moments(moments: Array, c: Sequence[float]) -> tuple[Array, float, float]:
+    """G (3, 3) = (g1 g2 g3) for a given profile: the null vector; with its residual and the next singular value."""
+    mix = np.zeros((9, len(moments)))
+    mix[:6, :6] = np.eye(6)
+    for k, factor in enumerate((1.0, *c)):
+        mix[6:, 6 + 3 * k : 9 + 3 * k] = factor * np.eye(3)
+    values, vectors = np.linalg.eigh(mix @ moments @ mix.T)
+    roots = np.sqrt(np.maximum(values, 0.0))
+    return vectors[:, 0].reshape(3, 3).T, float(roots[0]), float(roots[1])
+
+
+def profile_from_moments(moments: Array, terms: int) -> tuple[float, ...]:
+    """The profile of lines seen through an unknown lens: the null vector holds g3 x (1, c), best rank one."""
+    products = null_vector(moments)[6:].reshape(terms + 1, 3)
+    left = np.linalg.svd(products)[0][:, 0]
+    return tuple(float(c / left[0]) for c in left[1:]) if abs(left[0]) > 1e-9 else (0.0,) * terms
+
+
+def orthogonality_error(homographies: Array, phi: ArrayLike) -> Array:
+    """How far r1 and r2 are from orthogonal and equally long for each phi, (len(phi), count), 0 for a true phi."""
+    phi = np.atleast_1d(np.asarray(phi, dtype=float))[:, None]
+    a, b = homographies[:, :, 0], homographies[:, :, 1]
+    dot = a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1] + phi**2 * a[:, 2] * b[:, 2]
+    aa = a[:, 0] ** 2 + a[:, 1] ** 2 + phi**2 * a[:, 2] ** 2
+    bb = b[:, 0] ** 2 + b[:, 1] ** 2 + phi**2 * b[:, 2] ** 2
+    return np.asarray(np.sqrt(4.0 * dot**2 + (aa - bb) ** 2) / (aa + bb))

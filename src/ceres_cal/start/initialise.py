@@ -1,0 +1,253 @@
+"""From nothing to a start for the solve, in closed form (design, section 7; the paper's sections 2 and 3).
+
+For each camera: the radial profile, one homography per sight, phi, lens coefficients, poses; then the poses are chained
+into stations and placements. Nothing here is the answer: the bundle is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Container, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ceres_cal.base.errors import DegenerateError
+from ceres_cal.base.transforms import Array, Pose, Poses, chained, inverted
+from ceres_cal.model.parameters import Estimate, Options, Station, anchored_stations
+from ceres_cal.model.structure import make_structure
+from ceres_cal.observations import Observations, Prior
+from ceres_cal.observations.sights import Rows, Sights
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.lens import Brown, KannalaBrandt, Lens, Radial
+from ceres_cal.start.closed_forms import Profile, orthogonality_error, polar_poses
+from ceres_cal.start.planes import Homographies, profile_and_homographies
+
+PHI_RANGE = (0.15, 15.0)
+"""In half image diagonals: 163 to 8 degrees across the image's diagonal. What lies beyond is no lens over a field."""
+USUAL_PHI = 1.4
+"""In half image diagonals: 71 degrees across the diagonal, a usual lens."""
+_ENOUGH_VIEWS = 50  # for phi
+_GRID = np.geomspace(*PHI_RANGE, 120)
+_NEAR = np.geomspace(1.0 / 1.04, 1.04, 13)  # a grid step to either side
+
+
+@dataclass(frozen=True)
+class Start:
+    """A start for the solve, and where phi of each camera came from: "fixed", "views", "prior" or "guess"."""
+
+    estimate: Estimate
+    phi_from: Mapping[str, str]
+
+
+def initialise(observations: Observations, sights: Sights, options: Options) -> Start:
+    """A start for everything the observations show.
+
+    Raises:
+        DegenerateError: naming the sight whose pose the observations cannot tell.
+    """
+    cameras: dict[str, Camera] = {}
+    phi_from: dict[str, str] = {}
+    numbers, poses = [], []
+    priors = (*observations.priors, *options.priors)
+    for name, image_size in observations.cameras.items():
+        own = np.array([number for number, key in enumerate(sights.keys) if key.camera == name], dtype=np.int64)
+        start = _start_camera(name, image_size, sights.take(own), options, priors)
+        cameras[name], phi_from[name] = start.camera, start.phi_from
+        numbers.append(own[start.sights])
+        poses.append(start.poses)
+    stations, placements = _chain_poses(observations, sights, np.concatenate(numbers), np.concatenate(poses))
+    structure = make_structure(observations.targets, options.tolerances)
+    return Start(Estimate(cameras, stations, placements, structure), phi_from)
+
+
+# ---- one camera -----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _CameraStart:
+    camera: Camera
+    phi_from: str
+    sights: Rows
+    poses: Array
+
+
+def _start_camera(
+    name: str, image_size: tuple[int, int], sights: Sights, options: Options, priors: Sequence[Prior]
+) -> _CameraStart:
+    blank = _blank_camera(name, image_size, options, priors)
+    if set(blank.lens.names) <= set(options.fixed) and blank.lens.kind == "radial":
+        blank.require_monotone(name)
+    unit = 0.5 * float(np.hypot(*image_size))
+    profile, homographies = profile_and_homographies(sights, blank, unit)
+    phi, phi_from = _choose_phi(sights, homographies, unit, options, [p for p in priors if _concerns(p, name, sights)])
+    reach = sights.reach_px(blank)
+    camera = replace(blank, phi=phi, lens=_fit_lens(blank.lens, profile, phi, reach, options.fixed))
+    return _CameraStart(camera, phi_from, homographies.sights, _poses_at(homographies, phi))
+
+
+def _concerns(prior: Prior, camera: str, sights: Sights) -> bool:
+    if prior.owner == "camera":
+        return prior.name == camera
+    return any(key.station == prior.name for key in sights.keys)
+
+
+def _poses_at(homographies: Homographies, phi: float) -> Array:
+    """cam_from_frame (K, 3, 4) of the homographies for one phi."""
+    matrices = polar_poses(homographies.matrices * np.array([[1.0 / phi], [1.0 / phi], [1.0]]))
+    matrices[:, :, 3] -= homographies.heights_m[:, None] * matrices[:, :, 2]
+    return matrices
+
+
+def _blank_camera(name: str, image_size: tuple[int, int], options: Options, priors: Sequence[Prior]) -> Camera:
+    """Fixed numbers and principal point put in; phi still to come."""
+    centre = [(image_size[0] - 1) / 2.0, (image_size[1] - 1) / 2.0]
+    aspect = options.fixed.get("aspect", 1.0)
+    for prior in priors:
+        if prior.owner == "camera" and prior.name == name:
+            if prior.quantity == "principal_point":
+                centre = list(prior.value)
+            elif prior.quantity in ("cx", "cy"):
+                centre[prior.quantity == "cy"] = prior.value[0]
+            elif prior.quantity == "aspect":
+                aspect = prior.value[0]
+    cx, cy = options.fixed.get("cx", centre[0]), options.fixed.get("cy", centre[1])
+    return Camera(image_size, 1.0, (cx, cy), options.blank_lens, aspect)
+
+
+# ---- phi and lens ---------------------------------------------------------------------------------------------------
+
+
+def _choose_phi(
+    sights: Sights,
+    homographies: Homographies,
+    unit: float,
+    options: Options,
+    priors: Sequence[Prior],
+) -> tuple[float, str]:
+    """phi from r1 . r2 = 0 and |r1| = |r2| over all sights, with what is known beforehand, by a one-dimensional search.
+
+    Where no view is tilted enough to tell and nothing is known, a usual field of view is guessed; the bundle then says
+    how little is known.
+    """
+    if "phi" in options.fixed:
+        return options.fixed["phi"], "fixed"
+    known = [p for p in priors if p.quantity in ("phi", "height_m", "position_m")]
+
+    some = slice(None, None, max(1, len(homographies.matrices) // _ENOUGH_VIEWS))
+
+    def cost(phi: Array) -> Array:
+        error = orthogonality_error(homographies.matrices[some], phi) * homographies.sizes_px[some]
+        total = np.sum(np.log1p((error / 0.5) ** 2), axis=1)
+        return np.asarray(total + sum(_prior_cost(prior, phi, sights, homographies) for prior in known))
+
+    grid = unit * _GRID
+    values = cost(grid)
+    acceptable = grid[values <= values.min() + 1.0]
+    flat = acceptable[-1] > 1.6 * acceptable[0]
+    middle = min(acceptable, key=lambda phi: abs(np.log(phi / (USUAL_PHI * unit)))) if flat else grid[np.argmin(values)]
+    for _ in range(0 if flat else 6):
+        place = int(np.argmin(cost(middle * _NEAR)))
+        middle *= _NEAR[place]
+        if 0 < place < len(_NEAR) - 1:
+            break
+    source = "guess" if flat else ("prior" if known else "views")
+    return float(middle), source
+
+
+def _prior_cost(prior: Prior, phi: Array, sights: Sights, homographies: Homographies) -> Array:
+    if prior.quantity == "phi":
+        return np.asarray(((phi - prior.value[0]) / prior.sigma[0]) ** 2)
+    keys = [sights.keys[i] for i in homographies.sights]
+    own = np.array([key.placement is None and key.station == prior.name for key in keys])
+    if not own.any():
+        return np.zeros(len(phi))
+    heights = []
+    for value in phi:
+        poses = _poses_at(homographies, value)[own]
+        heights.append(float(np.mean(-np.sum(poses[:, :, 2] * poses[:, :, 3], axis=1))))
+    spread = max(prior.sigma[-1], 0.01 * abs(prior.value[-1]))  # a start's height is no better than that
+    return np.asarray(((np.array(heights) - prior.value[-1]) / spread) ** 2)
+
+
+def _fit_lens(blank: Lens, profile: Profile, phi: float, reach_px: float, fixed: Mapping[str, float]) -> Lens:
+    """The lens nearest to the profile over the observed radii: every model is linear in its coefficients there."""
+    r = np.linspace(0.02, 1.0, 50) * reach_px
+    w = profile.lift(np.column_stack([r, np.zeros_like(r)]))[:, 2]
+    columns, right = _lens_equations(blank, r, w, phi)
+    free = [i for i, name in enumerate(blank.names) if name in columns and name not in fixed]
+    ahead = np.isfinite(right)
+    right = right - sum(
+        np.nan_to_num(columns[n]) * blank.coefficients[n] for n in blank.names if n in columns and n in fixed
+    )
+    for count in range(len(free), 0, -1):
+        basis = np.column_stack([columns[blank.names[i]] for i in free[:count]])[ahead]
+        values = np.array(blank.values)
+        values[free[:count]] = np.linalg.lstsq(basis, right[ahead], rcond=1e-8)[0]
+        lens = blank.with_values(values)
+        if lens.monotone_radius(phi) > 1.05 * reach_px:
+            return lens
+    return blank
+
+
+def _lens_equations(lens: Lens, r: Array, w: Array, phi: float) -> tuple[dict[str, Array], Array]:
+    """Columns by coefficient name and right side of the model at measured radii r whose rays are (r, phi w)."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ideal = np.where(w > 0.02, r / w, np.nan)
+    if isinstance(lens, Radial):
+        return {name: r**power for name, power in zip(lens.names, lens.powers, strict=True)}, ideal - r
+    if isinstance(lens, Brown):
+        u = ideal / phi
+        return {name: u**power for name, power in (("k1", 3), ("k2", 5), ("k3", 7))}, r / phi - u
+    assert isinstance(lens, KannalaBrandt)
+    angle = np.arctan2(r, phi * w)
+    return {name: angle**power for name, power in zip(lens.names, lens.radius_powers, strict=True)}, r / phi - angle
+
+
+# ---- stations and placements ----------------------------------------------------------------------------------------
+
+
+def _chain_poses(
+    observations: Observations, sights: Sights, numbers: Rows, poses: Array
+) -> tuple[dict[str, Station], Poses]:
+    """Stations and placements from the poses (K, 3, 4) of sights: best-seen first, each one extending what is known."""
+    sizes = np.diff(sights.point_bounds) + np.diff(sights.curve_bounds)
+    order = np.argsort(-sizes[numbers], kind="stable")
+    keys, seen = [sights.keys[i] for i in numbers[order]], poses[order]
+    stations = {name: np.eye(3, 4) for name in anchored_stations(observations)}
+    placements: dict[str | None, Array] = {None: np.eye(3, 4)}
+    known = -1
+    while len(stations) + len(placements) > known:
+        known = len(stations) + len(placements)
+        for key, pose in zip(keys, seen, strict=True):
+            if key.station not in stations and key.placement in placements:
+                stations[key.station] = chained(pose, inverted(placements[key.placement]))
+        fresh: dict[str | None, int] = {}
+        for place, key in enumerate(keys):
+            if key.placement not in placements and key.station in stations:
+                fresh.setdefault(key.placement, place)
+        if fresh:
+            places = list(fresh.values())
+            world_from_cam = inverted(np.array([stations[keys[place].station] for place in places]))
+            placements |= dict(zip(fresh, chained(world_from_cam, seen[places]), strict=True))
+    _require_all(observations, sights, stations, placements)
+    cameras = observations.stations
+    named = [name for name in placements if name is not None]
+    return (
+        {n: Station(cameras[n], Pose(stations[n][:, :3], stations[n][:, 3])) for n in cameras if n in stations},
+        Poses.stacked(named, np.array([placements[name] for name in named]).reshape(-1, 3, 4)),
+    )
+
+
+def _require_all(
+    observations: Observations, sights: Sights, stations: Container[str], placements: Container[str | None]
+) -> None:
+    for number, key in enumerate(sights.keys):
+        if key.station in stations and key.placement in placements:
+            continue
+        sight = sights[number]
+        frames = ", ".join(repr(observations.views[i].frame) for i in sight.views[0][:3])
+        raise DegenerateError(
+            f"frame {frames} ({key}): {len(sight.point_rows)} points and {len(sight.curve_rows)} curve observations "
+            f"(on {len(np.unique(sight.track))} curves) cannot fix its pose: give at least four points, not on one "
+            "line, or straight lines in two directions, two of each, or remove the view"
+        )

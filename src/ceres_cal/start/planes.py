@@ -1,0 +1,346 @@
+"""Sights as planes: the radial profile of a camera, and each sight's homography, from any mix of points and lines.
+
+The steps of design section 7, 1 and 2, on top of `closed_forms`: which sights can tell what, reweighting and LO-RANSAC
+against wrong labels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ceres_cal.base.errors import DegenerateError
+from ceres_cal.base.transforms import Array
+from ceres_cal.kernels import grouped_scatter
+from ceres_cal.observations.sights import Mask, Rows, Sights, bounds_of, ranges
+from ceres_cal.scene.camera import Camera
+from ceres_cal.start.closed_forms import (
+    PlaneData,
+    Profile,
+    facing,
+    homographies_of_sights,
+    homography_from_points,
+    inverse_homography_from_moments,
+    line_moments,
+    profile_from_moments,
+    radial_alignment,
+    ring_profile,
+)
+
+_MOST = 1500  # observations of one kind in a sight beyond which a start learns nothing more
+_ENOUGH_BOARDS = 24  # for a profile
+_ENOUGH_POINTS = 40.0  # of a board
+_GOLDEN = 0.6180339887498949
+_ROUGH_PX = 1.0  # a median beyond it may be no fit at all, however even
+_SUSPICIOUS = 8.0  # medians: no clean residual is that long
+_NO_FIT = 0.01  # typical distance in a plane scaled to unit size; the fits are 20 times better
+
+
+@dataclass(frozen=True, eq=False)
+class PlaneSight:
+    """A sight's observations on its plane z = height: points and straight segments, offsets in px."""
+
+    sight: Sights
+    height_m: float
+    points: Array
+    offsets: Array
+    lines: Array
+    line_offsets: Array
+
+    @property
+    def equations(self) -> int:
+        """What the sight can say of a homography's eight numbers: two for each point, two for each line."""
+        return 2 * len(np.unique(self.points, axis=0)) + 2 * len(np.unique(self.lines, axis=0))
+
+    @property
+    def size_px(self) -> float:
+        """Spread of the observations over the image; 0 where there are none on the plane."""
+        every = np.vstack([self.offsets, self.line_offsets])
+        if not len(every):
+            return 0.0
+        return float(np.sqrt(np.mean(np.sum((every - every.mean(axis=0)) ** 2, axis=1))))
+
+
+def _on_plane(sight: Sights, camera: Camera) -> PlaneSight:
+    """The observations on the plane that holds most of them, thinned where there are very many."""
+    starts, along = sight.tracks[:, 0], sight.tracks[:, 1]
+    level = np.abs(along[:, 2]) < 1e-12
+    on_level = np.flatnonzero(level[sight.track])
+    z = np.concatenate([sight.points[:, 2], starts[sight.track[on_level[:: max(1, len(on_level) // _MOST)]], 2]])
+    heights, votes = np.unique(z.round(9), return_counts=True)
+    height = float(heights[np.argmax(votes)]) if len(heights) else 0.0
+    on = np.flatnonzero(np.abs(sight.points[:, 2] - height) < 1e-9)
+    on = on[:: max(1, len(on) // _MOST)]
+    usable = level & ~sight.is_arc & (np.abs(starts[:, 2] - height) < 1e-9)
+    straight = np.flatnonzero(usable[sight.track])
+    straight = straight[:: max(1, len(straight) // _MOST)]
+    c, a = starts[sight.track[straight], :2], along[sight.track[straight], :2]
+    normal = np.column_stack([-a[:, 1], a[:, 0]]) / np.linalg.norm(a, axis=1, keepdims=True)
+    return PlaneSight(
+        sight,
+        height,
+        sight.points[on, :2],
+        camera.offsets(sight.pixels[on]),
+        np.column_stack([normal, -np.sum(normal * c, axis=1)]),
+        camera.offsets(sight.curve_pixels[straight]),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Homographies:
+    """The homographies that a camera's sights could tell.
+
+    Attributes:
+        sights: (K,) numbers of the sights. matrices: (K, 3, 3), plane (x, y, 1) m to (p px, w), see `closed_forms`.
+        heights_m: (K,) z of each plane. sizes_px: (K,) spread of its observations over the image.
+    """
+
+    sights: Rows
+    matrices: Array
+    heights_m: Array
+    sizes_px: Array
+
+
+def profile_and_homographies(sights: Sights, camera: Camera, unit: float) -> tuple[Profile, Homographies]:
+    """The camera's radial profile and the homography of each of its sights that can tell one."""
+    pure = _flat_sights_of_points(sights)
+    rest = np.delete(np.arange(len(sights)), pure)
+    planes = {int(i): _on_plane(sights[int(i)], camera) for i in rest}
+    found: dict[int, Array] = {}
+    profile: Profile | None = None
+    board = sights.take(pure)
+    if len(pure):
+        data = _plane_data(board, _spread_rows(board.point_bounds), camera)
+        profile = _profile_of_boards(board, data, camera, unit)
+    for i, plane in planes.items():
+        if plane.equations == 0 and len(sights[i].track) and sights[i].is_arc[sights[i].track].all():
+            ring, found[i] = _from_rings(sights[i], camera, unit)
+            profile = profile or ring
+    mixed = [i for i, plane in planes.items() if plane.equations >= 8]
+    # Boards in a corner of the image may say nothing of the rest of it.
+    if profile is None or any(_solve_plane(planes[i], profile, rounds=2)[1] > _NO_FIT for i in mixed):
+        profile = _profile_from_lines([planes[i] for i in mixed], unit)
+    found |= {i: _homography_of(planes[i], profile) for i in mixed}
+    parts = [Homographies(np.array([i]), h[None], *_extent(planes[i])) for i, h in found.items()]
+    if len(pure):
+        sizes = np.sqrt(np.trace(grouped_scatter(data.offsets, data.bounds), axis1=1, axis2=2))
+        heights = board.points[board.point_bounds[:-1], 2]
+        matrices = _homographies_of_boards(board, data, camera, profile)
+        told = _spans(matrices)
+        parts.append(Homographies(pure[told], matrices[told], heights[told], sizes[told]))
+    names = ("sights", "matrices", "heights_m", "sizes_px")
+    if not parts:
+        return profile, Homographies(np.empty(0, np.int64), np.empty((0, 3, 3)), np.empty(0), np.empty(0))
+    return profile, Homographies(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+
+
+def _spans(homographies: Array) -> Mask:
+    """Which homographies (K, 3, 3) send the plane to more than a point or a line."""
+    b = homographies[:, :, :2]
+    m = np.swapaxes(b, 1, 2) @ b
+    return np.asarray(np.linalg.det(m) > 1e-20 * np.trace(m, axis1=1, axis2=2) ** 2)
+
+
+def _extent(plane: PlaneSight) -> tuple[Array, Array]:
+    return np.array([plane.height_m]), np.array([plane.size_px])
+
+
+def _flat_sights_of_points(sights: Sights) -> Rows:
+    """Numbers of the sights that show at least six points of one plane, not on one line, and no curve."""
+    few = (np.diff(sights.point_bounds) >= 6) & (np.diff(sights.curve_bounds) == 0)
+    candidates = np.flatnonzero(few)
+    board = sights.take(candidates)
+    scatter = grouped_scatter(board.points, board.point_bounds)
+    xx, xy, yy = scatter[:, 0, 0], scatter[:, 0, 1], scatter[:, 1, 1]
+    flat = scatter[:, 2, 2] < 1e-18
+    return np.asarray(candidates[flat & (xx * yy - xy**2 > 1e-12 * (xx + yy) ** 2)])
+
+
+def _profile_of_boards(board: Sights, data: PlaneData, camera: Camera, unit: float) -> Profile:
+    """By radial alignment on some points of some sights; on all points of these, with more patience, where not all fit.
+
+    A profile needs no more: every other homography follows from it.
+    """
+    numbers = np.unique(np.linspace(0, len(board) - 1, _ENOUGH_BOARDS).round().astype(np.int64))
+    rows, sizes = ranges(data.bounds, numbers), np.diff(board.point_bounds)[numbers]
+    few = PlaneData(
+        bounds_of(np.diff(data.bounds)[numbers]), data.plane.take(rows, axis=0), data.offsets.take(rows, axis=0)
+    )
+    terms = int(np.clip((sizes.sum() - 3 * len(numbers)) // 8, 1, 3))
+    first = radial_alignment(few, unit, terms, rounds=2)
+    wrong = (first.relative_error > _SUSPICIOUS) & (first.error_px > 1.0)
+    if np.mean(wrong) < 0.02 and np.median(first.error_px) < _ROUGH_PX:
+        return first.profile
+    some = board.take(numbers)
+    return radial_alignment(_plane_data(some, np.arange(len(some.points)), camera), unit, terms, rounds=8).profile
+
+
+def _spread_rows(bounds: Rows) -> Rows:
+    """Rows of about as many points of each sight as are enough.
+
+    Steps of the golden ratio spread them evenly and never along one row of a board.
+    """
+    sizes = np.diff(bounds)
+    order = (np.arange(sizes.max()) * _GOLDEN) % 1.0
+    place = np.arange(bounds[-1]) - np.repeat(bounds[:-1], sizes)
+    return np.flatnonzero(order[place] < np.repeat(_ENOUGH_POINTS / sizes, sizes))
+
+
+def _plane_data(board: Sights, rows: Rows, camera: Camera) -> PlaneData:
+    """Of some points of the sights, given by their rows there."""
+    return PlaneData(
+        np.searchsorted(rows, board.point_bounds),
+        np.ascontiguousarray(board.points.take(rows, axis=0)[:, :2]),
+        camera.offsets(board.pixels.take(rows, axis=0)),
+    )
+
+
+def _as_lines(plane: PlaneSight, scale: float) -> tuple[Array, Array]:
+    """Every observation as pixels on lines of the plane scaled to unit size; a point is the crossing of two."""
+    x, y = scale * plane.points.T
+    one, zero = np.ones(len(x)), np.zeros(len(x))
+    lines = np.vstack(
+        [
+            np.column_stack([one, zero, -x]),
+            np.column_stack([zero, one, -y]),
+            plane.lines * (1.0, 1.0, scale),
+        ]
+    )
+    return lines, np.vstack([plane.offsets, plane.offsets, plane.line_offsets])
+
+
+def _scale_of(plane: PlaneSight) -> float:
+    reach = max(
+        float(np.max(np.abs(plane.points), initial=0.0)), float(np.max(np.abs(plane.lines[:, 2]), initial=0.0)), 1e-9
+    )
+    return 1.0 / reach
+
+
+def _solve_plane(plane: PlaneSight, profile: Profile, rounds: int) -> tuple[Array, float, float]:
+    """(G, typical distance in the scaled plane, distinctness): point-on-line DLT, reweighted against wrong labels."""
+    scale = _scale_of(plane)
+    lines, offsets = _as_lines(plane, scale)
+    lifted = profile.lift(offsets) / (profile.unit_px, profile.unit_px, 1.0)
+    weights = np.ones(len(lines))
+    inverse, typical, distinct = np.eye(3), np.inf, 0.0
+    for _ in range(rounds):
+        moments = line_moments(lines, offsets, weights, profile.unit_px, len(profile.coefficients))
+        inverse, _, distinct = inverse_homography_from_moments(moments / len(lines), profile.coefficients)
+        sent = lifted @ inverse.T
+        distance = np.abs(np.sum(lines * sent, axis=1)) / np.maximum(np.abs(sent[:, 2]), 1e-9)
+        typical = float(np.median(distance))
+        bound = max(3.0 * typical, 1e-9)
+        weights = 1.0 / (np.maximum(sent[:, 2] ** 2, 1e-9) * (1.0 + (distance / bound) ** 2))
+        weights /= weights.mean()
+    return np.diag([1.0, 1.0, scale]) @ inverse, typical, distinct
+
+
+def _homography_of(plane: PlaneSight, profile: Profile) -> Array:
+    """H of one sight: plane (x, y, 1) m to (p in px, w)."""
+    inverse, _, distinct = _solve_plane(plane, profile, rounds=6)
+    if distinct < 1e-6:
+        raise DegenerateError(
+            f"{plane.sight.key}: its {len(plane.points)} points and {len(np.unique(plane.lines, axis=0))} lines "
+            "cannot fix the plane's pose (all on one line, or parallel): add points or lines in other directions"
+        )
+    homography = np.diag([profile.unit_px, profile.unit_px, 1.0]) @ np.linalg.inv(inverse)
+    lifted = profile.lift(np.vstack([plane.offsets, plane.line_offsets]))
+    sent = lifted @ np.linalg.inv(homography).T
+    return facing(homography, sent[:, :2] / sent[:, 2:], lifted)
+
+
+def _profile_from_lines(planes: Sequence[PlaneSight], unit: float) -> Profile:
+    """The profile under which lines are straight and points in place: rank-one closed form, then a shrinking grid."""
+    candidates = [(0.0, 0.0)]
+    for plane in planes:
+        lines, offsets = _as_lines(plane, _scale_of(plane))
+        candidates.append(profile_from_moments(line_moments(lines, offsets, np.ones(len(lines)), unit, 2), 2))  # type: ignore[arg-type]
+    candidates += [(c1, c2) for c1 in np.linspace(-1.0, 0.4, 8) for c2 in np.linspace(-0.6, 0.6, 5)]
+
+    def misfit(c: tuple[float, ...]) -> float:
+        if np.min(1.0 + c[0] * _RADII**2 + c[1] * _RADII**4) < -0.5:
+            return np.inf
+        return sum(_solve_plane(plane, Profile(c, unit), rounds=2)[1] for plane in planes)
+
+    best = min(candidates, key=misfit) if planes else candidates[0]
+    for width in (0.1, 0.03, 0.01, 0.003) if planes else ():
+        around = [(best[0] + i * width, best[1] + j * width) for i in (-1, 0, 1) for j in (-1, 0, 1)]
+        best = min(around, key=misfit)
+    return Profile(best, unit)
+
+
+_RADII = np.linspace(0.0, 1.0, 21)
+
+
+@dataclass(frozen=True, eq=False)
+class RingRadii:
+    """Rings seen about frontally: their centre (2,) px, and for each observation (M,) its distance from there (px) and
+    the radius of its ring (m).
+    """
+
+    centre: Array
+    measured_px: Array
+    ring_m: Array
+
+
+def ring_radii(sight: Sights, camera: Camera) -> RingRadii:
+    """Radii of the observed rings around their own centre, which need not be the principal point (paper, section 2)."""
+    on_ring = sight.is_arc[sight.track]
+    offsets = camera.offsets(sight.curve_pixels)[on_ring]
+    radii = np.linalg.norm(sight.tracks[sight.track[on_ring], 1], axis=1)
+    _, ring = np.unique(radii, return_inverse=True)
+    centre = offsets.mean(axis=0)
+    for _ in range(10):  # each ring's own mean radius, so that stretches that are not seen do not pull the centre
+        away = offsets - centre
+        radius = np.linalg.norm(away, axis=1)
+        mean = np.bincount(ring, radius) / np.bincount(ring)
+        direction = away / np.maximum(radius, 1e-9)[:, None]
+        centre = centre + np.linalg.lstsq(direction, radius - mean[ring], rcond=None)[0]
+    return RingRadii(centre, np.linalg.norm(offsets - centre, axis=1), radii)
+
+
+def _from_rings(sight: Sights, camera: Camera, unit: float) -> tuple[Profile, Array]:
+    """Profile and homography of concentric rings seen about frontally."""
+    radii = ring_radii(sight, camera)
+    profile, kappa = ring_profile(radii.measured_px, radii.ring_m, unit)
+    if len(np.unique(radii.ring_m)) < 3:
+        profile = Profile((0.0, 0.0), unit)
+    cx, cy = radii.centre
+    return profile, np.array([[kappa, 0.0, cx], [0.0, kappa, cy], [0.0, 0.0, 1.0]])
+
+
+def _homographies_of_boards(board: Sights, data: PlaneData, camera: Camera, profile: Profile) -> Array:
+    """The homographies, by LO-RANSAC (pycolmap) where some points of a sight lie far off while most fit."""
+    homographies, error_px = homographies_of_sights(data, profile)
+    limit = max(_SUSPICIOUS * float(np.median(error_px)), 2.0)
+    far = np.add.reduceat(error_px > limit, data.bounds[:-1], dtype=np.int64)
+    sizes = np.diff(data.bounds)
+    for number in np.flatnonzero((far > 0.1 * sizes) & (sizes >= 8)):
+        sight = board[int(number)]
+        found = consensus_homography(sight.points[:, :2], profile.lift(camera.offsets(sight.pixels)), limit)
+        if found is not None:
+            homographies[number] = found
+    return homographies
+
+
+def consensus_homography(plane: Array, lifted: Array, limit_px: float) -> Array | None:
+    """The homography that most points agree on within `limit_px`, by LO-RANSAC (pycolmap), or None.
+
+    Args:
+        plane: (N, 2) m. lifted: (N, 3) homogeneous undistorted offsets, px.
+    """
+    import pycolmap
+
+    options = pycolmap.RANSACOptions()
+    options.max_error = limit_px
+    options.random_seed = 0
+    found = pycolmap.estimate_homography_matrix(plane, lifted[:, :2] / lifted[:, 2:], options)
+    if found is None:
+        return None
+    inliers = np.asarray(found["inlier_mask"], dtype=bool)
+    try:
+        return homography_from_points(plane[inliers], lifted[inliers])
+    except DegenerateError:
+        return None
