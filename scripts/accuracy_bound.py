@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from accuracy_scenes import Problem
 
+from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import CalibrationError
-from ceres_cal.base.transforms import Array
 from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
 from ceres_cal.model import quantities

@@ -23,8 +23,9 @@ from accuracy_scenes import FIELD, field_places
 from cases import Row, run
 from photographs import varied
 
+from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import CalibrationError
-from ceres_cal.base.transforms import Array, Pose, rotation_exp
+from ceres_cal.base.transforms import Pose, rotation_exp
 from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
 from ceres_cal.detect.boards import detect_boards

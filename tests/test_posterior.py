@@ -11,9 +11,10 @@ import pytest
 from scenes import SCENES
 from scipy.stats import t as student
 
+from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.spread import Spread
-from ceres_cal.base.transforms import Array, Pose, left_jacobian, skew
+from ceres_cal.base.transforms import Pose, left_jacobian, skew
 from ceres_cal.calibrating import calibrate
 from ceres_cal.model.parameters import Estimate, Layout, Options, intrinsics_scales, make_layout
 from ceres_cal.model.quantities import Key, difference, moved, pose_keys, shared_keys

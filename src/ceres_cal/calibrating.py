@@ -7,14 +7,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.errors import DegenerateError, SolutionError
 from ceres_cal.base.threads import at_most, meanwhile, single_threaded_blas
-from ceres_cal.base.transforms import Array
 from ceres_cal.calibration import Calibration, Fit, Rejected
 from ceres_cal.model.parameters import Estimate, Layout, Options, make_layout
 from ceres_cal.model.residuals import Residuals, residuals
 from ceres_cal.observations import Observations
-from ceres_cal.observations.sights import Rows, SightKey, Sights, gather_sights
+from ceres_cal.observations.sights import SightKey, Sights, gather_sights
 from ceres_cal.scene.camera import Camera
 from ceres_cal.solve import Progress, Solution, Weighting, private_placements, settle_placements, solve
 from ceres_cal.solve.lost import with_lost_boards_found
@@ -195,7 +195,7 @@ def _settle(
     return _Settled(solution, inliers, found, rounds)
 
 
-def _spread(sights: Sights, layout: Layout) -> Rows:
+def _spread(sights: Sights, layout: Layout) -> Indices:
     """Numbers of some sights that tell a camera well enough for a start: of private placements no more than enough."""
     private = private_placements(sights, layout)
     chosen: list[int] = []

@@ -13,8 +13,9 @@ from typing import Any
 
 import numpy as np
 
+from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.errors import CalibrationError, DegenerateError, InputError
-from ceres_cal.base.transforms import Array, Pose
+from ceres_cal.base.transforms import Pose
 from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
 from ceres_cal.diagnostics.equations import write_equations
@@ -23,7 +24,7 @@ from ceres_cal.model.parameters import Estimate, Layout, Options
 from ceres_cal.model.residuals import residuals
 from ceres_cal.model.structure import make_structure
 from ceres_cal.observations import Columns, Observations
-from ceres_cal.observations.sights import Mask, Sights, gather_sights
+from ceres_cal.observations.sights import Sights, gather_sights
 from ceres_cal.solve import Weighting, solve
 
 FOLDS = 5

@@ -8,7 +8,8 @@ from functools import cached_property
 
 import numpy as np
 
-from ceres_cal.base.transforms import Array, Pose
+from ceres_cal.base.arrays import Array
+from ceres_cal.base.transforms import Pose
 from ceres_cal.scene.camera import Camera
 
 _TOLD = 1e-11  # eigenvalue, at unit diagonal, from which on a direction counts as told

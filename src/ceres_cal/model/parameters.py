@@ -12,10 +12,10 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.transforms import Array, Pose, Poses, chained, inverted
+from ceres_cal.base.transforms import Pose, Poses, chained, inverted
 from ceres_cal.model.joint import JointPrior
 from ceres_cal.model.structure import Structure, Tolerance
 from ceres_cal.observations import Observations, Prior
@@ -174,7 +174,7 @@ class Layout:
         priors: on free numbers. joint: what an earlier calibration knew of many numbers together.
     """
 
-    free: Mapping[str, NDArray[np.int64]]
+    free: Mapping[str, Indices]
     stations: frozenset[str]
     placements: frozenset[str]
     priors: tuple[Prior, ...] = ()

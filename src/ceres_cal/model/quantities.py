@@ -13,7 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ceres_cal.base.transforms import Array, Pose, rotation_exp, rotation_log, skew
+from ceres_cal.base.arrays import Array
+from ceres_cal.base.transforms import Pose, rotation_exp, rotation_log, skew
 from ceres_cal.model.parameters import (
     Estimate,
     Layout,

@@ -8,8 +8,8 @@ from functools import cached_property
 import numpy as np
 
 from ceres_cal import kernels
+from ceres_cal.base.arrays import Array
 from ceres_cal.base.threads import parts_of, run_parts
-from ceres_cal.base.transforms import Array
 from ceres_cal.model.parameters import Estimate, intrinsics_vector, unit_px
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights, nearest_places

@@ -11,10 +11,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.errors import CalibrationError, InputError
 from ceres_cal.base.spread import Spread
 from ceres_cal.base.tails import upper_tail
-from ceres_cal.base.transforms import Array, Pose
+from ceres_cal.base.transforms import Pose
 from ceres_cal.calibration import Calibration
 from ceres_cal.model.joint import JointPrior
 from ceres_cal.model.parameters import Estimate, Layout, intrinsic_names
@@ -22,7 +23,7 @@ from ceres_cal.model.quantities import Key, sigma_limits
 from ceres_cal.moves.carried import kept_prior, require_same_things, with_structure, without_keys
 from ceres_cal.moves.poses import Place, Scene, movement, places
 from ceres_cal.observations import Observations
-from ceres_cal.observations.sights import Mask, Sights, gather_sights
+from ceres_cal.observations.sights import Sights, gather_sights
 from ceres_cal.scene.camera import Camera
 from ceres_cal.solve import Weighting, information, solve
 from ceres_cal.uncertainty import Posterior

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.spread import Spread, known_inverses
 from ceres_cal.base.tails import upper_tail
-from ceres_cal.base.transforms import Array
 from ceres_cal.calibration import Calibration
 from ceres_cal.model.parameters import Estimate
 from ceres_cal.model.quantities import Key, difference, sigma_limits

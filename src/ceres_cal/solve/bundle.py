@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 import pyceres
-from numpy.typing import NDArray
 
+from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.errors import DegenerateError, InputError, SolutionError
 from ceres_cal.base.threads import at_most, available
-from ceres_cal.base.transforms import Array, Pose, Poses
+from ceres_cal.base.transforms import Pose, Poses
 from ceres_cal.model.parameters import (
     Estimate,
     Layout,
@@ -288,7 +288,7 @@ def settle_placements(sights: Sights, estimate: Estimate, layout: Layout, weight
     return estimate
 
 
-def _numbers(sights: Sights, camera: str, placements: Container[str | None]) -> NDArray[np.int64]:
+def _numbers(sights: Sights, camera: str, placements: Container[str | None]) -> Indices:
     """Of a camera's sights of these placements."""
     keys = enumerate(sights.keys)
     return np.array([i for i, key in keys if key.camera == camera and key.placement in placements], dtype=np.int64)
@@ -361,15 +361,13 @@ def _prior_blocks(layout: Layout, estimate: Estimate, blocks: _Blocks) -> Iterab
         yield LinearPriorCost(fresh, np.zeros(len(fresh)), sigma_m[fresh], len(sigma_m)), blocks.structure
 
 
-def own_structure(layout: Layout, estimate: Estimate) -> NDArray[np.int64]:
+def own_structure(layout: Layout, estimate: Estimate) -> Indices:
     """Places of the structure numbers under their tolerance, not under the joint prior, which holds theirs."""
     known = frozenset() if layout.joint is None else layout.joint.structure_names
     return np.array([i for i, name in enumerate(estimate.structure.names) if name not in known], dtype=np.int64)
 
 
-def prior_on_intrinsics(
-    prior: Prior, estimate: Estimate, free: Mapping[str, NDArray[np.int64]]
-) -> tuple[NDArray[np.int64], Array, Array]:
+def prior_on_intrinsics(prior: Prior, estimate: Estimate, free: Mapping[str, Indices]) -> tuple[Indices, Array, Array]:
     """Places in the camera's block, mean and sigma in the solver's units; a number that is held needs no prior."""
     camera = estimate.cameras[prior.name]
     names = intrinsic_names(camera.lens)

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pyceres
-from numpy.typing import NDArray
 
 from ceres_cal import kernels
+from ceres_cal.base.arrays import AnyArray, Array, Indices
 from ceres_cal.base.threads import parts_of, run_parts
-from ceres_cal.base.transforms import Array, left_jacobian, rotation_exp, skew
+from ceres_cal.base.transforms import left_jacobian, rotation_exp, skew
 from ceres_cal.model.parameters import Estimate, Layout
 from ceres_cal.model.residuals import lens_arguments, starting_places
 from ceres_cal.model.structure import Structure
@@ -118,7 +118,7 @@ class SightCost(pyceres.CostFunction):
         return (at, residuals, [outputs[slot] for slot in self.slots]) if answered else None
 
 
-def kernel_columns(sights: Sights, structure: Structure, weighting: Weighting) -> tuple[NDArray[Any], ...]:
+def kernel_columns(sights: Sights, structure: Structure, weighting: Weighting) -> tuple[AnyArray, ...]:
     """The observations as the kernels take them, but for points and tracks, which the structure moves."""
     moves = len(structure.values) > 0
     feature = sights.feature if moves else sights.feature[:0]
@@ -167,7 +167,7 @@ class EliminatedCost(pyceres.CostFunction):
         run: Run,
         sights: Sights,
         estimate: Estimate,
-        free: NDArray[np.int64],
+        free: Indices,
         weighting: Weighting,
         places: Array | None = None,
     ) -> None:
@@ -274,7 +274,7 @@ class EliminatedCost(pyceres.CostFunction):
 class LinearPriorCost(pyceres.CostFunction):
     """(value - mean) / sigma of some free intrinsics of one camera."""
 
-    def __init__(self, places: NDArray[np.int64], mean: Array, sigma: Array, size: int) -> None:
+    def __init__(self, places: Indices, mean: Array, sigma: Array, size: int) -> None:
         super().__init__()
         self._places, self._mean, self._sigma = places, mean, sigma
         self.set_num_residuals(len(places))
@@ -292,7 +292,7 @@ class LinearPriorCost(pyceres.CostFunction):
 class PositionPriorCost(pyceres.CostFunction):
     """(position - mean) / sigma of a station, on some axes: position = -R^T t."""
 
-    def __init__(self, axes: NDArray[np.int64], mean: Array, sigma: Array) -> None:
+    def __init__(self, axes: Indices, mean: Array, sigma: Array) -> None:
         super().__init__()
         self._axes, self._mean, self._sigma = axes, mean, sigma
         self.set_num_residuals(len(axes))

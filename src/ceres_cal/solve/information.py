@@ -10,13 +10,12 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ceres_cal import kernels
+from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.errors import SolutionError
 from ceres_cal.base.spread import known_inverses
 from ceres_cal.base.threads import parts_of, run_parts
-from ceres_cal.base.transforms import Array
 from ceres_cal.model.parameters import Estimate, Layout, intrinsics_scales
 from ceres_cal.model.quantities import (
     Key,
@@ -32,7 +31,6 @@ from ceres_cal.observations.sights import SightKey, Sights
 from ceres_cal.solve.bundle import own_structure, private_placements
 from ceres_cal.solve.costs import NORMAL_NS, Weighting, kernel_columns
 
-Places = NDArray[np.int64]
 _BATCH = 2_000_000  # numbers of normal equations worked on at once
 
 
@@ -50,7 +48,7 @@ class Eliminated:
     own: Array
     inverses: Array
     gains: Array
-    places: Places
+    places: Indices
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +95,7 @@ def information(
     return Information(keys, 0.5 * (matrix + matrix.T), tuple(eliminated))
 
 
-Owned = Callable[[str, str], Places]
+Owned = Callable[[str, str], Indices]
 
 
 def _owned(keys: Sequence[Key]) -> Owned:

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 import pyceres
 
-from ceres_cal.base.transforms import Array, Pose, left_jacobian, rotation_exp, rotation_log, skew
+from ceres_cal.base.arrays import Array
+from ceres_cal.base.transforms import Pose, left_jacobian, rotation_exp, rotation_log, skew
 from ceres_cal.model.joint import JointPrior
 from ceres_cal.model.parameters import (
     Estimate,

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ceres_cal.base.transforms import Array
+from ceres_cal.base.arrays import Array
 from ceres_cal.model.parameters import Estimate, Layout
 from ceres_cal.observations.sights import Sights
 from ceres_cal.solve import Weighting, placement_costs, private_placements

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from ceres_cal.base.transforms import Array
+from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.model.parameters import Estimate, Layout
-from ceres_cal.observations.sights import Rows, SightKey, Sights
+from ceres_cal.observations.sights import SightKey, Sights
 from ceres_cal.solve import Weighting, placement_costs, private_placements
 
 _DECIDED_SIGMA = 100.0  # perspective that bends a view by so many standard deviations leaves no doubt
@@ -73,7 +73,7 @@ def _boxes(sights: Sights) -> tuple[Array, Array]:
     return 0.5 * (low + high), 0.5 * np.linalg.norm(high - low, axis=1)
 
 
-def _doubtful(sights: Sights, poses: Array, estimate: Estimate, weighting: Weighting) -> Rows:
+def _doubtful(sights: Sights, poses: Array, estimate: Estimate, weighting: Weighting) -> Indices:
     """Sights of points whose two poses differ by little: the bend that perspective adds, phi (size / depth)^2 sin(tilt)
     cos(tilt), against the noise.
     """

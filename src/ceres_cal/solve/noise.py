@@ -10,10 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ceres_cal.base.transforms import Array
+from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.model.residuals import Residuals
 from ceres_cal.observations import Observations
-from ceres_cal.observations.sights import Mask
 
 _LEAST_FREEDOM = 8.0  # spare equations below which a spread says nothing
 _USUAL_FREEDOM = 10.0  # spare equations that a scale seen before stands for

@@ -12,8 +12,9 @@ from itertools import combinations
 
 import numpy as np
 
+from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import DegenerateError
-from ceres_cal.base.transforms import Array, Pose
+from ceres_cal.base.transforms import Pose
 from ceres_cal.model.parameters import Estimate, Station
 from ceres_cal.observations.sights import Sights
 from ceres_cal.scene.camera import Camera

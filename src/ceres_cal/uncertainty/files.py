@@ -7,8 +7,8 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.transforms import Array
 from ceres_cal.model.quantities import Key
 from ceres_cal.uncertainty.posterior import Posterior
 from ceres_cal.uncertainty.profile import Profile

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.spread import Spread
-from ceres_cal.base.transforms import Array
 from ceres_cal.model.parameters import Estimate
 from ceres_cal.model.quantities import STATION_QUANTITIES, Key, camera_moved, moved, natural_sizes, sigma_limits
 from ceres_cal.uncertainty.posterior import Posterior

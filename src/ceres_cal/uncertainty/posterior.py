@@ -7,11 +7,10 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.spread import Spread, without
-from ceres_cal.base.transforms import Array
 from ceres_cal.model.quantities import Key, pose_keys, sigma_limits
 from ceres_cal.solve import Eliminated, Information
 from ceres_cal.uncertainty.profile import Profile
@@ -104,7 +103,7 @@ class Posterior:
             raise InputError(f"placement {name!r} has no free pose: it was held, or is not there")
         return Spread.of(self.marginal(np.array(at)), sigma_limits(keys))
 
-    def marginal(self, places: NDArray[np.int64]) -> Array:
+    def marginal(self, places: Indices) -> Array:
         """(n, n) information about the numbers at these places, all others integrated out."""
         others = np.setdiff1d(np.arange(len(self.keys)), places)
         here = self.information[np.ix_(places, places)]

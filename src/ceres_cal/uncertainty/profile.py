@@ -14,9 +14,9 @@ from itertools import pairwise
 
 import numpy as np
 
+from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import CalibrationError, SolutionError
 from ceres_cal.base.spread import known_inverses, without
-from ceres_cal.base.transforms import Array
 from ceres_cal.model.parameters import Estimate, Layout, Options, unit_px
 from ceres_cal.model.quantities import Key, difference, moved, sigma_limits
 from ceres_cal.observations.sights import Sights

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ceres_cal.base.arrays import Array
 from ceres_cal.base.digits import two_digits
-from ceres_cal.base.transforms import Array
 from ceres_cal.model.parameters import Estimate, intrinsic_names, intrinsics_scales, intrinsics_vector
 from ceres_cal.model.quantities import PLACEMENT_QUANTITIES, Key, natural_sizes
 from ceres_cal.uncertainty.posterior import Posterior
