@@ -198,13 +198,12 @@ def _settle(
 def _spread(sights: Sights, layout: Layout) -> Indices:
     """Numbers of some sights that tell a camera well enough for a start: of private placements no more than enough."""
     private = private_placements(sights, layout)
-    chosen: list[int] = []
-    for camera in {key.camera for key in sights.keys}:
-        own = [number for number, key in enumerate(sights.keys) if key.camera == camera]
-        boards = [number for number in own if sights.keys[number].placement in private]
-        chosen += boards[:: max(1, len(boards) // _ENOUGH_PLACEMENTS)]
-        chosen += [number for number in own if sights.keys[number].placement not in private]
-    return np.array(sorted(chosen), dtype=np.int64)
+    chosen = np.empty(0, dtype=np.int64)
+    for camera in sights.cameras:
+        boards = sights.numbers(camera, placements=private)
+        few = boards[:: max(1, len(boards) // _ENOUGH_PLACEMENTS)]
+        chosen = np.concatenate([chosen, few, np.setdiff1d(sights.numbers(camera), boards)])
+    return np.sort(chosen)
 
 
 def _mended(
@@ -240,7 +239,7 @@ def _require_usable(settled: _Settled, sights: Sights) -> tuple[str, ...]:
             continue
         fold, corner = camera.lens.monotone_radius(camera.phi), camera.corner_radius
         where = f"camera {name!r}: the solved {camera.lens.kind} lens folds {fold:.0f} px from the principal point"
-        seen = _of(name, sights.used(settled.inliers.points, settled.inliers.curves)).reach_px(camera)
+        seen = sights.used(settled.inliers.points, settled.inliers.curves).of_camera(name).reach_px(camera)
         # The paper's polynomial can be had without a fold; the others' published models fold in corners nobody saw.
         if camera.lens.kind == "radial" or fold <= seen:
             raise SolutionError(
@@ -282,13 +281,9 @@ def _unknown(settled: _Settled, posterior: Posterior) -> Iterator[str]:
             yield _UNKNOWN.format(name, bounds_text(verdict.low, verdict.high, "px"))
 
 
-def _of(camera: str, sights: Sights) -> Sights:
-    return sights.take(np.array([i for i, key in enumerate(sights.keys) if key.camera == camera], dtype=np.int64))
-
-
 def _require_fit(name: str, camera: Camera, settled: _Settled, sights: Sights) -> None:
     """Raise SolutionError where half of a camera's observations are missed by more than any lens could explain."""
-    own = _of(name, sights)
+    own = sights.of_camera(name)
     limit_px = _NO_FIT * float(np.hypot(*camera.image_size))
     points, curves = settled.residuals.lengths
     met = np.count_nonzero(points[own.point_rows] <= limit_px)  # NaN is not

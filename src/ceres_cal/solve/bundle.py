@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
@@ -138,7 +138,7 @@ def _assemble(
     blocks = _Blocks.pack(estimate, layout, private)
     assembly = _Assembly(blocks, [], [])
     for camera in estimate.cameras:
-        own = _numbers(sights, camera, private)
+        own = sights.numbers(camera, placements=private)
         if len(own):
             cost = EliminatedCost(run, sights.take(own), estimate, layout.free[camera], weighting, places)
             assembly.eliminated.append((cost, blocks.of(sights.keys[own[0]], cost.slots)))
@@ -280,18 +280,12 @@ def settle_placements(sights: Sights, estimate: Estimate, layout: Layout, weight
     """The estimate with every private placement where it fits best, everything else held."""
     private = private_placements(sights, layout)
     for camera in estimate.cameras:
-        own = sights.take(_numbers(sights, camera, private))
+        own = sights.take(sights.numbers(camera, placements=private))
         if len(own):
             poses = estimate.pose_stack(own.keys)
             _, found = placement_costs(own, estimate, weighting, poses, _POSED)
             estimate = estimate.with_placements(own.keys, found)
     return estimate
-
-
-def _numbers(sights: Sights, camera: str, placements: Container[str | None]) -> Indices:
-    """Of a camera's sights of these placements."""
-    keys = enumerate(sights.keys)
-    return np.array([i for i, key in keys if key.camera == camera and key.placement in placements], dtype=np.int64)
 
 
 def _rests(history: Sequence[float]) -> bool:

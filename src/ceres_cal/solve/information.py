@@ -81,10 +81,10 @@ def information(
     private = private_placements(sights, layout)
     keys = shared_keys(estimate, layout, private)
     matrix, owned = np.zeros((len(keys), len(keys))), _owned(keys)
-    alone = [number for number, key in enumerate(sights.keys) if key.placement in private]
+    alone = sights.numbers(placements=private)
     eliminated = []
     for name in dict.fromkeys(sights.keys[number].station for number in alone):
-        own = sights.take(np.array([number for number in alone if sights.keys[number].station == name]))
+        own = sights.take(sights.numbers(station=name, placements=private))
         parts = list(_normals(own, estimate, layout, weighting, places))
         eliminated.append(_eliminate(own, parts, estimate, owned, matrix))
     for number in np.delete(np.arange(len(sights)), alone):
