@@ -19,7 +19,7 @@ from ceres_cal.photographs.refit import CAMERA, Shown
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Radial
 from ceres_cal.scene.targets import Target
-from ceres_cal.start.closed_forms import homography_from_points, orthogonality_error, polar_pose
+from ceres_cal.start.closed_forms import homography_from_points, orthogonality_error, pose_from_homography
 
 FORMAT, VERSION = "ceres-cal/corners", 1
 SIGMA_PX = 15.0
@@ -90,7 +90,7 @@ def starts_from_clicks(clicks: Clicks, target: Target, image_size: tuple[int, in
         except DegenerateError as error:
             raise InputError(f"the points to start from tell no pose: {error}") from None
         phi = _phi(homography, half)
-        pose = polar_pose(np.diag([1.0 / phi, 1.0 / phi, 1.0]) @ homography)
+        pose = pose_from_homography(homography, phi)
         if pose.position[2] < 0.0:
             raise InputError("the points to start from go round the wrong way, as if seen from below: check names")
         cameras.append(Camera(image_size, phi, (float(middle[0]), float(middle[1])), lens, 1.0, pose))
