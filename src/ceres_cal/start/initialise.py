@@ -25,8 +25,9 @@ from ceres_cal.start.planes import Homographies, profile_and_homographies
 
 PHI_RANGE = (0.15, 15.0)
 """In half image diagonals: 163 to 8 degrees across the image's diagonal. What lies beyond is no lens over a field."""
-USUAL_PHI = 1.4
-"""In half image diagonals: 71 degrees across the diagonal, a usual lens."""
+USUAL_PHI, USUAL_PHI_FACTOR = 1.1, 1.4
+"""In half image diagonals: 85 degrees across the diagonal; 66 to 104 within the factor either way, a standard deviation
+of log phi. It decides where the image cannot, so it is that of usual cameras over a field or before a board."""
 _ENOUGH_VIEWS = 50  # for phi
 _GRID = np.geomspace(*PHI_RANGE, 120)
 _NEAR = np.geomspace(1.0 / 1.04, 1.04, 13)  # a grid step to either side
