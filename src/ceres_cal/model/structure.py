@@ -74,7 +74,7 @@ class Structure:
 
     def points(self, sights: Sights) -> Array:
         """(N, 3) where the observed points of the sights lie, m."""
-        return self._points(sights.points, sights.feature)
+        return self._points(sights.points, sights.point_index)
 
     def tracks(self, sights: Sights) -> Array:
         """(T, 3, 3) the tracks of all targets as built."""

@@ -1,4 +1,8 @@
-"""Observations: what the frames show, as columns, in memory and in files."""
+"""Observations: what the frames show, as columns, in memory and in files; and `sights`, as the method takes them.
+
+A view is what one frame shows of one target; a sight is what one camera at one station sees of one rigid frame, over
+all its views, and so what one pose projects (see `observations.sights`).
+"""
 
 from ceres_cal.observations.columns import Columns, Curves, Points, Prior, View, taken
 from ceres_cal.observations.files import FORMAT, VERSION, prior_from_json, prior_to_json

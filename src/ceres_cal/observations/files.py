@@ -14,7 +14,7 @@ import numpy as np
 from ceres_cal.base.arrays import AnyArray
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import check_header, convert, parse_json, read_bytes, write_bytes
-from ceres_cal.observations.columns import TYPES, Curves, Points, Prior, View, listed, place_of
+from ceres_cal.observations.columns import TYPES, Curves, Points, Prior, View, choices, view_label
 from ceres_cal.scene.targets import SIDES, Target, target_from_spec
 
 FORMAT, VERSION = "ceres-cal/observations", 1
@@ -172,13 +172,13 @@ def _from_json(content: bytes, where: str) -> Content:
     for number, view in enumerate(views):
         if view.target not in targets:
             raise InputError(
-                f"{place_of(number, views)} names target {view.target!r}, which is not there: {listed(targets)}"
+                f"{view_label(number, views)} names target {view.target!r}, which is not there: {choices(targets)}"
             )
     points = [(i, entry.points) for i, entry in enumerate(data.views) if entry.points is not None]
     curves = [(i, entry.curves) for i, entry in enumerate(data.views) if entry.curves is not None]
     point_index = {name: {f: i for i, f in enumerate(target.point_names)} for name, target in targets.items()}
     curve_index = {name: {f: i for i, f in enumerate(target.curve_names)} for name, target in targets.items()}
-    sides = [_sides(entry, place_of(i, views)) for i, entry in curves]
+    sides = [_sides(entry, view_label(i, views)) for i, entry in curves]
     return Content(
         targets,
         sizes,
@@ -203,7 +203,7 @@ def _columns(
     view, feature, sigma = [], [], []
     pixels: list[tuple[float, float]] = []
     for number, entry in entries:
-        here, count = place_of(number, views), len(entry.features)
+        here, count = view_label(number, views), len(entry.features)
         if len(entry.pixels) != count:
             raise InputError(f"{here}: {count} {kind} features but {len(entry.pixels)} pixels")
         names = index[views[number].target]
@@ -290,7 +290,7 @@ def _arrays(content: bytes, where: str) -> dict[str, AnyArray]:
 
 def _taken(arrays: dict[str, AnyArray], kind: str, names: Sequence[str], where: str) -> dict[str, Any]:
     """The columns of one kind, taken out of the arrays."""
-    found = {}
+    columns = {}
     for name in names:
         array, dtype, ndim = arrays.pop(f"{kind}_{name}", None), np.dtype(TYPES[name]), 2 if name == "pixels" else 1
         if array is None:
@@ -299,8 +299,8 @@ def _taken(arrays: dict[str, AnyArray], kind: str, names: Sequence[str], where: 
             raise InputError(
                 f"{where}: column {kind}_{name} must be {dtype} in {ndim} dimensions, not {array.dtype} in {array.ndim}"
             )
-        found[name] = array
-    return found
+        columns[name] = array
+    return columns
 
 
 def _from_npz(content: bytes, where: str) -> Content:

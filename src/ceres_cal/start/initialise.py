@@ -45,7 +45,7 @@ def initialise(observations: Observations, sights: Sights, options: Options) -> 
     """A start for everything the observations show.
 
     Raises:
-        DegenerateError: naming the sight whose pose the observations cannot tell.
+        DegenerateError: naming the sight whose pose the observations do not determine.
     """
     cameras: dict[str, Camera] = {}
     phi_from: dict[str, str] = {}
@@ -128,7 +128,7 @@ def _choose_phi(
 ) -> tuple[float, str]:
     """phi from r1 . r2 = 0 and |r1| = |r2| over all sights, with what is known beforehand, by a one-dimensional search.
 
-    Where no view is tilted enough to tell and nothing is known, a usual field of view is guessed; the bundle then says
+    Where no view is tilted enough and nothing is known, a usual field of view is guessed; the bundle then says
     how little is known.
     """
     if "phi" in options.fixed:
@@ -250,6 +250,6 @@ def _require_all(
         frames = ", ".join(repr(observations.views[i].frame) for i in sight.views[0][:3])
         raise DegenerateError(
             f"frame {frames} ({key}): {len(sight.point_rows)} points and {len(sight.curve_rows)} curve observations "
-            f"(on {len(np.unique(sight.track))} curves) cannot fix its pose: give at least four points, not on one "
-            "line, or straight lines in two directions, two of each, or remove the view"
+            f"(on {len(np.unique(sight.track_index))} curves) cannot fix its pose: give at least four points, "
+            "not on one line, or straight lines in two directions, two of each, or remove the view"
         )
