@@ -11,7 +11,8 @@ import numpy as np
 from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.spread import Spread
 from ceres_cal.model.parameters import Estimate
-from ceres_cal.model.quantities import Key, moved, sigma_limits
+from ceres_cal.model.keys import Key
+from ceres_cal.model.quantities import moved
 from ceres_cal.uncertainty import FieldMap, Posterior, Profile
 from ceres_cal.uncertainty.maps import locate_slopes, shown_pixels, station_keys
 

@@ -19,7 +19,7 @@ from ceres_cal.base.transforms import Pose
 from ceres_cal.calibration import Calibration
 from ceres_cal.model.joint import JointPrior
 from ceres_cal.model.parameters import Estimate, Layout, intrinsic_names
-from ceres_cal.model.quantities import Key, sigma_limits
+from ceres_cal.model.keys import Key
 from ceres_cal.moves.carried import kept_prior, require_same_things, with_structure, without_keys
 from ceres_cal.moves.poses import Place, Scene, movement, places
 from ceres_cal.observations import Observations
