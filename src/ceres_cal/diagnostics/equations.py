@@ -81,7 +81,9 @@ def write_equations(observations: Observations, sights: Sights, estimate: Estima
         raise SolutionError("the calibration can show none of the observations: give those it was made from")
     poses = estimate.pose_stack(sights.keys)
     parts = [
-        part for own in _by_camera(sights) for part in _of_camera(observations, sights, own, poses, estimate, found)
+        part
+        for name in sights.cameras
+        for part in _of_camera(observations, sights, sights.numbers(name), poses, estimate, found)
     ]
     size = max(part["intrinsics"].shape[1] for part in parts)
     for part in parts:
@@ -92,13 +94,6 @@ def write_equations(observations: Observations, sights: Sights, estimate: Estima
     columns = {name: column[order] for name, column in columns.items()}
     bounds = np.searchsorted(columns["sight"], np.arange(len(sights) + 1))
     return Equations(sights=sights, poses=poses, bounds=bounds, **columns)
-
-
-def _by_camera(sights: Sights) -> Iterator[Indices]:
-    """The numbers of each camera's sights."""
-    owners = np.array([key.camera for key in sights.keys])
-    for name in np.unique(owners):
-        yield np.flatnonzero(owners == name)
 
 
 def _of_camera(

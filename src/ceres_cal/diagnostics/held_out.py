@@ -278,7 +278,7 @@ def _predicted(
     if new:
         placements = {**estimate.placements, **{str(name): whole.estimate.placements[str(name)] for name in new}}
         estimate = replace(estimate, placements=placements)
-        of_new = sights.take(np.array([i for i, key in enumerate(sights.keys) if key.placement in new]))
+        of_new = sights.take(sights.numbers(placements=new))
         estimate = replace(estimate, placements=_posed(of_new, estimate, trained, observations))
     return _errors(observations, held, estimate)
 

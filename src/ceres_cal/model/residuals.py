@@ -58,8 +58,8 @@ def residuals(observations: Observations, sights: Sights, estimate: Estimate, fe
     points = np.full((len(observations.points), 2), np.nan)
     curves, ends = np.full(len(observations.curves), np.nan), np.full(len(observations.curves), np.nan)
     poses = estimate.pose_stack(sights.keys)
-    for name in dict.fromkeys(key.camera for key in sights.keys):
-        numbers = np.array([number for number, key in enumerate(sights.keys) if key.camera == name], dtype=np.int64)
+    for name in sights.cameras:
+        numbers = sights.numbers(camera=name)
         own = sights.take(numbers)
         optics = lens_arguments(estimate.cameras[name])
         _point_residuals(optics, poses[numbers], own, estimate.structure.points(own), points)

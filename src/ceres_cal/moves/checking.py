@@ -119,7 +119,7 @@ def check(calibration: Calibration, observations: Observations, false_alarms: fl
             raise InputError(f"station {name!r} is not in the calibration, which has {names}: name it as there")
     observed = replace(observations, targets={**calibration.targets, **observations.targets})
     sights = gather_sights(observed)
-    world = {key.station: sights[i] for i, key in enumerate(sights.keys) if key.placement is None}
+    world = sights.of_world
     for name in observations.stations:
         if name not in world:
             raise InputError(f"station {name!r} sees nothing that lies in the world: observe the field with it")

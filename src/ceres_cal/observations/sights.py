@@ -7,7 +7,7 @@ of its own. Rows are kept so that residuals find their way back to the observati
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -97,6 +97,36 @@ class Sights(Sequence["Sights"]):
     def equations(self) -> int:
         """Measured numbers: two of each point, one of each curve observation."""
         return 2 * len(self.point_rows) + len(self.curve_rows)
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """Names of the cameras, each once."""
+        return tuple(dict.fromkeys(key.camera for key in self.keys))
+
+    def numbers(
+        self,
+        camera: str | None = None,
+        station: str | None = None,
+        placements: Container[str | None] | None = None,
+    ) -> Indices:
+        """Numbers of the sights of this camera, station and these placements; None asks for nothing."""
+        numbers = [
+            number
+            for number, key in enumerate(self.keys)
+            if (camera is None or key.camera == camera)
+            and (station is None or key.station == station)
+            and (placements is None or key.placement in placements)
+        ]
+        return np.array(numbers, dtype=np.int64)
+
+    def of_camera(self, name: str) -> Sights:
+        """The sights of one camera."""
+        return self.take(self.numbers(camera=name))
+
+    @property
+    def of_world(self) -> dict[str, Sights]:
+        """What each station sees of the world."""
+        return {self.keys[number].station: self[int(number)] for number in self.numbers(placements=(None,))}
 
     def take(self, numbers: Indices) -> Sights:
         """The sights with these numbers, in this order."""

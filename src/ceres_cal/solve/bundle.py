@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -118,7 +118,7 @@ def _assemble(run: Run, problem: Problem, estimate: Estimate) -> _Assembly:
     blocks = _Blocks.pack(estimate, layout, private)
     assembly = _Assembly(blocks, [], [])
     for camera in estimate.cameras:
-        own = _numbers(sights, camera, private)
+        own = sights.numbers(camera, placements=private)
         if len(own):
             cost = EliminatedCost(run, sights.take(own), problem, estimate)
             assembly.eliminated.append((cost, blocks.of(sights.keys[own[0]], cost.slots)))
@@ -257,18 +257,12 @@ def placement_costs(
 def with_placements_at_best(problem: Problem, estimate: Estimate) -> Estimate:
     """The estimate with every private placement where it fits best, everything else held."""
     for camera in estimate.cameras:
-        own = problem.sights.take(_numbers(problem.sights, camera, problem.private))
+        own = problem.sights.take(problem.sights.numbers(camera, placements=problem.private))
         if len(own):
             poses = estimate.pose_stack(own.keys)
             _, best = placement_costs(own, estimate, problem.weighting, poses, _POSED)
             estimate = estimate.with_placements(own.keys, best)
     return estimate
-
-
-def _numbers(sights: Sights, camera: str, placements: Container[str | None]) -> Indices:
-    """Of a camera's sights of these placements."""
-    keys = enumerate(sights.keys)
-    return np.array([i for i, key in keys if key.camera == camera and key.placement in placements], dtype=np.int64)
 
 
 def _rests(history: Sequence[float]) -> bool:

@@ -111,10 +111,10 @@ class _Sums:
     def result(self) -> ReducedInformation:
         """Everything that the problem says."""
         sights, private = self._problem.sights, self._problem.private
-        alone = [number for number, key in enumerate(sights.keys) if key.placement in private]
+        alone = sights.numbers(placements=private)
         eliminated = []
         for name in dict.fromkeys(sights.keys[number].station for number in alone):
-            own = sights.take(np.array([number for number in alone if sights.keys[number].station == name]))
+            own = sights.take(sights.numbers(station=name, placements=private))
             eliminated.append(self._eliminate(own))
         for number in np.delete(np.arange(len(sights)), alone):
             sight = sights[int(number)]

@@ -33,16 +33,9 @@ def without_mirrored_poses(
     sights, weighting = problem.sights, problem.weighting
     changed, undecided = 0, frozenset[SightKey]()
     for camera in estimate.cameras:
-        own = np.array(
-            [
-                number
-                for number, key in enumerate(sights.keys)
-                if key.camera == camera and key.placement in problem.private and key in among
-            ],
-            dtype=np.int64,
-        )
-        if len(own):
-            estimate, count, open_ones = _with_better_poses(sights.take(own), estimate, weighting)
+        own = [number for number in sights.numbers(camera, placements=problem.private) if sights.keys[number] in among]
+        if own:
+            estimate, count, open_ones = _with_better_poses(sights.take(np.array(own)), estimate, weighting)
             changed, undecided = changed + count, undecided | open_ones
     return estimate, changed, undecided
 

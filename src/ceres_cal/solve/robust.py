@@ -165,11 +165,10 @@ class _Rounds:
 
 def _evenly(problem: Problem) -> Indices:
     """Numbers of some sights that tell a camera well enough for a start: of private placements no more than enough."""
-    keys, private = problem.sights.keys, problem.private
+    private = problem.private
     chosen: list[int] = []
-    for camera in {key.camera for key in keys}:
-        own = [number for number, key in enumerate(keys) if key.camera == camera]
-        boards = [number for number in own if keys[number].placement in private]
+    for camera in problem.sights.cameras:
+        boards = problem.sights.numbers(camera, placements=private).tolist()
         chosen += boards[:: max(1, len(boards) // _ENOUGH_PLACEMENTS)]
-        chosen += [number for number in own if keys[number].placement not in private]
+        chosen += set(problem.sights.numbers(camera).tolist()) - set(boards)
     return np.array(sorted(chosen), dtype=np.int64)

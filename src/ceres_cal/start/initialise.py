@@ -51,7 +51,7 @@ def initialise(observations: Observations, sights: Sights, options: Options) -> 
     numbers, poses = [], []
     priors = (*observations.priors, *options.priors)
     for name, image_size in observations.cameras.items():
-        own = np.array([number for number, key in enumerate(sights.keys) if key.camera == name], dtype=np.int64)
+        own = sights.numbers(camera=name)
         start = _start_camera(name, image_size, sights.take(own), options, priors)
         cameras[name], phi_from[name] = start.camera, start.phi_from
         numbers.append(own[start.sights])
