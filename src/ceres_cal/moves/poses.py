@@ -20,7 +20,8 @@ from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import SightKey, Sights
 from ceres_cal.scene.camera import Camera
 from ceres_cal.solve import Weighting, placement_costs
-from ceres_cal.start.closed_forms import null_vector, polar_pose
+from ceres_cal.start.closed_forms import fit_lines, pose_from_homography
+from ceres_cal.start.planes import plane_sight
 
 _WIDE = (60.0, 12.0)  # standard deviations: scale of the loss while a candidate is far off
 _FARTHEST_M = 1e3
@@ -28,7 +29,7 @@ _GRID_DEG = (-24.0, 0.0, 24.0)  # of turns about each axis of the camera; neighb
 _STRAY = 0.05  # share of observations that may be anywhere in the image
 _ALIKE = (0.02, 0.01)  # m and rad: candidates nearer than this are one
 _FITS_SHARE, _FITS_SIGMA, _FITS_SCALE = 0.6, 5.0, 4.0
-_FEWEST_ROUNDS = 4
+_ROUNDS = 4  # of the closed form's reweighting
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,53 +130,16 @@ def equations(sight: Sights) -> int:
 
 
 def closed_form(search: PoseSearch) -> Pose | None:
-    """The pose by a linear homography between undistorted rays and the floor, from points and straight lines; None
-    where they are too few (a point gives two equations, a line two) or lie so that they tell none.
+    """The pose by a homography between the lens's rays and the floor, from points and straight lines; None where they
+    are too few (a point gives two equations, a line two) or cannot fix it.
     """
-    camera, sight = search.camera, search.sight
-    flat = np.abs(sight.points[:, 2]) < 1e-9
-    x, y = sight.points[flat, :2].T
-    one, zero = np.ones(len(x)), np.zeros(len(x))
-    tracks, arcs = sight.tracks[sight.track], sight.is_arc[sight.track]
-    straight = ~arcs & (np.abs(tracks[:, 0, 2]) < 1e-9) & (np.abs(tracks[:, 1, 2]) < 1e-12)
-    c, a = tracks[straight, 0, :2], tracks[straight, 1, :2]
-    normal = np.column_stack([-a[:, 1], a[:, 0]]) / np.linalg.norm(a, axis=1, keepdims=True)
-    equations = 2 * len(np.unique(sight.points[flat], axis=0)) + 2 * len(np.unique(sight.track[straight]))
-    lines = np.vstack(
-        [
-            np.column_stack([one, zero, -x]),
-            np.column_stack([zero, one, -y]),
-            np.column_stack([normal, -np.sum(normal * c, axis=1)]),
-        ]
-    )
-    pixels = [sight.pixels[flat], sight.pixels[flat], sight.curve_pixels[straight]]
-    rays = camera.rays(np.vstack(pixels))
-    told = np.isfinite(rays[:, 0])
-    if equations < 8 or np.count_nonzero(told) < 8:
+    plane = plane_sight(search.sight, height_m=0.0)
+    rays = search.camera.rays(plane.pixels)
+    known = np.isfinite(rays[:, 0])
+    if plane.equations < 8 or np.count_nonzero(known) < 8:
         return None
-    return _pose_of_lines(lines[told], rays[told])
-
-
-def _pose_of_lines(lines: Array, rays: Array) -> Pose | None:
-    """cam_from_world from rays (N, 3) whose feet on the floor lie on lines (N, 3) of it, reweighted against strays."""
-    size = 1.0 / max(float(np.max(np.abs(lines[:, 2]))), 1e-9)
-    lines = lines * (1.0, 1.0, size)
-    weights, inverse = np.ones(len(lines)), np.eye(3)
-    for _ in range(_FEWEST_ROUNDS):
-        rows = (lines[:, :, None] * rays[:, None, :]).reshape(-1, 9)
-        inverse = null_vector((rows * weights[:, None]).T @ rows).reshape(3, 3)
-        sent = rays @ inverse.T
-        off = np.abs(np.sum(lines * sent, axis=1)) / np.maximum(np.abs(sent[:, 2]), 1e-9)
-        bound = max(3.0 * float(np.median(off)), 1e-9)
-        weights = 1.0 / (np.maximum(sent[:, 2] ** 2, 1e-9) * (1.0 + (off / bound) ** 2))
-    matrix = np.diag([1.0, 1.0, size]) @ inverse
-    if abs(np.linalg.det(matrix)) < 1e-12 * np.linalg.norm(matrix) ** 3:
-        return None
-    homography = np.asarray(np.linalg.inv(matrix), dtype=float)
-    if np.median((rays @ inverse.T)[:, 2]) < 0.0:  # rays and places on the floor must lie on one side
-        homography = -homography
-    pose = polar_pose(homography)
-    return pose if np.all(np.isfinite(pose.matrix)) else None
+    homography, _ = fit_lines(plane.lines[known], rays[known], _ROUNDS)
+    return None if homography is None else pose_from_homography(homography)
 
 
 def _settled(search: PoseSearch, poses: Sequence[Pose]) -> list[Place]:
