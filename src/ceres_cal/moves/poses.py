@@ -54,7 +54,7 @@ class Place:
 
 
 @dataclass(frozen=True, eq=False)
-class Scene:
+class PoseSearch:
     """What one station sees of the world, through a lens that is taken as known.
 
     Attributes:
@@ -77,7 +77,7 @@ class Scene:
         near = float(np.hypot(x, y)) < _FARTHEST_M and abs(float(height)) < _FARTHEST_M
         return near and (self.sight.key.placement is not None or height > 0.0)
 
-    def with_camera(self, camera: Camera) -> Scene:
+    def with_camera(self, camera: Camera) -> PoseSearch:
         """The same through another lens."""
         cameras = {**self.estimate.cameras, self.sight.key.camera: camera}
         return replace(self, estimate=replace(self.estimate, cameras=cameras))
@@ -92,7 +92,7 @@ class Scene:
         return residuals(self.observations, self.sight, there)
 
 
-def places(scene: Scene, old: Sequence[Pose], patience: int = 2) -> list[Place]:
+def places(search: PoseSearch, old: Sequence[Pose], patience: int = 2) -> list[Place]:
     """Poses that come into question, best first, each once.
 
     Args:
@@ -100,11 +100,11 @@ def places(scene: Scene, old: Sequence[Pose], patience: int = 2) -> list[Place]:
             the grid around them as well, where none of those fits.
     """
     seeds = [*old, *(turn for pose in old for turn in _turned(pose))]
-    closed = closed_form(scene)
-    found = _settled(scene, [*seeds, *([closed] if closed is not None else [])])
+    closed = closed_form(search)
+    found = _settled(search, [*seeds, *([closed] if closed is not None else [])])
     if patience and not (found and found[0].fits):
         around = [turn for pose in seeds for turn in _grid(pose)]
-        found = _distinct([*found, *_settled(scene, around)])
+        found = _distinct([*found, *_settled(search, around)])
     return found
 
 
@@ -129,12 +129,12 @@ def equations(sight: Sights) -> int:
     return 2 * len(np.unique(sight.points, axis=0)) + int(np.sum(np.minimum(counts, most)))
 
 
-def closed_form(scene: Scene) -> Pose | None:
+def closed_form(search: PoseSearch) -> Pose | None:
     """The pose by a homography between the lens's rays and the floor, from points and straight lines; None where they
     are too few (a point gives two equations, a line two) or cannot fix it.
     """
-    plane = plane_sight(scene.sight, height_m=0.0)
-    rays = scene.camera.rays(plane.pixels)
+    plane = plane_sight(search.sight, height_m=0.0)
+    rays = search.camera.rays(plane.pixels)
     known = np.isfinite(rays[:, 0])
     if plane.equations < 8 or np.count_nonzero(known) < 8:
         return None
@@ -142,40 +142,40 @@ def closed_form(scene: Scene) -> Pose | None:
     return None if homography is None else pose_from_homography(homography)
 
 
-def _settled(scene: Scene, poses: Sequence[Pose]) -> list[Place]:
+def _settled(search: PoseSearch, poses: Sequence[Pose]) -> list[Place]:
     """Each candidate at its best, best first; those from which something cannot be seen are left out."""
     stack = np.array([pose.matrix for pose in poses])
     for wide in _WIDE:
-        stack = _searched(scene, stack, Weighting(*scene.scales, "huber", wide), 1e-3)
-    stack = _searched(scene, stack, Weighting(*scene.scales, "cauchy", 2.0), 1e-8)
+        stack = _searched(search, stack, Weighting(*search.scales, "huber", wide), 1e-3)
+    stack = _searched(search, stack, Weighting(*search.scales, "cauchy", 2.0), 1e-8)
     found = [Pose(matrix[:, :3], matrix[:, 3]) for matrix in stack]
-    return _distinct([place_of(scene, pose) for pose in found if scene.allows(pose)])
+    return _distinct([place_of(search, pose) for pose in found if search.allows(pose)])
 
 
-def _searched(scene: Scene, stack: Array, weighting: Weighting, tolerance: float) -> Array:
+def _searched(search: PoseSearch, stack: Array, weighting: Weighting, tolerance: float) -> Array:
     """Poses (K, 3, 4) after the search, without those from which something cannot be seen."""
     if not len(stack):
         return stack
-    key, count = scene.sight.key, len(stack)
-    many = scene.sight.take(np.zeros(count, dtype=np.int64))
+    key, count = search.sight.key, len(stack)
+    many = search.sight.take(np.zeros(count, dtype=np.int64))
     keys = tuple(SightKey(key.camera, key.station, str(number)) for number in range(count))
-    world = scene.estimate.stations[key.station].cam_from_world
+    world = search.estimate.stations[key.station].cam_from_world
     placements = {k.placement: world for k in keys if k.placement is not None}
-    estimate = replace(scene.estimate, placements=placements).with_placements(keys, stack)
+    estimate = replace(search.estimate, placements=placements).with_placements(keys, stack)
     costs, found = placement_costs(replace(many, keys=keys), estimate, weighting, stack, tolerance)
     return found[np.isfinite(costs)]
 
 
-def place_of(scene: Scene, pose: Pose) -> Place:
+def place_of(search: PoseSearch, pose: Pose) -> Place:
     """How well a pose explains the sight."""
-    sight, found = scene.sight, scene.residuals(pose)
-    points = np.linalg.norm(found.points[sight.point_rows], axis=1) / (sight.sigma_px * scene.scales[0])
-    curves = np.abs(found.curves[sight.curve_rows]) / (sight.curve_sigma_px * scene.scales[1])
+    sight, found = search.sight, search.residuals(pose)
+    points = np.linalg.norm(found.points[sight.point_rows], axis=1) / (sight.sigma_px * search.scales[0])
+    curves = np.abs(found.curves[sight.curve_rows]) / (sight.curve_sigma_px * search.scales[1])
     lengths = np.nan_to_num(np.concatenate([points / 1.1774, curves / 0.6745]), nan=np.inf)
     scale = float(np.median(lengths))
     sigmas = np.nan_to_num(np.concatenate([points, curves]), nan=np.inf)
     share = float(np.mean(sigmas <= _FITS_SIGMA * np.clip(scale, 1.0, _FITS_SCALE)))
-    return Place(pose, misfit(scene.sight, scene.camera, found, scene.scales), scale, share)
+    return Place(pose, misfit(search.sight, search.camera, found, search.scales), scale, share)
 
 
 def misfit(sights: Sights, camera: Camera, found: Residuals, scales: tuple[float, float]) -> float:

@@ -184,6 +184,15 @@ class Sights(Sequence["Sights"]):
         numbers = np.flatnonzero(point_sizes + curve_sizes)
         return self._rows(numbers, p, c, point_sizes[numbers], curve_sizes[numbers])
 
+    @property
+    def by_kind(self) -> tuple[Sights, Sights]:
+        """The same sights with their points alone, and with their curve observations alone."""
+        nothing, every = np.zeros(len(self), dtype=np.int64), np.arange(len(self))
+        return (
+            self._rows(every, slice(None), slice(0, 0), np.diff(self.point_bounds), nothing),
+            self._rows(every, slice(0, 0), slice(None), nothing, np.diff(self.curve_bounds)),
+        )
+
     def _rows(
         self, numbers: Indices, p: Indices | slice, c: Indices | slice, point_sizes: Indices, curve_sizes: Indices
     ) -> Sights:

@@ -53,7 +53,7 @@ def predicted(
         keys = station_keys(estimate, posterior, station)
         pixels = shown_pixels(estimate, station, places, height_m)
         shown &= np.isfinite(pixels[:, 0])
-        at = [posterior.keys.index(key) for key in keys]
+        at = posterior.information.columns(keys)
         slopes[:, :, at] += sign * locate_slopes(estimate, keys, station, pixels, height_m)
     found[shown] = posterior.spread.through(slopes[shown])
     return found
