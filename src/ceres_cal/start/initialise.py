@@ -14,7 +14,7 @@ import numpy as np
 from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.errors import DegenerateError
 from ceres_cal.base.transforms import Pose, Poses, chained, inverted
-from ceres_cal.model.parameters import Estimate, Options, Station, anchored_stations
+from ceres_cal.model.parameters import Estimate, Options, Station, anchored_stations, unit_px
 from ceres_cal.model.structure import make_structure
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.observations.sights import Sights
@@ -79,7 +79,7 @@ def _start_camera(
     blank = _blank_camera(name, image_size, options, priors)
     if set(blank.lens.names) <= set(options.fixed) and blank.lens.kind == "radial":
         blank.require_monotone(name)
-    unit = 0.5 * float(np.hypot(*image_size))
+    unit = unit_px(blank)
     profile, homographies = profile_and_homographies(sights, blank, unit)
     phi, phi_from = _choose_phi(sights, homographies, unit, options, [p for p in priors if _concerns(p, name, sights)])
     reach = sights.reach_px(blank)
@@ -148,9 +148,9 @@ def _choose_phi(
     flat = acceptable[-1] > 1.6 * acceptable[0]
     middle = min(acceptable, key=lambda phi: abs(np.log(phi / (USUAL_PHI * unit)))) if flat else grid[np.argmin(values)]
     for _ in range(0 if flat else 6):
-        place = int(np.argmin(cost(middle * _NEAR)))
-        middle *= _NEAR[place]
-        if 0 < place < len(_NEAR) - 1:
+        step = int(np.argmin(cost(middle * _NEAR)))
+        middle *= _NEAR[step]
+        if 0 < step < len(_NEAR) - 1:
             break
     source = "guess" if flat else ("prior" if known else "views")
     return float(middle), source
@@ -224,13 +224,13 @@ def _chain_poses(
             if key.station not in stations and key.placement in placements:
                 stations[key.station] = chained(pose, inverted(placements[key.placement]))
         fresh: dict[str | None, int] = {}
-        for place, key in enumerate(keys):
+        for row, key in enumerate(keys):
             if key.placement not in placements and key.station in stations:
-                fresh.setdefault(key.placement, place)
+                fresh.setdefault(key.placement, row)
         if fresh:
-            places = list(fresh.values())
-            world_from_cam = inverted(np.array([stations[keys[place].station] for place in places]))
-            placements |= dict(zip(fresh, chained(world_from_cam, seen[places]), strict=True))
+            rows = list(fresh.values())
+            world_from_cam = inverted(np.array([stations[keys[row].station] for row in rows]))
+            placements |= dict(zip(fresh, chained(world_from_cam, seen[rows]), strict=True))
     _require_all(observations, sights, stations, placements)
     cameras = observations.stations
     named = [name for name in placements if name is not None]

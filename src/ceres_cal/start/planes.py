@@ -115,6 +115,9 @@ class Homographies:
     sizes_px: Array
 
 
+_NONE = Homographies(np.empty(0, np.int64), np.empty((0, 3, 3)), np.empty(0), np.empty(0))
+
+
 def profile_and_homographies(sights: Sights, camera: Camera, unit: float) -> tuple[RadialProfile, Homographies]:
     """The camera's radial profile and the homography of each of its sights that determines one."""
     pure = _flat_sights_of_points(sights)
@@ -137,27 +140,29 @@ def profile_and_homographies(sights: Sights, camera: Camera, unit: float) -> tup
     if profile is None or any(fit_lines(seen, profile.lift(p), rounds=2)[1] > _NO_FIT for seen, p in lined):
         profile = _profile_from_lines(lined, unit)
     matrices |= {i: _homography_of(planes[i], profile.lift(offsets[i])) for i in mixed}
-    parts = [
-        Homographies(np.array([i]), h[None], np.array([planes[i].height_m]), np.array([planes[i].size_px(camera)]))
-        for i, h in matrices.items()
-    ]
+    parts = [_NONE, *(_of_plane(i, planes[i], camera, matrix) for i, matrix in matrices.items())]
     if len(pure):
-        sizes = np.sqrt(np.trace(grouped_scatter(data.offsets, data.bounds), axis1=1, axis2=2))
-        heights = board.points[board.point_bounds[:-1], 2]
-        stack = _homographies_of_boards(board, data, camera, profile)
-        posed = _spans(stack)
-        parts.append(Homographies(pure[posed], stack[posed], heights[posed], sizes[posed]))
+        parts.append(_of_boards(pure, board, data, camera, profile))
     names = ("sights", "matrices", "heights_m", "sizes_px")
-    if not parts:
-        return profile, Homographies(np.empty(0, np.int64), np.empty((0, 3, 3)), np.empty(0), np.empty(0))
     return profile, Homographies(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
 
-def _spans(homographies: Array) -> Mask:
-    """Which homographies (K, 3, 3) send the plane to more than a point or a line."""
-    b = homographies[:, :, :2]
+def _of_plane(number: int, plane: PlaneSight, camera: Camera, matrix: Array) -> Homographies:
+    height, size = np.array([plane.height_m]), np.array([plane.size_px(camera)])
+    return Homographies(np.array([number]), matrix[None], height, size)
+
+
+def _of_boards(
+    numbers: Indices, board: Sights, data: PlaneData, camera: Camera, profile: RadialProfile
+) -> Homographies:
+    """The homographies of sights of points that send the plane to more than a point or a line."""
+    matrices = _homographies_of_boards(board, data, camera, profile)
+    sizes = np.sqrt(np.trace(grouped_scatter(data.offsets, data.bounds), axis1=1, axis2=2))
+    heights = board.points[board.point_bounds[:-1], 2]
+    b = matrices[:, :, :2]
     m = np.swapaxes(b, 1, 2) @ b
-    return np.asarray(np.linalg.det(m) > 1e-20 * np.trace(m, axis1=1, axis2=2) ** 2)
+    posed = np.linalg.det(m) > 1e-20 * np.trace(m, axis1=1, axis2=2) ** 2
+    return Homographies(numbers[posed], matrices[posed], heights[posed], sizes[posed])
 
 
 def _flat_sights_of_points(sights: Sights) -> Indices:
