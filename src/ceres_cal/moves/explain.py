@@ -17,7 +17,7 @@ from ceres_cal.calibration import Calibration
 from ceres_cal.model.parameters import Estimate
 from ceres_cal.model.residuals import residuals
 from ceres_cal.moves.carried import Plan, without_keys
-from ceres_cal.moves.labels import MIRRORED, TURNED, other_divisions, relabelled
+from ceres_cal.moves.labels import MIRRORED, TURNED, mistaken_targets, relabelled
 from ceres_cal.moves.poses import Place, Scene, misfit, movement, places
 from ceres_cal.observations import Observations, taken
 from ceres_cal.observations.sights import gather_sights
@@ -100,7 +100,7 @@ def _others(plan: Plan, scene: Scene) -> Iterator[str]:
     mirrored = relabelled(scene.observations, MIRRORED)
     if mirrored is not None and _fits(_seen_as(scene, mirrored), old):
         yield "with mirrored labels they do: left and right are swapped, or the image is flipped: correct that"
-    for name, observations in other_divisions(scene.observations).items():
+    for name, observations in mistaken_targets(scene.observations).items():
         if _fits(_seen_as(scene, observations), old):
             yield f"on {name} they do: this is the wrong field: correct the target's dimensions"
     zoomed = zoomed_place(scene, old)

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from ceres_cal.base.transforms import Array
 from ceres_cal.model.parameters import Estimate
 from ceres_cal.observations import Columns, Observations
-from ceres_cal.scene.targets import Target, along_track, nearest_on_track
+from ceres_cal.scene.curves import along_track, nearest_on_track
+from ceres_cal.scene.targets import Target
 from ceres_cal.uncertainty.maps import FieldMap, field_map, locate_slopes, radius_95, shown_pixels, station_keys
 from ceres_cal.uncertainty.posterior import Posterior
 
