@@ -96,6 +96,7 @@ def test_help_lists_every_command(say: Say) -> None:
         "compare",
         "locate",
         "project",
+        "export",
         "export-table",
         "simulate",
         "targets",

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.files import check_header, convert, read_json, write_json
+from ceres_cal.base.files import check_header, convert, make_folder, read_json, write_json
 from ceres_cal.base.transforms import Array, Pose, euler_from_rotation, rotation_exp, rotation_from_euler, rotation_log
 from ceres_cal.model.parameters import Station
 from ceres_cal.scene.camera import Camera
@@ -290,13 +290,3 @@ def write_simulation(simulation: Simulation, folder: str | Path, more_truth: Map
     folder = make_folder(folder)
     simulation.observations.save(folder / "observations.json")
     write_json(folder / "truth.json", truth_to_json({"observations.json": simulation}) | dict(more_truth or {}))
-
-
-def make_folder(folder: str | Path) -> Path:
-    """A folder, made where it is missing; InputError where it cannot be."""
-    folder = Path(folder)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{folder}: cannot be made: {error.strerror}") from None
-    return folder
