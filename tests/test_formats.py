@@ -86,9 +86,9 @@ def test_from_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert main(["export", str(saved(tmp_path)), "--to", "folder", "-o", str(tmp_path / "many")]) == 0
     assert (tmp_path / "many" / "overhead.txt").exists()
     assert main(["export", "--help"]) == 0
-    said = " ".join(capsys.readouterr().out.split())
-    assert "toy: for this test (.toy, .gz.toy)" in said and "a folder" in said and "--digits" in said
-    assert "table: a look-up table from pixels to the field (.npz)" in said
+    helped = " ".join(capsys.readouterr().out.split())
+    assert "toy: for this test (.toy, .gz.toy)" in helped and "a folder" in helped and "--digits" in helped
+    assert "table: a look-up table from pixels to the field (.npz)" in helped
 
 
 def test_the_look_up_table_is_a_format(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

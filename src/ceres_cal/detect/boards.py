@@ -19,7 +19,7 @@ from ceres_cal.base.files import read_bytes
 from ceres_cal.base.transforms import Array
 from ceres_cal.detect.saddles import REACH, measure_saddles
 from ceres_cal.detect.scatter import scatter_px
-from ceres_cal.observations import Curves, Observations, Points, View
+from ceres_cal.observations import NO_CURVES, Observations, Points, View
 from ceres_cal.scene.targets import Grid, Target
 
 Image = NDArray[Any]
@@ -111,7 +111,7 @@ def detect_boards(
         )
     views = tuple(View(path.stem, camera, station or camera, TARGET_NAME, placements[path]) for path in found)
     points = _points(list(found.values()), board)
-    observations = Observations({TARGET_NAME: board}, {camera: size}, views, points, _no_curves())
+    observations = Observations({TARGET_NAME: board}, {camera: size}, views, points, NO_CURVES)
     return BoardDetections(observations, tuple(map(str, found)), tuple(missed))
 
 
@@ -330,8 +330,3 @@ def _points(grids: Sequence[Array], board: Target) -> Points:
         pixels=np.concatenate([grid[s] for grid, s in zip(grids, seen, strict=True)]),
         sigma_px=np.full(sum(count), scatter_px(grids)),
     )
-
-
-def _no_curves() -> Curves:
-    nothing = np.empty(0, np.int32)
-    return Curves(nothing, nothing.copy(), np.empty((0, 2)), np.empty(0), np.empty(0, np.int8))

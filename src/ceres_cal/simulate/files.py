@@ -17,7 +17,7 @@ from ceres_cal.base.files import check_header, convert, make_folder, read_json, 
 from ceres_cal.base.transforms import Array, Pose, euler_from_rotation, rotation_exp, rotation_from_euler, rotation_log
 from ceres_cal.model.parameters import Station
 from ceres_cal.scene.camera import Camera
-from ceres_cal.scene.lens import Radial, make_lens
+from ceres_cal.scene.files import CameraFile, Vector, camera_to_json
 from ceres_cal.scene.targets import target_from_spec
 from ceres_cal.simulate.photography import Photography
 from ceres_cal.simulate.scene import Disturbance, Scene, ViewPlan
@@ -27,22 +27,7 @@ SCENE_FORMAT, SCENE_VERSION = "ceres-cal/scene", 1
 TRUTH_FORMAT, TRUTH_VERSION = "ceres-cal/truth", 1
 UNITS = "metres, radians, pixels"
 
-Vector = tuple[float, float, float]
 Settings = TypeVar("Settings", Disturbance, Photography)
-
-
-class _LensFile(msgspec.Struct, forbid_unknown_fields=True):
-    kind: str
-    powers: tuple[int, ...] = (2, 3)
-    coefficients: dict[str, float] = {}
-
-
-class _CameraFile(msgspec.Struct, forbid_unknown_fields=True):
-    image_size: tuple[int, int]
-    phi: float
-    principal_point: tuple[float, float]
-    lens: _LensFile
-    aspect: float = 1.0
 
 
 class _RotationFile(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
@@ -132,10 +117,9 @@ def scene_from_json(data: Mapping[str, Any], where: str) -> tuple[Scene, Disturb
 
 
 def _camera(entry: Any, here: str) -> Camera:
-    file = convert(entry, _CameraFile, here)
+    file = convert(entry, CameraFile, here)
     with _naming(here):
-        lens = make_lens(file.lens.kind, file.lens.powers, file.lens.coefficients)
-        return Camera(file.image_size, file.phi, file.principal_point, lens, file.aspect)
+        return file.camera()
 
 
 def _rotation(file: _RotationFile, here: str) -> Array:
@@ -180,7 +164,7 @@ def scene_to_json(scene: Scene, disturbance: Disturbance | None = None) -> dict[
         "version": SCENE_VERSION,
         "units": UNITS,
         "targets": {name: dict(target.spec) for name, target in scene.targets.items()},
-        "cameras": {name: _camera_to_json(camera) for name, camera in scene.cameras.items()},
+        "cameras": {name: camera_to_json(camera) for name, camera in scene.cameras.items()},
         "stations": {
             name: {
                 "camera": station.camera,
@@ -199,21 +183,6 @@ def scene_to_json(scene: Scene, disturbance: Disturbance | None = None) -> dict[
         "views": msgspec.to_builtins(views),
         "disturbance": vars(disturbance or Disturbance()).copy(),
         **({} if scene.photography is None else {"photography": vars(scene.photography).copy()}),
-    }
-
-
-def _camera_to_json(camera: Camera) -> dict[str, Any]:
-    lens = camera.lens
-    return {
-        "image_size": list(camera.image_size),
-        "phi": camera.phi,
-        "principal_point": list(camera.principal_point),
-        "aspect": camera.aspect,
-        "lens": {
-            "kind": lens.kind,
-            **({"powers": list(lens.powers)} if isinstance(lens, Radial) else {}),
-            "coefficients": lens.coefficients,
-        },
     }
 
 
@@ -236,7 +205,7 @@ def truth_to_json(simulations: Mapping[str, Simulation]) -> dict[str, Any]:
     }
     for file_name, simulation in simulations.items():
         scene = simulation.scene
-        truth["cameras"] |= {name: _camera_to_json(camera) for name, camera in scene.cameras.items()}
+        truth["cameras"] |= {name: camera_to_json(camera) for name, camera in scene.cameras.items()}
         truth["stations"] |= {name: _station_truth(station) for name, station in scene.stations.items()}
         truth["placements"] |= {name: _placement_truth(pose) for name, pose in scene.placements.items()}
         truth["files"][file_name] = {
