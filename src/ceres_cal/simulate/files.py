@@ -27,7 +27,7 @@ SCENE_FORMAT, SCENE_VERSION = "ceres-cal/scene", 1
 TRUTH_FORMAT, TRUTH_VERSION = "ceres-cal/truth", 1
 UNITS = "metres, radians, pixels"
 
-Settings = TypeVar("Settings", Disturbance, Photography)
+Settings = TypeVar("Settings", Disturbance, Photography, ViewPlan)
 
 
 class _RotationFile(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
@@ -44,24 +44,13 @@ class _PlacementFile(_RotationFile, forbid_unknown_fields=True, kw_only=True):
     translation_m: Vector
 
 
-class _ViewFile(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True):
-    frames: tuple[str, ...]
-    station: str
-    target: str
-    placement: str | None = None
-    points: tuple[str, ...] | None = None
-    curves: tuple[str, ...] | None = None
-    spacing_m: float = 0.1
-    side: str = "centre"
-
-
 class _SceneFile(msgspec.Struct, forbid_unknown_fields=True):
     format: str
     version: int
     targets: dict[str, Any]
     cameras: dict[str, Any]
     stations: dict[str, Any]
-    views: list[Any]
+    views: list[dict[str, Any]]
     placements: dict[str, Any] = {}
     disturbance: dict[str, Any] = {}
     photography: dict[str, Any] | None = None
@@ -110,7 +99,7 @@ def scene_from_json(data: Mapping[str, Any], where: str) -> tuple[Scene, Disturb
             {name: _camera(entry, f"camera {name!r}") for name, entry in file.cameras.items()},
             {name: _station(entry, f"station {name!r}") for name, entry in file.stations.items()},
             {name: _placement(entry, f"placement {name!r}") for name, entry in file.placements.items()},
-            tuple(_plan(entry, f"view {number}") for number, entry in enumerate(file.views)),
+            tuple(_named(ViewPlan, entry, f"view {number}") for number, entry in enumerate(file.views)),
             None if file.photography is None else _named(Photography, file.photography, "photography"),
         )
         return scene, _named(Disturbance, file.disturbance, "disturbance")
@@ -140,12 +129,8 @@ def _placement(entry: Any, here: str) -> Pose:
     return Pose(_rotation(file, here), np.array(file.translation_m))
 
 
-def _plan(entry: Any, here: str) -> ViewPlan:
-    return ViewPlan(**msgspec.structs.asdict(convert(entry, _ViewFile, here)))
-
-
 def _named(kind: type[Settings], entry: dict[str, Any], here: str) -> Settings:
-    """The disturbance or the photography that a file describes."""
+    """The disturbance, the photography or the view that a file describes."""
     known = [field.name for field in fields(kind)]
     for name in entry:
         if name not in known:
@@ -158,7 +143,6 @@ def _named(kind: type[Settings], entry: dict[str, Any], here: str) -> Settings:
 
 def scene_to_json(scene: Scene, disturbance: Disturbance | None = None) -> dict[str, Any]:
     """A scene and its disturbance as a file has them; poses come back to rounding, everything else exactly."""
-    views = [_ViewFile(**vars(plan)) for plan in scene.views]
     return {
         "format": SCENE_FORMAT,
         "version": SCENE_VERSION,
@@ -180,10 +164,14 @@ def scene_to_json(scene: Scene, disturbance: Disturbance | None = None) -> dict[
             }
             for name, pose in scene.placements.items()
         },
-        "views": msgspec.to_builtins(views),
+        "views": [_without_defaults(plan) for plan in scene.views],
         "disturbance": vars(disturbance or Disturbance()).copy(),
         **({} if scene.photography is None else {"photography": vars(scene.photography).copy()}),
     }
+
+
+def _without_defaults(plan: ViewPlan) -> dict[str, Any]:
+    return {one.name: value for one in fields(plan) if (value := getattr(plan, one.name)) != one.default}
 
 
 def truth_to_json(simulations: Mapping[str, Simulation]) -> dict[str, Any]:
