@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import read_bytes, write_bytes
-from ceres_cal.base.transforms import Array
 from ceres_cal.formats.export_format import Exported, ExportFormat, ExportRequest, Loss
 from ceres_cal.formats.loss import field_error_mm
 

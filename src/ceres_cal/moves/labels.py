@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ceres_cal.base.transforms import Array
+from ceres_cal.base.arrays import Array
 from ceres_cal.observations import Observations
 from ceres_cal.scene.symmetry import counterparts
 from ceres_cal.scene.targets import target_from_spec

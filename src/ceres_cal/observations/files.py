@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
+from ceres_cal.base.arrays import AnyArray, Codes
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import check_header, convert, parse_json, read_bytes, write_bytes
 from ceres_cal.observations.columns import NO_CURVES, NO_POINTS, TYPES, Curves, Points, Prior, View, listed, place_of
@@ -171,7 +171,7 @@ def _from_json(content: bytes, where: str) -> Content:
     )
 
 
-def _concatenate(parts: Sequence[Any], dtype: Any) -> NDArray[Any]:
+def _concatenate(parts: Sequence[Any], dtype: Any) -> AnyArray:
     return np.concatenate([np.empty(0, dtype), *parts]).astype(dtype)
 
 
@@ -220,7 +220,7 @@ def _sides(entry: _CurvesFile, here: str) -> list[int]:
     return [SIDES[name] for name in names]
 
 
-def _same_or_list(values: NDArray[Any]) -> Any:
+def _same_or_list(values: AnyArray) -> Any:
     return values[0].item() if len(values) and np.all(values == values[0]) else values.tolist()
 
 
@@ -241,18 +241,18 @@ def _to_json(content: Content) -> bytes:
     return head + b',\n "views": [\n  ' + lines + b"\n ]\n}\n"
 
 
-def _rows_by_view(columns: Points | Curves, views: int) -> list[NDArray[Any]]:
+def _rows_by_view(columns: Points | Curves, views: int) -> list[AnyArray]:
     order = np.argsort(columns.view, kind="stable")
     return np.split(order, np.searchsorted(columns.view[order], np.arange(1, views)))
 
 
-def _features(columns: Points | Curves, rows: NDArray[Any], names: Sequence[str]) -> tuple[Any, Any, Any]:
+def _features(columns: Points | Curves, rows: AnyArray, names: Sequence[str]) -> tuple[Any, Any, Any]:
     """Names, pixels and sigmas as files have them."""
     features = [names[i] for i in columns.feature[rows]]
     return features, columns.pixels[rows].tolist(), _same_or_list(columns.sigma_px[rows])
 
 
-def _side_names(sides: NDArray[np.int8]) -> str | list[str] | msgspec.UnsetType:
+def _side_names(sides: Codes) -> str | list[str] | msgspec.UnsetType:
     if not np.any(sides):
         return msgspec.UNSET
     side = _same_or_list(sides)
@@ -268,7 +268,7 @@ def _to_npz(content: Content) -> bytes:
     return stream.getvalue()
 
 
-def _arrays(content: bytes, where: str) -> dict[str, NDArray[Any]]:
+def _arrays(content: bytes, where: str) -> dict[str, AnyArray]:
     """What an NPZ file holds, by name."""
     reason = "it is cut short or no NPZ file"
     try:
@@ -281,7 +281,7 @@ def _arrays(content: bytes, where: str) -> dict[str, NDArray[Any]]:
     raise InputError(f"{where}: cannot be read, {reason}: write it again with Observations.save")
 
 
-def _taken(arrays: dict[str, NDArray[Any]], kind: str, names: Sequence[str], where: str) -> dict[str, Any]:
+def _taken(arrays: dict[str, AnyArray], kind: str, names: Sequence[str], where: str) -> dict[str, Any]:
     """The columns of one kind, taken out of the arrays."""
     found = {}
     for name in names:

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.transforms import Array, rotation_log
+from ceres_cal.base.transforms import rotation_log
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.curves import curve_points
 from ceres_cal.scene.symmetry import middle_of, size_of

@@ -10,9 +10,9 @@ from collections.abc import Sequence
 
 import msgspec
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from ceres_cal.base.transforms import Array
+from ceres_cal.base.arrays import Array, Mask
 
 SIDES = {"centre": 0, "left": 1, "right": -1}
 """Which part of a painted curve was observed. Left and right are those of someone walking along it: from `start` to
@@ -92,7 +92,7 @@ def _with_plain_floats(curve: Curve, *places: str) -> None:
 # ---- along a curve --------------------------------------------------------------------------------------------------
 
 
-def along_track(track: ArrayLike, is_arc: bool | NDArray[np.bool_], s: ArrayLike) -> Array:
+def along_track(track: ArrayLike, is_arc: bool | Mask, s: ArrayLike) -> Array:
     """C(s) on one track (3, 3) or on one track per s (N, 3, 3): (N, 3) m."""
     tracks, s = np.asarray(track, dtype=float), np.asarray(s, dtype=float)
     first = np.where(is_arc, np.cos(s), s)
@@ -114,7 +114,7 @@ def curve_points(curve: Curve, side: int, pieces: int) -> Array:
 # ---- the nearest place ----------------------------------------------------------------------------------------------
 
 
-def nearest_on_track(tracks: Array, is_arc: bool | NDArray[np.bool_], points: Array) -> Array:
+def nearest_on_track(tracks: Array, is_arc: bool | Mask, points: Array) -> Array:
     """Parameter s (N,) of the place on one track (3, 3), or on each track (N, 3, 3), nearest to each point (N, 3).
 
     Past the curve's ends, too; of an arc from -pi to pi.
@@ -126,7 +126,7 @@ def nearest_on_track(tracks: Array, is_arc: bool | NDArray[np.bool_], points: Ar
     return np.asarray(np.where(is_arc, turned, straight))
 
 
-def nearest_to_rays(tracks: Array, is_arc: bool | NDArray[np.bool_], origin: Array, rays: Array) -> Array:
+def nearest_to_rays(tracks: Array, is_arc: bool | Mask, origin: Array, rays: Array) -> Array:
     """Parameter s (N,) of where each ray (N, 3) from `origin` (3,) passes a track (3, 3) or (N, 3, 3) nearest.
 
     Of an arc it is where the ray meets the arc's plane, of a segment the foot of the common perpendicular; 0 where

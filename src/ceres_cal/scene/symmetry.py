@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Collection
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ceres_cal.base.transforms import Array, Pose, rotation_exp
+from ceres_cal.base.arrays import Array, Codes, Indices32
+from ceres_cal.base.transforms import Pose, rotation_exp
 from ceres_cal.scene.curves import Arc, Curve, curve_points, distance_to_curve
 from ceres_cal.scene.targets import Target
 
@@ -19,7 +19,7 @@ _MOST_TURNS = 12
 # ---- feature by feature ---------------------------------------------------------------------------------------------
 
 
-def counterparts(target: Target, image: Array) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int8]]:
+def counterparts(target: Target, image: Array) -> tuple[Indices32, Indices32, Codes]:
     """For each point and each curve the one that x, y, z times `image` (3,) sends it to (-1: none), and 1 or -1 for
     the curve's side.
     """

@@ -12,18 +12,15 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from ceres_cal.base.transforms import Array
+from ceres_cal.base.arrays import Array, Array32, Image8, Indices
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.curves import Arc, Curve, Segment, curve_points
 from ceres_cal.scene.targets import Target
 from ceres_cal.scene.targets.paper import Footprints, Paper, share_inside
 
-Canvas = NDArray[np.float32]
+Canvas = Array32
 """(height, width) times SUBPIXELS: the share of each small square that is paint, or the brightness of paper there."""
-Bytes = NDArray[np.uint8]
-Rows = NDArray[np.intp]
 
 SUBPIXELS = 3
 SHIFT = 4  # binary digits after the point in OpenCV's drawing coordinates
@@ -37,8 +34,8 @@ _BLOCK = 1 << 16
 class _Squares(Footprints):
     """Small squares on the target's plane z = const; `rows`, `columns` (M,) are their places on the canvas."""
 
-    rows: Rows
-    columns: Rows
+    rows: Indices
+    columns: Indices
 
 
 def blank_canvas(image_size: tuple[int, int]) -> Canvas:
@@ -51,7 +48,7 @@ def on_canvas(pixels: Array) -> Array:
     return np.asarray((pixels + 0.5) * SUBPIXELS - 0.5)
 
 
-def averaged(canvas: Canvas | Bytes) -> NDArray[np.float32]:
+def averaged(canvas: Canvas | Image8) -> Array32:
     """A canvas (or a stack of them along the last axis) as an image: what falls on each square pixel."""
     size = canvas.shape[1] // SUBPIXELS, canvas.shape[0] // SUBPIXELS
     return np.asarray(cv2.resize(canvas, size, interpolation=cv2.INTER_AREA), dtype=np.float32)
@@ -82,7 +79,7 @@ def _height_m(curve: Curve) -> float:
     return curve.start[2] if isinstance(curve, Segment) else curve.centre[2]
 
 
-def _near(curve: Curve, camera: Camera) -> Bytes:
+def _near(curve: Curve, camera: Camera) -> Image8:
     """The pixels that a curve's paint may touch, as a mask (height, width)."""
     width, height = camera.image_size
     mask = np.zeros((height, width), np.uint8)
@@ -98,7 +95,7 @@ def _near(curve: Curve, camera: Camera) -> Bytes:
     return mask
 
 
-def _squares(mask: Bytes, camera: Camera, height_m: float) -> Iterator[_Squares]:
+def _squares(mask: Image8, camera: Camera, height_m: float) -> Iterator[_Squares]:
     """The small squares of a mask's pixels on the plane z = height_m, some at a time."""
     y, x = np.nonzero(mask)
     for first in range(0, len(x), _BLOCK):
@@ -113,7 +110,7 @@ def _squares(mask: Bytes, camera: Camera, height_m: float) -> Iterator[_Squares]
         yield _divided(pixels[seen].astype(np.intp), middle[seen], along_x[seen], along_y[seen])
 
 
-def _divided(pixels: Rows, middle: Array, along_x: Array, along_y: Array) -> _Squares:
+def _divided(pixels: Indices, middle: Array, along_x: Array, along_y: Array) -> _Squares:
     """Pixels and their footprints, divided: within half a pixel the lens's map is straight to 1e-4 px."""
     j, i = (index.ravel() for index in np.indices((SUBPIXELS, SUBPIXELS)))
     place = middle[:, None] + _STEPS[i][:, None] * along_x[:, None] + _STEPS[j][:, None] * along_y[:, None]
@@ -169,7 +166,7 @@ def sheet_outline(paper: Paper) -> Array:
     return np.column_stack([border, np.zeros(len(border))])
 
 
-def print_sheet(canvas: Canvas, paper: Paper, camera: Camera) -> Bytes:
+def print_sheet(canvas: Canvas, paper: Paper, camera: Camera) -> Image8:
     """Print a sheet onto a canvas, and the mask (height, width) of the pixels it covers."""
     width, height = camera.image_size
     mask = np.zeros((height, width), np.uint8)
@@ -182,7 +179,7 @@ def print_sheet(canvas: Canvas, paper: Paper, camera: Camera) -> Bytes:
     return mask
 
 
-def fill(mask: Bytes, outline: Array, value: int | Sequence[int] = 1) -> None:
+def fill(mask: Image8, outline: Array, value: int | Sequence[int] = 1) -> None:
     """Fill a polygon (N, 2), in the coordinates of `mask` (height, width) or (height, width, channels)."""
     limit = 4 * max(mask.shape)
     rounded = np.round(np.clip(outline, -limit, limit) * 2**SHIFT).astype(np.int32)

@@ -8,9 +8,9 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import convert
-from ceres_cal.base.transforms import Array
 from ceres_cal.scene.targets.paper import Footprints, Paper, share_inside
 from ceres_cal.scene.targets.target import Grid, Target, TargetKind
 

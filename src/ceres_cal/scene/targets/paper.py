@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ceres_cal.base.transforms import Array
+from ceres_cal.base.arrays import Array
 
 
 @dataclass(frozen=True, eq=False)

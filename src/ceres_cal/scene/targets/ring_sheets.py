@@ -8,9 +8,9 @@ from functools import partial
 import msgspec
 import numpy as np
 
+from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import convert
-from ceres_cal.base.transforms import Array
 from ceres_cal.scene.curves import Arc, Curve
 from ceres_cal.scene.targets.paper import Footprints, Paper, share_inside
 from ceres_cal.scene.targets.target import Target, TargetKind

@@ -8,9 +8,8 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ceres_cal.base.transforms import Array
+from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.scene.curves import Arc, Curve
 from ceres_cal.scene.targets.paper import Paper
 
@@ -89,7 +88,7 @@ class Target:
         ).reshape(3, -1, 3, 3)
 
     @cached_property
-    def is_arc(self) -> NDArray[np.bool_]:
+    def is_arc(self) -> Mask:
         """(C,) whether each curve is an arc."""
         return np.array([isinstance(curve, Arc) for curve in self.curves.values()], dtype=bool)
 
