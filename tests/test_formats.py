@@ -7,11 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from moves import calibrated
+from scenes import lines_and_arcs
 
-from ceres_cal import InputError
+from ceres_cal import Calibration, InputError, calibrate
 from ceres_cal.cli import main
 from ceres_cal.formats import EXPORT_FORMATS, Exported, ExportFormat, ExportRequest, LookupTable, Loss, export
+from ceres_cal.simulate import Disturbance, simulate
 
 
 @dataclass(frozen=True)
@@ -49,19 +50,25 @@ def in_the_table(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @cache
+def calibrated() -> Calibration:
+    noise = Disturbance(curves_sigma_px=0.2)
+    return calibrate(simulate(lines_and_arcs("radial-2-3"), noise, seed=1).observations)
+
+
+@cache
 def saved(folder: Path) -> Path:
-    calibrated(0).save(folder / "calibration.json")
+    calibrated().save(folder / "calibration.json")
     return folder / "calibration.json"
 
 
 def test_from_python(tmp_path: Path) -> None:
-    exported = export(calibrated(0), "toy", tmp_path / "a.toy", digits=1)
-    phi = calibrated(0).station().phi
+    exported = export(calibrated(), "toy", tmp_path / "a.toy", digits=1)
+    phi = calibrated().station().phi
     assert (tmp_path / "a.toy").read_text() == f"overhead {phi:.1f}"
     assert exported.losses[0].field_mm[0.15] == (0.3, 0.4) and exported.warnings == ("toys break",)
-    export(calibrated(0), "toy", tmp_path / "a.toy", ["overhead"], digits=0)  # it edits what is there
+    export(calibrated(), "toy", tmp_path / "a.toy", ["overhead"], digits=0)  # it edits what is there
     assert (tmp_path / "a.toy").read_text() == f"overhead {phi:.1f}overhead {phi:.0f}"
-    export(calibrated(0), "folder", tmp_path / "many")
+    export(calibrated(), "folder", tmp_path / "many")
     assert (tmp_path / "many" / "overhead.txt").read_bytes() == b"here"
 
 
@@ -77,7 +84,7 @@ def test_from_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str
         "error     0.3000 mm rms, 0.4000 mm at most, 150 mm above the floor",
         "warning   toys break",
     ]
-    assert out.read_text() == f"hello\noverhead {calibrated(0).station().phi:.2f}"
+    assert out.read_text() == f"hello\noverhead {calibrated().station().phi:.2f}"
     assert main([*ask, "--json"]) == 0
     data = json.loads(capsys.readouterr().out)
     assert data["lines"] == 2 and data["format"] == "toy"
@@ -97,7 +104,7 @@ def test_the_look_up_table_is_a_format(tmp_path: Path, capsys: pytest.CaptureFix
     said = capsys.readouterr().out
     assert main(["export", str(saved(tmp_path)), "--to", "table", "-o", str(new), "--error-mm", "1"]) == 0
     assert capsys.readouterr().out == said.replace("old.npz", "new.npz")
-    exported = export(calibrated(0), "table", tmp_path / "python.npz", error_mm=1.0)
+    exported = export(calibrated(), "table", tmp_path / "python.npz", error_mm=1.0)
     one, other = LookupTable.load(old), LookupTable.load(new)
     assert np.array_equal(one.floor_m, other.floor_m, equal_nan=True) and one.error_mm == other.error_mm
     assert exported.losses == (Loss("overhead", one.error_mm),) and exported.losses[0].field_mm[0.0][1] <= 1.0
@@ -142,6 +149,6 @@ def test_without_any_format(
 
 def test_from_python_refusals(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="format toy has no option 'size': there are digits, comment"):
-        export(calibrated(0), "toy", tmp_path / "a.toy", size=3)
+        export(calibrated(), "toy", tmp_path / "a.toy", size=3)
     with pytest.raises(InputError, match="format folder has no option 'size': there are none"):
-        export(calibrated(0), "folder", tmp_path / "a", size=3)
+        export(calibrated(), "folder", tmp_path / "a", size=3)

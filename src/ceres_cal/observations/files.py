@@ -302,10 +302,10 @@ def _from_npz(content: bytes, where: str) -> Content:
     if header is None or header.dtype != np.uint8:
         raise InputError(f"{where}: no header: this is not a file of observations")
     plain = check_header(parse_json(header.tobytes(), where), where, FORMAT, VERSION)
-    read = convert(plain, _ObservationsFile, where).content()
+    header = convert(plain, _ObservationsFile, where).content()
     names = ("view", "feature", "pixels", "sigma_px")
     points = Points(**_taken(arrays, "points", names, where))
     curves = Curves(**_taken(arrays, "curves", (*names, "side"), where))
     if arrays:
         raise InputError(f"{where}: unknown column {min(arrays)!r}")
-    return read._replace(points=points, curves=curves)
+    return header._replace(points=points, curves=curves)
