@@ -296,16 +296,16 @@ def _taken(arrays: dict[str, AnyArray], kind: str, names: Sequence[str], where: 
     return found
 
 
-def _from_npz(content: bytes, where: str) -> Content:
-    arrays = _arrays(content, where)
+def _from_npz(packed: bytes, where: str) -> Content:
+    arrays = _arrays(packed, where)
     header = arrays.pop("header", None)
     if header is None or header.dtype != np.uint8:
         raise InputError(f"{where}: no header: this is not a file of observations")
     plain = check_header(parse_json(header.tobytes(), where), where, FORMAT, VERSION)
-    header = convert(plain, _ObservationsFile, where).content()
+    content = convert(plain, _ObservationsFile, where).content()
     names = ("view", "feature", "pixels", "sigma_px")
     points = Points(**_taken(arrays, "points", names, where))
     curves = Curves(**_taken(arrays, "curves", (*names, "side"), where))
     if arrays:
         raise InputError(f"{where}: unknown column {min(arrays)!r}")
-    return header._replace(points=points, curves=curves)
+    return content._replace(points=points, curves=curves)
