@@ -13,7 +13,8 @@ from ceres_cal.base.arrays import Array
 from ceres_cal.base.transforms import Pose
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import SightKey, Sights, gather_sights, nearest_feet
-from ceres_cal.scene.targets import Arc, Segment, along_track, checkerboard, custom
+from ceres_cal.scene.curves import along_track
+from ceres_cal.scene.targets import Arc, Segment, checkerboard, custom
 from ceres_cal.simulate import Disturbance, Scene, Station, ViewPlan, overhead_pose, simulate
 
 NOISE = Disturbance(points_sigma_px=0.3, curves_sigma_px=0.5, hidden_points=0.2)

@@ -19,7 +19,7 @@ from ceres_cal.model.parameters import Estimate
 from ceres_cal.model.residuals import Residuals, lens_arguments
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights
-from ceres_cal.scene.targets import along_track
+from ceres_cal.scene.curves import along_track
 
 
 @dataclass(frozen=True, eq=False)

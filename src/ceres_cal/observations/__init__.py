@@ -4,12 +4,14 @@ A view is what one frame shows of one target; a sight is what one camera at one 
 all its views, and so what one pose projects (see `observations.sights`).
 """
 
-from ceres_cal.observations.columns import Columns, Curves, Points, Prior, View, taken
+from ceres_cal.observations.columns import NO_CURVES, NO_POINTS, Columns, Curves, Points, Prior, View, taken
 from ceres_cal.observations.files import FORMAT, VERSION, prior_from_json, prior_to_json
 from ceres_cal.observations.observations import Observations, combine
 
 __all__ = [
     "FORMAT",
+    "NO_CURVES",
+    "NO_POINTS",
     "VERSION",
     "Columns",
     "Curves",

@@ -98,6 +98,9 @@ class Curves:
         return len(self.view)
 
 
+_NOBODY, _NOWHERE = np.empty(0, np.int32), np.empty((0, 2))
+NO_POINTS = Points(_NOBODY, _NOBODY, _NOWHERE, np.empty(0))
+NO_CURVES = Curves(_NOBODY, _NOBODY, _NOWHERE, np.empty(0), np.empty(0, np.int8))
 Columns = Points | Curves
 C = TypeVar("C")
 

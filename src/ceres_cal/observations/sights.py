@@ -26,6 +26,7 @@ from numpy.typing import ArrayLike
 from ceres_cal.base.arrays import AnyArray, Array, Indices, Indices32, Mask
 from ceres_cal.observations import Columns, Observations
 from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.curves import nearest_to_rays
 
 _BLOCK = 1 << 16  # rows worked on at once: memory stays small beside the observations
 
@@ -52,7 +53,7 @@ class Sights(Sequence["Sights"]):
         pixels: (N, 2). sigma_px: (N,).
         curve_bounds, curve_rows, curve_pixels, curve_sigma_px: the same of the M curve observations.
         track_index: (M,) number among tracks (T, 3, 3) and is_arc (T,): every side and curve of every target (see
-            `targets.along_track`).
+            `curves.along_track`).
     """
 
     keys: tuple[SightKey, ...]
@@ -297,12 +298,4 @@ def nearest_feet(sight: Sights, camera: Camera) -> Array:
 def _nearest(sight: Sights, camera: Camera, rows: slice) -> Array:
     rays = np.nan_to_num(camera.rays(sight.curve_pixels[rows]) @ camera.cam_from_world.rotation)
     track = sight.track_index[rows]
-    c, a = sight.tracks[track, 0], sight.tracks[track, 1]
-    away = camera.position - c
-    # Arc: where the ray meets the arc's plane. Segment: the common perpendicular of ray and line.
-    with np.errstate(divide="ignore", invalid="ignore"):
-        on_plane = away - (away[:, 2] / rays[:, 2])[:, None] * rays
-        turned = np.arctan2(on_plane[:, 1], on_plane[:, 0])
-        aa, ar, rr = np.sum(a * a, 1), np.sum(a * rays, 1), np.sum(rays * rays, 1)
-        straight = (np.sum(a * away, 1) * rr - np.sum(rays * away, 1) * ar) / (aa * rr - ar * ar)
-    return np.asarray(np.nan_to_num(np.where(sight.on_arc[rows], turned, straight), posinf=0.0, neginf=0.0))
+    return nearest_to_rays(sight.tracks[track], sight.on_arc[rows], camera.position, rays)
