@@ -241,8 +241,7 @@ def _require_usable(settled: _Settled, sights: Sights) -> tuple[str, ...]:
         fold, corner = camera.lens.monotone_radius(camera.phi), camera.corner_radius
         where = f"camera {name!r}: the solved {camera.lens.kind} lens folds {fold:.0f} px from the principal point"
         seen = _of(name, sights.used(settled.inliers.points, settled.inliers.curves)).reach_px(camera)
-        # The paper's polynomial can be had without a fold; the others' published models fold in corners nobody saw.
-        if camera.lens.kind == "radial" or fold <= seen:
+        if not camera.lens.may_fold or fold <= seen:
             raise SolutionError(
                 f"{where}, inside the image (corner at {corner:.0f} px): "
                 "choose fewer or other coefficients, or observe nearer to the corners"

@@ -292,8 +292,8 @@ class _CalibrationFile(msgspec.Struct, forbid_unknown_fields=True):
 def camera_to_json(camera: Camera) -> dict[str, Any]:
     """A camera's intrinsics as the files have them."""
     lens: dict[str, Any] = {"kind": camera.lens.kind, "coefficients": camera.lens.coefficients}
-    if camera.lens.kind == "radial":
-        lens["powers"] = list(camera.lens.radius_powers)
+    if camera.lens.powers:
+        lens["powers"] = list(camera.lens.powers)
     return {
         "image_size": list(camera.image_size),
         "phi": camera.phi,
@@ -383,7 +383,7 @@ def _from_file(data: _CalibrationFile) -> Calibration:
     cameras = {}
     for name, entry in data.cameras.items():
         cameras[name] = _camera(entry)
-        if entry.lens.kind == "radial":  # the others may fold in corners that nobody saw: `locate` gives NaN there
+        if not cameras[name].lens.may_fold:  # others may, in corners that nobody saw: `locate` gives NaN there
             cameras[name].require_monotone(name)
     stations = {}
     for name, station in data.stations.items():

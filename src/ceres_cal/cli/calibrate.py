@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -33,6 +33,18 @@ _STATION_QUANTITIES = ("height_m", "position_m")
 _PRIOR_EXAMPLE = "overhead.height_m=4.02:0.01"
 
 
+class _Kinds:
+    """The kinds of lenses, read when they are asked for: other wrong usage answers before numpy is there."""
+
+    def __iter__(self) -> Iterator[str]:
+        from ceres_cal.scene.lens import LENSES
+
+        return iter(LENSES)
+
+    def __contains__(self, kind: object) -> bool:
+        return kind in list(self)
+
+
 def _add_arguments(parser: ArgumentParser) -> None:
     add = parser.add_argument
     add("observations", nargs="+", metavar="OBS", help="files of observations (.json or .npz), taken together")
@@ -40,8 +52,14 @@ def _add_arguments(parser: ArgumentParser) -> None:
     add_report(parser)
     lens = parser.add_argument_group("the camera")
     add = lens.add_argument
-    add("--lens", choices=("radial", "brown", "kannala-brandt"), default="radial", help="default: radial")
-    add("--powers", metavar="2,3", help="powers of the radial lens; default: 2,3, the paper's")
+    add(
+        "--lens",
+        choices=_Kinds(),
+        metavar="KIND",
+        default="radial",
+        help="default: radial, the paper's; `--lens ?` names all",
+    )
+    add("--powers", metavar="2,3", help="powers of a lens that leaves the choice; default: 2,3, the paper's")
     add(
         "--fix",
         action="append",
@@ -163,8 +181,11 @@ def _shown_on(bar: ProgressBar, most: int) -> Callable[[Progress], None]:
 def _powers(args: Namespace) -> tuple[int, ...]:
     if args.powers is None:
         return (2, 3)
-    if args.lens != "radial":
-        raise InputError(f"--powers is for the radial lens, not for {args.lens}: leave it out")
+    from ceres_cal.scene.lens import LENSES
+
+    choosing = [kind for kind, lens in LENSES.items() if lens.trial_powers]
+    if args.lens not in choosing:
+        raise InputError(f"--powers is for the {' or '.join(choosing)} lens, not for {args.lens}: leave it out")
     try:
         return tuple(int(power) for power in args.powers.split(","))
     except ValueError:

@@ -156,7 +156,7 @@ def _weights(calibration: Calibration, inliers: Inliers, model: _Model) -> tuple
     lengths = np.concatenate([inliers.point_sigmas, inliers.curve_sigmas])
     options = calibration.options
     squared = np.where(np.isfinite(lengths), lengths, 0.0) ** 2
-    robust = kernels.loss_weights(kernels.LOSS_CODES[options.loss], options.loss_scale, squared)
+    robust = kernels.loss_weights(kernels.Loss(kernels.LOSS_CODES[options.loss], options.loss_scale), squared)
     inlier = np.concatenate([inliers.points, inliers.curves])
     return 1.0 / sigma[at], inlier[at], robust[at]
 

@@ -63,12 +63,8 @@ def natural_sizes(estimate: Estimate, keys: Sequence[Key]) -> Array:
     for (kind, owner), places in places_of(keys).items():
         if kind == "camera":
             camera = estimate.cameras[owner]
-            radius = unit_px(camera) if camera.lens.kind == "radial" else unit_px(camera) / camera.phi
-            powers = {"p1": 2, "p2": 2} | dict(
-                zip([n for n in camera.lens.names if n[0] != "p"], camera.lens.radius_powers, strict=True)
-            )
             known = {"phi": camera.phi, "cx": camera.phi, "cy": camera.phi, "aspect": 1.0}
-            known |= {name: radius ** (1 - power) for name, power in powers.items()}
+            known |= zip(camera.lens.names, camera.lens.natural_sizes(camera.phi, unit_px(camera)), strict=True)
             sizes[places] = [known[keys[place].quantity] for place in places]
         elif kind == "structure":
             names = [f"{owner}/{keys[place].quantity}" for place in places]
@@ -90,8 +86,7 @@ def _distance_m(estimate: Estimate, kind: str, owner: str) -> float:
 
 def camera_keys(name: str, camera: Camera, free: Iterable[int]) -> list[Key]:
     """Keys of the intrinsics with these places in the solver's vector."""
-    powers = camera.lens.radius_powers if camera.lens.kind == "radial" else (1,) * len(camera.lens.names)
-    units = ("px", "1", "px", "px", *("1" if power == 1 else f"px^{1 - power}" for power in powers))
+    units = ("px", "1", "px", "px", *camera.lens.units)
     names = intrinsic_names(camera.lens)
     return [Key("camera", name, names[int(i)], units[int(i)]) for i in free]
 

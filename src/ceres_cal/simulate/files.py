@@ -17,7 +17,7 @@ from ceres_cal.base.files import check_header, convert, read_json, write_json
 from ceres_cal.base.transforms import Array, Pose, euler_from_rotation, rotation_exp, rotation_from_euler, rotation_log
 from ceres_cal.model.parameters import Station
 from ceres_cal.scene.camera import Camera
-from ceres_cal.scene.lens import Radial, make_lens
+from ceres_cal.scene.lens import make_lens
 from ceres_cal.scene.targets import target_from_spec
 from ceres_cal.simulate.photography import Photography
 from ceres_cal.simulate.scene import Disturbance, Scene, ViewPlan
@@ -211,7 +211,7 @@ def _camera_to_json(camera: Camera) -> dict[str, Any]:
         "aspect": camera.aspect,
         "lens": {
             "kind": lens.kind,
-            **({"powers": list(lens.powers)} if isinstance(lens, Radial) else {}),
+            **({"powers": list(lens.powers)} if lens.powers else {}),
             "coefficients": lens.coefficients,
         },
     }

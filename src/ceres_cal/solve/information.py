@@ -27,10 +27,10 @@ from ceres_cal.model.quantities import (
     shared_keys,
     sigma_limits,
 )
-from ceres_cal.model.residuals import lens_arguments, starting_places
+from ceres_cal.model.residuals import camera_optics, curve_columns, point_columns, starting_places
 from ceres_cal.observations.sights import SightKey, Sights
 from ceres_cal.solve.bundle import own_structure, private_placements
-from ceres_cal.solve.costs import NORMAL_NS, Weighting, kernel_columns
+from ceres_cal.solve.costs import NORMAL_NS, Weighting, kernel_loss
 
 Places = NDArray[np.int64]
 _BATCH = 2_000_000  # numbers of normal equations worked on at once
@@ -115,33 +115,25 @@ def _normals(
     in the units of the files | structure | left perturbation of the pose: turn, shift].
     """
     camera = estimate.cameras[sights.keys[0].camera]
-    code, vector, powers, unit = lens_arguments(camera)
     free, structure = layout.free[sights.keys[0].camera], estimate.structure
-    pixels, weights, slots, bends, is_arc, track, curve_pixels, curve_weights = kernel_columns(
-        sights, structure, weighting
-    )
-    starts = starting_places(sights, estimate, places)
-    poses = estimate.pose_stack(sights.keys)
-    points, tracks = structure.points(sights), structure.tracks(sights)
+    optics, unknowns = camera_optics(camera), kernels.Unknowns(free, len(structure.values))
+    points = point_columns(sights, structure, weighting.point_scale)
+    curves = curve_columns(sights, structure, starting_places(sights, estimate, places), weighting.curve_scale)
+    loss, poses = kernel_loss(weighting), estimate.pose_stack(sights.keys)
     size = len(free) + len(structure.values) + 6
     units = np.ones(size)
     units[: len(free)] = intrinsics_scales(camera)[free]
 
     def told(first: int, last: int) -> Array:
         normals = np.empty((last - first, size, size))
-        if not kernels.sight_normals(
-            first, last, code, vector, free, powers, unit, sights.point_bounds, pixels, weights, slots, bends, is_arc,
-            sights.curve_bounds, track, curve_pixels, curve_weights, starts, structure.track_slots,
-            kernels.LOSS_CODES[weighting.loss], weighting.loss_scale, False, points, tracks, len(structure.values),
-            poses, units, normals,
-        ):  # fmt: skip
+        if not kernels.sight_normals(first, last, optics, unknowns, points, curves, loss, poses, units, normals):
             raise SolutionError("an observation cannot be projected where the solve ended: no uncertainty can be given")
         return normals
 
     batch = max(1, _BATCH // size**2)
     for first in range(0, len(sights), batch):
         last = min(first + batch, len(sights))
-        parts = [first + place for place in parts_of(last - first, len(points) + len(curve_pixels), NORMAL_NS)]
+        parts = [first + place for place in parts_of(last - first, len(points.pixels) + len(curves.pixels), NORMAL_NS)]
         yield poses[first:last], np.concatenate(run_parts(told, parts))
 
 
