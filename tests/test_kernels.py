@@ -13,11 +13,11 @@ import pytest
 import scenes
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
 from ceres_cal import kernels
-from ceres_cal.base.transforms import Array, Pose, rotation_exp
+from ceres_cal.base.arrays import Array, Indices, Indices32
+from ceres_cal.base.transforms import Pose, rotation_exp
 from ceres_cal.kernels import CurveColumns, Loss, PointColumns, Unknowns
 from ceres_cal.kernels.lenses import prepared
 from ceres_cal.kernels.sight import normal_equations as sum_up
@@ -57,7 +57,7 @@ Shown = tuple[PointColumns, CurveColumns]
 
 
 def shown(
-    places: Array, pixels: Array, point_sigma_px: Array, track: NDArray[np.int32], curve_pixels: Array,
+    places: Array, pixels: Array, point_sigma_px: Array, track: Indices32, curve_pixels: Array,
     curve_sigma_px: Array, feet: Array,
 ) -> Shown:  # fmt: skip
     tracks, is_arc = TARGET.tracks.reshape(-1, 3, 3), np.tile(TARGET.is_arc, 3)
@@ -390,7 +390,7 @@ class Block:
 
 def evaluate_block(
     camera: Camera, poses: tuple[Array, Array], seen: Shown, loss: str = "trivial", scale: float = 1.0, *,
-    free: NDArray[np.int64] | None = None, held: tuple[str, ...] = (), structure: int = 0,
+    free: Indices | None = None, held: tuple[str, ...] = (), structure: int = 0,
 ) -> Block | None:  # fmt: skip
     """The block of a camera at station @ placement; None where the kernel says that there is no answer."""
     optics = camera_optics(camera)

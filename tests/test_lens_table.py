@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 import scenes
 
+from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.transforms import Array
 from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
 from ceres_cal.cli import main
@@ -168,7 +168,7 @@ def test_its_derivatives_are_those_of_its_map(simulation: Simulation) -> None:
             changed = vector.copy()
             changed[number] += sign * step
             cameras = {"overhead": with_intrinsics(truth.cameras["overhead"], changed)}
-            moved.append(residuals(observations, sights, replace(truth, cameras=cameras), found.places))
+            moved.append(residuals(observations, sights, replace(truth, cameras=cameras), found.feet))
         slope = (np.concatenate([moved[0].points.ravel(), moved[0].curves]) - np.concatenate(
             [moved[1].points.ravel(), moved[1].curves]
         )) / (2.0 * step)  # fmt: skip

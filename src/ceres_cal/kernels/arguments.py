@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ceres_cal.base.transforms import Array
+from ceres_cal.base.arrays import Array
 
 
 class Optics(NamedTuple):

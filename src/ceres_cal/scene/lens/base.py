@@ -18,8 +18,8 @@ from typing import Any, ClassVar, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.transforms import Array
 
 LinearEquations = tuple[dict[str, Array], Array]
 _BLOCK = 16384  # rows at a time, so that what is worked on stays in the cache

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ceres_cal.base.transforms import Array
+from ceres_cal.base.arrays import Array
 from ceres_cal.scene.lens.base import Lens, LinearEquations
 from ceres_cal.scene.lens.polynomials import dense_polynomial, growing_until, horner, invert_increasing, monotone_limit
 

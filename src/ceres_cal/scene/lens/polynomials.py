@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ceres_cal.base.transforms import Array
+from ceres_cal.base.arrays import Array
 
 STEPS = 60  # a safeguard: Newton needs 4 to 8, bisection 53
 _FAR_STEPS = 96

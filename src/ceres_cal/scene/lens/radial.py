@@ -10,8 +10,8 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.transforms import Array
 from ceres_cal.scene.lens.base import Lens, LinearEquations, ahead, unit_rays
 from ceres_cal.scene.lens.polynomials import dense_polynomial, growing_until, horner, invert_increasing, monotone_limit
 
