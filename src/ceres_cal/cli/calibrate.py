@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from argparse import ArgumentParser, Namespace
-from collections.abc import Callable, Iterator, Mapping
+from argparse import ArgumentParser, ArgumentTypeError, Namespace
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -33,16 +33,17 @@ _STATION_QUANTITIES = ("height_m", "position_m")
 _PRIOR_EXAMPLE = "overhead.height_m=4.02:0.01"
 
 
-class _Kinds:
-    """The kinds of lenses, read when they are asked for: other wrong usage answers before numpy is there."""
+_DEFAULT_LENS = "radial"
 
-    def __iter__(self) -> Iterator[str]:
+
+def _lens_kind(name: str) -> str:
+    """A kind of lens that is in the table; the default is, and help and wrong usage need no table."""
+    if name != _DEFAULT_LENS:
         from ceres_cal.scene.lens import LENSES
 
-        return iter(LENSES)
-
-    def __contains__(self, kind: object) -> bool:
-        return kind in list(self)
+        if name not in LENSES:
+            raise ArgumentTypeError(f"invalid choice: {name!r} (choose from {', '.join(map(repr, LENSES))})")
+    return name
 
 
 def _add_arguments(parser: ArgumentParser) -> None:
@@ -52,13 +53,8 @@ def _add_arguments(parser: ArgumentParser) -> None:
     add_report(parser)
     lens = parser.add_argument_group("the camera")
     add = lens.add_argument
-    add(
-        "--lens",
-        choices=_Kinds(),
-        metavar="KIND",
-        default="radial",
-        help="default: radial, the paper's; `--lens ?` names all",
-    )
+    kinds = f"default: {_DEFAULT_LENS}, the paper's; `--lens ?` names all"
+    add("--lens", type=_lens_kind, metavar="KIND", default=_DEFAULT_LENS, help=kinds)
     add("--powers", metavar="2,3", help="powers of a lens that leaves the choice; default: 2,3, the paper's")
     add(
         "--fix",
