@@ -1,4 +1,4 @@
-"""After a move: the poses anew, everything else under what was known of it (design, sections 3 and 8).
+"""After a move: the poses anew, everything else under what was known of it (design, section 10).
 
 The same path as `calibrate`, from the old calibration's closed form with a known lens to solve, reject, solve, assess;
 the old posterior is one more prior, as a full matrix.
