@@ -1,8 +1,8 @@
 """What the constants that decide something decide: python scripts/constants.py [--help]
 
 Each is halved and doubled (a share of one half and more by its odds, a whole number to the nearest one), and small,
-fast scenes are measured again: false alarms and findings of `diagnose`, refusals, boards mirrored or lost, the error over
-the Cramer-Rao bound, false alarms and power of `check`, moves refitted, fields, boards and rings found in photographs. One
+fast scenes are measured again: false alarms and findings of `diagnose`, refusals, boards mirrored or lost, the error
+over the Cramer-Rao bound, false alarms and power of `check`, moves refitted, fields, boards and rings found. One
 row for each constant and factor says which figures change; "nothing" where none does in the digits shown.
 """
 
