@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 import scenes as usual
 
+from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.transforms import Array, Pose
+from ceres_cal.base.transforms import Pose
 from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
 from ceres_cal.cli import main

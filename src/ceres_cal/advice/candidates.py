@@ -9,7 +9,7 @@ import numpy as np
 
 from ceres_cal.advice.measurements import Ground, Measurement, together
 from ceres_cal.advice.outlook import Outlook
-from ceres_cal.base.transforms import Array
+from ceres_cal.base.arrays import Array
 from ceres_cal.model.structure import Tolerance
 from ceres_cal.observations import Prior
 from ceres_cal.scene.camera import Camera

@@ -7,11 +7,12 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.spread import without
-from ceres_cal.base.transforms import Array, Pose
+from ceres_cal.base.transforms import Pose
 from ceres_cal.model.parameters import Estimate, Layout, intrinsic_names
-from ceres_cal.model.quantities import Key, sigma_limits
+from ceres_cal.model.keys import Key
 from ceres_cal.model.structure import Tolerance, make_structure
 from ceres_cal.observations import Curves, Observations, Points, Prior
 from ceres_cal.observations.sights import gather_sights

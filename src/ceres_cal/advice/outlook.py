@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.spread import Spread
-from ceres_cal.base.transforms import Array
 from ceres_cal.model.parameters import Estimate
-from ceres_cal.model.quantities import Key, moved, sigma_limits
+from ceres_cal.model.keys import Key
+from ceres_cal.model.quantities import moved
 from ceres_cal.uncertainty import FieldMap, Posterior, Profile
 from ceres_cal.uncertainty.maps import locate_slopes, shown_pixels, station_keys
 
@@ -94,7 +94,7 @@ class Outlook:
         return _part(Spread.of(self.posterior.information + added, sigma_limits(self.posterior.keys)), at)
 
     @cached_property
-    def _places(self) -> NDArray[np.int64]:
+    def _places(self) -> Indices:
         return _indices(self.keys, self.posterior.keys)
 
     @cached_property
@@ -138,12 +138,12 @@ class Outlook:
             yield float(profile.phi[place]), self._phi_sd(there, known), errors
 
 
-def _indices(keys: tuple[Key, ...], every: tuple[Key, ...]) -> NDArray[np.int64]:
+def _indices(keys: tuple[Key, ...], every: tuple[Key, ...]) -> Indices:
     """Where some keys are among all of them."""
     return np.array([every.index(key) for key in keys], dtype=np.int64)
 
 
-def _part(known: Spread, at: NDArray[np.int64]) -> Spread:
+def _part(known: Spread, at: Indices) -> Spread:
     """What is known of some of the numbers."""
     return Spread(known.covariance[np.ix_(at, at)], known.unknown[at], known.scale[at])
 

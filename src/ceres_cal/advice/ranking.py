@@ -10,8 +10,8 @@ import numpy as np
 from ceres_cal.advice.candidates import BOARD, Search, still
 from ceres_cal.advice.measurements import Ground, Measurement
 from ceres_cal.advice.outlook import BENT, Errors, Outlook
+from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.transforms import Array
 from ceres_cal.calibration import Calibration, Fit
 from ceres_cal.model.parameters import Estimate
 from ceres_cal.scene.targets import Target

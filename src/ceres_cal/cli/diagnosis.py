@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ceres_cal.base.transforms import Array
+from ceres_cal.base.arrays import Array
 from ceres_cal.cli.command import plural, written
 from ceres_cal.cli.summary import section
 from ceres_cal.diagnostics import Choice, Diagnosis, Finding, HeldOut, Noise, ResidualTable, Summary

@@ -8,11 +8,12 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.cli.command import Answer, Command, parse_number
 
 if TYPE_CHECKING:
-    from ceres_cal.base.transforms import Array
+    from ceres_cal.base.arrays import Array
     from ceres_cal.scene.camera import Camera
 
 

@@ -9,14 +9,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ceres_cal.base.arrays import Image
 from ceres_cal.base.errors import InputError
 from ceres_cal.cli.command import Answer, Command, finishing, parse_number, parse_numbers
 from ceres_cal.cli.detect import image_files
 from ceres_cal.cli.progress import ProgressBar
 
 if TYPE_CHECKING:
+    from ceres_cal.base.arrays import Image
     from ceres_cal.calibration import Calibration
-    from ceres_cal.pictures.warp import Image
     from ceres_cal.scene.camera import Camera
 
 _MARGIN_M = 0.3  # around the field in a top view

@@ -6,14 +6,14 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
-from ceres_cal.base.transforms import Array, skew
-from ceres_cal.diagnostics.equations import Equations, Ints
+from ceres_cal.base.arrays import Array, Indices, Mask
+from ceres_cal.base.transforms import skew
+from ceres_cal.diagnostics.equations import Equations
 from ceres_cal.diagnostics.freedom import structure_columns
 from ceres_cal.diagnostics.scores import Family
 from ceres_cal.model.parameters import Estimate, Layout, unit_px
 from ceres_cal.model.structure import Tolerance, make_structure
 from ceres_cal.observations import Observations
-from ceres_cal.observations.sights import Mask
 from ceres_cal.scene.targets import Target
 from ceres_cal.solve import private_placements
 
@@ -59,7 +59,7 @@ def _lens_families(equations: Equations, estimate: Estimate, layout: Layout) -> 
         yield Family(kind, equations.intrinsics[:, places], group, names, units=("",) if kind == "aspect" else ("px",))
 
 
-def _camera_of(equations: Equations, names: tuple[str, ...]) -> Ints:
+def _camera_of(equations: Equations, names: tuple[str, ...]) -> Indices:
     """(E,) number of each equation's camera."""
     of_sight = np.array([names.index(key.camera) for key in equations.sights.keys])
     return np.asarray(of_sight[equations.sight])
@@ -153,7 +153,7 @@ def _solved_slots(equations: Equations, estimate: Estimate) -> Mask:
     return structure_columns(equations, estimate.structure)[0] >= 0
 
 
-def _numbered(values: Ints, rows: Mask) -> tuple[Ints, Ints]:
+def _numbered(values: Indices, rows: Mask) -> tuple[Indices, Indices]:
     """The different values in the chosen rows, and which of them each row (N,) has, -1 for the others."""
     numbers, inverse = np.unique(values[rows], return_inverse=True)
     group = np.full(len(values), -1)
@@ -200,7 +200,7 @@ def frame_order(observations: Observations) -> Mapping[str, Mapping[str, int]]:
     return order
 
 
-def _several_frames(equations: Equations, frame: Ints, sight: int) -> bool:
+def _several_frames(equations: Equations, frame: Indices, sight: int) -> bool:
     own = frame[equations.bounds[sight] : equations.bounds[sight + 1]]
     return bool(np.any(own != own[0]))
 

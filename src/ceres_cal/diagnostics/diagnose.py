@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ceres_cal import kernels
+from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.transforms import Array
 from ceres_cal.calibration import Calibration
 from ceres_cal.diagnostics.alternatives import all_families, target_families
 from ceres_cal.diagnostics.equations import Equations, write_equations
@@ -25,7 +25,7 @@ from ceres_cal.diagnostics.words import Context, label_findings, noise_findings,
 from ceres_cal.model.parameters import Estimate, Layout, make_layout
 from ceres_cal.model.residuals import Residuals, residuals
 from ceres_cal.observations import Observations
-from ceres_cal.observations.sights import Mask, gather_sights
+from ceres_cal.observations.sights import gather_sights
 from ceres_cal.solve.noise import Inliers, judge, relative_lengths
 
 FALSE_ALARM_RATE = 0.01

@@ -14,11 +14,11 @@ from functools import cached_property
 
 import numpy as np
 
-from ceres_cal.base.transforms import Array, skew
-from ceres_cal.diagnostics.equations import Equations, Ints
+from ceres_cal.base.arrays import Array, Indices, Mask
+from ceres_cal.base.transforms import skew
+from ceres_cal.diagnostics.equations import Equations
 from ceres_cal.model.parameters import Estimate, Layout, Station, intrinsics_vector
 from ceres_cal.model.structure import Structure
-from ceres_cal.observations.sights import Mask
 from ceres_cal.solve import prior_on_intrinsics, private_placements
 
 _SINGULAR = 1e-12  # share of its own information that a number must keep beside the others
@@ -98,7 +98,7 @@ class Freedom:
         """
         return np.asarray(np.sum(self.private**2, axis=1) + np.sum(self.shared**2, axis=1))
 
-    def overlap(self, first: Ints, second: Ints) -> Array:
+    def overlap(self, first: Indices, second: Indices) -> Array:
         """Entries of the hat matrix between pairs of equations of one sight, (N,)."""
         private = np.sum(self.private[first] * self.private[second], axis=1)
         return np.asarray(private + np.sum(self.shared[first] * self.shared[second], axis=1))
@@ -226,7 +226,7 @@ def add_structure(equations: Equations, structure: Structure, columns: Array) ->
         columns[rows, slots[rows, k]] += values[rows, k]
 
 
-def structure_columns(equations: Equations, structure: Structure) -> tuple[Ints, Array]:
+def structure_columns(equations: Equations, structure: Structure) -> tuple[Indices, Array]:
     """Which structure numbers move each equation, (E, 4), -1 for none, and by how many px per metre, (E, 4).
 
     Points: x, y, first and second bow. Curves: a segment's offset to the left, or an arc's centre and radius.

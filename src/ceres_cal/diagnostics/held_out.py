@@ -13,8 +13,9 @@ from typing import Any
 
 import numpy as np
 
+from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.errors import CalibrationError, DegenerateError, InputError
-from ceres_cal.base.transforms import Array, Pose
+from ceres_cal.base.transforms import Pose
 from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
 from ceres_cal.diagnostics.equations import write_equations
@@ -23,7 +24,7 @@ from ceres_cal.model.parameters import Estimate, Layout, Options
 from ceres_cal.model.residuals import residuals
 from ceres_cal.model.structure import make_structure
 from ceres_cal.observations import Columns, Observations
-from ceres_cal.observations.sights import Mask, Sights, gather_sights
+from ceres_cal.observations.sights import Sights, gather_sights
 from ceres_cal.solve import Weighting, solve
 
 FOLDS = 5
@@ -277,7 +278,7 @@ def _predicted(
     if new:
         placements = {**estimate.placements, **{str(name): whole.estimate.placements[str(name)] for name in new}}
         estimate = replace(estimate, placements=placements)
-        of_new = sights.take(np.array([i for i, key in enumerate(sights.keys) if key.placement in new]))
+        of_new = sights.take(sights.numbers(placements=new))
         estimate = replace(estimate, placements=_posed(of_new, estimate, trained, observations))
     return _errors(observations, held, estimate)
 

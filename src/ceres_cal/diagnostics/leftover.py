@@ -6,12 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ceres_cal.base.arrays import Array, Indices, Mask
 from ceres_cal.base.tails import log_chi2_tail
-from ceres_cal.base.transforms import Array
-from ceres_cal.diagnostics.equations import Ints
 from ceres_cal.diagnostics.freedom import Freedom
 from ceres_cal.observations import Observations
-from ceres_cal.observations.sights import Mask
 
 LARGER = 1.15  # noise within so much of what was stated is as stated
 _FEWEST_PAIRS = 20
@@ -75,7 +73,7 @@ def _noise_of(observations: Observations, freedom: Freedom, kind: str, rows: Mas
     return Noise(kind, count, typical, scale, stated, log_p, correlation, pairs_log_p, effective)
 
 
-def _neighbours(observations: Observations, freedom: Freedom, kind: str) -> tuple[Ints, Ints]:
+def _neighbours(observations: Observations, freedom: Freedom, kind: str) -> tuple[Indices, Indices]:
     """Pairs of used equations: next to one another along a line of one view, or on one row of a board."""
     equations = freedom.equations
     if kind == "curves":
@@ -99,7 +97,7 @@ def _neighbours(observations: Observations, freedom: Freedom, kind: str) -> tupl
     return first[near], second[near]
 
 
-def _along(freedom: Freedom, rows: Ints) -> Array:
+def _along(freedom: Freedom, rows: Indices) -> Array:
     """(N,) order of curve equations along their tracks."""
     equations = freedom.equations
     track = equations.feature[rows]
@@ -109,7 +107,7 @@ def _along(freedom: Freedom, rows: Ints) -> Array:
     return np.asarray(np.where(equations.sights.is_arc[track], turned, np.sum(away * a, axis=1)))
 
 
-def _correlation(freedom: Freedom, pairs: tuple[Ints, Ints], variance: float) -> tuple[float, float]:
+def _correlation(freedom: Freedom, pairs: tuple[Indices, Indices], variance: float) -> tuple[float, float]:
     """Correlation of neighbouring residuals beyond what the fit makes of white noise, and log P of so much."""
     first, second = pairs
     if len(first) < _FEWEST_PAIRS:

@@ -39,7 +39,7 @@ def with_newcomers_placed(observations: Observations, sights: Sights, calibratio
     start = replace(estimate, placements={**estimate.placements, **unplaced})
     nothing = np.zeros(len(observations.points), bool), np.zeros(len(observations.curves), bool)
     blank = Inliers(*nothing, fit.point_scale, fit.curve_scale, np.empty(0), np.empty(0))
-    own = sights.take(np.array([i for i, key in enumerate(sights.keys) if key.placement in new], dtype=np.int64))
+    own = sights.take(sights.numbers(placements=new))
     free = {name: np.empty(0, dtype=np.int64) for name in estimate.cameras}
     layout = Layout(free, frozenset(), new)
     weighting = Weighting(fit.point_scale, fit.curve_scale, "cauchy", options.loss_scale)

@@ -7,12 +7,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ceres_cal.base.transforms import Array
-from ceres_cal.diagnostics.equations import Equations, Ints
+from ceres_cal.base.arrays import Array, Indices, Mask
+from ceres_cal.diagnostics.equations import Equations
 from ceres_cal.diagnostics.findings import OF_LENS
 from ceres_cal.diagnostics.freedom import Freedom, inverse_root
 from ceres_cal.diagnostics.scores import LEAST_LEFT, Family, Score, score_all
-from ceres_cal.observations.sights import Mask
 
 _MOST = 12  # causes that are named; more than that is not a calibration with faults but none
 _LEAST_SHARE = 0.02  # of the first cause's statistic: below it the error of its linear picture speaks
@@ -127,7 +126,7 @@ def heard_again(
     return used
 
 
-def _agreeing(columns: Array, residual: Array, observation: Ints, reject_sigma: float) -> Mask:
+def _agreeing(columns: Array, residual: Array, observation: Indices, reject_sigma: float) -> Mask:
     """(N,) which equations one amount brings within the bound, by least absolute deviations; none if it is too far."""
     columns = columns[:, np.any(columns != 0.0, axis=0)]
     amount: Array = np.zeros(columns.shape[1])

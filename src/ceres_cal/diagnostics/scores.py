@@ -13,9 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.tails import log_f_tail
-from ceres_cal.base.transforms import Array
-from ceres_cal.diagnostics.equations import Ints
 from ceres_cal.diagnostics.freedom import Freedom, inverse_root
 
 LEAST_LEFT = 1e-7
@@ -37,7 +36,7 @@ class Family:
 
     kind: str
     columns: Array
-    group: Ints
+    group: Indices
     names: tuple[str, ...]
     onwards: bool = False
     units: tuple[str, ...] = ()
@@ -136,7 +135,7 @@ def _sums(freedom: Freedom, family: Family) -> tuple[Array, Array, Array]:
     return products, scores, sizes
 
 
-def _by_group(values: Array, group: Ints, count: int) -> Array:
+def _by_group(values: Array, group: Indices, count: int) -> Array:
     """Sums (count, K) of rows (N, K) sorted by group."""
     sums = np.zeros((count, values.shape[1]))
     if len(values):
@@ -145,7 +144,7 @@ def _by_group(values: Array, group: Ints, count: int) -> Array:
     return sums
 
 
-def _private_overlaps(freedom: Freedom, family: Family, rows: Ints, columns: Array) -> list[tuple[Ints, Array]]:
+def _private_overlaps(freedom: Freedom, family: Family, rows: Indices, columns: Array) -> list[tuple[Indices, Array]]:
     """Alternatives (N,) and what of their columns lies in the private bases of one sight or another, (N, Q, 6)."""
     basis = freedom.private[rows]
     held = np.flatnonzero(np.any(basis != 0.0, axis=1))

@@ -7,12 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ceres_cal.base.transforms import Array
-from ceres_cal.diagnostics.equations import Ints
+from ceres_cal.base.arrays import Array, Indices, Mask
 from ceres_cal.diagnostics.freedom import Freedom
 from ceres_cal.diagnostics.table import ResidualTable
 from ceres_cal.observations import Observations
-from ceres_cal.observations.sights import Mask
 from ceres_cal.scene.camera import Camera
 
 REGIONS = (6, 4)
@@ -33,9 +31,9 @@ class Summary:
     """
 
     names: tuple[str, ...]
-    points: Ints
-    curves: Ints
-    rejected: Ints
+    points: Indices
+    curves: Indices
+    rejected: Indices
     points_rms_px: Array
     curves_rms_px: Array
     rms_mm: Array
@@ -92,17 +90,17 @@ def summarise(
     )
 
 
-def _numbers(labels: list[str], known: list[str]) -> Ints:
+def _numbers(labels: list[str], known: list[str]) -> Indices:
     order = {name: number for number, name in enumerate(known)}
     return np.array([order[label] for label in labels], dtype=np.int64)
 
 
-def _summary(table: ResidualTable, group: Ints, names: list[str]) -> Summary:
+def _summary(table: ResidualTable, group: Indices, names: list[str]) -> Summary:
     """Groups with any observation, in the order of their names."""
     size, inlier = len(names), table.inlier
     points, curves = inlier & ~table.is_curve, inlier & table.is_curve
 
-    def count(rows: Mask) -> Ints:
+    def count(rows: Mask) -> Indices:
         return np.asarray(np.bincount(group[rows], minlength=size))
 
     def rms(rows: Mask, values: Array) -> Array:
@@ -127,8 +125,8 @@ def _summary(table: ResidualTable, group: Ints, names: list[str]) -> Summary:
 
 
 def _regions(
-    table: ResidualTable, camera: Ints, names: list[str], cameras: Mapping[str, Camera]
-) -> tuple[list[str], Ints]:
+    table: ResidualTable, camera: Indices, names: list[str], cameras: Mapping[str, Camera]
+) -> tuple[list[str], Indices]:
     columns, rows = REGIONS
     sizes = np.array([cameras[name].image_size for name in names], dtype=float)[camera]
     place = np.clip(((table.pixel + 0.5) / sizes * REGIONS).astype(np.int64), 0, np.array(REGIONS) - 1)
@@ -137,8 +135,8 @@ def _regions(
 
 
 def _rings(
-    table: ResidualTable, camera: Ints, names: list[str], cameras: Mapping[str, Camera]
-) -> tuple[list[str], Ints, list[Array]]:
+    table: ResidualTable, camera: Indices, names: list[str], cameras: Mapping[str, Camera]
+) -> tuple[list[str], Indices, list[Array]]:
     edges = [np.linspace(0.0, cameras[name].corner_radius, RADIUS_BINS + 1) for name in names]
     ring = np.zeros(len(table), dtype=np.int64)
     labels = []

@@ -9,15 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ceres_cal.base.arrays import AnyArray, Array, Codes, Indices, Mask
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import write_bytes, write_json
-from ceres_cal.base.transforms import Array
-from ceres_cal.diagnostics.equations import Equations, Ints
+from ceres_cal.diagnostics.equations import Equations
 from ceres_cal.diagnostics.freedom import Freedom
 from ceres_cal.observations import Observations
-from ceres_cal.observations.sights import Mask
 from ceres_cal.scene.camera import Camera
 from ceres_cal.solve.noise import Inliers
 
@@ -50,10 +48,10 @@ class ResidualTable:
     """
 
     is_curve: Mask
-    row: Ints
-    view: Ints
+    row: Indices
+    view: Indices
     views: tuple[dict[str, str | None], ...]
-    feature: Ints
+    feature: Indices
     features: tuple[str, ...]
     pixel: Array
     residual_px: Array
@@ -65,7 +63,7 @@ class ResidualTable:
     leverage: Array
     standardised: Array
     radius_px: Array
-    reason: NDArray[np.int8]
+    reason: Codes
 
     def __len__(self) -> int:
         return len(self.row)
@@ -78,7 +76,7 @@ class ResidualTable:
         """How messages name an observation: "point 17" or "curve 4"."""
         return f"{'curve' if self.is_curve[number] else 'point'} {self.row[number]}"
 
-    def columns(self) -> dict[str, NDArray[Any]]:
+    def columns(self) -> dict[str, AnyArray]:
         """Every column as a flat array under its name in the exported files, names written out."""
         views = {
             name: np.array([view[name] or "" for view in self.views], dtype=np.str_)[self.view]
@@ -129,7 +127,7 @@ class ResidualTable:
             write_bytes(path, text.getvalue().encode())
 
 
-def _plain(column: NDArray[Any]) -> list[Any]:
+def _plain(column: AnyArray) -> list[Any]:
     values: list[Any] = column.tolist()
     if column.dtype.kind == "f" and not np.all(np.isfinite(column)):
         return [value if np.isfinite(value) else None for value in values]
@@ -179,12 +177,12 @@ def make_table(
     )
 
 
-def _index(names: list[str], known: list[str]) -> Ints:
+def _index(names: list[str], known: list[str]) -> Indices:
     order = {name: number for number, name in enumerate(known)}
     return np.array([order[name] for name in names], dtype=np.int64)
 
 
-def _feature_names(observations: Observations) -> tuple[tuple[str, ...], Ints]:
+def _feature_names(observations: Observations) -> tuple[tuple[str, ...], Indices]:
     """All features as "target/name", points of all targets first, and where each target's points and curves begin."""
     targets = observations.targets
     points = [f"{name}/{point}" for name, target in targets.items() for point in target.point_names]
@@ -257,7 +255,7 @@ def _standardised(freedom: Freedom, count: int) -> Array:
     return answer
 
 
-def _radii(observations: Observations, view: Ints, pixel: Array, cameras: dict[str, Camera]) -> Array:
+def _radii(observations: Observations, view: Indices, pixel: Array, cameras: dict[str, Camera]) -> Array:
     owner = np.array([one.camera for one in observations.views])[view]
     radii = np.full(len(view), np.nan)
     for name in observations.cameras:

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.digits import two_digits
-from ceres_cal.base.transforms import Array
 from ceres_cal.diagnostics.alternatives import missing_powers, radial_column
 from ceres_cal.diagnostics.equations import Equations
 from ceres_cal.diagnostics.findings import SMALL, Amount, Finding
@@ -21,7 +21,6 @@ from ceres_cal.diagnostics.scores import Score
 from ceres_cal.diagnostics.table import ResidualTable, plane_shift
 from ceres_cal.model.parameters import Estimate, Layout
 from ceres_cal.observations import Observations
-from ceres_cal.observations.sights import Mask
 from ceres_cal.scene.targets import Arc, Segment
 
 _LN_10 = float(np.log(10.0))

@@ -13,7 +13,8 @@ from ceres_cal.calibrating import Again
 from ceres_cal.calibration import Calibration
 from ceres_cal.model.joint import JointPrior
 from ceres_cal.model.parameters import Estimate, Layout, Options, Station, intrinsic_names
-from ceres_cal.model.quantities import Key, camera_keys, pose_keys
+from ceres_cal.model.keys import Key
+from ceres_cal.model.quantities import intrinsic_keys
 from ceres_cal.model.structure import Structure, make_structure
 from ceres_cal.observations import Observations, Prior
 

@@ -11,18 +11,19 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.errors import CalibrationError, InputError
 from ceres_cal.base.spread import Spread
 from ceres_cal.base.tails import upper_tail
-from ceres_cal.base.transforms import Array, Pose
+from ceres_cal.base.transforms import Pose
 from ceres_cal.calibration import Calibration
 from ceres_cal.model.joint import JointPrior
 from ceres_cal.model.parameters import Estimate, Layout, intrinsic_names
-from ceres_cal.model.quantities import Key, sigma_limits
+from ceres_cal.model.keys import Key
 from ceres_cal.moves.carried import kept_prior, require_same_things, with_structure, without_keys
 from ceres_cal.moves.poses import Place, Scene, movement, places
 from ceres_cal.observations import Observations
-from ceres_cal.observations.sights import Mask, Sights, gather_sights
+from ceres_cal.observations.sights import Sights, gather_sights
 from ceres_cal.scene.camera import Camera
 from ceres_cal.solve import Weighting, information, solve
 from ceres_cal.uncertainty import Posterior
@@ -118,7 +119,7 @@ def check(calibration: Calibration, observations: Observations, false_alarms: fl
             raise InputError(f"station {name!r} is not in the calibration, which has {names}: name it as there")
     observed = replace(observations, targets={**calibration.targets, **observations.targets})
     sights = gather_sights(observed)
-    world = {key.station: sights[i] for i, key in enumerate(sights.keys) if key.placement is None}
+    world = sights.of_world
     for name in observations.stations:
         if name not in world:
             raise InputError(f"station {name!r} sees nothing that lies in the world: observe the field with it")

@@ -9,13 +9,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.spread import Spread, known_inverses
 from ceres_cal.base.tails import upper_tail
-from ceres_cal.base.transforms import Array
 from ceres_cal.calibration import Calibration
 from ceres_cal.model.parameters import Estimate
-from ceres_cal.model.quantities import Key, difference, sigma_limits
+from ceres_cal.model.keys import Key
+from ceres_cal.model.quantities import difference
 from ceres_cal.moves.poses import movement
 from ceres_cal.uncertainty.maps import field_map, shown_pixels
 from ceres_cal.uncertainty.uncertainty import field_grid

@@ -255,8 +255,7 @@ def _scores(plan: Plan, results: Mapping[str, Calibration]) -> dict[str, float]:
     for what, result in results.items():
         found = residuals(plan.observations, sights, result.estimate)
         total = 0.5 * judged(plan, what, result).strain + 0.5 * len(plan.loosened(what)) * np.log(count)
-        for name in dict.fromkeys(key.camera for key in sights.keys):
-            own = sights.take(np.array([i for i, key in enumerate(sights.keys) if key.camera == name], dtype=np.int64))
-            total += misfit(own, result.cameras[name], found, scales)
+        for name in sights.cameras:
+            total += misfit(sights.of_camera(name), result.cameras[name], found, scales)
         scores[what] = float(total)
     return scores

@@ -12,7 +12,8 @@ from itertools import product
 
 import numpy as np
 
-from ceres_cal.base.transforms import Array, Pose, rotation_exp
+from ceres_cal.base.arrays import Array
+from ceres_cal.base.transforms import Pose, rotation_exp
 from ceres_cal.model.parameters import Estimate
 from ceres_cal.model.residuals import Residuals, residuals
 from ceres_cal.observations import Observations

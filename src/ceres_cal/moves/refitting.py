@@ -119,7 +119,7 @@ def _start(plan: Plan, sights: Sights, *, check_labels: bool) -> Estimate:
 
 def _moved_sights(plan: Plan, sights: Sights) -> list[Sights]:
     """What each station that moved sees of the world."""
-    found = {k.station: sights[i] for i, k in enumerate(sights.keys) if k.placement is None and k.station in plan.moved}
+    found = {name: sight for name, sight in sights.of_world.items() if name in plan.moved}
     for name in sorted(plan.moved - found.keys()):
         raise DegenerateError(
             f"station {name!r} sees nothing that lies in the world: observe lines or points of the field with it"

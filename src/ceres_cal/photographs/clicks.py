@@ -10,9 +10,9 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import DegenerateError, InputError
 from ceres_cal.base.files import check_header, convert, read_json
-from ceres_cal.base.transforms import Array
 from ceres_cal.observations import Prior
 from ceres_cal.photographs.follow import Freedom
 from ceres_cal.photographs.refit import CAMERA, Shown

@@ -7,13 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ceres_cal.base.arrays import Array32, Mask
 from ceres_cal.base.errors import InputError, NothingShownError
 from ceres_cal.detect.boards import read_grey
 from ceres_cal.detect.crossings import Crossings, find_crossings
 from ceres_cal.detect.lines import Lines
-from ceres_cal.detect.profiles import Grey
 from ceres_cal.observations import Curves, Observations, Points, View, combine
 from ceres_cal.photographs.clicks import Clicks, starts_from_clicks
 from ceres_cal.photographs.follow import Followed, Freedom, follow
@@ -112,7 +111,7 @@ def _painted(target: Target, curves: Collection[str] | None) -> tuple[str, ...]:
 
 
 def _looked_for(
-    grey: Grey,
+    grey: Array32,
     target: Target,
     painted: tuple[str, ...],
     start: Camera | Clicks | Auto,
@@ -168,7 +167,7 @@ def _observations(
     )
 
 
-def _curves(lines: Lines, used: NDArray[np.bool_], edges: bool) -> Curves:
+def _curves(lines: Lines, used: Mask, edges: bool) -> Curves:
     """The middles of the paint, or both its edges, where they were found and are not used elsewhere."""
     rows = np.flatnonzero(lines.found & ~used)
     sides = (1, -1) if edges else (0,)

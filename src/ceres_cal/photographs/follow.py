@@ -7,12 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ceres_cal.base.arrays import Array, Array32
 from ceres_cal.base.errors import CalibrationError
-from ceres_cal.base.transforms import Array
 from ceres_cal.calibrating import calibrate
 from ceres_cal.detect.courses import clear_px, predict
 from ceres_cal.detect.lines import SPACING_PX, Lines, measure, search, window_px
-from ceres_cal.detect.profiles import Grey
 from ceres_cal.detect.registration import nearness, shifted
 from ceres_cal.model.parameters import Options
 from ceres_cal.observations import Prior
@@ -83,7 +82,7 @@ class Followed:
 
 
 def follow(
-    grey: Grey, target: Target, starts: Sequence[Camera], curves: Collection[str], freedom: Freedom | None = None
+    grey: Array32, target: Target, starts: Sequence[Camera], curves: Collection[str], freedom: Freedom | None = None
 ) -> Followed:
     """Follow a target's painted curves in a photograph, from the best of several starts.
 
@@ -114,7 +113,7 @@ def follow(
 
 
 def _candidates(
-    grey: Grey, target: Target, starts: Sequence[Camera], curves: Collection[str], freedom: Freedom
+    grey: Array32, target: Target, starts: Sequence[Camera], curves: Collection[str], freedom: Freedom
 ) -> list[Camera]:
     """Cameras that put the lines near something thin and bright, the best first."""
     courses = [predict(target, camera, curves, _ROUGH_SPACING_PX) for camera in starts]
@@ -138,7 +137,7 @@ def _candidates(
 
 
 def _close_in(
-    grey: Grey,
+    grey: Array32,
     target: Target,
     camera: Camera,
     curves: Collection[str],
@@ -166,7 +165,7 @@ def _close_in(
     return Followed(camera, lines, moved)
 
 
-def _with_its_lens(grey: Grey, target: Target, followed: Followed, curves: Collection[str]) -> Followed:
+def _with_its_lens(grey: Array32, target: Target, followed: Followed, curves: Collection[str]) -> Followed:
     """What is found when the lines are predicted with the kind of lens that suits them best.
 
     A polynomial that is a pixel off bends what crossings are extrapolated along.
@@ -198,7 +197,7 @@ def _moved_px(camera: Camera, refitted: Camera, pixels: Array) -> float:
 
 
 def _searched(
-    grey: Grey,
+    grey: Array32,
     target: Target,
     camera: Camera,
     curves: Collection[str],
@@ -221,7 +220,7 @@ def _searched(
     return refit_camera(camera, seen, free, freedom.priors)
 
 
-def _measured(grey: Grey, target: Target, camera: Camera, curves: Collection[str]) -> Lines:
+def _measured(grey: Array32, target: Target, camera: Camera, curves: Collection[str]) -> Lines:
     course = predict(target, camera, curves, SPACING_PX, SPACING_PX)
     clear = clear_px(target, camera, course, curves) > window_px(course)
     return measure(grey, course.take(clear), _LAST_REACH_PX)

@@ -5,10 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ceres_cal.base.arrays import Array, Indices32
 from ceres_cal.base.errors import CalibrationError
-from ceres_cal.base.transforms import Array
 from ceres_cal.model.parameters import Estimate, Layout, Options, Station, intrinsic_names
 from ceres_cal.model.structure import make_structure
 from ceres_cal.observations import Curves, Observations, Points, Prior, View
@@ -25,7 +24,7 @@ _QUICK = Options(max_iterations=30, threads=1)
 class Shown:
     """Points that somebody showed: index (P,) among the target's, pixels (P, 2), sigma_px (P,)."""
 
-    feature: NDArray[np.int32]
+    feature: Indices32
     pixels: Array
     sigma_px: Array
 
@@ -36,7 +35,7 @@ _NONE_SHOWN = Shown(np.empty(0, np.int32), np.empty((0, 2)), np.empty(0))
 def observations_of(
     target: Target,
     image_size: tuple[int, int],
-    curve: NDArray[np.int32],
+    curve: Indices32,
     pixels: Array,
     sigma_px: Array,
     shown: Shown | None = None,

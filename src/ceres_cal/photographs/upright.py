@@ -15,7 +15,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ceres_cal.base.transforms import Array, rotation_exp
+from ceres_cal.base.arrays import Array
+from ceres_cal.base.transforms import rotation_exp
 
 BENDS = (0.05, -0.05, -0.15, -0.25, -0.35, -0.45)
 PHIS = (0.8, 1.15, 1.6)

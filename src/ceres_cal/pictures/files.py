@@ -6,10 +6,10 @@ from pathlib import Path
 
 import cv2
 
+from ceres_cal.base.arrays import Image
 from ceres_cal.base.errors import InputError
 from ceres_cal.detect.boards import read_colour
 from ceres_cal.pictures.overlay import in_8_bit_colour
-from ceres_cal.pictures.warp import Image
 
 _QUALITIES = (90, 80, 70, 55, 40, 25)
 

@@ -9,14 +9,14 @@ from itertools import combinations, pairwise
 
 import numpy as np
 
+from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.errors import CalibrationError
-from ceres_cal.base.transforms import Array
 from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
 from ceres_cal.diagnostics import Diagnosis
 from ceres_cal.model.residuals import residuals
 from ceres_cal.observations import Observations
-from ceres_cal.observations.sights import Mask, gather_sights
+from ceres_cal.observations.sights import gather_sights
 from ceres_cal.scene.targets import Target, along_track
 from ceres_cal.uncertainty import Disagreement, FieldMap, Uncertainty, Verdict
 

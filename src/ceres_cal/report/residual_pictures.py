@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ceres_cal.base.transforms import Array
+from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.diagnostics import ResidualTable, Summary
-from ceres_cal.observations.sights import Rows
 from ceres_cal.report import canvas
 from ceres_cal.report.canvas import CURVE, INK, OUTLIER, PAINT, POINT, QUIET, Drawing
 from ceres_cal.report.material import Material
@@ -100,7 +99,7 @@ def _place(material: Material, camera: str) -> int:
     return list(material.observations.cameras).index(camera)
 
 
-def telling_means(table: ResidualTable, rows: Rows, camera: Camera) -> tuple[Array, Array, int]:
+def telling_means(table: ResidualTable, rows: Indices, camera: Camera) -> tuple[Array, Array, int]:
     """Mean displacements of the image's regions that noise does not explain: places (C, 2) and vectors (C, 2), px; and
     how many regions could tell one.
 
@@ -224,7 +223,7 @@ def against_radius(material: Material, name: str) -> Picture:
     )  # fmt: skip
 
 
-def _outward(table: ResidualTable, rows: Rows, camera: Camera) -> tuple[Array, Array]:
+def _outward(table: ResidualTable, rows: Indices, camera: Camera) -> tuple[Array, Array]:
     """Radius and outward residual of some rows, px; NaN of a curve that runs outwards, and so tells nothing of it."""
     offsets, residual = camera.offsets(table.pixel[rows]), table.residual_px[rows]
     radius = np.asarray(np.linalg.norm(offsets, axis=1))

@@ -12,14 +12,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.errors import DegenerateError
 from ceres_cal.base.threads import parts_of, run_parts
-from ceres_cal.base.transforms import Array, Pose, nearest_rotation
+from ceres_cal.base.transforms import Pose, nearest_rotation
 from ceres_cal.kernels import align_sights, alignment_errors, normalised_planes, plane_homographies, usual_by_radius
 
-Ints = NDArray[np.int64]
 _POINT_NS = 100.0  # that a point's share of a homography takes
 
 
@@ -171,7 +171,7 @@ class PlaneData:
         bounds: (S + 1,) where each sight begins. plane: (N, 2) m. offsets: (N, 2) px.
     """
 
-    bounds: Ints
+    bounds: Indices
     plane: Array
     offsets: Array
 

@@ -11,12 +11,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.errors import DegenerateError
-from ceres_cal.base.transforms import Array, Pose, Poses, chained, inverted
+from ceres_cal.base.transforms import Pose, Poses, chained, inverted
 from ceres_cal.model.parameters import Estimate, Options, Station, anchored_stations
 from ceres_cal.model.structure import make_structure
 from ceres_cal.observations import Observations, Prior
-from ceres_cal.observations.sights import Rows, Sights
+from ceres_cal.observations.sights import Sights
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Brown, KannalaBrandt, Lens, Radial
 from ceres_cal.start.closed_forms import Profile, orthogonality_error, polar_poses
@@ -50,7 +51,7 @@ def initialise(observations: Observations, sights: Sights, options: Options) -> 
     numbers, poses = [], []
     priors = (*observations.priors, *options.priors)
     for name, image_size in observations.cameras.items():
-        own = np.array([number for number, key in enumerate(sights.keys) if key.camera == name], dtype=np.int64)
+        own = sights.numbers(camera=name)
         start = _start_camera(name, image_size, sights.take(own), options, priors)
         cameras[name], phi_from[name] = start.camera, start.phi_from
         numbers.append(own[start.sights])
@@ -67,7 +68,7 @@ def initialise(observations: Observations, sights: Sights, options: Options) -> 
 class _CameraStart:
     camera: Camera
     phi_from: str
-    sights: Rows
+    sights: Indices
     poses: Array
 
 
@@ -207,7 +208,7 @@ def _lens_equations(lens: Lens, r: Array, w: Array, phi: float) -> tuple[dict[st
 
 
 def _chain_poses(
-    observations: Observations, sights: Sights, numbers: Rows, poses: Array
+    observations: Observations, sights: Sights, numbers: Indices, poses: Array
 ) -> tuple[dict[str, Station], Poses]:
     """Stations and placements from the poses (K, 3, 4) of sights: best-seen first, each one extending what is known."""
     sizes = np.diff(sights.point_bounds) + np.diff(sights.curve_bounds)

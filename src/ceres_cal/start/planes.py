@@ -11,10 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ceres_cal.base.arrays import Array, Indices, Mask
 from ceres_cal.base.errors import DegenerateError
-from ceres_cal.base.transforms import Array
 from ceres_cal.kernels import grouped_scatter
-from ceres_cal.observations.sights import Mask, Rows, Sights, bounds_of, ranges
+from ceres_cal.observations.sights import Sights, bounds_of, ranges
 from ceres_cal.scene.camera import Camera
 from ceres_cal.start.closed_forms import (
     PlaneData,
@@ -97,7 +97,7 @@ class Homographies:
         heights_m: (K,) z of each plane. sizes_px: (K,) spread of its observations over the image.
     """
 
-    sights: Rows
+    sights: Indices
     matrices: Array
     heights_m: Array
     sizes_px: Array
@@ -147,7 +147,7 @@ def _extent(plane: PlaneSight) -> tuple[Array, Array]:
     return np.array([plane.height_m]), np.array([plane.size_px])
 
 
-def _flat_sights_of_points(sights: Sights) -> Rows:
+def _flat_sights_of_points(sights: Sights) -> Indices:
     """Numbers of the sights that show at least six points of one plane, not on one line, and no curve."""
     few = (np.diff(sights.point_bounds) >= 6) & (np.diff(sights.curve_bounds) == 0)
     candidates = np.flatnonzero(few)
@@ -177,7 +177,7 @@ def _profile_of_boards(board: Sights, data: PlaneData, camera: Camera, unit: flo
     return radial_alignment(_plane_data(some, np.arange(len(some.points)), camera), unit, terms, rounds=8).profile
 
 
-def _spread_rows(bounds: Rows) -> Rows:
+def _spread_rows(bounds: Indices) -> Indices:
     """Rows of about as many points of each sight as are enough.
 
     Steps of the golden ratio spread them evenly and never along one row of a board.
@@ -188,7 +188,7 @@ def _spread_rows(bounds: Rows) -> Rows:
     return np.flatnonzero(order[place] < np.repeat(_ENOUGH_POINTS / sizes, sizes))
 
 
-def _plane_data(board: Sights, rows: Rows, camera: Camera) -> PlaneData:
+def _plane_data(board: Sights, rows: Indices, camera: Camera) -> PlaneData:
     """Of some points of the sights, given by their rows there."""
     return PlaneData(
         np.searchsorted(rows, board.point_bounds),
