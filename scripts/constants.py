@@ -72,8 +72,9 @@ def _of(module: str, names: str, *figures: str) -> list[Constant]:
 
 DECIDING: tuple[Constant, ...] = (
     *_of("model.parameters", "Options.loss_scale Options.reject_sigma", "calibrate", "diagnose"),
-    *_of("calibrating", "_NO_FIT _SETTLED_SCALE _ENOUGH_PLACEMENTS", "calibrate"),
-    *_of("calibrating", "_SETTLED_AGAIN", "refit"),
+    *_of("calibrating", "_NO_FIT", "calibrate"),
+    *_of("solve.robust", "_AT_REST _ENOUGH_PLACEMENTS", "calibrate"),
+    *_of("solve.robust", "_AT_REST_AGAIN", "refit"),
     *_of("solve.noise", "_LEAST_FREEDOM", "calibrate"),
     *_of("solve.noise", "_USUAL_FREEDOM", "refit"),
     *_of("solve.lost", "_LOST _FEWEST", "calibrate"),
