@@ -16,9 +16,9 @@ from ceres_cal.base.errors import InputError
 from ceres_cal.base.spread import Spread
 from ceres_cal.base.transforms import Pose, left_jacobian, skew
 from ceres_cal.calibrating import calibrate
-from ceres_cal.model.parameters import Estimate, Layout, Options, intrinsics_scales, make_layout
 from ceres_cal.model.keys import Key, pose_keys
-from ceres_cal.model.quantities import difference, free_keys, moved
+from ceres_cal.model.parameters import Estimate, Layout, Options, intrinsics_scales, make_layout
+from ceres_cal.model.quantities import difference, moved
 from ceres_cal.model.structure import Tolerance
 from ceres_cal.observations import Prior
 from ceres_cal.observations.sights import Sights, gather_sights

@@ -22,9 +22,9 @@ from ceres_cal.base.errors import InputError
 from ceres_cal.base.transforms import Pose
 from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
-from ceres_cal.model.parameters import Estimate, Options, make_layout, unit_px
 from ceres_cal.model.keys import Key, pose_keys
-from ceres_cal.model.quantities import intrinsic_keys, moved, natural_sizes
+from ceres_cal.model.parameters import Estimate, Options, make_layout, unit_px
+from ceres_cal.model.quantities import moved, natural_sizes
 from ceres_cal.model.structure import make_structure
 from ceres_cal.observations import Observations, Prior, combine
 from ceres_cal.observations.sights import gather_sights

@@ -12,17 +12,20 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from ceres_cal.base.arrays import Mask
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import convert, read_json, write_json
 from ceres_cal.base.transforms import Pose, euler_from_rotation
 from ceres_cal.model.keys import Key
-from ceres_cal.model.parameters import Estimate, Options, Station
-from ceres_cal.model.priors import GaussianPrior
+from ceres_cal.model.parameters import Estimate, Options, Station, make_layout
+from ceres_cal.model.priors import GaussianPrior, gather_priors, gather_stated, tolerances
 from ceres_cal.model.structure import EXACT, make_structure
 from ceres_cal.observations import Observations, prior_from_json, prior_to_json
+from ceres_cal.observations.sights import gather_sights
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import make_lens
 from ceres_cal.scene.targets import Target, target_from_spec
+from ceres_cal.solve import Problem, Weighting
 from ceres_cal.uncertainty import (
     Disagreement,
     Posterior,
@@ -188,12 +191,34 @@ class Calibration:
         """
         if observations.digest != self.digest:
             raise InputError("these are not the observations that the calibration was made from: give those")
-        points, curves = np.ones(len(observations.points), bool), np.ones(len(observations.curves), bool)
-        for entry in self.rejected:
-            (points if entry.kind == "point" else curves)[entry.row] = False
+        masks = self.inlier_masks(observations)
         scales = (self.fit.point_scale, self.fit.curve_scale)
         known = self.uncertainty
-        return disagreement(observations, known.estimate, known.posterior, (points, curves), scales, first, second)
+        return disagreement(observations, known.estimate, known.posterior, masks, scales, first, second)
+
+    def inlier_masks(self, observations: Observations) -> tuple[Mask, Mask]:
+        """(N,) of points and (M,) of curve observations: which rows took part."""
+        masks = np.ones(len(observations.points), bool), np.ones(len(observations.curves), bool)
+        for entry in self.rejected:
+            masks[entry.kind == "curve"][entry.row] = False
+        return masks
+
+    def problem(self, observations: Observations, *, new_data: bool = False) -> Problem:
+        """The problem of which this is the solution, of all the observations, at the noise that was found.
+
+        Args:
+            new_data: that the observations are others: then as if they were calibrated with the same options.
+        """
+        sights, options = gather_sights(observations), self.options
+        prior = None if self.refitted is None else self.refitted.prior
+        weighting = Weighting(self.fit.point_scale, self.fit.curve_scale, options.loss, options.loss_scale)
+        if new_data or prior is None or self.posterior is None:
+            priors = gather_priors(observations, options, self.estimate.structure)
+            return Problem(sights, make_layout(observations, options), priors, weighting, options)
+        lenses = {name: camera.lens for name, camera in self.cameras.items()}
+        fresh = tolerances(self.estimate.structure, prior.keys)
+        priors = (prior, *gather_stated(observations, options, lenses), *fresh)
+        return Problem(sights, self.posterior.layout(self.estimate), priors, weighting, options)
 
     @property
     def rms_px(self) -> float:

@@ -9,13 +9,13 @@ import numpy as np
 from ceres_cal.base.arrays import Array, Indices, Mask
 from ceres_cal.base.transforms import skew
 from ceres_cal.diagnostics.equations import Equations
-from ceres_cal.diagnostics.freedom import structure_columns
+from ceres_cal.diagnostics.linear_model import structure_columns
 from ceres_cal.diagnostics.scores import Family
 from ceres_cal.model.parameters import Estimate, Layout, unit_px
 from ceres_cal.model.structure import Tolerance, make_structure
 from ceres_cal.observations import Observations
 from ceres_cal.scene.targets import Target
-from ceres_cal.solve import private_placements
+from ceres_cal.solve import Problem
 
 _RADIAL_BASIS = 3  # powers of the radius past those of the lens: enough for any smooth trend that one more power mends
 _POWERS = {"radial": (2, 3, 4, 5, 6, 7)}  # of the others' polynomials: odd ones
@@ -25,13 +25,13 @@ _FEWEST_OF_POINT = 2
 
 
 def all_families(
-    observations: Observations, equations: Equations, estimate: Estimate, layout: Layout, used: Mask
+    observations: Observations, equations: Equations, estimate: Estimate, problem: Problem, used: Mask
 ) -> list[Family]:
     """Every alternative worth a test, by kind."""
     return [
-        *_lens_families(equations, estimate, layout),
+        *_lens_families(equations, estimate, problem.layout),
         *target_families(observations, equations, estimate, used),
-        *_frame_families(observations, equations, estimate, layout),
+        *_frame_families(observations, equations, estimate, problem.private),
     ]
 
 
@@ -165,12 +165,11 @@ def _numbered(values: Indices, rows: Mask) -> tuple[Indices, Indices]:
 
 
 def _frame_families(
-    observations: Observations, equations: Equations, estimate: Estimate, layout: Layout
+    observations: Observations, equations: Equations, estimate: Estimate, private: frozenset[str | None]
 ) -> Iterator[Family]:
     """Each station moved from some frame on, or in one frame alone: turned about the camera's axes, shifted in the
     world.
     """
-    private = private_placements(equations.sights, layout)
     order = frame_order(observations)
     frame = np.array([order[view.station][view.frame] for view in observations.views])[equations.view]
     several = np.array([_several_frames(equations, frame, i) for i in range(len(equations.sights))])

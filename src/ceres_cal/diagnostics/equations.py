@@ -119,7 +119,7 @@ def _of_camera(
         "pose": rows[:, :, size:].reshape(-1, 6),
         "place": np.repeat(places, 2, axis=0),
     }
-    tracks, feet = estimate.structure.tracks(own), found.places[own.curve_rows]
+    tracks, feet = estimate.structure.tracks(own), found.feet[own.curve_rows]
     rows, normals = np.empty((len(own.curve_rows), size + 6)), np.empty((len(own.curve_rows), 2))
     kernels.curve_rows(
         *optics, poses[numbers], own.curve_bounds, tracks, own.is_arc, own.track, own.curve_pixels, feet, rows, normals

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask
-from ceres_cal.diagnostics.freedom import Freedom
+from ceres_cal.diagnostics.linear_model import LinearModel
 from ceres_cal.diagnostics.table import ResidualTable
 from ceres_cal.observations import Observations
 from ceres_cal.scene.camera import Camera
@@ -70,7 +70,7 @@ class Summaries:
 
 
 def summarise(
-    observations: Observations, table: ResidualTable, freedom: Freedom, cameras: Mapping[str, Camera]
+    observations: Observations, table: ResidualTable, model: LinearModel, cameras: Mapping[str, Camera]
 ) -> Summaries:
     """All summaries of a table."""
     several = len(observations.stations) > 1
@@ -86,7 +86,7 @@ def summarise(
         _summary(table, table.feature, list(table.features)),
         _summary(table, region, region_names),
         _summary(table, ring, radius_names),
-        tuple(_trend(freedom, cameras[name], name, camera == i, edges[i]) for i, name in enumerate(camera_names)),
+        tuple(_trend(model, cameras[name], name, camera == i, edges[i]) for i, name in enumerate(camera_names)),
     )
 
 
@@ -150,14 +150,14 @@ def _rings(
     return labels, ring, edges
 
 
-def _trend(freedom: Freedom, camera: Camera, name: str, own: Mask, edges: Array) -> RadiusTrend:
-    equations = freedom.equations
-    rows = np.flatnonzero(own[equations.observation] & freedom.used)
+def _trend(model: LinearModel, camera: Camera, name: str, own: Mask, edges: Array) -> RadiusTrend:
+    equations = model.equations
+    rows = np.flatnonzero(own[equations.observation] & model.used)
     offsets = camera.offsets(equations.pixel[rows])
     radius = np.linalg.norm(offsets, axis=1)
     outward = np.sum(equations.direction[rows] * offsets, axis=1) / np.maximum(radius, 1e-9)
     ring = np.clip(np.searchsorted(edges, radius, side="right") - 1, 0, RADIUS_BINS - 1)
-    weight = freedom.weight[rows] ** 2
+    weight = model.weight[rows] ** 2
     total = np.bincount(ring, weight * outward**2, RADIUS_BINS)
     moved = np.bincount(ring, weight * outward * equations.residual[rows], RADIUS_BINS)
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -14,7 +14,7 @@ from ceres_cal.base.arrays import AnyArray, Array, Codes, Indices, Mask
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import write_bytes, write_json
 from ceres_cal.diagnostics.equations import Equations
-from ceres_cal.diagnostics.freedom import Freedom
+from ceres_cal.diagnostics.linear_model import LinearModel
 from ceres_cal.observations import Observations
 from ceres_cal.scene.camera import Camera
 from ceres_cal.solve.noise import Inliers
@@ -135,14 +135,14 @@ def _plain(column: AnyArray) -> list[Any]:
 
 
 def make_table(
-    observations: Observations, inliers: Inliers, freedom: Freedom, weight: Array, cameras: dict[str, Camera]
+    observations: Observations, inliers: Inliers, model: LinearModel, weight: Array, cameras: dict[str, Camera]
 ) -> ResidualTable:
     """The table of all observations.
 
     Args:
         weight: (E,) robust weight of each equation's observation.
     """
-    equations, points, curves = freedom.equations, observations.points, observations.curves
+    equations, points, curves = model.equations, observations.points, observations.curves
     count = len(points) + len(curves)
     is_curve = np.arange(count) >= len(points)
     features, first = _feature_names(observations)
@@ -170,8 +170,8 @@ def make_table(
         np.concatenate([points.sigma_px, curves.sigma_px]),
         np.where(is_curve, inliers.curve_scale, inliers.point_scale),
         np.where(inlier, _spread_out(equations, weight, count), 0.0),
-        _mean_leverage(freedom, count),
-        _standardised(freedom, count),
+        _mean_leverage(model, count),
+        _standardised(model, count),
         _radii(observations, view, pixel, cameras),
         np.where(inlier, INLIER, np.where(seen, TOO_FAR, NOT_SEEN)).astype(np.int8),
     )
@@ -230,24 +230,24 @@ def plane_shift(equations: Equations, values: Array) -> tuple[Array, Array]:
     return x, y
 
 
-def _mean_leverage(freedom: Freedom, count: int) -> Array:
-    equations, leverage = freedom.equations, freedom.leverage
+def _mean_leverage(model: LinearModel, count: int) -> Array:
+    equations, leverage = model.equations, model.leverage
     sums = np.bincount(equations.observation, leverage, count)
     numbers = np.bincount(equations.observation, minlength=count)
     return np.where(numbers > 0, sums / np.maximum(numbers, 1), np.nan)
 
 
-def _standardised(freedom: Freedom, count: int) -> Array:
+def _standardised(model: LinearModel, count: int) -> Array:
     """e' (1 - H)^-1 e as a length; 1 + H where the observation took no part."""
-    equations = freedom.equations
-    sign = np.where(freedom.used, -1.0, 1.0)
-    residual, leverage = freedom.weight * equations.residual, freedom.leverage
+    equations = model.equations
+    sign = np.where(model.used, -1.0, 1.0)
+    residual, leverage = model.weight * equations.residual, model.leverage
     answer = np.full(count, np.nan)
     variance = np.maximum(1.0 + sign * leverage, 1e-9)
     curves = equations.is_curve
     answer[equations.observation[curves]] = (residual / np.sqrt(variance))[curves]
     first, second = np.flatnonzero(~curves).reshape(-1, 2).T
-    cross = sign[first] * freedom.overlap(first, second)
+    cross = sign[first] * model.overlap(first, second)
     p, q = residual[first], residual[second]
     determinant = np.maximum(variance[first] * variance[second] - cross**2, 1e-18)
     squared = (variance[second] * p * p - 2.0 * cross * p * q + variance[first] * q * q) / determinant

@@ -76,22 +76,25 @@ class GaussianPrior:
         return np.asarray(self.information.root @ self.offsets(estimate))
 
 
-def gather_priors(
-    observations: Observations, options: Options, structure: Structure, lens: Lens | None = None
-) -> tuple[GaussianPrior, ...]:
+def gather_priors(observations: Observations, options: Options, structure: Structure) -> tuple[GaussianPrior, ...]:
     """Everything that is known beforehand of a calibration: the priors of observations and options, and the tolerances.
-
-    Args:
-        lens: of the cameras; by default the one that the options choose.
 
     Raises:
         InputError: a prior names a camera, a station or a quantity that is not there.
     """
-    lens = lens or options.blank_lens
-    stated = (*observations.priors, *options.priors)
-    for prior in stated:
+    lenses = dict.fromkeys(observations.cameras, options.blank_lens)
+    return (*gather_stated(observations, options, lenses), *tolerances(structure))
+
+
+def gather_stated(observations: Observations, options: Options, lenses: Mapping[str, Lens]) -> Iterator[GaussianPrior]:
+    """The priors of observations and options. `lenses`: of the cameras, by name.
+
+    Raises:
+        InputError: see `gather_priors`.
+    """
+    for prior in (*observations.priors, *options.priors):
         observations.require_owner(prior)
-    return (*(stated_prior(prior, lens) for prior in stated), *tolerances(structure))
+        yield stated_prior(prior, lenses.get(prior.name, options.blank_lens))
 
 
 def stated_prior(prior: Prior, lens: Lens) -> GaussianPrior:

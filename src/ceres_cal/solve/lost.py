@@ -15,7 +15,7 @@ from ceres_cal.solve.bundle import placement_costs
 from ceres_cal.solve.mirrored import mirrored
 from ceres_cal.solve.noise import Inliers
 from ceres_cal.solve.problem import Problem, Weighting
-from ceres_cal.start.closed_forms import polar_pose
+from ceres_cal.start.closed_forms import pose_from_homography
 from ceres_cal.start.planes import consensus_homography
 
 _LOST = 0.5  # share of a sight's observations; with less of them in use its pose was not understood
@@ -56,6 +56,6 @@ def _by_consensus(sight: Sights, estimate: Estimate, weighting: Weighting) -> Ar
     homography = consensus_homography(points[:, :2], ideal, limit_px)
     if homography is None:
         return None
-    pose = polar_pose(np.diag([1.0 / camera.phi, 1.0 / camera.phi, 1.0]) @ homography)
+    pose = pose_from_homography(homography, camera.phi)
     translation = pose.translation - points[0, 2] * pose.rotation[:, 2]
     return np.column_stack([pose.rotation, translation])[None]

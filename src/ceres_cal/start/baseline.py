@@ -19,7 +19,7 @@ from ceres_cal.model.parameters import Estimate, Station
 from ceres_cal.observations.sights import Sights
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Radial
-from ceres_cal.start.closed_forms import fit_rings, homography_from_points, max_norm_pose
+from ceres_cal.start.closed_forms import fit_rings, homography_from_points, pose_from_homography
 from ceres_cal.start.planes import ring_radii
 
 
@@ -59,7 +59,7 @@ def _from_four_points(camera: Camera, sight: Sights) -> Pose:
         raise DegenerateError(f"{sight.key}: the paper's method needs four points of the floor, not {len(places)}")
     chosen = floor[first[_widest_four(places)]]
     rays = camera.rays(sight.pixels[chosen])
-    return max_norm_pose(homography_from_points(sight.points[chosen, :2], rays[:, :2] / rays[:, 2:]))
+    return pose_from_homography(homography_from_points(sight.points[chosen, :2], rays[:, :2] / rays[:, 2:]))
 
 
 def _widest_four(places: Array) -> list[int]:

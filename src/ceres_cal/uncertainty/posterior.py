@@ -13,6 +13,7 @@ from ceres_cal.base.errors import InputError
 from ceres_cal.base.spread import Spread, without
 from ceres_cal.model.information import Information
 from ceres_cal.model.keys import Key, pose_keys, sigma_limits
+from ceres_cal.model.parameters import Estimate, Layout, intrinsic_names
 from ceres_cal.solve import Eliminated, ReducedInformation
 from ceres_cal.uncertainty.profile import PhiProfile
 
@@ -73,6 +74,18 @@ class Posterior:
             at = self.information.columns(profile.keys)
             bounds[at] = np.column_stack(profile.bounds(profile.steps, sds, self.half_width))
         return np.asarray(bounds)
+
+    def layout(self, estimate: Estimate) -> Layout:
+        """The layout of everything that it speaks of."""
+        free = {}
+        for name, camera in estimate.cameras.items():
+            names = intrinsic_names(camera.lens)
+            own = [names.index(key.quantity) for key in self.keys if key[:2] == ("camera", name)]
+            free[name] = np.array(sorted(own), dtype=np.int64)
+        stations, placements = (
+            frozenset(key.owner for key in self.keys if key.kind == kind) for kind in ("station", "placement")
+        )
+        return Layout(free, stations, placements | frozenset(self.placements))
 
     def place(self, kind: str, owner: str, quantity: str) -> int:
         """Where a number is among the keys.
