@@ -26,8 +26,11 @@ from ceres_cal.solve import Progress
 from ceres_cal.start.initialise import Start
 
 LABELS = ("check", "as-given", "turned")
+# Poses whose likelihoods differ by less compete: a factor of 20 000 decides. Nothing changes from half to double.
 _NATS_ALIKE = 10.0
-_UNIQUE = 8  # equations with which a pose is the only one
+# Equations with which a pose is the only one: six numbers, and two that contradict a wrong one. Nothing changes at
+# half of it; at double four corners are refused.
+_UNIQUE = 8
 _SMALL = (0.3, np.deg2rad(15.0))
 
 
