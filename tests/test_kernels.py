@@ -22,8 +22,9 @@ from ceres_cal.kernels.lenses import answer_limit, one_dimensional
 from ceres_cal.kernels.sight import working_space
 from ceres_cal.model.parameters import intrinsics_vector, unit_px, with_intrinsics
 from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.curves import along_track
 from ceres_cal.scene.lens import Brown, KannalaBrandt, Radial
-from ceres_cal.scene.targets import Arc, Segment, along_track, custom
+from ceres_cal.scene.targets import Arc, Segment, custom
 from ceres_cal.simulate import overhead_pose
 
 LOSSES = {

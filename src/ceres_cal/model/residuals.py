@@ -12,7 +12,7 @@ from ceres_cal.base.arrays import Array
 from ceres_cal.base.threads import parts_of, run_parts
 from ceres_cal.model.parameters import Estimate, intrinsics_vector, unit_px
 from ceres_cal.observations import Observations
-from ceres_cal.observations.sights import Sights, nearest_places
+from ceres_cal.observations.sights import Sights, nearest_feet
 from ceres_cal.scene.camera import Camera
 
 _POINT_NS = 10.0
@@ -67,7 +67,7 @@ def residuals(observations: Observations, sights: Sights, estimate: Estimate, fe
             distances = np.empty(len(own.curve_rows))
             starts = starting_feet(own, estimate, feet)
             kernels.curve_residuals(
-                *optics, poses[numbers], own.curve_bounds, estimate.structure.tracks(own), own.is_arc, own.track,
+                *optics, poses[numbers], own.curve_bounds, estimate.structure.tracks(own), own.is_arc, own.track_index,
                 own.curve_pixels, starts, distances,
             )  # fmt: skip
             curves[own.curve_rows], ends[own.curve_rows] = distances, starts
@@ -93,5 +93,5 @@ def starting_feet(sights: Sights, estimate: Estimate, feet: Array | None) -> Arr
         if np.all(np.isfinite(known)):
             return known
     seen = [sights[int(number)] for number in np.flatnonzero(np.diff(sights.curve_bounds))]
-    nearest = [nearest_places(s, estimate.camera_at(s.key.station, s.key.placement)) for s in seen]
+    nearest = [nearest_feet(s, estimate.camera_at(s.key.station, s.key.placement)) for s in seen]
     return np.concatenate(nearest)

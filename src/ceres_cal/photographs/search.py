@@ -25,9 +25,11 @@ from ceres_cal.photographs.refit import Shown
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.targets import Target
 
-# Of the strokes explained, by the first that is not doubted: no other is followed. It only saves time.
+# Of the strokes explained, by the first that is not doubted: no other is followed. It only saves time. Nothing
+# changes from 0.82 to 0.95.
 _SURE = 0.9
-# Of the best one's score: another way to see the picture that is as good makes it ambiguous.
+# Of the best one's score: another way to see the picture that is as good makes it ambiguous. Nothing changes from
+# 0.85 to 0.96.
 _AS_GOOD = 0.92
 _NO_LINES = (
     "no lines at right angles that could be this field's, two one way and one across: "

@@ -100,14 +100,14 @@ class SightCost(pyceres.CostFunction):
 def kernel_columns(sights: Sights, structure: Structure, weighting: Weighting) -> tuple[NDArray[Any], ...]:
     """The observations as the kernels take them, but for points and tracks, which the structure moves."""
     moves = len(structure.values) > 0
-    feature = sights.feature if moves else sights.feature[:0]
+    feature = sights.point_index if moves else sights.point_index[:0]
     return (
         sights.pixels,
         1.0 / (weighting.point_scale * sights.sigma_px),
         structure.point_slots[feature],
         structure.bends[feature],
         sights.is_arc,
-        sights.track,
+        sights.track_index,
         sights.curve_pixels,
         1.0 / (weighting.curve_scale * sights.curve_sigma_px),
     )
