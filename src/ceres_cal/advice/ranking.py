@@ -21,7 +21,9 @@ from ceres_cal.uncertainty import Posterior
 _LARGER, _LESS = 0.5, 0.2
 """Less work is nearly as good as the best where the error that it leaves is larger by no more than the first share of
 the best's, and what it takes off smaller by no more than the second share of the best's."""
-_WORTH = 0.9  # of today's worst error; what leaves more is not worth doing
+# Of today's worst error; what leaves more is not worth doing: less than a tenth is within what advice is off by.
+# Nothing changes from 0.82 to 0.95.
+_WORTH = 0.9
 
 
 @dataclass(frozen=True, eq=False)

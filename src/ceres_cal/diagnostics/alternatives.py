@@ -18,7 +18,11 @@ from ceres_cal.scene.targets import Target
 from ceres_cal.solve import Problem
 
 _RADIAL_BASIS = 3  # powers of the radius past those of the lens: enough for any smooth trend that one more power mends
+# Observations that say whether a curve lies aside: three numbers of an arc, and as many left to contradict them.
+# Nothing changes from half to double.
 _FEWEST_ON_CURVE = 8
+# Observations that say whether a point lies aside: one could be an outlier that was just not taken out. Nothing
+# changes from half to double.
 _FEWEST_OF_POINT = 2
 
 

@@ -25,9 +25,12 @@ SIDES = {
     "bottom-left": (-1.0, 1.0),
     "bottom-right": (1.0, 1.0),
 }
-_FACES = 0.3  # cosine of the angle between a side of the picture and a feature that lies towards it, at least
-_AS_WELL = 0.2  # a cosine less by no more than this is no worse
-_NEARER_DEG = 30.0  # by which an old calibration must be nearer to one turn than to the next
+# Cosine of the angle between a side of the picture and a feature that lies towards it, at least: within 73 degrees.
+_FACES = 0.3
+# A cosine less by no more than this is no worse.
+_AS_WELL = 0.2
+# By which an old calibration must be nearer to one turn than to the next: quarters are 90 degrees apart.
+_NEARER_DEG = 30.0
 _MIDDLE = 0.02  # of the target's size: nearer to its middle a feature lies on no side
 
 

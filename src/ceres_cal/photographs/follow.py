@@ -21,9 +21,12 @@ from ceres_cal.scene.lens import LENSES
 from ceres_cal.scene.targets import Target
 
 FAR_PX = 130.0  # how far off the start may be
-LEAST_SHARE = 0.5  # of the places in view where paint must be found
+# Of the places in view where paint must be found: robots and wear hide a third. Nothing changes from 0.33 to 0.67.
+LEAST_SHARE = 0.5
+# Share from which on no other start is tried. At half of its odds nothing changes.
 _SURE_SHARE = 0.7
-_ABSENT, _MOST_ABSENT = 0.2, 0.08  # found of a curve, at least; places on curves without that, at most
+# Found of a curve, at least; places on curves without that, at most.
+_ABSENT, _MOST_ABSENT = 0.2, 0.08
 _ROUGH_SPACING_PX = 12.0
 _NEAR_REACHES_PX = (12.0, 6.0, 4.0)
 _FAR_REACHES_PX = (45.0, 45.0, 30.0, 30.0, 20.0, 12.0, 8.0, 5.0)
