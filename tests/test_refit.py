@@ -30,6 +30,7 @@ from ceres_cal.base.errors import DegenerateError, InputError, SolutionError
 from ceres_cal.base.transforms import Pose, rotation_exp
 from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
+from ceres_cal.calibration.file import PriorFile
 from ceres_cal.model.parameters import Layout, Options, Station
 from ceres_cal.model.priors import GaussianPrior
 from ceres_cal.model.quantities import difference, moved
@@ -39,6 +40,7 @@ from ceres_cal.moves.carried import carried_prior, make_plan
 from ceres_cal.moves.labels import MIRRORED, TURNED, relabelled
 from ceres_cal.moves.poses import movement
 from ceres_cal.observations import Observations, taken
+from ceres_cal.scene.files import CameraFile, PoseFile
 from ceres_cal.scene.lens import Radial
 from ceres_cal.scene.targets import ssl_field
 from ceres_cal.simulate import field_scene, overhead_pose, simulate
@@ -203,6 +205,24 @@ def test_a_refit_of_a_refit_changes_nothing(
     assert np.max(np.abs(change)) < 1e-3  # 2.5e-6
     np.testing.assert_allclose(again.posterior.sd, posterior.sd, rtol=1e-4)
     assert not again.warnings
+
+
+def test_the_prior_of_an_older_file_is_the_same(calibration: Calibration, observations: Observations) -> None:
+    """Files of 0.1 have its mean as the cameras, stations and structure that it is around."""
+    refitted, estimate = refit(calibration, observations).refitted, calibration.estimate
+    assert refitted is not None
+    file = PriorFile.of(refitted.prior)
+    older = PriorFile(
+        file.keys,
+        file.information,
+        cameras={name: CameraFile.of(camera) for name, camera in estimate.cameras.items()},
+        stations={name: PoseFile.of(station.cam_from_world) for name, station in estimate.stations.items()},
+        structure_m=dict(zip(estimate.structure.names, estimate.structure.values.tolist(), strict=True)),
+    )
+    for prior in (file.prior(), older.prior()):
+        assert prior.keys == refitted.prior.keys and prior.mean.tolist() == refitted.prior.mean.tolist()
+        assert np.array_equal(prior.information.matrix, refitted.prior.information.matrix)
+        assert prior.rotations.keys() == refitted.prior.rotations.keys()
 
 
 def test_other_observations_do_count(calibration: Calibration, observations: Observations) -> None:

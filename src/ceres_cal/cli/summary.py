@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ceres_cal.base.transforms import Pose, euler_from_rotation
-from ceres_cal.calibration import Calibration, calibration_to_json
+from ceres_cal.calibration import Calibration
 from ceres_cal.cli.command import plural, written
 from ceres_cal.cli.trust import Trust, with_sd
 from ceres_cal.model.parameters import Options, anchored_stations
@@ -44,7 +44,7 @@ def calibration_data(
 ) -> dict[str, Any]:
     """Everything, for --json."""
     return {
-        "calibration": calibration_to_json(calibration),
+        "calibration": calibration.to_file(),
         "inputs": list(inputs),
         "output": None if output is None else str(output),
         "report": None if report is None else str(report),

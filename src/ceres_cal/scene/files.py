@@ -12,6 +12,7 @@ from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import make_lens
 
 Vector = tuple[float, float, float]
+Matrix = tuple[Vector, Vector, Vector]
 
 
 class LensFile(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True):
@@ -31,6 +32,13 @@ class CameraFile(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
     aspect: float = 1.0
     lens: LensFile
 
+    @classmethod
+    def of(cls, camera: Camera) -> CameraFile:
+        """As a file has it."""
+        lens = LensFile(camera.lens.kind, camera.lens.powers or None, camera.lens.coefficients)
+        size, centre = camera.image_size, camera.principal_point
+        return cls(image_size=size, phi=camera.phi, principal_point=centre, aspect=camera.aspect, lens=lens)
+
     def camera(self) -> Camera:
         """The camera, at no particular pose; InputError where it is none."""
         lens = make_lens(self.lens.kind, self.lens.powers or (2, 3), self.lens.coefficients)
@@ -40,8 +48,13 @@ class CameraFile(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
 class PoseFile(msgspec.Struct, forbid_unknown_fields=True):
     """A rotation's rows and a translation."""
 
-    rotation: tuple[Vector, Vector, Vector]
+    rotation: Matrix
     translation_m: Vector
+
+    @classmethod
+    def of(cls, pose: Pose) -> PoseFile:
+        """As a file has it."""
+        return cls(pose.rotation.tolist(), pose.translation.tolist())
 
     def pose(self) -> Pose:
         """The pose; InputError where the rotation is none."""
@@ -50,16 +63,4 @@ class PoseFile(msgspec.Struct, forbid_unknown_fields=True):
 
 def camera_to_json(camera: Camera) -> dict[str, Any]:
     """A camera's intrinsics as plain data."""
-    file = CameraFile(
-        image_size=camera.image_size,
-        phi=camera.phi,
-        principal_point=camera.principal_point,
-        aspect=camera.aspect,
-        lens=LensFile(camera.lens.kind, camera.lens.powers or None, camera.lens.coefficients),
-    )
-    return dict(msgspec.to_builtins(file))
-
-
-def pose_to_json(pose: Pose) -> dict[str, Any]:
-    """A pose as plain data."""
-    return {"rotation": pose.rotation.tolist(), "translation_m": pose.translation.tolist()}
+    return dict(msgspec.to_builtins(CameraFile.of(camera)))

@@ -1,13 +1,7 @@
 """How well a calibration is known: covariance, weak directions, bounds beyond the quadratic picture, maps in mm."""
 
 from ceres_cal.uncertainty.assess import assess
-from ceres_cal.uncertainty.files import (
-    PosteriorFile,
-    information_from,
-    lower_triangle,
-    posterior_from_file,
-    posterior_to_file,
-)
+from ceres_cal.uncertainty.files import PosteriorFile, information_from, lower_triangle
 from ceres_cal.uncertainty.maps import FieldMap, PointSpread
 from ceres_cal.uncertainty.posterior import Posterior, make_posterior
 from ceres_cal.uncertainty.profile import PhiProfile
@@ -31,6 +25,4 @@ __all__ = [
     "information_from",
     "lower_triangle",
     "make_posterior",
-    "posterior_from_file",
-    "posterior_to_file",
 ]

@@ -15,7 +15,7 @@ from ceres_cal.uncertainty.profile import PhiProfile
 
 
 class ProfileFile(msgspec.Struct, forbid_unknown_fields=True):
-    """A valley in a calibration's file; of each place the steps and the lower triangle of the information."""
+    """A valley in a calibration's file; at each of its nodes the steps and the lower triangle of the information."""
 
     keys: list[Key]
     phi_px: float
@@ -24,6 +24,23 @@ class ProfileFile(msgspec.Struct, forbid_unknown_fields=True):
     information: list[list[float]]
     open_below: bool
     open_above: bool
+
+    @classmethod
+    def of(cls, profile: PhiProfile) -> ProfileFile:
+        """As a file has it."""
+        steps, rises = profile.steps.tolist(), profile.rises.tolist()
+        across = [lower_triangle(information) for information in profile.across]
+        return cls(list(profile.keys), profile.phi_px, steps, rises, across, profile.open_below, profile.open_above)
+
+    def profile(self, camera: str) -> PhiProfile:
+        """The valley along phi of a camera; InputError where its numbers do not fit each other."""
+        where = f"posterior.profiles.{camera}"
+        counts = {len(self.steps), len(self.rises), len(self.information)}
+        if len(counts) != 1 or any(len(row) != len(self.keys) for row in self.steps):
+            raise InputError(f"{where}: steps, rises and information do not fit each other: calibrate again")
+        steps, rises = np.array(self.steps), np.array(self.rises)
+        across = tuple(information_from(row, self.keys[1:], f"{where}.information") for row in self.information)
+        return PhiProfile(camera, tuple(self.keys), self.phi_px, steps, rises, across, self.open_below, self.open_above)
 
 
 class PosteriorFile(msgspec.Struct, forbid_unknown_fields=True):
@@ -35,64 +52,27 @@ class PosteriorFile(msgspec.Struct, forbid_unknown_fields=True):
     freedom: float | None
     profiles: dict[str, ProfileFile]
 
+    @classmethod
+    def of(cls, posterior: Posterior) -> PosteriorFile:
+        """As a file has it."""
+        degrees = posterior.degrees_of_freedom
+        return cls(
+            list(posterior.keys),
+            lower_triangle(posterior.information),
+            {name: lower_triangle(information) for name, information in posterior.placements.items()},
+            degrees if np.isfinite(degrees) else None,
+            {name: ProfileFile.of(profile) for name, profile in posterior.profiles.items()},
+        )
 
-def posterior_to_file(posterior: Posterior) -> PosteriorFile:
-    """Lower triangles, row by row."""
-    degrees = posterior.degrees_of_freedom
-    return PosteriorFile(
-        list(posterior.keys),
-        lower_triangle(posterior.information),
-        {name: lower_triangle(information) for name, information in posterior.placements.items()},
-        degrees if np.isfinite(degrees) else None,
-        {name: _profile_to_file(profile) for name, profile in posterior.profiles.items()},
-    )
-
-
-def _profile_to_file(profile: PhiProfile) -> ProfileFile:
-    return ProfileFile(
-        list(profile.keys),
-        profile.phi_px,
-        profile.steps.tolist(),
-        profile.rises.tolist(),
-        [lower_triangle(information) for information in profile.across],
-        profile.open_below,
-        profile.open_above,
-    )
-
-
-def posterior_from_file(data: PosteriorFile) -> Posterior:
-    """The posterior of a file.
-
-    Raises:
-        InputError: a matrix of the wrong size.
-    """
-    placements = {
-        name: information_from(row, pose_keys("placement", name), f"posterior.placements.{name}")
-        for name, row in data.placements.items()
-    }
-    return Posterior(
-        information_from(data.information, data.keys, "posterior.information"),
-        placements,
-        np.inf if data.freedom is None else data.freedom,
-        {name: _profile_from_file(name, entry) for name, entry in data.profiles.items()},
-    )
-
-
-def _profile_from_file(name: str, data: ProfileFile) -> PhiProfile:
-    where, size = f"posterior.profiles.{name}", len(data.keys)
-    counts = {len(data.steps), len(data.rises), len(data.information)}
-    if len(counts) != 1 or any(len(row) != size for row in data.steps):
-        raise InputError(f"{where}: steps, rises and information do not fit each other: calibrate again")
-    return PhiProfile(
-        name,
-        tuple(data.keys),
-        data.phi_px,
-        np.array(data.steps),
-        np.array(data.rises),
-        tuple(information_from(row, data.keys[1:], f"{where}.information") for row in data.information),
-        data.open_below,
-        data.open_above,
-    )
+    def posterior(self) -> Posterior:
+        """The posterior; InputError where a matrix has the wrong size."""
+        placements = {
+            name: information_from(row, pose_keys("placement", name), f"posterior.placements.{name}")
+            for name, row in self.placements.items()
+        }
+        information = information_from(self.information, self.keys, "posterior.information")
+        profiles = {name: entry.profile(name) for name, entry in self.profiles.items()}
+        return Posterior(information, placements, np.inf if self.freedom is None else self.freedom, profiles)
 
 
 def lower_triangle(information: Information) -> list[float]:

@@ -1,0 +1,7 @@
+"""The result of a calibration, how it came about, and its file."""
+
+from ceres_cal.calibration.calibration import Calibration
+from ceres_cal.calibration.file import FORMAT, CalibrationFile
+from ceres_cal.calibration.origin import Fit, Refitted, Rejected, package_versions
+
+__all__ = ["FORMAT", "Calibration", "CalibrationFile", "Fit", "Refitted", "Rejected", "package_versions"]

@@ -1,0 +1,216 @@
+"""The result: calibrated cameras, stations and placements, and how they came about."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from ceres_cal.base.arrays import Mask
+from ceres_cal.base.errors import InputError
+from ceres_cal.base.files import convert, read_json, write_json
+from ceres_cal.base.transforms import Pose
+from ceres_cal.calibration.file import (
+    FORMAT,
+    VERSION,
+    CalibrationFile,
+    RefittedFile,
+    StationFile,
+    options_from_json,
+    options_to_json,
+)
+from ceres_cal.calibration.origin import Fit, Refitted, Rejected, package_versions
+from ceres_cal.model.parameters import Estimate, Options, make_layout
+from ceres_cal.model.priors import gather_priors, gather_stated, tolerances
+from ceres_cal.observations import Observations
+from ceres_cal.observations.sights import gather_sights
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.files import CameraFile, PoseFile
+from ceres_cal.scene.targets import Target, target_from_spec
+from ceres_cal.solve import Problem, Weighting
+from ceres_cal.uncertainty import Disagreement, Posterior, PosteriorFile, Uncertainty, disagreement
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """Calibrated cameras and where they stood.
+
+    Attributes:
+        estimate: cameras, stations, placements, and the targets as built. targets: as drawn, by name.
+        fit: residuals and noise. rejected: every observation that was taken out.
+        termination: why the last solve stopped. converged: whether it had come to rest.
+        rounds: solves it took. history: cost at each iteration of the last one.
+        phi_from: camera -> "fixed", "views", "prior" or "guess": what the start for phi rested on; after a refit
+            "posterior", where phi is under what was known of it.
+        warnings: what to know before using it, each one line.
+        posterior: what is known of every number; None where nothing was minimised, or a file says nothing of it.
+        options: how it was solved. digest: SHA-256 of the observations. versions: of the packages that solved it.
+        refitted: how it came from an earlier calibration; None for one from scratch.
+    """
+
+    estimate: Estimate
+    targets: Mapping[str, Target]
+    fit: Fit
+    rejected: tuple[Rejected, ...]
+    termination: str
+    converged: bool
+    rounds: int
+    history: tuple[float, ...]
+    phi_from: Mapping[str, str]
+    warnings: tuple[str, ...]
+    options: Options
+    digest: str
+    posterior: Posterior | None = None
+    versions: Mapping[str, str] = field(default_factory=package_versions)
+    refitted: Refitted | None = None
+
+    @property
+    def cameras(self) -> Mapping[str, Camera]:
+        """Cameras by name, at no particular pose."""
+        return self.estimate.cameras
+
+    @cached_property
+    def stations(self) -> Mapping[str, Camera]:
+        """The camera at each station, by the station's name."""
+        return {name: self.estimate.camera_at(name) for name in self.estimate.stations}
+
+    @property
+    def placements(self) -> Mapping[str, Pose]:
+        """world_from_target of each placement."""
+        return self.estimate.placements
+
+    def station(self, name: str | None = None) -> Camera:
+        """The camera at a station; without a name, at the only one there is.
+
+        Raises:
+            InputError: no such station, or no name where there are several.
+        """
+        if name is None and len(self.stations) == 1:
+            return next(iter(self.stations.values()))
+        if name is None or name not in self.stations:
+            raise InputError(f"station {name!r} is not there: there are {', '.join(map(repr, self.stations))}")
+        return self.stations[name]
+
+    @cached_property
+    def uncertainty(self) -> Uncertainty:
+        """How well everything is known: verdicts, weak directions, maps in mm.
+
+        Raises:
+            InputError: nothing was minimised, or the file says nothing of it.
+        """
+        if self.posterior is None:
+            raise InputError("this calibration does not say how well it is known: calibrate again")
+        return Uncertainty(self.estimate, self.posterior, self.targets)
+
+    def disagreement(self, observations: Observations, first: str, second: str) -> Disagreement:
+        """What two stations say of what both observed in the observations that this calibration was made from.
+
+        Raises:
+            InputError: there is no uncertainty to compare with, see `uncertainty`; or other observations.
+        """
+        if observations.digest != self.digest:
+            raise InputError("these are not the observations that the calibration was made from: give those")
+        masks = self.inlier_masks(observations)
+        scales = (self.fit.point_scale, self.fit.curve_scale)
+        known = self.uncertainty
+        return disagreement(observations, known.estimate, known.posterior, masks, scales, first, second)
+
+    def inlier_masks(self, observations: Observations) -> tuple[Mask, Mask]:
+        """(N,) of points and (M,) of curve observations: which rows took part."""
+        masks = np.ones(len(observations.points), bool), np.ones(len(observations.curves), bool)
+        for entry in self.rejected:
+            masks[entry.kind == "curve"][entry.row] = False
+        return masks
+
+    def problem(self, observations: Observations, *, new_data: bool = False) -> Problem:
+        """The problem of which this is the solution, of all the observations, at the noise that was found.
+
+        Args:
+            new_data: that the observations are others: then as if they were calibrated with the same options.
+        """
+        sights, options = gather_sights(observations), self.options
+        prior = None if self.refitted is None else self.refitted.prior
+        weighting = Weighting(self.fit.point_scale, self.fit.curve_scale, options.loss, options.loss_scale)
+        if new_data or prior is None or self.posterior is None:
+            priors = gather_priors(observations, options, self.estimate.structure)
+            return Problem(sights, make_layout(observations, options), priors, weighting, options)
+        lenses = {name: camera.lens for name, camera in self.cameras.items()}
+        fresh = tolerances(self.estimate.structure, prior.keys)
+        priors = (prior, *gather_stated(observations, options, lenses), *fresh)
+        return Problem(sights, self.posterior.layout(self.estimate), priors, weighting, options)
+
+    @property
+    def rms_px(self) -> float:
+        """Root mean square residual over all observations that took part, px."""
+        return self.fit.rms_px
+
+    def save(self, path: str | Path) -> None:
+        """Write the calibration as JSON; every number comes back exactly."""
+        write_json(path, self.to_file())
+
+    @classmethod
+    def load(cls, path: str | Path) -> Calibration:
+        """Read a calibration.
+
+        Raises:
+            InputError: one line that names the file and the place; also for a radial lens that folds inside the image.
+        """
+        data = convert(read_json(path, FORMAT, VERSION), CalibrationFile, str(path))
+        try:
+            return cls.from_file(data)
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from None
+
+    def to_file(self) -> CalibrationFile:
+        """The calibration as its file has it."""
+        estimate = self.estimate
+        return CalibrationFile(
+            format=FORMAT,
+            version=VERSION,
+            units="metres, radians, pixels",
+            pixel_origin="centre of the top-left pixel",
+            cameras={name: CameraFile.of(camera) for name, camera in estimate.cameras.items()},
+            stations={name: StationFile.of_station(station) for name, station in estimate.stations.items()},
+            placements={name: PoseFile.of(pose) for name, pose in estimate.placements.items()},
+            targets={name: target.spec for name, target in self.targets.items()},
+            structure_m=dict(zip(estimate.structure.names, estimate.structure.values.tolist(), strict=True)),
+            fit=self.fit,
+            rejected=self.rejected,
+            termination=self.termination,
+            converged=self.converged,
+            rounds=self.rounds,
+            history=self.history,
+            phi_from=dict(self.phi_from),
+            warnings=self.warnings,
+            options=options_to_json(self.options),
+            digest=self.digest,
+            versions=dict(self.versions),
+            posterior=None if self.posterior is None else PosteriorFile.of(self.posterior),
+            refitted=None if self.refitted is None else RefittedFile.of(self.refitted),
+        )
+
+    @classmethod
+    def from_file(cls, data: CalibrationFile) -> Calibration:
+        """The calibration that a file describes; InputError naming the place inside it."""
+        options = options_from_json(data.options)
+        targets = {name: target_from_spec(spec, f"target {name!r}") for name, spec in data.targets.items()}
+        return cls(
+            data.estimate(targets, options),
+            targets,
+            data.fit,
+            data.rejected,
+            data.termination,
+            data.converged,
+            data.rounds,
+            data.history,
+            data.phi_from,
+            data.warnings,
+            options,
+            data.digest,
+            None if data.posterior is None else data.posterior.posterior(),
+            data.versions,
+            None if data.refitted is None else data.refitted.refitted(),
+        )

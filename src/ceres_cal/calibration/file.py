@@ -1,0 +1,149 @@
+"""Calibrations in JSON files (design, section 9): every number comes back exactly."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, replace
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from ceres_cal.base.errors import InputError
+from ceres_cal.base.files import convert
+from ceres_cal.base.transforms import euler_from_rotation
+from ceres_cal.calibration.origin import Fit, Refitted, Rejected
+from ceres_cal.model.keys import Key
+from ceres_cal.model.parameters import Estimate, Options, Station
+from ceres_cal.model.priors import GaussianPrior
+from ceres_cal.model.structure import EXACT, make_structure
+from ceres_cal.observations import prior_from_json, prior_to_json
+from ceres_cal.scene.files import CameraFile, Matrix, PoseFile, Vector
+from ceres_cal.scene.targets import Target
+from ceres_cal.uncertainty import PosteriorFile, information_from, lower_triangle
+
+FORMAT, VERSION = "ceres-cal/calibration", 1
+
+
+class StationFile(PoseFile, forbid_unknown_fields=True):
+    """A station; position and Euler angles (the paper's) are there for people."""
+
+    camera: str
+    position_m: Vector
+    euler_rad: Vector
+
+    @classmethod
+    def of_station(cls, station: Station) -> StationFile:
+        """As a file has it."""
+        pose = station.cam_from_world
+        rotation, translation, position = (part.tolist() for part in (pose.rotation, pose.translation, pose.position))
+        return cls(rotation, translation, station.camera, position, euler_from_rotation(pose.rotation))
+
+
+class PriorFile(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True):
+    """A prior; its mean by number, or, in files of 0.1, as the cameras, stations and structure that it is around."""
+
+    keys: list[Key]
+    information: list[float]
+    mean: list[float] | None = None
+    rotations: dict[str, Matrix] | None = None
+    cameras: dict[str, CameraFile] | None = None
+    stations: dict[str, PoseFile] | None = None
+    structure_m: dict[str, float] | None = None
+
+    @classmethod
+    def of(cls, prior: GaussianPrior) -> PriorFile:
+        """As a file has it."""
+        rotations = {name: rotation.tolist() for name, rotation in prior.rotations.items()}
+        return cls(list(prior.keys), lower_triangle(prior.information), prior.mean.tolist(), rotations)
+
+    def prior(self) -> GaussianPrior:
+        """The prior; InputError where its numbers do not fit its keys."""
+        information = information_from(self.information, self.keys, "refitted.prior.information")
+        if self.mean is not None:
+            if len(self.mean) != len(self.keys):
+                raise InputError("refitted.prior.mean does not fit its keys: calibrate again")
+            rotations = {name: np.array(rotation) for name, rotation in (self.rotations or {}).items()}
+            return GaussianPrior(information, np.array(self.mean), rotations)
+        cameras = {name: entry.camera() for name, entry in (self.cameras or {}).items()}
+        stations = {name: Station("", entry.pose()) for name, entry in (self.stations or {}).items()}
+        structure_m = self.structure_m or {}
+        structure = replace(EXACT, names=tuple(structure_m), values=np.array(list(structure_m.values())))
+        return GaussianPrior.about(information, Estimate(cameras, stations, {}, structure))
+
+
+class RefittedFile(msgspec.Struct, forbid_unknown_fields=True):
+    """How a calibration came from an earlier one."""
+
+    what: str
+    moved: tuple[str, ...]
+    explanation: str
+    prior: PriorFile
+    scales: tuple[float, float]
+    digests: tuple[str, ...]
+
+    @classmethod
+    def of(cls, refitted: Refitted) -> RefittedFile:
+        """As a file has it."""
+        return cls(**{**vars(refitted), "prior": PriorFile.of(refitted.prior)})
+
+    def refitted(self) -> Refitted:
+        """What the file says; InputError where the prior's numbers do not fit."""
+        return Refitted(**{**msgspec.structs.asdict(self), "prior": self.prior.prior()})
+
+
+class CalibrationFile(msgspec.Struct, forbid_unknown_fields=True):
+    """A calibration."""
+
+    format: str
+    version: int
+    units: str
+    pixel_origin: str
+    cameras: dict[str, CameraFile]
+    stations: dict[str, StationFile]
+    placements: dict[str, PoseFile]
+    targets: dict[str, Any]
+    structure_m: dict[str, float]
+    fit: Fit
+    rejected: tuple[Rejected, ...]
+    termination: str
+    converged: bool
+    rounds: int
+    history: tuple[float, ...]
+    phi_from: dict[str, str]
+    warnings: tuple[str, ...]
+    options: dict[str, Any]
+    digest: str
+    versions: dict[str, str]
+    posterior: PosteriorFile | None = None
+    refitted: RefittedFile | None = None
+
+    def estimate(self, targets: Mapping[str, Target], options: Options) -> Estimate:
+        """Cameras, stations, placements and the targets as built; InputError where one does not fit the others."""
+        cameras = {}
+        for name, entry in self.cameras.items():
+            cameras[name] = entry.camera()
+            if not cameras[name].lens.may_fold:  # others may, in corners that nobody saw: `locate` gives NaN there
+                cameras[name].require_monotone(name)
+        stations = {}
+        for name, station in self.stations.items():
+            if station.camera not in cameras:
+                raise InputError(f"station {name!r} names camera {station.camera!r}, which is not there")
+            stations[name] = Station(station.camera, station.pose())
+        placements = {name: entry.pose() for name, entry in self.placements.items()}
+        structure = make_structure(targets, options.tolerances)
+        if structure.names != tuple(self.structure_m):
+            raise InputError("structure_m does not fit the targets and the tolerances: calibrate again")
+        built = structure.with_values(np.array(list(self.structure_m.values())))
+        return Estimate(cameras, stations, placements, built)
+
+
+def options_to_json(options: Options) -> dict[str, Any]:
+    """Options as plain data, their priors as observations have them."""
+    return {**asdict(options), "priors": [prior_to_json(prior) for prior in options.priors]}
+
+
+def options_from_json(data: Mapping[str, Any]) -> Options:
+    """The options that a file describes; InputError naming what is wrong."""
+    priors = tuple(prior_from_json(entry, "options.priors") for entry in data.get("priors", []))
+    return convert({**data, "priors": priors}, Options, "options")

@@ -1,0 +1,80 @@
+"""How a calibration came about: its fit, what was taken out, what it is a refit of, and by which packages."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
+
+from ceres_cal.model.priors import GaussianPrior
+
+
+@dataclass(frozen=True)
+class Rejected:
+    """One observation that was taken out: its permanent id (kind and row), what it shows, and why it was taken out."""
+
+    kind: str
+    row: int
+    frame: str
+    feature: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class Fit:
+    """How well the observations fit.
+
+    Attributes:
+        points, curves: numbers of observations that took part.
+        points_rms_px: root mean square length of the points' residual vectors, of those that took part (OpenCV's rms).
+            curves_rms_px: the same of the distances to the curves. They say how consistent the data are with the model,
+            not how well the camera is known.
+        point_scale, curve_scale: estimated factors on the stated sigmas.
+        unknowns: free numbers.
+    """
+
+    points: int
+    curves: int
+    points_rms_px: float
+    curves_rms_px: float
+    point_scale: float
+    curve_scale: float
+    unknowns: int
+
+    @property
+    def rms_px(self) -> float:
+        """Root mean square residual over points and curves together."""
+        total = self.points * self.points_rms_px**2 + self.curves * self.curves_rms_px**2
+        return float((total / max(self.points + self.curves, 1)) ** 0.5)
+
+
+@dataclass(frozen=True, eq=False)
+class Refitted:
+    """How a calibration came from an earlier one.
+
+    Attributes:
+        what: was free, one of `moves.WHAT`. moved: stations whose poses were sought.
+        explanation: what the observations say has happened, in words.
+        prior: what was known beforehand of everything that was carried over.
+        scales: noise scales of points and curves of the calibration before.
+        digests: of the observations that are in the prior.
+    """
+
+    what: str
+    moved: tuple[str, ...]
+    explanation: str
+    prior: GaussianPrior
+    scales: tuple[float, float]
+    digests: tuple[str, ...]
+
+
+@cache
+def package_versions() -> dict[str, str]:
+    """Versions of what the numbers depend on."""
+    versions = {}
+    for name in ("ceres-cal", "pyceres", "numpy", "numba"):
+        try:
+            versions[name] = version(name)
+        except PackageNotFoundError:
+            versions[name] = "not installed"
+    return versions
