@@ -23,7 +23,7 @@ from ceres_cal.calibration import Calibration
 from ceres_cal.model.keys import pose_keys
 from ceres_cal.model.quantities import difference
 from ceres_cal.simulate import Disturbance
-from ceres_cal.uncertainty.maps import shown_pixels
+from ceres_cal.uncertainty.maps import visible_pixels
 
 WEAKLY, BADLY = frozenset({"weak"}), frozenset({"unknown"})
 LEAST, MOST, LEAST_PARAMETER = 0.93, 0.97, 0.91
@@ -109,7 +109,7 @@ def _add(found: Coverage, case: Case, trial: Trial, calibration: Calibration) ->
         if not any(key.kind == "station" for key in posterior.keys):
             continue
         for height_m in HEIGHTS_M:
-            pixels = shown_pixels(truth, station, _PLACES, height_m)
+            pixels = visible_pixels(truth, station, _PLACES, height_m)
             shown = np.isfinite(pixels[:, 0])
             points = uncertainty.located(pixels[shown], height_m, station)
             held = (points.low <= _PLACES[shown]) & (_PLACES[shown] <= points.high)

@@ -54,7 +54,7 @@ from ceres_cal.simulate import (
 )
 from ceres_cal.simulate.photograph import frames, photograph
 from ceres_cal.solve import Weighting, information
-from ceres_cal.uncertainty.maps import locate_slopes, shown_pixels
+from ceres_cal.uncertainty.maps import locate_slopes, visible_pixels
 
 CAMERA = Camera((1280, 960), 868.0, (646.5, 473.8), Radial((-5.2e-5, 6.1e-7)))
 HOME = overhead_pose(-2.27, -0.12, 4.02, tilt_x_deg=1.8, tilt_y_deg=-2.4, yaw_deg=90.6)
@@ -192,7 +192,7 @@ def bound_case(runs: int) -> Iterator[Row]:
         truth = truth_of(calibration, TILTED)
         keys, covariance = bound_of(calibration, pixels, TILTED)
         for height_m, found in squared.items():
-            shown = shown_pixels(truth, "overhead", places, height_m)
+            shown = visible_pixels(truth, "overhead", places, height_m)
             shown = shown[np.isfinite(shown[:, 0])]
             slopes = locate_slopes(truth, keys, "overhead", shown, height_m)
             expected = np.einsum("nij,jk,nik->", slopes, covariance, slopes) / len(shown)

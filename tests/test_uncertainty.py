@@ -33,7 +33,7 @@ from ceres_cal.scene.targets import Segment
 from ceres_cal.solve import Problem, Weighting, solve
 from ceres_cal.start.initialise import PHI_RANGE
 from ceres_cal.uncertainty import Posterior, Uncertainty, Verdict, bounds_text
-from ceres_cal.uncertainty.maps import locate_slopes, radius_95, shown_pixels
+from ceres_cal.uncertainty.maps import locate_slopes, radius_95, visible_pixels
 from ceres_cal.uncertainty.seam import predicted
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -179,7 +179,7 @@ def test_where_a_usual_lens_was_taken_the_floor_is_as_good() -> None:
     calibration, truth = calibrated(1.0, 0), make_trial(tilted(1.0), CLEAN_NOISE, 0).truth
     assert phi_of(calibration).low == 0.0 and phi_of(calibration).verdict == "unknown"
     places = np.array([[-4.0, -2.5], [0.0, 0.0], [3.0, 2.0]])
-    pixels = shown_pixels(truth, "overhead", places, 0.0)
+    pixels = visible_pixels(truth, "overhead", places, 0.0)
     points = calibration.uncertainty.located(pixels)
     assert np.max(np.linalg.norm(points.located - places, axis=1)) < 0.004
     assert np.max(points.radius_95_m) < 0.005
@@ -276,7 +276,7 @@ def test_a_map_covers_what_the_image_shows() -> None:
     found = calibration.uncertainty.map_sd_mm("overhead", 0.0, np.linspace(-20.0, 20.0, 41), [0.0, 0.5])
     assert found.sd_mm.shape == found.radius_95_mm.shape == (2, 41)
     places = np.column_stack([found.x_m, np.full(41, 0.5)])
-    shown = np.isfinite(shown_pixels(calibration.estimate, "overhead", places, 0.0)[:, 0])
+    shown = np.isfinite(visible_pixels(calibration.estimate, "overhead", places, 0.0)[:, 0])
     assert np.array_equal(np.isfinite(found.sd_mm[1]), shown) and 5 < shown.sum() < 41
     assert found.worst_mm == np.nanmax(found.sd_mm) and found.mean_mm < found.worst_mm
     x, y = found.worst_place_m
@@ -323,8 +323,8 @@ def test_the_predicted_seam_is_what_draws_do() -> None:
     posterior = calibration.posterior
     assert posterior is not None
     places = np.array([[0.0, 0.0], [0.4, 1.5], [-0.5, -2.0]])
-    covariances = predicted(calibration.estimate, posterior, "left", "right", places, 0.15)
-    pixels = {name: shown_pixels(calibration.estimate, name, places, 0.15) for name in ("left", "right")}
+    covariances = predicted(calibration.estimate, posterior, ("left", "right"), places, 0.15)
+    pixels = {name: visible_pixels(calibration.estimate, name, places, 0.15) for name in ("left", "right")}
     gaps = []
     for step in drawn(calibration, 1000):
         there = moved(calibration.estimate, posterior.keys, step)

@@ -15,7 +15,7 @@ from ceres_cal.model.keys import Key
 from ceres_cal.model.parameters import Estimate
 from ceres_cal.model.quantities import moved
 from ceres_cal.uncertainty import FieldMap, PhiProfile, Posterior
-from ceres_cal.uncertainty.maps import locate_slopes, shown_pixels, station_keys
+from ceres_cal.uncertainty.maps import locate_slopes, station_keys, visible_pixels
 
 BENT = 0.05  # relative sigma of phi up to which the quadratic picture holds (`uncertainty.assess` leaves it there)
 _PLACES = 7  # of a valley at which a promise is worked out
@@ -150,5 +150,5 @@ def _errors(known: Spread, slopes: Array) -> Errors:
 def _slopes(estimate: Estimate, grid: FieldMap, keys: tuple[Key, ...]) -> Array:
     """(N, 2, K) of the N places of the grid that the image shows."""
     x, y = np.meshgrid(grid.x_m, grid.y_m)
-    pixels = shown_pixels(estimate, grid.station, np.column_stack([x.ravel(), y.ravel()]), grid.height_m)
+    pixels = visible_pixels(estimate, grid.station, np.column_stack([x.ravel(), y.ravel()]), grid.height_m)
     return locate_slopes(estimate, keys, grid.station, pixels[np.isfinite(pixels[:, 0])], grid.height_m)

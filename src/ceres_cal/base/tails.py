@@ -14,6 +14,10 @@ from numpy.typing import ArrayLike
 
 from ceres_cal.base.arrays import Array
 
+NORMAL_95 = 1.959963984540054
+"""Half width, in standard deviations, of the interval that holds 95 % of a normal variable."""
+NORMAL_95_ONE_SIDED = 1.645
+"""Standard deviations that 95 % of a normal variable stay below."""
 _PARTS, _REACH = 40, 6.0  # of a mean over a normal variable: steps to either side, and how far in sigmas
 _TINY = 1e-300
 _MOST_TERMS = 20_000

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -25,7 +25,7 @@ from ceres_cal.calibration.file import (
 from ceres_cal.calibration.origin import Fit, Refitted, Rejected, package_versions
 from ceres_cal.model.parameters import Estimate, Options, make_layout
 from ceres_cal.model.priors import gather_priors, gather_stated, tolerances
-from ceres_cal.observations import Observations
+from ceres_cal.observations import Observations, taken
 from ceres_cal.observations.sights import gather_sights
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.files import CameraFile, PoseFile
@@ -88,11 +88,7 @@ class Calibration:
         Raises:
             InputError: no such station, or no name where there are several.
         """
-        if name is None and len(self.stations) == 1:
-            return next(iter(self.stations.values()))
-        if name is None or name not in self.stations:
-            raise InputError(f"station {name!r} is not there: there are {', '.join(map(repr, self.stations))}")
-        return self.stations[name]
+        return self.stations[self.estimate.station_name(name)]
 
     @cached_property
     def uncertainty(self) -> Uncertainty:
@@ -113,10 +109,12 @@ class Calibration:
         """
         if observations.digest != self.digest:
             raise InputError("these are not the observations that the calibration was made from: give those")
-        masks = self.inlier_masks(observations)
-        scales = (self.fit.point_scale, self.fit.curve_scale)
-        known = self.uncertainty
-        return disagreement(observations, known.estimate, known.posterior, masks, scales, first, second)
+        points, curves = self.inlier_masks(observations)
+        used = replace(
+            observations, points=taken(observations.points, points), curves=taken(observations.curves, curves)
+        )
+        known, scales = self.uncertainty, (self.fit.point_scale, self.fit.curve_scale)
+        return disagreement(used, known.estimate, known.posterior, scales, (first, second))
 
     def inlier_masks(self, observations: Observations) -> tuple[Mask, Mask]:
         """(N,) of points and (M,) of curve observations: which rows took part."""

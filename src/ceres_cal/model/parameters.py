@@ -138,6 +138,18 @@ class Estimate:
     def __post_init__(self) -> None:
         object.__setattr__(self, "placements", Poses.of(self.placements))  # which costs nothing from then on
 
+    def station_name(self, name: str | None) -> str:
+        """The name of a station; without one, that of the only one there is.
+
+        Raises:
+            InputError: no such station, or no name where there are several.
+        """
+        if name is None and len(self.stations) == 1:
+            return next(iter(self.stations))
+        if name is None or name not in self.stations:
+            raise InputError(f"station {name!r} is not there: there are {', '.join(map(repr, self.stations))}")
+        return name
+
     def camera_at(self, station: str, placement: str | None = None) -> Camera:
         """The station's camera in the world, or in the frame of a placement (its cam_from_world is cam_from_target)."""
         pose = self.stations[station].cam_from_world

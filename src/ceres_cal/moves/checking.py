@@ -20,16 +20,15 @@ from ceres_cal.model.keys import Key
 from ceres_cal.model.parameters import Estimate, Layout, intrinsic_names
 from ceres_cal.model.priors import GaussianPrior, tolerances
 from ceres_cal.moves.carried import posterior_of, require_same_things, with_structure
-from ceres_cal.moves.poses import Place, PoseSearch, movement, places
+from ceres_cal.moves.poses import PoseCandidate, PoseSearch, in_sigmas, movement, pose_candidates
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights, gather_sights
 from ceres_cal.scene.camera import Camera
 from ceres_cal.solve import Problem, Weighting, information, solve
-from ceres_cal.uncertainty.maps import shown_pixels
+from ceres_cal.uncertainty.maps import HEIGHTS_M, Grid, visible_pixels
 from ceres_cal.uncertainty.uncertainty import field_grid
 
 FALSE_ALARMS = 0.01
-HEIGHTS_M = (0.0, 0.15)
 # Of 2000 clean distances to a curve one is longer. At half of it too many good ones go, and false alarms rise (0.05
 # -> 0.075 of 80 cases); at double nothing changes.
 _INLIER_SIGMA = 3.5
@@ -74,10 +73,10 @@ class StationCheck:
     words: str
 
     @classmethod
-    def untold(cls, station: str, words: str, used: int = 0, outliers: int = 0) -> StationCheck:
-        """A station that does not hold, of which nothing more can be told."""
-        nothing, far = dict.fromkeys(HEIGHTS_M, (np.inf, np.inf)), (np.inf,) * 5
-        return cls(station, False, 0.0, np.inf, 0, used, outliers, *far, nothing, words)
+    def unknown(cls, station: str, words: str, used: int = 0, outliers: int = 0) -> StationCheck:
+        """A station that does not hold, of whose movement nothing is known."""
+        shifts, far = dict.fromkeys(HEIGHTS_M, (np.inf, np.inf)), (np.inf,) * 5
+        return cls(station, False, 0.0, np.inf, 0, used, outliers, *far, shifts, words)
 
 
 @dataclass(frozen=True)
@@ -94,7 +93,7 @@ class Check:
     @property
     def holds(self) -> bool:
         """Whether every station still is as it was."""
-        return all(found.holds for found in self.stations.values())
+        return all(station.holds for station in self.stations.values())
 
 
 def check(calibration: Calibration, observations: Observations, false_alarms: float = FALSE_ALARMS) -> Check:
@@ -171,65 +170,75 @@ class _Case:
 def _case(calibration: Calibration, observed: Observations, sight: Sights) -> _Case:
     key, old, posterior = sight.key, calibration.estimate, calibration.posterior
     assert posterior is not None
-    owners = {("camera", key.camera), ("station", key.station)}
-    kept = [k for k in posterior.keys if k[:2] in owners or k.kind == "structure"]
-    if not any(k.kind == "station" for k in kept):
+    own = posterior.keys_of(old, key.station)
+    if not posterior.knows_station(key.station):
         raise InputError(f"station {key.station!r} was held as the world: it cannot be said to have moved")
     structure = with_structure(old, observed, calibration.options)
     estimate = Estimate({key.camera: old.cameras[key.camera]}, {key.station: old.stations[key.station]}, {}, structure)
-    phi = ("camera", key.camera, "phi")
-    tested = tuple(k for k in kept if k[:2] == ("station", key.station) or k[:3] == phi)
+    tested = tuple(k for k in own if k.kind == "station" or k.quantity == "phi")
+    kept = [k for k in posterior.keys if k in own or k.kind == "structure"]
     return _Case(calibration, sight, estimate, posterior_of(calibration, kept), tested)
 
 
+@dataclass(frozen=True)
+class _Test:
+    """The outcome of a station's test: the first attributes of its `StationCheck`."""
+
+    holds: bool
+    probability: float
+    statistic: float
+    degrees: int
+    used: int
+    outliers: int
+    noise: float
+
+
 def _checked(calibration: Calibration, observed: Observations, sight: Sights, level: float) -> StationCheck:
-    case = _case(calibration, observed, sight)
-    fit = calibration.fit
+    case, fit = _case(calibration, observed, sight), calibration.fit
     search = PoseSearch(observed, sight, case.estimate, (fit.point_scale, fit.curve_scale))
-    near = places(search, [case.estimate.stations[case.name].cam_from_world], patience=0)
-    count = len(sight.point_rows) + len(sight.curve_rows)
-    points, curves = _inliers(search, near[0] if near else None)
-    used = sight.used(points, curves)
-    inside = int(np.count_nonzero(points) + np.count_nonzero(curves))
-    if inside < _LEAST_SHARE * count:
-        return _not_understood(case, inside, count)
+    near = pose_candidates(search, [case.estimate.stations[case.name].cam_from_world], patience=0)
+    used = sight.used(*_inliers(search, near[0])) if near else sight[:0]
+    inside, count = (len(s.point_rows) + len(s.curve_rows) for s in (used, sight))
     free = case.prior.without(case.tested)
-    old, new = case.estimate.stations[case.name].cam_from_world, near[0].pose
-    as_was, anew = case.least(used, case.prior, old), case.least(used, free, new)
+    anew = case.least(used, free, near[0].pose) if inside >= _LEAST_SHARE * count else None
     if anew is None:
         return _not_understood(case, inside, count)
-    degrees = _degrees(case, used, anew[1], free)
-    spare = 2 * len(used.point_rows) + len(used.curve_rows) - degrees
-    noise = float(np.sqrt(anew[0] / spare)) if spare > 0 else 1.0
-    noisy = spare > 0 and upper_tail(anew[0], spare) < _NOISY
-    statistic = np.inf if as_was is None else max(as_was[0] - anew[0], 0.0) / (noise**2 if noisy else 1.0)
-    assert calibration.posterior is not None
-    spare_of_noise = float(spare) if noisy else calibration.posterior.degrees_of_freedom
-    probability = 0.0 if np.isinf(statistic) else upper_tail(statistic, degrees, spare_of_noise)
+    test = _tested(case, used, anew, level, count - inside)
     # Sizes are stated with phi under what is known of it, where that will do: next to it a height says little.
-    posed = case.least(used, case.prior.without([key for key in case.tested if key.kind == "station"]), new)
-    at = posed[1] if posed is not None and posed[0] - anew[0] < _WILL_DO else anew[1]
-    return _answer(case, at, probability >= level, probability, float(statistic), degrees, inside, count, noise)
+    posed = case.least(used, case.prior.without([k for k in case.tested if k.kind == "station"]), near[0].pose)
+    return _answer(case, test, posed[1] if posed is not None and posed[0] - anew[0] < _WILL_DO else anew[1])
 
 
-def _inliers(search: PoseSearch, place: Place | None) -> tuple[Mask, Mask]:
-    """Which rows of the observations some pose near by explains."""
-    observations = search.observations
+def _tested(case: _Case, used: Sights, anew: tuple[float, Estimate], level: float, outliers: int) -> _Test:
+    """By how much the cost falls from the least one with the old pose and phi under what was known of them to that
+    with both free, `anew`, and how often it would fall as far.
+    """
+    least, estimate = anew
+    degrees = _degrees(case, used, estimate)
+    spare = used.equations - degrees
+    noise = float(np.sqrt(least / spare)) if spare > 0 else 1.0
+    noisy = spare > 0 and upper_tail(least, spare) < _NOISY
+    as_was = case.least(used, case.prior, case.estimate.stations[case.name].cam_from_world)
+    statistic = np.inf if as_was is None else max(as_was[0] - least, 0.0) / (noise**2 if noisy else 1.0)
+    spare_of_noise = float(spare) if noisy else case.calibration.uncertainty.posterior.degrees_of_freedom
+    probability = 0.0 if np.isinf(statistic) else upper_tail(statistic, degrees, spare_of_noise)
+    inside = len(used.point_rows) + len(used.curve_rows)
+    return _Test(probability >= level, probability, float(statistic), degrees, inside, outliers, noise)
+
+
+def _inliers(search: PoseSearch, near: PoseCandidate) -> tuple[Mask, Mask]:
+    """Which rows of the observations a pose near by explains."""
+    observations, sight = search.observations, search.sight
     points, curves = (np.zeros(len(c), dtype=bool) for c in (observations.points, observations.curves))
-    if place is None:
-        return points, curves
-    there, sight = search.residuals(place.pose), search.sight
-    limit = _INLIER_SIGMA * max(1.0, min(place.scale, 2.0))
-    with np.errstate(invalid="ignore"):
-        p = np.linalg.norm(there.points[sight.point_rows], axis=1) <= limit * search.scales[0] * sight.sigma_px
-        c = np.abs(there.curves[sight.curve_rows]) <= limit * search.scales[1] * sight.curve_sigma_px
-    points[sight.point_rows], curves[sight.curve_rows] = p, c
+    limit = _INLIER_SIGMA * max(1.0, min(near.scale, 2.0))
+    in_points, in_curves = in_sigmas(sight, search.residuals(near.pose), search.scales)
+    points[sight.point_rows], curves[sight.curve_rows] = in_points <= limit, in_curves <= limit  # NaN is not
     return points, curves
 
 
-def _degrees(case: _Case, used: Sights, estimate: Estimate, free: GaussianPrior) -> int:
+def _degrees(case: _Case, used: Sights, estimate: Estimate) -> int:
     """How many of the tested numbers' directions both the old posterior and the new observations determine."""
-    new = information(case.problem(used, free), estimate).shared
+    new = information(case.problem(used, case.prior.without(case.tested)), estimate).shared
     ranks = [about.marginal(case.tested).known_rank for about in (new, case.prior.information)]
     return max(min(ranks), 1)
 
@@ -242,69 +251,54 @@ def _not_understood(case: _Case, inside: int, count: int) -> StationCheck:
         f"moved far, or not understood: only {inside} of {count} observations fit the known lens from anywhere near: "
         "refit, or check labels and camera"
     )
-    return StationCheck.untold(case.name, words, inside, count - inside)
+    return StationCheck.unknown(case.name, words, inside, count - inside)
 
 
-def _answer(
-    case: _Case,
-    anew: Estimate,
-    holds: bool,
-    probability: float,
-    statistic: float,
-    degrees: int,
-    inside: int,
-    count: int,
-    noise: float,
-) -> StationCheck:
+def _answer(case: _Case, test: _Test, anew: Estimate) -> StationCheck:
     old, new = case.estimate.camera_at(case.name), anew.camera_at(case.name)
     shift_m, turn = movement(new.cam_from_world, old.cam_from_world)
-    maps = {
-        height_m: _map_shift_mm(case.estimate.camera_at(case.name), new, _field_grid(case, height_m), height_m)
-        for height_m in HEIGHTS_M
-    }
-    floor = _field_grid(case, 0.0)
-    pixels = np.linalg.norm(old.project(floor) - new.project(floor), axis=1)
-    seen = pixels[np.isfinite(pixels)]
-    shift_px = float(np.sqrt(np.mean(seen**2))) if len(seen) else np.nan
-    worst = maps[0.0][1]
-    words = (
-        f"holds: no movement beyond what is known ({worst:.1f} mm on the floor at most, probability {probability:.2g})"
-        if holds
-        else f"no longer holds: moved by about {1e3 * shift_m:.1f} mm and {np.degrees(turn):.3f} deg, "
-        f"which shifts the map by up to {worst:.1f} mm on the floor (probability {probability:.1g})"
-    )
-    if count - inside > _MANY_OUTLIERS * count:
-        words += f"; but {count - inside} of {count} observations fit nowhere: check labels"
+    maps = {height_m: _map_shift_mm(old, new, _visible_places(case, height_m)) for height_m in HEIGHTS_M}
+    floor = _visible_places(case, 0.0)
+    shift_px = np.linalg.norm(old.project(floor) - new.project(floor), axis=1)
+    shift_px = shift_px[np.isfinite(shift_px)]
     return StationCheck(
         case.name,
-        holds,
-        probability,
-        statistic,
-        degrees,
-        inside,
-        count - inside,
-        noise,
-        1e3 * shift_m,
-        float(np.degrees(turn)),
-        new.phi / old.phi - 1.0,
-        shift_px,
-        maps,
-        words,
+        **vars(test),
+        moved_mm=1e3 * shift_m,
+        turned_deg=float(np.degrees(turn)),
+        phi_change=new.phi / old.phi - 1.0,
+        shift_px=float(np.sqrt(np.mean(shift_px**2))) if len(shift_px) else np.nan,
+        shift_mm=maps,
+        words=_words(test, f"{1e3 * shift_m:.1f} mm and {np.degrees(turn):.3f} deg", maps[0.0][1]),
     )
 
 
-def _field_grid(case: _Case, height_m: float) -> Array:
+def _words(test: _Test, movement: str, worst_mm: float) -> str:
+    if test.holds:
+        probability = f"probability {test.probability:.2g}"
+        words = f"holds: no movement beyond what is known ({worst_mm:.1f} mm on the floor at most, {probability})"
+    else:
+        shift = f"shifts the map by up to {worst_mm:.1f} mm on the floor (probability {test.probability:.1g})"
+        words = f"no longer holds: moved by about {movement}, which {shift}"
+    count = test.used + test.outliers
+    if test.outliers > _MANY_OUTLIERS * count:
+        words += f"; but {test.outliers} of {count} observations fit nowhere: check labels"
+    return words
+
+
+def _visible_places(case: _Case, height_m: float) -> Array:
     """Places (N, 3) of the map's grid that the station sees."""
-    grid = field_grid(case.calibration.targets)
-    x, y = (part.ravel() for part in np.meshgrid(*grid))
-    places_seen = np.column_stack([x, y])
-    visible = np.isfinite(shown_pixels(case.estimate, case.name, places_seen, height_m)[:, 0])
-    return np.column_stack([places_seen[visible], np.full(np.count_nonzero(visible), height_m)])
+    places = Grid(height_m, *field_grid(case.calibration.targets)).places
+    visible = np.isfinite(visible_pixels(case.estimate, case.name, places, height_m)[:, 0])
+    return np.column_stack([places[visible], np.full(np.count_nonzero(visible), height_m)])
 
 
-def _map_shift_mm(old: Camera, new: Camera, seen: Array, height_m: float) -> tuple[float, float]:
-    """Mean and largest distance (mm) between where the old and the new camera locate the same pixels."""
-    pixels = old.project(seen)
-    off = 1e3 * np.linalg.norm(new.locate(pixels, height_m) - seen[:, :2], axis=1)
+def _map_shift_mm(old: Camera, new: Camera, places: Array) -> tuple[float, float]:
+    """Mean and largest distance (mm) between where the old and the new camera locate the pixels of places (N, 3) of
+    one height.
+    """
+    if not len(places):
+        return np.nan, np.nan
+    off = 1e3 * np.linalg.norm(new.locate(old.project(places), places[0, 2]) - places[:, :2], axis=1)
     off = off[np.isfinite(off)]
     return (float(np.mean(off)), float(np.max(off))) if len(off) else (np.nan, np.nan)

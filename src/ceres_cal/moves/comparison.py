@@ -13,12 +13,10 @@ from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.tails import upper_tail
 from ceres_cal.calibration import Calibration
-from ceres_cal.model.information import Information
-from ceres_cal.model.keys import Key
 from ceres_cal.model.parameters import Estimate
 from ceres_cal.model.quantities import difference
 from ceres_cal.moves.poses import movement
-from ceres_cal.uncertainty.maps import field_map, shown_pixels
+from ceres_cal.uncertainty.maps import Grid, field_map, visible_pixels
 from ceres_cal.uncertainty.uncertainty import field_grid
 
 # Probability below which uncertainty alone does not explain a difference; that often two sound calibrations differ.
@@ -27,12 +25,11 @@ _DOUBTFUL = 0.01
 
 
 @dataclass(frozen=True, eq=False)
-class StationComparison:
-    """One station in two calibrations, a and b.
+class StationComparison(Grid):
+    """One station in two calibrations, a and b, and a map of their difference.
 
     Attributes:
         moved_mm, turned_deg: from a to b. phi_px: of a and of b.
-        height_m, x_m (X,), y_m (Y,): the map's height and grid.
         difference_mm: (Y, X, 2) where b locates what a sees there, less the place itself; NaN where a does not show it.
         expected_mm: (Y, X) standard deviation of its length if nothing but noise lies between a and b, whose errors
             count as independent; NaN where that cannot be said.
@@ -44,9 +41,6 @@ class StationComparison:
     moved_mm: float
     turned_deg: float
     phi_px: tuple[float, float]
-    height_m: float
-    x_m: Array
-    y_m: Array
     difference_mm: Array
     expected_mm: Array
     probability: float | None
@@ -102,61 +96,42 @@ def _listed(names: Sequence[str]) -> str:
 
 def _compared(a: Calibration, b: Calibration, station: str, height_m: float) -> StationComparison:
     first, second = a.station(station), b.station(station)
-    x, y = field_grid(a.targets)
-    places = np.column_stack([part.ravel() for part in np.meshgrid(x, y)])
-    pixels = shown_pixels(a.estimate, station, places, height_m)
-    off = 1e3 * (second.locate(pixels, height_m) - places)
+    grid = Grid(height_m, *field_grid(a.targets))
+    pixels = visible_pixels(a.estimate, station, grid.places, height_m)
+    off = 1e3 * (second.locate(pixels, height_m) - grid.places)
     shift_m, turn = movement(second.cam_from_world, first.cam_from_world)
+    known = [c for c in (a, b) if c.posterior is not None and c.posterior.knows_station(station)]
     return StationComparison(
+        height_m,
+        grid.x_m,
+        grid.y_m,
         station,
         1e3 * shift_m,
         float(np.degrees(turn)),
         (first.phi, second.phi),
-        height_m,
-        x,
-        y,
-        off.reshape(len(y), len(x), 2),
-        _expected_mm(a, b, station, height_m, x, y),
-        _probability(a, b, station),
+        off.reshape(*grid.shape, 2),
+        _expected_mm(a, b, station, grid) if len(known) == 2 else np.full(grid.shape, np.nan),
+        _probability(a, b, station) if len(known) == 2 else None,
     )
 
 
-def _is_known(calibration: Calibration, station: str) -> bool:
-    posterior = calibration.posterior
-    return posterior is not None and any(key[:2] == ("station", station) for key in posterior.keys)
-
-
-def _expected_mm(a: Calibration, b: Calibration, station: str, height_m: float, x: Array, y: Array) -> Array:
-    if not (_is_known(a, station) and _is_known(b, station)):
-        return np.full((len(y), len(x)), np.nan)
-    maps = [field_map(c.estimate, c.posterior, station, height_m, x, y).sd_mm for c in (a, b) if c.posterior]
+def _expected_mm(a: Calibration, b: Calibration, station: str, grid: Grid) -> Array:
+    maps = [field_map(c.estimate, c.uncertainty.posterior, station, grid).sd_mm for c in (a, b)]
     return np.asarray(np.hypot(*maps))
 
 
 def _probability(a: Calibration, b: Calibration, station: str) -> float | None:
     """Of a chi-squared as large: the difference d under (A^-1 + B^-1)^-1 = A (A + B)^+ B, which needs no inverse of
-    either information where a direction is not told.
+    either information where a direction is unknown.
     """
-    if not (_is_known(a, station) and _is_known(b, station)):
+    keys, others = (c.uncertainty.posterior.keys_of(c.estimate, station) for c in (a, b))
+    if set(keys) != set(others):
         return None
-    keys = _keys(a, station)
-    if set(keys) != set(_keys(b, station)):
-        return None
-    first, second = (_known(calibration).marginal(keys) for calibration in (a, b))
+    first, second = (c.uncertainty.posterior.information.marginal(keys) for c in (a, b))
     both = first.matrix @ (first + second).inverse @ second.matrix
     off = difference(_only(b, station), _only(a, station), keys)
     degrees = min(first.known_rank, second.known_rank)
     return upper_tail(float(off @ both @ off), degrees) if degrees > 0 else None
-
-
-def _known(calibration: Calibration) -> Information:
-    assert calibration.posterior is not None
-    return calibration.posterior.information
-
-
-def _keys(calibration: Calibration, station: str) -> list[Key]:
-    owners = {("station", station), ("camera", calibration.estimate.stations[station].camera)}
-    return [key for key in _known(calibration).keys if key[:2] in owners]
 
 
 def _only(calibration: Calibration, station: str) -> Estimate:

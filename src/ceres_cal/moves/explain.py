@@ -18,7 +18,7 @@ from ceres_cal.model.parameters import Estimate
 from ceres_cal.model.residuals import residuals
 from ceres_cal.moves.carried import RefitPlan
 from ceres_cal.moves.labels import MIRRORED, TURNED, mistaken_targets, relabelled
-from ceres_cal.moves.poses import Place, PoseSearch, misfit, movement, places
+from ceres_cal.moves.poses import PoseCandidate, PoseSearch, misfit, movement, pose_candidates
 from ceres_cal.observations import Observations, taken
 from ceres_cal.observations.sights import gather_sights
 
@@ -57,12 +57,12 @@ WORDS = {
 }
 
 
-def labels_turned(found: Pose, old: Pose) -> tuple[float, float] | None:
+def labels_turned(pose: Pose, old: Pose) -> tuple[float, float] | None:
     """How far (m) the camera moved with the labels as given and with the field's labels turned by half a turn, where
     the latter is the likelier story: a camera at its place, not one across the field.
     """
-    given_m, _ = movement(found, old)
-    turned_m, turn = movement(found @ _TURN, old)
+    given_m, _ = movement(pose, old)
+    turned_m, turn = movement(pose @ _TURN, old)
     likelier = given_m > _FAR_M and turned_m < min(_NEAR_M, given_m / 3.0) and turn < _NEAR_RAD
     return (given_m, turned_m) if likelier else None
 
@@ -113,7 +113,7 @@ def _others(plan: RefitPlan, search: PoseSearch) -> Iterator[str]:
     for name, observations in mistaken_targets(search.observations).items():
         if _fits(_seen_as(search, observations), old):
             yield f"on {name} they do: this is the wrong field: correct the target's dimensions"
-    zoomed = zoomed_place(search, old)
+    zoomed = zoomed_search(search, old)
     if zoomed is not None and _good(zoomed[1]) and plan.what not in ("zoom", "everything"):
         phi = zoomed[0].camera.phi
         before = search.camera.phi
@@ -130,13 +130,13 @@ def _others(plan: RefitPlan, search: PoseSearch) -> Iterator[str]:
 
 
 def _fits(search: PoseSearch, old: list[Pose]) -> bool:
-    found = places(search, old, patience=0)
-    return bool(found) and _good(found[0])
+    candidates = pose_candidates(search, old, patience=0)
+    return bool(candidates) and _good(candidates[0])
 
 
-def _good(place: Place) -> bool:
+def _good(candidate: PoseCandidate) -> bool:
     """Whether a pose explains the observations about as well as the old calibration did its own."""
-    return place.fits and place.scale < _NOISIER
+    return candidate.fits and candidate.scale < _NOISIER
 
 
 def _seen_as(search: PoseSearch, observations: Observations) -> PoseSearch:
@@ -168,16 +168,16 @@ def _of_camera(search: PoseSearch) -> Observations:
     )
 
 
-def zoomed_place(search: PoseSearch, old: list[Pose]) -> tuple[PoseSearch, Place] | None:
+def zoomed_search(search: PoseSearch, old: list[Pose]) -> tuple[PoseSearch, PoseCandidate] | None:
     """The search with the phi that explains it best, and the pose there; None where none explains half of it."""
-    best: tuple[PoseSearch, Place] | None = None
+    best: tuple[PoseSearch, PoseCandidate] | None = None
     for width in (2.0, 1.05, 1.008):  # each grid is finer, around the best of the one before
         middle = search.camera.phi if best is None else best[0].camera.phi
         for phi in middle * np.geomspace(1.0 / width, width, _ZOOMS):
             zoomed = search.with_camera(replace(search.camera, phi=float(phi)))
-            for place in places(zoomed, old, patience=0)[:1]:
-                if best is None or place.misfit < best[1].misfit:
-                    best = zoomed, place
+            for candidate in pose_candidates(zoomed, old, patience=0)[:1]:
+                if best is None or candidate.misfit < best[1].misfit:
+                    best = zoomed, candidate
     return best if best is not None and best[1].share >= _HALF else None
 
 
@@ -186,7 +186,7 @@ def zoomed_place(search: PoseSearch, old: list[Pose]) -> tuple[PoseSearch, Place
 
 @dataclass(frozen=True)
 class Judged:
-    """How a solved refit stands to what was known.
+    """How a solved refit stands to what was known before.
 
     Attributes:
         strain: squared distance of intrinsics, structure and stations that stay from their prior, in its sigmas.
@@ -199,7 +199,7 @@ class Judged:
 
     @property
     def noisy(self) -> bool:
-        """Whether the noise is worth a word."""
+        """Whether the noise is to be named."""
         return self.noise > _NOISIER
 
     @property
@@ -262,9 +262,9 @@ def _scores(plan: RefitPlan, results: Mapping[str, Calibration]) -> dict[str, fl
     count = len(sights.point_rows) + len(sights.curve_rows)
     scores = {}
     for what, result in results.items():
-        found = residuals(plan.observations, sights, result.estimate)
+        there = residuals(plan.observations, sights, result.estimate)
         total = 0.5 * judged(plan, what, result).strain + 0.5 * len(plan.loosened(what)) * np.log(count)
         for name in sights.cameras:
-            total += misfit(sights.of_camera(name), result.cameras[name], found, scales)
+            total += misfit(sights.of_camera(name), result.cameras[name], there, scales)
         scores[what] = float(total)
     return scores

@@ -17,29 +17,29 @@ _LOW, _HIGH = (247, 251, 255), (8, 48, 107)  # white to dark blue: readable in g
 _PAINT = "#d55e00"
 
 
-def picture(found: StationComparison, targets: Mapping[str, Target]) -> str:
+def picture(comparison: StationComparison, targets: Mapping[str, Target]) -> str:
     """The map of one station as SVG text."""
-    x, y = found.x_m, found.y_m
+    x, y = comparison.x_m, comparison.y_m
     left, top = x[0] - _MARGIN_M, y[-1] + _MARGIN_M
     width, height = (_SCALE * (np.ptp(v) + 2.0 * _MARGIN_M) for v in (x, y))
-    worst = found.worst_mm if np.isfinite(found.worst_mm) and found.worst_mm > 0.0 else 1.0
+    worst = comparison.worst_mm if np.isfinite(comparison.worst_mm) and comparison.worst_mm > 0.0 else 1.0
     parts = [
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width:.0f} {height + 40:.0f}"',
         f'  width="{width:.0f}" height="{height + 40:.0f}" font-family="sans-serif">',
         f'<rect width="{width:.0f}" height="{height + 40:.0f}" fill="#ffffff"/>',
-        *_cells(found, left, top, worst),
+        *_cells(comparison, left, top, worst),
         *_field(targets, left, top),
-        *_legend(found, worst, height),
+        *_legend(comparison, worst, height),
         "</svg>",
     ]
     return "\n".join(parts) + "\n"
 
 
-def _cells(found: StationComparison, left: float, top: float, worst: float) -> Iterator[str]:
-    dx, dy = (float(v[1] - v[0]) for v in (found.x_m, found.y_m))
-    for row, y in enumerate(found.y_m):
-        for column, x in enumerate(found.x_m):
-            value = found.length_mm[row, column]
+def _cells(comparison: StationComparison, left: float, top: float, worst: float) -> Iterator[str]:
+    dx, dy = (float(v[1] - v[0]) for v in (comparison.x_m, comparison.y_m))
+    for row, y in enumerate(comparison.y_m):
+        for column, x in enumerate(comparison.x_m):
+            value = comparison.length_mm[row, column]
             if np.isfinite(value):
                 at = f'x="{_SCALE * (x - 0.5 * dx - left):.1f}" y="{_SCALE * (top - y - 0.5 * dy):.1f}"'
                 size = f'width="{_SCALE * dx + 0.5:.1f}" height="{_SCALE * dy + 0.5:.1f}"'
@@ -56,17 +56,17 @@ def _field(targets: Mapping[str, Target], left: float, top: float) -> Iterator[s
         if target.movable:
             continue
         for curve in target.curves.values():
-            places = curve_points(curve, 0, 59 if isinstance(curve, Arc) else 1)
-            path = " ".join(f"{_SCALE * (px - left):.1f},{_SCALE * (top - py):.1f}" for px, py, _ in places)
+            points = curve_points(curve, 0, 59 if isinstance(curve, Arc) else 1)
+            path = " ".join(f"{_SCALE * (px - left):.1f},{_SCALE * (top - py):.1f}" for px, py, _ in points)
             yield f'<polyline points="{path}" fill="none" stroke="{_PAINT}" stroke-width="1.5"/>'
 
 
-def _legend(found: StationComparison, worst: float, height: float) -> Iterator[str]:
+def _legend(comparison: StationComparison, worst: float, height: float) -> Iterator[str]:
     for step in range(_STEPS):
         share = (step + 0.5) / _STEPS
         yield f'<rect x="{20 + 30 * step}" y="{height:.0f}" width="30" height="14" fill="{_colour(share)}"/>'
     yield f'<text x="20" y="{height + 30:.0f}" font-size="13">0</text>'
     yield f'<text x="{20 + 30 * _STEPS}" y="{height + 30:.0f}" font-size="13" text-anchor="end">{worst:.2f} mm</text>'
-    name = found.station.replace("&", "&amp;").replace("<", "&lt;")
-    words = f"{name}, {1e3 * found.height_m:.0f} mm above the floor: {found.mean_mm:.2f} mm on average"
+    name = comparison.station.replace("&", "&amp;").replace("<", "&lt;")
+    words = f"{name}, {1e3 * comparison.height_m:.0f} mm above the floor: {comparison.mean_mm:.2f} mm on average"
     yield f'<text x="{50 + 30 * _STEPS}" y="{height + 12:.0f}" font-size="14">{words}</text>'

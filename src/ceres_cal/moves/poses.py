@@ -39,7 +39,7 @@ _ROUNDS = 4  # of the closed form's reweighting
 
 
 @dataclass(frozen=True, eq=False)
-class Place:
+class PoseCandidate:
     """A pose that a station may have.
 
     Attributes:
@@ -98,7 +98,7 @@ class PoseSearch:
         return residuals(self.observations, self.sight, there)
 
 
-def places(search: PoseSearch, old: Sequence[Pose], patience: int = 2) -> list[Place]:
+def pose_candidates(search: PoseSearch, old: Sequence[Pose], patience: int = 2) -> list[PoseCandidate]:
     """Poses that come into question, best first, each once.
 
     Args:
@@ -107,11 +107,11 @@ def places(search: PoseSearch, old: Sequence[Pose], patience: int = 2) -> list[P
     """
     seeds = [*old, *(turn for pose in old for turn in _turned(pose))]
     closed = closed_form(search)
-    found = _settled(search, [*seeds, *([closed] if closed is not None else [])])
-    if patience and not (found and found[0].fits):
+    candidates = _refined(search, [*seeds, *([closed] if closed is not None else [])])
+    if patience and not (candidates and candidates[0].fits):
         around = [turn for pose in seeds for turn in _grid(pose)]
-        found = _distinct([*found, *_settled(search, around)])
-    return found
+        candidates = _distinct([*candidates, *_refined(search, around)])
+    return candidates
 
 
 def _turned(pose: Pose) -> list[Pose]:
@@ -148,14 +148,14 @@ def closed_form(search: PoseSearch) -> Pose | None:
     return None if homography is None else pose_from_homography(homography)
 
 
-def _settled(search: PoseSearch, poses: Sequence[Pose]) -> list[Place]:
+def _refined(search: PoseSearch, poses: Sequence[Pose]) -> list[PoseCandidate]:
     """Each candidate at its best, best first; those from which something cannot be seen are left out."""
     stack = np.array([pose.matrix for pose in poses])
     for wide in _WIDE:
         stack = _searched(search, stack, Weighting(*search.scales, "huber", wide), 1e-3)
     stack = _searched(search, stack, Weighting(*search.scales, "cauchy", 2.0), 1e-8)
-    found = [Pose(matrix[:, :3], matrix[:, 3]) for matrix in stack]
-    return _distinct([place_of(search, pose) for pose in found if search.allows(pose)])
+    refined = [Pose(matrix[:, :3], matrix[:, 3]) for matrix in stack]
+    return _distinct([candidate_at(search, pose) for pose in refined if search.allows(pose)])
 
 
 def _searched(search: PoseSearch, stack: Array, weighting: Weighting, tolerance: float) -> Array:
@@ -168,30 +168,36 @@ def _searched(search: PoseSearch, stack: Array, weighting: Weighting, tolerance:
     world = search.estimate.stations[key.station].cam_from_world
     placements = {k.placement: world for k in keys if k.placement is not None}
     estimate = replace(search.estimate, placements=placements).with_placements(keys, stack)
-    costs, found = placement_costs(replace(many, keys=keys), estimate, weighting, stack, tolerance)
-    return found[np.isfinite(costs)]
+    costs, refined = placement_costs(replace(many, keys=keys), estimate, weighting, stack, tolerance)
+    return refined[np.isfinite(costs)]
 
 
-def place_of(search: PoseSearch, pose: Pose) -> Place:
+def candidate_at(search: PoseSearch, pose: Pose) -> PoseCandidate:
     """How well a pose explains the sight."""
-    sight, found = search.sight, search.residuals(pose)
-    points = np.linalg.norm(found.points[sight.point_rows], axis=1) / (sight.sigma_px * search.scales[0])
-    curves = np.abs(found.curves[sight.curve_rows]) / (sight.curve_sigma_px * search.scales[1])
+    there = search.residuals(pose)
+    points, curves = in_sigmas(search.sight, there, search.scales)
     lengths = np.nan_to_num(np.concatenate([points / 1.1774, curves / 0.6745]), nan=np.inf)
     scale = float(np.median(lengths))
     sigmas = np.nan_to_num(np.concatenate([points, curves]), nan=np.inf)
     share = float(np.mean(sigmas <= _FITS_SIGMA * np.clip(scale, 1.0, _FITS_SCALE)))
-    return Place(pose, misfit(search.sight, search.camera, found, search.scales), scale, share)
+    return PoseCandidate(pose, misfit(search.sight, search.camera, there, search.scales), scale, share)
 
 
-def misfit(sights: Sights, camera: Camera, found: Residuals, scales: tuple[float, float]) -> float:
+def in_sigmas(sights: Sights, there: Residuals, scales: tuple[float, float]) -> tuple[Array, Array]:
+    """(N,) of the sights' points and (M,) of their curve observations: lengths of the residuals at these noise scales,
+    in standard deviations.
+    """
+    points = np.linalg.norm(there.points[sights.point_rows], axis=1) / (scales[0] * sights.sigma_px)
+    return points, np.abs(there.curves[sights.curve_rows]) / (scales[1] * sights.curve_sigma_px)
+
+
+def misfit(sights: Sights, camera: Camera, there: Residuals, scales: tuple[float, float]) -> float:
     """Negative log likelihood of a camera's residuals at these noise scales, each observation a stray with a small
     probability; in nats.
     """
     width, height = camera.image_size
+    points, curves = in_sigmas(sights, there, scales)
     p, c = sights.sigma_px * scales[0], sights.curve_sigma_px * scales[1]
-    points = np.linalg.norm(found.points[sights.point_rows], axis=1) / p
-    curves = np.abs(found.curves[sights.curve_rows]) / c
     total = 0.0
     for lengths, inside, stray in (
         (points, 1.0 / (2.0 * np.pi * p**2), 1.0 / (width * height)),
@@ -202,12 +208,12 @@ def misfit(sights: Sights, camera: Camera, found: Residuals, scales: tuple[float
     return total
 
 
-def _distinct(found: Sequence[Place]) -> list[Place]:
-    """The places, best first, without repetitions."""
-    kept: list[Place] = []
-    for place in sorted(found, key=lambda p: p.misfit):
-        if not any(_alike(place.pose, other.pose) for other in kept):
-            kept.append(place)
+def _distinct(candidates: Sequence[PoseCandidate]) -> list[PoseCandidate]:
+    """The candidates, best first, without repetitions."""
+    kept: list[PoseCandidate] = []
+    for candidate in sorted(candidates, key=lambda c: c.misfit):
+        if not any(_alike(candidate.pose, other.pose) for other in kept):
+            kept.append(candidate)
     return kept
 
 

@@ -17,9 +17,16 @@ from ceres_cal.calibrating import Again, solved_from
 from ceres_cal.calibration import Calibration, Refitted
 from ceres_cal.model.parameters import Estimate
 from ceres_cal.moves.carried import RefitPlan, first_estimate, make_plan, refit_problem
-from ceres_cal.moves.explain import judged, old_poses, require_labels, require_supported, why_nothing_fits, zoomed_place
+from ceres_cal.moves.explain import (
+    judged,
+    old_poses,
+    require_labels,
+    require_supported,
+    why_nothing_fits,
+    zoomed_search,
+)
 from ceres_cal.moves.labels import TURNED, relabelled
-from ceres_cal.moves.poses import PoseSearch, equations, movement, places
+from ceres_cal.moves.poses import PoseSearch, equations, movement, pose_candidates
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.observations.sights import Sights, gather_sights
 from ceres_cal.solve import Progress
@@ -122,12 +129,12 @@ def _start(plan: RefitPlan, sights: Sights, *, check_labels: bool) -> Estimate:
 
 def _moved_sights(plan: RefitPlan, sights: Sights) -> list[Sights]:
     """What each station that moved sees of the world."""
-    found = {name: sight for name, sight in sights.of_world.items() if name in plan.moved}
-    for name in sorted(plan.moved - found.keys()):
+    moved = {name: sight for name, sight in sights.of_world.items() if name in plan.moved}
+    for name in sorted(plan.moved - moved.keys()):
         raise DegenerateError(
             f"station {name!r} sees nothing that lies in the world: observe lines or points of the field with it"
         )
-    return list(found.values())
+    return list(moved.values())
 
 
 def _search_of(plan: RefitPlan, sight: Sights, estimate: Estimate) -> PoseSearch:
@@ -137,14 +144,14 @@ def _search_of(plan: RefitPlan, sight: Sights, estimate: Estimate) -> PoseSearch
 def _sought(plan: RefitPlan, search: PoseSearch) -> tuple[PoseSearch, Pose]:
     """The search as it is understood, and the station's pose there."""
     old = old_poses(plan, search)
-    found = places(search, old)
-    fitting = [place for place in found if place.fits and place.misfit <= found[0].misfit + _NATS_ALIKE]
+    candidates = pose_candidates(search, old)
+    fitting = [c for c in candidates if c.fits and c.misfit <= candidates[0].misfit + _NATS_ALIKE]
     if fitting:
-        pose = min(fitting, key=lambda place: _far(place.pose, old)).pose
+        pose = min(fitting, key=lambda candidate: _far(candidate.pose, old)).pose
         _require_unique(search, pose, old)
         return search, pose
     if plan.what in ("zoom", "iris", "everything"):
-        zoomed = zoomed_place(search, old)
+        zoomed = zoomed_search(search, old)
         if zoomed is not None:
             return zoomed[0], zoomed[1].pose
     raise why_nothing_fits(plan, [search])
@@ -177,17 +184,18 @@ def _far(pose: Pose, old: list[Pose]) -> float:
 
 def _placements(plan: RefitPlan, sights: Sights, estimate: Estimate) -> dict[str, Pose]:
     """Every placement that the observations show, from the first sight that can tell its pose."""
-    found: dict[str, Pose] = {}
+    poses: dict[str, Pose] = {}
     for number, key in enumerate(sights.keys):
-        if key.placement is None or key.placement in found:
+        if key.placement is None or key.placement in poses:
             continue
-        seen = places(_search_of(plan, sights[number], replace(estimate, placements={})), [], patience=0)
-        if seen:
-            found[key.placement] = estimate.stations[key.station].cam_from_world.inverse @ seen[0].pose
+        search = _search_of(plan, sights[number], replace(estimate, placements={}))
+        candidates = pose_candidates(search, [], patience=0)
+        if candidates:
+            poses[key.placement] = estimate.stations[key.station].cam_from_world.inverse @ candidates[0].pose
     for key in sights.keys:
-        if key.placement is not None and key.placement not in found:
+        if key.placement is not None and key.placement not in poses:
             raise DegenerateError(f"{key}: its pose cannot be told: show at least four points, not on one line")
-    return found
+    return poses
 
 
 # ---- what came out --------------------------------------------------------------------------------------------------
@@ -196,8 +204,8 @@ def _placements(plan: RefitPlan, sights: Sights, estimate: Estimate) -> dict[str
 def _require_known(plan: RefitPlan, result: Calibration) -> None:
     """Raise DegenerateError where the observations leave a pose open."""
     assert result.posterior is not None
-    for place, key in enumerate(result.posterior.keys):
-        if key.kind == "station" and key.owner in plan.moved and not np.isfinite(result.posterior.sd[place]):
+    for key, sd in zip(result.posterior.keys, result.posterior.sd.tolist(), strict=True):
+        if key.kind == "station" and key.owner in plan.moved and not np.isfinite(sd):
             raise DegenerateError(
                 f"station {key.owner!r}: the observations do not tell its {key.quantity.replace('_', ' ')}: "
                 "add points, or lines in another direction"
@@ -222,17 +230,17 @@ def _explained(plan: RefitPlan, result: Calibration) -> str:
 
 def movements(before: Calibration, after: Calibration) -> dict[str, tuple[float, float]]:
     """How far (m) and by how much (degrees) each station that both have stands elsewhere."""
-    found = {}
+    moves = {}
     for name, station in after.estimate.stations.items():
         if name in before.estimate.stations:
             old = before.estimate.stations[name].cam_from_world
             shift_m, turn = movement(station.cam_from_world, old)
-            found[name] = (shift_m, float(np.degrees(turn)))
-    return found
+            moves[name] = (shift_m, float(np.degrees(turn)))
+    return moves
 
 
 def _warnings(plan: RefitPlan, result: Calibration) -> tuple[str, ...]:
     """Those of the solve, and what the noise says."""
-    found = judged(plan, plan.what, result)
-    noisy = f"the noise is {found.noise:.1f} times that of the calibration before"
-    return (*result.warnings, noisy) if found.noisy else result.warnings
+    judgement = judged(plan, plan.what, result)
+    noisy = f"the noise is {judgement.noise:.1f} times that of the calibration before"
+    return (*result.warnings, noisy) if judgement.noisy else result.warnings

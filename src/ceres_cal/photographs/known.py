@@ -142,7 +142,7 @@ def check_photographs(
         f"not found: no field within {_REACH} of where it was in {_counted(len(images))}: the camera has moved "
         "farther, or it sees no field (dark, covered, other lines): look at the picture"
     )
-    return Check(false_alarms, {found.station: StationCheck.untold(found.station, words)}), found
+    return Check(false_alarms, {found.station: StationCheck.unknown(found.station, words)}), found
 
 
 def is_painted(target: Target) -> bool:

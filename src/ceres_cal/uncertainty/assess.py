@@ -25,7 +25,7 @@ def assess(
 
     Nearly frontal views can be fitted a little better by a camera a hand's breadth over the floor, or in the clouds,
     than by the true one. Where the least cost lies at a phi that no lens has, or the observations say nothing of phi as
-    far as lenses go, the place of the valley within the 95 % bound that is nearest to a usual lens is taken; the
+    far as lenses go, the node of the valley within the 95 % bound that is nearest to a usual lens is taken; the
     posterior says that phi is unknown.
 
     Args:
@@ -59,7 +59,7 @@ def _is_lens(camera: Camera) -> bool:
 
 
 def _usual(name: str, nodes: Sequence[Node], width: float) -> Estimate:
-    """Of the places within the 95 % bound the one whose phi is nearest to a usual lens'."""
+    """Of the nodes within the 95 % bound the one whose phi is nearest to a usual lens'."""
     least = min(node.cost for node in nodes)
     possible = [node.estimate for node in nodes if node.cost - least <= width**2]
     return min(possible, key=lambda e: abs(np.log(e.cameras[name].phi / (USUAL_PHI * unit_px(e.cameras[name])))))

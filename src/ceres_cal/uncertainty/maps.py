@@ -13,14 +13,15 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.tails import NORMAL_95, NORMAL_95_ONE_SIDED
 from ceres_cal.model.keys import STATION_QUANTITIES, Key
 from ceres_cal.model.parameters import Estimate
 from ceres_cal.model.quantities import camera_moved, moved, natural_sizes
 from ceres_cal.uncertainty.posterior import Posterior
-from ceres_cal.uncertainty.profile import PhiProfile
 
+HEIGHTS_M = (0.0, 0.15)
+"""Heights of interest: the floor, and a robot's top."""
 _STEP = 1e-5  # of each number's natural size: the differences are good to 1e-9 of the slope
-_NORMAL_95 = 1.645  # one-sided
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +32,7 @@ class PointSpread:
         located: (N, 2) m, by the estimate.
         low, high: (N, 2) m, 95 % bounds of x and of y, each by itself; infinite where unknown.
         radius_95_m: (N,) 95 % of the errors are shorter. sd_m: (N,) root mean square length of the error; where phi
-            is known by its profile alone, the radius over 1.96.
+            is known by its profile alone, the radius over NORMAL_95.
     """
 
     located: Array
@@ -47,14 +48,9 @@ def station_keys(estimate: Estimate, posterior: Posterior, station: str) -> tupl
     Raises:
         InputError: no such station, or one that was held, so that where it stands in the world is nobody's guess.
     """
-    if station not in estimate.stations:
-        names = ", ".join(map(repr, estimate.stations))
-        raise InputError(f"station {station!r} is not there: there are {names}")
-    owners = {("station", station), ("camera", estimate.stations[station].camera)}
-    keys = tuple(key for key in posterior.keys if key[:2] in owners)
-    if not any(key.kind == "station" for key in keys):
+    if not posterior.knows_station(estimate.station_name(station)):
         raise InputError(f"station {station!r} was held as the world: it has no map of a field: observe one with it")
-    return keys
+    return posterior.keys_of(estimate, station)
 
 
 def locate_slopes(estimate: Estimate, keys: Sequence[Key], station: str, pixels: Array, height_m: float) -> Array:
@@ -97,8 +93,8 @@ def radius_95(covariance: Array) -> Array:
     with np.errstate(invalid="ignore"):
         mean, variance = a + b, 2.0 * (a**2 + b**2 + 2.0 * np.nan_to_num(c) ** 2)
         cubed = variance / (9.0 * mean**2)  # 2 / (9 degrees of freedom); Wilson and Hilferty
-        found = np.sqrt(mean * (1.0 - cubed + _NORMAL_95 * np.sqrt(cubed)) ** 3)
-    return np.where(np.isinf(mean), np.inf, np.where(mean > 0.0, found, 0.0))
+        radius = np.sqrt(mean * (1.0 - cubed + NORMAL_95_ONE_SIDED * np.sqrt(cubed)) ** 3)
+    return np.where(np.isinf(mean), np.inf, np.where(mean > 0.0, radius, 0.0))
 
 
 def spread_of_points(
@@ -110,23 +106,22 @@ def spread_of_points(
         InputError: see `station_keys`.
     """
     keys = station_keys(estimate, posterior, station)
+    if estimate.stations[station].camera in posterior.profiles:
+        return _by_profile(estimate, posterior, station, pixels, height_m)
     located = estimate.camera_at(station).locate(pixels, height_m)
-    profile = posterior.profiles.get(estimate.stations[station].camera)
-    if profile is not None:
-        return _by_profile(estimate, profile, posterior.half_width, station, pixels, height_m, located)
     slopes = np.zeros((len(pixels), 2, len(posterior.keys)))
     slopes[:, :, posterior.information.columns(keys)] = locate_slopes(estimate, keys, station, pixels, height_m)
     covariance = posterior.spread.through(slopes)
     variance = np.diagonal(covariance, axis1=1, axis2=2)
     reach = posterior.half_width * np.sqrt(variance)
-    radius = radius_95(covariance) * posterior.half_width / 1.96
+    radius = radius_95(covariance) * posterior.half_width / NORMAL_95
     return PointSpread(located, located - reach, located + reach, radius, np.sqrt(np.sum(variance, axis=1)))
 
 
-def _by_profile(
-    estimate: Estimate, profile: PhiProfile, width: float, station: str, pixels: Array, height_m: float, located: Array
-) -> PointSpread:
-    """The same along the valley: where each of its places puts the points, and how sure it is of that."""
+def _by_profile(estimate: Estimate, posterior: Posterior, station: str, pixels: Array, height_m: float) -> PointSpread:
+    """The same along the valley: where each of its nodes puts the points, and how sure it is of that."""
+    profile, width = posterior.profiles[estimate.stations[station].camera], posterior.half_width
+    located = estimate.camera_at(station).locate(pixels, height_m)
     offsets, covariances = [], []
     for step, across in zip(profile.steps, profile.across, strict=True):
         there = moved(estimate, profile.keys, step)
@@ -134,34 +129,50 @@ def _by_profile(
         slopes = locate_slopes(there, profile.keys[1:], station, pixels, height_m)
         covariances.append(across.spread.through(slopes))
     values, known = np.array(offsets), np.array(covariances)
-    nowhere = np.asarray(np.isnan(values).any(axis=(0, 2)))  # from some place of the valley nothing is seen there
+    nowhere = np.asarray(np.isnan(values).any(axis=(0, 2)))  # from some node of the valley nothing is seen there
     sds = np.sqrt(np.diagonal(known, axis1=2, axis2=3))
     shape = (len(values), -1)
     below, above = profile.bounds(values.reshape(shape), sds.reshape(shape), width)
     low = np.where(nowhere[:, None], -np.inf, below.reshape(-1, 2))
     high = np.where(nowhere[:, None], np.inf, above.reshape(-1, 2))
-    circles = np.array([radius_95(part) for part in known]) / 1.96
+    circles = np.array([radius_95(part) for part in known]) / NORMAL_95
     weights, widths = profile.reaches(width)
     away = np.linalg.norm(np.einsum("mn,npk->mpk", weights, values), axis=2)
-    unknown = ~np.isfinite(circles).all(axis=0)  # from some place of the valley
+    unknown = ~np.isfinite(circles).all(axis=0)  # from some node of the valley
     radius = np.max(away + widths[:, None] * (weights @ np.where(unknown, 0.0, circles)), axis=0)
     radius = np.where(unknown | np.isinf(low).any(axis=1) | np.isinf(high).any(axis=1), np.inf, radius)
-    return PointSpread(located, located + low, located + high, radius, radius / 1.96)
+    return PointSpread(located, located + low, located + high, radius, radius / NORMAL_95)
 
 
 @dataclass(frozen=True, eq=False)
-class FieldMap:
-    """How well one station locates points at one height, over a grid.
+class Grid:
+    """Places on the field at one height: all x_m (X,) at all y_m (Y,)."""
 
-    Attributes:
-        x_m: (X,), y_m: (Y,) the grid. sd_mm, radius_95_mm: (Y, X) as in `PointSpread`; NaN where the image does not
-            show the place, infinite where it is not known.
-    """
-
-    station: str
     height_m: float
     x_m: Array
     y_m: Array
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(Y, X)."""
+        return len(self.y_m), len(self.x_m)
+
+    @property
+    def places(self) -> Array:
+        """(Y * X, 2) m, row by row."""
+        return np.column_stack([part.ravel() for part in np.meshgrid(self.x_m, self.y_m)])
+
+
+@dataclass(frozen=True, eq=False)
+class FieldMap(Grid):
+    """How well one station locates points at one height, over a grid.
+
+    Attributes:
+        sd_mm, radius_95_mm: (Y, X) as in `PointSpread`; NaN where the image does not show the place, infinite where it
+            is not known.
+    """
+
+    station: str
     sd_mm: Array
     radius_95_mm: Array
 
@@ -184,7 +195,7 @@ class FieldMap:
         return float(self.x_m[column]), float(self.y_m[row])
 
 
-def shown_pixels(estimate: Estimate, station: str, places: Array, height_m: float) -> Array:
+def visible_pixels(estimate: Estimate, station: str, places: Array, height_m: float) -> Array:
     """Pixels (N, 2) of places (N, 2) m at a height; NaN where the station's image does not show them."""
     camera = estimate.camera_at(station)
     pixels = camera.project(np.column_stack([places, np.full(len(places), height_m)]))
@@ -197,18 +208,16 @@ def shown_pixels(estimate: Estimate, station: str, places: Array, height_m: floa
     return np.where(inside[:, None], pixels, np.nan)
 
 
-def field_map(
-    estimate: Estimate, posterior: Posterior, station: str, height_m: float, x_m: Array, y_m: Array
-) -> FieldMap:
+def field_map(estimate: Estimate, posterior: Posterior, station: str, grid: Grid) -> FieldMap:
     """The map over a grid.
 
     Raises:
         InputError: see `station_keys`.
     """
-    x, y = np.meshgrid(x_m, y_m)
-    pixels = shown_pixels(estimate, station, np.column_stack([x.ravel(), y.ravel()]), height_m)
+    pixels = visible_pixels(estimate, station, grid.places, grid.height_m)
     visible = np.isfinite(pixels[:, 0])
-    sd, radius = np.full(len(pixels), np.nan), np.full(len(pixels), np.nan)
-    found = spread_of_points(estimate, posterior, station, pixels[visible], height_m)
-    sd[visible], radius[visible] = 1e3 * found.sd_m, 1e3 * found.radius_95_m
-    return FieldMap(station, height_m, x_m, y_m, sd.reshape(x.shape), radius.reshape(x.shape))
+    sd_mm, radius_mm = np.full(len(pixels), np.nan), np.full(len(pixels), np.nan)
+    spread = spread_of_points(estimate, posterior, station, pixels[visible], grid.height_m)
+    sd_mm[visible], radius_mm[visible] = 1e3 * spread.sd_m, 1e3 * spread.radius_95_m
+    values = (part.reshape(grid.shape) for part in (sd_mm, radius_mm))
+    return FieldMap(grid.height_m, grid.x_m, grid.y_m, station, *values)

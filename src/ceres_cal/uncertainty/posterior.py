@@ -11,13 +11,12 @@ import numpy as np
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.spread import Spread, without
+from ceres_cal.base.tails import NORMAL_95
 from ceres_cal.model.information import Information
 from ceres_cal.model.keys import Key, pose_keys, sigma_limits
 from ceres_cal.model.parameters import Estimate, Layout, intrinsic_names
 from ceres_cal.solve import Eliminated, ReducedInformation
 from ceres_cal.uncertainty.profile import PhiProfile
-
-_NORMAL_95 = 1.959963984540054  # half width of the 95 % interval of a standard normal
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,15 +86,24 @@ class Posterior:
         )
         return Layout(free, stations, placements | frozenset(self.placements))
 
-    def place(self, kind: str, owner: str, quantity: str) -> int:
+    def keys_of(self, estimate: Estimate, station: str) -> tuple[Key, ...]:
+        """Keys of a station and of its camera."""
+        owners = {("station", station), ("camera", estimate.stations[station].camera)}
+        return tuple(key for key in self.keys if key[:2] in owners)
+
+    def knows_station(self, station: str) -> bool:
+        """Whether it says where a station stands: not of one that was held as the world."""
+        return any(key[:2] == ("station", station) for key in self.keys)
+
+    def column(self, kind: str, owner: str, quantity: str) -> int:
         """Where a number is among the keys.
 
         Raises:
             InputError: it is not: held, or not there at all.
         """
-        for place, key in enumerate(self.keys):
+        for column, key in enumerate(self.keys):
             if key[:3] == (kind, owner, quantity):
-                return place
+                return column
         raise InputError(f"{kind} {owner!r} has no free number {quantity!r}: it was held, or is not there")
 
     def sd_of(self, kind: str, owner: str, quantity: str) -> float:
@@ -104,7 +112,7 @@ class Posterior:
         Raises:
             InputError: it is not a free number.
         """
-        return float(self.sd[self.place(kind, owner, quantity)])
+        return float(self.sd[self.column(kind, owner, quantity)])
 
     def placement(self, name: str) -> Spread:
         """What is known of a placement's six numbers (`keys.PLACEMENT_QUANTITIES`).
@@ -122,7 +130,7 @@ class Posterior:
 
 def student_95(degrees_of_freedom: float) -> float:
     """Half width of the 95 % interval of Student's t, by the series of Cornish and Fisher: 0.1 % from 5 degrees on."""
-    z, n = _NORMAL_95, max(degrees_of_freedom, 1.0)
+    z, n = NORMAL_95, max(degrees_of_freedom, 1.0)
     terms = (
         (z**3 + z) / 4.0,
         (5.0 * z**5 + 16.0 * z**3 + 3.0 * z) / 96.0,

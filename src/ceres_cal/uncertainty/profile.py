@@ -1,7 +1,7 @@
 """What phi could be: the cost along it, everything else at its best (the profile likelihood).
 
 The views of a flat field from nearly above tell phi by the small differences of large numbers, so the least cost has a
-long, bent valley that no ellipse describes. The valley is followed step by step; at each of its places the other
+long, bent valley that no ellipse describes. The valley is followed step by step; at each of its nodes the other
 numbers have a covariance of their own. Together they bound any number or mapped point that depends on both: along the
 valley exactly, across it by the quadratic picture.
 """
@@ -27,13 +27,13 @@ from ceres_cal.start.initialise import PHI_RANGE
 # changes from half to double.
 _FAR = 9.0
 _STEPS = (0.02, 0.35)  # of log phi
-_MOST_RISE = 1.5  # from one place to the next
+_MOST_RISE = 1.5  # from one node to the next
 _MOST_NODES = 60
-_FINE = 16  # places interpolated between two
+_FINE = 16  # steps interpolated between two nodes
 _TWICE = (np.log(2.0), np.log(4.0))
 # Standard deviation across: what changes by less over the last factor two of phi is bounded by the data. Straight
 # from above 32 % of the intervals are open, 55 % at half of it, 18 % at double; the truth is in all of them.
-_SETTLED = 1.0
+_BOUNDED = 1.0
 # Ratio of two changes over a factor two each: 1/2 of what goes with phi towards 0, 1 of what goes on for ever.
 # Nothing changes from 0.6 to 0.86.
 _SHRINKING = 0.75
@@ -41,7 +41,7 @@ _SHRINKING = 0.75
 
 @dataclass(frozen=True, eq=False)
 class Node:
-    """One place of the valley: phi held, everything else at its best.
+    """One point of the valley: phi held, everything else at its best.
 
     Attributes:
         cost: twice the least cost there, with that of the priors on phi.
@@ -60,8 +60,8 @@ class PhiProfile:
     Attributes:
         camera: whose phi. keys: (K) phi first, then the camera's other numbers and those of its stations.
         phi_px: where the estimate has it.
-        steps: (N, K) from the estimate to each place, in the order of phi. rises: (N,) of twice the cost, from the
-            lowest place.
+        steps: (N, K) from the estimate to each node, in the order of phi. rises: (N,) of twice the cost, from the
+            lowest node.
         across: (N) information about all of the keys but phi, there, every other number integrated out.
         open_below, open_above: the rise stays within the 95 % bound as far as PHI_RANGE goes.
     """
@@ -82,7 +82,7 @@ class PhiProfile:
 
     def reaches(self, half_width: float) -> tuple[Array, Array]:
         """Fine steps along the valley within the 95 % bound: weights (M, N) that interpolate what is known at the N
-        places, and how many standard deviations across the valley each leaves, (M,).
+        nodes, and how many standard deviations across the valley each leaves, (M,).
         """
         phi, root = self.steps[:, 0], np.sqrt(self.rises)
         fine = np.concatenate([np.linspace(a, b, _FINE, endpoint=False) for a, b in pairwise(phi)])
@@ -120,7 +120,7 @@ class PhiProfile:
         with np.errstate(divide="ignore", invalid="ignore"):
             ratio = np.abs(last / before)
             limit = values[end] + last * ratio / (1.0 - ratio)
-        going = np.where(np.abs(last) > _SETTLED * sds, np.copysign(np.inf, last), values[end] + last)
+        going = np.where(np.abs(last) > _BOUNDED * sds, np.copysign(np.inf, last), values[end] + last)
         return np.asarray(np.where(ratio < _SHRINKING, limit, going))
 
 
@@ -212,24 +212,24 @@ def _walk(camera: str, problem: Problem, first: Node, direction: int) -> Iterato
 
 def _first_step(camera: str, node: Node) -> float:
     """Half a standard deviation of log phi by the quadratic picture, within reason."""
-    place = _phi_place(camera, node.information.keys)
-    sd = float(np.sqrt(node.information.inverse[place, place])) or np.inf
+    column = _phi_column(camera, node.information.keys)
+    sd = float(np.sqrt(node.information.inverse[column, column])) or np.inf
     return float(np.clip(0.5 * sd / node.estimate.cameras[camera].phi, *_STEPS))
 
 
 def _ahead(camera: str, node: Node, phi: float) -> Estimate:
     """The estimate with another phi, and everything shared moved along with it as the normal equations say."""
     keys = node.information.keys
-    place = _phi_place(camera, keys)
-    others = np.delete(np.arange(len(keys)), place)
+    column = _phi_column(camera, keys)
+    others = np.delete(np.arange(len(keys)), column)
     step = np.zeros(len(keys))
-    step[place] = phi - node.estimate.cameras[camera].phi
+    step[column] = phi - node.estimate.cameras[camera].phi
     held = node.information.given([keys[i] for i in others])
-    step[others] = -held.inverse @ node.information.matrix[others, place] * step[place]
+    step[others] = -held.inverse @ node.information.matrix[others, column] * step[column]
     return moved(node.estimate, keys, step)
 
 
-def _phi_place(camera: str, keys: tuple[Key, ...]) -> int:
+def _phi_column(camera: str, keys: tuple[Key, ...]) -> int:
     return next(i for i, key in enumerate(keys) if key[:3] == ("camera", camera, "phi"))
 
 

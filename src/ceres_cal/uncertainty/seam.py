@@ -3,16 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices, Mask
+from ceres_cal.base.arrays import Array, Indices
+from ceres_cal.base.tails import NORMAL_95
 from ceres_cal.model.parameters import Estimate
 from ceres_cal.observations import Columns, Observations
-from ceres_cal.scene.curves import along_track, nearest_on_track
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.curves import along_track, nearest_on_track, turned_on
 from ceres_cal.scene.targets import Target
-from ceres_cal.uncertainty.maps import FieldMap, field_map, locate_slopes, radius_95, shown_pixels, station_keys
+from ceres_cal.uncertainty.maps import (
+    FieldMap,
+    Grid,
+    field_map,
+    locate_slopes,
+    radius_95,
+    station_keys,
+    visible_pixels,
+)
 from ceres_cal.uncertainty.posterior import Posterior
 
 _BIN_M = 0.5  # along a curve; observations of one stretch are taken together
@@ -20,9 +30,7 @@ _FEWEST = 2  # observations of a stretch by each of the two stations
 _PIXEL = 0.5  # for the slope of a map by differences
 
 
-def seam_map(
-    estimate: Estimate, posterior: Posterior, first: str, second: str, height_m: float, x_m: Array, y_m: Array
-) -> FieldMap:
+def seam_map(estimate: Estimate, posterior: Posterior, pair: tuple[str, str], grid: Grid) -> FieldMap:
     """Predicted disagreement of two stations about places that both see, over a grid; `station` names both.
 
     What they have in common (one field, one camera, shared boards) is taken into account, but for cameras whose phi is
@@ -31,33 +39,28 @@ def seam_map(
     Raises:
         InputError: see `maps.station_keys`.
     """
-    name = f"{first} - {second}"
-    if {estimate.stations[s].camera for s in (first, second) if s in estimate.stations} & set(posterior.profiles):
-        maps = [field_map(estimate, posterior, s, height_m, x_m, y_m) for s in (first, second)]
-        sd, radius = (np.hypot(getattr(maps[0], w), getattr(maps[1], w)) for w in ("sd_mm", "radius_95_mm"))
-        return FieldMap(name, height_m, x_m, y_m, sd, radius)
-    x, y = np.meshgrid(x_m, y_m)
-    places = np.column_stack([x.ravel(), y.ravel()])
-    covariance = predicted(estimate, posterior, first, second, places, height_m)
-    radius = radius_95(covariance) * posterior.half_width / 1.96
-    sd = np.sqrt(np.trace(covariance, axis1=1, axis2=2))
-    return FieldMap(name, height_m, x_m, y_m, 1e3 * sd.reshape(x.shape), 1e3 * radius.reshape(x.shape))
+    if {estimate.stations[s].camera for s in pair if s in estimate.stations} & set(posterior.profiles):
+        a, b = (field_map(estimate, posterior, station, grid) for station in pair)
+        sd_mm, radius_mm = np.hypot(a.sd_mm, b.sd_mm), np.hypot(a.radius_95_mm, b.radius_95_mm)
+    else:
+        covariance = predicted(estimate, posterior, pair, grid.places, grid.height_m)
+        sd_mm = 1e3 * np.sqrt(np.trace(covariance, axis1=1, axis2=2)).reshape(grid.shape)
+        radius_mm = 1e3 * (radius_95(covariance) * posterior.half_width / NORMAL_95).reshape(grid.shape)
+    return FieldMap(grid.height_m, grid.x_m, grid.y_m, " - ".join(pair), sd_mm, radius_mm)
 
 
-def predicted(
-    estimate: Estimate, posterior: Posterior, first: str, second: str, places: Array, height_m: float
-) -> Array:
+def predicted(estimate: Estimate, posterior: Posterior, pair: tuple[str, str], places: Array, height_m: float) -> Array:
     """Covariances (N, 2, 2) m^2 of first less second about places (N, 2) m; NaN where not both see them."""
-    found, slopes = np.full((len(places), 2, 2), np.nan), np.zeros((len(places), 2, len(posterior.keys)))
+    covariances, slopes = np.full((len(places), 2, 2), np.nan), np.zeros((len(places), 2, len(posterior.keys)))
     visible = np.ones(len(places), dtype=bool)
-    for station, sign in ((first, 1.0), (second, -1.0)):
+    for station, sign in zip(pair, (1.0, -1.0), strict=True):
         keys = station_keys(estimate, posterior, station)
-        pixels = shown_pixels(estimate, station, places, height_m)
+        pixels = visible_pixels(estimate, station, places, height_m)
         visible &= np.isfinite(pixels[:, 0])
         at = posterior.information.columns(keys)
         slopes[:, :, at] += sign * locate_slopes(estimate, keys, station, pixels, height_m)
-    found[visible] = posterior.spread.through(slopes[visible])
-    return found
+    covariances[visible] = posterior.spread.through(slopes[visible])
+    return covariances
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +80,7 @@ class Disagreement:
 
     @property
     def rms_mm(self) -> float:
-        """Root mean square of what was found; NaN where the two observed nothing in common."""
+        """Root mean square of the differences; NaN where the two observed nothing in common."""
         return float(np.sqrt(np.mean(self.off_mm**2))) if len(self.off_mm) else np.nan
 
     @property
@@ -92,13 +95,13 @@ class _Sighting:
 
     Attributes:
         place: (3,) where the thing is as drawn. off_m: (2,) by how much the station locates it elsewhere, on average.
-        normal: (2,) of a curve, None of a point. noise_m: what the pixels' noise leaves in off_m, along each axis.
+        noise_m: what the pixels' noise leaves in off_m, along each axis. normal: (2,) of a curve, None of a point.
     """
 
     place: Array
     off_m: Array
-    normal: Array | None
     noise_m: float
+    normal: Array | None = None
 
 
 _Thing = tuple[str, int]
@@ -109,110 +112,90 @@ def disagreement(
     observations: Observations,
     estimate: Estimate,
     posterior: Posterior,
-    inliers: tuple[Mask, Mask],
     scales: tuple[float, float],
-    first: str,
-    second: str,
-    took_part: bool = True,
+    pair: tuple[str, str],
 ) -> Disagreement:
     """Compare what two stations say of the points, and of the stretches of curve of half a metre, that both observed.
 
     Only what lies in the world counts; how it was built does not matter, both saw the same.
 
     Args:
-        inliers: rows of the points and of the curves that count. scales: noise scales of points and curves.
-        took_part: whether the calibration was made from these observations: then it has followed their noise a little.
+        observations: that the calibration was made from, without those that were taken out.
+        scales: noise scales of points and curves.
     """
-    a, b = (
-        _points(observations, estimate, station, inliers[0], scales[0])
-        | _stretches(observations, estimate, station, inliers[1], scales[1])
-        for station in (first, second)
-    )
+    a, b = (dict(_sightings(observations, estimate, station, scales)) for station in pair)
     common = [thing for thing in a if thing in b]
     places = np.array([a[thing].place for thing in common]).reshape(-1, 3)
     covariances = np.empty((len(common), 2, 2))
     for height_m in np.unique(places[:, 2]):
         here = places[:, 2] == height_m
-        covariances[here] = predicted(estimate, posterior, first, second, places[here, :2], float(height_m))
-    found = [
-        _compare(a[thing], b[thing], covariance, 1.0 if took_part else -1.0)
-        for thing, covariance in zip(common, covariances, strict=True)
-    ]
-    kept = [number for number, (_, expected) in enumerate(found) if np.isfinite(expected)]
-    off, expected = 1e3 * np.array([found[number] for number in kept]).reshape(-1, 2).T
-    return Disagreement(tuple(common[number][0] for number in kept), places[kept, :2], off, expected)
+        covariances[here] = predicted(estimate, posterior, pair, places[here, :2], float(height_m))
+    gaps = [_gap(a[thing], b[thing], covariance) for thing, covariance in zip(common, covariances, strict=True)]
+    known = [number for number, (_, expected) in enumerate(gaps) if np.isfinite(expected)]
+    off, expected = 1e3 * np.array([gaps[number] for number in known]).reshape(-1, 2).T
+    return Disagreement(tuple(common[number][0] for number in known), places[known, :2], off, expected)
 
 
-def _compare(here: _Sighting, there: _Sighting, covariance: Array, taken: float) -> tuple[float, float]:
+def _gap(here: _Sighting, there: _Sighting, covariance: Array) -> tuple[float, float]:
     """By how much the two differ and its standard deviation, m: what a fit has taken up of its own noise is missing."""
     gap = here.off_m - there.off_m
-    noise = (here.noise_m**2 + there.noise_m**2) * np.eye(2) - taken * covariance
+    noise = (here.noise_m**2 + there.noise_m**2) * np.eye(2) - covariance
     if here.normal is None:
         return float(np.linalg.norm(gap)), float(np.sqrt(np.maximum(np.trace(noise), 0.0)))
     return float(here.normal @ gap), float(np.sqrt(np.maximum(here.normal @ noise @ here.normal, 0.0)))
 
 
-def _rows(
-    observations: Observations, columns: Columns, station: str, inlier: Mask
-) -> Iterator[tuple[Target, int, Indices]]:
+def _sightings(
+    observations: Observations, estimate: Estimate, station: str, scales: tuple[float, float]
+) -> Iterator[tuple[_Thing, _Sighting]]:
+    """What a station saw of the points and of the stretches of curve that lie in the world."""
+    camera = estimate.camera_at(station)
+    points, curves = observations.points, observations.curves
+    for target, feature, rows in _rows(observations, points, station):
+        drawn = np.broadcast_to(target.point_array[feature], (len(rows), 3))
+        yield (target.point_names[feature], 0), _sighting(camera, points, rows, drawn, scales[0])
+    for target, feature, rows in _rows(observations, curves, station):
+        name, tracks = target.curve_names[feature], target.tracks[curves.side[rows], feature]
+        curve, is_arc, height_m = target.curves[name], bool(target.is_arc[feature]), float(tracks[0, 0, 2])
+        located = camera.locate(curves.pixels[rows], height_m)
+        s = nearest_on_track(tracks, is_arc, np.column_stack([located, np.full(len(rows), height_m)]))
+        feet, start = along_track(tracks, is_arc, s), curve.parameter_range[0]
+        length = (turned_on(curve, s) - start) * np.linalg.norm(tracks[:, 1], axis=1)
+        stretch = np.floor(length / _BIN_M).astype(int)
+        for number in np.unique(stretch):
+            part = stretch == number
+            if np.count_nonzero(part) >= _FEWEST:
+                sighting = _sighting(camera, curves, rows[part], feet[part], scales[1])
+                normal = _normal(tracks[0], is_arc, sighting.place)
+                yield (name, int(number)), replace(sighting, normal=normal)
+
+
+def _sighting(camera: Camera, columns: Columns, rows: Indices, drawn: Array, scale: float) -> _Sighting:
+    """Some rows taken together that show what is drawn at (N, 3), all of it at one height."""
+    pixels, height_m = columns.pixels[rows], float(drawn[0, 2])
+    off_m = np.mean(camera.locate(pixels, height_m) - drawn[:, :2], axis=0)
+    sigma_px = scale * float(np.mean(columns.sigma_px[rows])) / np.sqrt(len(rows))
+    return _Sighting(np.mean(drawn, axis=0), off_m, sigma_px * _metres_per_px(camera, pixels, height_m))
+
+
+def _rows(observations: Observations, columns: Columns, station: str) -> Iterator[tuple[Target, int, Indices]]:
     """What a station saw of targets that lie in the world: the number of each feature, and its rows."""
     rows: dict[str, list[Indices]] = {}
     for number, view in enumerate(observations.views):
         if view.station == station and view.placement is None:
             first, last = np.searchsorted(columns.view, [number, number + 1])
-            rows.setdefault(view.target, []).append(np.arange(first, last)[inlier[first:last]])
+            rows.setdefault(view.target, []).append(np.arange(first, last))
     for name, parts in rows.items():
         every = np.concatenate(parts)
         for feature in np.unique(columns.feature[every]):
             yield observations.targets[name], int(feature), every[columns.feature[every] == feature]
 
 
-def _metres_per_px(estimate: Estimate, station: str, pixels: Array, height_m: float) -> float:
+def _metres_per_px(camera: Camera, pixels: Array, height_m: float) -> float:
     """Of the map about the mean of some pixels, in the mean over directions."""
     middle = np.mean(pixels, axis=0) + _PIXEL * np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
-    x1, x0, y1, y0 = estimate.camera_at(station).locate(middle, height_m)
+    x1, x0, y1, y0 = camera.locate(middle, height_m)
     return float(np.sqrt(0.5 * (np.sum((x1 - x0) ** 2) + np.sum((y1 - y0) ** 2)))) / (2.0 * _PIXEL)
-
-
-def _points(
-    observations: Observations, estimate: Estimate, station: str, inlier: Mask, scale: float
-) -> dict[_Thing, _Sighting]:
-    found: dict[_Thing, _Sighting] = {}
-    columns = observations.points
-    for target, feature, own in _rows(observations, columns, station, inlier):
-        pixels, place = columns.pixels[own], target.point_array[feature]
-        off = np.mean(estimate.camera_at(station).locate(pixels, place[2]), axis=0) - place[:2]
-        sigma_px = scale * float(np.mean(columns.sigma_px[own])) / np.sqrt(len(own))
-        noise = sigma_px * _metres_per_px(estimate, station, pixels, place[2])
-        found[target.point_names[feature], 0] = _Sighting(place, off, None, noise)
-    return found
-
-
-def _stretches(
-    observations: Observations, estimate: Estimate, station: str, inlier: Mask, scale: float
-) -> dict[_Thing, _Sighting]:
-    found: dict[_Thing, _Sighting] = {}
-    columns = observations.curves
-    for target, feature, own in _rows(observations, columns, station, inlier):
-        tracks, is_arc = target.tracks[columns.side[own], feature], np.repeat(target.is_arc[feature], len(own))
-        height = float(tracks[0, 0, 2])
-        located = estimate.camera_at(station).locate(columns.pixels[own], height)
-        there = np.column_stack([located, np.full(len(own), height)])
-        s = nearest_on_track(tracks, is_arc, there)
-        feet = along_track(tracks, is_arc, s)
-        turned = s - target.curves[target.curve_names[feature]].parameter_range[0]
-        radius = np.linalg.norm(tracks[:, 1], axis=1)
-        stretch = np.floor((turned % (2.0 * np.pi) if is_arc[0] else turned) * radius / _BIN_M).astype(int)
-        for number in np.unique(stretch):
-            part = stretch == number
-            if np.count_nonzero(part) < _FEWEST:
-                continue
-            place, off = np.mean(feet[part], axis=0), np.mean(there[part] - feet[part], axis=0)[:2]
-            sigma_px = scale * float(np.mean(columns.sigma_px[own[part]])) / np.sqrt(np.count_nonzero(part))
-            noise = sigma_px * _metres_per_px(estimate, station, columns.pixels[own[part]], height)
-            normal = _normal(tracks[0], bool(is_arc[0]), place)
-            found[target.curve_names[feature], int(number)] = _Sighting(place, off, normal, noise)
-    return found
 
 
 def _normal(track: Array, is_arc: bool, place: Array) -> Array:

@@ -13,7 +13,7 @@ from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.model.parameters import Estimate
 from ceres_cal.scene.targets import Target
-from ceres_cal.uncertainty.maps import FieldMap, PointSpread, field_map, spread_of_points
+from ceres_cal.uncertainty.maps import FieldMap, Grid, PointSpread, field_map, spread_of_points
 from ceres_cal.uncertainty.posterior import Posterior
 from ceres_cal.uncertainty.seam import seam_map
 from ceres_cal.uncertainty.weak import (
@@ -47,7 +47,7 @@ class Uncertainty:
         Raises:
             InputError: it is not a free number.
         """
-        return self.verdicts[self.posterior.place(kind, owner, quantity)]
+        return self.verdicts[self.posterior.column(kind, owner, quantity)]
 
     @cached_property
     def weak_directions(self) -> tuple[WeakDirection, ...]:
@@ -69,9 +69,8 @@ class Uncertainty:
         Raises:
             InputError: see `map_sd_mm`.
         """
-        return spread_of_points(
-            self.estimate, self.posterior, self._station(station), np.asarray(pixels, dtype=float), height_m
-        )
+        name = self.estimate.station_name(station)
+        return spread_of_points(self.estimate, self.posterior, name, np.asarray(pixels, dtype=float), height_m)
 
     def map_sd_mm(
         self,
@@ -85,8 +84,8 @@ class Uncertainty:
         Raises:
             InputError: no such station, none named where there are several, or it was held as the world.
         """
-        name = self._station(station)
-        return field_map(self.estimate, self.posterior, name, height_m, *self._grid(x_m, y_m))
+        name = self.estimate.station_name(station)
+        return field_map(self.estimate, self.posterior, name, self._grid(height_m, x_m, y_m))
 
     def seam_sd_mm(
         self,
@@ -101,27 +100,17 @@ class Uncertainty:
         Raises:
             InputError: see `map_sd_mm`.
         """
-        return seam_map(self.estimate, self.posterior, first, second, height_m, *self._grid(x_m, y_m))
+        return seam_map(self.estimate, self.posterior, (first, second), self._grid(height_m, x_m, y_m))
 
-    def _station(self, name: str | None) -> str:
-        if name is None and len(self.estimate.stations) == 1:
-            return next(iter(self.estimate.stations))
-        if name is None or name not in self.estimate.stations:
-            names = ", ".join(map(repr, self.estimate.stations))
-            raise InputError(f"station {name!r} is not there: there are {names}")
-        return name
-
-    def _grid(self, x_m: ArrayLike | None, y_m: ArrayLike | None) -> tuple[Array, Array]:
-        """x and y of a grid over the box around what does not move, where they are not given.
+    def _grid(self, height_m: float, x_m: ArrayLike | None, y_m: ArrayLike | None) -> Grid:
+        """A grid over the box around what does not move, where x and y are not given.
 
         Raises:
             InputError: there is nothing that does not move.
         """
-        if x_m is not None and y_m is not None:
-            return np.asarray(x_m, dtype=float), np.asarray(y_m, dtype=float)
-        found = field_grid(self.targets)
-        x, y = found if x_m is None else (np.asarray(x_m, dtype=float), found[1])
-        return x, (y if y_m is None else np.asarray(y_m, dtype=float))
+        field = field_grid(self.targets) if x_m is None or y_m is None else ()
+        x, y = (field[axis] if given is None else given for axis, given in enumerate((x_m, y_m)))
+        return Grid(height_m, np.asarray(x, dtype=float), np.asarray(y, dtype=float))
 
 
 def field_grid(targets: Mapping[str, Target]) -> tuple[Array, Array]:

@@ -52,7 +52,7 @@ class WeakDirection:
 
     Attributes:
         words: one line. relative: sigma along it in natural sizes, infinite where unknown.
-        shares: key -> share, the largest one 1, of those worth naming.
+        shares: key -> share, the largest one 1, of those that are not small.
     """
 
     words: str
@@ -68,10 +68,10 @@ def verdicts(estimate: Estimate, posterior: Posterior) -> tuple[Verdict, ...]:
     low, high = values + bounds[:, 0], values + bounds[:, 1]
     followed = np.zeros(len(values), dtype=bool)
     for profile in posterior.profiles.values():
-        at = [posterior.keys.index(key) for key in profile.keys]
+        at = posterior.information.columns(profile.keys)
         followed[at] = True
         if profile.open_below or profile.open_above:  # an open valley has no width, whatever it is compared with
-            along = [place for place in at if posterior.keys[place].quantity in ("phi", "height")]
+            along = [column for column in at if posterior.keys[column].quantity in ("phi", "height")]
             relative[along], low[along] = np.inf, np.maximum(low[along], 0.0)
     sd = np.where(followed, half, posterior.sd)
     columns = (c.tolist() for c in (values, sd, low, high, relative, followed))
@@ -96,12 +96,12 @@ def bounds_text(low: float, high: float, unit: str) -> str:
 
 def unknown_placements(posterior: Posterior) -> dict[str, tuple[str, ...]]:
     """Placements of which some number is not known at all, and which: the roll of a ring sheet about its axis."""
-    found = {}
+    unknown = {}
     for name in posterior.placements:
         lost = np.isinf(posterior.placement(name).sd)
         if lost.any():
-            found[name] = tuple(q for q, is_lost in zip(PLACEMENT_QUANTITIES, lost, strict=True) if is_lost)
-    return found
+            unknown[name] = tuple(q for q, is_lost in zip(PLACEMENT_QUANTITIES, lost, strict=True) if is_lost)
+    return unknown
 
 
 def weak_directions(estimate: Estimate, posterior: Posterior) -> tuple[WeakDirection, ...]:
@@ -110,15 +110,15 @@ def weak_directions(estimate: Estimate, posterior: Posterior) -> tuple[WeakDirec
     Natural sizes make units irrelevant: a direction is weak when moving along it by what goes unnoticed changes some
     number by more than a hundredth of itself.
     """
-    at = [place for place, key in enumerate(posterior.keys) if key.kind != "structure"]
-    keys = [posterior.keys[place] for place in at]
+    keys = [key for key in posterior.keys if key.kind != "structure"]
+    at = posterior.information.columns(keys)
     sizes = natural_sizes(estimate, keys)
     lost = posterior.spread.unknown[at] / sizes[:, None]
     finite = posterior.spread.covariance[np.ix_(at, at)] / sizes[:, None] / sizes
     values, vectors = np.linalg.eigh(finite)
-    found = [(np.inf, column / np.linalg.norm(column)) for column in lost.T if np.any(column)]
-    found += [(float(np.sqrt(v)), vectors[:, i]) for i, v in enumerate(values) if v > KNOWN**2][::-1]
-    return tuple(_direction(estimate, posterior, keys, relative, vector) for relative, vector in found)
+    weak = [(np.inf, column / np.linalg.norm(column)) for column in lost.T if np.any(column)]
+    weak += [(float(np.sqrt(v)), vectors[:, i]) for i, v in enumerate(values) if v > KNOWN**2][::-1]
+    return tuple(_direction(estimate, posterior, keys, relative, vector) for relative, vector in weak)
 
 
 def _direction(
@@ -159,7 +159,7 @@ def ratio_sd(estimate: Estimate, posterior: Posterior, camera: str, station: str
         InputError: one of them was held.
     """
     slopes = np.zeros(len(posterior.keys))
-    slopes[posterior.place("camera", camera, "phi")] = 1.0 / estimate.cameras[camera].phi
+    slopes[posterior.column("camera", camera, "phi")] = 1.0 / estimate.cameras[camera].phi
     height = float(estimate.stations[station].cam_from_world.position[2])
-    slopes[posterior.place("station", station, "height")] = -1.0 / height
+    slopes[posterior.column("station", station, "height")] = -1.0 / height
     return float(np.sqrt(posterior.spread.through(slopes[None])[0, 0]))
