@@ -25,7 +25,7 @@ from ceres_cal.cli.progress import ProgressBar
 from ceres_cal.detect.boards import CORNER_FITS
 from ceres_cal.model.parameters import LOSSES, Options
 from ceres_cal.observations import Observations
-from ceres_cal.scene.lens import LENS_KINDS
+from ceres_cal.scene.lens import LENSES
 from ceres_cal.scene.targets import TARGET_KINDS, ssl_field
 from ceres_cal.simulate import scene_names
 
@@ -175,7 +175,7 @@ def test_wrong_usage_is_one_line(say: Say, arguments: Sequence[object], words: s
 
 def test_choices_are_those_of_the_package() -> None:
     calibrate, detect = COMMANDS["calibrate"], COMMANDS["detect board"]
-    assert [calibrate.parse(["x", "--lens", lens]).lens for lens in LENS_KINDS] == list(LENS_KINDS)
+    assert [calibrate.parse(["x", "--lens", lens]).lens for lens in LENSES] == list(LENSES)
     assert [calibrate.parse(["x", "--loss", loss]).loss for loss in LOSSES] == list(LOSSES)
     board = ["x.png", "--columns", "4", "--rows", "3", "--square", "1", "-o", "y.json"]
     assert [detect.parse([*board, "--corner-fit", fit]).corner_fit for fit in CORNER_FITS] == list(CORNER_FITS)

@@ -183,8 +183,7 @@ def _require_usable(end: RobustSolution, problem: Problem) -> tuple[str, ...]:
         fold, corner = camera.lens.monotone_radius(camera.phi), camera.corner_radius
         where = f"camera {name!r}: the solved {camera.lens.kind} lens folds {fold:.0f} px from the principal point"
         farthest = end.problem.sights.of_camera(name).reach_px(camera)
-        # The paper's polynomial can be had without a fold; the others' published models fold in corners nobody saw.
-        if camera.lens.kind == "radial" or fold <= farthest:
+        if not camera.lens.may_fold or fold <= farthest:
             raise SolutionError(
                 f"{where}, inside the image (corner at {corner:.0f} px): "
                 "choose fewer or other coefficients, or observe nearer to the corners"

@@ -374,7 +374,7 @@ def _from_file(data: _CalibrationFile) -> Calibration:
     cameras = {}
     for name, entry in data.cameras.items():
         cameras[name] = entry.camera()
-        if entry.lens.kind == "radial":  # the others may fold in corners that nobody saw: `locate` gives NaN there
+        if not cameras[name].lens.may_fold:  # others may, in corners that nobody saw: `locate` gives NaN there
             cameras[name].require_monotone(name)
     stations = {}
     for name, station in data.stations.items():

@@ -16,7 +16,7 @@ from ceres_cal import kernels
 from ceres_cal.base.arrays import AnyArray, Array, Indices, Mask
 from ceres_cal.base.errors import SolutionError
 from ceres_cal.model.parameters import Estimate
-from ceres_cal.model.residuals import Residuals, lens_arguments
+from ceres_cal.model.residuals import Residuals, camera_optics, curve_columns, point_columns
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights
 from ceres_cal.scene.curves import along_track
@@ -101,11 +101,11 @@ def _of_camera(
 ) -> Iterator[dict[str, AnyArray]]:
     """The columns of one camera's points, then of its curve observations."""
     own = sights.take(numbers)
-    optics = lens_arguments(estimate.cameras[own.keys[0].camera])
-    size = len(optics[1])
+    optics = camera_optics(estimate.cameras[own.keys[0].camera])
+    size = len(optics.intrinsics)
     rows = np.empty((len(own.point_rows), 2, size + 6))
-    places = estimate.structure.points(own)
-    kernels.point_rows(*optics, poses[numbers], own.point_bounds, places, rows)
+    points = point_columns(own, estimate.structure)
+    kernels.point_rows(optics, poses[numbers], points, rows)
     yield {
         "sight": np.repeat(numbers[_sight_of(own.point_bounds)], 2),
         "observation": np.repeat(own.point_rows, 2),
@@ -117,22 +117,11 @@ def _of_camera(
         "pixel": np.repeat(own.pixels + found.points[own.point_rows], 2, axis=0),
         "intrinsics": rows[:, :, :size].reshape(-1, size),
         "pose": rows[:, :, size:].reshape(-1, 6),
-        "place": np.repeat(places, 2, axis=0),
+        "place": np.repeat(points.places, 2, axis=0),
     }
-    tracks, feet = estimate.structure.tracks(own), found.feet[own.curve_rows]
+    curves = curve_columns(own, estimate.structure, found.feet[own.curve_rows])
     rows, normals = np.empty((len(own.curve_rows), size + 6)), np.empty((len(own.curve_rows), 2))
-    kernels.curve_rows(
-        *optics,
-        poses[numbers],
-        own.curve_bounds,
-        tracks,
-        own.is_arc,
-        own.track_index,
-        own.curve_pixels,
-        feet,
-        rows,
-        normals,
-    )
+    kernels.curve_rows(optics, poses[numbers], curves, rows, normals)
     distance = found.curves[own.curve_rows]
     yield {
         "sight": numbers[_sight_of(own.curve_bounds)],
@@ -145,7 +134,7 @@ def _of_camera(
         "pixel": own.curve_pixels + distance[:, None] * normals,
         "intrinsics": rows[:, :size],
         "pose": rows[:, size:],
-        "place": along_track(tracks[own.track_index], own.on_arc, feet),
+        "place": along_track(curves.tracks[own.track_index], own.on_arc, curves.feet),
     }
 
 

@@ -15,7 +15,8 @@ from ceres_cal import kernels
 from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.tails import log_binomial_tail
 from ceres_cal.model.parameters import Estimate
-from ceres_cal.model.residuals import lens_arguments
+from ceres_cal.model.residuals import camera_optics
+from ceres_cal.model.structure import EXACT
 from ceres_cal.observations import Curves, Observations, Points
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.curves import Arc, Curve, curve_points, nearest_to_rays, turned_on
@@ -145,9 +146,10 @@ def _curve_distances(target: Target, camera: Camera, pixels: Array) -> Array:
 
 def _signed_distances(camera: Camera, track: Array, arc: bool, pixels: Array, s: Array) -> Array:
     pose = np.column_stack([camera.cam_from_world.rotation, camera.cam_from_world.translation])[None]
-    distance, feet = np.empty(len(pixels)), s.copy()
-    kernels.curve_residuals(
-        *lens_arguments(camera), pose, np.array([0, len(pixels)]), track[None], np.array([arc]),
-        np.zeros(len(pixels), np.int32), np.ascontiguousarray(pixels), feet, distance,
+    distance, count = np.empty(len(pixels)), len(pixels)
+    curves = kernels.CurveColumns(
+        np.array([0, count]), track[None], np.array([arc]), np.zeros(count, np.int32), np.ascontiguousarray(pixels),
+        np.ones(count), s.copy(), EXACT.track_slots,
     )  # fmt: skip
+    kernels.curve_residuals(camera_optics(camera), pose, curves, distance)
     return distance

@@ -20,7 +20,7 @@ from ceres_cal.model.structure import Structure, Tolerance
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.observations.sights import SightKey
 from ceres_cal.scene.camera import Camera
-from ceres_cal.scene.lens import LENS_KINDS, Lens, make_lens
+from ceres_cal.scene.lens import Lens, lens_class, make_lens
 
 LOSSES = ("trivial", "huber", "soft_l1", "cauchy", "tukey")
 
@@ -30,7 +30,7 @@ class Options:
     """What to solve for and how.
 
     Attributes:
-        lens: "radial", "brown" or "kannala-brandt"; powers: those of the radial lens.
+        lens: one of `scene.lens.LENSES`; powers: of a lens that leaves the choice, as "radial" does.
         free_principal_point: else it is held at the image centre, or where `fixed` says.
         free_aspect: whether fy / fx is free; else 1, or what `fixed` says.
         fixed: numbers held, by name: phi, aspect, cx, cy (px) and the lens's coefficients in the units of the files.
@@ -64,8 +64,7 @@ class Options:
     threads: int = 0
 
     def __post_init__(self) -> None:
-        if self.lens not in LENS_KINDS:
-            raise InputError(f"unknown lens {self.lens!r}: choose one of {', '.join(LENS_KINDS)}")
+        lens_class(self.lens)
         if self.loss not in LOSSES:
             raise InputError(f"unknown loss {self.loss!r}: choose one of {', '.join(LOSSES)}")
         if self.noise_scale not in ("estimate", "stated"):

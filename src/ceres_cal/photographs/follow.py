@@ -17,6 +17,7 @@ from ceres_cal.model.parameters import Options
 from ceres_cal.observations import Prior
 from ceres_cal.photographs.refit import Shown, observations_of, refit_camera
 from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.lens import LENSES
 from ceres_cal.scene.targets import Target
 
 FAR_PX = 130.0  # how far off the start may be
@@ -34,7 +35,6 @@ _CANDIDATES = 5
 _FEWEST = 12
 _ROUNDS = 6
 _AT_REST_PX = 0.02
-_LENSES = (Options(powers=(2, 3, 4, 5)), Options(lens="brown"), Options(lens="kannala-brandt"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,9 +178,9 @@ def _with_its_lens(grey: Array32, target: Target, followed: Followed, curves: Co
     seen = observations_of(
         target, followed.camera.image_size, lines.course.curve[found], lines.pixels[found], lines.sigma_px[found]
     )
-    for options in _LENSES:
+    for kind, lens in LENSES.items():
         try:
-            calibration = calibrate(seen, options)
+            calibration = calibrate(seen, Options(lens=kind, powers=(lens.trial_powers or ((),))[-1]))
         except CalibrationError:
             continue
         fits.append((calibration.fit.curve_scale * len(lines.found) / calibration.fit.curves, calibration))

@@ -9,7 +9,7 @@ import numpy as np
 
 from ceres_cal.base.transforms import Pose
 from ceres_cal.scene.camera import Camera
-from ceres_cal.scene.lens import Radial, make_lens
+from ceres_cal.scene.lens import make_lens
 
 Vector = tuple[float, float, float]
 
@@ -50,13 +50,12 @@ class PoseFile(msgspec.Struct, forbid_unknown_fields=True):
 
 def camera_to_json(camera: Camera) -> dict[str, Any]:
     """A camera's intrinsics as plain data."""
-    powers = camera.lens.powers if isinstance(camera.lens, Radial) else None
     file = CameraFile(
         image_size=camera.image_size,
         phi=camera.phi,
         principal_point=camera.principal_point,
         aspect=camera.aspect,
-        lens=LensFile(camera.lens.kind, powers, camera.lens.coefficients),
+        lens=LensFile(camera.lens.kind, camera.lens.powers or None, camera.lens.coefficients),
     )
     return dict(msgspec.to_builtins(file))
 

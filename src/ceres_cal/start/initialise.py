@@ -19,7 +19,7 @@ from ceres_cal.model.structure import make_structure
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.observations.sights import Sights
 from ceres_cal.scene.camera import Camera
-from ceres_cal.scene.lens import Brown, KannalaBrandt, Lens, Radial
+from ceres_cal.scene.lens import Lens
 from ceres_cal.start.closed_forms import RadialProfile, orthogonality_error, poses_from_homographies
 from ceres_cal.start.planes import Homographies, profile_and_homographies
 
@@ -77,7 +77,7 @@ def _start_camera(
     name: str, image_size: tuple[int, int], sights: Sights, options: Options, priors: Sequence[Prior]
 ) -> _CameraStart:
     blank = _blank_camera(name, image_size, options, priors)
-    if set(blank.lens.names) <= set(options.fixed) and blank.lens.kind == "radial":
+    if set(blank.lens.names) <= set(options.fixed) and not blank.lens.may_fold:
         blank.require_monotone(name)
     unit = unit_px(blank)
     profile, homographies = profile_and_homographies(sights, blank, unit)
@@ -175,7 +175,9 @@ def _fit_lens(blank: Lens, profile: RadialProfile, phi: float, reach_px: float, 
     """The lens nearest to the profile over the observed radii: every model is linear in its coefficients there."""
     r = np.linspace(0.02, 1.0, 50) * reach_px
     w = profile.lift(np.column_stack([r, np.zeros_like(r)]))[:, 2]
-    columns, right = _lens_equations(blank, r, w, phi)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ideal = np.where(w > 0.02, r / w, np.nan)
+    columns, right = blank.start_equations(r, ideal, np.arctan2(r, phi * w), phi)
     free = [i for i, name in enumerate(blank.names) if name in columns and name not in fixed]
     ahead = np.isfinite(right)
     right = right - sum(
@@ -189,20 +191,6 @@ def _fit_lens(blank: Lens, profile: RadialProfile, phi: float, reach_px: float, 
         if lens.monotone_radius(phi) > 1.05 * reach_px:
             return lens
     return blank
-
-
-def _lens_equations(lens: Lens, r: Array, w: Array, phi: float) -> tuple[dict[str, Array], Array]:
-    """Columns by coefficient name and right side of the model at measured radii r whose rays are (r, phi w)."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ideal = np.where(w > 0.02, r / w, np.nan)
-    if isinstance(lens, Radial):
-        return {name: r**power for name, power in zip(lens.names, lens.powers, strict=True)}, ideal - r
-    if isinstance(lens, Brown):
-        u = ideal / phi
-        return {name: u**power for name, power in (("k1", 3), ("k2", 5), ("k3", 7))}, r / phi - u
-    assert isinstance(lens, KannalaBrandt)
-    angle = np.arctan2(r, phi * w)
-    return {name: angle**power for name, power in zip(lens.names, lens.radius_powers, strict=True)}, r / phi - angle
 
 
 # ---- stations and placements ----------------------------------------------------------------------------------------
