@@ -34,7 +34,8 @@ _STRAY = 0.05
 # m and rad: candidates nearer than this end in one minimum. Nothing changes from half to double.
 _ALIKE = (0.02, 0.01)
 # A pose fits where that share of the observations lies within so many standard deviations, at a noise of at most so
-# many times that of the calibration: up to 40 % may be wrong.
+# many times that of the calibration: up to 40 % may be wrong. Nothing changes but at a noise of twice: another iris
+# then fits no pose, and is not named.
 _FITS_SHARE, _FITS_SIGMA, _FITS_SCALE = 0.6, 5.0, 4.0
 _ROUNDS = 4  # of the closed form's reweighting
 
