@@ -26,8 +26,9 @@ from ceres_cal.model.parameters import intrinsics_vector, with_intrinsics
 from ceres_cal.model.residuals import camera_optics
 from ceres_cal.model.structure import EXACT
 from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.curves import along_track
 from ceres_cal.scene.lens import Brown, KannalaBrandt, Radial
-from ceres_cal.scene.targets import Arc, Segment, along_track, custom
+from ceres_cal.scene.targets import Arc, Segment, custom
 from ceres_cal.simulate import overhead_pose
 
 LOSSES = {

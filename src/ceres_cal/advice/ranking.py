@@ -90,7 +90,7 @@ def advise(
         InputError: no such station, one that was held as the world, or a calibration that says nothing of how well it
             is known.
     """
-    if board is not None and board.kind != "checkerboard":
+    if board is not None and board.grid is None:
         raise InputError(f"a board to show is a checkerboard, not of kind {board.kind!r}")
     ground, outlook = _prepared(calibration, station, height_m)
     search = Search(ground, outlook, _board(calibration.targets, board), calibration.fit.curves > 0)
@@ -160,7 +160,7 @@ def _weighting(fit: Fit) -> Weighting:
 def _board(targets: Mapping[str, Target], board: Target | None) -> tuple[str, Target]:
     """The board to show, and a name for it."""
     for name, target in targets.items():
-        if target.kind == "checkerboard" and board in (None, target):
+        if target.grid is not None and board in (None, target):
             return name, target
     name = "board"
     while name in targets:

@@ -17,8 +17,8 @@ from ceres_cal.base.errors import InputError, NothingShownError
 from ceres_cal.base.files import read_bytes
 from ceres_cal.detect.saddles import REACH, measure_saddles
 from ceres_cal.detect.scatter import scatter_px
-from ceres_cal.observations import Curves, Observations, Points, View
-from ceres_cal.scene.targets import Target
+from ceres_cal.observations import NO_CURVES, Observations, Points, View
+from ceres_cal.scene.targets import Grid, Target
 
 Progress = Callable[[int, int, str], None]
 
@@ -98,17 +98,17 @@ def detect_boards(
         NothingShownError: no image shows the board.
     """
     paths = [Path(path) for path in images]
-    placements = _placement_names(paths)
-    size, found, missed = _find_all(paths, _finder(board, charuco, corner_fit), progress)
+    placements, squares = _placement_names(paths), _squares_of(board)
+    size, found, missed = _find_all(paths, _finder(squares, charuco, corner_fit), progress)
     if not found:
         raise NothingShownError(
-            f"no board of {board.spec['columns']} x {board.spec['rows']} inner corners in any of {len(paths)} images "
+            f"no board of {squares.columns} x {squares.rows} inner corners in any of {len(paths)} images "
             f"(count the corners between squares, not the squares); {missed[0][0]}: {missed[0][1]}",
             tuple(missed),
         )
     views = tuple(View(path.stem, camera, station or camera, TARGET_NAME, placements[path]) for path in found)
     points = _points(list(found.values()), board)
-    observations = Observations({TARGET_NAME: board}, {camera: size}, views, points, _no_curves())
+    observations = Observations({TARGET_NAME: board}, {camera: size}, views, points, NO_CURVES)
     return BoardDetections(observations, tuple(map(str, found)), tuple(missed))
 
 
@@ -167,18 +167,23 @@ def _find_all(
     return size, found, missed
 
 
-def _finder(board: Target, charuco: CharucoSpec | None, corner_fit: str) -> Finder:
+def _squares_of(board: Target) -> Grid:
+    """How the squares of a checkerboard meet; InputError where it is none."""
+    if board.grid is None or not board.grid.checkered:
+        raise InputError(f"target of kind {board.kind!r}: boards are detected with a target of kind 'checkerboard'")
+    return board.grid
+
+
+def _finder(squares: Grid, charuco: CharucoSpec | None, corner_fit: str) -> Finder:
     if corner_fit not in CORNER_FITS:
         raise InputError(f"unknown corner fit {corner_fit!r}: choose one of {', '.join(CORNER_FITS)}")
-    if board.kind != "checkerboard":
-        raise InputError(f"target of kind {board.kind!r}: boards are detected with a target of kind 'checkerboard'")
-    columns, rows = int(board.spec["columns"]), int(board.spec["rows"])
+    columns, rows, square_m = squares.columns, squares.rows, squares.spacing_m
     if min(columns, rows) < 3:
         raise InputError(f"a board to be found in images needs 3 inner corners a side or more, not {columns} x {rows}")
     if charuco is None:
         return lambda image: _measured_chessboard(image, columns, rows, corner_fit)
-    detector = _charuco_detector(charuco, columns, rows, float(board.spec["square_m"]))
-    margin = 0.5 * (1.0 - charuco.marker_m / float(board.spec["square_m"]))  # white around a marker, in squares
+    detector = _charuco_detector(charuco, columns, rows, square_m)
+    margin = 0.5 * (1.0 - charuco.marker_m / square_m)  # white around a marker, in squares
     return lambda image: _measured_charuco(image, detector, columns, rows, margin)
 
 
@@ -322,8 +327,3 @@ def _points(grids: Sequence[Array], board: Target) -> Points:
         pixels=np.concatenate([grid[s] for grid, s in zip(grids, seen, strict=True)]),
         sigma_px=np.full(sum(count), scatter_px(grids)),
     )
-
-
-def _no_curves() -> Curves:
-    nothing = np.empty(0, np.int32)
-    return Curves(nothing, nothing.copy(), np.empty((0, 2)), np.empty(0), np.empty(0, np.int8))

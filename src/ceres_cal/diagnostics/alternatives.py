@@ -128,7 +128,7 @@ def target_families(
 
 
 def _everything(target: Target) -> Tolerance:
-    return Tolerance(1.0, 1.0, 1.0 if target.kind == "checkerboard" else 0.0)
+    return Tolerance(1.0, 1.0, 1.0 if target.bows else 0.0)
 
 
 def _feature_of(name: str) -> str:

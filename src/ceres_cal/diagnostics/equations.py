@@ -19,7 +19,7 @@ from ceres_cal.model.parameters import Estimate
 from ceres_cal.model.residuals import Residuals, camera_optics, curve_columns, point_columns
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights
-from ceres_cal.scene.targets import along_track
+from ceres_cal.scene.curves import along_track
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +30,7 @@ class Equations:
         sights: what can be shown, S of them; none is empty. poses: (S, 3, 4) cam_from_frame. bounds: (S + 1,) where
             each sight's equations begin. sight: (E,).
         observation: (E,) number of the observation: points by row, then curves by row. view: (E,) of the observation.
-        is_curve: (E,). feature: (E,) number among the points, or among the curves, of all targets.
+        is_curve: (E,). feature: (E,) its `point_index` or, of a curve, its `track_index` (see `Sights`).
         residual: (E,) px. direction: (E, 2) the image direction it is taken along. pixel: (E, 2) where it should lie.
         intrinsics: (E, K) px per solver's unit of [phi, aspect, cx, cy, coefficients], 0 past a camera's own.
         pose: (E, 6) px per left perturbation of cam_from_frame. motion: (E, 3) px per metre that the point or foot
@@ -111,7 +111,7 @@ def _of_camera(
         "observation": np.repeat(own.point_rows, 2),
         "view": np.repeat(observations.points.view[own.point_rows].astype(np.int64), 2),
         "is_curve": np.zeros(2 * len(rows), dtype=bool),
-        "feature": np.repeat(own.feature, 2),
+        "feature": np.repeat(own.point_index, 2),
         "residual": found.points[own.point_rows].ravel(),
         "direction": np.tile(np.eye(2), (len(rows), 1)),
         "pixel": np.repeat(own.pixels + found.points[own.point_rows], 2, axis=0),
@@ -128,13 +128,13 @@ def _of_camera(
         "observation": len(observations.points) + own.curve_rows,
         "view": observations.curves.view[own.curve_rows].astype(np.int64),
         "is_curve": np.ones(len(rows), dtype=bool),
-        "feature": own.track.astype(np.int64),
+        "feature": own.track_index.astype(np.int64),
         "residual": distance,
         "direction": normals,
         "pixel": own.curve_pixels + distance[:, None] * normals,
         "intrinsics": rows[:, :size],
         "pose": rows[:, size:],
-        "place": along_track(curves.tracks[own.track], own.is_arc[own.track], curves.feet),
+        "place": along_track(curves.tracks[own.track_index], own.on_arc, curves.feet),
     }
 
 

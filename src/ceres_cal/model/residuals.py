@@ -13,7 +13,7 @@ from ceres_cal.base.threads import parts_of, run_parts
 from ceres_cal.model.parameters import Estimate, intrinsics_vector, unit_px
 from ceres_cal.model.structure import Structure
 from ceres_cal.observations import Observations
-from ceres_cal.observations.sights import Sights, nearest_places
+from ceres_cal.observations.sights import Sights, nearest_feet
 from ceres_cal.scene.camera import Camera
 
 _POINT_NS = 10.0
@@ -73,7 +73,7 @@ def curve_columns(sights: Sights, structure: Structure, feet: Array, noise_scale
         sights.curve_bounds,
         structure.tracks(sights),
         sights.is_arc,
-        sights.track,
+        sights.track_index,
         sights.curve_pixels,
         1.0 / (noise_scale * sights.curve_sigma_px),
         feet,
@@ -122,5 +122,5 @@ def starting_feet(sights: Sights, estimate: Estimate, feet: Array | None) -> Arr
         if np.all(np.isfinite(known)):
             return known
     seen = [sights[int(number)] for number in np.flatnonzero(np.diff(sights.curve_bounds))]
-    nearest = [nearest_places(s, estimate.camera_at(s.key.station, s.key.placement)) for s in seen]
+    nearest = [nearest_feet(s, estimate.camera_at(s.key.station, s.key.placement)) for s in seen]
     return np.concatenate(nearest)

@@ -17,7 +17,7 @@ from ceres_cal.calibration import Calibration
 from ceres_cal.model.parameters import Estimate
 from ceres_cal.model.residuals import residuals
 from ceres_cal.moves.carried import RefitPlan
-from ceres_cal.moves.labels import MIRRORED, TURNED, other_divisions, relabelled
+from ceres_cal.moves.labels import MIRRORED, TURNED, mistaken_targets, relabelled
 from ceres_cal.moves.poses import Place, PoseSearch, misfit, movement, places
 from ceres_cal.observations import Observations, taken
 from ceres_cal.observations.sights import gather_sights
@@ -99,7 +99,7 @@ def _others(plan: RefitPlan, search: PoseSearch) -> Iterator[str]:
     mirrored = relabelled(search.observations, MIRRORED)
     if mirrored is not None and _fits(_seen_as(search, mirrored), old):
         yield "with mirrored labels they do: left and right are swapped, or the image is flipped: correct that"
-    for name, observations in other_divisions(search.observations).items():
+    for name, observations in mistaken_targets(search.observations).items():
         if _fits(_seen_as(search, observations), old):
             yield f"on {name} they do: this is the wrong field: correct the target's dimensions"
     zoomed = zoomed_place(search, old)

@@ -7,7 +7,8 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 
 from ceres_cal.moves.comparison import StationComparison
-from ceres_cal.scene.targets import MOVABLE, Arc, Target, along_track
+from ceres_cal.scene.curves import Arc, curve_points
+from ceres_cal.scene.targets import Target
 
 _SCALE = 80.0  # px per metre
 _MARGIN_M = 0.6
@@ -52,12 +53,10 @@ def _colour(share: float) -> str:
 
 def _field(targets: Mapping[str, Target], left: float, top: float) -> Iterator[str]:
     for target in targets.values():
-        if target.kind in MOVABLE:
+        if target.movable:
             continue
         for curve in target.curves.values():
-            is_arc = isinstance(curve, Arc)
-            s = np.linspace(*curve.parameter_range, 60 if is_arc else 2)
-            places = along_track(curve.track(), is_arc, s)
+            places = curve_points(curve, 0, 59 if isinstance(curve, Arc) else 1)
             path = " ".join(f"{_SCALE * (px - left):.1f},{_SCALE * (top - py):.1f}" for px, py, _ in places)
             yield f'<polyline points="{path}" fill="none" stroke="{_PAINT}" stroke-width="1.5"/>'
 

@@ -124,7 +124,7 @@ def equations(sight: Sights) -> int:
     """What a sight can say of a pose's six numbers and more: two for each point and straight line, three for each arc,
     but no more than its observations.
     """
-    tracks, counts = np.unique(sight.track, return_counts=True)
+    tracks, counts = np.unique(sight.track_index, return_counts=True)
     most = np.where(sight.is_arc[tracks], 3, 2)
     return 2 * len(np.unique(sight.points, axis=0)) + int(np.sum(np.minimum(counts, most)))
 

@@ -11,12 +11,12 @@ from ceres_cal.base.arrays import Array32
 from ceres_cal.base.transforms import Pose, rotation_log
 from ceres_cal.detect.registration import nearness_to
 from ceres_cal.detect.strokes import drawn, find_strokes
-from ceres_cal.photographs.facing import turns_of
 from ceres_cal.photographs.grid import Grid, grid_of, offsets_of
 from ceres_cal.photographs.matching import FloorLines, Match, Picture, lines_seen, match
 from ceres_cal.photographs.upright import Upright, find_upright
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Radial
+from ceres_cal.scene.symmetry import turns_of
 from ceres_cal.scene.targets import Target
 
 _UPRIGHTS = 4  # answers for lens and tilt, at most, that are matched

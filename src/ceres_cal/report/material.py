@@ -17,12 +17,13 @@ from ceres_cal.diagnostics import Diagnosis
 from ceres_cal.model.residuals import residuals
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import gather_sights
-from ceres_cal.scene.targets import Target, along_track
+from ceres_cal.scene.curves import curve_points
+from ceres_cal.scene.targets import Target
 from ceres_cal.uncertainty import Disagreement, FieldMap, Uncertainty, Verdict
 
 HEIGHTS_M = (0.0, 0.15)
 """Of the maps: the floor, and the top of a robot."""
-_CURVE_STEPS = 96
+_CURVE_PIECES = 95
 _FINER = 2  # than the maps' own grid, where that is quick
 _BORDER_STEPS = 60
 _MOST_SEAMS = 6
@@ -148,6 +149,5 @@ class Material:
     def paint(self) -> Iterator[Array]:
         """Each curve of what lies in the world as a polyline (S, 3) m."""
         for target in self.fields:
-            for curve, is_arc in zip(target.curves.values(), target.is_arc, strict=True):
-                s = np.linspace(*curve.parameter_range, _CURVE_STEPS)
-                yield along_track(curve.track(), bool(is_arc), s)
+            for curve in target.curves.values():
+                yield curve_points(curve, 0, _CURVE_PIECES)
