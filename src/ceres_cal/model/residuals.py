@@ -56,14 +56,14 @@ def camera_optics(camera: Camera) -> kernels.Optics:
 
 def point_columns(sights: Sights, structure: Structure, noise_scale: float = 1.0) -> kernels.PointColumns:
     """The point observations of some sights as the kernels take them."""
-    feature = sights.feature if len(structure.values) else sights.feature[:0]
+    index = sights.point_index if len(structure.values) else sights.point_index[:0]
     return kernels.PointColumns(
         sights.point_bounds,
         structure.points(sights),
         sights.pixels,
         1.0 / (noise_scale * sights.sigma_px),
-        structure.point_slots[feature],
-        structure.bends[feature],
+        structure.point_slots[index],
+        structure.bends[index],
     )
 
 

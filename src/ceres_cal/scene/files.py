@@ -15,7 +15,7 @@ Vector = tuple[float, float, float]
 
 
 class LensFile(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True):
-    """A lens; only `radial` has powers."""
+    """A lens; powers where its kind leaves the choice."""
 
     kind: str
     powers: tuple[int, ...] | None = None
