@@ -53,7 +53,7 @@ def _add_arguments(parser: ArgumentParser) -> None:
     add_report(parser)
     lens = parser.add_argument_group("the camera")
     add = lens.add_argument
-    kinds = f"default: {_DEFAULT_LENS}, the paper's; `--lens ?` names all"
+    kinds = "radial (the paper's), brown (OpenCV's), kannala-brandt (its fisheye), ...: `--lens ?` names all"
     add("--lens", type=_lens_kind, metavar="KIND", default=_DEFAULT_LENS, help=kinds)
     add("--powers", metavar="2,3", help="powers of a lens that leaves the choice; default: 2,3, the paper's")
     add(
