@@ -16,7 +16,7 @@ from cases import Row
 from photographs import LENSES, NOT_PAINTED, Shot, distances_px, real_target, take, varied
 
 from ceres_cal.base.errors import InputError
-from ceres_cal.detect.boards import read_grey
+from ceres_cal.detect.images import read_grey
 from ceres_cal.detect.profiles import Grey
 from ceres_cal.photographs import Auto, Facing
 from ceres_cal.photographs.search import search

@@ -21,10 +21,10 @@ from numpy.typing import NDArray
 
 from ceres_cal.base.transforms import Array, Pose
 from ceres_cal.calibrating import calibrate
-from ceres_cal.detect.boards import BoardDetections, detect_boards, read_colour
+from ceres_cal.detect.boards import BoardDetections, detect_boards
+from ceres_cal.detect.images import Image, read_colour
 from ceres_cal.model.parameters import Options
 from ceres_cal.pictures.straight import Straight, straighten
-from ceres_cal.pictures.warp import Image
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.targets import checkerboard
 from ceres_cal.start.closed_forms import homography_from_points

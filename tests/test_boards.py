@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.transforms import Array, Pose
-from ceres_cal.detect.boards import BoardDetections, CharucoSpec, detect_boards, read_grey, right_handed
+from ceres_cal.detect.boards import BoardDetections, CharucoSpec, detect_boards, right_handed
+from ceres_cal.detect.images import read_grey
 from ceres_cal.detect.saddles import measure_saddles
 from ceres_cal.observations import Observations
 from ceres_cal.scene.camera import Camera

@@ -10,6 +10,7 @@ import numpy as np
 from ceres_cal.base.errors import DegenerateError, SolutionError
 from ceres_cal.base.threads import at_most, meanwhile, single_threaded_blas
 from ceres_cal.base.transforms import Array
+from ceres_cal.base.words import bounds_text
 from ceres_cal.calibration import Calibration, Fit, Rejected
 from ceres_cal.model.parameters import Estimate, Layout, Options, make_layout
 from ceres_cal.model.residuals import Residuals, residuals
@@ -22,7 +23,7 @@ from ceres_cal.solve.mirrored import without_mirrored_poses
 from ceres_cal.solve.noise import Inliers, judge, start_weights
 from ceres_cal.start.baseline import four_point_baseline
 from ceres_cal.start.initialise import Start, initialise
-from ceres_cal.uncertainty import Posterior, Setting, Uncertainty, assess, bounds_text
+from ceres_cal.uncertainty import Posterior, Setting, Uncertainty, assess
 
 _MOST_ROUNDS = 15
 _SETTLED_SCALE, _SETTLED_AGAIN = 1e-2, 1e-5  # relative change of a noise scale that is no change

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
-from pathlib import Path
 
 from ceres_cal.base.errors import InputError
-from ceres_cal.cli.command import Answer, Command, add_output, finishing, parse_number, require_output
+from ceres_cal.cli.arguments import add_calibration, add_output, add_station, parse_number
+from ceres_cal.cli.command import Answer, Command
+from ceres_cal.cli.inputs import read_calibration, station_of
+from ceres_cal.cli.outputs import finishing, require_output
 
 
 def _add_arguments(parser: ArgumentParser) -> None:
     add = parser.add_argument
-    add("calibration", metavar="CALIBRATION", type=Path, help="file that `ceres-cal calibrate` or `refit` wrote")
+    add_calibration(parser)
     add_output(parser, "the table (.npz)", required=True)
-    add("--station", help="which station; may be left out where there is only one")
+    add_station(parser)
     add("--error-mm", default="0.1", metavar="MM", help="largest interpolation error on the field; default: 0.1")
     add("--step-px", type=int, metavar="PX", help="distance of the nodes; default: the widest that keeps to the error")
 
@@ -23,14 +25,12 @@ def _run(args: Namespace) -> Answer:
     error_mm = parse_number(args.error_mm, "--error-mm")
     if error_mm <= 0.0:
         raise InputError(f"--error-mm must be above 0, not {error_mm:g}")
-    from ceres_cal.calibration import Calibration
     from ceres_cal.scene.lookup import make_table
     from ceres_cal.uncertainty.uncertainty import field_grid
 
-    calibration = Calibration.load(args.calibration)
-    camera = calibration.station(args.station)
-    name = args.station or next(iter(calibration.stations))
-    table = make_table(camera, name, *field_grid(calibration.targets), error_mm, args.step_px)
+    calibration = read_calibration(args)
+    name = station_of(args, calibration)
+    table = make_table(calibration.stations[name], name, *field_grid(calibration.targets), error_mm, args.step_px)
     with finishing():
         table.save(args.output)
     errors = [{"height_m": h, "rms_mm": rms, "worst_mm": worst} for h, (rms, worst) in table.error_mm.items()]

@@ -8,22 +8,19 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from ceres_cal.base.errors import InputError, NothingShownError
-from ceres_cal.base.files import read_bytes
+from ceres_cal.base.progress import ImageProgress
 from ceres_cal.base.transforms import Array
+from ceres_cal.detect.images import Image, read_grey
 from ceres_cal.detect.saddles import REACH, measure_saddles
 from ceres_cal.detect.scatter import scatter_px
-from ceres_cal.observations import Curves, Observations, Points, View
+from ceres_cal.observations import Observations, Points, View, no_curves
 from ceres_cal.scene.targets import Target
-
-Image = NDArray[Any]
-Progress = Callable[[int, int, str], None]
 
 CORNER_FITS = ("opencv", "saddle")
 MIN_CORNERS = 6
@@ -70,7 +67,7 @@ def detect_boards(
     station: str | None = None,
     charuco: CharucoSpec | None = None,
     corner_fit: str = "opencv",
-    progress: Progress | None = None,
+    progress: ImageProgress | None = None,
 ) -> BoardDetections:
     """Chessboard or ChArUco corners of one camera's images.
 
@@ -93,7 +90,7 @@ def detect_boards(
         corner_fit: "opencv" measures with cornerSubPix, as the peers do, so that results compare; "saddle" fits a
             blurred saddle to each corner: about four times more precise on rendered boards (0.005 px against 0.02),
             and without cornerSubPix's pull towards the middle of its window. ChArUco corners are always saddles.
-        progress: called after each image with (images done, images in all, file name).
+        progress: called after each image.
 
     Raises:
         InputError: an image cannot be read or has another size (each named), the target is no checkerboard or too
@@ -111,31 +108,8 @@ def detect_boards(
         )
     views = tuple(View(path.stem, camera, station or camera, TARGET_NAME, placements[path]) for path in found)
     points = _points(list(found.values()), board)
-    observations = Observations({TARGET_NAME: board}, {camera: size}, views, points, _no_curves())
+    observations = Observations({TARGET_NAME: board}, {camera: size}, views, points, no_curves())
     return BoardDetections(observations, tuple(map(str, found)), tuple(missed))
-
-
-def read_grey(path: str | Path) -> Image:
-    """An image as (height, width) grey levels of its own depth, its pixels as stored (any noted rotation ignored).
-
-    Raises:
-        InputError: the file is missing or no image.
-    """
-    return _decoded(path, cv2.IMREAD_GRAYSCALE)
-
-
-def read_colour(path: str | Path) -> Image:
-    """An image as (height, width) grey levels or (height, width, 3) blue, green and red; otherwise as `read_grey`."""
-    return _decoded(path, cv2.IMREAD_ANYCOLOR)
-
-
-def _decoded(path: str | Path, channels: int) -> Image:
-    content = np.frombuffer(read_bytes(path), np.uint8)
-    flags = channels | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
-    image = cv2.imdecode(content, flags) if content.size else None
-    if image is None:
-        raise InputError(f"{path}: not an image that OpenCV can read (cut short?): convert it to PNG or leave it out")
-    return image
 
 
 # ---- finding --------------------------------------------------------------------------------------------------------
@@ -145,7 +119,7 @@ Finder = Callable[[Image], Array | str]
 
 
 def _find_all(
-    paths: Sequence[Path], find: Finder, progress: Progress | None
+    paths: Sequence[Path], find: Finder, progress: ImageProgress | None
 ) -> tuple[tuple[int, int], dict[Path, Array], list[tuple[str, str]]]:
     """The images' (width, height), the grid in each image that shows the board, and (path, reason) of the others."""
     size = (0, 0)
@@ -325,8 +299,3 @@ def _points(grids: Sequence[Array], board: Target) -> Points:
         pixels=np.concatenate([grid[s] for grid, s in zip(grids, seen, strict=True)]),
         sigma_px=np.full(sum(count), scatter_px(grids)),
     )
-
-
-def _no_curves() -> Curves:
-    nothing = np.empty(0, np.int32)
-    return Curves(nothing, nothing.copy(), np.empty((0, 2)), np.empty(0), np.empty(0, np.int8))

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.transforms import Array
-from ceres_cal.detect.boards import read_grey
+from ceres_cal.detect.images import read_grey
 from ceres_cal.detect.profiles import Grey, Windows, cut_windows, fit_profiles, fit_shape
-from ceres_cal.observations import Curves, Observations, Points, View
+from ceres_cal.observations import Curves, Observations, View, no_points
 from ceres_cal.scene.targets import Target, rings
 
 TARGET_NAME = "rings"
@@ -42,7 +42,7 @@ class RingsDetection:
     Attributes:
         observations: one view, its edges as curve observations.
         centre: (2,) px, where the rings' common centre is seen.
-        found: number of rings, from the inside out; those beyond are outside the image.
+        rings: how many, from the inside out; those beyond are outside the image.
         polynomial: (3,) the paper's a1, a2, a3 (section 2), r' in units of the first ring's measured radius per its
             real one: r' = a1 r + a2 r^2 + a3 r^3 px.
         rms_px: of the rings' radii about that polynomial, in measured pixels.
@@ -51,7 +51,7 @@ class RingsDetection:
 
     observations: Observations
     centre: Array
-    found: int
+    rings: int
     polynomial: Array
     rms_px: float
     blur_px: float
@@ -359,12 +359,11 @@ def _polynomial(edges: _Edges, centre: Array, radii_m: Array) -> tuple[Array, fl
 
 def _observations(edges: _Edges, sheet: Target, grey: Grey, frame: str, camera: str, station: str) -> Observations:
     count = len(edges.ring)
-    none = np.empty(0, dtype=np.int32)
     size = (int(grey.shape[1]), int(grey.shape[0]))
     return Observations(
         {TARGET_NAME: sheet},
         {camera: size},
         (View(frame, camera, station, TARGET_NAME, frame),),
-        Points(none, none, np.empty((0, 2)), np.empty(0)),
+        no_points(),
         Curves(np.zeros(count, np.int32), edges.ring, edges.pixels, edges.sigma_px, np.zeros(count, np.int8)),
     )

@@ -24,13 +24,13 @@ from ceres_cal.moves.poses import Place, Scene, movement, places
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Mask, Sights, gather_sights
 from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.heights import HEIGHTS_M
 from ceres_cal.solve import Weighting, information, solve
 from ceres_cal.uncertainty import Posterior
 from ceres_cal.uncertainty.maps import shown_pixels
 from ceres_cal.uncertainty.uncertainty import field_grid
 
 FALSE_ALARMS = 0.01
-HEIGHTS_M = (0.0, 0.15)
 _INLIER_SIGMA = 3.5
 _LEAST_SHARE = 0.5  # of observations that fit somewhere; with fewer nothing is understood
 _MANY_OUTLIERS = 0.25

@@ -102,6 +102,16 @@ class Curves:
         return len(self.view)
 
 
+def no_points() -> Points:
+    """Columns without any row."""
+    return Points(np.empty(0, np.int32), np.empty(0, np.int32), np.empty((0, 2)), np.empty(0))
+
+
+def no_curves() -> Curves:
+    """Columns without any row."""
+    return Curves(**vars(no_points()), side=np.empty(0, np.int8))
+
+
 Columns = Points | Curves
 C = TypeVar("C")
 

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ceres_cal.base.transforms import Array
+from ceres_cal.detect.images import Image
 from ceres_cal.pictures.model import Line, Model
-from ceres_cal.pictures.warp import Image
 
 Colour = tuple[int, int, int]
 """Blue, green, red."""

@@ -39,14 +39,14 @@ class Straight:
         camera: the straight image's own: a pinhole at the photograph's pose. What it projects and locates holds in
             the straight image.
         warp: makes the images.
-        shown: share of the photograph's pixels that the straight image shows.
+        share: of the photograph's pixels, that the straight image shows.
         limit_deg: angle off the axis from which on nothing is shown, because the lens has no answer there or draws
             pixels out too much, or for `angle_deg`; None where the photograph ends before.
     """
 
     camera: Camera
     warp: Warp
-    shown: float
+    share: float
     limit_deg: float | None
 
     @property
@@ -103,7 +103,7 @@ def straighten(
         return found
 
     warp = make_warp(new_size, camera.image_size, places)
-    return Straight(straight, warp, _shown(camera, straight, region.slope), region.limit_deg)
+    return Straight(straight, warp, _share_shown(camera, straight, region.slope), region.limit_deg)
 
 
 def _scaled(box: Array, wanted: tuple[int, int], phi: float | None, *, whole: bool) -> tuple[float, tuple[int, int]]:
@@ -116,7 +116,7 @@ def _scaled(box: Array, wanted: tuple[int, int], phi: float | None, *, whole: bo
     return float(phi), (int(count[0]), int(count[1]))
 
 
-def _shown(camera: Camera, straight: Camera, slope: float) -> float:
+def _share_shown(camera: Camera, straight: Camera, slope: float) -> float:
     """The share of the photograph's pixels, of every few, whose centres fall into the straight image."""
     width, height = camera.image_size
     step = max(1, int(np.sqrt(width * height / _COUNTED)))

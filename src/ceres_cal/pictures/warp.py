@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
@@ -16,8 +15,8 @@ from numpy.typing import NDArray
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.transforms import Array
+from ceres_cal.detect.images import Image
 
-Image = NDArray[Any]
 Plane = NDArray[np.float32]
 
 MOST_PIXELS, LONGEST_SIDE = 100_000_000, 32_000  # OpenCV's remap ends at 32 767

@@ -65,6 +65,12 @@ class Camera:
         return self.cam_from_world.position
 
     @property
+    def tilt_deg(self) -> float:
+        """Angle between the camera's axis and straight down."""
+        x, y, z = self.cam_from_world.rotation[2]
+        return float(np.degrees(np.arctan2(np.hypot(x, y), -z)))
+
+    @property
     def matrix(self) -> Array:
         """The camera matrix K (3, 3) of the undistorted image (paper, section 3.4)."""
         cx, cy = self.principal_point

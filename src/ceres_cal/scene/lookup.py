@@ -17,9 +17,9 @@ from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import read_bytes, write_bytes
 from ceres_cal.base.transforms import Array
 from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.heights import HEIGHTS_M
 
 FORMAT, VERSION = "ceres-cal/table", 1
-HEIGHTS_M = (0.0, 0.15)  # at which the error is stated
 _STEPS_PX = (64, 32, 16, 8, 4, 2, 1)
 
 

@@ -7,7 +7,7 @@ from ceres_cal.uncertainty.posterior import Posterior, make_posterior
 from ceres_cal.uncertainty.profile import Profile, Setting
 from ceres_cal.uncertainty.seam import Disagreement, disagreement
 from ceres_cal.uncertainty.uncertainty import Uncertainty
-from ceres_cal.uncertainty.weak import Verdict, WeakDirection, bounds_text
+from ceres_cal.uncertainty.weak import Verdict, WeakDirection
 
 __all__ = [
     "Disagreement",
@@ -21,7 +21,6 @@ __all__ = [
     "Verdict",
     "WeakDirection",
     "assess",
-    "bounds_text",
     "disagreement",
     "lower_triangle",
     "make_posterior",
