@@ -57,7 +57,6 @@ def vectors(material: Material, name: str) -> Figure:
     field = _VectorField(
         camera, table, inliers[::step], outliers[::step], typical, means, _paint_in_image(material, name)
     )
-    number = len(field.inliers) + len(field.outliers)
     shape = camera.image_size[1] / camera.image_size[0]
     return Figure(
         f"vectors-{_number_of(material, name)}",
