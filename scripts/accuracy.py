@@ -29,7 +29,7 @@ from accuracy_scenes import (
 from benchmark_problems import corner_observations, wide_lens
 from cases import Row, run
 
-from ceres_cal.base.transforms import Array
+from ceres_cal.base.arrays import Array
 from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
 from ceres_cal.model.parameters import Options

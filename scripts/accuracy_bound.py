@@ -8,13 +8,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from accuracy_scenes import Problem
 
+from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import CalibrationError
-from ceres_cal.base.transforms import Array
 from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
 from ceres_cal.model import quantities
+from ceres_cal.model.keys import Key
 from ceres_cal.model.parameters import Estimate, Layout, Options, Station, make_layout
-from ceres_cal.model.quantities import Key, shared_keys
 from ceres_cal.model.structure import make_structure
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights, gather_sights

@@ -9,7 +9,8 @@ from math import hypot
 
 import numpy as np
 
-from ceres_cal.base.transforms import Array, Pose
+from ceres_cal.base.arrays import Array
+from ceres_cal.base.transforms import Pose
 from ceres_cal.model.parameters import Options
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.scene.camera import Camera

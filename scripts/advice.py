@@ -21,8 +21,8 @@ from accuracy_scenes import CLEAN_NOISE, FIELD, Problem, tilted
 from cases import Row, run
 
 from ceres_cal.advice import Measurement, Promise, advise, promised
+from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import CalibrationError
-from ceres_cal.base.transforms import Array
 from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
 from ceres_cal.model.parameters import Options, Station

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from benchmark_peers import Corners
 
-from ceres_cal.base.transforms import Array, rotation_exp
+from ceres_cal.base.arrays import Array
+from ceres_cal.base.transforms import rotation_exp
 from ceres_cal.observations import Columns, Curves, Observations, Points, Prior, View
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Brown, Radial

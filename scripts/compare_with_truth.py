@@ -12,9 +12,10 @@ from typing import Any
 
 import numpy as np
 
+from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import CalibrationError, InputError
 from ceres_cal.base.files import read_json
-from ceres_cal.base.transforms import Array, Pose, euler_from_rotation
+from ceres_cal.base.transforms import Pose, euler_from_rotation
 from ceres_cal.calibration import Calibration
 from ceres_cal.observations import Observations
 from ceres_cal.scene.camera import Camera

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from ceres_cal import Calibration, Camera, Observations, calibrate
-from ceres_cal.base.transforms import Array
+from ceres_cal.base.arrays import Array
 from ceres_cal.model.residuals import residuals
 from ceres_cal.observations.sights import gather_sights
 from ceres_cal.scene.targets import along_track

@@ -23,13 +23,15 @@ from accuracy_scenes import FIELD, field_places
 from cases import Row, run
 from photographs import varied
 
+from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import CalibrationError
-from ceres_cal.base.transforms import Array, Pose, rotation_exp
+from ceres_cal.base.transforms import Pose, rotation_exp
 from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
 from ceres_cal.detect.boards import detect_boards
+from ceres_cal.model.keys import Key
 from ceres_cal.model.parameters import Estimate
-from ceres_cal.model.quantities import Key, difference
+from ceres_cal.model.quantities import difference
 from ceres_cal.model.structure import make_structure
 from ceres_cal.moves import check, refit
 from ceres_cal.moves.carried import layouts, make_plan

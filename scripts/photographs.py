@@ -18,13 +18,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 from cases import Row, exit_code, json_text, printed
-from numpy.typing import NDArray
 from straightness import observed_boards, straight_rows
 
+from ceres_cal.base.arrays import Array, Array32, Indices32, Mask
 from ceres_cal.base.errors import CalibrationError
-from ceres_cal.base.transforms import Array, Pose, rotation_exp
+from ceres_cal.base.transforms import Pose, rotation_exp
 from ceres_cal.calibrating import calibrate
-from ceres_cal.detect.profiles import Grey
 from ceres_cal.detect.rings import detect_rings
 from ceres_cal.model.parameters import Options
 from ceres_cal.model.structure import Tolerance
@@ -69,7 +68,7 @@ class Shot:
     good_light: bool
 
     @property
-    def grey(self) -> Grey:
+    def grey(self) -> Array32:
         return cv2.cvtColor(self.picture.image, cv2.COLOR_BGR2GRAY).astype(np.float32)
 
 
@@ -125,7 +124,7 @@ def off_by(camera: Camera, angle_rad: float, seed: int) -> Camera:
     return turned(camera, [angle_rad * np.cos(direction), angle_rad * np.sin(direction), 0.0])
 
 
-def distances_px(shot: Shot, curve: NDArray[np.int32], pixels: Array) -> Array:
+def distances_px(shot: Shot, curve: Indices32, pixels: Array) -> Array:
     """(N,) distance of pixels to the left of their true curves, px."""
     target, camera = shot.target, shot.camera
     floor = np.column_stack([camera.locate(pixels), np.zeros(len(pixels))])
@@ -143,7 +142,7 @@ def distances_px(shot: Shot, curve: NDArray[np.int32], pixels: Array) -> Array:
     return np.asarray(np.sum((pixels - there) * normal, axis=1))
 
 
-def hidden_places(shot: Shot, pixels: Array) -> NDArray[np.bool_]:
+def hidden_places(shot: Shot, pixels: Array) -> Mask:
     """(N,) whether a place and two pixels around it are hidden: at the rim of a robot a window still sees paint."""
     steps = [(0.0, 0.0), (2.0, 0.0), (-2.0, 0.0), (0.0, 2.0), (0.0, -2.0)]
     return np.asarray(np.all([shot.picture.hides(pixels + step) for step in steps], axis=0))

@@ -17,12 +17,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 from cases import Row
-from numpy.typing import NDArray
 
-from ceres_cal.base.transforms import Array, Pose
+from ceres_cal.base.arrays import Array, Image, Image8
+from ceres_cal.base.transforms import Pose
 from ceres_cal.calibrating import calibrate
 from ceres_cal.detect.boards import BoardDetections, detect_boards
-from ceres_cal.detect.images import Image, read_colour
+from ceres_cal.detect.images import read_colour
 from ceres_cal.model.parameters import Options
 from ceres_cal.pictures.straight import Straight, straighten
 from ceres_cal.scene.camera import Camera
@@ -51,7 +51,7 @@ def _off_line(pixels: Array) -> Array:
 
 def refined(image: Image, grid: Array) -> Array:
     """Corners (rows, columns, 2) where they are seen in an image, from near them."""
-    grey: NDArray[np.uint8] = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY).astype(np.uint8)
+    grey: Image8 = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY).astype(np.uint8)
     steps = [np.linalg.norm(np.diff(grid, axis=axis), axis=2).min() for axis in (0, 1)]
     found = grid.reshape(-1, 1, 2).astype(np.float32)
     for widest in _WINDOWS_PX:

@@ -19,7 +19,8 @@ import numpy as np
 import pytest
 from benchmark_problems import corner_observations, wide_lens
 
-from ceres_cal.base.transforms import Array, Pose
+from ceres_cal.base.arrays import Array
+from ceres_cal.base.transforms import Pose
 from ceres_cal.calibrating import calibrate
 from ceres_cal.model.parameters import Options
 from ceres_cal.model.quantities import moved

@@ -21,8 +21,8 @@ from advice import CASES, Kept, followed, promised_for
 from ceres_cal.advice import Advice, Errors, Measurement, Promise, advise, promised
 from ceres_cal.advice.measurements import Ground, _observed, together
 from ceres_cal.advice.ranking import _chosen, _prepared, _weighting
+from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.transforms import Array
 from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
 from ceres_cal.cli import main

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scenes import SCENES
 
+from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import DegenerateError
-from ceres_cal.base.transforms import Array
 from ceres_cal.calibrating import calibrate
 from ceres_cal.model.parameters import Options
 from ceres_cal.observations import Observations, Prior, combine

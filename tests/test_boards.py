@@ -2,17 +2,16 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
+from ceres_cal.base.arrays import AnyArray, Array, Image8
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.transforms import Array, Pose
+from ceres_cal.base.transforms import Pose
 from ceres_cal.detect.boards import BoardDetections, CharucoSpec, detect_boards, right_handed
 from ceres_cal.detect.images import read_grey
 from ceres_cal.detect.saddles import measure_saddles
@@ -25,7 +24,6 @@ BOARD = checkerboard(7, 6, 0.03)
 CAMERA = Camera((480, 360), 450.0, (243.3, 177.8), Radial((1e-4, 7e-7)))
 POSE = Pose.exp((0.35, -0.45, 0.1, -0.07, -0.08, 0.33))  # tilted by half a radian; the board fills half the image
 
-Image = NDArray[np.uint8]
 Paint = Callable[[Array], Array]
 """Places on the board (N, 2) in squares -> brightness 0 to 1."""
 
@@ -65,7 +63,7 @@ def ideal_picture(camera: Camera, square_m: float, paint: Paint) -> Array:
     return np.asarray(picture.reshape(height, width))
 
 
-def photograph(picture: Array, blur_px: float = 0.7, noise: float = 2.0, seed: int = 1) -> Image:
+def photograph(picture: Array, blur_px: float = 0.7, noise: float = 2.0, seed: int = 1) -> Image8:
     """Grey levels 40 to 200 of a picture, blurred, with noise (grey levels)."""
     blurred = cv2.GaussianBlur(40.0 + 160.0 * picture, (0, 0), blur_px)
     levels = blurred + noise * np.random.default_rng(seed).standard_normal(picture.shape)
@@ -92,7 +90,7 @@ def truth() -> Array:
     return CAMERA.at(POSE).project(BOARD.point_array)
 
 
-def write(path: Path, image: NDArray[Any]) -> Path:
+def write(path: Path, image: AnyArray) -> Path:
     path.parent.mkdir(exist_ok=True)
     assert cv2.imwrite(str(path), image)
     return path
@@ -342,7 +340,7 @@ CHARUCO = CharucoSpec("DICT_4X4_50", 0.03)
 
 
 @pytest.fixture(scope="module")
-def charuco() -> tuple[Image, Array]:
+def charuco() -> tuple[Image8, Array]:
     """OpenCV's own drawing of the board, in perspective, and its corners (35, 2)."""
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
     drawing = cv2.aruco.CharucoBoard((8, 6), 0.04, 0.03, dictionary).generateImage(
@@ -359,14 +357,14 @@ def charuco() -> tuple[Image, Array]:
     return image, cv2.perspectiveTransform(corners[None], from_drawing)[0]
 
 
-def test_charuco_corners(tmp_path: Path, charuco: tuple[Image, Array]) -> None:
+def test_charuco_corners(tmp_path: Path, charuco: tuple[Image8, Array]) -> None:
     image, truth = charuco
     points = detect_boards([write(tmp_path / "a.png", image)], CHARUCO_BOARD, charuco=CHARUCO).observations.points
     assert np.array_equal(points.feature, np.arange(35))
     assert rms(points.pixels - truth) < 0.02  # 0.009; OpenCV's own corners 0.05
 
 
-def test_charuco_may_be_partly_seen(tmp_path: Path, charuco: tuple[Image, Array]) -> None:
+def test_charuco_may_be_partly_seen(tmp_path: Path, charuco: tuple[Image8, Array]) -> None:
     image, truth = charuco
     image = image.copy()
     image[:, 330:] = 128
@@ -386,7 +384,7 @@ def test_charuco_may_be_partly_seen(tmp_path: Path, charuco: tuple[Image, Array]
     ],
 )
 def test_charuco_too_little_seen(
-    right: int, below: int, reason: str, tmp_path: Path, charuco: tuple[Image, Array]
+    right: int, below: int, reason: str, tmp_path: Path, charuco: tuple[Image8, Array]
 ) -> None:
     whole = write(tmp_path / "a.png", charuco[0])
     part = np.full_like(charuco[0], 128)

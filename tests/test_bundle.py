@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scenes import SCENES
 from scipy.optimize import least_squares
 
+from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.errors import DegenerateError
-from ceres_cal.base.transforms import Array, Pose, rotation_exp, rotation_log
+from ceres_cal.base.transforms import Pose, rotation_exp, rotation_log
 from ceres_cal.model.parameters import (
     Estimate,
     Layout,
@@ -217,7 +217,7 @@ def test_what_is_held_comes_back_as_it_was(held: str) -> None:
     name = "brown/two-cameras"
     observations, options = case(name)
     whole, start = make_layout(observations, options), start_of(name)
-    none: NDArray[np.int64] = np.empty(0, dtype=np.int64)
+    none: Indices = np.empty(0, dtype=np.int64)
     layout = Layout(
         dict.fromkeys(whole.free, none) if held in ("cameras", "all") else whole.free,
         frozenset() if held in ("stations", "all") else whole.stations,

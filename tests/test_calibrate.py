@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scenes import SCENES
 from scipy.optimize import least_squares
 
+from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.errors import DegenerateError, InputError, SolutionError
-from ceres_cal.base.transforms import Array, Pose, rotation_exp, rotation_log
+from ceres_cal.base.transforms import Pose, rotation_exp, rotation_log
 from ceres_cal.calibrating import calibrate
 from ceres_cal.model.parameters import Options, intrinsic_names, intrinsics_scales, intrinsics_vector, with_intrinsics
 from ceres_cal.observations import Curves, Observations, Points, Prior, View, combine
@@ -373,7 +373,7 @@ class DensePoints:
     Unknowns: the free intrinsics, and a left perturbation of the pose.
     """
 
-    def __init__(self, simulation: Simulation, free: NDArray[np.int64], priors: tuple[Prior, ...] = ()) -> None:
+    def __init__(self, simulation: Simulation, free: Indices, priors: tuple[Prior, ...] = ()) -> None:
         self.start = camera_before(simulation, simulation.observations.views[0])
         self.free, self.priors = free, priors
         points, (target,) = simulation.observations.points, simulation.observations.targets.values()

@@ -8,8 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import CalibrationError, DegenerateError, InputError
-from ceres_cal.base.transforms import Array, Pose, rotation_exp, rotation_from_euler
+from ceres_cal.base.transforms import Pose, rotation_exp, rotation_from_euler
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Brown, KannalaBrandt, Lens, Radial
 

@@ -13,11 +13,11 @@ import pytest
 import scenes
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
 from ceres_cal import kernels
-from ceres_cal.base.transforms import Array, Pose, rotation_exp
+from ceres_cal.base.arrays import Array, Indices, Indices32, Mask
+from ceres_cal.base.transforms import Pose, rotation_exp
 from ceres_cal.kernels.lenses import answer_limit, one_dimensional
 from ceres_cal.kernels.sight import working_space
 from ceres_cal.model.parameters import intrinsics_vector, unit_px, with_intrinsics
@@ -55,14 +55,14 @@ class Seen:
     points: Array
     pixels: Array
     sigma_px: Array
-    track: NDArray[np.int32]
+    track: Indices32
     curve_pixels: Array
     curve_sigma_px: Array
     start: Array
     tracks: Array = field(default_factory=lambda: TARGET.tracks.reshape(-1, 3, 3))
 
     @property
-    def is_arc(self) -> NDArray[np.bool_]:
+    def is_arc(self) -> Mask:
         return np.tile(TARGET.is_arc, 3)
 
     def take(self, points: Any = slice(0, 0), curves: Any = slice(0, 0)) -> Seen:
@@ -106,7 +106,7 @@ def looked_at(lens: str) -> tuple[Camera, Seen]:
     )
 
 
-def optics(camera: Camera) -> tuple[int, Array, NDArray[np.int64], float]:
+def optics(camera: Camera) -> tuple[int, Array, Indices, float]:
     powers = np.asarray(camera.lens.radius_powers, dtype=np.int64)
     return kernels.LENS_CODES[camera.lens.kind], intrinsics_vector(camera), powers, unit_px(camera)
 
@@ -120,9 +120,9 @@ class Moves:
     """Which structure numbers move what, as the kernels take it; nothing by default."""
 
     count: int = 0
-    slots: NDArray[np.int32] = field(default_factory=lambda: np.empty((0, 4), np.int32))
+    slots: Indices32 = field(default_factory=lambda: np.empty((0, 4), np.int32))
     bends: Array = field(default_factory=lambda: np.empty((0, 2)))
-    track_slots: NDArray[np.int32] = field(default_factory=lambda: np.empty((0, 3), np.int32))
+    track_slots: Indices32 = field(default_factory=lambda: np.empty((0, 3), np.int32))
 
 
 NOTHING_MOVES = Moves()
@@ -401,7 +401,7 @@ class Block:
 
 def evaluate_block(
     camera: Camera, poses: tuple[Array, Array], seen: Seen, loss: str = "trivial", scale: float = 1.0, *,
-    free: NDArray[np.int64] | None = None, held: tuple[str, ...] = (), moves: Moves = NOTHING_MOVES,
+    free: Indices | None = None, held: tuple[str, ...] = (), moves: Moves = NOTHING_MOVES,
 ) -> Block | None:  # fmt: skip
     """The block of a camera at station @ placement; None where the kernel says that there is no answer."""
     code, vector, powers, unit = optics(camera)

@@ -10,8 +10,8 @@ import pytest
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
+from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.transforms import Array
 from ceres_cal.scene.lens import LENS_KINDS, Brown, KannalaBrandt, Lens, Radial, make_lens
 
 quick = settings(deadline=None, max_examples=60)

@@ -5,7 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ceres_cal.base.transforms import Array, Pose, rotation_from_euler
+from ceres_cal.base.arrays import Array
+from ceres_cal.base.transforms import Pose, rotation_from_euler
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Radial
 

@@ -18,7 +18,8 @@ import pycolmap
 import pycolmap.cost_functions
 import pytest
 
-from ceres_cal.base.transforms import Array, Pose, rotation_exp, rotation_log
+from ceres_cal.base.arrays import Array
+from ceres_cal.base.transforms import Pose, rotation_exp, rotation_log
 from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
 from ceres_cal.detect.boards import BoardDetections

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from scenes import LENSES, camera, lines
 
+from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.transforms import Array, Pose
+from ceres_cal.base.transforms import Pose
 from ceres_cal.cli import main
 from ceres_cal.detect.images import read_grey
 from ceres_cal.detect.saddles import measure_saddles

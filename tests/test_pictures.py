@@ -15,8 +15,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scenes import LENSES, camera
 
+from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.transforms import Array, Pose
+from ceres_cal.base.transforms import Pose
 from ceres_cal.calibrating import calibrate
 from ceres_cal.detect.boards import BoardDetections
 from ceres_cal.detect.images import encoded, read_grey

@@ -11,12 +11,14 @@ import pytest
 from scenes import SCENES
 from scipy.stats import t as student
 
+from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.spread import Spread
-from ceres_cal.base.transforms import Array, Pose, left_jacobian, skew
+from ceres_cal.base.transforms import Pose, left_jacobian, skew
 from ceres_cal.calibrating import calibrate
+from ceres_cal.model.keys import Key, pose_keys
 from ceres_cal.model.parameters import Estimate, Layout, Options, intrinsics_scales, make_layout
-from ceres_cal.model.quantities import Key, difference, moved, pose_keys, shared_keys
+from ceres_cal.model.quantities import difference, moved
 from ceres_cal.model.structure import Tolerance
 from ceres_cal.observations import Prior
 from ceres_cal.observations.sights import Sights, gather_sights

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from ceres_cal.base.transforms import Array
-from ceres_cal.detect.profiles import Grey, cut_windows, fit_profiles, fit_shape, normal_step
+from ceres_cal.base.arrays import Array, Array32
+from ceres_cal.detect.profiles import cut_windows, fit_profiles, fit_shape, normal_step
 
 WIDTH_PX = 2.4
 COUNT = 200
@@ -71,7 +71,7 @@ def test_sigma_is_the_scatter() -> None:
 def test_curves_bend() -> None:
     y, x = np.indices((61, 61)) - 30.0
     radius = np.hypot(x, y + 40.0)  # a circle of 40 px radius whose lowest place is the middle
-    image: Grey = (200.0 * normal_step((41.3 - radius) / 0.8)[0]).astype(np.float32)
+    image: Array32 = (200.0 * normal_step((41.3 - radius) / 0.8)[0]).astype(np.float32)
     normal = np.array([[0.0, 1.0]])
     bent = cut_windows(image, np.array([[30.0, 30.0]]), normal, np.array([-1.0 / 40.0]), 5.0, 4)
     straight = cut_windows(image, np.array([[30.0, 30.0]]), normal, np.zeros(1), 5.0, 4)

@@ -6,6 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from accuracy_scenes import FIELD
+from ceres_cal.model.joint import JointPrior
+from ceres_cal.solve.joint import JointPriorCost, offsets
 from moves import (
     CAMERA,
     CORNERS,
@@ -30,7 +32,6 @@ from ceres_cal.base.errors import DegenerateError, InputError, SolutionError
 from ceres_cal.base.transforms import Pose, rotation_exp
 from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
-from ceres_cal.model.joint import JointPrior
 from ceres_cal.model.parameters import Layout, Options, Station
 from ceres_cal.model.quantities import difference, moved
 from ceres_cal.model.structure import Tolerance
@@ -43,7 +44,6 @@ from ceres_cal.scene.lens import Radial
 from ceres_cal.scene.targets import ssl_field
 from ceres_cal.simulate import field_scene, overhead_pose, simulate
 from ceres_cal.solve.costs import Run
-from ceres_cal.solve.joint import JointPriorCost, offsets
 
 FAR = overhead_pose(-2.3, -1.9, 3.9, tilt_y_deg=-25.0, yaw_deg=90.0)
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scenes import camera, rings_and_field
 
+from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.transforms import Array
 from ceres_cal.calibrating import calibrate
 from ceres_cal.cli import main
 from ceres_cal.detect.rings import RingsDetection, detect_rings

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ceres_cal.base.transforms import Array
+from ceres_cal.base.arrays import Array
 from ceres_cal.detect.scatter import USUAL_PX, scatter_px
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Brown

@@ -9,7 +9,8 @@ import pytest
 from scenes import SCENES
 from scipy.optimize import minimize_scalar
 
-from ceres_cal.base.transforms import Array, Pose
+from ceres_cal.base.arrays import Array
+from ceres_cal.base.transforms import Pose
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import SightKey, Sights, gather_sights, nearest_places
 from ceres_cal.scene.targets import Arc, Segment, along_track, checkerboard, custom

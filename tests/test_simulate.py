@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 from scenes import SCENES
 
+from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.transforms import Pose
 from ceres_cal.observations import Observations
@@ -69,7 +69,7 @@ def camera_before_target(scene: Scene, observations: Observations, view: int) ->
     return scene.cameras[station.camera].at(station.cam_from_world @ placement)
 
 
-def distance_to_curve(curve: Curve, side: int, xy: NDArray[np.float64]) -> NDArray[np.float64]:
+def distance_to_curve(curve: Curve, side: int, xy: Array) -> Array:
     """Distance (N,) m of places in the plane to a curve's line of paint, by elementary geometry."""
     if isinstance(curve, Arc):
         radius = curve.radius_m - 0.5 * side * curve.width_m

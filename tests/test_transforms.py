@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from ceres_cal.base.arrays import Array
 from ceres_cal.base.transforms import (
-    Array,
     Pose,
     euler_from_rotation,
     left_jacobian,

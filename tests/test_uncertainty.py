@@ -17,13 +17,15 @@ from accuracy_scenes import CLEAN_NOISE, FIELD, painted_by_two_cameras, tilted, 
 from coverage import CASES, cover, share
 from scenes import SCENES
 
+from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.transforms import Array, Pose
+from ceres_cal.base.transforms import Pose
 from ceres_cal.base.words import bounds_text
 from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
+from ceres_cal.model.keys import Key, pose_keys
 from ceres_cal.model.parameters import Estimate, Options, make_layout, unit_px
-from ceres_cal.model.quantities import Key, camera_keys, moved, natural_sizes, pose_keys
+from ceres_cal.model.quantities import moved, natural_sizes
 from ceres_cal.model.structure import make_structure
 from ceres_cal.observations import Observations, Prior, combine
 from ceres_cal.observations.sights import gather_sights

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import cache, cached_property
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -12,26 +12,30 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from ceres_cal.base.arrays import Mask
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import convert, read_json, write_json
 from ceres_cal.base.transforms import Pose, euler_from_rotation
-from ceres_cal.model.joint import JointPrior
-from ceres_cal.model.parameters import Estimate, Options, Station
-from ceres_cal.model.structure import make_structure
+from ceres_cal.model.keys import Key
+from ceres_cal.model.parameters import Estimate, Options, Station, make_layout
+from ceres_cal.model.priors import GaussianPrior, gather_priors, gather_stated, tolerances
+from ceres_cal.model.structure import EXACT, make_structure
 from ceres_cal.observations import Observations, prior_from_json, prior_to_json
+from ceres_cal.observations.sights import gather_sights
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import make_lens
 from ceres_cal.scene.targets import Target, target_from_spec
+from ceres_cal.solve import Problem, Weighting
 from ceres_cal.uncertainty import (
     Disagreement,
     Posterior,
     PosteriorFile,
     Uncertainty,
     disagreement,
+    information_from,
     lower_triangle,
     posterior_from_file,
-    posterior_to_json,
-    symmetric,
+    posterior_to_file,
 )
 
 FORMAT, VERSION = "ceres-cal/calibration", 1
@@ -91,7 +95,7 @@ class Refitted:
     what: str
     moved: tuple[str, ...]
     explanation: str
-    prior: JointPrior
+    prior: GaussianPrior
     scales: tuple[float, float]
     digests: tuple[str, ...]
 
@@ -187,12 +191,34 @@ class Calibration:
         """
         if observations.digest != self.digest:
             raise InputError("these are not the observations that the calibration was made from: give those")
-        points, curves = np.ones(len(observations.points), bool), np.ones(len(observations.curves), bool)
-        for entry in self.rejected:
-            (points if entry.kind == "point" else curves)[entry.row] = False
+        masks = self.inlier_masks(observations)
         scales = (self.fit.point_scale, self.fit.curve_scale)
         known = self.uncertainty
-        return disagreement(observations, known.estimate, known.posterior, (points, curves), scales, first, second)
+        return disagreement(observations, known.estimate, known.posterior, masks, scales, first, second)
+
+    def inlier_masks(self, observations: Observations) -> tuple[Mask, Mask]:
+        """(N,) of points and (M,) of curve observations: which rows took part."""
+        masks = np.ones(len(observations.points), bool), np.ones(len(observations.curves), bool)
+        for entry in self.rejected:
+            masks[entry.kind == "curve"][entry.row] = False
+        return masks
+
+    def problem(self, observations: Observations, *, new_data: bool = False) -> Problem:
+        """The problem of which this is the solution, of all the observations, at the noise that was found.
+
+        Args:
+            new_data: that the observations are others: then as if they were calibrated with the same options.
+        """
+        sights, options = gather_sights(observations), self.options
+        prior = None if self.refitted is None else self.refitted.prior
+        weighting = Weighting(self.fit.point_scale, self.fit.curve_scale, options.loss, options.loss_scale)
+        if new_data or prior is None or self.posterior is None:
+            priors = gather_priors(observations, options, self.estimate.structure)
+            return Problem(sights, make_layout(observations, options), priors, weighting, options)
+        lenses = {name: camera.lens for name, camera in self.cameras.items()}
+        fresh = tolerances(self.estimate.structure, prior.keys)
+        priors = (prior, *gather_stated(observations, options, lenses), *fresh)
+        return Problem(sights, self.posterior.layout(self.estimate), priors, weighting, options)
 
     @property
     def rms_px(self) -> float:
@@ -247,19 +273,23 @@ class _PlacementFile(msgspec.Struct, forbid_unknown_fields=True):
     translation_m: _Vector
 
 
-class _JointPriorFile(msgspec.Struct, forbid_unknown_fields=True):
-    keys: list[tuple[str, str, str, str]]
+class _PriorFile(msgspec.Struct, forbid_unknown_fields=True):
+    """A prior; its mean by number, or, in files of 0.1, as the cameras, stations and structure that it is around."""
+
+    keys: list[Key]
     information: list[float]
-    cameras: dict[str, _CameraFile]
-    stations: dict[str, _PlacementFile]
-    structure_m: dict[str, float]
+    mean: list[float] | None = None
+    rotations: dict[str, tuple[_Vector, _Vector, _Vector]] | None = None
+    cameras: dict[str, _CameraFile] | None = None
+    stations: dict[str, _PlacementFile] | None = None
+    structure_m: dict[str, float] | None = None
 
 
 class _RefittedFile(msgspec.Struct, forbid_unknown_fields=True):
     what: str
     moved: tuple[str, ...]
     explanation: str
-    prior: _JointPriorFile
+    prior: _PriorFile
     scales: tuple[float, float]
     digests: tuple[str, ...]
 
@@ -305,7 +335,7 @@ def camera_to_json(camera: Camera) -> dict[str, Any]:
 
 def calibration_to_json(calibration: Calibration) -> dict[str, Any]:
     """The calibration as its file has it. Position and Euler angles (the paper's) are there for people."""
-    estimate = calibration.estimate
+    estimate, known = calibration.estimate, calibration.posterior
     options = {**asdict(calibration.options), "priors": [prior_to_json(p) for p in calibration.options.priors]}
     return {
         "format": FORMAT,
@@ -336,7 +366,7 @@ def calibration_to_json(calibration: Calibration) -> dict[str, Any]:
         "options": options,
         "digest": calibration.digest,
         "versions": dict(calibration.versions),
-        "posterior": None if calibration.posterior is None else posterior_to_json(calibration.posterior),
+        "posterior": known and msgspec.to_builtins(posterior_to_file(known)),
         "refitted": None if calibration.refitted is None else _refitted_to_json(calibration.refitted),
     }
 
@@ -350,9 +380,8 @@ def _refitted_to_json(refitted: Refitted) -> dict[str, Any]:
         "prior": {
             "keys": [list(key) for key in prior.keys],
             "information": lower_triangle(prior.information),
-            "cameras": {name: camera_to_json(camera) for name, camera in prior.cameras.items()},
-            "stations": {name: _pose_to_json(pose) for name, pose in prior.stations.items()},
-            "structure_m": dict(prior.structure),
+            "mean": prior.mean.tolist(),
+            "rotations": {name: rotation.tolist() for name, rotation in prior.rotations.items()},
         },
         "scales": list(refitted.scales),
         "digests": list(refitted.digests),
@@ -360,14 +389,23 @@ def _refitted_to_json(refitted: Refitted) -> dict[str, Any]:
 
 
 def _refitted_from_file(data: _RefittedFile) -> Refitted:
-    prior = JointPrior(
-        tuple(data.prior.keys),
-        symmetric(data.prior.information, len(data.prior.keys), "refitted.prior.information"),
-        {name: _camera(entry) for name, entry in data.prior.cameras.items()},
-        {name: Pose(p.rotation, p.translation_m) for name, p in data.prior.stations.items()},  # type: ignore[arg-type]
-        data.prior.structure_m,
-    )
+    prior = _prior_from_file(data.prior)
     return Refitted(data.what, data.moved, data.explanation, prior, data.scales, data.digests)
+
+
+def _prior_from_file(data: _PriorFile) -> GaussianPrior:
+    information = information_from(data.information, data.keys, "refitted.prior.information")
+    if data.mean is not None:
+        if len(data.mean) != len(data.keys):
+            raise InputError("refitted.prior.mean does not fit its keys: calibrate again")
+        rotations = {name: np.array(rotation) for name, rotation in (data.rotations or {}).items()}
+        return GaussianPrior(information, np.array(data.mean), rotations)
+    cameras = {name: _camera(entry) for name, entry in (data.cameras or {}).items()}
+    poses = {name: Pose(p.rotation, p.translation_m) for name, p in (data.stations or {}).items()}  # type: ignore[arg-type]
+    structure_m = data.structure_m or {}
+    structure = replace(EXACT, names=tuple(structure_m), values=np.array(list(structure_m.values())))
+    around = Estimate(cameras, {name: Station("", pose) for name, pose in poses.items()}, {}, structure)
+    return GaussianPrior.about(information, around)
 
 
 def _pose_to_json(pose: Pose) -> dict[str, Any]:

@@ -9,7 +9,8 @@ import numpy as np
 
 from ceres_cal.advice.measurements import Ground, Measurement, together
 from ceres_cal.advice.outlook import Outlook
-from ceres_cal.base.transforms import Array
+from ceres_cal.base.arrays import Array
+from ceres_cal.model.information import Information
 from ceres_cal.model.structure import Tolerance
 from ceres_cal.observations import Prior
 from ceres_cal.scene.camera import Camera
@@ -72,13 +73,13 @@ class Search:
     ) -> Iterator[Measurement]:
         """Of a pool the best ones, each the one that brings most beside those before it."""
         left = list(pool)
-        told = [self.ground.told_by(measurement) for measurement in left]
+        informations = [self.ground.information_of(measurement) for measurement in left]
         taken: list[Measurement] = []
-        total = np.zeros((len(self.ground.keys), len(self.ground.keys)))
+        total = Information.nothing(self.ground.keys)
         while left and len(taken) < max(counts):
-            errors = [self.outlook.after(total + one) for one in told]
+            errors = [self.outlook.after(total + one) for one in informations]
             number = choose(left, np.array([e.worst_mm for e in errors]))
-            total = total + told.pop(number)
+            total = total + informations.pop(number)
             taken.append(left.pop(number))
             if len(taken) in counts:
                 yield together(taken, words(taken))

@@ -8,16 +8,17 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.spread import without
-from ceres_cal.base.transforms import Array, Pose
+from ceres_cal.base.transforms import Pose
+from ceres_cal.model.information import Information
+from ceres_cal.model.keys import Key
 from ceres_cal.model.parameters import Estimate, Layout, intrinsic_names
-from ceres_cal.model.quantities import Key, sigma_limits
+from ceres_cal.model.priors import stated_prior, tolerances
 from ceres_cal.model.structure import Tolerance, make_structure
 from ceres_cal.observations import Curves, Observations, Points, Prior
 from ceres_cal.observations.sights import gather_sights
 from ceres_cal.scene.targets import Target
 from ceres_cal.simulate import Scene, ViewPlan, simulate
-from ceres_cal.solve import Weighting, information
+from ceres_cal.solve import Problem, Weighting, information
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,17 +77,21 @@ class Ground:
     tolerances: Mapping[str, Tolerance]
     weighting: Weighting
 
-    def told_by(self, measurement: Measurement) -> Array:
-        """(P, P) what a measurement would say of the free numbers, its own unknowns integrated out.
+    def information_of(self, measurement: Measurement) -> Information:
+        """What a measurement would say of the free numbers, its own unknowns integrated out.
 
         A placement is one of those, and so is how far a pole stands aside. It is nothing where the camera sees nothing.
+        Tolerances that the calibration had already are no news.
         """
         targets = {**self.targets, **measurement.targets}
         estimate = self._with(measurement, targets)
         observations = replace(_observed(estimate, targets, measurement.views), targets=targets)
-        layout = replace(_layout(estimate, self.keys, measurement.placements), priors=measurement.priors)
-        told = information(gather_sights(observations), estimate, layout, self.weighting)
-        return self._own(told.keys, told.matrix)
+        layout = _layout(estimate, self.keys, measurement.placements)
+        lenses = {name: camera.lens for name, camera in estimate.cameras.items()}
+        stated = (stated_prior(prior, lenses[estimate.stations[prior.name].camera]) for prior in measurement.priors)
+        priors = (*stated, *tolerances(estimate.structure, self.keys))
+        problem = Problem(gather_sights(observations), layout, priors, self.weighting)
+        return information(problem, estimate).shared.marginal(self.keys)
 
     def _with(self, measurement: Measurement, targets: Mapping[str, Target]) -> Estimate:
         """The estimate with what the measurement brings along; of the placements those that are still free."""
@@ -98,18 +103,6 @@ class Ground:
             placements={**{name: self.estimate.placements[name] for name in shared}, **measurement.placements},
             structure=structure.with_values(np.array([known.get(name, 0.0) for name in structure.names])),
         )
-
-    def _own(self, keys: Sequence[Key], matrix: Array) -> Array:
-        at = np.array([keys.index(key) for key in self.keys])
-        rest = np.setdiff1d(np.arange(len(keys)), at)
-        here = matrix[np.ix_(at, at)].copy()
-        # Tolerances that the calibration had already are no news.
-        old = [place for place, key in enumerate(self.keys) if key.kind == "structure"]
-        here[old, old] -= self.estimate.structure.sigma_m**-2.0
-        if not len(rest):
-            return np.asarray(here)
-        limits = sigma_limits([keys[place] for place in rest])
-        return without(here, matrix[np.ix_(rest, at)], matrix[np.ix_(rest, rest)], limits)
 
 
 def _layout(estimate: Estimate, keys: Sequence[Key], placements: Iterable[str]) -> Layout:

@@ -7,13 +7,14 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.spread import Spread
-from ceres_cal.base.transforms import Array
+from ceres_cal.model.information import Information
+from ceres_cal.model.keys import Key
 from ceres_cal.model.parameters import Estimate
-from ceres_cal.model.quantities import Key, moved, sigma_limits
-from ceres_cal.uncertainty import FieldMap, Posterior, Profile
+from ceres_cal.model.quantities import moved
+from ceres_cal.uncertainty import FieldMap, PhiProfile, Posterior
 from ceres_cal.uncertainty.maps import locate_slopes, shown_pixels, station_keys
 
 BENT = 0.05  # relative sigma of phi up to which the quadratic picture holds (`uncertainty.assess` leaves it there)
@@ -59,12 +60,12 @@ class Outlook:
         return Errors(self.today.worst_mm, self.today.mean_mm)
 
     @property
-    def profile(self) -> Profile | None:
+    def profile(self) -> PhiProfile | None:
         """The valley along phi that today's map follows, where it does."""
         return self.posterior.profiles.get(self.estimate.stations[self.today.station].camera)
 
-    def after(self, added: Array) -> Errors:
-        """The errors with information (P, P) added, by the quadratic picture at the estimate.
+    def after(self, added: Information) -> Errors:
+        """The errors with information added, by the quadratic picture at the estimate.
 
         Where phi was followed along its profile and would have to be still, see `shrunk`.
         """
@@ -72,9 +73,10 @@ class Outlook:
         bent = self.profile is not None and self._phi_sd(self.estimate, known) > BENT
         return self.shrunk(added) if bent else _errors(known, self.slopes)
 
-    def shrunk(self, added: Array) -> Errors:
-        """Today's errors, smaller as those of the quadratic picture get smaller with information (P, P) added."""
-        now, then = (_errors(self._known(more), self.slopes) for more in (np.zeros_like(added), added))
+    def shrunk(self, added: Information) -> Errors:
+        """Today's errors, smaller as those of the quadratic picture get smaller with information added."""
+        today = Information.nothing(added.keys)
+        now, then = (_errors(self._known(more), self.slopes) for more in (today, added))
         if not np.isfinite(now.worst_mm):
             return then
         worst = self.before.worst_mm * min(then.worst_mm / now.worst_mm, 1.0)
@@ -86,20 +88,17 @@ class Outlook:
         place = next((i for i, key in enumerate(self.keys) if key[:3] == ("camera", camera, "phi")), None)
         return 0.0 if place is None else float(known.sd[place]) / estimate.cameras[camera].phi
 
-    def _known(self, added: Array) -> Spread:
-        """What is known of the K numbers with information (P, P) added."""
-        at = self._places
-        if not np.any(np.delete(added, at, axis=0)):  # it tells of nothing else: that can be integrated out before
-            return Spread.of(self._own + added[np.ix_(at, at)], sigma_limits(self.keys))
-        return _part(Spread.of(self.posterior.information + added, sigma_limits(self.posterior.keys)), at)
+    def _known(self, added: Information) -> Spread:
+        """What is known of the K numbers with information added."""
+        others = [key for key in added.keys if key not in set(self.keys)]
+        if not np.any(added.matrix[added.columns(others)]):  # nothing of what is integrated out: do that once
+            return (self._own + added.given(self.keys)).spread
+        whole = self.posterior.information + added
+        return _part(whole.spread, whole.columns(self.keys))
 
     @cached_property
-    def _places(self) -> NDArray[np.int64]:
-        return _indices(self.keys, self.posterior.keys)
-
-    @cached_property
-    def _own(self) -> Array:
-        return self.posterior.marginal(self._places)
+    def _own(self) -> Information:
+        return self.posterior.information.marginal(self.keys)
 
     @cached_property
     def possible(self) -> tuple[tuple[int, Estimate], ...]:
@@ -111,8 +110,8 @@ class Outlook:
         some = within[np.unique(np.linspace(0, len(within) - 1, _PLACES).round().astype(int))]
         return tuple((int(place), moved(self.estimate, keys, steps[place])) for place in some)
 
-    def along_valley(self, told_at: Callable[[Estimate], Array]) -> Iterator[tuple[float, float, Errors]]:
-        """phi (px), its relative standard deviation and the errors if that is what it is and information `told_at` is
+    def along_valley(self, information_at: Callable[[Estimate], Information]) -> Iterator[tuple[float, float, Errors]]:
+        """phi (px), its relative standard deviation and the errors if that is what it is and the information there is
         added, over what phi may be by its 95 % bounds.
 
         There the observations of today tell everything but phi as the valley has it, and phi by the parabola that fits
@@ -120,30 +119,24 @@ class Outlook:
         """
         profile = self.profile
         assert profile is not None
-        at = _indices(profile.keys, self.posterior.keys)
-        own, limits = _indices(self.keys, profile.keys), sigma_limits(profile.keys)
         tangents = np.gradient(profile.steps[:, 1:], profile.steps[:, 0], axis=0)
         bend = max(float(np.polyfit(np.log(profile.phi), profile.rises, 2)[0]), 0.0) if len(profile.phi) > 2 else 0.0
         for place, there in self.possible:
-            added = told_at(there)[np.ix_(at, at)]
-            if not np.any(added):
+            added = information_at(there).given(profile.keys)
+            if not np.any(added.matrix):
                 yield float(profile.phi[place]), np.inf, Errors(np.inf, np.inf)
                 continue
-            across, along = profile.information[place], tangents[place]
+            across, along = profile.across[place].matrix, tangents[place]
             coupling = -across @ along
             phi = along @ across @ along + bend / profile.phi[place] ** 2
-            told = np.block([[np.atleast_2d(phi), coupling[None]], [coupling[:, None], across]])
-            known = _part(Spread.of(told + added, limits), own)
+            matrix = np.block([[np.atleast_2d(phi), coupling[None]], [coupling[:, None], across]])
+            whole = Information(profile.keys, matrix) + added
+            known = _part(whole.spread, whole.columns(self.keys))
             errors = _errors(known, _slopes(there, self.today, self.keys))
             yield float(profile.phi[place]), self._phi_sd(there, known), errors
 
 
-def _indices(keys: tuple[Key, ...], every: tuple[Key, ...]) -> NDArray[np.int64]:
-    """Where some keys are among all of them."""
-    return np.array([every.index(key) for key in keys], dtype=np.int64)
-
-
-def _part(known: Spread, at: NDArray[np.int64]) -> Spread:
+def _part(known: Spread, at: Indices) -> Spread:
     """What is known of some of the numbers."""
     return Spread(known.covariance[np.ix_(at, at)], known.unknown[at], known.scale[at])
 

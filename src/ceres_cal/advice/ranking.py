@@ -11,8 +11,8 @@ from ceres_cal.advice.candidates import BOARD, Search, still
 from ceres_cal.advice.measurements import Ground, Measurement
 from ceres_cal.advice.outlook import BENT, Errors, Outlook
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.transforms import Array
 from ceres_cal.calibration import Calibration, Fit
+from ceres_cal.model.information import Information
 from ceres_cal.model.parameters import Estimate
 from ceres_cal.scene.heights import ROBOT_TOP_M
 from ceres_cal.scene.targets import Target
@@ -96,11 +96,11 @@ def advise(
     ground, outlook = _prepared(calibration, station, height_m)
     search = Search(ground, outlook, _board(calibration.targets, board), calibration.fit.curves > 0)
     candidates = list(search.candidates())
-    told = [ground.told_by(measurement) for measurement in candidates]
-    promises = [_promise(*each, ground, outlook) for each in zip(candidates, told, strict=True)]
+    informations = [ground.information_of(measurement) for measurement in candidates]
+    promises = [_promise(*each, ground, outlook) for each in zip(candidates, informations, strict=True)]
     enough = 0.0 if good_enough_mm is None else good_enough_mm
     best = _chosen(promises, outlook.before, enough)
-    then = None if best is None else _next(best, candidates, told, outlook, enough)
+    then = None if best is None else _next(best, candidates, informations, outlook, enough)
     ranked = sorted(promises, key=lambda promise: (promise.after.worst_mm, promise.after.mean_mm))
     today = outlook.today
     return Advice(
@@ -127,7 +127,7 @@ def promised(
         InputError: see `advise`.
     """
     ground, outlook = _prepared(calibration, station, height_m)
-    return tuple(_promise(one, ground.told_by(one), ground, outlook) for one in measurements)
+    return tuple(_promise(one, ground.information_of(one), ground, outlook) for one in measurements)
 
 
 def _prepared(calibration: Calibration, station: str | None, height_m: float) -> tuple[Ground, Outlook]:
@@ -147,8 +147,8 @@ def _prepared(calibration: Calibration, station: str | None, height_m: float) ->
 def _of_camera(posterior: Posterior, estimate: Estimate, camera: str) -> Posterior:
     """What is known of a camera, its stations and the targets as built, all else integrated out."""
     owners = {("camera", camera), *(("station", name) for name, s in estimate.stations.items() if s.camera == camera)}
-    places = np.array([i for i, k in enumerate(posterior.keys) if k[:2] in owners or k.kind == "structure"])
-    return replace(posterior, keys=tuple(posterior.keys[i] for i in places), information=posterior.marginal(places))
+    keys = [key for key in posterior.keys if key[:2] in owners or key.kind == "structure"]
+    return replace(posterior, information=posterior.information.marginal(keys))
 
 
 def _weighting(fit: Fit) -> Weighting:
@@ -172,7 +172,7 @@ def _board(targets: Mapping[str, Target], board: Target | None) -> tuple[str, Ta
     return name, board or BOARD
 
 
-def _promise(measurement: Measurement, added: Array, ground: Ground, outlook: Outlook) -> Promise:
+def _promise(measurement: Measurement, added: Information, ground: Ground, outlook: Outlook) -> Promise:
     """Sure where phi is not followed along its profile, or would not have to be any more, whatever it is.
 
     Where the camera would not see what is measured does not count: who measures will see.
@@ -180,17 +180,17 @@ def _promise(measurement: Measurement, added: Array, ground: Ground, outlook: Ou
     after = outlook.after(added)
     if outlook.profile is None:
         return Promise(measurement, after)
-    valley = tuple(outlook.along_valley(lambda there: _told_there(measurement, ground, there, outlook)))
+    valley = tuple(outlook.along_valley(lambda there: _information_there(measurement, ground, there, outlook)))
     known = [sd for _, sd, _ in valley if np.isfinite(sd)]
     if not known or max(known) > BENT or not np.isfinite(after.worst_mm):
         return Promise(measurement, outlook.shrunk(added), rough=True)
     return Promise(measurement, after, valley=tuple((phi, errors) for phi, _, errors in valley))
 
 
-def _told_there(measurement: Measurement, ground: Ground, there: Estimate, outlook: Outlook) -> Array:
+def _information_there(measurement: Measurement, ground: Ground, there: Estimate, outlook: Outlook) -> Information:
     """What it would say if everything were elsewhere: boards are held before the camera, wherever that is."""
     here, other = (e.stations[outlook.today.station].cam_from_world for e in (ground.estimate, there))
-    return replace(ground, estimate=there).told_by(measurement.before(here, other))
+    return replace(ground, estimate=there).information_of(measurement.before(here, other))
 
 
 def _chosen(promises: Sequence[Promise], before: Errors, enough_mm: float) -> int | None:
@@ -207,13 +207,15 @@ def _chosen(promises: Sequence[Promise], before: Errors, enough_mm: float) -> in
 def _next(
     first: int,
     candidates: Sequence[Measurement],
-    told: Sequence[Array],
+    informations: Sequence[Information],
     outlook: Outlook,
     enough_mm: float,
 ) -> Promise | None:
     """What brings most after the first, of another kind; None where nothing does, or the first is good enough."""
     kind = candidates[first].kind
     others = [number for number, candidate in enumerate(candidates) if candidate.kind != kind]
-    promises = [Promise(candidates[number], outlook.after(told[first] + told[number])) for number in others]
-    chosen = _chosen(promises, outlook.after(told[first]), enough_mm) if promises else None
+    promises = [
+        Promise(candidates[number], outlook.after(informations[first] + informations[number])) for number in others
+    ]
+    chosen = _chosen(promises, outlook.after(informations[first]), enough_mm) if promises else None
     return None if chosen is None else promises[chosen]

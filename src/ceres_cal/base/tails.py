@@ -12,7 +12,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ceres_cal.base.transforms import Array
+from ceres_cal.base.arrays import Array
 
 _PARTS, _REACH = 40, 6.0  # of a mean over a normal variable: steps to either side, and how far in sigmas
 _TINY = 1e-300

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+from ceres_cal.base.arrays import Array
 
 _SMALL_ANGLE = 1e-4  # below it the series below are exact to rounding
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ceres_cal.base.transforms import Array
+from ceres_cal.base.arrays import Array
 from ceres_cal.base.words import chance, plural
 from ceres_cal.cli.outputs import WIDTH, section, wrapped, written, written_data
 from ceres_cal.diagnostics import Choice, Diagnosis, Finding, HeldOut, Noise, ResidualTable, Summary

@@ -7,13 +7,14 @@ from argparse import ArgumentParser, Namespace
 from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING, Any
 
+from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.cli.arguments import add_calibration, add_station, parse_number
 from ceres_cal.cli.command import Answer, Command
 from ceres_cal.cli.inputs import read_calibration, station_of
 
 if TYPE_CHECKING:
-    from ceres_cal.base.transforms import Array
+    from ceres_cal.base.arrays import Array
     from ceres_cal.scene.camera import Camera
 
 

@@ -16,8 +16,8 @@ from ceres_cal.cli.outputs import finishing
 from ceres_cal.cli.progress import progress_bar
 
 if TYPE_CHECKING:
+    from ceres_cal.base.arrays import Image
     from ceres_cal.calibration import Calibration
-    from ceres_cal.detect.images import Image
     from ceres_cal.pictures.straight import Straight
     from ceres_cal.scene.camera import Camera
 

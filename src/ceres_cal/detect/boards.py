@@ -11,12 +11,11 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from ceres_cal.base.arrays import Array, Image, Image8
 from ceres_cal.base.errors import InputError, NothingShownError
 from ceres_cal.base.progress import ImageProgress
-from ceres_cal.base.transforms import Array
-from ceres_cal.detect.images import Image, read_grey
+from ceres_cal.detect.images import read_grey
 from ceres_cal.detect.saddles import REACH, measure_saddles
 from ceres_cal.detect.scatter import scatter_px
 from ceres_cal.observations import Observations, Points, View, no_curves
@@ -173,7 +172,7 @@ def _measured_chessboard(image: Image, columns: int, rows: int, corner_fit: str)
     return _enough(grid)
 
 
-def _subpixel(image: NDArray[np.uint8], grid: Array) -> Array:
+def _subpixel(image: Image8, grid: Array) -> Array:
     """OpenCV's sub-pixel corners, in a window that holds no other corner."""
     steps = np.concatenate([np.diff(grid, axis=axis).reshape(-1, 2) for axis in (0, 1)])
     half = int(np.clip(np.min(np.linalg.norm(steps, axis=1)) / 3.0, 2, _SUBPIX_HALF_WINDOW_PX))
@@ -191,7 +190,7 @@ def right_handed(grid: Array) -> Array:
     return grid[:, ::-1] if np.sum(turn) < 0.0 else grid
 
 
-def _find_chessboard(image: NDArray[np.uint8], columns: int, rows: int) -> Array | None:
+def _find_chessboard(image: Image8, columns: int, rows: int) -> Array | None:
     """Roughly where the corners are, (rows, columns, 2) px, by OpenCV's two detectors at several scales."""
     legacy = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
     for scale in _scales(image.size):
@@ -259,7 +258,7 @@ def _enough(grid: Array) -> Array | str:
     return grid
 
 
-def _as_8_bit(image: Image) -> NDArray[np.uint8]:
+def _as_8_bit(image: Image) -> Image8:
     """What OpenCV's detectors take; deeper images are stretched, but for half a percent at either end."""
     if image.dtype == np.uint8:
         return image.astype(np.uint8, copy=False)

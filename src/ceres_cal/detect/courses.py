@@ -6,14 +6,10 @@ from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ceres_cal.base.transforms import Array
+from ceres_cal.base.arrays import Array, Indices, Indices32, Mask
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.targets import Arc, Target, along_track, nearest_on_track
-
-Ints = NDArray[np.int32]
-Mask = NDArray[np.bool_]
 
 _WIDEST_PX = 100.0
 _PIECES = 240  # of a curve, to measure its length in the image
@@ -29,7 +25,7 @@ class Course:
             the normal. width_px: (N,) of the paint, along the normal.
     """
 
-    curve: Ints
+    curve: Indices32
     s: Array
     pixels: Array
     normals: Array
@@ -39,7 +35,7 @@ class Course:
     def __len__(self) -> int:
         return len(self.curve)
 
-    def take(self, rows: Mask | NDArray[np.intp]) -> Course:
+    def take(self, rows: Mask | Indices) -> Course:
         """These places only."""
         return Course(**{name: column[rows] for name, column in vars(self).items()})
 
@@ -86,7 +82,7 @@ def _places(target: Target, camera: Camera, number: int, spacing_px: float, marg
     return number, chosen[inside]
 
 
-def course_at(target: Target, camera: Camera, number: Ints, s: Array) -> Course:
+def course_at(target: Target, camera: Camera, number: Indices32, s: Array) -> Course:
     """The course through places that are given by curve (N,) and parameter (N,)."""
     is_arc = target.is_arc[number]
     span = np.array([np.diff(curve.parameter_range)[0] for curve in target.curves.values()])[number]

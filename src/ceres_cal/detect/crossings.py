@@ -5,10 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ceres_cal.base.transforms import Array
-from ceres_cal.detect.courses import Ints, Mask, course_at
+from ceres_cal.base.arrays import Array, Indices, Indices32, Mask
+from ceres_cal.detect.courses import course_at
 from ceres_cal.detect.lines import Lines
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.targets import Arc, Target, along_track, nearest_on_track
@@ -28,7 +27,7 @@ class Crossings:
         used: (N,) the lines' places that went into them; who takes both must leave these out, or pixels count twice.
     """
 
-    feature: Ints
+    feature: Indices32
     pixels: Array
     sigma_px: Array
     used: Mask
@@ -41,7 +40,7 @@ class _Branch:
     normal: Array
     offset_px: float
     variance: float
-    rows: NDArray[np.intp]
+    rows: Indices
 
 
 def find_crossings(target: Target, camera: Camera, lines: Lines) -> Crossings:

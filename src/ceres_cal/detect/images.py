@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from ceres_cal.base.arrays import Image
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import read_bytes
-
-Image = NDArray[Any]
-"""(height, width) grey levels, or (height, width, 3) blue, green and red."""
 
 
 def read_grey(path: str | Path) -> Image:

@@ -10,11 +10,10 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from ceres_cal.base.transforms import Array
-from ceres_cal.detect.courses import Course, Mask
-from ceres_cal.detect.profiles import Grey, Profiles, Windows, cut_windows, fit_profiles, fit_shape
+from ceres_cal.base.arrays import Array, Array32, Indices32, Mask
+from ceres_cal.detect.courses import Course
+from ceres_cal.detect.profiles import Profiles, Windows, cut_windows, fit_profiles, fit_shape
 
 HALF_WIDTH_PX = 3  # of a window, along the line
 SPACING_PX = 2.0 * HALF_WIDTH_PX + 2.0  # neighbouring windows share no pixels
@@ -73,7 +72,7 @@ class Lines:
         return float(np.mean(self.found)) if len(self.found) else 0.0
 
 
-def search(grey: Grey, course: Course, reach_px: float, spare_px: float = 0.0) -> tuple[Array, Array]:
+def search(grey: Array32, course: Course, reach_px: float, spare_px: float = 0.0) -> tuple[Array, Array]:
     """Where along the normals there is most likely paint: offsets (N,) px, and how much brighter it is, grey levels.
 
     Args:
@@ -102,7 +101,7 @@ def search(grey: Grey, course: Course, reach_px: float, spare_px: float = 0.0) -
     return steps[best], response[np.arange(len(best)), best]
 
 
-def _along_normals(grey: Grey, course: Course, steps: Array, shift_px: float) -> Array:
+def _along_normals(grey: Array32, course: Course, steps: Array, shift_px: float) -> Array:
     tangents = np.column_stack([course.normals[:, 1], -course.normals[:, 0]])
     start = course.pixels + shift_px * tangents
     x = start[:, 0, None] + steps * course.normals[:, 0, None]
@@ -111,7 +110,7 @@ def _along_normals(grey: Grey, course: Course, steps: Array, shift_px: float) ->
     return np.asarray(cv2.remap(grey, x.astype(np.float32), y.astype(np.float32), flags, borderMode=border), float)
 
 
-def measure(grey: Grey, course: Course, reach_px: float) -> Lines:
+def measure(grey: Array32, course: Course, reach_px: float) -> Lines:
     """Measure the paint at every place of a course, whose windows hold no other paint (see `courses.clear_px`).
 
     Args:
@@ -177,7 +176,7 @@ def _is_paint(course: Course, fits: Profiles, contrast: Array) -> Mask:
     return np.asarray(clear & (fits.noise < _NOISY * np.median(fits.noise[clear])))
 
 
-def _neighbours(values: Array, curve: NDArray[np.int32]) -> Array:
+def _neighbours(values: Array, curve: Indices32) -> Array:
     """(N, 2 * _NEARBY) the values of the places before and after on the same curve, NaN where there are none."""
     count = len(values)
     steps = np.array([step for step in range(-_NEARBY, _NEARBY + 1) if step != 0])
@@ -187,7 +186,7 @@ def _neighbours(values: Array, curve: NDArray[np.int32]) -> Array:
     return np.where(same, values[there], np.nan)
 
 
-def _medians(values: Array, curve: NDArray[np.int32]) -> Array:
+def _medians(values: Array, curve: Indices32) -> Array:
     """(N,) the median of each place's neighbours, its own value where there are none."""
     around = np.column_stack([_neighbours(values, curve), values])
     around[np.all(np.isnan(around), axis=1), 0] = 0.0

@@ -16,11 +16,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ceres_cal.base.transforms import Array
+from ceres_cal.base.arrays import Array, Array32, Mask
 
-Grey = NDArray[np.float32]
 """(height, width) grey levels."""
 
 LEAST_BLUR_PX, MOST_BLUR_PX = 0.3, 4.0
@@ -43,7 +41,7 @@ class Windows:
 
     values: Array
     distance: Array
-    inside: NDArray[np.bool_]
+    inside: Mask
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +62,7 @@ class Profiles:
 
 
 def cut_windows(
-    image: Grey, places: Array, normals: Array, curvature: Array, half_length_px: float, half_width_px: int
+    image: Array32, places: Array, normals: Array, curvature: Array, half_length_px: float, half_width_px: int
 ) -> Windows:
     """The pixels around places on curves.
 

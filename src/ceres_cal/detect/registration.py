@@ -10,11 +10,9 @@ from itertools import product
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from ceres_cal.base.transforms import Array
+from ceres_cal.base.arrays import Array, Array32, Mask
 from ceres_cal.detect.courses import Course
-from ceres_cal.detect.profiles import Grey
 
 _REDUCED = 4
 _NEAR_PX = 8.0
@@ -28,7 +26,7 @@ _APART_PX = 25.0
 class Nearness:
     """(H, W) a photograph's nearness to bright lines, 1 on them and 0 far off, `reduced` times smaller."""
 
-    plane: NDArray[np.float32]
+    plane: Array32
     reduced: int = _REDUCED
 
     def score(self, pixels: Array) -> float:
@@ -44,7 +42,7 @@ class Nearness:
         return np.where(inside, self.plane[places], 0.0)
 
 
-def nearness(grey: Grey, width_px: float) -> Nearness:
+def nearness(grey: Array32, width_px: float) -> Nearness:
     """How near each pixel is to something brighter than its surroundings and about `width_px` wide, or less."""
     soft = cv2.GaussianBlur(grey, (0, 0), 0.8)
     size = 2 * int(np.ceil(width_px) + 2) + 1
@@ -58,7 +56,7 @@ def nearness(grey: Grey, width_px: float) -> Nearness:
     return nearness_to(kept[labels])
 
 
-def nearness_to(mask: NDArray[np.bool_]) -> Nearness:
+def nearness_to(mask: Mask) -> Nearness:
     """How near each pixel is to those of a mask (height, width)."""
     size = mask.shape[1] // _REDUCED, mask.shape[0] // _REDUCED
     if not np.any(mask):

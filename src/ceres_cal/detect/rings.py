@@ -13,12 +13,11 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from ceres_cal.base.arrays import Array, Array32, Indices32, Mask
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.transforms import Array
 from ceres_cal.detect.images import read_grey
-from ceres_cal.detect.profiles import Grey, Windows, cut_windows, fit_profiles, fit_shape
+from ceres_cal.detect.profiles import Windows, cut_windows, fit_profiles, fit_shape
 from ceres_cal.observations import Curves, Observations, View, no_points
 from ceres_cal.scene.targets import Target, rings
 
@@ -91,7 +90,7 @@ def detect_rings(
 # ---- the centre -----------------------------------------------------------------------------------------------------
 
 
-def _centre(grey: Grey) -> Array:
+def _centre(grey: Array32) -> Array:
     """Where the gradients' lines meet, (2,) px: by votes on a grid, then by least squares."""
     soft = cv2.GaussianBlur(grey, (0, 0), 1.5)
     gradient = np.dstack([cv2.Sobel(soft, cv2.CV_32F, 1, 0), cv2.Sobel(soft, cv2.CV_32F, 0, 1)]).astype(float)
@@ -147,7 +146,7 @@ def _waves(angle: Array) -> Array:
     )
 
 
-def _follow(grey: Grey, centre: Array, most: int) -> list[_Track]:
+def _follow(grey: Array32, centre: Array, most: int) -> list[_Track]:
     """The rings' edges from the inside out, `most` at most, as far as enough rays show them.
 
     One more than `most` is an error.
@@ -172,7 +171,7 @@ def _follow(grey: Grey, centre: Array, most: int) -> list[_Track]:
     return tracks
 
 
-def _slopes(grey: Grey, centre: Array, angle: Array) -> tuple[Array, Array]:
+def _slopes(grey: Array32, centre: Array, angle: Array) -> tuple[Array, Array]:
     """(RAYS, N) change of the light along each ray, NaN outside the image, and (RAYS,) how far it stays inside, px."""
     height, width = grey.shape
     steps = np.arange(0.0, float(np.hypot(height, width)), _STEP_PX)
@@ -227,7 +226,7 @@ def _smooth(found: tuple[Array, bool], angle: Array, reach: Array) -> _Track | N
     return _Track(series, rises) if enough else None
 
 
-def _require_all_seen(grey: Grey, centre: Array, tracks: Sequence[_Track], expected: int) -> None:
+def _require_all_seen(grey: Array32, centre: Array, tracks: Sequence[_Track], expected: int) -> None:
     """Raise InputError where a ring is missing whose place would be well inside the image."""
     if len(tracks) == expected:
         return
@@ -249,13 +248,13 @@ def _require_all_seen(grey: Grey, centre: Array, tracks: Sequence[_Track], expec
 class _Edges:
     """Measured edges: number of the ring (from 0), pixels (N, 2), sigma_px (N,), radius from the centre (N,) px."""
 
-    ring: NDArray[np.int32]
+    ring: Indices32
     pixels: Array
     sigma_px: Array
     radius: Array
 
 
-def _measured(grey: Grey, centre: Array, tracks: Sequence[_Track]) -> tuple[_Edges, float]:
+def _measured(grey: Array32, centre: Array, tracks: Sequence[_Track]) -> tuple[_Edges, float]:
     angle = 2.0 * np.pi * np.arange(RAYS) / RAYS
     radii = np.array([track.radius(angle) for track in tracks])
     # A window ends before the next edge begins, and neighbouring windows of a ring do not overlap.
@@ -274,7 +273,7 @@ def _measured(grey: Grey, centre: Array, tracks: Sequence[_Track]) -> tuple[_Edg
 
 
 def _measured_ring(
-    grey: Grey, centre: Array, track: _Track, angle: Array, half_length_px: float
+    grey: Array32, centre: Array, track: _Track, angle: Array, half_length_px: float
 ) -> tuple[Array, Array, float]:
     """Pixels (N, 2), NaN where there is no edge, their sigmas, and the blur."""
     radius = track.radius(angle)
@@ -296,7 +295,7 @@ def _measured_ring(
     return places + offset[:, None] * outward, fits.sigma_px, blur
 
 
-def _usual(ring: NDArray[np.int32], radius: Array, sigma: Array, angle: Array) -> tuple[NDArray[np.bool_], float]:
+def _usual(ring: Indices32, radius: Array, sigma: Array, angle: Array) -> tuple[Mask, float]:
     """Which edges lie on the smooth course of their ring, and the factor on sigma that their scatter tells."""
     kept, pulls = np.isfinite(radius), [np.zeros(0)]
     for number in range(int(ring.max()) + 1):
@@ -357,7 +356,7 @@ def _polynomial(edges: _Edges, centre: Array, radii_m: Array) -> tuple[Array, fl
     return polynomial, rms
 
 
-def _observations(edges: _Edges, sheet: Target, grey: Grey, frame: str, camera: str, station: str) -> Observations:
+def _observations(edges: _Edges, sheet: Target, grey: Array32, frame: str, camera: str, station: str) -> Observations:
     count = len(edges.ring)
     size = (int(grey.shape[1]), int(grey.shape[0]))
     return Observations(

@@ -23,13 +23,11 @@ flat the board is.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from ceres_cal.base.transforms import Array
+from ceres_cal.base.arrays import AnyArray, Array
 
 REACH = 0.6
 """Radius of the disc around a corner as a part of the distance to the next edges: further, they would be in it."""
@@ -60,7 +58,7 @@ class Saddles:
     contrast: Array
 
 
-def measure_saddles(image: NDArray[Any], grid: Array, reach: float = REACH) -> Saddles:
+def measure_saddles(image: AnyArray, grid: Array, reach: float = REACH) -> Saddles:
     """The corners of a board near where a detector saw them.
 
     A corner is left out (NaN) where the fit walks away from its start, where the contrast has the wrong sign for its
@@ -84,7 +82,7 @@ def measure_saddles(image: NDArray[Any], grid: Array, reach: float = REACH) -> S
     return Saddles(np.where(wrong[..., None], np.nan, measured), np.where(wrong, np.nan, contrast))
 
 
-def _fit_grid(smooth: NDArray[Any], start: Array, seen: Array, reach: float, curved: bool) -> tuple[Array, Array]:
+def _fit_grid(smooth: AnyArray, start: Array, seen: Array, reach: float, curved: bool) -> tuple[Array, Array]:
     """Grid and contrasts of one fit from `start`; NaN where a corner got lost on its way from where it was `seen`."""
     along_row, row_bend, row_step = _line_geometry(start, axis=1)
     along_column, column_bend, column_step = _line_geometry(start, axis=0)
@@ -140,7 +138,7 @@ class _Patches:
     bends: Array
 
     @classmethod
-    def cut(cls, image: NDArray[Any], corners: Array, radius: Array, bends: Array) -> _Patches:
+    def cut(cls, image: AnyArray, corners: Array, radius: Array, bends: Array) -> _Patches:
         height, width = image.shape
         half = int(np.ceil(radius.max()))
         dy, dx = (d.ravel() for d in np.mgrid[-half : half + 1, -half : half + 1])
@@ -167,7 +165,7 @@ def _first_guess(patches: _Patches, corners: Array, along_row: Array, along_colu
 
 
 def _model(params: Array, patches: _Patches) -> tuple[Array, Array]:
-    """Grey levels (n, pixels) and their derivatives (n, pixels, 11) by the parameters (n, 11)."""
+    """Array32 levels (n, pixels) and their derivatives (n, pixels, 11) by the parameters (n, 11)."""
     dx, dy = patches.x - params[:, _X, None], patches.y - params[:, _Y, None]
     sharp = params[:, _SHARP, None]
     contrast = _plane(params, _CONTRAST, dx, dy)

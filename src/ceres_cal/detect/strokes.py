@@ -10,10 +10,8 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from ceres_cal.base.transforms import Array
-from ceres_cal.detect.profiles import Grey
+from ceres_cal.base.arrays import Array, Array32, Indices, Mask
 
 _SCALES = (1, 2)  # a photograph is searched at full and at half size: for narrow paint and for wide
 _SIGMA_PX = 1.6
@@ -40,14 +38,14 @@ class Strokes:
         return np.asarray(np.linalg.norm(self.ends[:, 1] - self.ends[:, 0], axis=1))
 
 
-def drawn(strokes: Strokes, image_size: tuple[int, int]) -> NDArray[np.bool_]:
+def drawn(strokes: Strokes, image_size: tuple[int, int]) -> Mask:
     """(height, width) where strokes are."""
     mask = np.zeros(image_size[::-1], np.uint8)
     cv2.polylines(mask, list(np.round(strokes.ends).astype(np.int32)), isClosed=False, color=1)
     return mask > 0
 
 
-def find_strokes(grey: Grey) -> Strokes:
+def find_strokes(grey: Array32) -> Strokes:
     """Every stroke of a photograph, of paint up to some 12 px wide."""
     found = []
     for scale in _SCALES:
@@ -65,10 +63,10 @@ class _Ridge:
 
     pixels: Array
     strength: Array
-    piece: NDArray[np.int64]
+    piece: Indices
 
 
-def _ridge_points(grey: Grey) -> _Ridge:
+def _ridge_points(grey: Array32) -> _Ridge:
     soft = cv2.GaussianBlur(grey, (0, 0), _SIGMA_PX)
     xx, yy = (np.asarray(cv2.Sobel(soft, cv2.CV_32F, *order, ksize=3)) / 4.0 for order in ((2, 0), (0, 2)))
     xy = np.asarray(cv2.Sobel(soft, cv2.CV_32F, 1, 1, ksize=3)) / 4.0

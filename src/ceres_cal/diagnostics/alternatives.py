@@ -6,16 +6,16 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
-from ceres_cal.base.transforms import Array, skew
-from ceres_cal.diagnostics.equations import Equations, Ints
-from ceres_cal.diagnostics.freedom import structure_columns
+from ceres_cal.base.arrays import Array, Indices, Mask
+from ceres_cal.base.transforms import skew
+from ceres_cal.diagnostics.equations import Equations
+from ceres_cal.diagnostics.linear_model import structure_columns
 from ceres_cal.diagnostics.scores import Family
 from ceres_cal.model.parameters import Estimate, Layout, unit_px
 from ceres_cal.model.structure import Tolerance, make_structure
 from ceres_cal.observations import Observations
-from ceres_cal.observations.sights import Mask
 from ceres_cal.scene.targets import Target
-from ceres_cal.solve import private_placements
+from ceres_cal.solve import Problem
 
 _RADIAL_BASIS = 3  # powers of the radius past those of the lens: enough for any smooth trend that one more power mends
 _POWERS = {"radial": (2, 3, 4, 5, 6, 7)}  # of the others' polynomials: odd ones
@@ -25,13 +25,13 @@ _FEWEST_OF_POINT = 2
 
 
 def all_families(
-    observations: Observations, equations: Equations, estimate: Estimate, layout: Layout, used: Mask
+    observations: Observations, equations: Equations, estimate: Estimate, problem: Problem, used: Mask
 ) -> list[Family]:
     """Every alternative worth a test, by kind."""
     return [
-        *_lens_families(equations, estimate, layout),
+        *_lens_families(equations, estimate, problem.layout),
         *target_families(observations, equations, estimate, used),
-        *_frame_families(observations, equations, estimate, layout),
+        *_frame_families(observations, equations, estimate, problem.private),
     ]
 
 
@@ -59,7 +59,7 @@ def _lens_families(equations: Equations, estimate: Estimate, layout: Layout) -> 
         yield Family(kind, equations.intrinsics[:, places], group, names, units=("",) if kind == "aspect" else ("px",))
 
 
-def _camera_of(equations: Equations, names: tuple[str, ...]) -> Ints:
+def _camera_of(equations: Equations, names: tuple[str, ...]) -> Indices:
     """(E,) number of each equation's camera."""
     of_sight = np.array([names.index(key.camera) for key in equations.sights.keys])
     return np.asarray(of_sight[equations.sight])
@@ -153,7 +153,7 @@ def _solved_slots(equations: Equations, estimate: Estimate) -> Mask:
     return structure_columns(equations, estimate.structure)[0] >= 0
 
 
-def _numbered(values: Ints, rows: Mask) -> tuple[Ints, Ints]:
+def _numbered(values: Indices, rows: Mask) -> tuple[Indices, Indices]:
     """The different values in the chosen rows, and which of them each row (N,) has, -1 for the others."""
     numbers, inverse = np.unique(values[rows], return_inverse=True)
     group = np.full(len(values), -1)
@@ -165,12 +165,11 @@ def _numbered(values: Ints, rows: Mask) -> tuple[Ints, Ints]:
 
 
 def _frame_families(
-    observations: Observations, equations: Equations, estimate: Estimate, layout: Layout
+    observations: Observations, equations: Equations, estimate: Estimate, private: frozenset[str | None]
 ) -> Iterator[Family]:
     """Each station moved from some frame on, or in one frame alone: turned about the camera's axes, shifted in the
     world.
     """
-    private = private_placements(equations.sights, layout)
     order = frame_order(observations)
     frame = np.array([order[view.station][view.frame] for view in observations.views])[equations.view]
     several = np.array([_several_frames(equations, frame, i) for i in range(len(equations.sights))])
@@ -200,7 +199,7 @@ def frame_order(observations: Observations) -> Mapping[str, Mapping[str, int]]:
     return order
 
 
-def _several_frames(equations: Equations, frame: Ints, sight: int) -> bool:
+def _several_frames(equations: Equations, frame: Indices, sight: int) -> bool:
     own = frame[equations.bounds[sight] : equations.bounds[sight + 1]]
     return bool(np.any(own != own[0]))
 

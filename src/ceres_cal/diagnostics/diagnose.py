@@ -9,24 +9,23 @@ import numpy as np
 
 from ceres_cal import kernels
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.transforms import Array
 from ceres_cal.calibration import Calibration
 from ceres_cal.diagnostics.alternatives import all_families, target_families
 from ceres_cal.diagnostics.equations import Equations, write_equations
 from ceres_cal.diagnostics.findings import Finding
-from ceres_cal.diagnostics.freedom import Freedom, make_freedom
 from ceres_cal.diagnostics.labels import Mislabelled, find_mislabelled
 from ceres_cal.diagnostics.leftover import Noise, measure_noise
+from ceres_cal.diagnostics.linear_model import LinearModel, Weights, make_linear_model
 from ceres_cal.diagnostics.new_data import validity_finding, with_newcomers_placed
 from ceres_cal.diagnostics.patterns import heard_again, select
 from ceres_cal.diagnostics.summaries import Summaries, summarise
 from ceres_cal.diagnostics.table import ResidualTable, make_table
 from ceres_cal.diagnostics.words import Context, label_findings, noise_findings, pattern_finding
-from ceres_cal.model.parameters import Estimate, Layout, make_layout
+from ceres_cal.model.parameters import Estimate
 from ceres_cal.model.residuals import Residuals, residuals
 from ceres_cal.observations import Observations
-from ceres_cal.observations.sights import Mask, gather_sights
-from ceres_cal.solve.noise import Inliers, judge, relative_lengths
+from ceres_cal.solve import Problem
+from ceres_cal.solve.noise import Inliers, Redundancy, judge, relative_lengths
 
 FALSE_ALARM_RATE = 0.01
 """Probability that a calibration of sound data gets any finding at all."""
@@ -40,7 +39,8 @@ class Diagnosis:
     Attributes:
         findings: causes of what is left over, the largest first (by effect in px). None: what is left looks like noise.
         table: every observation. summaries: the same by frame, feature, image region and radius.
-        noise: of points and of curves, with the findings taken off.
+        noise: of points and of curves, with the findings taken off; without any it is the calibration's own.
+        degrees_of_freedom: spare equations behind it, the calibration's own; infinite where sigmas are as stated.
         new_data: whether the observations are others than those the calibration was made from. tests: how many
             alternatives were tested, and false_alarm_rate: the probability that sound data get any finding at all,
             Bonferroni over all of them. It holds for normal noise; what it does not hold for is said by "correlated".
@@ -51,6 +51,7 @@ class Diagnosis:
     table: ResidualTable
     summaries: Summaries
     noise: tuple[Noise, ...]
+    degrees_of_freedom: float
     new_data: bool
     tests: int
     false_alarm_rate: float
@@ -81,22 +82,20 @@ def diagnose(
         SolutionError: it can show none of them.
     """
     _require_known(calibration, observations, new_data)
-    sights = gather_sights(observations)
+    problem = calibration.problem(observations, new_data=new_data)
     estimate = calibration.estimate
     if new_data:
-        estimate = with_newcomers_placed(observations, sights, calibration)
-    found = residuals(observations, sights, estimate)
-    inliers = _judged(calibration, observations, found, new_data)
-    layout = make_layout(observations, calibration.options)
-    equations = write_equations(observations, sights, estimate, found)
-    model = _Model(observations, estimate, layout, inliers, calibration.options.reject_sigma, equations)
-    weight, used, robust = _weights(calibration, inliers, model)
-    freedom = make_freedom(equations, estimate, layout, weight, used, robust)
-    table = make_table(observations, inliers, freedom, robust, dict(estimate.cameras))
-    findings, noise, tests = _judge_patterns(model, freedom, table, false_alarm_rate, calibration if new_data else None)
+        estimate = with_newcomers_placed(observations, problem, calibration)
+    there = residuals(observations, problem.sights, estimate)
+    inliers = _judged(calibration, observations, there, new_data)
+    equations = write_equations(observations, problem.sights, estimate, there)
+    case = _Case(observations, problem, estimate, inliers, equations)
+    model = make_linear_model(problem, estimate, equations, _weights(case))
+    table = make_table(observations, inliers, model, _weights(case).robust, dict(estimate.cameras))
+    findings, noise, tests = _judge_patterns(case, model, table, false_alarm_rate, calibration if new_data else None)
     return Diagnosis(
-        findings, table, summarise(observations, table, freedom, dict(estimate.cameras)), noise,
-        observations.digest != calibration.digest, tests, false_alarm_rate,
+        findings, table, summarise(observations, table, model, dict(estimate.cameras)), noise,
+        inliers.degrees_of_freedom, observations.digest != calibration.digest, tests, false_alarm_rate,
     )  # fmt: skip
 
 
@@ -119,85 +118,87 @@ def _require_known(calibration: Calibration, observations: Observations, new_dat
 
 
 @dataclass(frozen=True, eq=False)
-class _Model:
-    """What the steps of a diagnosis share."""
+class _Case:
+    """What the steps of a diagnosis share. `problem`: of all the observations."""
 
     observations: Observations
+    problem: Problem
     estimate: Estimate
-    layout: Layout
     inliers: Inliers
-    reject_sigma: float
     equations: Equations
 
     @property
     def scales(self) -> tuple[float, float]:
         return self.inliers.point_scale, self.inliers.curve_scale
 
+    @property
+    def reject_sigma(self) -> float:
+        return self.problem.options.reject_sigma
 
-def _judged(calibration: Calibration, observations: Observations, found: Residuals, new_data: bool) -> Inliers:
+
+def _judged(calibration: Calibration, observations: Observations, there: Residuals, new_data: bool) -> Inliers:
     """The calibration's own verdict on its observations, a fresh one on new ones."""
     if new_data:
-        estimated = calibration.options.noise_scale == "estimate"
-        return judge(observations, found, 0, calibration.options.reject_sigma, estimate_noise=estimated)
-    masks = np.ones(len(observations.points), bool), np.ones(len(observations.curves), bool)
-    for entry in calibration.rejected:
-        masks[entry.kind == "curve"][entry.row] = False
-    points, curves = relative_lengths(observations, found)
+        return judge(observations, there, Redundancy(1.0, 1.0), calibration.options)
+    inliers, posterior = calibration.inlier_masks(observations), calibration.posterior
+    points, curves = relative_lengths(observations, there)
     p, c = calibration.fit.point_scale, calibration.fit.curve_scale
-    return Inliers(masks[0] & np.isfinite(points), masks[1] & np.isfinite(curves), p, c, points / p, curves / c)
+    degrees = np.inf if posterior is None else posterior.degrees_of_freedom
+    return Inliers(
+        inliers[0] & np.isfinite(points), inliers[1] & np.isfinite(curves), p, c, points / p, curves / c, degrees
+    )
 
 
-def _weights(calibration: Calibration, inliers: Inliers, model: _Model) -> tuple[Array, Mask, Array]:
-    """Of each equation: 1 / sigma (px^-1), whether it takes part, and the robust weight of its observation."""
-    observations, at = model.observations, model.equations.observation
+def _weights(case: _Case) -> Weights:
+    """Of each equation."""
+    observations, inliers, options = case.observations, case.inliers, case.problem.options
     sigma = np.concatenate(
         [inliers.point_scale * observations.points.sigma_px, inliers.curve_scale * observations.curves.sigma_px]
     )
     lengths = np.concatenate([inliers.point_sigmas, inliers.curve_sigmas])
-    options = calibration.options
     squared = np.where(np.isfinite(lengths), lengths, 0.0) ** 2
     robust = kernels.loss_weights(kernels.LOSS_CODES[options.loss], options.loss_scale, squared)
-    inlier = np.concatenate([inliers.points, inliers.curves])
-    return 1.0 / sigma[at], inlier[at], robust[at]
+    inlier, at = np.concatenate([inliers.points, inliers.curves]), case.equations.observation
+    return Weights(1.0 / sigma[at], inlier[at], robust[at])
 
 
 def _judge_patterns(
-    model: _Model, freedom: Freedom, table: ResidualTable, rate: float, calibration: Calibration | None
+    case: _Case, model: LinearModel, table: ResidualTable, rate: float, calibration: Calibration | None
 ) -> tuple[tuple[Finding, ...], tuple[Noise, ...], int]:
     """Findings, noise and how many tests there were. `calibration`: that may not hold, where the data are new."""
-    rejected = np.flatnonzero(~model.inliers.points), np.flatnonzero(~model.inliers.curves)
-    labels, groups = find_mislabelled(model.observations, model.estimate, *rejected, model.scales, model.reject_sigma)
-    freedom = _with_the_rejected(model, freedom, labels)
-    families = all_families(model.observations, model.equations, model.estimate, model.layout, freedom.used)
+    rejected = np.flatnonzero(~case.inliers.points), np.flatnonzero(~case.inliers.curves)
+    labels, groups = find_mislabelled(case.observations, case.estimate, *rejected, case.scales, case.reject_sigma)
+    model = _with_the_rejected(case, model, labels)
+    families = all_families(case.observations, case.equations, case.estimate, case.problem, model.used)
     extra = groups + _OTHER_TESTS
-    selection = select(freedom, families, rate, extra)
-    noise = measure_noise(model.observations, selection.freedom, model.scales)
+    selection = select(model, families, rate, extra)
+    noise = measure_noise(case.observations, selection.model, model, case.scales)
     level = selection.log_level
     agreeing = max((one.inflation for one in noise if one.correlation_log_p < level), default=1.0)
     if agreeing > 1.0 and selection.chosen:  # correlated noise makes every other test too eager
-        selection = select(freedom, families, rate, extra, agreeing)
-        noise = measure_noise(model.observations, selection.freedom, model.scales)
+        selection = select(model, families, rate, extra, agreeing)
+        noise = measure_noise(case.observations, selection.model, model, case.scales)
     context = Context(
-        model.observations, model.estimate, model.layout, model.equations, freedom, table, selection.tests
+        case.observations, case.estimate, case.problem.layout, case.equations, model, table, selection.tests
     )
     findings = [
         *(pattern_finding(context, selection, number) for number in range(len(selection.chosen))),
         *label_findings(context, labels, level),
         *noise_findings(context, noise, level),
-        *([] if calibration is None else validity_finding(context, freedom, calibration, level)),
+        *([] if calibration is None else validity_finding(context, model, calibration, level)),
     ]
     return tuple(sorted(findings, key=lambda finding: -finding.effect_px)), noise, selection.tests
 
 
-def _with_the_rejected(model: _Model, freedom: Freedom, labels: Sequence[Mislabelled]) -> Freedom:
+def _with_the_rejected(case: _Case, model: LinearModel, labels: Sequence[Mislabelled]) -> LinearModel:
     """The model in which lines and points that were taken out nearly whole take part where they agree."""
-    explained = np.zeros(len(model.observations.points) + len(model.observations.curves), dtype=bool)
+    explained = np.zeros(len(case.observations.points) + len(case.observations.curves), dtype=bool)
     for label in labels:
-        explained[label.rows + (len(model.observations.points) if label.is_curve else 0)] = True
-    silent = explained[model.equations.observation]
-    families = list(target_families(model.observations, model.equations, model.estimate, ~silent))
-    used = heard_again(model.equations, freedom.weight, freedom.used, families, model.reject_sigma, silent)
-    if np.array_equal(used, freedom.used):
-        return freedom
-    robust = np.where(freedom.score != 0.0, freedom.score / (freedom.weight * model.equations.residual), 1.0)
-    return make_freedom(model.equations, model.estimate, model.layout, freedom.weight, used, robust)
+        explained[label.rows + (len(case.observations.points) if label.is_curve else 0)] = True
+    silent = explained[case.equations.observation]
+    families = list(target_families(case.observations, case.equations, case.estimate, ~silent))
+    used = heard_again(case.equations, model.weight, model.used, families, case.reject_sigma, silent)
+    if np.array_equal(used, model.used):
+        return model
+    robust = np.where(model.score != 0.0, model.score / (model.weight * case.equations.residual), 1.0)
+    return make_linear_model(case.problem, case.estimate, case.equations, Weights(model.weight, used, robust))

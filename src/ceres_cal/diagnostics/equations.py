@@ -9,21 +9,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ceres_cal import kernels
+from ceres_cal.base.arrays import AnyArray, Array, Indices, Mask
 from ceres_cal.base.errors import SolutionError
-from ceres_cal.base.transforms import Array
 from ceres_cal.model.parameters import Estimate
 from ceres_cal.model.residuals import Residuals, lens_arguments
 from ceres_cal.observations import Observations
-from ceres_cal.observations.sights import Mask, Sights
+from ceres_cal.observations.sights import Sights
 from ceres_cal.scene.targets import along_track
-
-Ints = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,12 +39,12 @@ class Equations:
 
     sights: Sights
     poses: Array
-    bounds: Ints
-    sight: Ints
-    observation: Ints
-    view: Ints
+    bounds: Indices
+    sight: Indices
+    observation: Indices
+    view: Indices
     is_curve: Mask
-    feature: Ints
+    feature: Indices
     residual: Array
     direction: Array
     pixel: Array
@@ -85,7 +81,9 @@ def write_equations(observations: Observations, sights: Sights, estimate: Estima
         raise SolutionError("the calibration can show none of the observations: give those it was made from")
     poses = estimate.pose_stack(sights.keys)
     parts = [
-        part for own in _by_camera(sights) for part in _of_camera(observations, sights, own, poses, estimate, found)
+        part
+        for name in sights.cameras
+        for part in _of_camera(observations, sights, sights.numbers(name), poses, estimate, found)
     ]
     size = max(part["intrinsics"].shape[1] for part in parts)
     for part in parts:
@@ -98,16 +96,9 @@ def write_equations(observations: Observations, sights: Sights, estimate: Estima
     return Equations(sights=sights, poses=poses, bounds=bounds, **columns)
 
 
-def _by_camera(sights: Sights) -> Iterator[Ints]:
-    """The numbers of each camera's sights."""
-    owners = np.array([key.camera for key in sights.keys])
-    for name in np.unique(owners):
-        yield np.flatnonzero(owners == name)
-
-
 def _of_camera(
-    observations: Observations, sights: Sights, numbers: Ints, poses: Array, estimate: Estimate, found: Residuals
-) -> Iterator[dict[str, NDArray[Any]]]:
+    observations: Observations, sights: Sights, numbers: Indices, poses: Array, estimate: Estimate, found: Residuals
+) -> Iterator[dict[str, AnyArray]]:
     """The columns of one camera's points, then of its curve observations."""
     own = sights.take(numbers)
     optics = lens_arguments(estimate.cameras[own.keys[0].camera])
@@ -128,7 +119,7 @@ def _of_camera(
         "pose": rows[:, :, size:].reshape(-1, 6),
         "place": np.repeat(places, 2, axis=0),
     }
-    tracks, feet = estimate.structure.tracks(own), found.places[own.curve_rows]
+    tracks, feet = estimate.structure.tracks(own), found.feet[own.curve_rows]
     rows, normals = np.empty((len(own.curve_rows), size + 6)), np.empty((len(own.curve_rows), 2))
     kernels.curve_rows(
         *optics, poses[numbers], own.curve_bounds, tracks, own.is_arc, own.track, own.curve_pixels, feet, rows, normals
@@ -149,6 +140,6 @@ def _of_camera(
     }
 
 
-def _sight_of(bounds: Ints) -> Ints:
+def _sight_of(bounds: Indices) -> Indices:
     """Which sight each row belongs to."""
     return np.repeat(np.arange(len(bounds) - 1), np.diff(bounds))

@@ -13,8 +13,9 @@ from typing import Any
 
 import numpy as np
 
+from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.errors import CalibrationError, DegenerateError, InputError
-from ceres_cal.base.transforms import Array, Pose
+from ceres_cal.base.transforms import Pose
 from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
 from ceres_cal.diagnostics.equations import write_equations
@@ -23,8 +24,8 @@ from ceres_cal.model.parameters import Estimate, Layout, Options
 from ceres_cal.model.residuals import residuals
 from ceres_cal.model.structure import make_structure
 from ceres_cal.observations import Columns, Observations
-from ceres_cal.observations.sights import Mask, Sights, gather_sights
-from ceres_cal.solve import Weighting, solve
+from ceres_cal.observations.sights import Sights, gather_sights
+from ceres_cal.solve import Problem, Weighting, solve
 
 FOLDS = 5
 MOST_OBSERVATIONS = 10_000
@@ -105,7 +106,7 @@ def cross_validate(
     """
     options = options or Options()
     whole = calibration or calibrate(observations, options)
-    kept = counted or _kept(whole, observations)
+    kept = counted or whole.inlier_masks(observations)
     names, frame = _frames(observations)
     if k < 2:
         raise InputError(f"cross-validation needs at least 2 folds, not {k}")
@@ -154,7 +155,7 @@ def choose(observations: Observations, options: Options, k: int = FOLDS, *, most
     good = [whole for whole in wholes if isinstance(whole, Calibration)]
     if not good:
         raise DegenerateError(f"no lens can be calibrated: {wholes[0]}")
-    masks = [_kept(whole, few) for whole in good]
+    masks = [whole.inlier_masks(few) for whole in good]
     counted = np.any([m[0] for m in masks], axis=0), np.any([m[1] for m in masks], axis=0)
     found = []
     for one, whole in zip(tried, wholes, strict=True):
@@ -257,13 +258,6 @@ def thinned(observations: Observations, most: int) -> Observations:
     return _subset(observations, *rows)
 
 
-def _kept(calibration: Calibration, observations: Observations) -> tuple[Mask, Mask]:
-    masks = np.ones(len(observations.points), bool), np.ones(len(observations.curves), bool)
-    for entry in calibration.rejected:
-        masks[entry.kind == "curve"][entry.row] = False
-    return masks
-
-
 def _predicted(
     observations: Observations, held: tuple[Mask, Mask], trained: Calibration, whole: Calibration
 ) -> tuple[Array, Array]:
@@ -277,7 +271,7 @@ def _predicted(
     if new:
         placements = {**estimate.placements, **{str(name): whole.estimate.placements[str(name)] for name in new}}
         estimate = replace(estimate, placements=placements)
-        of_new = sights.take(np.array([i for i, key in enumerate(sights.keys) if key.placement in new]))
+        of_new = sights.take(sights.numbers(placements=new))
         estimate = replace(estimate, placements=_posed(of_new, estimate, trained, observations))
     return _errors(observations, held, estimate)
 
@@ -290,7 +284,7 @@ def _posed(sights: Sights, estimate: Estimate, trained: Calibration, observation
     layout = Layout(none, frozenset(), frozenset(str(key.placement) for key in sights.keys))
     fit, options = trained.fit, trained.options
     weighting = Weighting(fit.point_scale, fit.curve_scale, options.loss, options.loss_scale)
-    return solve(built, start, layout, weighting, options).estimate.placements
+    return solve(Problem(built, layout, weighting=weighting, options=options), start).estimate.placements
 
 
 def _errors(observations: Observations, rows: tuple[Mask, Mask], estimate: Estimate) -> tuple[Array, Array]:

@@ -12,9 +12,8 @@ from functools import cache, cached_property
 import numpy as np
 
 from ceres_cal import kernels
+from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.tails import log_binomial_tail
-from ceres_cal.base.transforms import Array
-from ceres_cal.diagnostics.equations import Ints
 from ceres_cal.model.parameters import Estimate
 from ceres_cal.model.residuals import lens_arguments
 from ceres_cal.observations import Curves, Observations, Points
@@ -38,14 +37,14 @@ class Mislabelled:
     view: int
     feature: int
     instead: int
-    rows: Ints
+    rows: Indices
     distance_px: Array
     tried: int
     log_p: float
 
 
 def find_mislabelled(
-    observations: Observations, estimate: Estimate, rejected_points: Ints, rejected_curves: Ints,
+    observations: Observations, estimate: Estimate, rejected_points: Indices, rejected_curves: Indices,
     scales: tuple[float, float], reject_sigma: float,
 ) -> tuple[list[Mislabelled], int]:  # fmt: skip
     """Every group of rejected observations that another feature explains within the noise, and how many groups were
@@ -95,7 +94,7 @@ class _Sight:
         return min(1.0, 2.0 * distance_px * self.length_px / (width * height))
 
 
-def _of_view(sight: _Sight, column: Points | Curves, view: int, rows: Ints, bound: Array) -> list[Mislabelled]:
+def _of_view(sight: _Sight, column: Points | Curves, view: int, rows: Indices, bound: Array) -> list[Mislabelled]:
     """The groups of one view."""
     is_curve = isinstance(column, Curves)
     pixels, named = column.pixels[rows], column.feature[rows]

@@ -6,12 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ceres_cal.base.arrays import Array, Indices, Mask
 from ceres_cal.base.tails import log_chi2_tail
-from ceres_cal.base.transforms import Array
-from ceres_cal.diagnostics.equations import Ints
-from ceres_cal.diagnostics.freedom import Freedom
+from ceres_cal.diagnostics.linear_model import LinearModel
 from ceres_cal.observations import Observations
-from ceres_cal.observations.sights import Mask
 
 LARGER = 1.15  # noise within so much of what was stated is as stated
 _FEWEST_PAIRS = 20
@@ -47,40 +45,47 @@ class Noise:
         return self.observations / self.effective if self.observations else 1.0
 
 
-def measure_noise(observations: Observations, freedom: Freedom, scales: tuple[float, float]) -> tuple[Noise, ...]:
-    """The noise of points and of curves, where there are any. `scales`: by which the model's weights were made."""
+def measure_noise(
+    observations: Observations, model: LinearModel, before: LinearModel, scales: tuple[float, float]
+) -> tuple[Noise, ...]:
+    """The noise of points and of curves, where there are any.
+
+    Args:
+        model: with the named causes taken off. before: the calibration's own. scales: its noise scales.
+    """
     answer = []
     for is_curve, kind in ((False, "points"), (True, "curves")):
-        rows = freedom.used & (freedom.equations.is_curve == is_curve)
+        rows = model.used & (model.equations.is_curve == is_curve)
         if np.any(rows):
-            answer.append(_noise_of(observations, freedom, kind, rows, scales[is_curve]))
+            own = before.variance(before.used & (before.equations.is_curve == is_curve))
+            answer.append(_noise_of(observations, model, kind, rows, scales[is_curve], own))
     return tuple(answer)
 
 
-def _noise_of(observations: Observations, freedom: Freedom, kind: str, rows: Mask, model_scale: float) -> Noise:
-    left, column = freedom.left_over, observations.curves if kind == "curves" else observations.points
-    spare = float(np.sum(1.0 - freedom.leverage[rows]))
-    squares = float(np.sum(left[rows] ** 2))
-    variance = squares / max(spare, 1e-9)
-    scale = model_scale * float(np.sqrt(variance))
+def _noise_of(
+    observations: Observations, model: LinearModel, kind: str, rows: Mask, own_scale: float, own_variance: float
+) -> Noise:
+    column = observations.curves if kind == "curves" else observations.points
+    variance, spare = model.variance(rows), model.spare_of(rows)
+    scale = own_scale * float(np.sqrt(variance / own_variance)) if own_variance > 0.0 else own_scale
     count = int(np.count_nonzero(rows)) // (1 if kind == "curves" else 2)
     stated = float("nan") if np.all(column.sigma_px == 1.0) else float(np.sqrt(np.mean(column.sigma_px**2)))
     log_p = 0.0
     if np.isfinite(stated) and spare >= 1.0:
-        log_p = float(log_chi2_tail(squares * model_scale**2 / LARGER**2, spare))
+        log_p = float(log_chi2_tail(variance * spare * own_scale**2 / LARGER**2, spare))
     typical = scale * float(np.sqrt(np.mean(column.sigma_px**2)))
-    correlation, pairs_log_p = _correlation(freedom, _neighbours(observations, freedom, kind), variance)
+    correlation, pairs_log_p = _correlation(model, _neighbours(observations, model, kind), variance)
     agree = max(correlation, 0.0) if np.isfinite(correlation) and pairs_log_p < np.log(0.01) else 0.0
     effective = count * (1.0 - agree) / (1.0 + agree)  # of a first-order autoregression
     return Noise(kind, count, typical, scale, stated, log_p, correlation, pairs_log_p, effective)
 
 
-def _neighbours(observations: Observations, freedom: Freedom, kind: str) -> tuple[Ints, Ints]:
+def _neighbours(observations: Observations, model: LinearModel, kind: str) -> tuple[Indices, Indices]:
     """Pairs of used equations: next to one another along a line of one view, or on one row of a board."""
-    equations = freedom.equations
+    equations = model.equations
     if kind == "curves":
-        rows = np.flatnonzero(freedom.used & equations.is_curve)
-        along = _along(freedom, rows)
+        rows = np.flatnonzero(model.used & equations.is_curve)
+        along = _along(model, rows)
         order = rows[np.lexsort((along, equations.feature[rows], equations.view[rows]))]
         first, second = order[:-1], order[1:]
         near = (equations.view[first] == equations.view[second]) & (
@@ -88,7 +93,7 @@ def _neighbours(observations: Observations, freedom: Freedom, kind: str) -> tupl
         )
         return first[near], second[near]
     boards = np.array([observations.targets[view.target].kind == "checkerboard" for view in observations.views])
-    rows = np.flatnonzero(freedom.used & ~equations.is_curve & boards[equations.view])
+    rows = np.flatnonzero(model.used & ~equations.is_curve & boards[equations.view])
     component = (equations.direction[rows, 1] > 0.5).astype(int)
     order = rows[np.lexsort((equations.feature[rows], component, equations.view[rows]))]
     first, second = order[:-1], order[1:]
@@ -99,9 +104,9 @@ def _neighbours(observations: Observations, freedom: Freedom, kind: str) -> tupl
     return first[near], second[near]
 
 
-def _along(freedom: Freedom, rows: Ints) -> Array:
+def _along(model: LinearModel, rows: Indices) -> Array:
     """(N,) order of curve equations along their tracks."""
-    equations = freedom.equations
+    equations = model.equations
     track = equations.feature[rows]
     c, a, b = equations.sights.tracks[track].transpose(1, 0, 2)
     away = equations.place[rows] - c
@@ -109,13 +114,13 @@ def _along(freedom: Freedom, rows: Ints) -> Array:
     return np.asarray(np.where(equations.sights.is_arc[track], turned, np.sum(away * a, axis=1)))
 
 
-def _correlation(freedom: Freedom, pairs: tuple[Ints, Ints], variance: float) -> tuple[float, float]:
+def _correlation(model: LinearModel, pairs: tuple[Indices, Indices], variance: float) -> tuple[float, float]:
     """Correlation of neighbouring residuals beyond what the fit makes of white noise, and log P of so much."""
     first, second = pairs
     if len(first) < _FEWEST_PAIRS:
         return float("nan"), 0.0
-    left, leverage = freedom.left_over, np.minimum(freedom.leverage, 1.0)
-    overlap = freedom.overlap(first, second)
+    left, leverage = model.left_over, np.minimum(model.leverage, 1.0)
+    overlap = model.overlap(first, second)
     total = float(np.sum(left[first] * left[second] + variance * overlap))
     kept = (1.0 - leverage[first]) * (1.0 - leverage[second])
     z = total / (variance * np.sqrt(np.sum(kept + overlap**2)))

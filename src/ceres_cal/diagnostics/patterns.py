@@ -7,12 +7,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ceres_cal.base.transforms import Array
-from ceres_cal.diagnostics.equations import Equations, Ints
+from ceres_cal.base.arrays import Array, Indices, Mask
+from ceres_cal.diagnostics.equations import Equations
 from ceres_cal.diagnostics.findings import OF_LENS
-from ceres_cal.diagnostics.freedom import Freedom, inverse_root
+from ceres_cal.diagnostics.linear_model import LinearModel, inverse_root
 from ceres_cal.diagnostics.scores import LEAST_LEFT, Family, Score, score_all
-from ceres_cal.observations.sights import Mask
 
 _MOST = 12  # causes that are named; more than that is not a calibration with faults but none
 _LEAST_SHARE = 0.02  # of the first cause's statistic: below it the error of its linear picture speaks
@@ -29,17 +28,19 @@ class Selection:
         shift: (E, len(chosen)) px that each moves; of the lens, beyond what the calibration would absorb.
         tests: number of alternatives that could be tested, and `extra`.
         log_level: natural logarithm of the probability below which one is chosen.
-        freedom: the model with the chosen ones free.
+        model: the model with the chosen ones free.
     """
 
     chosen: tuple[Score, ...]
     shift: Array
     tests: int
     log_level: float
-    freedom: Freedom
+    model: LinearModel
 
 
-def select(freedom: Freedom, families: Sequence[Family], rate: float, extra: int, inflation: float = 1.0) -> Selection:
+def select(
+    model: LinearModel, families: Sequence[Family], rate: float, extra: int, inflation: float = 1.0
+) -> Selection:
     """Alternatives whose tests would give a false alarm with probability `rate` in all, one after the other, each with
     those before it free.
 
@@ -47,7 +48,7 @@ def select(freedom: Freedom, families: Sequence[Family], rate: float, extra: int
         extra: how many other tests share the rate. inflation: see `score_all`.
     """
     chosen: list[Score] = []
-    now, scores = freedom, score_all(freedom, families, inflation)
+    now, scores = model, score_all(model, families, inflation)
     tests = len(scores) + extra
     log_level = float(np.log(rate / tests))
     while scores and len(chosen) < _MOST:
@@ -55,51 +56,51 @@ def select(freedom: Freedom, families: Sequence[Family], rate: float, extra: int
         if best.log_p > log_level or (chosen and best.statistic < _LEAST_SHARE * chosen[0].statistic):
             break
         chosen.append(best)
-        now = now.with_columns(best.family.of(best.number) * freedom.weight[:, None])
+        now = now.with_columns(best.family.of(best.number) * model.weight[:, None])
         scores = score_all(now, families, inflation)
-    shift = np.zeros((len(freedom.equations), len(chosen)))
+    shift = np.zeros((len(model.equations), len(chosen)))
     if chosen:
         columns = [score.family.of(score.number) for score in chosen]
-        amount, sd, _ = amounts_of(freedom, np.hstack(columns))
+        amount, sd, _ = amounts_of(model, np.hstack(columns))
         ends = np.cumsum([column.shape[1] for column in columns])[:-1]
         parts = zip(chosen, np.split(amount, ends), np.split(sd, ends), strict=True)
         chosen = [replace(score, amount=own, sd=own_sd) for score, own, own_sd in parts]
         for k, score in enumerate(chosen):
             moved = columns[k] @ score.amount
-            shift[:, k] = beyond(freedom, moved) if score.family.kind in OF_LENS else moved
+            shift[:, k] = beyond(model, moved) if score.family.kind in OF_LENS else moved
     return Selection(tuple(chosen), shift, tests, log_level, now)
 
 
-def amounts_of(freedom: Freedom, columns: Array) -> tuple[Array, Array, float]:
+def amounts_of(model: LinearModel, columns: Array) -> tuple[Array, Array, float]:
     """Amounts (Q,) that mend most with columns (E, Q) px per unit, their standard deviations, and by how much the
     squared residuals fall; 0 and infinite for what cannot be told.
     """
-    scaled = columns * freedom.weight[:, None]
-    rest = freedom.beyond_private(scaled)[freedom.used]
-    taken = freedom.shared[freedom.used].T @ rest
-    sizes = np.sum(scaled[freedom.used] ** 2, axis=0)
+    scaled = columns * model.weight[:, None]
+    rest = model.beyond_private(scaled)[model.used]
+    taken = model.shared[model.used].T @ rest
+    sizes = np.sum(scaled[model.used] ** 2, axis=0)
     root = inverse_root(rest.T @ rest - taken.T @ taken, sizes, LEAST_LEFT)
-    z = root.T @ (rest.T @ freedom.score[freedom.used] - taken.T @ freedom.pull)
+    z = root.T @ (rest.T @ model.score[model.used] - taken.T @ model.step)
     sd = np.where(np.any(root != 0.0, axis=1), np.sqrt(np.sum(root**2, axis=1)), np.inf)
     return -root @ z, sd, float(z @ z)
 
 
-def gains_of(freedom: Freedom, columns: Array) -> Array:
+def gains_of(model: LinearModel, columns: Array) -> Array:
     """(Q,) by how much the squared residuals fall with each of the columns (E, Q), px per unit, alone."""
-    scaled = columns * freedom.weight[:, None]
-    rest = freedom.beyond_private(scaled)[freedom.used]
-    taken = freedom.shared[freedom.used].T @ rest
+    scaled = columns * model.weight[:, None]
+    rest = model.beyond_private(scaled)[model.used]
+    taken = model.shared[model.used].T @ rest
     left = np.sum(rest**2, axis=0) - np.sum(taken**2, axis=0)
-    told = left > LEAST_LEFT * np.sum(scaled[freedom.used] ** 2, axis=0)
-    slope = rest.T @ freedom.score[freedom.used] - taken.T @ freedom.pull
+    told = left > LEAST_LEFT * np.sum(scaled[model.used] ** 2, axis=0)
+    slope = rest.T @ model.score[model.used] - taken.T @ model.step
     return np.where(told, slope**2 / np.where(told, left, 1.0), 0.0)
 
 
-def beyond(freedom: Freedom, column: Array) -> Array:
+def beyond(model: LinearModel, column: Array) -> Array:
     """(E,) px of a displacement (E,) px that the calibration could not have absorbed."""
-    rest = freedom.beyond_private((column * freedom.weight)[:, None])
-    rest -= freedom.shared @ (freedom.shared[freedom.used].T @ rest[freedom.used])
-    return np.asarray(rest[:, 0] / freedom.weight)
+    rest = model.beyond_private((column * model.weight)[:, None])
+    rest -= model.shared @ (model.shared[model.used].T @ rest[model.used])
+    return np.asarray(rest[:, 0] / model.weight)
 
 
 def heard_again(
@@ -127,7 +128,7 @@ def heard_again(
     return used
 
 
-def _agreeing(columns: Array, residual: Array, observation: Ints, reject_sigma: float) -> Mask:
+def _agreeing(columns: Array, residual: Array, observation: Indices, reject_sigma: float) -> Mask:
     """(N,) which equations one amount brings within the bound, by least absolute deviations; none if it is too far."""
     columns = columns[:, np.any(columns != 0.0, axis=0)]
     amount: Array = np.zeros(columns.shape[1])

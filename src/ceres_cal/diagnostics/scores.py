@@ -13,10 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.tails import log_f_tail
-from ceres_cal.base.transforms import Array
-from ceres_cal.diagnostics.equations import Ints
-from ceres_cal.diagnostics.freedom import Freedom, inverse_root
+from ceres_cal.diagnostics.linear_model import LinearModel, inverse_root
 
 LEAST_LEFT = 1e-7
 """Share of an alternative's squared length that the free numbers must leave for it to be testable."""
@@ -37,7 +36,7 @@ class Family:
 
     kind: str
     columns: Array
-    group: Ints
+    group: Indices
     names: tuple[str, ...]
     onwards: bool = False
     units: tuple[str, ...] = ()
@@ -67,17 +66,17 @@ class Score:
     sd: Array
 
 
-def score_all(freedom: Freedom, families: Sequence[Family], inflation: float = 1.0) -> list[Score]:
+def score_all(model: LinearModel, families: Sequence[Family], inflation: float = 1.0) -> list[Score]:
     """The tests of every alternative that the free numbers leave testable.
 
     Args:
         inflation: how many observations weigh as much as one independent one, where neighbours agree.
     """
-    squares = float(freedom.left_over @ freedom.left_over)
-    slope = _robust_slope(freedom)
+    squares = float(model.left_over @ model.left_over)
+    slope = _robust_slope(model)
     found: list[tuple[Family, int, Array, Array, Array]] = []
     for family in families:
-        normals, scores, sizes = _sums(freedom, family)
+        normals, scores, sizes = _sums(model, family)
         for number in np.flatnonzero(sizes.max(axis=1) > 0.0):
             root = inverse_root(normals[number], sizes[number], LEAST_LEFT)
             if root.shape[1]:
@@ -86,7 +85,7 @@ def score_all(freedom: Freedom, families: Sequence[Family], inflation: float = 1
         return []
     ranks = np.array([root.shape[1] for _, _, root, _, _ in found])
     statistics = np.array([float(z @ z) for _, _, _, z, _ in found])
-    spare = np.maximum(freedom.spare - ranks, 1)
+    spare = np.maximum(model.spare - ranks, 1)
     variance = np.maximum(squares - statistics, 1e-12 * squares) / spare
     log_p = log_f_tail(statistics / (inflation * ranks * np.maximum(variance, 1e-300)), ranks, spare)
     return [
@@ -102,20 +101,20 @@ def _spread(root: Array, sizes: Array, scale: float) -> Array:
     return np.where(sizes > 0.0, scale * np.sqrt(np.sum(root**2, axis=1)), np.inf)
 
 
-def _robust_slope(freedom: Freedom) -> float:
+def _robust_slope(model: LinearModel) -> float:
     """Mean derivative of a robust residual by the residual itself: 1 without a loss (Stein's lemma)."""
-    plain = freedom.weight * freedom.equations.residual * freedom.used
-    return float(plain @ freedom.score) / max(float(plain @ plain), 1e-300)
+    plain = model.weight * model.equations.residual * model.used
+    return float(plain @ model.score) / max(float(plain @ plain), 1e-300)
 
 
-def _sums(freedom: Freedom, family: Family) -> tuple[Array, Array, Array]:
+def _sums(model: LinearModel, family: Family) -> tuple[Array, Array, Array]:
     """Of each alternative: X'X (G, Q, Q), X'r (G, Q), and the squared lengths (G, Q) before any projection."""
-    rows = np.flatnonzero((family.group >= 0) & freedom.used)
+    rows = np.flatnonzero((family.group >= 0) & model.used)
     rows = rows[np.argsort(family.group[rows], kind="stable")]
     group, count = family.group[rows], len(family.names)
-    columns = family.columns[rows] * freedom.weight[rows, None]
+    columns = family.columns[rows] * model.weight[rows, None]
     size = columns.shape[1]
-    rest = freedom.placed_score[rows]
+    rest = model.placed_score[rows]
 
     def total(values: Array) -> Array:
         sums = _by_group(values, group, count)
@@ -127,16 +126,16 @@ def _sums(freedom: Freedom, family: Family) -> tuple[Array, Array, Array]:
         -1, size, size
     )
     sizes = np.einsum("gqq->gq", products).copy()
-    shared = freedom.shared[rows]
+    shared = model.shared[rows]
     taken = np.stack([total(columns[:, k, None] * shared) for k in range(size)], axis=1)
-    scores = total(columns * rest[:, None]) - taken @ freedom.pull
+    scores = total(columns * rest[:, None]) - taken @ model.step
     products -= taken @ taken.transpose(0, 2, 1)
-    for places, overlap in _private_overlaps(freedom, family, rows, columns):
+    for places, overlap in _private_overlaps(model, family, rows, columns):
         np.subtract.at(products, places, overlap @ overlap.transpose(0, 2, 1))
     return products, scores, sizes
 
 
-def _by_group(values: Array, group: Ints, count: int) -> Array:
+def _by_group(values: Array, group: Indices, count: int) -> Array:
     """Sums (count, K) of rows (N, K) sorted by group."""
     sums = np.zeros((count, values.shape[1]))
     if len(values):
@@ -145,14 +144,14 @@ def _by_group(values: Array, group: Ints, count: int) -> Array:
     return sums
 
 
-def _private_overlaps(freedom: Freedom, family: Family, rows: Ints, columns: Array) -> list[tuple[Ints, Array]]:
+def _private_overlaps(model: LinearModel, family: Family, rows: Indices, columns: Array) -> list[tuple[Indices, Array]]:
     """Alternatives (N,) and what of their columns lies in the private bases of one sight or another, (N, Q, 6)."""
-    basis = freedom.private[rows]
+    basis = model.private[rows]
     held = np.flatnonzero(np.any(basis != 0.0, axis=1))
     if not len(held):
         return []
     size, count = columns.shape[1], len(family.names)
-    sight, group = freedom.equations.sight[rows[held]], family.group[rows[held]]
+    sight, group = model.equations.sight[rows[held]], family.group[rows[held]]
     order = np.lexsort((group, sight))
     products = (columns[held, :, None] * basis[held, None, :]).reshape(len(held), -1)[order]
     key = (sight * count + group)[order]

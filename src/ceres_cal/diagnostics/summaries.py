@@ -7,12 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ceres_cal.base.transforms import Array
-from ceres_cal.diagnostics.equations import Ints
-from ceres_cal.diagnostics.freedom import Freedom
+from ceres_cal.base.arrays import Array, Indices, Mask
+from ceres_cal.diagnostics.linear_model import LinearModel
 from ceres_cal.diagnostics.table import ResidualTable
 from ceres_cal.observations import Observations
-from ceres_cal.observations.sights import Mask
 from ceres_cal.scene.camera import Camera
 
 REGIONS = (6, 4)
@@ -33,9 +31,9 @@ class Summary:
     """
 
     names: tuple[str, ...]
-    points: Ints
-    curves: Ints
-    rejected: Ints
+    points: Indices
+    curves: Indices
+    rejected: Indices
     points_rms_px: Array
     curves_rms_px: Array
     rms_mm: Array
@@ -72,7 +70,7 @@ class Summaries:
 
 
 def summarise(
-    observations: Observations, table: ResidualTable, freedom: Freedom, cameras: Mapping[str, Camera]
+    observations: Observations, table: ResidualTable, model: LinearModel, cameras: Mapping[str, Camera]
 ) -> Summaries:
     """All summaries of a table."""
     several = len(observations.stations) > 1
@@ -88,21 +86,21 @@ def summarise(
         _summary(table, table.feature, list(table.features)),
         _summary(table, region, region_names),
         _summary(table, ring, radius_names),
-        tuple(_trend(freedom, cameras[name], name, camera == i, edges[i]) for i, name in enumerate(camera_names)),
+        tuple(_trend(model, cameras[name], name, camera == i, edges[i]) for i, name in enumerate(camera_names)),
     )
 
 
-def _numbers(labels: list[str], known: list[str]) -> Ints:
+def _numbers(labels: list[str], known: list[str]) -> Indices:
     order = {name: number for number, name in enumerate(known)}
     return np.array([order[label] for label in labels], dtype=np.int64)
 
 
-def _summary(table: ResidualTable, group: Ints, names: list[str]) -> Summary:
+def _summary(table: ResidualTable, group: Indices, names: list[str]) -> Summary:
     """Groups with any observation, in the order of their names."""
     size, inlier = len(names), table.inlier
     points, curves = inlier & ~table.is_curve, inlier & table.is_curve
 
-    def count(rows: Mask) -> Ints:
+    def count(rows: Mask) -> Indices:
         return np.asarray(np.bincount(group[rows], minlength=size))
 
     def rms(rows: Mask, values: Array) -> Array:
@@ -127,8 +125,8 @@ def _summary(table: ResidualTable, group: Ints, names: list[str]) -> Summary:
 
 
 def _regions(
-    table: ResidualTable, camera: Ints, names: list[str], cameras: Mapping[str, Camera]
-) -> tuple[list[str], Ints]:
+    table: ResidualTable, camera: Indices, names: list[str], cameras: Mapping[str, Camera]
+) -> tuple[list[str], Indices]:
     columns, rows = REGIONS
     sizes = np.array([cameras[name].image_size for name in names], dtype=float)[camera]
     place = np.clip(((table.pixel + 0.5) / sizes * REGIONS).astype(np.int64), 0, np.array(REGIONS) - 1)
@@ -137,8 +135,8 @@ def _regions(
 
 
 def _rings(
-    table: ResidualTable, camera: Ints, names: list[str], cameras: Mapping[str, Camera]
-) -> tuple[list[str], Ints, list[Array]]:
+    table: ResidualTable, camera: Indices, names: list[str], cameras: Mapping[str, Camera]
+) -> tuple[list[str], Indices, list[Array]]:
     edges = [np.linspace(0.0, cameras[name].corner_radius, RADIUS_BINS + 1) for name in names]
     ring = np.zeros(len(table), dtype=np.int64)
     labels = []
@@ -152,14 +150,14 @@ def _rings(
     return labels, ring, edges
 
 
-def _trend(freedom: Freedom, camera: Camera, name: str, own: Mask, edges: Array) -> RadiusTrend:
-    equations = freedom.equations
-    rows = np.flatnonzero(own[equations.observation] & freedom.used)
+def _trend(model: LinearModel, camera: Camera, name: str, own: Mask, edges: Array) -> RadiusTrend:
+    equations = model.equations
+    rows = np.flatnonzero(own[equations.observation] & model.used)
     offsets = camera.offsets(equations.pixel[rows])
     radius = np.linalg.norm(offsets, axis=1)
     outward = np.sum(equations.direction[rows] * offsets, axis=1) / np.maximum(radius, 1e-9)
     ring = np.clip(np.searchsorted(edges, radius, side="right") - 1, 0, RADIUS_BINS - 1)
-    weight = freedom.weight[rows] ** 2
+    weight = model.weight[rows] ** 2
     total = np.bincount(ring, weight * outward**2, RADIUS_BINS)
     moved = np.bincount(ring, weight * outward * equations.residual[rows], RADIUS_BINS)
     with np.errstate(divide="ignore", invalid="ignore"):

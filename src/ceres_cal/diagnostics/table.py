@@ -9,15 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ceres_cal.base.arrays import AnyArray, Array, Codes, Indices, Mask
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import write_bytes, write_json
-from ceres_cal.base.transforms import Array
-from ceres_cal.diagnostics.equations import Equations, Ints
-from ceres_cal.diagnostics.freedom import Freedom
+from ceres_cal.diagnostics.equations import Equations
+from ceres_cal.diagnostics.linear_model import LinearModel
 from ceres_cal.observations import Observations
-from ceres_cal.observations.sights import Mask
 from ceres_cal.scene.camera import Camera
 from ceres_cal.solve.noise import Inliers
 
@@ -50,10 +48,10 @@ class ResidualTable:
     """
 
     is_curve: Mask
-    row: Ints
-    view: Ints
+    row: Indices
+    view: Indices
     views: tuple[dict[str, str | None], ...]
-    feature: Ints
+    feature: Indices
     features: tuple[str, ...]
     pixel: Array
     residual_px: Array
@@ -65,7 +63,7 @@ class ResidualTable:
     leverage: Array
     standardised: Array
     radius_px: Array
-    reason: NDArray[np.int8]
+    reason: Codes
 
     def __len__(self) -> int:
         return len(self.row)
@@ -78,7 +76,7 @@ class ResidualTable:
         """How messages name an observation: "point 17" or "curve 4"."""
         return f"{'curve' if self.is_curve[number] else 'point'} {self.row[number]}"
 
-    def columns(self) -> dict[str, NDArray[Any]]:
+    def columns(self) -> dict[str, AnyArray]:
         """Every column as a flat array under its name in the exported files, names written out."""
         views = {
             name: np.array([view[name] or "" for view in self.views], dtype=np.str_)[self.view]
@@ -129,7 +127,7 @@ class ResidualTable:
             write_bytes(path, text.getvalue().encode())
 
 
-def _plain(column: NDArray[Any]) -> list[Any]:
+def _plain(column: AnyArray) -> list[Any]:
     values: list[Any] = column.tolist()
     if column.dtype.kind == "f" and not np.all(np.isfinite(column)):
         return [value if np.isfinite(value) else None for value in values]
@@ -137,14 +135,14 @@ def _plain(column: NDArray[Any]) -> list[Any]:
 
 
 def make_table(
-    observations: Observations, inliers: Inliers, freedom: Freedom, weight: Array, cameras: dict[str, Camera]
+    observations: Observations, inliers: Inliers, model: LinearModel, weight: Array, cameras: dict[str, Camera]
 ) -> ResidualTable:
     """The table of all observations.
 
     Args:
         weight: (E,) robust weight of each equation's observation.
     """
-    equations, points, curves = freedom.equations, observations.points, observations.curves
+    equations, points, curves = model.equations, observations.points, observations.curves
     count = len(points) + len(curves)
     is_curve = np.arange(count) >= len(points)
     features, first = _feature_names(observations)
@@ -172,19 +170,19 @@ def make_table(
         np.concatenate([points.sigma_px, curves.sigma_px]),
         np.where(is_curve, inliers.curve_scale, inliers.point_scale),
         np.where(inlier, _spread_out(equations, weight, count), 0.0),
-        _mean_leverage(freedom, count),
-        _standardised(freedom, count),
+        _mean_leverage(model, count),
+        _standardised(model, count),
         _radii(observations, view, pixel, cameras),
         np.where(inlier, INLIER, np.where(seen, TOO_FAR, NOT_SEEN)).astype(np.int8),
     )
 
 
-def _index(names: list[str], known: list[str]) -> Ints:
+def _index(names: list[str], known: list[str]) -> Indices:
     order = {name: number for number, name in enumerate(known)}
     return np.array([order[name] for name in names], dtype=np.int64)
 
 
-def _feature_names(observations: Observations) -> tuple[tuple[str, ...], Ints]:
+def _feature_names(observations: Observations) -> tuple[tuple[str, ...], Indices]:
     """All features as "target/name", points of all targets first, and where each target's points and curves begin."""
     targets = observations.targets
     points = [f"{name}/{point}" for name, target in targets.items() for point in target.point_names]
@@ -232,24 +230,24 @@ def plane_shift(equations: Equations, values: Array) -> tuple[Array, Array]:
     return x, y
 
 
-def _mean_leverage(freedom: Freedom, count: int) -> Array:
-    equations, leverage = freedom.equations, freedom.leverage
+def _mean_leverage(model: LinearModel, count: int) -> Array:
+    equations, leverage = model.equations, model.leverage
     sums = np.bincount(equations.observation, leverage, count)
     numbers = np.bincount(equations.observation, minlength=count)
     return np.where(numbers > 0, sums / np.maximum(numbers, 1), np.nan)
 
 
-def _standardised(freedom: Freedom, count: int) -> Array:
+def _standardised(model: LinearModel, count: int) -> Array:
     """e' (1 - H)^-1 e as a length; 1 + H where the observation took no part."""
-    equations = freedom.equations
-    sign = np.where(freedom.used, -1.0, 1.0)
-    residual, leverage = freedom.weight * equations.residual, freedom.leverage
+    equations = model.equations
+    sign = np.where(model.used, -1.0, 1.0)
+    residual, leverage = model.weight * equations.residual, model.leverage
     answer = np.full(count, np.nan)
     variance = np.maximum(1.0 + sign * leverage, 1e-9)
     curves = equations.is_curve
     answer[equations.observation[curves]] = (residual / np.sqrt(variance))[curves]
     first, second = np.flatnonzero(~curves).reshape(-1, 2).T
-    cross = sign[first] * freedom.overlap(first, second)
+    cross = sign[first] * model.overlap(first, second)
     p, q = residual[first], residual[second]
     determinant = np.maximum(variance[first] * variance[second] - cross**2, 1e-18)
     squared = (variance[second] * p * p - 2.0 * cross * p * q + variance[first] * q * q) / determinant
@@ -257,7 +255,7 @@ def _standardised(freedom: Freedom, count: int) -> Array:
     return answer
 
 
-def _radii(observations: Observations, view: Ints, pixel: Array, cameras: dict[str, Camera]) -> Array:
+def _radii(observations: Observations, view: Indices, pixel: Array, cameras: dict[str, Camera]) -> Array:
     owner = np.array([one.camera for one in observations.views])[view]
     radii = np.full(len(view), np.nan)
     for name in observations.cameras:

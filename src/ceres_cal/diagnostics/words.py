@@ -8,20 +8,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ceres_cal.base.transforms import Array
+from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.words import two_digits
 from ceres_cal.diagnostics.alternatives import missing_powers, radial_column
 from ceres_cal.diagnostics.equations import Equations
 from ceres_cal.diagnostics.findings import SMALL, Amount, Finding
-from ceres_cal.diagnostics.freedom import Freedom
 from ceres_cal.diagnostics.labels import Mislabelled
 from ceres_cal.diagnostics.leftover import Noise
+from ceres_cal.diagnostics.linear_model import LinearModel
 from ceres_cal.diagnostics.patterns import Selection, amounts_of, gains_of
 from ceres_cal.diagnostics.scores import Score
 from ceres_cal.diagnostics.table import ResidualTable, plane_shift
 from ceres_cal.model.parameters import Estimate, Layout
 from ceres_cal.observations import Observations
-from ceres_cal.observations.sights import Mask
 from ceres_cal.scene.targets import Arc, Segment
 
 _LN_10 = float(np.log(10.0))
@@ -30,13 +29,13 @@ _MOST_NAMED = 5
 
 @dataclass(frozen=True, eq=False)
 class Context:
-    """What the words are made from. `freedom` is the model before any alternative was put in; tests: how many."""
+    """What the words are made from. `model` is the model before any alternative was put in; tests: how many."""
 
     observations: Observations
     estimate: Estimate
     layout: Layout
     equations: Equations
-    freedom: Freedom
+    model: LinearModel
     table: ResidualTable
     tests: int
 
@@ -56,7 +55,7 @@ class Context:
     def noise_px(self, left_over: Array, rows: Mask) -> float:
         """Root mean square over observations of what is left over, (E,) in standard deviations, px."""
         count = len(np.unique(self.equations.observation[rows]))
-        return float(np.sqrt(np.sum((left_over / self.freedom.weight)[rows] ** 2) / count))
+        return float(np.sqrt(np.sum((left_over / self.model.weight)[rows] ** 2) / count))
 
 
 @dataclass(frozen=True)
@@ -73,13 +72,13 @@ class _Said:
 def pattern_finding(context: Context, selection: Selection, number: int) -> Finding:
     """The finding of one chosen alternative."""
     score, shift = selection.chosen[number], selection.shift[:, number]
-    rows = np.any(score.family.of(score.number) != 0.0, axis=1) & context.freedom.used
+    rows = np.any(score.family.of(score.number) != 0.0, axis=1) & context.model.used
     effect_px, effect_mm, count = context.effect(shift, rows)
-    others = context.freedom
+    others = context.model
     for k, other in enumerate(selection.chosen):
         if k != number:
             others = others.with_columns(other.family.of(other.number) * others.weight[:, None])
-    ratio = effect_px / context.noise_px(selection.freedom.left_over, rows)
+    ratio = effect_px / context.noise_px(selection.model.left_over, rows)
     size = f"{effect_px:.2f} px, {effect_mm:.{1 if effect_mm >= 0.1 else 2}f} mm rms, {two_digits(ratio)} of the noise"
     said = _SPEAKERS[score.family.kind](context, others, score, shift, size, ratio)
     name = score.family.names[score.number]
@@ -96,10 +95,10 @@ _COEFFICIENTS = {"brown": {3: "k1", 5: "k2", 7: "k3"}, "kannala-brandt": {3: "k1
 
 def _most(context: Context, shift: Array) -> float:
     """The largest displacement (px) of an observation that took part."""
-    return float(np.max(np.abs(shift[context.freedom.used])))
+    return float(np.max(np.abs(shift[context.model.used])))
 
 
-def _radius(context: Context, others: Freedom, score: Score, shift: Array, size: str, ratio: float) -> _Said:
+def _radius(context: Context, others: LinearModel, score: Score, shift: Array, size: str, ratio: float) -> _Said:
     name = score.family.names[score.number]
     lens = context.estimate.cameras[name].lens
     own = score.family.group == score.number
@@ -124,7 +123,7 @@ def _radius(context: Context, others: Freedom, score: Score, shift: Array, size:
     return _Said(sentence, advice, ())
 
 
-def _decentring(context: Context, others: Freedom, score: Score, shift: Array, size: str, ratio: float) -> _Said:
+def _decentring(context: Context, others: LinearModel, score: Score, shift: Array, size: str, ratio: float) -> _Said:
     name = score.family.names[score.number]
     most = _most(context, shift)
     fixed = context.estimate.cameras[name].lens.kind == "brown"
@@ -135,7 +134,7 @@ def _decentring(context: Context, others: Freedom, score: Score, shift: Array, s
     )
 
 
-def _aspect(context: Context, others: Freedom, score: Score, shift: Array, size: str, ratio: float) -> _Said:
+def _aspect(context: Context, others: LinearModel, score: Score, shift: Array, size: str, ratio: float) -> _Said:
     name = score.family.names[score.number]
     held = context.estimate.cameras[name].aspect
     return _Said(
@@ -146,7 +145,9 @@ def _aspect(context: Context, others: Freedom, score: Score, shift: Array, size:
     )
 
 
-def _principal_point(context: Context, others: Freedom, score: Score, shift: Array, size: str, ratio: float) -> _Said:
+def _principal_point(
+    context: Context, others: LinearModel, score: Score, shift: Array, size: str, ratio: float
+) -> _Said:
     name = score.family.names[score.number]
     x, y = score.amount
     return _Said(
@@ -157,7 +158,7 @@ def _principal_point(context: Context, others: Freedom, score: Score, shift: Arr
     )  # fmt: skip
 
 
-def _phi(context: Context, others: Freedom, score: Score, shift: Array, size: str, ratio: float) -> _Said:
+def _phi(context: Context, others: LinearModel, score: Score, shift: Array, size: str, ratio: float) -> _Said:
     name = score.family.names[score.number]
     return _Said(
         f"camera {name!r}: phi is held, but residuals ask for {score.amount[0]:+.2f} ± {score.sd[0]:.2f} px ({size})",
@@ -169,7 +170,7 @@ def _phi(context: Context, others: Freedom, score: Score, shift: Array, size: st
 # ---- the target as built --------------------------------------------------------------------------------------------
 
 
-def _curve_aside(context: Context, others: Freedom, score: Score, shift: Array, size: str, ratio: float) -> _Said:
+def _curve_aside(context: Context, others: LinearModel, score: Score, shift: Array, size: str, ratio: float) -> _Said:
     name = score.family.names[score.number]
     target, _, feature = name.partition("/")
     curve = context.observations.targets[target].curves[feature]
@@ -190,7 +191,7 @@ def _curve_aside(context: Context, others: Freedom, score: Score, shift: Array, 
     return _Said(sentence, advice, (Amount("left", float(mm[0]), float(sd[0]), "mm"),))
 
 
-def _point_aside(context: Context, others: Freedom, score: Score, shift: Array, size: str, ratio: float) -> _Said:
+def _point_aside(context: Context, others: LinearModel, score: Score, shift: Array, size: str, ratio: float) -> _Said:
     name = score.family.names[score.number]
     target = name.partition("/")[0]
     mm, sd = 1e3 * score.amount, 1e3 * score.sd
@@ -201,7 +202,7 @@ def _point_aside(context: Context, others: Freedom, score: Score, shift: Array, 
     )
 
 
-def _board_bent(context: Context, others: Freedom, score: Score, shift: Array, size: str, ratio: float) -> _Said:
+def _board_bent(context: Context, others: LinearModel, score: Score, shift: Array, size: str, ratio: float) -> _Said:
     name = score.family.names[score.number]
     mm, sd = 1e3 * score.amount, 1e3 * score.sd
     return _Said(
@@ -215,7 +216,7 @@ def _board_bent(context: Context, others: Freedom, score: Score, shift: Array, s
 # ---- a camera that moved --------------------------------------------------------------------------------------------
 
 
-def _moved(context: Context, others: Freedom, score: Score, shift: Array, size: str, ratio: float) -> _Said:
+def _moved(context: Context, others: LinearModel, score: Score, shift: Array, size: str, ratio: float) -> _Said:
     station, _, frame = score.family.names[score.number].partition("\n")
     when = f"after frame {frame!r}" if score.family.onwards else f"in frame {frame!r} alone"
     columns = score.family.of(score.number)
@@ -249,7 +250,7 @@ def _length(vector: Array, sd: Array) -> tuple[float, float]:
     return length, float(np.linalg.norm(vector[known] * sd[known])) / max(length, 1e-300)
 
 
-_SPEAKERS: dict[str, Callable[[Context, Freedom, Score, Array, str, float], _Said]] = {
+_SPEAKERS: dict[str, Callable[[Context, LinearModel, Score, Array, str, float], _Said]] = {
     "radius": _radius,
     "decentring": _decentring,
     "aspect": _aspect,
@@ -303,7 +304,7 @@ def _mean(values: Array) -> float:
 def noise_findings(context: Context, noise: Sequence[Noise], log_level: float) -> Iterator[Finding]:
     """Noise larger than stated, and neighbours that agree."""
     for one in noise:
-        rows = context.freedom.used & (context.equations.is_curve == (one.kind == "curves"))
+        rows = context.model.used & (context.equations.is_curve == (one.kind == "curves"))
         px, mm, _ = context.effect(context.equations.residual, rows)
         per_px = mm / px if px > 0.0 else float("nan")
         if one.log_p <= log_level:

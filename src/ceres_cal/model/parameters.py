@@ -12,11 +12,10 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.transforms import Array, Pose, Poses, chained, inverted
-from ceres_cal.model.joint import JointPrior
+from ceres_cal.base.transforms import Pose, Poses, chained, inverted
 from ceres_cal.model.structure import Structure, Tolerance
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.observations.sights import SightKey
@@ -171,24 +170,20 @@ class Layout:
     Attributes:
         free: camera -> indices into its intrinsics vector.
         stations, placements: names of the poses that are free.
-        priors: on free numbers. joint: what an earlier calibration knew of many numbers together.
     """
 
-    free: Mapping[str, NDArray[np.int64]]
+    free: Mapping[str, Indices]
     stations: frozenset[str]
     placements: frozenset[str]
-    priors: tuple[Prior, ...] = ()
-    joint: JointPrior | None = None
 
     @property
     def size(self) -> int:
         """Number of free numbers."""
         return sum(len(f) for f in self.free.values()) + 6 * (len(self.stations) + len(self.placements))
 
-    @property
-    def unknowns(self) -> int:
-        """Number of free numbers that use up observations: what is known beforehand does not."""
-        return self.size if self.joint is None else max(self.size - self.joint.rank, 0)
+    def holding(self, camera: str, number: int) -> Layout:
+        """The layout with one of a camera's intrinsics held."""
+        return replace(self, free={**self.free, camera: self.free[camera][self.free[camera] != number]})
 
     def of(self, keys: Iterable[SightKey]) -> Layout:
         """The layout of a problem with these sights alone: no placement that they do not show is free."""
@@ -196,11 +191,7 @@ class Layout:
 
 
 def make_layout(observations: Observations, options: Options) -> Layout:
-    """The layout of a calibration: everything free but what the options fix and what nothing can tell.
-
-    Raises:
-        InputError: a prior names a camera, a station or a quantity that is not there.
-    """
+    """The layout of a calibration: everything free but what the options fix and what nothing can tell."""
     names = intrinsic_names(options.blank_lens)
     held = set(options.fixed)
     if not options.free_principal_point:
@@ -208,17 +199,11 @@ def make_layout(observations: Observations, options: Options) -> Layout:
     if not options.free_aspect:
         held |= {"aspect"}
     free = np.array([i for i, name in enumerate(names) if name not in held], dtype=np.int64)
-    priors = (*observations.priors, *options.priors)
-    for prior in priors:
-        observations.require_owner(prior)
-        if prior.owner == "camera" and prior.quantity not in (*names, "principal_point"):
-            raise InputError(f"prior on camera {prior.name!r}: it has no {prior.quantity!r}, only {', '.join(names)}")
     shown = observations.shown_views
     return Layout(
         dict.fromkeys(observations.cameras, free),
         frozenset(view.station for view in shown) - anchored_stations(observations),
         frozenset(view.placement for view in shown if view.placement is not None),
-        priors,
     )
 
 

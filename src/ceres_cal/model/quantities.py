@@ -1,19 +1,15 @@
-"""The numbers that a calibration is uncertain about, each with an owner, a name and a unit; steps along them.
-
-Intrinsics are in the units of the files. A pose has a position in the world (m) and three turns (rad): of a station
-about the camera's own axes (x right, y down, z forward), of a placement about the target's own. Turns are small angles
-from where the pose is, so no pose is special, not even one turned by half a turn.
-"""
+"""The numbers behind the keys: their values in an estimate, their natural sizes, and steps along them."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 
-from ceres_cal.base.transforms import Array, Pose, rotation_exp, rotation_log, skew
+from ceres_cal.base.arrays import Array
+from ceres_cal.base.transforms import Pose, rotation_exp, rotation_log, skew
+from ceres_cal.model.keys import PLACEMENT_QUANTITIES, STATION_QUANTITIES, Key, columns_by_owner, pose_keys
 from ceres_cal.model.parameters import (
     Estimate,
     Layout,
@@ -25,32 +21,7 @@ from ceres_cal.model.parameters import (
     with_intrinsics,
 )
 from ceres_cal.scene.camera import Camera
-
-_TURNS = ("turn_x", "turn_y", "turn_z")
-STATION_QUANTITIES = ("x", "y", "height", *_TURNS)
-PLACEMENT_QUANTITIES = ("x", "y", "z", *_TURNS)
-_POSE_UNITS = ("m", "m", "m", "rad", "rad", "rad")
-
-
-class Key(NamedTuple):
-    """One number: whose it is (a "camera", "station", "placement" or "structure" by name), what, and in which unit.
-
-    A camera, a station and a placement may carry the same name. Of a structure number the owner is the target, the
-    quantity the feature ("HalfwayLine", "CenterCircle.radius", "0,0.x", "bow.x").
-    """
-
-    kind: str
-    owner: str
-    quantity: str
-    unit: str
-
-
-_LIMITS = {"rad": 1e2, "m": 1e6, "px": 1e7}
-
-
-def sigma_limits(keys: Sequence[Key]) -> Array:
-    """(P,) sigmas beyond which a number means nothing: turns of many turns, a camera in orbit."""
-    return np.array([_LIMITS.get(key.unit, 1e12) for key in keys])
+from ceres_cal.scene.lens import Lens
 
 
 def natural_sizes(estimate: Estimate, keys: Sequence[Key]) -> Array:
@@ -60,7 +31,7 @@ def natural_sizes(estimate: Estimate, keys: Sequence[Key]) -> Array:
     with the one that moves a pixel half an image diagonal from the middle by as much; structure with its tolerance.
     """
     sizes = np.ones(len(keys))
-    for (kind, owner), places in places_of(keys).items():
+    for (kind, owner), places in columns_by_owner(keys).items():
         if kind == "camera":
             camera = estimate.cameras[owner]
             radius = unit_px(camera) if camera.lens.kind == "radial" else unit_px(camera) / camera.phi
@@ -88,41 +59,43 @@ def _distance_m(estimate: Estimate, kind: str, owner: str) -> float:
     return max(float(min(away)), 1e-3)
 
 
-def camera_keys(name: str, camera: Camera, free: Iterable[int]) -> list[Key]:
-    """Keys of the intrinsics with these places in the solver's vector."""
-    powers = camera.lens.radius_powers if camera.lens.kind == "radial" else (1,) * len(camera.lens.names)
+def values_of(estimate: Estimate, keys: Sequence[Key]) -> Array:
+    """(P,) the estimate's numbers in the units of the keys; 0 for a turn."""
+    found = np.zeros(len(keys))
+    for place, (kind, owner, quantity, unit) in enumerate(keys):
+        if kind == "camera":
+            camera = estimate.cameras[owner]
+            at = intrinsic_names(camera.lens).index(quantity)
+            found[place] = intrinsics_vector(camera)[at] / intrinsics_scales(camera)[at]
+        elif kind == "structure":
+            found[place] = estimate.structure.values[estimate.structure.names.index(f"{owner}/{quantity}")]
+        elif unit == "m":
+            if kind == "station":
+                position = estimate.stations[owner].cam_from_world.position
+            else:
+                position = estimate.placements[owner].translation
+            found[place] = position[{"x": 0, "y": 1}.get(quantity, 2)]
+    return found
+
+
+def intrinsic_keys(name: str, lens: Lens) -> list[Key]:
+    """Keys of all intrinsics of a camera, in the order of the solver's vector."""
+    powers = lens.radius_powers if lens.kind == "radial" else (1,) * len(lens.names)
     units = ("px", "1", "px", "px", *("1" if power == 1 else f"px^{1 - power}" for power in powers))
-    names = intrinsic_names(camera.lens)
-    return [Key("camera", name, names[int(i)], units[int(i)]) for i in free]
+    return [Key("camera", name, quantity, unit) for quantity, unit in zip(intrinsic_names(lens), units, strict=True)]
 
 
-def pose_keys(kind: str, name: str) -> list[Key]:
-    """The six keys of a station or a placement."""
-    quantities = STATION_QUANTITIES if kind == "station" else PLACEMENT_QUANTITIES
-    return [Key(kind, name, q, unit) for q, unit in zip(quantities, _POSE_UNITS, strict=True)]
-
-
-def shared_keys(estimate: Estimate, layout: Layout, private: frozenset[str | None]) -> tuple[Key, ...]:
+def free_keys(estimate: Estimate, layout: Layout, private: frozenset[str | None] = frozenset()) -> tuple[Key, ...]:
     """Keys of everything free but the private placements: cameras, stations, placements, structure."""
     keys: list[Key] = []
     for name, camera in estimate.cameras.items():
-        keys += camera_keys(name, camera, layout.free[name])
+        every = intrinsic_keys(name, camera.lens)
+        keys += [every[number] for number in layout.free[name]]
     for name in estimate.stations:
         keys += pose_keys("station", name) if name in layout.stations else []
     for name in estimate.placements:
         keys += pose_keys("placement", name) if name in layout.placements and name not in private else []
-    for name in estimate.structure.names:
-        target, _, feature = name.partition("/")
-        keys.append(Key("structure", target, feature, "m"))
-    return tuple(keys)
-
-
-def places_of(keys: Sequence[Key]) -> dict[tuple[str, str], list[int]]:
-    """(kind, owner) -> where its keys are."""
-    places: dict[tuple[str, str], list[int]] = {}
-    for place, key in enumerate(keys):
-        places.setdefault((key.kind, key.owner), []).append(place)
-    return places
+    return (*keys, *map(Key.of_structure, estimate.structure.names))
 
 
 def from_station(cam_from_frame: Array, cam_from_world: Pose) -> Array:
@@ -164,7 +137,7 @@ def moved(estimate: Estimate, keys: Sequence[Key], step: Array) -> Estimate:
     """
     cameras, stations, placements = dict(estimate.cameras), dict(estimate.stations), dict(estimate.placements)
     values = estimate.structure.values.copy()
-    for (kind, owner), places in places_of(keys).items():
+    for (kind, owner), places in columns_by_owner(keys).items():
         names = [keys[place].quantity for place in places]
         if kind == "camera":
             cameras[owner] = camera_moved(cameras[owner], names, step[places])
@@ -193,7 +166,7 @@ def moved(estimate: Estimate, keys: Sequence[Key], step: Array) -> Estimate:
 def difference(estimate: Estimate, reference: Estimate, keys: Sequence[Key]) -> Array:
     """The step (P,) along the keys that leads from the reference to the estimate."""
     found = np.empty(len(keys))
-    for (kind, owner), places in places_of(keys).items():
+    for (kind, owner), places in columns_by_owner(keys).items():
         values = _differences(kind, owner, estimate, reference)
         found[places] = [values[keys[place].quantity] for place in places]
     return found

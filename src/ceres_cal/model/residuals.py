@@ -8,8 +8,8 @@ from functools import cached_property
 import numpy as np
 
 from ceres_cal import kernels
+from ceres_cal.base.arrays import Array
 from ceres_cal.base.threads import parts_of, run_parts
-from ceres_cal.base.transforms import Array
 from ceres_cal.model.parameters import Estimate, intrinsics_vector, unit_px
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights, nearest_places
@@ -24,12 +24,12 @@ class Residuals:
 
     Attributes:
         points: (N, 2), projected minus observed. curves: (M,), signed distance from the observed pixel to the curve.
-        places: (M,) the foot of that distance, as the parameter of the curve's track.
+        feet: (M,) the foot of that distance, as the parameter of the curve's track.
     """
 
     points: Array
     curves: Array
-    places: Array
+    feet: Array
 
     @cached_property
     def lengths(self) -> tuple[Array, Array]:
@@ -48,30 +48,30 @@ def lens_arguments(camera: Camera) -> tuple[int, Array, Array, float]:
     )
 
 
-def residuals(observations: Observations, sights: Sights, estimate: Estimate, places: Array | None = None) -> Residuals:
+def residuals(observations: Observations, sights: Sights, estimate: Estimate, feet: Array | None = None) -> Residuals:
     """Residuals of every observation in the sights; NaN for rows in none of them.
 
     Args:
-        places: (M,) where on its track the search for each curve observation's foot starts, such as those of earlier
+        feet: (M,) where on its track the search for each curve observation's foot starts, such as those of earlier
             residuals; without them it starts where the ray passes nearest.
     """
     points = np.full((len(observations.points), 2), np.nan)
-    curves, feet = np.full(len(observations.curves), np.nan), np.full(len(observations.curves), np.nan)
+    curves, ends = np.full(len(observations.curves), np.nan), np.full(len(observations.curves), np.nan)
     poses = estimate.pose_stack(sights.keys)
-    for name in dict.fromkeys(key.camera for key in sights.keys):
-        numbers = np.array([number for number, key in enumerate(sights.keys) if key.camera == name], dtype=np.int64)
+    for name in sights.cameras:
+        numbers = sights.numbers(camera=name)
         own = sights.take(numbers)
         optics = lens_arguments(estimate.cameras[name])
         _point_residuals(optics, poses[numbers], own, estimate.structure.points(own), points)
         if len(own.curve_rows):
             distances = np.empty(len(own.curve_rows))
-            starts = starting_places(own, estimate, places)
+            starts = starting_feet(own, estimate, feet)
             kernels.curve_residuals(
                 *optics, poses[numbers], own.curve_bounds, estimate.structure.tracks(own), own.is_arc, own.track,
                 own.curve_pixels, starts, distances,
             )  # fmt: skip
-            curves[own.curve_rows], feet[own.curve_rows] = distances, starts
-    return Residuals(points, curves, feet)
+            curves[own.curve_rows], ends[own.curve_rows] = distances, starts
+    return Residuals(points, curves, ends)
 
 
 def _point_residuals(
@@ -84,12 +84,12 @@ def _point_residuals(
     run_parts(part, parts_of(len(sights), len(points), _POINT_NS))
 
 
-def starting_places(sights: Sights, estimate: Estimate, places: Array | None) -> Array:
-    """(M of the sights,) a copy of the places of their rows, or where the rays pass nearest."""
+def starting_feet(sights: Sights, estimate: Estimate, feet: Array | None) -> Array:
+    """(M of the sights,) a copy of the feet of their rows, or where the rays pass nearest."""
     if not len(sights.curve_rows):
         return np.empty(0)
-    if places is not None:
-        known = places[sights.curve_rows]
+    if feet is not None:
+        known = feet[sights.curve_rows]
         if np.all(np.isfinite(known)):
             return known
     seen = [sights[int(number)] for number in np.flatnonzero(np.diff(sights.curve_bounds))]

@@ -11,14 +11,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ceres_cal.base.arrays import Array, Indices, Indices32, Mask
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.transforms import Array
 from ceres_cal.observations.sights import Sights
 from ceres_cal.scene.targets import Arc, Target
 
-Slots = NDArray[np.int32]
 _NONE = -1
 
 
@@ -66,9 +64,9 @@ class Structure:
     names: tuple[str, ...]
     values: Array
     sigma_m: Array
-    point_slots: Slots
+    point_slots: Indices32
     bends: Array
-    track_slots: Slots
+    track_slots: Indices32
 
     def with_values(self, values: Array) -> Structure:
         """The same corrections with other numbers."""
@@ -95,14 +93,14 @@ class Structure:
             found[name] = Built(target, own, curves.reshape(3, -1, 3, 3))
         return found
 
-    def _points(self, points: Array, feature: NDArray[np.int64]) -> Array:
+    def _points(self, points: Array, feature: Indices) -> Array:
         if not len(self.values):
             return points
         moved = np.append(self.values, 0.0)[self.point_slots[feature]]  # slot -1 is the 0 at the end
         bow = np.sum(moved[:, 2:] * self.bends[feature], axis=1)
         return np.asarray(points + np.column_stack([moved[:, :2], bow]))
 
-    def _tracks(self, given: Array, is_arc: NDArray[np.bool_]) -> Array:
+    def _tracks(self, given: Array, is_arc: Mask) -> Array:
         if not len(self.values):
             return given
         moved = np.append(self.values, 0.0)[self.track_slots]

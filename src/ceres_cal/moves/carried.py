@@ -9,19 +9,22 @@ import numpy as np
 
 from ceres_cal.base.errors import InputError, SolutionError
 from ceres_cal.base.transforms import Pose
-from ceres_cal.calibrating import Again
 from ceres_cal.calibration import Calibration
-from ceres_cal.model.joint import JointPrior
+from ceres_cal.model.information import Information
+from ceres_cal.model.keys import Key
 from ceres_cal.model.parameters import Estimate, Layout, Options, Station, intrinsic_names
-from ceres_cal.model.quantities import Key, camera_keys, pose_keys
+from ceres_cal.model.priors import GaussianPrior, gather_stated, tolerances
+from ceres_cal.model.quantities import intrinsic_keys
 from ceres_cal.model.structure import Structure, make_structure
 from ceres_cal.observations import Observations, Prior
+from ceres_cal.observations.sights import Sights
+from ceres_cal.solve import Problem
 
 WHAT = ("pose", "pose-only", "zoom", "iris", "everything")
 
 
 @dataclass(frozen=True, eq=False)
-class Plan:
+class RefitPlan:
     """A refit as it was asked for.
 
     Attributes:
@@ -41,7 +44,7 @@ class Plan:
     moved: frozenset[str]
     stays: frozenset[str]
     hold_others: bool
-    prior: JointPrior
+    prior: GaussianPrior
     scales: tuple[float, float]
 
     @property
@@ -51,13 +54,16 @@ class Plan:
 
     def loosened(self, what: str) -> frozenset[Key]:
         """The intrinsics of which nothing is taken to be known any more."""
-        found: set[Key] = set()
+        keys: set[Key] = set()
         for name in self.moved_cameras:
-            camera = self.calibration.cameras[name]
-            names = intrinsic_names(camera.lens)
-            which = {"zoom": ("phi",), "iris": camera.lens.names, "everything": names}.get(what, ())
-            found |= {key for key in camera_keys(name, camera, range(len(names))) if key.quantity in which}
-        return frozenset(found)
+            lens = self.calibration.cameras[name].lens
+            which = {"zoom": ("phi",), "iris": lens.names, "everything": intrinsic_names(lens)}.get(what, ())
+            keys |= {key for key in intrinsic_keys(name, lens) if key.quantity in which}
+        return frozenset(keys)
+
+    def prior_for(self, what: str) -> GaussianPrior:
+        """What is known beforehand when so much is let go."""
+        return self.prior.without(self.loosened(what))
 
 
 def make_plan(
@@ -67,7 +73,7 @@ def make_plan(
     moved: Collection[str] | None,
     hold_others: bool,
     priors: tuple[Prior, ...] = (),
-) -> Plan:
+) -> RefitPlan:
     """Who moved, who stays, and what is known of everything.
 
     Raises:
@@ -91,10 +97,10 @@ def make_plan(
     observed = replace(observations, targets={**calibration.targets, **observations.targets})
     same = calibration.digest == observations.digest  # then the question is the same, too
     options = replace(calibration.options, priors=priors or (calibration.options.priors if same else ()))
-    prior = prior_for(calibration, observations, stays)
+    prior = carried_prior(calibration, observations, stays)
     fit, before = calibration.fit, calibration.refitted
     scales = before.scales if same and before is not None else (fit.point_scale, fit.curve_scale)
-    return Plan(calibration, observed, options, what, stations, chosen, stays, hold_others, prior, scales)
+    return RefitPlan(calibration, observed, options, what, stations, chosen, stays, hold_others, prior, scales)
 
 
 def require_same_things(calibration: Calibration, observations: Observations) -> None:
@@ -121,93 +127,53 @@ def require_same_things(calibration: Calibration, observations: Observations) ->
             raise InputError(f"station {name!r} is one of camera {station.camera!r}, not of {camera!r}: name another")
 
 
-def prior_for(calibration: Calibration, observations: Observations, stays: frozenset[str]) -> JointPrior:
+def carried_prior(calibration: Calibration, observations: Observations, stays: frozenset[str]) -> GaussianPrior:
     """What is known of intrinsics, structure and stations that stay, without these observations.
 
     The posterior of the calibration, all else integrated out. Where it has these same observations in it already, it is
     what had been known before them: nothing counts twice.
     """
     if calibration.digest == observations.digest:
-        before = calibration.refitted.prior if calibration.refitted is not None else _nothing()
-        return _among(before, calibration, stays)
+        before = calibration.refitted.prior if calibration.refitted is not None else None
+        before = before or GaussianPrior(Information.nothing(), np.empty(0))
+        return before.without([key for key in before.keys if not _is_kept(key, stays)])
     posterior = calibration.posterior
     assert posterior is not None
-    return kept_prior(calibration, [i for i, key in enumerate(posterior.keys) if _is_kept(key, stays)], stays)
+    return posterior_of(calibration, [key for key in posterior.keys if _is_kept(key, stays)])
 
 
-def kept_prior(calibration: Calibration, kept: Sequence[int], stations: frozenset[str]) -> JointPrior:
-    """What the posterior says of the keys at these places, all others integrated out."""
-    posterior, estimate = calibration.posterior, calibration.estimate
-    assert posterior is not None
-    return JointPrior(
-        tuple(posterior.keys[i] for i in kept),
-        posterior.marginal(np.array(kept, dtype=np.int64)),
-        estimate.cameras,
-        {name: estimate.stations[name].cam_from_world for name in stations},
-        dict(zip(estimate.structure.names, estimate.structure.values.tolist(), strict=True)),
-    )
+def posterior_of(calibration: Calibration, keys: Sequence[Key]) -> GaussianPrior:
+    """What the posterior says of some numbers, all others integrated out, as the prior of the next solve."""
+    assert calibration.posterior is not None
+    return GaussianPrior.about(calibration.posterior.information.marginal(keys), calibration.estimate)
 
 
 def _is_kept(key: Key, stays: frozenset[str]) -> bool:
     return key.kind in ("camera", "structure") or (key.kind == "station" and key.owner in stays)
 
 
-def _nothing() -> JointPrior:
-    return JointPrior((), np.empty((0, 0)), {}, {}, {})
-
-
-def _among(prior: JointPrior, calibration: Calibration, stays: frozenset[str]) -> JointPrior:
-    """The prior without the stations that are said to have moved now."""
-    gone = [key for key in prior.keys if not _is_kept(Key(*key), stays)]
-    return without_keys(prior, gone) if gone else prior
-
-
-def without_keys(prior: JointPrior, gone: Collection[tuple[str, str, str, str]]) -> JointPrior:
-    """The prior with some numbers integrated out: nothing is known of them any more."""
-    from ceres_cal.uncertainty import Posterior
-
-    if not any(key in gone for key in prior.keys):
-        return prior
-    kept = [i for i, key in enumerate(prior.keys) if key not in gone]
-    whole = Posterior(tuple(Key(*key) for key in prior.keys), prior.information)
-    keys = tuple(prior.keys[i] for i in kept)
-    return replace(prior, keys=keys, information=whole.marginal(np.array(kept, dtype=np.int64)))
-
-
-def layouts(plan: Plan, what: str, estimate: Estimate, placements: Collection[str]) -> tuple[Layout, Layout]:
-    """What the solver may move, and what is known at all: the posterior speaks of everything, held or not."""
+def refit_problem(plan: RefitPlan, what: str, sights: Sights, start: Estimate) -> tuple[Problem, Layout]:
+    """What is solved, and the layout of what is known at all: the posterior speaks of everything, held or not."""
     calibration = plan.calibration
     posterior = calibration.posterior
     assert posterior is not None
-    free = {}
-    for name, camera in calibration.cameras.items():
-        names = intrinsic_names(camera.lens)
-        mine = [names.index(key.quantity) for key in posterior.keys if key[:2] == ("camera", name)]
-        free[name] = np.array(sorted(mine), dtype=np.int64)
-    joint = without_keys(plan.prior, plan.loosened(what))
-    told = {key.owner for key in posterior.keys if key.kind == "station"}
-    stations = plan.moved | (plan.stays & told)
-    priors = (*plan.observations.priors, *plan.options.priors)
-    known = Layout(free, frozenset(stations), frozenset(placements), priors, joint)
+    everything = posterior.layout(calibration.estimate)
+    free, stations = everything.free, plan.moved | (plan.stays & everything.stations)
+    known = Layout(free, stations, frozenset(start.placements))
     held = {name for name in free if what == "pose-only" or (plan.hold_others and name not in plan.moved_cameras)}
     moving = plan.moved if plan.hold_others else stations
-    solved = replace(known, free={n: f[:0] if n in held else f for n, f in free.items()}, stations=frozenset(moving))
-    return replace(solved, joint=joint.given(_free_keys(solved, estimate))), known
+    solved = replace(known, free={n: f[:0] if n in held else f for n, f in free.items()}, stations=moving)
+    return Problem(sights, solved, _priors(plan, what, start), options=plan.options), known
 
 
-def _free_keys(layout: Layout, estimate: Estimate) -> set[tuple[str, str, str, str]]:
-    keys: list[Key] = []
-    for name, numbers in layout.free.items():
-        keys += camera_keys(name, estimate.cameras[name], numbers)
-    for name in layout.stations:
-        keys += pose_keys("station", name)
-    for name in estimate.structure.names:
-        target, _, feature = name.partition("/")
-        keys.append(Key("structure", target, feature, "m"))
-    return set(keys)
+def _priors(plan: RefitPlan, what: str, start: Estimate) -> tuple[GaussianPrior, ...]:
+    """The old posterior, what was measured since, and tolerances of what is new among the targets."""
+    carried = plan.prior_for(what)
+    stated = gather_stated(plan.observations, plan.options, {n: c.lens for n, c in plan.calibration.cameras.items()})
+    return (carried, *stated, *tolerances(start.structure, carried.keys))
 
 
-def first_estimate(plan: Plan, poses: dict[str, Pose], placements: dict[str, Pose]) -> Estimate:
+def first_estimate(plan: RefitPlan, poses: dict[str, Pose], placements: dict[str, Pose]) -> Estimate:
     """The old cameras, structure and stations that stay, with poses for what is sought."""
     old = plan.calibration.estimate
     stations = {name: old.stations[name] for name in old.stations if name in plan.stays}
@@ -225,8 +191,3 @@ def with_structure(old: Estimate, observations: Observations, options: Options) 
 
 def _ordered(stations: dict[str, Station], names: Sequence[str]) -> dict[str, Station]:
     return {name: stations[name] for name in dict.fromkeys(names) if name in stations}
-
-
-def again(plan: Plan, known: Layout, *, assessed: bool) -> Again:
-    """How the shared steps take the old calibration up."""
-    return Again(known, plan.scales, assessed)

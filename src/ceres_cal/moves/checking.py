@@ -11,22 +11,21 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.errors import CalibrationError, InputError
-from ceres_cal.base.spread import Spread
 from ceres_cal.base.tails import upper_tail
-from ceres_cal.base.transforms import Array, Pose
+from ceres_cal.base.transforms import Pose
 from ceres_cal.calibration import Calibration
-from ceres_cal.model.joint import JointPrior
+from ceres_cal.model.keys import Key
 from ceres_cal.model.parameters import Estimate, Layout, intrinsic_names
-from ceres_cal.model.quantities import Key, sigma_limits
-from ceres_cal.moves.carried import kept_prior, require_same_things, with_structure, without_keys
-from ceres_cal.moves.poses import Place, Scene, movement, places
+from ceres_cal.model.priors import GaussianPrior, tolerances
+from ceres_cal.moves.carried import posterior_of, require_same_things, with_structure
+from ceres_cal.moves.poses import Place, PoseSearch, movement, places
 from ceres_cal.observations import Observations
-from ceres_cal.observations.sights import Mask, Sights, gather_sights
+from ceres_cal.observations.sights import Sights, gather_sights
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.heights import HEIGHTS_M
-from ceres_cal.solve import Weighting, information, solve
-from ceres_cal.uncertainty import Posterior
+from ceres_cal.solve import Problem, Weighting, information, solve
 from ceres_cal.uncertainty.maps import shown_pixels
 from ceres_cal.uncertainty.uncertainty import field_grid
 
@@ -118,7 +117,7 @@ def check(calibration: Calibration, observations: Observations, false_alarms: fl
             raise InputError(f"station {name!r} is not in the calibration, which has {names}: name it as there")
     observed = replace(observations, targets={**calibration.targets, **observations.targets})
     sights = gather_sights(observed)
-    world = {key.station: sights[i] for i, key in enumerate(sights.keys) if key.placement is None}
+    world = sights.of_world
     for name in observations.stations:
         if name not in world:
             raise InputError(f"station {name!r} sees nothing that lies in the world: observe the field with it")
@@ -136,68 +135,61 @@ class _Case:
     calibration: Calibration
     sight: Sights
     estimate: Estimate
-    prior: JointPrior
+    prior: GaussianPrior
     tested: tuple[Key, ...]
 
     @property
     def name(self) -> str:
         return self.sight.key.station
 
-    def layout(self, joint: JointPrior) -> Layout:
+    def problem(self, used: Sights, prior: GaussianPrior) -> Problem:
+        """The station's pose and its camera's intrinsics from what is used, under a prior."""
         names = intrinsic_names(self.estimate.cameras[self.sight.key.camera].lens)
-        free = sorted(names.index(key[2]) for key in self.prior.keys if key[0] == "camera")
-        return Layout(
-            {self.sight.key.camera: np.array(free, dtype=np.int64)},
-            frozenset([self.name]),
-            frozenset(),
-            (),
-            joint,
-        )
+        free = sorted(names.index(key.quantity) for key in self.prior.keys if key.kind == "camera")
+        layout = Layout({self.sight.key.camera: np.array(free, dtype=np.int64)}, frozenset([self.name]), frozenset())
+        fresh = tolerances(self.estimate.structure, self.prior.keys)
+        fit = self.calibration.fit
+        weighting = Weighting(fit.point_scale, fit.curve_scale, "trivial")
+        return Problem(used, layout, (prior, *fresh), weighting, self.calibration.options)
 
-    def least(self, used: Sights, joint: JointPrior, pose: Pose) -> tuple[float, Estimate] | None:
+    def least(self, used: Sights, prior: GaussianPrior, pose: Pose) -> tuple[float, Estimate] | None:
         """Twice the least cost under a prior, and where, from a pose; None where the solver does not get there."""
         station = replace(self.estimate.stations[self.name], cam_from_world=pose)
         start = replace(self.estimate, stations={self.name: station})
         try:
-            found = solve(used, start, self.layout(joint), self.weighting, self.calibration.options)
+            solution = solve(self.problem(used, prior), start)
         except CalibrationError:
             return None
-        return None if found.failed else (2.0 * found.cost, found.estimate)
-
-    @property
-    def weighting(self) -> Weighting:
-        fit = self.calibration.fit
-        return Weighting(fit.point_scale, fit.curve_scale, "trivial")
+        return None if solution.failed else (2.0 * solution.cost, solution.estimate)
 
 
 def _case(calibration: Calibration, observed: Observations, sight: Sights) -> _Case:
     key, old, posterior = sight.key, calibration.estimate, calibration.posterior
     assert posterior is not None
     owners = {("camera", key.camera), ("station", key.station)}
-    kept = [i for i, k in enumerate(posterior.keys) if k[:2] in owners or k.kind == "structure"]
-    if not any(posterior.keys[i].kind == "station" for i in kept):
+    kept = [k for k in posterior.keys if k[:2] in owners or k.kind == "structure"]
+    if not any(k.kind == "station" for k in kept):
         raise InputError(f"station {key.station!r} was held as the world: it cannot be said to have moved")
-    prior = kept_prior(calibration, kept, frozenset([key.station]))
     structure = with_structure(old, observed, calibration.options)
     estimate = Estimate({key.camera: old.cameras[key.camera]}, {key.station: old.stations[key.station]}, {}, structure)
     phi = ("camera", key.camera, "phi")
-    tested = tuple(Key(*k) for k in prior.keys if k[:2] == ("station", key.station) or k[:3] == phi)
-    return _Case(calibration, sight, estimate, prior, tested)
+    tested = tuple(k for k in kept if k[:2] == ("station", key.station) or k[:3] == phi)
+    return _Case(calibration, sight, estimate, posterior_of(calibration, kept), tested)
 
 
 def _checked(calibration: Calibration, observed: Observations, sight: Sights, level: float) -> StationCheck:
     case = _case(calibration, observed, sight)
     fit = calibration.fit
-    scene = Scene(observed, sight, case.estimate, (fit.point_scale, fit.curve_scale))
-    found = places(scene, [case.estimate.stations[case.name].cam_from_world], patience=0)
+    search = PoseSearch(observed, sight, case.estimate, (fit.point_scale, fit.curve_scale))
+    near = places(search, [case.estimate.stations[case.name].cam_from_world], patience=0)
     count = len(sight.point_rows) + len(sight.curve_rows)
-    points, curves = _inliers(scene, found[0] if found else None)
+    points, curves = _inliers(search, near[0] if near else None)
     used = sight.used(points, curves)
     inside = int(np.count_nonzero(points) + np.count_nonzero(curves))
     if inside < _LEAST_SHARE * count:
         return _not_understood(case, inside, count)
-    free = without_keys(case.prior, case.tested)
-    old, new = case.estimate.stations[case.name].cam_from_world, found[0].pose
+    free = case.prior.without(case.tested)
+    old, new = case.estimate.stations[case.name].cam_from_world, near[0].pose
     as_was, anew = case.least(used, case.prior, old), case.least(used, free, new)
     if anew is None:
         return _not_understood(case, inside, count)
@@ -207,41 +199,34 @@ def _checked(calibration: Calibration, observed: Observations, sight: Sights, le
     noisy = spare > 0 and upper_tail(anew[0], spare) < _NOISY
     statistic = np.inf if as_was is None else max(as_was[0] - anew[0], 0.0) / (noise**2 if noisy else 1.0)
     assert calibration.posterior is not None
-    freedom = float(spare) if noisy else calibration.posterior.freedom
-    probability = 0.0 if np.isinf(statistic) else upper_tail(statistic, degrees, freedom)
-    # Sizes are told with phi under what is known of it, where that will do: next to it a height says little.
-    posed = case.least(used, without_keys(case.prior, [key for key in case.tested if key.kind == "station"]), new)
+    spare_of_noise = float(spare) if noisy else calibration.posterior.degrees_of_freedom
+    probability = 0.0 if np.isinf(statistic) else upper_tail(statistic, degrees, spare_of_noise)
+    # Sizes are stated with phi under what is known of it, where that will do: next to it a height says little.
+    posed = case.least(used, case.prior.without([key for key in case.tested if key.kind == "station"]), new)
     at = posed[1] if posed is not None and posed[0] - anew[0] < _WILL_DO else anew[1]
     return _answer(case, at, probability >= level, probability, float(statistic), degrees, inside, count, noise)
 
 
-def _inliers(scene: Scene, place: Place | None) -> tuple[Mask, Mask]:
+def _inliers(search: PoseSearch, place: Place | None) -> tuple[Mask, Mask]:
     """Which rows of the observations some pose near by explains."""
-    observations = scene.observations
+    observations = search.observations
     points, curves = (np.zeros(len(c), dtype=bool) for c in (observations.points, observations.curves))
     if place is None:
         return points, curves
-    found, sight = scene.residuals(place.pose), scene.sight
+    there, sight = search.residuals(place.pose), search.sight
     limit = _INLIER_SIGMA * max(1.0, min(place.scale, 2.0))
     with np.errstate(invalid="ignore"):
-        p = np.linalg.norm(found.points[sight.point_rows], axis=1) <= limit * scene.scales[0] * sight.sigma_px
-        c = np.abs(found.curves[sight.curve_rows]) <= limit * scene.scales[1] * sight.curve_sigma_px
+        p = np.linalg.norm(there.points[sight.point_rows], axis=1) <= limit * search.scales[0] * sight.sigma_px
+        c = np.abs(there.curves[sight.curve_rows]) <= limit * search.scales[1] * sight.curve_sigma_px
     points[sight.point_rows], curves[sight.curve_rows] = p, c
     return points, curves
 
 
-def _degrees(case: _Case, used: Sights, estimate: Estimate, free: JointPrior) -> int:
-    """How many of the tested numbers' directions both the old posterior and the new observations tell."""
-    told = information(used, estimate, case.layout(free), case.weighting)
-    new = _rank(Posterior(told.keys, told.matrix), case.tested)
-    old = _rank(Posterior(tuple(Key(*key) for key in case.prior.keys), case.prior.information), case.tested)
-    return max(min(new, old), 1)
-
-
-def _rank(posterior: Posterior, keys: tuple[Key, ...]) -> int:
-    places_of_keys = np.array([posterior.keys.index(key) for key in keys], dtype=np.int64)
-    spread = Spread.of(posterior.marginal(places_of_keys), sigma_limits(keys))
-    return len(keys) - int(spread.unknown.shape[1])
+def _degrees(case: _Case, used: Sights, estimate: Estimate, free: GaussianPrior) -> int:
+    """How many of the tested numbers' directions both the old posterior and the new observations determine."""
+    new = information(case.problem(used, free), estimate).shared
+    ranks = [about.marginal(case.tested).known_rank for about in (new, case.prior.information)]
+    return max(min(ranks), 1)
 
 
 # ---- in words -------------------------------------------------------------------------------------------------------

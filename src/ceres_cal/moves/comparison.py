@@ -9,13 +9,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.spread import Spread, known_inverses
 from ceres_cal.base.tails import upper_tail
-from ceres_cal.base.transforms import Array
 from ceres_cal.calibration import Calibration
+from ceres_cal.model.information import Information
+from ceres_cal.model.keys import Key
 from ceres_cal.model.parameters import Estimate
-from ceres_cal.model.quantities import Key, difference, sigma_limits
+from ceres_cal.model.quantities import difference
 from ceres_cal.moves.poses import movement
 from ceres_cal.uncertainty.maps import field_map, shown_pixels
 from ceres_cal.uncertainty.uncertainty import field_grid
@@ -118,13 +119,13 @@ def _compared(a: Calibration, b: Calibration, station: str, height_m: float) -> 
     )
 
 
-def _is_told(calibration: Calibration, station: str) -> bool:
+def _is_known(calibration: Calibration, station: str) -> bool:
     posterior = calibration.posterior
     return posterior is not None and any(key[:2] == ("station", station) for key in posterior.keys)
 
 
 def _expected_mm(a: Calibration, b: Calibration, station: str, height_m: float, x: Array, y: Array) -> Array:
-    if not (_is_told(a, station) and _is_told(b, station)):
+    if not (_is_known(a, station) and _is_known(b, station)):
         return np.full((len(y), len(x)), np.nan)
     maps = [field_map(c.estimate, c.posterior, station, height_m, x, y).sd_mm for c in (a, b) if c.posterior]
     return np.asarray(np.hypot(*maps))
@@ -134,28 +135,26 @@ def _probability(a: Calibration, b: Calibration, station: str) -> float | None:
     """Of a chi-squared as large: the difference d under (A^-1 + B^-1)^-1 = A (A + B)^+ B, which needs no inverse of
     either information where a direction is not told.
     """
-    if not (_is_told(a, station) and _is_told(b, station)):
+    if not (_is_known(a, station) and _is_known(b, station)):
         return None
     keys = _keys(a, station)
     if set(keys) != set(_keys(b, station)):
         return None
-    told = []
-    for calibration in (a, b):
-        posterior = calibration.posterior
-        assert posterior is not None
-        told.append(posterior.marginal(np.array([posterior.keys.index(key) for key in keys])))
-    limits = sigma_limits(keys)
-    both = told[0] @ known_inverses(told[0] + told[1], limits) @ told[1]
+    first, second = (_known(calibration).marginal(keys) for calibration in (a, b))
+    both = first.matrix @ (first + second).inverse @ second.matrix
     off = difference(_only(b, station), _only(a, station), keys)
-    degrees = len(keys) - max(int(Spread.of(matrix, limits).unknown.shape[1]) for matrix in told)
+    degrees = min(first.known_rank, second.known_rank)
     return upper_tail(float(off @ both @ off), degrees) if degrees > 0 else None
+
+
+def _known(calibration: Calibration) -> Information:
+    assert calibration.posterior is not None
+    return calibration.posterior.information
 
 
 def _keys(calibration: Calibration, station: str) -> list[Key]:
     owners = {("station", station), ("camera", calibration.estimate.stations[station].camera)}
-    posterior = calibration.posterior
-    assert posterior is not None
-    return [key for key in posterior.keys if key[:2] in owners]
+    return [key for key in _known(calibration).keys if key[:2] in owners]
 
 
 def _only(calibration: Calibration, station: str) -> Estimate:

@@ -16,12 +16,11 @@ from ceres_cal.base.transforms import Pose
 from ceres_cal.calibration import Calibration
 from ceres_cal.model.parameters import Estimate
 from ceres_cal.model.residuals import residuals
-from ceres_cal.moves.carried import Plan, without_keys
+from ceres_cal.moves.carried import RefitPlan
 from ceres_cal.moves.labels import MIRRORED, TURNED, other_divisions, relabelled
-from ceres_cal.moves.poses import Place, Scene, misfit, movement, places
+from ceres_cal.moves.poses import Place, PoseSearch, misfit, movement, places
 from ceres_cal.observations import Observations, taken
 from ceres_cal.observations.sights import gather_sights
-from ceres_cal.solve.joint import offsets
 
 _ZOOMS = 15
 _HALF = 0.5
@@ -57,7 +56,7 @@ def labels_turned(found: Pose, old: Pose) -> tuple[float, float] | None:
     return (given_m, turned_m) if likelier else None
 
 
-def require_labels(plan: Plan, poses: Mapping[str, Pose]) -> None:
+def require_labels(plan: RefitPlan, poses: Mapping[str, Pose]) -> None:
     """Raise SolutionError where the field's labels look turned by half a turn."""
     for name, pose in poses.items():
         old = plan.calibration.estimate.stations.get(name)
@@ -70,9 +69,9 @@ def require_labels(plan: Plan, poses: Mapping[str, Pose]) -> None:
             )
 
 
-def old_poses(plan: Plan, scene: Scene) -> list[Pose]:
-    """Where the camera of a scene stood before, the scene's own station first."""
-    stations, key = plan.calibration.estimate.stations, scene.sight.key
+def old_poses(plan: RefitPlan, search: PoseSearch) -> list[Pose]:
+    """Where the camera of a search stood before, the search's own station first."""
+    stations, key = plan.calibration.estimate.stations, search.sight.key
     names = sorted((n for n in stations if stations[n].camera == key.camera), key=lambda name: name != key.station)
     return [stations[name].cam_from_world for name in names]
 
@@ -80,47 +79,47 @@ def old_poses(plan: Plan, scene: Scene) -> list[Pose]:
 # ---- where nothing fits ---------------------------------------------------------------------------------------------
 
 
-def why_nothing_fits(plan: Plan, scenes: Sequence[Scene]) -> SolutionError:
+def why_nothing_fits(plan: RefitPlan, searches: Sequence[PoseSearch]) -> SolutionError:
     """What else the observations of the stations could be, as the error that refuses them."""
-    for scene in scenes:
-        words = next(_others(plan, scene), None)
-        station = scene.sight.key.station
+    for search in searches:
+        words = next(_others(plan, search), None)
+        station = search.sight.key.station
         if words is not None:
             return SolutionError(f"station {station!r}: its observations do not fit the known lens and field; {words}")
-    names = ", ".join(repr(scene.sight.key.station) for scene in scenes)
+    names = ", ".join(repr(search.sight.key.station) for search in searches)
     return SolutionError(
         f"station {names}: no explanation fits, neither a move, another zoom or lens, mirrored labels nor another "
         "field: check labels, which camera and which field it is"
     )
 
 
-def _others(plan: Plan, scene: Scene) -> Iterator[str]:
+def _others(plan: RefitPlan, search: PoseSearch) -> Iterator[str]:
     """Explanations that fit, in words, with what to do."""
-    old = old_poses(plan, scene)
-    mirrored = relabelled(scene.observations, MIRRORED)
-    if mirrored is not None and _fits(_seen_as(scene, mirrored), old):
+    old = old_poses(plan, search)
+    mirrored = relabelled(search.observations, MIRRORED)
+    if mirrored is not None and _fits(_seen_as(search, mirrored), old):
         yield "with mirrored labels they do: left and right are swapped, or the image is flipped: correct that"
-    for name, observations in other_divisions(scene.observations).items():
-        if _fits(_seen_as(scene, observations), old):
+    for name, observations in other_divisions(search.observations).items():
+        if _fits(_seen_as(search, observations), old):
             yield f"on {name} they do: this is the wrong field: correct the target's dimensions"
-    zoomed = zoomed_place(scene, old)
+    zoomed = zoomed_place(search, old)
     if zoomed is not None and _good(zoomed[1]) and plan.what not in ("zoom", "everything"):
         phi = zoomed[0].camera.phi
-        before = scene.camera.phi
+        before = search.camera.phi
         yield f"with phi {phi:.0f} px in place of {before:.0f} they do: {WORDS['zoom']}: refit with --what zoom"
     from ceres_cal.calibrating import calibrate
 
     try:
-        fresh = calibrate(_of_camera(scene), replace(plan.options, priors=()))
+        fresh = calibrate(_of_camera(search), replace(plan.options, priors=()))
     except CalibrationError:
         return
-    noise = max(fresh.fit.point_scale / scene.scales[0], fresh.fit.curve_scale / scene.scales[1])
+    noise = max(fresh.fit.point_scale / search.scales[0], fresh.fit.curve_scale / search.scales[1])
     if noise < _NOISIER and len(fresh.rejected) < _FEW * (fresh.fit.points + fresh.fit.curves):
         yield f"with another lens they do: {WORDS['everything']}: calibrate it anew"
 
 
-def _fits(scene: Scene, old: list[Pose]) -> bool:
-    found = places(scene, old, patience=0)
+def _fits(search: PoseSearch, old: list[Pose]) -> bool:
+    found = places(search, old, patience=0)
     return bool(found) and _good(found[0])
 
 
@@ -129,26 +128,26 @@ def _good(place: Place) -> bool:
     return place.fits and place.scale < _NOISIER
 
 
-def _seen_as(scene: Scene, observations: Observations) -> Scene:
-    """The scene with its observations renamed or its targets exchanged; structure is left out of it."""
+def _seen_as(search: PoseSearch, observations: Observations) -> PoseSearch:
+    """The search with its observations renamed or its targets exchanged; structure is left out of it."""
     from ceres_cal.model.structure import make_structure
 
     sights = gather_sights(observations)
-    number = sights.keys.index(scene.sight.key)
-    estimate = replace(scene.estimate, structure=make_structure(observations.targets, {}))
-    return replace(scene, observations=observations, sight=sights[number], estimate=estimate)
+    number = sights.keys.index(search.sight.key)
+    estimate = replace(search.estimate, structure=make_structure(observations.targets, {}))
+    return replace(search, observations=observations, sight=sights[number], estimate=estimate)
 
 
-def _of_camera(scene: Scene) -> Observations:
-    """The observations of the scene's station alone."""
-    observations = scene.observations
-    views = [n for n, view in enumerate(observations.views) if view.station == scene.sight.key.station]
+def _of_camera(search: PoseSearch) -> Observations:
+    """The observations of the search's station alone."""
+    observations = search.observations
+    views = [n for n, view in enumerate(observations.views) if view.station == search.sight.key.station]
     order = np.full(len(observations.views), -1, dtype=np.int32)
     order[views] = np.arange(len(views))
 
     points = taken(observations.points, order[observations.points.view] >= 0)
     curves = taken(observations.curves, order[observations.curves.view] >= 0)
-    camera = scene.sight.key.camera
+    camera = search.sight.key.camera
     return Observations(
         observations.targets,
         {camera: observations.cameras[camera]},
@@ -158,13 +157,13 @@ def _of_camera(scene: Scene) -> Observations:
     )
 
 
-def zoomed_place(scene: Scene, old: list[Pose]) -> tuple[Scene, Place] | None:
-    """The scene with the phi that explains it best, and the pose there; None where none explains half of it."""
-    best: tuple[Scene, Place] | None = None
+def zoomed_place(search: PoseSearch, old: list[Pose]) -> tuple[PoseSearch, Place] | None:
+    """The search with the phi that explains it best, and the pose there; None where none explains half of it."""
+    best: tuple[PoseSearch, Place] | None = None
     for width in (2.0, 1.05, 1.008):  # each grid is finer, around the best of the one before
-        middle = scene.camera.phi if best is None else best[0].camera.phi
+        middle = search.camera.phi if best is None else best[0].camera.phi
         for phi in middle * np.geomspace(1.0 / width, width, _ZOOMS):
-            zoomed = scene.with_camera(replace(scene.camera, phi=float(phi)))
+            zoomed = search.with_camera(replace(search.camera, phi=float(phi)))
             for place in places(zoomed, old, patience=0)[:1]:
                 if best is None or place.misfit < best[1].misfit:
                     best = zoomed, place
@@ -198,17 +197,16 @@ class Judged:
         return self.noisy or (upper_tail(self.strain, self.rank) < _RARE)
 
 
-def judged(plan: Plan, what: str, result: Calibration) -> Judged:
+def judged(plan: RefitPlan, what: str, result: Calibration) -> Judged:
     """Strain and noise of a result."""
-    prior = without_keys(plan.prior, plan.loosened(what))
-    strain = float(np.sum((prior.root @ offsets(prior, result.estimate)) ** 2)) if prior.rank else 0.0
+    off = plan.prior_for(what).residuals(result.estimate)
     fit, (points, curves) = result.fit, plan.scales
     ratios = ((fit.points, fit.point_scale / points), (fit.curves, fit.curve_scale / curves))
     noise = [ratio for count, ratio in ratios if count]
-    return Judged(strain, prior.rank, max(noise, default=1.0))
+    return Judged(float(off @ off), len(off), max(noise, default=1.0))
 
 
-def require_supported(plan: Plan, result: Calibration, attempt: Callable[[str, Estimate], Calibration]) -> bool:
+def require_supported(plan: RefitPlan, result: Calibration, attempt: Callable[[str, Estimate], Calibration]) -> bool:
     """Whether nothing fits; SolutionError where another explanation than the chosen one is supported.
 
     Args:
@@ -234,7 +232,7 @@ def require_supported(plan: Plan, result: Calibration, attempt: Callable[[str, E
     return judged(plan, plan.what, result).noise > _TOO_NOISY or best != plan.what
 
 
-def _changes(plan: Plan, what: str, result: Calibration) -> str:
+def _changes(plan: RefitPlan, what: str, result: Calibration) -> str:
     if what == "iris":
         return ""
     old = plan.calibration.cameras
@@ -242,7 +240,7 @@ def _changes(plan: Plan, what: str, result: Calibration) -> str:
     return f" (phi of camera {', '.join(changes)})"
 
 
-def _scores(plan: Plan, results: Mapping[str, Calibration]) -> dict[str, float]:
+def _scores(plan: RefitPlan, results: Mapping[str, Calibration]) -> dict[str, float]:
     """Misfit of observations and prior, and half the logarithm of the count for every number let go; in nats."""
     sights = gather_sights(plan.observations)
     fits = [result.fit for result in results.values()]
@@ -255,8 +253,7 @@ def _scores(plan: Plan, results: Mapping[str, Calibration]) -> dict[str, float]:
     for what, result in results.items():
         found = residuals(plan.observations, sights, result.estimate)
         total = 0.5 * judged(plan, what, result).strain + 0.5 * len(plan.loosened(what)) * np.log(count)
-        for name in dict.fromkeys(key.camera for key in sights.keys):
-            own = sights.take(np.array([i for i, key in enumerate(sights.keys) if key.camera == name], dtype=np.int64))
-            total += misfit(own, result.cameras[name], found, scales)
+        for name in sights.cameras:
+            total += misfit(sights.of_camera(name), result.cameras[name], found, scales)
         scores[what] = float(total)
     return scores

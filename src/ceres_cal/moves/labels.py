@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ceres_cal.base.transforms import Array
+from ceres_cal.base.arrays import Array, Codes, Indices32
 from ceres_cal.observations import Observations
 from ceres_cal.scene.targets import Arc, Segment, Target, ssl_field
 
@@ -37,7 +36,7 @@ def relabelled(observations: Observations, image: Array) -> Observations | None:
     return replace(observations, points=replace(points, feature=p), curves=replace(curves, feature=c, side=side))
 
 
-def _counterparts(target: Target, image: Array) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int8]]:
+def _counterparts(target: Target, image: Array) -> tuple[Indices32, Indices32, Codes]:
     """For each point and each curve the one it is sent to (-1: none), and 1 or -1 for the curve's side."""
     places = target.point_array
     to_point = np.full(len(places), -1, dtype=np.int32)

@@ -12,14 +12,16 @@ from itertools import product
 
 import numpy as np
 
-from ceres_cal.base.transforms import Array, Pose, rotation_exp
+from ceres_cal.base.arrays import Array
+from ceres_cal.base.transforms import Pose, rotation_exp
 from ceres_cal.model.parameters import Estimate
 from ceres_cal.model.residuals import Residuals, residuals
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import SightKey, Sights
 from ceres_cal.scene.camera import Camera
 from ceres_cal.solve import Weighting, placement_costs
-from ceres_cal.start.closed_forms import null_vector, polar_pose
+from ceres_cal.start.closed_forms import fit_lines, pose_from_homography
+from ceres_cal.start.planes import plane_sight
 
 _WIDE = (60.0, 12.0)  # standard deviations: scale of the loss while a candidate is far off
 _FARTHEST_M = 1e3
@@ -27,7 +29,7 @@ _GRID_DEG = (-24.0, 0.0, 24.0)  # of turns about each axis of the camera; neighb
 _STRAY = 0.05  # share of observations that may be anywhere in the image
 _ALIKE = (0.02, 0.01)  # m and rad: candidates nearer than this are one
 _FITS_SHARE, _FITS_SIGMA, _FITS_SCALE = 0.6, 5.0, 4.0
-_FEWEST_ROUNDS = 4
+_ROUNDS = 4  # of the closed form's reweighting
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +54,7 @@ class Place:
 
 
 @dataclass(frozen=True, eq=False)
-class Scene:
+class PoseSearch:
     """What one station sees of the world, through a lens that is taken as known.
 
     Attributes:
@@ -75,7 +77,7 @@ class Scene:
         near = float(np.hypot(x, y)) < _FARTHEST_M and abs(float(height)) < _FARTHEST_M
         return near and (self.sight.key.placement is not None or height > 0.0)
 
-    def with_camera(self, camera: Camera) -> Scene:
+    def with_camera(self, camera: Camera) -> PoseSearch:
         """The same through another lens."""
         cameras = {**self.estimate.cameras, self.sight.key.camera: camera}
         return replace(self, estimate=replace(self.estimate, cameras=cameras))
@@ -90,7 +92,7 @@ class Scene:
         return residuals(self.observations, self.sight, there)
 
 
-def places(scene: Scene, old: Sequence[Pose], patience: int = 2) -> list[Place]:
+def places(search: PoseSearch, old: Sequence[Pose], patience: int = 2) -> list[Place]:
     """Poses that come into question, best first, each once.
 
     Args:
@@ -98,11 +100,11 @@ def places(scene: Scene, old: Sequence[Pose], patience: int = 2) -> list[Place]:
             the grid around them as well, where none of those fits.
     """
     seeds = [*old, *(turn for pose in old for turn in _turned(pose))]
-    closed = closed_form(scene)
-    found = _settled(scene, [*seeds, *([closed] if closed is not None else [])])
+    closed = closed_form(search)
+    found = _settled(search, [*seeds, *([closed] if closed is not None else [])])
     if patience and not (found and found[0].fits):
         around = [turn for pose in seeds for turn in _grid(pose)]
-        found = _distinct([*found, *_settled(scene, around)])
+        found = _distinct([*found, *_settled(search, around)])
     return found
 
 
@@ -127,90 +129,53 @@ def equations(sight: Sights) -> int:
     return 2 * len(np.unique(sight.points, axis=0)) + int(np.sum(np.minimum(counts, most)))
 
 
-def closed_form(scene: Scene) -> Pose | None:
-    """The pose by a linear homography between undistorted rays and the floor, from points and straight lines; None
-    where they are too few (a point gives two equations, a line two) or lie so that they tell none.
+def closed_form(search: PoseSearch) -> Pose | None:
+    """The pose by a homography between the lens's rays and the floor, from points and straight lines; None where they
+    are too few (a point gives two equations, a line two) or cannot fix it.
     """
-    camera, sight = scene.camera, scene.sight
-    flat = np.abs(sight.points[:, 2]) < 1e-9
-    x, y = sight.points[flat, :2].T
-    one, zero = np.ones(len(x)), np.zeros(len(x))
-    tracks, arcs = sight.tracks[sight.track], sight.is_arc[sight.track]
-    straight = ~arcs & (np.abs(tracks[:, 0, 2]) < 1e-9) & (np.abs(tracks[:, 1, 2]) < 1e-12)
-    c, a = tracks[straight, 0, :2], tracks[straight, 1, :2]
-    normal = np.column_stack([-a[:, 1], a[:, 0]]) / np.linalg.norm(a, axis=1, keepdims=True)
-    equations = 2 * len(np.unique(sight.points[flat], axis=0)) + 2 * len(np.unique(sight.track[straight]))
-    lines = np.vstack(
-        [
-            np.column_stack([one, zero, -x]),
-            np.column_stack([zero, one, -y]),
-            np.column_stack([normal, -np.sum(normal * c, axis=1)]),
-        ]
-    )
-    pixels = [sight.pixels[flat], sight.pixels[flat], sight.curve_pixels[straight]]
-    rays = camera.rays(np.vstack(pixels))
-    told = np.isfinite(rays[:, 0])
-    if equations < 8 or np.count_nonzero(told) < 8:
+    plane = plane_sight(search.sight, height_m=0.0)
+    rays = search.camera.rays(plane.pixels)
+    known = np.isfinite(rays[:, 0])
+    if plane.equations < 8 or np.count_nonzero(known) < 8:
         return None
-    return _pose_of_lines(lines[told], rays[told])
+    homography, _ = fit_lines(plane.lines[known], rays[known], _ROUNDS)
+    return None if homography is None else pose_from_homography(homography)
 
 
-def _pose_of_lines(lines: Array, rays: Array) -> Pose | None:
-    """cam_from_world from rays (N, 3) whose feet on the floor lie on lines (N, 3) of it, reweighted against strays."""
-    size = 1.0 / max(float(np.max(np.abs(lines[:, 2]))), 1e-9)
-    lines = lines * (1.0, 1.0, size)
-    weights, inverse = np.ones(len(lines)), np.eye(3)
-    for _ in range(_FEWEST_ROUNDS):
-        rows = (lines[:, :, None] * rays[:, None, :]).reshape(-1, 9)
-        inverse = null_vector((rows * weights[:, None]).T @ rows).reshape(3, 3)
-        sent = rays @ inverse.T
-        off = np.abs(np.sum(lines * sent, axis=1)) / np.maximum(np.abs(sent[:, 2]), 1e-9)
-        bound = max(3.0 * float(np.median(off)), 1e-9)
-        weights = 1.0 / (np.maximum(sent[:, 2] ** 2, 1e-9) * (1.0 + (off / bound) ** 2))
-    matrix = np.diag([1.0, 1.0, size]) @ inverse
-    if abs(np.linalg.det(matrix)) < 1e-12 * np.linalg.norm(matrix) ** 3:
-        return None
-    homography = np.asarray(np.linalg.inv(matrix), dtype=float)
-    if np.median((rays @ inverse.T)[:, 2]) < 0.0:  # rays and places on the floor must lie on one side
-        homography = -homography
-    pose = polar_pose(homography)
-    return pose if np.all(np.isfinite(pose.matrix)) else None
-
-
-def _settled(scene: Scene, poses: Sequence[Pose]) -> list[Place]:
+def _settled(search: PoseSearch, poses: Sequence[Pose]) -> list[Place]:
     """Each candidate at its best, best first; those from which something cannot be seen are left out."""
     stack = np.array([pose.matrix for pose in poses])
     for wide in _WIDE:
-        stack = _searched(scene, stack, Weighting(*scene.scales, "huber", wide), 1e-3)
-    stack = _searched(scene, stack, Weighting(*scene.scales, "cauchy", 2.0), 1e-8)
+        stack = _searched(search, stack, Weighting(*search.scales, "huber", wide), 1e-3)
+    stack = _searched(search, stack, Weighting(*search.scales, "cauchy", 2.0), 1e-8)
     found = [Pose(matrix[:, :3], matrix[:, 3]) for matrix in stack]
-    return _distinct([place_of(scene, pose) for pose in found if scene.allows(pose)])
+    return _distinct([place_of(search, pose) for pose in found if search.allows(pose)])
 
 
-def _searched(scene: Scene, stack: Array, weighting: Weighting, tolerance: float) -> Array:
+def _searched(search: PoseSearch, stack: Array, weighting: Weighting, tolerance: float) -> Array:
     """Poses (K, 3, 4) after the search, without those from which something cannot be seen."""
     if not len(stack):
         return stack
-    key, count = scene.sight.key, len(stack)
-    many = scene.sight.take(np.zeros(count, dtype=np.int64))
+    key, count = search.sight.key, len(stack)
+    many = search.sight.take(np.zeros(count, dtype=np.int64))
     keys = tuple(SightKey(key.camera, key.station, str(number)) for number in range(count))
-    world = scene.estimate.stations[key.station].cam_from_world
+    world = search.estimate.stations[key.station].cam_from_world
     placements = {k.placement: world for k in keys if k.placement is not None}
-    estimate = replace(scene.estimate, placements=placements).with_placements(keys, stack)
+    estimate = replace(search.estimate, placements=placements).with_placements(keys, stack)
     costs, found = placement_costs(replace(many, keys=keys), estimate, weighting, stack, tolerance)
     return found[np.isfinite(costs)]
 
 
-def place_of(scene: Scene, pose: Pose) -> Place:
+def place_of(search: PoseSearch, pose: Pose) -> Place:
     """How well a pose explains the sight."""
-    sight, found = scene.sight, scene.residuals(pose)
-    points = np.linalg.norm(found.points[sight.point_rows], axis=1) / (sight.sigma_px * scene.scales[0])
-    curves = np.abs(found.curves[sight.curve_rows]) / (sight.curve_sigma_px * scene.scales[1])
+    sight, found = search.sight, search.residuals(pose)
+    points = np.linalg.norm(found.points[sight.point_rows], axis=1) / (sight.sigma_px * search.scales[0])
+    curves = np.abs(found.curves[sight.curve_rows]) / (sight.curve_sigma_px * search.scales[1])
     lengths = np.nan_to_num(np.concatenate([points / 1.1774, curves / 0.6745]), nan=np.inf)
     scale = float(np.median(lengths))
     sigmas = np.nan_to_num(np.concatenate([points, curves]), nan=np.inf)
     share = float(np.mean(sigmas <= _FITS_SIGMA * np.clip(scale, 1.0, _FITS_SCALE)))
-    return Place(pose, misfit(scene.sight, scene.camera, found, scene.scales), scale, share)
+    return Place(pose, misfit(search.sight, search.camera, found, search.scales), scale, share)
 
 
 def misfit(sights: Sights, camera: Camera, found: Residuals, scales: tuple[float, float]) -> float:

@@ -13,13 +13,13 @@ import numpy as np
 
 from ceres_cal.base.errors import DegenerateError, InputError, SolutionError
 from ceres_cal.base.transforms import Pose
-from ceres_cal.calibrating import solved_from
+from ceres_cal.calibrating import Again, solved_from
 from ceres_cal.calibration import Calibration, Refitted
 from ceres_cal.model.parameters import Estimate
-from ceres_cal.moves.carried import Plan, again, first_estimate, layouts, make_plan
+from ceres_cal.moves.carried import RefitPlan, first_estimate, make_plan, refit_problem
 from ceres_cal.moves.explain import judged, old_poses, require_labels, require_supported, why_nothing_fits, zoomed_place
 from ceres_cal.moves.labels import TURNED, relabelled
-from ceres_cal.moves.poses import Scene, equations, movement, places
+from ceres_cal.moves.poses import PoseSearch, equations, movement, places
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.observations.sights import Sights, gather_sights
 from ceres_cal.solve import Progress
@@ -73,15 +73,15 @@ def refit(
     sights = gather_sights(plan.observations)
     estimate = _start(plan, sights, check_labels=labels == "check")
 
-    def attempt(freedom: str, start: Estimate, *, assessed: bool = False) -> Calibration:
-        solved, known = layouts(plan, freedom, start, set(start.placements))
-        begin, taken_up = Start(start, _phi_from(plan)), again(plan, known, assessed=assessed)
-        return solved_from(begin, plan.observations, sights, solved, plan.options, progress, taken_up)
+    def attempt(what: str, start: Estimate, *, assessed: bool = False) -> Calibration:
+        problem, known = refit_problem(plan, what, sights, start)
+        again = Again(known, plan.scales, assessed)
+        return solved_from(Start(start, _phi_from(plan)), plan.observations, problem, again, progress)
 
     result = attempt(what, estimate, assessed=True)
     others = require_supported(plan, result, attempt)
     if others:
-        raise why_nothing_fits(plan, [_scene(plan, sight, estimate) for sight in _moved_sights(plan, sights)])
+        raise why_nothing_fits(plan, [_search_of(plan, sight, estimate) for sight in _moved_sights(plan, sights)])
     _require_known(plan, result)
     explanation = _explained(plan, result)
     seen = (*calibration.refitted.digests, calibration.digest) if calibration.refitted else (calibration.digest,)
@@ -102,24 +102,24 @@ def _turned(observations: Observations) -> Observations:
     return turned
 
 
-def _start(plan: Plan, sights: Sights, *, check_labels: bool) -> Estimate:
+def _start(plan: RefitPlan, sights: Sights, *, check_labels: bool) -> Estimate:
     """Poses of everything that is sought, lenses as they were (or zoomed, where that may be)."""
     old = plan.calibration.estimate
     poses: dict[str, Pose] = {}
     cameras = dict(old.cameras)
     empty = first_estimate(plan, {name: Pose.identity() for name in plan.moved}, {})
     for sight in _moved_sights(plan, sights):
-        scene, pose = _sought(plan, _scene(plan, sight, empty))
-        poses[sight.key.station], cameras[sight.key.camera] = pose, scene.camera
+        search, pose = _sought(plan, _search_of(plan, sight, empty))
+        poses[sight.key.station], cameras[sight.key.camera] = pose, search.camera
     if check_labels:
         require_labels(plan, poses)
     estimate = replace(first_estimate(plan, poses, {}), cameras=cameras)
     return replace(estimate, placements=_placements(plan, sights, estimate))
 
 
-def _moved_sights(plan: Plan, sights: Sights) -> list[Sights]:
+def _moved_sights(plan: RefitPlan, sights: Sights) -> list[Sights]:
     """What each station that moved sees of the world."""
-    found = {k.station: sights[i] for i, k in enumerate(sights.keys) if k.placement is None and k.station in plan.moved}
+    found = {name: sight for name, sight in sights.of_world.items() if name in plan.moved}
     for name in sorted(plan.moved - found.keys()):
         raise DegenerateError(
             f"station {name!r} sees nothing that lies in the world: observe lines or points of the field with it"
@@ -127,33 +127,33 @@ def _moved_sights(plan: Plan, sights: Sights) -> list[Sights]:
     return list(found.values())
 
 
-def _scene(plan: Plan, sight: Sights, estimate: Estimate) -> Scene:
-    return Scene(plan.observations, sight, estimate, plan.scales)
+def _search_of(plan: RefitPlan, sight: Sights, estimate: Estimate) -> PoseSearch:
+    return PoseSearch(plan.observations, sight, estimate, plan.scales)
 
 
-def _sought(plan: Plan, scene: Scene) -> tuple[Scene, Pose]:
-    """The scene as it is understood, and the station's pose there."""
-    old = old_poses(plan, scene)
-    found = places(scene, old)
+def _sought(plan: RefitPlan, search: PoseSearch) -> tuple[PoseSearch, Pose]:
+    """The search as it is understood, and the station's pose there."""
+    old = old_poses(plan, search)
+    found = places(search, old)
     fitting = [place for place in found if place.fits and place.misfit <= found[0].misfit + _NATS_ALIKE]
     if fitting:
         pose = min(fitting, key=lambda place: _far(place.pose, old)).pose
-        _require_unique(scene, pose, old)
-        return scene, pose
+        _require_unique(search, pose, old)
+        return search, pose
     if plan.what in ("zoom", "iris", "everything"):
-        zoomed = zoomed_place(scene, old)
+        zoomed = zoomed_place(search, old)
         if zoomed is not None:
             return zoomed[0], zoomed[1].pose
-    raise why_nothing_fits(plan, [scene])
+    raise why_nothing_fits(plan, [search])
 
 
-def _require_unique(scene: Scene, pose: Pose, old: list[Pose]) -> None:
+def _require_unique(search: PoseSearch, pose: Pose, old: list[Pose]) -> None:
     """Raise DegenerateError where so few features cannot tell a large move from another one."""
-    told = equations(scene.sight)
+    told = equations(search.sight)
     if told >= _UNIQUE or any(_is_small(*movement(pose, before)) for before in old):
         return
     raise DegenerateError(
-        f"station {scene.sight.key.station!r}: its points, lines and arcs give {told} equations, which tell a small "
+        f"station {search.sight.key.station!r}: its points, lines and arcs give {told} equations, which tell a small "
         f"move but not a large one for sure: show {_UNIQUE} (two a point or straight line, three an arc)"
     )
 
@@ -162,7 +162,7 @@ def _is_small(shift_m: float, turn: float) -> bool:
     return shift_m < _SMALL[0] and turn < _SMALL[1]
 
 
-def _phi_from(plan: Plan) -> dict[str, str]:
+def _phi_from(plan: RefitPlan) -> dict[str, str]:
     free = plan.moved_cameras if plan.what in ("zoom", "everything") else ()
     return {name: "views" if name in free else "posterior" for name in plan.calibration.cameras}
 
@@ -172,13 +172,13 @@ def _far(pose: Pose, old: list[Pose]) -> float:
     return min((sum(movement(pose, before)) for before in old), default=0.0)
 
 
-def _placements(plan: Plan, sights: Sights, estimate: Estimate) -> dict[str, Pose]:
+def _placements(plan: RefitPlan, sights: Sights, estimate: Estimate) -> dict[str, Pose]:
     """Every placement that the observations show, from the first sight that can tell its pose."""
     found: dict[str, Pose] = {}
     for number, key in enumerate(sights.keys):
         if key.placement is None or key.placement in found:
             continue
-        seen = places(_scene(plan, sights[number], replace(estimate, placements={})), [], patience=0)
+        seen = places(_search_of(plan, sights[number], replace(estimate, placements={})), [], patience=0)
         if seen:
             found[key.placement] = estimate.stations[key.station].cam_from_world.inverse @ seen[0].pose
     for key in sights.keys:
@@ -190,7 +190,7 @@ def _placements(plan: Plan, sights: Sights, estimate: Estimate) -> dict[str, Pos
 # ---- what came out --------------------------------------------------------------------------------------------------
 
 
-def _require_known(plan: Plan, result: Calibration) -> None:
+def _require_known(plan: RefitPlan, result: Calibration) -> None:
     """Raise DegenerateError where the observations leave a pose open."""
     assert result.posterior is not None
     for place, key in enumerate(result.posterior.keys):
@@ -204,7 +204,7 @@ def _require_known(plan: Plan, result: Calibration) -> None:
             raise SolutionError(f"station {name!r}: the solve ended nowhere: check labels and target dimensions")
 
 
-def _explained(plan: Plan, result: Calibration) -> str:
+def _explained(plan: RefitPlan, result: Calibration) -> str:
     """What has happened to each station that was sought, in words."""
     words, moves = [], movements(plan.calibration, result)
     for name in sorted(plan.moved):
@@ -228,7 +228,7 @@ def movements(before: Calibration, after: Calibration) -> dict[str, tuple[float,
     return found
 
 
-def _warnings(plan: Plan, result: Calibration) -> tuple[str, ...]:
+def _warnings(plan: RefitPlan, result: Calibration) -> tuple[str, ...]:
     """Those of the solve, and what the noise says."""
     found = judged(plan, plan.what, result)
     noisy = f"the noise is {found.noise:.1f} times that of the calibration before"

@@ -7,13 +7,9 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ceres_cal.base.arrays import Array, Codes, Indices, Indices32, Mask
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.transforms import Array
-
-Ints = NDArray[np.int32]
-Rows = NDArray[np.int64] | NDArray[np.int32] | NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -73,8 +69,8 @@ def _freeze(columns: Columns) -> None:
 class Points:
     """Columns of the point observations: index of the view, index into the target's point names, pixel, its sigma."""
 
-    view: Ints
-    feature: Ints
+    view: Indices32
+    feature: Indices32
     pixels: Array
     sigma_px: Array
 
@@ -89,11 +85,11 @@ class Points:
 class Curves:
     """Columns of the curve observations; `side` is 0 for the centre of the paint, +1 for left, -1 for right."""
 
-    view: Ints
-    feature: Ints
+    view: Indices32
+    feature: Indices32
     pixels: Array
     sigma_px: Array
-    side: NDArray[np.int8]
+    side: Codes
 
     def __post_init__(self) -> None:
         _freeze(self)
@@ -116,7 +112,7 @@ Columns = Points | Curves
 C = TypeVar("C")
 
 
-def taken(columns: C, rows: Rows) -> C:
+def taken(columns: C, rows: Indices | Indices32 | Mask) -> C:
     """Points, curves, or columns of another kind, at these rows only: their numbers, or True for each that stays."""
     return type(columns)(**{name: column[rows] for name, column in vars(columns).items()})
 

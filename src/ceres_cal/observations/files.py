@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
+from ceres_cal.base.arrays import AnyArray
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import check_header, convert, parse_json, read_bytes, write_bytes
 from ceres_cal.observations.columns import TYPES, Curves, Points, Prior, View, listed, place_of
@@ -189,7 +189,7 @@ def _from_json(content: bytes, where: str) -> Content:
     )
 
 
-def _concatenate(parts: Sequence[Any], dtype: Any) -> NDArray[Any]:
+def _concatenate(parts: Sequence[Any], dtype: Any) -> AnyArray:
     return np.concatenate([np.empty(0, dtype), *parts]).astype(dtype)
 
 
@@ -237,7 +237,7 @@ def _sides(entry: _CurvesFile, here: str) -> list[int]:
     return [SIDES[name] for name in names]
 
 
-def _same_or_list(values: NDArray[Any]) -> Any:
+def _same_or_list(values: AnyArray) -> Any:
     return values[0].item() if len(values) and np.all(values == values[0]) else values.tolist()
 
 
@@ -275,7 +275,7 @@ def _to_npz(content: Content) -> bytes:
     return stream.getvalue()
 
 
-def _arrays(content: bytes, where: str) -> dict[str, NDArray[Any]]:
+def _arrays(content: bytes, where: str) -> dict[str, AnyArray]:
     """What an NPZ file holds, by name."""
     reason = "it is cut short or no NPZ file"
     try:
@@ -288,7 +288,7 @@ def _arrays(content: bytes, where: str) -> dict[str, NDArray[Any]]:
     raise InputError(f"{where}: cannot be read, {reason}: write it again with Observations.save")
 
 
-def _taken(arrays: dict[str, NDArray[Any]], kind: str, names: Sequence[str], where: str) -> dict[str, Any]:
+def _taken(arrays: dict[str, AnyArray], kind: str, names: Sequence[str], where: str) -> dict[str, Any]:
     """The columns of one kind, taken out of the arrays."""
     found = {}
     for name in names:

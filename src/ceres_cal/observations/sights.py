@@ -7,20 +7,18 @@ of its own. Rows are kept so that residuals find their way back to the observati
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from ceres_cal.base.transforms import Array
+from ceres_cal.base.arrays import AnyArray, Array, Indices, Indices32, Mask
 from ceres_cal.observations import Columns, Observations
 from ceres_cal.scene.camera import Camera
 
-Rows = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 _BLOCK = 1 << 16  # rows worked on at once: memory stays small beside the observations
 
 
@@ -51,15 +49,15 @@ class Sights(Sequence["Sights"]):
 
     keys: tuple[SightKey, ...]
     views: tuple[tuple[int, ...], ...]
-    point_bounds: Rows
-    point_rows: Rows
-    feature: Rows
+    point_bounds: Indices
+    point_rows: Indices
+    feature: Indices
     points: Array
     pixels: Array
     sigma_px: Array
-    curve_bounds: Rows
-    curve_rows: Rows
-    track: NDArray[np.int32]
+    curve_bounds: Indices
+    curve_rows: Indices
+    track: Indices32
     curve_pixels: Array
     curve_sigma_px: Array
     tracks: Array
@@ -100,7 +98,37 @@ class Sights(Sequence["Sights"]):
         """Measured numbers: two of each point, one of each curve observation."""
         return 2 * len(self.point_rows) + len(self.curve_rows)
 
-    def take(self, numbers: Rows) -> Sights:
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """Names of the cameras, each once."""
+        return tuple(dict.fromkeys(key.camera for key in self.keys))
+
+    def numbers(
+        self,
+        camera: str | None = None,
+        station: str | None = None,
+        placements: Container[str | None] | None = None,
+    ) -> Indices:
+        """Numbers of the sights of this camera, station and these placements; None asks for nothing."""
+        numbers = [
+            number
+            for number, key in enumerate(self.keys)
+            if (camera is None or key.camera == camera)
+            and (station is None or key.station == station)
+            and (placements is None or key.placement in placements)
+        ]
+        return np.array(numbers, dtype=np.int64)
+
+    def of_camera(self, name: str) -> Sights:
+        """The sights of one camera."""
+        return self.take(self.numbers(camera=name))
+
+    @property
+    def of_world(self) -> dict[str, Sights]:
+        """What each station sees of the world."""
+        return {self.keys[number].station: self[int(number)] for number in self.numbers(placements=(None,))}
+
+    def take(self, numbers: Indices) -> Sights:
         """The sights with these numbers, in this order."""
         if len(numbers) == len(self) and np.array_equal(numbers, np.arange(len(self))):
             return self
@@ -143,7 +171,18 @@ class Sights(Sequence["Sights"]):
         numbers = np.flatnonzero(point_sizes + curve_sizes)
         return self._rows(numbers, p, c, point_sizes[numbers], curve_sizes[numbers])
 
-    def _rows(self, numbers: Rows, p: Rows | slice, c: Rows | slice, point_sizes: Rows, curve_sizes: Rows) -> Sights:
+    @property
+    def by_kind(self) -> tuple[Sights, Sights]:
+        """The same sights with their points alone, and with their curve observations alone."""
+        nothing, every = np.zeros(len(self), dtype=np.int64), np.arange(len(self))
+        return (
+            self._rows(every, slice(None), slice(0, 0), np.diff(self.point_bounds), nothing),
+            self._rows(every, slice(0, 0), slice(None), nothing, np.diff(self.curve_bounds)),
+        )
+
+    def _rows(
+        self, numbers: Indices, p: Indices | slice, c: Indices | slice, point_sizes: Indices, curve_sizes: Indices
+    ) -> Sights:
         return Sights(
             tuple(self.keys[i] for i in numbers),
             tuple(self.views[i] for i in numbers),
@@ -163,17 +202,17 @@ class Sights(Sequence["Sights"]):
         )
 
 
-def _at(values: NDArray[Any], rows: Rows | slice) -> NDArray[Any]:
+def _at(values: AnyArray, rows: Indices | slice) -> AnyArray:
     """values[rows]; `take` is several times as fast where a row holds more than one number."""
     return values[rows] if isinstance(rows, slice) else values.take(rows, axis=0)
 
 
-def bounds_of(sizes: ArrayLike) -> Rows:
+def bounds_of(sizes: ArrayLike) -> Indices:
     """(S + 1,) where each of so many rows begins, one after the other, and where the last one ends."""
     return np.concatenate([[0], np.cumsum(sizes)])
 
 
-def ranges(bounds: Rows, numbers: Rows) -> Rows:
+def ranges(bounds: Indices, numbers: Indices) -> Indices:
     """All row numbers from bounds[i] to bounds[i + 1], for each i of numbers in turn."""
     sizes = np.diff(bounds)[numbers]
     starts = np.repeat(bounds[numbers] - bounds_of(sizes)[:-1], sizes)
@@ -223,7 +262,7 @@ def gather_sights(observations: Observations) -> Sights:
     return every if len(filled) == len(every) else every.take(filled)
 
 
-def _grouped(columns: Columns, sight_of_view: Rows, count: int) -> tuple[Rows | slice, Rows]:
+def _grouped(columns: Columns, sight_of_view: Indices, count: int) -> tuple[Indices | slice, Indices]:
     """Rows in the order of their sights, all of them as they are where that is their order; where each sight begins."""
     sight = sight_of_view[columns.view]
     if np.all(sight[1:] >= sight[:-1]):

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ceres_cal.base.arrays import Array32
 from ceres_cal.base.transforms import Pose, rotation_log
-from ceres_cal.detect.profiles import Grey
 from ceres_cal.detect.registration import nearness_to
 from ceres_cal.detect.strokes import drawn, find_strokes
 from ceres_cal.photographs.facing import turns_of
@@ -35,7 +35,7 @@ class FieldSearch:
         turns: of the target that put its painted curves onto themselves; the first is none.
     """
 
-    grey: Grey
+    grey: Array32
     stroke_map: StrokeMap
     grid: Grid
     turns: tuple[Pose, ...]
@@ -50,7 +50,7 @@ class FieldSearch:
         return self.grid.curves
 
 
-def prepare_search(grey: Grey, target: Target, curves: Collection[str]) -> FieldSearch:
+def prepare_search(grey: Array32, target: Target, curves: Collection[str]) -> FieldSearch:
     """The strokes of a photograph, beside what they are to be taken for.
 
     Raises:

@@ -10,23 +10,23 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import DegenerateError, InputError
 from ceres_cal.base.files import check_header, convert, read_json
-from ceres_cal.base.transforms import Array
 from ceres_cal.observations import Prior
 from ceres_cal.photographs.follow import FreeIntrinsics
 from ceres_cal.photographs.refit import CAMERA, PointHints
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Radial
 from ceres_cal.scene.targets import Target
-from ceres_cal.start.closed_forms import homography_from_points, orthogonality_error, polar_pose
+from ceres_cal.start.closed_forms import homography_from_points, orthogonality_error, pose_from_homography
+from ceres_cal.start.initialise import USUAL_PHI, USUAL_PHI_FACTOR
 
 FORMAT, VERSION = "ceres-cal/corners", 1
 SIGMA_PX = 15.0
 FEWEST = 4
 _STRETCHES = (1.0, 1.06, 1.14, 1.25, 1.4)  # of the image's corner by the lens
 _PHI = np.geomspace(0.5, 3.0, 40)  # in half image diagonals
-_PHI_GUESS, _PHI_FACTOR = 1.3, 2.0
 _FREED = ("a3", "phi", "a2", "cx", "cy", "a4", "a5")
 _SQUARE = 0.02  # how square clicks are good to make the axes
 
@@ -92,7 +92,7 @@ def starts_from_clicks(
         except DegenerateError as error:
             raise InputError(f"the points to start from tell no pose: {error}") from None
         phi = _phi(homography, half)
-        pose = polar_pose(np.diag([1.0 / phi, 1.0 / phi, 1.0]) @ homography)
+        pose = pose_from_homography(homography, phi)
         if pose.position[2] < 0.0:
             raise InputError("the points to start from go round the wrong way, as if seen from below: check names")
         cameras.append(Camera(image_size, phi, (float(middle[0]), float(middle[1])), lens, 1.0, pose))
@@ -113,5 +113,5 @@ def unknown_optics(image_size: tuple[int, int], phi: float, hints: PointHints) -
 def _phi(homography: Array, half_px: float) -> float:
     """The focal length that makes the field's axes square, held near what lenses have where the view is too frontal."""
     error = orthogonality_error(homography[None], _PHI * half_px)[:, 0]
-    cost = (error / _SQUARE) ** 2 + (np.log(_PHI / _PHI_GUESS) / np.log(_PHI_FACTOR)) ** 2
+    cost = (error / _SQUARE) ** 2 + (np.log(_PHI / USUAL_PHI) / np.log(USUAL_PHI_FACTOR)) ** 2
     return float(_PHI[np.argmin(cost)] * half_px)

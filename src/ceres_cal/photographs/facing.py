@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.transforms import Array, Pose, rotation_exp, rotation_log
+from ceres_cal.base.transforms import Pose, rotation_exp, rotation_log
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.targets import Arc, Target, along_track, nearest_on_track
 

@@ -7,14 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ceres_cal.base.arrays import Array32, Mask
 from ceres_cal.base.errors import InputError, NothingShownError
 from ceres_cal.base.progress import ImageProgress
 from ceres_cal.detect.crossings import find_crossings
 from ceres_cal.detect.images import read_grey
 from ceres_cal.detect.lines import Lines
-from ceres_cal.detect.profiles import Grey
 from ceres_cal.observations import Curves, Observations, Points, View, combine, no_points
 from ceres_cal.photographs.clicks import Clicks, starts_from_clicks
 from ceres_cal.photographs.follow import Followed, FreeIntrinsics, follow
@@ -116,7 +115,7 @@ def _painted(target: Target, curves: Collection[str] | None) -> tuple[str, ...]:
 
 
 def _looked_for(
-    grey: Grey, target: Target, painted: tuple[str, ...], start: Camera | Clicks | Auto | Followed, path: Path
+    grey: Array32, target: Target, painted: tuple[str, ...], start: Camera | Clicks | Auto | Followed, path: Path
 ) -> SearchResult:
     """The field from where the last image showed it, or from the start that was given, or from none."""
     if isinstance(start, Auto):
@@ -165,7 +164,7 @@ def _observations(frame: str, followed: Followed, target: Target, options: Field
     )
 
 
-def _curves(lines: Lines, taken: NDArray[np.bool_], edges: bool) -> Curves:
+def _curves(lines: Lines, taken: Mask, edges: bool) -> Curves:
     """The middles of the paint, or both its edges, at the places taken."""
     rows = np.flatnonzero(taken)
     sides = (1, -1) if edges else (0,)

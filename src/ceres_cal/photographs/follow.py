@@ -7,12 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ceres_cal.base.arrays import Array, Array32
 from ceres_cal.base.errors import CalibrationError
-from ceres_cal.base.transforms import Array
 from ceres_cal.calibrating import calibrate
 from ceres_cal.detect.courses import Course, clear_px, predict
 from ceres_cal.detect.lines import SPACING_PX, Lines, measure, search, window_px
-from ceres_cal.detect.profiles import Grey
 from ceres_cal.detect.registration import nearness, shifted
 from ceres_cal.model.parameters import Options
 from ceres_cal.observations import Observations, Prior
@@ -83,7 +82,7 @@ class Followed:
 
 
 def follow(
-    grey: Grey, target: Target, starts: Sequence[Camera], curves: Collection[str], free: FreeIntrinsics | None = None
+    grey: Array32, target: Target, starts: Sequence[Camera], curves: Collection[str], free: FreeIntrinsics | None = None
 ) -> Followed:
     """Follow a target's painted curves in a photograph, from the best of several starts.
 
@@ -114,7 +113,7 @@ def follow(
 class _Tracker:
     """A photograph, the target's painted curves that are followed in it, and what of the camera is free."""
 
-    grey: Grey
+    grey: Array32
     target: Target
     curves: Collection[str]
     free: FreeIntrinsics

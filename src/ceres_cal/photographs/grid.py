@@ -6,10 +6,9 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.transforms import Array
 from ceres_cal.photographs.facing import turns_of
 from ceres_cal.scene.targets import Arc, Segment, Target, along_track
 
@@ -46,7 +45,7 @@ class Places:
     """Places (P, 2) along the painted curves in the grid's frame; `first` (P,) is 1 where a curve begins."""
 
     grid: Array
-    first: NDArray[np.bool_]
+    first: Mask
 
 
 def places_along(grid: Grid, count: int) -> Places:

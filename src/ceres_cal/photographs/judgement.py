@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ceres_cal.base.transforms import Array
+from ceres_cal.base.arrays import Array
 from ceres_cal.detect.courses import predict
 from ceres_cal.photographs.candidates import FieldSearch
 from ceres_cal.photographs.follow import LEAST_SHARE, Followed

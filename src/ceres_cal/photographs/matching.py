@@ -13,7 +13,7 @@ from math import gcd
 
 import numpy as np
 
-from ceres_cal.base.transforms import Array
+from ceres_cal.base.arrays import Array
 from ceres_cal.detect.registration import Nearness
 from ceres_cal.detect.strokes import Strokes
 from ceres_cal.photographs.grid import Grid, Places, places_along

@@ -5,17 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ceres_cal.base.arrays import Array, Indices32
 from ceres_cal.base.errors import CalibrationError
-from ceres_cal.base.transforms import Array
 from ceres_cal.model.parameters import Estimate, Layout, Options, Station, intrinsic_names
+from ceres_cal.model.priors import stated_prior
 from ceres_cal.model.structure import make_structure
 from ceres_cal.observations import Curves, Observations, Points, Prior, View, no_points
 from ceres_cal.observations.sights import gather_sights
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.targets import Target
-from ceres_cal.solve import Weighting, solve
+from ceres_cal.solve import Problem, Weighting, solve
 
 CAMERA, STATION, TARGET = "camera", "station", "field"
 _QUICK = Options(max_iterations=30, threads=1)
@@ -25,7 +25,7 @@ _QUICK = Options(max_iterations=30, threads=1)
 class PointHints:
     """Points that somebody showed: index (P,) among the target's, pixels (P, 2), sigma_px (P,)."""
 
-    feature: NDArray[np.int32]
+    feature: Indices32
     pixels: Array
     sigma_px: Array
 
@@ -33,7 +33,7 @@ class PointHints:
 def observations_of(
     target: Target,
     image_size: tuple[int, int],
-    curve: NDArray[np.int32],
+    curve: Indices32,
     pixels: Array,
     sigma_px: Array,
     hints: PointHints | None = None,
@@ -68,10 +68,11 @@ def refit_camera(
         {},
         make_structure(observations.targets, {}),
     )
-    layout = Layout({CAMERA: freed}, frozenset({STATION}), frozenset(), priors)
-    weighting = Weighting(loss="cauchy", loss_scale=2.0, precision=1e-6)
+    layout = Layout({CAMERA: freed}, frozenset({STATION}), frozenset())
+    known = tuple(stated_prior(prior, camera.lens) for prior in priors)
+    problem = Problem(gather_sights(observations), layout, known, Weighting(loss="cauchy", loss_scale=2.0), _QUICK)
     try:
-        solution = solve(gather_sights(observations), estimate, layout, weighting, _QUICK)
+        solution = solve(problem, estimate, precision=1e-6)
         refitted = solution.estimate.camera_at(STATION)
     except CalibrationError:
         return None

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ceres_cal.base.arrays import Array32
 from ceres_cal.base.errors import InputError
-from ceres_cal.detect.profiles import Grey
 from ceres_cal.photographs.candidates import FieldSearch, alike, candidates, prepare_search
 from ceres_cal.photographs.clicks import SIGMA_PX, unknown_optics
 from ceres_cal.photographs.facing import (
@@ -62,7 +62,7 @@ class SearchResult:
     chosen_by: str = ""
 
 
-def search(grey: Grey, target: Target, curves: Collection[str], auto: Auto) -> SearchResult:
+def search(grey: Array32, target: Target, curves: Collection[str], auto: Auto) -> SearchResult:
     """Find a target's painted curves in a photograph and follow them.
 
     The picture must show straight lines at right angles, two one way and one across at least; whatever else the target

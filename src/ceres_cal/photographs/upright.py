@@ -15,11 +15,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ceres_cal.base.transforms import Array, rotation_exp
+from ceres_cal.base.arrays import Array
+from ceres_cal.base.transforms import rotation_exp
+from ceres_cal.start.initialise import USUAL_PHI, USUAL_PHI_FACTOR
 
 BENDS = (0.05, -0.05, -0.15, -0.25, -0.35, -0.45)
 PHIS = (0.8, 1.15, 1.6)
-_USUAL_PHI, _PHI_FACTOR = 1.1, 1.4
 _USUAL_BEND, _BEND_SIGMA = -0.15, 0.2
 _USUAL_TILT = 0.5  # rad
 _PRIOR_WEIGHT = 0.03  # of all strokes, at one standard deviation
@@ -119,7 +120,7 @@ def _score(normals: Array, weights: Array, rotations: Array, tolerance: float) -
 
 
 def _penalty(optics: Upright) -> float:
-    phi = np.log(optics.phi / _USUAL_PHI) / np.log(_PHI_FACTOR)
+    phi = np.log(optics.phi / USUAL_PHI) / np.log(USUAL_PHI_FACTOR)
     tilt = np.arccos(np.clip(-optics.rotation[2, 2], -1.0, 1.0)) / _USUAL_TILT
     return float(_PRIOR_WEIGHT * (phi**2 + ((optics.bend - _USUAL_BEND) / _BEND_SIGMA) ** 2 + tilt**2))
 
@@ -140,8 +141,8 @@ def _refined(one: Upright, ends: Array, weights: Array) -> Upright:
         base, which = _deviation(one, ends, None)
         columns = np.array([(_deviation(_moved(one, step), ends, which)[0] - base) / 1e-5 for step in step_sizes])
         weight = weights / weights.sum() * np.exp(-((base / tolerance) ** 2)) / tolerance**2
-        prior = _PRIOR_WEIGHT * np.diag([0.0, 0.0, 0.0, _BEND_SIGMA**-2, np.log(_PHI_FACTOR) ** -2])
-        off = np.array([0.0, 0.0, 0.0, one.bend - _USUAL_BEND, np.log(one.phi / _USUAL_PHI)])
+        prior = _PRIOR_WEIGHT * np.diag([0.0, 0.0, 0.0, _BEND_SIGMA**-2, np.log(USUAL_PHI_FACTOR) ** -2])
+        off = np.array([0.0, 0.0, 0.0, one.bend - _USUAL_BEND, np.log(one.phi / USUAL_PHI)])
         normal = (columns * weight) @ columns.T + prior + 1e-9 * np.eye(5)
         step = np.linalg.solve(normal, -(columns * weight) @ base - prior @ off)
         one = _moved(one, np.clip(step, -0.1, 0.1))

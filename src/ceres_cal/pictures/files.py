@@ -6,8 +6,9 @@ from pathlib import Path
 
 import cv2
 
+from ceres_cal.base.arrays import Image
 from ceres_cal.base.errors import InputError
-from ceres_cal.detect.images import Image, encoded, read_colour
+from ceres_cal.detect.images import encoded, read_colour
 from ceres_cal.pictures.overlay import in_8_bit_colour
 
 _QUALITIES = (90, 80, 70, 55, 40, 25)

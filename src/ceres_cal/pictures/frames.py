@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.errors import InputError
 from ceres_cal.calibration import Calibration
 from ceres_cal.observations import Observations
@@ -101,8 +101,8 @@ def marks_of(calibration: Calibration, observations: Observations, frame: Frame)
     was taken out.
     """
     own = observations.digest == calibration.digest
-    pixels: list[NDArray[np.float64]] = []
-    out: list[NDArray[np.bool_]] = []
+    pixels: list[Array] = []
+    out: list[Mask] = []
     for kind, columns in (("point", observations.points), ("curve", observations.curves)):
         rejected = np.zeros(len(columns), dtype=bool)
         rejected[[entry.row for entry in calibration.rejected if own and entry.kind == kind]] = True

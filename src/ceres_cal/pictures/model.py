@@ -6,9 +6,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ceres_cal.base.transforms import Array, Pose
+from ceres_cal.base.arrays import Array, Mask
+from ceres_cal.base.transforms import Pose
 from ceres_cal.model.parameters import Estimate
 from ceres_cal.model.structure import Built
 from ceres_cal.scene.camera import Camera
@@ -52,7 +52,7 @@ class Model:
         apart = apart[np.isfinite(apart)]
         return (float(np.median(apart)), float(np.max(apart))) if len(apart) else (np.nan, np.nan)
 
-    def _inside(self, pixels: Array) -> NDArray[np.bool_]:
+    def _inside(self, pixels: Array) -> Mask:
         return _inside(pixels, self.image_size)
 
 
@@ -103,5 +103,5 @@ def _between(corners: Array) -> Array:
     return np.column_stack([np.interp(at, np.arange(len(corners)), axis) for axis in corners.T])
 
 
-def _inside(pixels: Array, size: tuple[int, int]) -> NDArray[np.bool_]:
+def _inside(pixels: Array, size: tuple[int, int]) -> Mask:
     return np.asarray(np.all((pixels >= -0.5) & (pixels <= np.array(size) - 0.5), axis=1))  # False for NaN

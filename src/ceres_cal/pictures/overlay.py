@@ -7,10 +7,8 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from ceres_cal.base.transforms import Array
-from ceres_cal.detect.images import Image
+from ceres_cal.base.arrays import Array, Image, Image8, Indices32, Mask
 from ceres_cal.pictures.model import Line, Model
 
 Colour = tuple[int, int, int]
@@ -50,7 +48,7 @@ class Marks:
     crosses: bool = False
 
 
-def draw_overlay(photograph: Image, layers: Sequence[Layer], marks: Sequence[Marks] = ()) -> NDArray[np.uint8]:
+def draw_overlay(photograph: Image, layers: Sequence[Layer], marks: Sequence[Marks] = ()) -> Image8:
     """A photograph with models and marks drawn into it, the last on top: (height, width, 3) blue, green, red, 8 bit.
 
     Lines run where the model says, to 1/16 px; the eye compares them with the paint. How well that is known they do
@@ -74,7 +72,7 @@ def draw_overlay(photograph: Image, layers: Sequence[Layer], marks: Sequence[Mar
     )
 
 
-def in_8_bit_colour(image: Image) -> NDArray[np.uint8]:
+def in_8_bit_colour(image: Image) -> Image8:
     """A copy of any photograph as (height, width, 3) uint8; deeper ones are stretched to what they hold."""
     plain = np.array(image)
     if plain.dtype != np.uint8:
@@ -84,38 +82,36 @@ def in_8_bit_colour(image: Image) -> NDArray[np.uint8]:
     return np.asarray(cv2.cvtColor(plain, cv2.COLOR_GRAY2BGR) if plain.ndim == 2 else plain, dtype=np.uint8)
 
 
-def _draw_line(canvas: NDArray[np.uint8], line: Line, colour: Colour, thickness: int) -> None:
+def _draw_line(canvas: Image8, line: Line, colour: Colour, thickness: int) -> None:
     for pixels in line.edges or (line.middle,):
         pairs = np.stack([pixels[:-1], pixels[1:]], axis=1)
         pairs = pairs[_drawable(pairs.reshape(-1, 2), canvas).reshape(-1, 2).all(axis=1)]
         cv2.polylines(canvas, list(_fixed(pairs)), False, colour, thickness, cv2.LINE_AA, _SHIFT)
 
 
-def _draw_crosses(
-    canvas: NDArray[np.uint8], pixels: Array, size: float, colour: Colour, thickness: int, *, upright: bool
-) -> None:
+def _draw_crosses(canvas: Image8, pixels: Array, size: float, colour: Colour, thickness: int, *, upright: bool) -> None:
     arms = 0.5 * size * (np.eye(2) if upright else np.array([[0.7, 0.7], [0.7, -0.7]]))
     for x in pixels[_drawable(pixels, canvas)]:
         ends = [_fixed(np.array([x - arm, x + arm])) for arm in arms]
         cv2.polylines(canvas, ends, False, colour, thickness, cv2.LINE_AA, _SHIFT)
 
 
-def _draw_dots(canvas: NDArray[np.uint8], pixels: Array, radius: float, colour: Colour) -> None:
+def _draw_dots(canvas: Image8, pixels: Array, radius: float, colour: Colour) -> None:
     for x, y in _fixed(pixels[_drawable(pixels, canvas)]).tolist():
         cv2.circle(canvas, (x, y), round(radius * _ONE), colour, -1, cv2.LINE_AA, _SHIFT)
 
 
-def _drawable(pixels: Array, canvas: NDArray[np.uint8]) -> NDArray[np.bool_]:
+def _drawable(pixels: Array, canvas: Image8) -> Mask:
     """(N,) whether pixels are numbers and not so far outside that OpenCV's coordinates overflow."""
     height, width = canvas.shape[:2]
     return np.asarray(np.all(np.abs(pixels - (0.5 * width, 0.5 * height)) < (2.0 * width, 2.0 * height), axis=1))
 
 
-def _fixed(pixels: Array) -> NDArray[np.int32]:
+def _fixed(pixels: Array) -> Indices32:
     return np.round(_ONE * pixels).astype(np.int32)
 
 
-def _with_legend(canvas: NDArray[np.uint8], entries: Sequence[tuple[str, Colour]], thick: float) -> NDArray[np.uint8]:
+def _with_legend(canvas: Image8, entries: Sequence[tuple[str, Colour]], thick: float) -> Image8:
     """The legend in the lower left corner, on a ground that lets the photograph through."""
     scale, pad, row = _LETTER_PX * thick / _FONT_PX / 1.4, _PAD_PX * thick, 1.3 * _LETTER_PX * thick
     stroke = max(1, round(thick))

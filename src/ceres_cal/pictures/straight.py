@@ -9,10 +9,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.transforms import Array, Pose
+from ceres_cal.base.transforms import Pose
 from ceres_cal.pictures.warp import Warp, make_warp, require_size
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Brown
@@ -143,14 +143,14 @@ class _Region:
     limit_deg: float | None
     outline: Array
 
-    def holds(self, places: Array) -> NDArray[np.bool_]:
+    def holds(self, places: Array) -> Mask:
         """(N,) whether the photograph shows these places (N, 2)."""
         pixels = self.camera.at(Pose.identity()).project(np.column_stack([places, np.ones(len(places))]))
         near = np.hypot(places[:, 0], places[:, 1]) <= self.slope
         return np.asarray(near & _inside(pixels, self.camera.image_size))
 
 
-def _inside(pixels: Array, size: tuple[int, int]) -> NDArray[np.bool_]:
+def _inside(pixels: Array, size: tuple[int, int]) -> Mask:
     return np.asarray(np.all((pixels >= -0.5) & (pixels <= np.array(size) - 0.5), axis=1))  # False for NaN
 
 

@@ -11,13 +11,11 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from ceres_cal.base.arrays import Array, Array32, Image, Mask
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.transforms import Array
-from ceres_cal.detect.images import Image
 
-Plane = NDArray[np.float32]
+Plane = Array32
 
 MOST_PIXELS, LONGEST_SIDE = 100_000_000, 32_000  # OpenCV's remap ends at 32 767
 _FINEST = 4  # small squares along a pixel
@@ -41,9 +39,9 @@ class Warp:
     size: tuple[int, int]
     photograph_size: tuple[int, int]
     fine: int
-    x: Plane
-    y: Plane
-    seen: NDArray[np.bool_]
+    x: Array32
+    y: Array32
+    seen: Mask
 
     @property
     def black(self) -> int:
@@ -87,7 +85,7 @@ def make_warp(size: tuple[int, int], photograph_size: tuple[int, int], places: C
     return Warp(size, photograph_size, fine, np.where(seen, x, -1.0), np.where(seen, y, -1.0), seen)
 
 
-def _placed(size: tuple[int, int], places: Callable[[Array], Array]) -> tuple[Plane, Plane]:
+def _placed(size: tuple[int, int], places: Callable[[Array], Array]) -> tuple[Array32, Array32]:
     """Places of all pixels and of one more around them."""
     across, down = (np.arange(-1.0, count + 1.0) for count in size)
     found = np.empty((len(down), len(across), 2), dtype=np.float32)
@@ -99,14 +97,14 @@ def _placed(size: tuple[int, int], places: Callable[[Array], Array]) -> tuple[Pl
     return found[..., 0], found[..., 1]
 
 
-def _divided(plane: Plane, fine: int) -> Plane:
+def _divided(plane: Array32, fine: int) -> Array32:
     """Of each pixel `fine` x `fine` squares, between their neighbours' middles; without the pixels around."""
     size = fine * plane.shape[1], fine * plane.shape[0]
     squares = plane if fine == 1 else cv2.resize(plane, size, interpolation=cv2.INTER_LINEAR)
     return np.asarray(squares[fine:-fine, fine:-fine])
 
 
-def _squares_along(x: Plane, y: Plane) -> int:
+def _squares_along(x: Array32, y: Array32) -> int:
     """How many pixels of the photograph most of the new ones span."""
     spans = [np.hypot(np.diff(x, axis=axis), np.diff(y, axis=axis)).ravel() for axis in (0, 1)]
     finite = np.concatenate(spans)

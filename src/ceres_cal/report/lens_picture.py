@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ceres_cal.base.transforms import Array
+from ceres_cal.base.arrays import Array
 from ceres_cal.base.words import powered
 from ceres_cal.report import canvas
 from ceres_cal.report.canvas import POINT, QUIET, Drawing

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ceres_cal.base.transforms import Array
+from ceres_cal.base.arrays import Array
 from ceres_cal.base.words import metres, mm, sentence, short
 from ceres_cal.calibration import Calibration
 from ceres_cal.moves import StationComparison

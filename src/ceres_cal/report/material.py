@@ -10,13 +10,13 @@ from pathlib import Path
 
 import numpy as np
 
+from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.errors import CalibrationError
-from ceres_cal.base.transforms import Array
 from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
 from ceres_cal.diagnostics import Choice, Diagnosis
 from ceres_cal.model.residuals import residuals
-from ceres_cal.observations.sights import Mask, gather_sights
+from ceres_cal.observations.sights import gather_sights
 from ceres_cal.report.quality import Quality, Seam
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.targets import Target, along_track

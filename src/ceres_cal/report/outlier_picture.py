@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ceres_cal.base.transforms import Array
+from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.words import fixed, grouped, short
-from ceres_cal.observations.sights import Rows
 from ceres_cal.report.canvas import INK, OUTLIER, QUIET, Drawing
 from ceres_cal.report.material import Material
 from ceres_cal.report.page import Figure, Table
@@ -58,7 +57,7 @@ def outliers(material: Material) -> Figure | None:
     )
 
 
-def _sigmas(material: Material, rows: Rows) -> Array:
+def _sigmas(material: Material, rows: Indices) -> Array:
     table = material.diagnosis.table
     sigmas = np.abs(table.distance_px[rows]) / (table.sigma_px[rows] * table.scale[rows])
     return np.where(np.isfinite(sigmas), sigmas, np.inf)

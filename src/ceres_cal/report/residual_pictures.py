@@ -9,11 +9,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ceres_cal.base.transforms import Array
+from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.words import fixed, grouped, short
 from ceres_cal.diagnostics import ResidualTable, Summary
 from ceres_cal.diagnostics.summaries import RadiusTrend
-from ceres_cal.observations.sights import Rows
 from ceres_cal.report import canvas
 from ceres_cal.report.canvas import CURVE, INK, OUTLIER, PAINT, POINT, QUIET, Drawing
 from ceres_cal.report.material import Material
@@ -63,8 +62,8 @@ def vectors(material: Material, name: str) -> Figure:
         f"Residual vectors over the image{_owner_suffix(material, name)}",
         f"Each stroke leads from an observation to where the model puts it, {field.enlarged} times enlarged; of a line "
         "or arc it is the shortest way to the curve. Strokes that point anyhow are noise. Dark: means of regions that "
-        f"noise cannot explain ({len(means.places)} of {means.regions}); where they grow or turn together, the model is "
-        f"wrong.{_thinned(len(field.inliers) + len(field.outliers), len(inliers) + len(outliers))}",
+        f"noise cannot explain ({len(means.places)} of {means.regions}); where they grow or turn together, the model "
+        f"is wrong.{_thinned(len(field.inliers) + len(field.outliers), len(inliers) + len(outliers))}",
         Drawing(field.draw, 0.93 * shape + 0.07),
         _region_table(material.diagnosis.summaries.regions, name),
         wide=True,
@@ -78,8 +77,8 @@ class _VectorField:
 
     camera: Camera
     table: ResidualTable
-    inliers: Rows
-    outliers: Rows
+    inliers: Indices
+    outliers: Indices
     typical_px: float
     means: RegionMeans
     paint: list[Array]
@@ -132,7 +131,7 @@ class RegionMeans:
     regions: int
 
 
-def significant_means(table: ResidualTable, rows: Rows, camera: Camera) -> RegionMeans:
+def significant_means(table: ResidualTable, rows: Indices, camera: Camera) -> RegionMeans:
     """Those of the image's regions that noise does not explain.
 
     A point tells both of its coordinates, a curve the one across it: least squares over the region, in their sigmas.
@@ -251,7 +250,7 @@ def _trend_rows(trend: RadiusTrend) -> Iterator[tuple[str, ...]]:
         yield f"{low:.0f} to {high:.0f}", fixed(mean, 4, "+"), fixed(sd, 4), fixed(mean / sd if sd else np.nan, 1, "+")
 
 
-def _outward(table: ResidualTable, rows: Rows, camera: Camera) -> tuple[Array, Array]:
+def _outward(table: ResidualTable, rows: Indices, camera: Camera) -> tuple[Array, Array]:
     """Radius and outward residual of some rows, px; NaN of a curve that runs outwards, and so tells nothing of it."""
     offsets, residual = camera.offsets(table.pixel[rows]), table.residual_px[rows]
     radius = np.asarray(np.linalg.norm(offsets, axis=1))

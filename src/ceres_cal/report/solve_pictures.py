@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ceres_cal.base.transforms import Array
+from ceres_cal.base.arrays import Array
 from ceres_cal.base.words import counted, fixed, short
 from ceres_cal.calibration import Calibration
-from ceres_cal.model.quantities import Key
+from ceres_cal.model.keys import Key
 from ceres_cal.report import canvas
 from ceres_cal.report.canvas import DIVERGING, OUTLIER, PAINT, POINT, Drawing
 from ceres_cal.report.material import ClosedForm, Material

@@ -11,8 +11,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import DegenerateError, InputError
-from ceres_cal.base.transforms import Array, Pose
+from ceres_cal.base.transforms import Pose
 from ceres_cal.scene.lens import Lens
 
 

@@ -19,8 +19,8 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.transforms import Array
 
 _STEPS = 60  # a safeguard: Newton needs 4 to 8, bisection 53
 _BLOCK = 16384  # rows at a time, so that what is worked on stays in the cache

@@ -14,11 +14,11 @@ from typing import Any
 
 import msgspec
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import convert
-from ceres_cal.base.transforms import Array
 
 MOVABLE = ("checkerboard", "rings")
 """Kinds of targets that lie where somebody put them; the others are the world."""
@@ -96,7 +96,7 @@ class Arc:
 Curve = Segment | Arc
 
 
-def along_track(track: ArrayLike, is_arc: bool | NDArray[np.bool_], s: ArrayLike) -> Array:
+def along_track(track: ArrayLike, is_arc: bool | Mask, s: ArrayLike) -> Array:
     """C(s) on one track (3, 3) or on one track per s (N, 3, 3): (N, 3) m."""
     tracks, s = np.asarray(track, dtype=float), np.asarray(s, dtype=float)
     first = np.where(is_arc, np.cos(s), s)
@@ -105,7 +105,7 @@ def along_track(track: ArrayLike, is_arc: bool | NDArray[np.bool_], s: ArrayLike
     return np.asarray(c + first[:, None] * a + second[:, None] * b)
 
 
-def nearest_on_track(tracks: Array, is_arc: NDArray[np.bool_], points: Array) -> Array:
+def nearest_on_track(tracks: Array, is_arc: Mask, points: Array) -> Array:
     """Parameter s (N,) of the place on each track (N, 3, 3) nearest to each point (N, 3)."""
     c, a, b = tracks[:, 0], tracks[:, 1], tracks[:, 2]
     away = points - c
@@ -164,7 +164,7 @@ class Target:
         ).reshape(3, -1, 3, 3)
 
     @cached_property
-    def is_arc(self) -> NDArray[np.bool_]:
+    def is_arc(self) -> Mask:
         """(C,) whether each curve is an arc."""
         return np.array([isinstance(curve, Arc) for curve in self.curves.values()], dtype=bool)
 

@@ -9,8 +9,8 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from ceres_cal.base.arrays import Indices32, Mask
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import write_bytes
 from ceres_cal.observations import taken
@@ -86,7 +86,7 @@ def _encoded(shot: Photograph, ending: str, quality: int) -> bytes:
     return content.tobytes()
 
 
-def _hidden_rows(simulation: Simulation, shot: Photograph, truth: Truth, view: NDArray[np.int32]) -> NDArray[np.bool_]:
+def _hidden_rows(simulation: Simulation, shot: Photograph, truth: Truth, view: Indices32) -> Mask:
     """Which rows a photograph shows something in front of."""
     here = np.array([(v.station, v.frame) == (shot.station, shot.frame) for v in simulation.observations.views])
     rows = here[view]
@@ -94,7 +94,7 @@ def _hidden_rows(simulation: Simulation, shot: Photograph, truth: Truth, view: N
     return np.asarray(rows)
 
 
-def _without(simulation: Simulation, points: NDArray[np.bool_], curves: NDArray[np.bool_]) -> Simulation:
+def _without(simulation: Simulation, points: Mask, curves: Mask) -> Simulation:
     """A simulation with these rows only."""
     observations = simulation.observations
     return replace(

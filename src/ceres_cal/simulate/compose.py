@@ -7,10 +7,11 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.transforms import Array, Pose, rotation_exp
+from ceres_cal.base.transforms import Pose, rotation_exp
 from ceres_cal.model.parameters import Station
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.targets import Target
@@ -111,7 +112,7 @@ def board_pose(
     return Pose(rotation, line_of_sight * distance_m - rotation @ middle)
 
 
-def well_inside(camera: Camera, points_world: Array) -> NDArray[np.bool_]:
+def well_inside(camera: Camera, points_world: Array) -> Mask:
     """(N,) whether points (N, 3) are before the camera, so far inside the image that noise keeps them there."""
     pixels = camera.project(points_world)
     with np.errstate(invalid="ignore"):

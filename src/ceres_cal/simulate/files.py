@@ -12,9 +12,10 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import check_header, convert, read_json, write_json
-from ceres_cal.base.transforms import Array, Pose, euler_from_rotation, rotation_exp, rotation_from_euler, rotation_log
+from ceres_cal.base.transforms import Pose, euler_from_rotation, rotation_exp, rotation_from_euler, rotation_log
 from ceres_cal.model.parameters import Station
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Radial, make_lens

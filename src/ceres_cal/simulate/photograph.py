@@ -7,9 +7,8 @@ from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from ceres_cal.base.transforms import Array
+from ceres_cal.base.arrays import Array, Array32, Image8, Mask
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.targets import Target, along_track
 from ceres_cal.simulate import render
@@ -17,8 +16,6 @@ from ceres_cal.simulate.photography import Photography
 from ceres_cal.simulate.scene import Scene
 from ceres_cal.simulate.things import Ball, Robot, Shadow, Thing, outline, patches, shadow_outline
 
-Image = NDArray[np.uint8]
-Plane = NDArray[np.float32]
 Stretches = Mapping[str, tuple[tuple[float, float], ...]]
 """Curve -> (from, to) m along it."""
 
@@ -46,13 +43,13 @@ class Photograph:
     station: str
     frame: str
     targets: Mapping[str, str | None]
-    image: Image
+    image: Image8
     things: tuple[Thing, ...]
     shadows: tuple[Shadow, ...]
     hidden: Mapping[str, Stretches]
-    cover: Image = field(repr=False)
+    cover: Image8 = field(repr=False)
 
-    def hides(self, pixels: Array) -> NDArray[np.bool_]:
+    def hides(self, pixels: Array) -> Mask:
         """(N,) whether a robot or a ball is in front of each pixel (N, 2); outside the image nothing is."""
         return _covered(self.cover, pixels)
 
@@ -122,7 +119,7 @@ def _places(camera: Camera, count: int, apart_m: float, rng: np.random.Generator
     return found
 
 
-def _drawn(things: Sequence[Thing], camera: Camera) -> tuple[Image, Image]:
+def _drawn(things: Sequence[Thing], camera: Camera) -> tuple[Image8, Image8]:
     """The things' colours (height, width, 3) and their cover (height, width), as canvases of bytes."""
     blank = render.blank_canvas(camera.image_size).shape
     colours, cover = np.zeros((*blank, 3), np.uint8), np.zeros(blank, np.uint8)
@@ -139,7 +136,7 @@ def _drawn(things: Sequence[Thing], camera: Camera) -> tuple[Image, Image]:
 # ---- light ----------------------------------------------------------------------------------------------------------
 
 
-def _light(camera: Camera, shadows: Sequence[Shadow], how: Photography, rng: np.random.Generator) -> Plane:
+def _light(camera: Camera, shadows: Sequence[Shadow], how: Photography, rng: np.random.Generator) -> Array32:
     """(height, width) light that reaches each pixel, 1 in the middle of an evenly lit image."""
     width, height = camera.image_size
     y, x = np.mgrid[0:height:_LIGHT_STEP, 0:width:_LIGHT_STEP].astype(np.float32)
@@ -160,7 +157,7 @@ def _light(camera: Camera, shadows: Sequence[Shadow], how: Photography, rng: np.
 # ---- surfaces -------------------------------------------------------------------------------------------------------
 
 
-def _painted(scene: Scene, shown: Mapping[str, str | None], camera: Camera) -> tuple[render.Canvas, Image]:
+def _painted(scene: Scene, shown: Mapping[str, str | None], camera: Camera) -> tuple[render.Canvas, Image8]:
     """The canvas of paint and print, and the mask (height, width) of pixels that paper covers."""
     canvas = render.blank_canvas(camera.image_size)
     paper = np.zeros((camera.image_size[1], camera.image_size[0]), np.uint8)
@@ -175,8 +172,8 @@ def _painted(scene: Scene, shown: Mapping[str, str | None], camera: Camera) -> t
 
 
 def _reflected(
-    canvas: render.Canvas, paper: Image, colours: Image, cover: Image, how: Photography, rng: np.random.Generator
-) -> Plane:
+    canvas: render.Canvas, paper: Image8, colours: Image8, cover: Image8, how: Photography, rng: np.random.Generator
+) -> Array32:
     """(height, width, 3) share of the light that comes from each pixel, through the lens."""
     printed = np.repeat(np.repeat(paper, render.SUBPIXELS, axis=0), render.SUBPIXELS, axis=1) if paper.any() else None
     if how.wear > 0.0:
@@ -198,13 +195,13 @@ def _reflected(
     return np.asarray(np.dstack(channels), dtype=np.float32)
 
 
-def _blurred(plane: Plane, sigma: float) -> Plane:
+def _blurred(plane: Array32, sigma: float) -> Array32:
     return (
         plane if sigma <= 0.0 else np.asarray(cv2.GaussianBlur(plane, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE))
     )
 
 
-def _noise(shape: Sequence[int], rng: np.random.Generator, scale_px: float) -> Plane:
+def _noise(shape: Sequence[int], rng: np.random.Generator, scale_px: float) -> Array32:
     """Random numbers of standard deviation 1 that are alike over about `scale_px`."""
     small = [int(np.ceil(size / scale_px)) + 3 for size in shape[:2]]
     rough = rng.standard_normal(small, dtype=np.float32)
@@ -212,7 +209,7 @@ def _noise(shape: Sequence[int], rng: np.random.Generator, scale_px: float) -> P
     return np.asarray(fine / max(float(np.std(fine[::5, ::5])), 1e-6), dtype=np.float32)
 
 
-def _worn(shape: Sequence[int], share: float, rng: np.random.Generator) -> Plane:
+def _worn(shape: Sequence[int], share: float, rng: np.random.Generator) -> Array32:
     """1 where the paint is gone, on a canvas: small patches, more of them in some places than in others."""
     fine = _noise(shape, rng, _WEAR_PATCH_PX * render.SUBPIXELS)
     level = fine + 0.5 * _noise(shape, rng, _BLOTCH_PX * render.SUBPIXELS)
@@ -220,7 +217,7 @@ def _worn(shape: Sequence[int], share: float, rng: np.random.Generator) -> Plane
     return np.clip(2.0 * (level - limit) + 0.5, 0.0, 1.0)
 
 
-def _carpet(shape: Sequence[int], how: Photography, rng: np.random.Generator) -> Plane:
+def _carpet(shape: Sequence[int], how: Photography, rng: np.random.Generator) -> Array32:
     fibres = _blurred(rng.standard_normal(shape, dtype=np.float32), 0.7)  # seen through the lens
     fibres /= max(float(np.std(fibres[::5, ::5])), 1e-6)
     texture = 0.8 * fibres + 0.6 * _noise(shape, rng, _BLOTCH_PX)
@@ -230,14 +227,14 @@ def _carpet(shape: Sequence[int], how: Photography, rng: np.random.Generator) ->
 # ---- the sensor -----------------------------------------------------------------------------------------------------
 
 
-def _exposed(light: Plane, reflected: Plane, how: Photography, rng: np.random.Generator) -> Image:
+def _exposed(light: Array32, reflected: Array32, how: Photography, rng: np.random.Generator) -> Image8:
     signal = reflected * (light * np.float32(how.exposure))[..., None]
     noise = rng.standard_normal(signal.shape, dtype=np.float32)
     noise *= np.sqrt(np.float32(how.read_noise**2) + np.float32(how.shot_noise) * np.maximum(signal, 0.0))
     return np.asarray(np.clip(np.round(signal + noise), 0.0, 255.0), dtype=np.uint8)
 
 
-def _compressed(image: Image, how: Photography) -> Image:
+def _compressed(image: Image8, how: Photography) -> Image8:
     if how.jpeg_quality == 0:
         return image
     _, content = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, how.jpeg_quality])
@@ -247,21 +244,21 @@ def _compressed(image: Image, how: Photography) -> Image:
 # ---- truth ----------------------------------------------------------------------------------------------------------
 
 
-def _covered(cover: Image, pixels: Array) -> NDArray[np.bool_]:
+def _covered(cover: Image8, pixels: Array) -> Mask:
     places = np.round(np.nan_to_num(render.on_canvas(pixels), nan=-1.0, posinf=-1.0, neginf=-1.0))
     inside = np.all((places >= 0) & (places < (cover.shape[1], cover.shape[0])), axis=1)
     x, y = np.where(inside[:, None], places, 0.0).astype(np.intp).T
     return np.asarray(inside & (cover[y, x] > 0))
 
 
-def _hidden(scene: Scene, name: str, placement: str | None, camera: Camera, cover: Image) -> Stretches:
+def _hidden(scene: Scene, name: str, placement: str | None, camera: Camera, cover: Image8) -> Stretches:
     """The stretches of each curve of a target that are covered."""
     target = scene.targets[name]
     before = camera.at(camera.cam_from_world @ scene.world_from_target(placement))
     return {curve: found for curve in target.curves if (found := _hidden_stretches(target, curve, before, cover))}
 
 
-def _hidden_stretches(target: Target, name: str, camera: Camera, cover: Image) -> tuple[tuple[float, float], ...]:
+def _hidden_stretches(target: Target, name: str, camera: Camera, cover: Image8) -> tuple[tuple[float, float], ...]:
     if not cover.any():
         return ()
     curve = target.curves[name]

@@ -12,16 +12,13 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from ceres_cal.base.transforms import Array
+from ceres_cal.base.arrays import Array, Array32, Image8, Indices
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.targets import Arc, Curve, Segment, Target, along_track
 
-Canvas = NDArray[np.float32]
+Canvas = Array32
 """(height, width) times SUBPIXELS: the share of each small square that is paint, or the brightness of paper there."""
-Bytes = NDArray[np.uint8]
-Rows = NDArray[np.intp]
 
 SUBPIXELS = 3
 SHIFT = 4  # binary digits after the point in OpenCV's drawing coordinates
@@ -40,8 +37,8 @@ class _Squares:
         along_x, along_y: (M, 2) what a step of one square to the right and down is on the plane, m.
     """
 
-    rows: Rows
-    columns: Rows
+    rows: Indices
+    columns: Indices
     plane: Array
     along_x: Array
     along_y: Array
@@ -62,7 +59,7 @@ def on_canvas(pixels: Array) -> Array:
     return np.asarray((pixels + 0.5) * SUBPIXELS - 0.5)
 
 
-def averaged(canvas: Canvas | Bytes) -> NDArray[np.float32]:
+def averaged(canvas: Canvas | Image8) -> Array32:
     """A canvas (or a stack of them along the last axis) as an image: what falls on each square pixel."""
     size = canvas.shape[1] // SUBPIXELS, canvas.shape[0] // SUBPIXELS
     return np.asarray(cv2.resize(canvas, size, interpolation=cv2.INTER_AREA), dtype=np.float32)
@@ -99,7 +96,7 @@ def curve_points(curve: Curve, side: int, pieces: int) -> Array:
     return along_track(curve.track(side), isinstance(curve, Arc), np.linspace(low, high, pieces + 1))
 
 
-def _near(curve: Curve, camera: Camera) -> Bytes:
+def _near(curve: Curve, camera: Camera) -> Image8:
     """The pixels that a curve's paint may touch, as a mask (height, width)."""
     width, height = camera.image_size
     mask = np.zeros((height, width), np.uint8)
@@ -115,7 +112,7 @@ def _near(curve: Curve, camera: Camera) -> Bytes:
     return mask
 
 
-def _squares(mask: Bytes, camera: Camera, height_m: float) -> Iterator[_Squares]:
+def _squares(mask: Image8, camera: Camera, height_m: float) -> Iterator[_Squares]:
     """The small squares of a mask's pixels on the plane z = height_m, some at a time."""
     y, x = np.nonzero(mask)
     for first in range(0, len(x), _BLOCK):
@@ -130,7 +127,7 @@ def _squares(mask: Bytes, camera: Camera, height_m: float) -> Iterator[_Squares]
         yield _divided(pixels[seen].astype(np.intp), middle[seen], along_x[seen], along_y[seen])
 
 
-def _divided(pixels: Rows, middle: Array, along_x: Array, along_y: Array) -> _Squares:
+def _divided(pixels: Indices, middle: Array, along_x: Array, along_y: Array) -> _Squares:
     """Pixels and their footprints, divided: within half a pixel the lens's map is straight to 1e-4 px."""
     j, i = (index.ravel() for index in np.indices((SUBPIXELS, SUBPIXELS)))
     place = middle[:, None] + _STEPS[i][:, None] * along_x[:, None] + _STEPS[j][:, None] * along_y[:, None]
@@ -201,7 +198,7 @@ def sheet_outline(target: Target) -> Array:
     return np.column_stack([border, np.zeros(len(border))])
 
 
-def print_sheet(canvas: Canvas, target: Target, camera: Camera) -> Bytes:
+def print_sheet(canvas: Canvas, target: Target, camera: Camera) -> Image8:
     """Print a board or a sheet of rings onto a canvas, and the mask (height, width) of the pixels it covers.
 
     The disc inside the first ring is dark, and from then on every other ring. The square between a board's corners
@@ -219,7 +216,7 @@ def print_sheet(canvas: Canvas, target: Target, camera: Camera) -> Bytes:
     return mask
 
 
-def fill(mask: Bytes, outline: Array, value: int | Sequence[int] = 1) -> None:
+def fill(mask: Image8, outline: Array, value: int | Sequence[int] = 1) -> None:
     """Fill a polygon (N, 2), in the coordinates of `mask` (height, width) or (height, width, channels)."""
     limit = 4 * max(mask.shape)
     rounded = np.round(np.clip(outline, -limit, limit) * 2**SHIFT).astype(np.int32)

@@ -6,18 +6,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ceres_cal.base.transforms import Array
+from ceres_cal.base.arrays import Array, Codes, Indices, Indices32, Mask
 from ceres_cal.observations import Curves, Observations, Points, View
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.targets import SIDES, Arc, Target, along_track, nearest_on_track
 from ceres_cal.simulate.scene import Disturbance, Scene, ViewPlan
 
 CLEAN, OUTLIER, WRONG_LABEL = 0, 1, 2
-
-Ints = NDArray[np.int32]
-Bools = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,11 +26,11 @@ class Truth:
         pixels: (N, 2) where it is seen without noise, px.
     """
 
-    flag: NDArray[np.int8]
-    feature: Ints
+    flag: Codes
+    feature: Indices32
     pixels: Array
 
-    def rows(self, flag: int) -> NDArray[np.intp]:
+    def rows(self, flag: int) -> Indices:
         """Numbers of the rows with this flag."""
         return np.flatnonzero(self.flag == flag)
 
@@ -59,24 +55,24 @@ class _InView:
     place. Points have neither. `features` is how many names a wrong label can be drawn from.
     """
 
-    feature: Ints
+    feature: Indices32
     pixels: Array
     features: int
     position_m: Array | None = None
-    neighbour: Ints | None = None
+    neighbour: Indices32 | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class _Rows:
     """Columns of the observations of one plan, with their truth; `view` counts from the first view of all plans."""
 
-    view: Ints
-    feature: Ints
+    view: Indices32
+    feature: Indices32
     pixels: Array
     sigma_px: Array
-    side: NDArray[np.int8]
-    flag: NDArray[np.int8]
-    true_feature: Ints
+    side: Codes
+    flag: Codes
+    true_feature: Indices32
     true_pixels: Array
 
 
@@ -114,12 +110,12 @@ def simulate(scene: Scene, disturbance: Disturbance | None = None, seed: int = 0
 # ---- what can be seen -----------------------------------------------------------------------------------------------
 
 
-def _inside(pixels: Array, image_size: tuple[int, int]) -> Bools:
+def _inside(pixels: Array, image_size: tuple[int, int]) -> Mask:
     """Whether pixels (N, 2) lie inside the image: within half a pixel of a pixel's centre."""
     return np.asarray(np.all((pixels >= -0.5) & (pixels <= np.array(image_size) - 0.5), axis=1))
 
 
-def _project_seen(scene: Scene, plan: ViewPlan, camera: Camera, points: Array) -> tuple[NDArray[np.intp], Array]:
+def _project_seen(scene: Scene, plan: ViewPlan, camera: Camera, points: Array) -> tuple[Indices, Array]:
     """Which of the target's points (N, 3) the camera sees, and their pixels."""
     points_world = scene.world_from_target(plan.placement).transform(points)
     ahead = np.flatnonzero(camera.cam_from_world.transform(points_world)[:, 2] > 0.0)
@@ -128,7 +124,7 @@ def _project_seen(scene: Scene, plan: ViewPlan, camera: Camera, points: Array) -
     return ahead[seen], pixels[seen]
 
 
-def _chosen(names: tuple[str, ...] | None, known: tuple[str, ...]) -> Ints:
+def _chosen(names: tuple[str, ...] | None, known: tuple[str, ...]) -> Indices32:
     """Indices of the chosen features, ascending."""
     if names is None:
         return np.arange(len(known), dtype=np.int32)
@@ -165,7 +161,7 @@ def _curves_in_view(scene: Scene, plan: ViewPlan, camera: Camera) -> _InView:
     return _InView(feature[rows], pixels, len(chosen), np.concatenate(positions)[rows], neighbour)
 
 
-def _neighbours(target: Target, feature: Ints, places: Array) -> Ints:
+def _neighbours(target: Target, feature: Indices32, places: Array) -> Indices32:
     """For each place (N, 3) on a curve, the nearest other curve of the target; the same one where there is no other."""
     nearest, distance = feature.copy(), np.full(len(places), np.inf)
     for i, curve in enumerate(target.curves.values()):
@@ -186,7 +182,7 @@ def _neighbours(target: Target, feature: Ints, places: Array) -> Ints:
 # ---- what is seen ---------------------------------------------------------------------------------------------------
 
 
-def _hidden_points(in_view: _InView, frames: int, disturbance: Disturbance, rng: np.random.Generator) -> Bools:
+def _hidden_points(in_view: _InView, frames: int, disturbance: Disturbance, rng: np.random.Generator) -> Mask:
     """(frames, N) which points are hidden."""
     shape = frames, len(in_view.feature)
     if disturbance.hidden_points == 0.0:
@@ -194,7 +190,7 @@ def _hidden_points(in_view: _InView, frames: int, disturbance: Disturbance, rng:
     return rng.random(shape) < disturbance.hidden_points
 
 
-def _hidden_stretches(in_view: _InView, frames: int, disturbance: Disturbance, rng: np.random.Generator) -> Bools:
+def _hidden_stretches(in_view: _InView, frames: int, disturbance: Disturbance, rng: np.random.Generator) -> Mask:
     """(frames, N) which places on curves are hidden: each stretch lies around one of the places in view."""
     count, stretches, position = len(in_view.feature), disturbance.hidden_stretches, in_view.position_m
     if position is None or count == 0 or stretches == 0:
@@ -215,7 +211,7 @@ def _hidden_stretches(in_view: _InView, frames: int, disturbance: Disturbance, r
 
 def _observe(
     in_view: _InView,
-    hidden: Bools,
+    hidden: Mask,
     first_view: int,
     side: int,
     sigma_px: float,
@@ -252,7 +248,7 @@ def _observe(
     return rows if np.all(kept) else _Rows(**{name: column[kept] for name, column in vars(rows).items()})
 
 
-def _mislabel(in_view: _InView, place: NDArray[np.intp], flag: NDArray[np.int8], rng: np.random.Generator) -> Ints:
+def _mislabel(in_view: _InView, place: Indices, flag: Codes, rng: np.random.Generator) -> Indices32:
     """The features as they are named: those of WRONG_LABEL rows by another name, where there is one."""
     feature = in_view.feature[place]
     wrong = np.flatnonzero(flag == WRONG_LABEL)

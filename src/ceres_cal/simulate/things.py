@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ceres_cal.base.transforms import Array
+from ceres_cal.base.arrays import Array
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.heights import ROBOT_TOP_M
 

@@ -5,28 +5,22 @@ over its free intrinsics alone; every other sight is one compressed block over i
 and its placement; each prior is one small block. What Ceres minimises is the same function either way.
 """
 
-from ceres_cal.solve.bundle import (
-    Progress,
-    Solution,
-    placement_costs,
-    prior_on_intrinsics,
-    private_placements,
-    settle_placements,
-    solve,
-)
-from ceres_cal.solve.costs import Weighting
-from ceres_cal.solve.information import Eliminated, Information, information
+from ceres_cal.solve.bundle import Progress, Solution, placement_costs, solve, with_placements_at_best
+from ceres_cal.solve.information import Eliminated, ReducedInformation, information
+from ceres_cal.solve.problem import Problem, Weighting
+from ceres_cal.solve.robust import RobustSolution, solve_robustly
 
 __all__ = [
     "Eliminated",
-    "Information",
+    "Problem",
     "Progress",
+    "ReducedInformation",
+    "RobustSolution",
     "Solution",
     "Weighting",
     "information",
     "placement_costs",
-    "prior_on_intrinsics",
-    "private_placements",
-    "settle_placements",
     "solve",
+    "solve_robustly",
+    "with_placements_at_best",
 ]

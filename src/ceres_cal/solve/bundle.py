@@ -2,40 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import pyceres
-from numpy.typing import NDArray
 
+from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import DegenerateError, InputError, SolutionError
 from ceres_cal.base.threads import at_most, available
-from ceres_cal.base.transforms import Array, Pose, Poses
-from ceres_cal.model.parameters import (
-    Estimate,
-    Layout,
-    Options,
-    Station,
-    intrinsic_names,
-    intrinsics_scales,
-    intrinsics_vector,
-    with_intrinsics,
-)
-from ceres_cal.observations import Prior
+from ceres_cal.base.transforms import Pose, Poses
+from ceres_cal.model.parameters import Estimate, Layout, Station, intrinsics_vector, with_intrinsics
 from ceres_cal.observations.sights import SightKey, Sights
-from ceres_cal.solve.costs import (
-    ROWS_WORTH_A_THREAD,
-    EliminatedCost,
-    LinearPriorCost,
-    PositionPriorCost,
-    Run,
-    SightCost,
-    Weighting,
-)
-from ceres_cal.solve.joint import joint_block
+from ceres_cal.solve.costs import ROWS_WORTH_A_THREAD, EliminatedCost, Run, SightCost
+from ceres_cal.solve.prior_cost import PriorCost
+from ceres_cal.solve.problem import Problem, Weighting
 
 _AT_REST = 10  # iterations
 _NOTHING_LEFT = "Nothing left to gain."
@@ -100,6 +83,10 @@ class _Blocks:
         )
         return [every[slot]() for slot in slots]
 
+    def owned_by(self, kind: str, name: str) -> Array:
+        """The array of a camera, a station, or the structure."""
+        return self.cameras[name] if kind == "camera" else self.stations[name] if kind == "station" else self.structure
+
     def unpack(self, estimate: Estimate, layout: Layout) -> Estimate:
         cameras = {}
         for name, camera in estimate.cameras.items():
@@ -126,21 +113,14 @@ class _Assembly:
     """Blocks that are worth a thread each."""
 
 
-def _assemble(
-    run: Run,
-    sights: Sights,
-    estimate: Estimate,
-    layout: Layout,
-    weighting: Weighting,
-    places: Array | None = None,
-) -> _Assembly:
-    private = private_placements(sights, layout)
+def _assemble(run: Run, problem: Problem, estimate: Estimate) -> _Assembly:
+    private, sights, layout = problem.private, problem.sights, problem.layout
     blocks = _Blocks.pack(estimate, layout, private)
     assembly = _Assembly(blocks, [], [])
     for camera in estimate.cameras:
-        own = _numbers(sights, camera, private)
+        own = sights.numbers(camera, placements=private)
         if len(own):
-            cost = EliminatedCost(run, sights.take(own), estimate, layout.free[camera], weighting, places)
+            cost = EliminatedCost(run, sights.take(own), problem, estimate)
             assembly.eliminated.append((cost, blocks.of(sights.keys[own[0]], cost.slots)))
     assembly.costs += assembly.eliminated
     for number, key in enumerate(sights.keys):
@@ -148,11 +128,12 @@ def _assemble(
             parts = list(_parts(sights[number]))
             assembly.threads = max(assembly.threads, len(parts))
             for part in parts:
-                sight_cost = SightCost(run, part, estimate, layout, weighting, places)
+                sight_cost = SightCost(run, part, problem, estimate)
                 assembly.costs.append((sight_cost, blocks.of(key, sight_cost.slots)))
-    assembly.costs += [(cost, [array]) for cost, array in _prior_blocks(layout, estimate, blocks)]
-    joint = joint_block(run, estimate, layout, blocks)
-    return assembly if joint is None else replace(assembly, costs=[*assembly.costs, joint])
+    for prior in problem.priors_at(estimate):
+        prior_cost = PriorCost(run, prior, estimate, layout)
+        assembly.costs.append((prior_cost, [blocks.owned_by(*owner) for owner in prior_cost.owners]))
+    return assembly
 
 
 class _Watcher(pyceres.IterationCallback):
@@ -208,39 +189,39 @@ def _parts(sight: Sights) -> list[Sights]:
 
 
 def solve(
-    sights: Sights,
+    problem: Problem,
     estimate: Estimate,
-    layout: Layout,
-    weighting: Weighting,
-    options: Options,
     progress: Callable[[Progress], None] | None = None,
-    places: Array | None = None,
+    *,
+    precision: float = 1e-14,
+    is_near: bool = True,
 ) -> Solution:
     """Minimise the robust cost over everything free, from `estimate`.
 
     Args:
-        progress: called at every iteration. places: feet of the curve observations, see `residuals`.
+        progress: called at every iteration. precision: relative change of the cost at which the solve ends.
+        is_near: whether the estimate is near the minimum. There plain Gauss-Newton is right where the loss is convex,
+            and phi against height creeps without it.
 
     Raises:
         DegenerateError: fewer observations than free numbers.
         SolutionError: the least cost lies where phi or the aspect is negative.
     """
-    _require_enough(sights, layout)
-    run = Run()
-    with at_most(options.threads):
-        assembly = _assemble(run, sights, estimate, layout, weighting, places)
-    watcher = _Watcher(run, progress, weighting.precision)
-    problem = pyceres.Problem()
+    _require_enough(problem, estimate)
+    run, layout = Run(), problem.layout
+    with at_most(problem.options.threads):
+        assembly = _assemble(run, problem, estimate)
+    ceres = pyceres.Problem()
     for cost, arrays in assembly.costs:
         if arrays:
-            problem.add_residual_block(cost, None, arrays)
+            ceres.add_residual_block(cost, None, arrays)
+    settings = _solver_options(problem, assembly, precision)
+    settings.callbacks = [_Watcher(run, progress, precision)]
+    if is_near and problem.weighting.is_convex:
+        settings.initial_trust_region_radius = 1e8
     summary = pyceres.SolverSummary()
     with _quiet():
-        pyceres.solve(
-            _solver_options(layout, assembly.blocks, options, weighting, assembly.threads, watcher),
-            problem,
-            summary,
-        )
+        pyceres.solve(settings, ceres, summary)
     if run.failure is not None:
         raise run.failure
     try:
@@ -248,7 +229,7 @@ def solve(
     except InputError as error:  # phi or aspect below 0
         raise SolutionError(f"the solve ended at no camera ({error}): check labels and target dimensions") from None
     for eliminated, arrays in assembly.eliminated:
-        solved = solved.with_placements(*eliminated.settled(arrays))
+        solved = solved.with_placements(*eliminated.converged(arrays))
     return Solution(
         solved,
         float(summary.final_cost),
@@ -260,11 +241,7 @@ def solve(
 
 
 def placement_costs(
-    sights: Sights,
-    estimate: Estimate,
-    weighting: Weighting,
-    poses: Array,
-    tolerance: float = 1e-6,
+    sights: Sights, estimate: Estimate, weighting: Weighting, poses: Array, tolerance: float = 1e-6
 ) -> tuple[Array, Array]:
     """Costs (S,) and cam_from_target (S, 3, 4) of one camera's sights after each placement alone was solved for.
 
@@ -272,26 +249,20 @@ def placement_costs(
         poses: (S, 3, 4) where the search for each cam_from_target starts; a start from where an observation cannot be
             projected costs infinity. tolerance: relative, of each cost.
     """
-    held = np.empty(0, dtype=np.int64)
-    return EliminatedCost(Run(), sights, estimate, held, weighting).from_poses(poses, tolerance)
+    held = Layout({sights.keys[0].camera: np.empty(0, dtype=np.int64)}, frozenset(), frozenset())
+    problem = Problem(sights, held, weighting=weighting)
+    return EliminatedCost(Run(), sights, problem, estimate).from_poses(poses, tolerance)
 
 
-def settle_placements(sights: Sights, estimate: Estimate, layout: Layout, weighting: Weighting) -> Estimate:
+def with_placements_at_best(problem: Problem, estimate: Estimate) -> Estimate:
     """The estimate with every private placement where it fits best, everything else held."""
-    private = private_placements(sights, layout)
     for camera in estimate.cameras:
-        own = sights.take(_numbers(sights, camera, private))
+        own = problem.sights.take(problem.sights.numbers(camera, placements=problem.private))
         if len(own):
             poses = estimate.pose_stack(own.keys)
-            _, found = placement_costs(own, estimate, weighting, poses, _POSED)
-            estimate = estimate.with_placements(own.keys, found)
+            _, best = placement_costs(own, estimate, problem.weighting, poses, _POSED)
+            estimate = estimate.with_placements(own.keys, best)
     return estimate
-
-
-def _numbers(sights: Sights, camera: str, placements: Container[str | None]) -> NDArray[np.int64]:
-    """Of a camera's sights of these placements."""
-    keys = enumerate(sights.keys)
-    return np.array([i for i, key in keys if key.camera == camera and key.placement in placements], dtype=np.int64)
 
 
 def _rests(history: Sequence[float]) -> bool:
@@ -300,82 +271,27 @@ def _rests(history: Sequence[float]) -> bool:
     return len(last) == _AT_REST and max(last) - min(last) <= 1e-11 * max(last)
 
 
-def private_placements(sights: Sights, layout: Layout) -> frozenset[str | None]:
-    """Free placements that a single sight shows."""
-    return layout.placements & sights.seen_once
-
-
-def _require_enough(sights: Sights, layout: Layout) -> None:
-    equations = sights.equations + sum(
-        len(prior.value) for prior in layout.priors
-    )  # each structure number has a prior of its own
-    if equations < layout.unknowns:
+def _require_enough(problem: Problem, estimate: Estimate) -> None:
+    unknowns = problem.layout.size + len(estimate.structure.values)
+    known = unknowns - problem.unknowns(estimate)
+    if problem.sights.equations + known < unknowns:
         raise DegenerateError(
-            f"{equations} measured numbers (two a point, one a curve observation or prior) cannot determine "
-            f"{layout.unknowns} unknowns: add observations, or fix some of the unknowns"
+            f"{problem.sights.equations + known} measured numbers (two a point, one a curve observation or prior) "
+            f"cannot determine {unknowns} unknowns: add observations, or fix some of the unknowns"
         )
 
 
-def _solver_options(
-    layout: Layout,
-    blocks: _Blocks,
-    options: Options,
-    weighting: Weighting,
-    threads: int,
-    watcher: _Watcher,
-) -> Any:
+def _solver_options(problem: Problem, assembly: _Assembly, precision: float) -> Any:
     solver = pyceres.SolverOptions()
-    kept = sum(len(free) for free in layout.free.values())
-    kept += 6 * len(layout.stations) if blocks.placements else 0
+    kept = sum(len(free) for free in problem.layout.free.values())
+    kept += 6 * len(problem.layout.stations) if assembly.blocks.placements else 0
     few = kept < _DENSE_LIMIT
     solver.linear_solver_type = pyceres.LinearSolverType.DENSE_SCHUR if few else pyceres.LinearSolverType.SPARSE_SCHUR
-    solver.max_num_iterations = options.max_iterations
-    solver.function_tolerance = weighting.precision
-    # Near the end of a convex problem plain Gauss-Newton is right, and phi against height creeps without it.
-    if not weighting.rough and weighting.loss in ("trivial", "huber", "soft_l1"):
-        solver.initial_trust_region_radius = 1e8
+    solver.max_num_iterations = problem.options.max_iterations
+    solver.function_tolerance = precision
     solver.parameter_tolerance = 1e-12
     solver.gradient_tolerance = 1e-14
     # Short kernels are over before Python's lock is had; only parts of very large sights are worth a thread each.
-    solver.num_threads = threads
+    solver.num_threads = assembly.threads
     solver.logging_type = pyceres.LoggingType.SILENT
-    solver.callbacks = [watcher]
     return solver
-
-
-def _prior_blocks(layout: Layout, estimate: Estimate, blocks: _Blocks) -> Iterable[tuple[Any, Array]]:
-    """The cost and the array of each prior on something free."""
-    for prior in layout.priors:
-        if prior.owner == "station":
-            if prior.name in layout.stations:
-                axes = np.array([2] if prior.quantity == "height_m" else [0, 1, 2])
-                cost = PositionPriorCost(axes, np.asarray(prior.value), np.asarray(prior.sigma))
-                yield cost, blocks.stations[prior.name]
-            continue
-        places, mean, sigma = prior_on_intrinsics(prior, estimate, layout.free)
-        if len(places):
-            array = blocks.cameras[prior.name]
-            yield LinearPriorCost(places, mean, sigma, len(array)), array
-    sigma_m, fresh = estimate.structure.sigma_m, own_structure(layout, estimate)
-    if len(fresh):
-        yield LinearPriorCost(fresh, np.zeros(len(fresh)), sigma_m[fresh], len(sigma_m)), blocks.structure
-
-
-def own_structure(layout: Layout, estimate: Estimate) -> NDArray[np.int64]:
-    """Places of the structure numbers under their tolerance, not under the joint prior, which holds theirs."""
-    known = frozenset() if layout.joint is None else layout.joint.structure_names
-    return np.array([i for i, name in enumerate(estimate.structure.names) if name not in known], dtype=np.int64)
-
-
-def prior_on_intrinsics(
-    prior: Prior, estimate: Estimate, free: Mapping[str, NDArray[np.int64]]
-) -> tuple[NDArray[np.int64], Array, Array]:
-    """Places in the camera's block, mean and sigma in the solver's units; a number that is held needs no prior."""
-    camera = estimate.cameras[prior.name]
-    names = intrinsic_names(camera.lens)
-    quantities = ("cx", "cy") if prior.quantity == "principal_point" else (prior.quantity,)
-    wanted = np.array([names.index(quantity) for quantity in quantities])
-    scales = intrinsics_scales(camera)[wanted]
-    held = np.isin(wanted, free[prior.name])
-    places = np.searchsorted(free[prior.name], wanted[held])
-    return places, (np.asarray(prior.value) * scales)[held], (np.asarray(prior.sigma) * scales)[held]

@@ -1,4 +1,4 @@
-"""The cost functions that Ceres calls: compressed sights, eliminated placements, priors (design, sections 5 and 6)."""
+"""The cost functions of the observations that Ceres calls: compressed sights, eliminated placements."""
 
 from __future__ import annotations
 
@@ -11,40 +11,19 @@ import pyceres
 from numpy.typing import NDArray
 
 from ceres_cal import kernels
+from ceres_cal.base.arrays import Array
 from ceres_cal.base.threads import parts_of, run_parts
-from ceres_cal.base.transforms import Array, left_jacobian, rotation_exp, skew
-from ceres_cal.model.parameters import Estimate, Layout
-from ceres_cal.model.residuals import lens_arguments, starting_places
+from ceres_cal.model.parameters import Estimate
+from ceres_cal.model.residuals import lens_arguments, starting_feet
 from ceres_cal.model.structure import Structure
 from ceres_cal.observations.sights import SightKey, Sights
+from ceres_cal.solve.problem import Problem, Weighting
 
 ROWS_WORTH_A_THREAD = 20_000
 NORMAL_NS = 60.0
 """That an observation's share of the normal equations takes."""
 _NOTHING = np.empty(0)
 _LEFT_TO_THE_COMPLEMENT = 1e-2  # of a sight's cost, by the step its pose would take
-
-
-@dataclass(frozen=True)
-class Weighting:
-    """How residuals become costs, and how far down they are followed.
-
-    Attributes:
-        point_scale, curve_scale: noise scales, factors on the stated sigmas.
-        loss, loss_scale: robust loss of each observation, its scale in standard deviations.
-        precision: relative change of the cost at which the solve ends.
-    """
-
-    point_scale: float = 1.0
-    curve_scale: float = 1.0
-    loss: str = "huber"
-    loss_scale: float = 2.5
-    precision: float = 1e-14
-
-    @property
-    def rough(self) -> bool:
-        """Whether the solve only prepares another one."""
-        return self.precision > 1e-6
 
 
 @dataclass(eq=False)
@@ -63,17 +42,15 @@ class SightCost(pyceres.CostFunction):
             are held.
     """
 
-    def __init__(
-        self, run: Run, sight: Sights, estimate: Estimate, layout: Layout, weighting: Weighting, places: Array | None
-    ) -> None:
+    def __init__(self, run: Run, sight: Sights, problem: Problem, estimate: Estimate) -> None:
         super().__init__()
         self._run, self._sight, self._structure = run, sight, estimate.structure
-        key = sight.key
+        key, layout, weighting = sight.key, problem.layout, problem.weighting
         code, vector, powers, unit = lens_arguments(estimate.cameras[key.camera])
         free = layout.free[key.camera]
         self._static = (
             code, vector, free, powers, unit, *kernel_columns(sight, estimate.structure, weighting),
-            starting_places(sight, estimate, places),
+            starting_feet(sight, estimate, problem.feet),
             estimate.structure.track_slots, kernels.LOSS_CODES[weighting.loss], weighting.loss_scale,
         )  # fmt: skip
         self._poses = [estimate.stations[key.station].cam_from_world.log(), np.zeros(6)]
@@ -162,26 +139,18 @@ class _Evaluation:
 class EliminatedCost(pyceres.CostFunction):
     """All sights of one camera whose placements no other station sees, over its free intrinsics and the structure."""
 
-    def __init__(
-        self,
-        run: Run,
-        sights: Sights,
-        estimate: Estimate,
-        free: NDArray[np.int64],
-        weighting: Weighting,
-        places: Array | None = None,
-    ) -> None:
+    def __init__(self, run: Run, sights: Sights, problem: Problem, estimate: Estimate) -> None:
         super().__init__()
-        self.camera = sights.keys[0].camera
+        self.camera, weighting = sights.keys[0].camera, problem.weighting
         self._run, self._sights, self._structure = run, sights, estimate.structure
         self._optics = lens_arguments(estimate.cameras[self.camera])
-        self._free = free
+        self._free = problem.layout.free[self.camera]
         pixels, weights, slots, bends, is_arc, track, curve_pixels, curve_weights = kernel_columns(
             sights, estimate.structure, weighting
         )
         self._observations = (
             sights.point_bounds, pixels, weights, slots, bends, is_arc, sights.curve_bounds, track, curve_pixels,
-            curve_weights, starting_places(sights, estimate, places), estimate.structure.track_slots,
+            curve_weights, starting_feet(sights, estimate, problem.feet), estimate.structure.track_slots,
         )  # fmt: skip
         self._loss = (kernels.LOSS_CODES[weighting.loss], weighting.loss_scale)
         sizes = (len(self._free), len(estimate.structure.values))
@@ -262,47 +231,10 @@ class EliminatedCost(pyceres.CostFunction):
         swept = self._swept(self._accepted.at, tolerance)
         return swept.costs, swept.poses
 
-    def settled(self, parameters: Sequence[Array]) -> tuple[tuple[SightKey, ...], Array]:
+    def converged(self, parameters: Sequence[Array]) -> tuple[tuple[SightKey, ...], Array]:
         """The sights' keys and their cam_from_target, (S, 3, 4), at their best for these numbers."""
         at = np.concatenate([_NOTHING, *parameters])
         # At rest they have come to rest as well; elsewhere, or where Ceres had nothing to move, they are sought.
         if not len(self._accepted.residuals) or not np.array_equal(self._accepted.at, at):
             self._accepted = self._evaluated(at, 1e-14) or self._accepted
         return self._sights.keys, self._accepted.poses
-
-
-class LinearPriorCost(pyceres.CostFunction):
-    """(value - mean) / sigma of some free intrinsics of one camera."""
-
-    def __init__(self, places: NDArray[np.int64], mean: Array, sigma: Array, size: int) -> None:
-        super().__init__()
-        self._places, self._mean, self._sigma = places, mean, sigma
-        self.set_num_residuals(len(places))
-        self.set_parameter_block_sizes([size])
-
-    def Evaluate(self, parameters: Sequence[Array], residuals: Array, jacobians: Sequence[Array] | None) -> bool:
-        residuals[:] = (parameters[0][self._places] - self._mean) / self._sigma
-        if jacobians is not None:
-            jacobian = jacobians[0].reshape(len(residuals), -1)
-            jacobian[:] = 0.0
-            jacobian[np.arange(len(residuals)), self._places] = 1.0 / self._sigma
-        return True
-
-
-class PositionPriorCost(pyceres.CostFunction):
-    """(position - mean) / sigma of a station, on some axes: position = -R^T t."""
-
-    def __init__(self, axes: NDArray[np.int64], mean: Array, sigma: Array) -> None:
-        super().__init__()
-        self._axes, self._mean, self._sigma = axes, mean, sigma
-        self.set_num_residuals(len(axes))
-        self.set_parameter_block_sizes([6])
-
-    def Evaluate(self, parameters: Sequence[Array], residuals: Array, jacobians: Sequence[Array] | None) -> bool:
-        vector = parameters[0]
-        inverse = rotation_exp(vector[:3]).T
-        residuals[:] = ((-inverse @ vector[3:])[self._axes] - self._mean) / self._sigma
-        if jacobians is not None:
-            turned = -inverse @ skew(vector[3:]) @ left_jacobian(vector[:3])
-            jacobians[0].reshape(-1, 6)[:] = np.hstack([turned, -inverse])[self._axes] / self._sigma[:, None]
-        return True

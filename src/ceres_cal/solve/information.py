@@ -1,38 +1,32 @@
 """What observations and priors say of every number, where an estimate stands: J^T W J, nothing moved (design, 6).
 
 Every sight gives its compressed normal equations once; placements that one station sees are eliminated, the rest is
-added up over what is shared, in the coordinates of `quantities`.
+added up over what is shared, in the coordinates of `model.keys`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import reduce
+from operator import add
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ceres_cal import kernels
+from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.errors import SolutionError
 from ceres_cal.base.spread import known_inverses
 from ceres_cal.base.threads import parts_of, run_parts
-from ceres_cal.base.transforms import Array
-from ceres_cal.model.parameters import Estimate, Layout, intrinsics_scales
-from ceres_cal.model.quantities import (
-    Key,
-    from_placement,
-    from_station,
-    places_of,
-    pose_keys,
-    shared_keys,
-    sigma_limits,
-)
-from ceres_cal.model.residuals import lens_arguments, starting_places
+from ceres_cal.model.information import Information
+from ceres_cal.model.keys import Key, columns_by_owner, pose_keys, sigma_limits
+from ceres_cal.model.parameters import Estimate, intrinsics_scales
+from ceres_cal.model.quantities import free_keys, from_placement, from_station
+from ceres_cal.model.residuals import lens_arguments, starting_feet
 from ceres_cal.observations.sights import SightKey, Sights
-from ceres_cal.solve.bundle import own_structure, private_placements
-from ceres_cal.solve.costs import NORMAL_NS, Weighting, kernel_columns
+from ceres_cal.solve.costs import NORMAL_NS, kernel_columns
+from ceres_cal.solve.problem import Problem
 
-Places = NDArray[np.int64]
 _BATCH = 2_000_000  # numbers of normal equations worked on at once
 
 
@@ -42,164 +36,197 @@ class Eliminated:
 
     Attributes:
         names: (S). own: (S, 6, 6) information about each with everything shared held; inverses: (S, 6, 6) of that,
-            over what it tells.
-        gains: (S, 6, K); a step d of the shared numbers at `places` (K,) takes each placement along by -gains d.
+            over what is known. rank: directions of all of them that are known.
+        gains: (S, 6, K); a step d of the shared numbers `keys` (K) takes each placement along by -gains d.
     """
 
     names: tuple[str, ...]
     own: Array
     inverses: Array
     gains: Array
-    places: Places
+    keys: tuple[Key, ...]
+
+    @property
+    def ranks(self) -> Array:
+        """(S,) directions of each that its own observations determine."""
+        return np.asarray(np.einsum("sij,sji->s", self.own, self.inverses))
 
 
 @dataclass(frozen=True, eq=False)
-class Information:
-    """J^T W J of everything shared, private placements eliminated; priors are in it.
+class ReducedInformation:
+    """J^T W J of everything shared, private placements eliminated.
 
     Attributes:
-        keys: (P) of the shared numbers. matrix: (P, P). eliminated: the private placements, by station.
+        points, curves: what the observations of either kind say. priors: what was known before.
+        eliminated: the private placements, by station.
+        point_leverage, curve_leverage: equations of either kind that private placements take up by themselves.
     """
 
-    keys: tuple[Key, ...]
-    matrix: Array
+    points: Information
+    curves: Information
+    priors: Information
     eliminated: tuple[Eliminated, ...]
+    point_leverage: float
+    curve_leverage: float
+
+    @property
+    def shared(self) -> Information:
+        """All of it together."""
+        return self.points + self.curves + self.priors
+
+    @property
+    def leverages(self) -> tuple[float, float]:
+        """Equations of points and of curves that the free numbers take up: the traces of the hat matrix."""
+        covariance = self.shared.inverse
+        return (
+            self.point_leverage + float(np.sum(covariance * self.points.matrix)),
+            self.curve_leverage + float(np.sum(covariance * self.curves.matrix)),
+        )
 
 
-def information(
-    sights: Sights, estimate: Estimate, layout: Layout, weighting: Weighting, places: Array | None = None
-) -> Information:
+def information(problem: Problem, estimate: Estimate) -> ReducedInformation:
     """What the observations and priors say of the free intrinsics, stations, placements and structure.
 
     Each observation counts with its robust weight rho'. For a placement to be eliminated rightly it must be at its
     best, as it is after a solve.
 
-    Args:
-        places: feet of the curve observations, see `residuals`.
-
     Raises:
         SolutionError: an observation cannot be projected from there.
     """
-    private = private_placements(sights, layout)
-    keys = shared_keys(estimate, layout, private)
-    matrix, owned = np.zeros((len(keys), len(keys))), _owned(keys)
-    alone = [number for number, key in enumerate(sights.keys) if key.placement in private]
-    eliminated = []
-    for name in dict.fromkeys(sights.keys[number].station for number in alone):
-        own = sights.take(np.array([number for number in alone if sights.keys[number].station == name]))
-        parts = list(_normals(own, estimate, layout, weighting, places))
-        eliminated.append(_eliminate(own, parts, estimate, owned, matrix))
-    for number in np.delete(np.arange(len(sights)), alone):
-        sight = sights[int(number)]
-        for pose, normal in _normals(sight, estimate, layout, weighting, places):
-            _add(sight.key, pose[0], normal[0], estimate, owned, matrix)
-    _add_priors(keys, estimate, layout, matrix)
-    return Information(keys, 0.5 * (matrix + matrix.T), tuple(eliminated))
+    return _Sums(problem, estimate).result()
 
 
-Owned = Callable[[str, str], Places]
+class _Sums:
+    """The sums of one pass over the sights."""
+
+    def __init__(self, problem: Problem, estimate: Estimate) -> None:
+        self._problem, self._estimate = problem, estimate
+        self._keys = free_keys(estimate, problem.layout, problem.private)
+        self._columns = {owner: np.array(at, dtype=np.int64) for owner, at in columns_by_owner(self._keys).items()}
+        structure = [column for column, key in enumerate(self._keys) if key.kind == "structure"]
+        self._structure = np.array(structure, dtype=np.int64)
+        size = len(self._keys)
+        self._matrices, self._leverages = np.zeros((2, size, size)), np.zeros(2)  # of points, of curves
+
+    def result(self) -> ReducedInformation:
+        """Everything that the problem says."""
+        sights, private = self._problem.sights, self._problem.private
+        alone = sights.numbers(placements=private)
+        eliminated = []
+        for name in dict.fromkeys(sights.keys[number].station for number in alone):
+            own = sights.take(sights.numbers(station=name, placements=private))
+            eliminated.append(self._eliminate(own))
+        for number in np.delete(np.arange(len(sights)), alone):
+            sight = sights[int(number)]
+            for pose, normals in self._normals(sight):
+                self._add(sight.key, pose[0], {kind: normal[0] for kind, normal in normals.items()})
+        points, curves = (Information(self._keys, 0.5 * (matrix + matrix.T)) for matrix in self._matrices)
+        priors = [prior.information for prior in self._problem.priors_at(self._estimate)]
+        known = reduce(add, priors, Information.nothing(self._keys))
+        return ReducedInformation(points, curves, known, tuple(eliminated), *self._leverages.tolist())
+
+    def _owned(self, kind: str, name: str) -> Indices:
+        return self._columns.get((kind, name), np.empty(0, dtype=np.int64))
+
+    def _normals(self, sights: Sights) -> Iterator[tuple[Array, dict[int, Array]]]:
+        """cam_from_frame (n, 3, 4) of a camera's sights, and normal equations (n, K, K) by kind: of points (0) and of
+        curves (1), where there are any; in batches. K is [free intrinsics in the units of the files | structure | left
+        perturbation of the pose: turn, shift].
+        """
+        kernel_of = {
+            kind: _Normals(own, self._problem, self._estimate)
+            for kind, own in enumerate(sights.by_kind)
+            if own.equations
+        }
+        poses = self._estimate.pose_stack(sights.keys)
+        size = len(self._problem.layout.free[sights.keys[0].camera]) + len(self._estimate.structure.values) + 6
+        batch = max(1, _BATCH // size**2)
+        for first in range(0, len(sights), batch):
+            last = min(first + batch, len(sights))
+            parts = [
+                first + place
+                for place in parts_of(last - first, len(sights.points) + len(sights.curve_pixels), NORMAL_NS)
+            ]
+            yield poses[first:last], {k: np.concatenate(run_parts(one.of, parts)) for k, one in kernel_of.items()}
+
+    def _eliminate(self, sights: Sights) -> Eliminated:
+        """The private placements of one station; what is left of their sights is added to the sums."""
+        key = sights.keys[0]
+        world = self._estimate.stations[key.station].cam_from_world
+        lead = np.concatenate([self._owned("camera", key.camera), self._structure])
+        station = self._owned("station", key.station)
+        stacks, limits = [], sigma_limits(pose_keys("placement", ""))
+        for poses, normals in self._normals(sights):
+            chain = from_placement(poses, world)
+            whole = np.sum(list(normals.values()), axis=0)
+            own = np.swapaxes(chain, 1, 2) @ whole[:, -6:, -6:] @ chain
+            inverse = known_inverses(own, limits)
+            gain = inverse @ (np.swapaxes(chain, 1, 2) @ whole[:, -6:, :-6])
+            self._add_reduced(lead, normals, chain, inverse, gain)
+            if len(station):  # the placement makes up for whatever its station does: the chain is orthogonal
+                gain = np.concatenate([gain, np.swapaxes(chain, 1, 2) @ from_station(poses, world)], axis=2)
+            stacks.append((own, inverse, gain))
+        own, inverse, gain = (np.concatenate(parts) for parts in zip(*stacks, strict=True))
+        names = tuple(str(key.placement) for key in sights.keys)
+        return Eliminated(names, own, inverse, gain, tuple(self._keys[i] for i in np.concatenate([lead, station])))
+
+    def _add_reduced(self, lead: Indices, normals: dict[int, Array], chain: Array, inverse: Array, gain: Array) -> None:
+        """V^T N V of each kind, with V how a sight's numbers follow the shared ones, summed over the sights."""
+        follows = chain @ gain
+        for kind, normal in normals.items():
+            coupling, own = normal[:, -6:, :-6], np.swapaxes(chain, 1, 2) @ normal[:, -6:, -6:] @ chain
+            taken = coupling.reshape(-1, len(lead)).T @ follows.reshape(-1, len(lead))
+            reduced = np.sum(normal[:, :-6, :-6], axis=0) - taken
+            if len(normals) > 1:  # of all kinds together the placements are at their best, not of each
+                left = coupling - normal[:, -6:, -6:] @ follows
+                reduced -= follows.reshape(-1, len(lead)).T @ left.reshape(-1, len(lead))
+            self._matrices[kind][np.ix_(lead, lead)] += reduced
+            self._leverages[kind] += float(np.einsum("sij,sji->", own, inverse))
+
+    def _add(self, key: SightKey, pose: Array, normals: dict[int, Array]) -> None:
+        """What a sight that nothing is eliminated from says, added to the sums."""
+        world, lead = self._estimate.stations[key.station].cam_from_world, len(next(iter(normals.values()))) - 6
+        at = [self._owned("camera", key.camera), self._structure]
+        chain = [np.eye(lead + 6)[:, :lead]]
+        if len(station := self._owned("station", key.station)):
+            at.append(station)
+            chain.append(np.vstack([np.zeros((lead, 6)), from_station(pose[None], world)[0]]))
+        if key.placement is not None and len(placement := self._owned("placement", key.placement)):
+            at.append(placement)
+            chain.append(np.vstack([np.zeros((lead, 6)), from_placement(pose[None], world)[0]]))
+        steps, everywhere = np.hstack(chain), np.concatenate(at)
+        for kind, normal in normals.items():
+            self._matrices[kind][np.ix_(everywhere, everywhere)] += steps.T @ normal @ steps
 
 
-def _owned(keys: Sequence[Key]) -> Owned:
-    """Where the keys of an owner are, by kind and name; all structure numbers are the structure's."""
-    places = {owner: np.array(at, dtype=np.int64) for owner, at in places_of(keys).items()}
-    structure = np.array([i for i, key in enumerate(keys) if key.kind == "structure"], dtype=np.int64)
-    nothing = np.empty(0, dtype=np.int64)
-    return lambda kind, name: structure if kind == "structure" else places.get((kind, name), nothing)
+class _Normals:
+    """The normal equations of one camera's sights, as the kernels give them."""
 
+    def __init__(self, sights: Sights, problem: Problem, estimate: Estimate) -> None:
+        camera = estimate.cameras[sights.keys[0].camera]
+        code, vector, powers, unit = lens_arguments(camera)
+        free, structure, weighting = problem.layout.free[sights.keys[0].camera], estimate.structure, problem.weighting
+        pixels, weights, slots, bends, is_arc, track, curve_pixels, curve_weights = kernel_columns(
+            sights, structure, weighting
+        )
+        self._size = len(free) + len(structure.values) + 6
+        units = np.ones(self._size)
+        units[: len(free)] = intrinsics_scales(camera)[free]
+        self._arguments = (
+            code, vector, free, powers, unit, sights.point_bounds, pixels, weights, slots, bends, is_arc,
+            sights.curve_bounds, track, curve_pixels, curve_weights, starting_feet(sights, estimate, problem.feet),
+            structure.track_slots, kernels.LOSS_CODES[weighting.loss], weighting.loss_scale, False,
+            structure.points(sights), structure.tracks(sights), len(structure.values),
+            estimate.pose_stack(sights.keys), units,
+        )  # fmt: skip
 
-def _normals(
-    sights: Sights, estimate: Estimate, layout: Layout, weighting: Weighting, places: Array | None
-) -> Iterator[tuple[Array, Array]]:
-    """cam_from_frame (n, 3, 4) and normal equations (n, K, K) of a camera's sights, in batches; K is [free intrinsics
-    in the units of the files | structure | left perturbation of the pose: turn, shift].
-    """
-    camera = estimate.cameras[sights.keys[0].camera]
-    code, vector, powers, unit = lens_arguments(camera)
-    free, structure = layout.free[sights.keys[0].camera], estimate.structure
-    pixels, weights, slots, bends, is_arc, track, curve_pixels, curve_weights = kernel_columns(
-        sights, structure, weighting
-    )
-    starts = starting_places(sights, estimate, places)
-    poses = estimate.pose_stack(sights.keys)
-    points, tracks = structure.points(sights), structure.tracks(sights)
-    size = len(free) + len(structure.values) + 6
-    units = np.ones(size)
-    units[: len(free)] = intrinsics_scales(camera)[free]
+    def of(self, first: int, last: int) -> Array:
+        """(n, K, K) of the sights from one number to another.
 
-    def told(first: int, last: int) -> Array:
-        normals = np.empty((last - first, size, size))
-        if not kernels.sight_normals(
-            first, last, code, vector, free, powers, unit, sights.point_bounds, pixels, weights, slots, bends, is_arc,
-            sights.curve_bounds, track, curve_pixels, curve_weights, starts, structure.track_slots,
-            kernels.LOSS_CODES[weighting.loss], weighting.loss_scale, False, points, tracks, len(structure.values),
-            poses, units, normals,
-        ):  # fmt: skip
+        Raises:
+            SolutionError: an observation cannot be projected.
+        """
+        normals = np.empty((last - first, self._size, self._size))
+        if not kernels.sight_normals(first, last, *self._arguments, normals):
             raise SolutionError("an observation cannot be projected where the solve ended: no uncertainty can be given")
         return normals
-
-    batch = max(1, _BATCH // size**2)
-    for first in range(0, len(sights), batch):
-        last = min(first + batch, len(sights))
-        parts = [first + place for place in parts_of(last - first, len(points) + len(curve_pixels), NORMAL_NS)]
-        yield poses[first:last], np.concatenate(run_parts(told, parts))
-
-
-def _eliminate(
-    sights: Sights, parts: Sequence[tuple[Array, Array]], estimate: Estimate, owned: Owned, matrix: Array
-) -> Eliminated:
-    """The private placements of one station; what is left of their sights is added to the matrix."""
-    key = sights.keys[0]
-    world = estimate.stations[key.station].cam_from_world
-    lead = np.concatenate([owned("camera", key.camera), owned("structure", "")])
-    station = owned("station", key.station)
-    eliminated, limits = [], sigma_limits(pose_keys("placement", ""))
-    for poses, normals in parts:
-        chain = from_placement(poses, world)
-        own = np.swapaxes(chain, 1, 2) @ normals[:, -6:, -6:] @ chain
-        coupling = np.swapaxes(chain, 1, 2) @ normals[:, -6:, :-6]
-        inverse = known_inverses(own, limits)
-        gain = inverse @ coupling
-        taken = coupling.reshape(-1, len(lead)).T @ gain.reshape(-1, len(lead))  # summed over the sights
-        matrix[np.ix_(lead, lead)] += np.sum(normals[:, :-6, :-6], axis=0) - taken
-        if len(station):  # the placement makes up for whatever its station does: the chain is orthogonal
-            moved = np.swapaxes(chain, 1, 2) @ from_station(poses, world)
-            gain = np.concatenate([gain, moved], axis=2)
-        eliminated.append((own, inverse, gain))
-    own, inverse, gain = (np.concatenate(stacks) for stacks in zip(*eliminated, strict=True))
-    names = tuple(str(key.placement) for key in sights.keys)
-    return Eliminated(names, own, inverse, gain, np.concatenate([lead, station]))
-
-
-def _add(key: SightKey, pose: Array, normal: Array, estimate: Estimate, owned: Owned, matrix: Array) -> None:
-    """What a sight that nothing is eliminated from says, added to the matrix."""
-    world, lead = estimate.stations[key.station].cam_from_world, len(normal) - 6
-    at = [owned("camera", key.camera), owned("structure", "")]
-    chain = [np.eye(len(normal))[:, :lead]]
-    if len(station := owned("station", key.station)):
-        at.append(station)
-        chain.append(np.vstack([np.zeros((lead, 6)), from_station(pose[None], world)[0]]))
-    if key.placement is not None and len(placement := owned("placement", key.placement)):
-        at.append(placement)
-        chain.append(np.vstack([np.zeros((lead, 6)), from_placement(pose[None], world)[0]]))
-    steps, everywhere = np.hstack(chain), np.concatenate(at)
-    matrix[np.ix_(everywhere, everywhere)] += steps.T @ normal @ steps
-
-
-def _add_priors(keys: Sequence[Key], estimate: Estimate, layout: Layout, matrix: Array) -> None:
-    """1 / sigma^2 of every prior on a number that is free: each is on one number of the keys."""
-    places = {key[:3]: place for place, key in enumerate(keys)}
-    several = {"principal_point": ("cx", "cy"), "height_m": ("height",), "position_m": ("x", "y", "height")}
-    for prior in layout.priors:
-        quantities = several.get(prior.quantity, (prior.quantity,))
-        for quantity, sigma in zip(quantities, prior.sigma, strict=True):
-            place = places.get((prior.owner, prior.name, quantity))
-            if place is not None:  # a number that is held needs no prior
-                matrix[place, place] += sigma**-2.0
-    structure, fresh = _owned(keys)("structure", ""), own_structure(layout, estimate)
-    matrix[structure[fresh], structure[fresh]] += estimate.structure.sigma_m[fresh] ** -2.0
-    if layout.joint is not None:  # what it says of numbers that are held now, it says with them held
-        own = [i for i, key in enumerate(layout.joint.keys) if key in keys]
-        at = [keys.index(Key(*layout.joint.keys[i])) for i in own]
-        if own:
-            matrix[np.ix_(at, at)] += layout.joint.information[np.ix_(own, own)]

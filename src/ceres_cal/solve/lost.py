@@ -8,39 +8,37 @@ from __future__ import annotations
 
 import numpy as np
 
-from ceres_cal.base.transforms import Array
-from ceres_cal.model.parameters import Estimate, Layout
+from ceres_cal.base.arrays import Array
+from ceres_cal.model.parameters import Estimate
 from ceres_cal.observations.sights import Sights
-from ceres_cal.solve import Weighting, placement_costs, private_placements
+from ceres_cal.solve.bundle import placement_costs
 from ceres_cal.solve.mirrored import mirrored
 from ceres_cal.solve.noise import Inliers
-from ceres_cal.start.closed_forms import polar_pose
+from ceres_cal.solve.problem import Problem, Weighting
+from ceres_cal.start.closed_forms import pose_from_homography
 from ceres_cal.start.planes import consensus_homography
 
 _LOST = 0.5  # share of a sight's observations; with less of them in use its pose was not understood
 _FEWEST = 6
 
 
-def with_lost_boards_found(
-    sights: Sights, inliers: Inliers, estimate: Estimate, layout: Layout, weighting: Weighting
-) -> tuple[Estimate, int]:
+def with_lost_boards_posed(problem: Problem, inliers: Inliers, estimate: Estimate) -> tuple[Estimate, int]:
     """The estimate with lost private placements posed again where that lowers their cost, and how many were.
 
     Args:
-        sights: with all their observations, those rejected too. weighting: with a loss that bears outliers.
+        problem: of all observations, those rejected too, weighted with a loss that bears outliers.
     """
-    private = private_placements(sights, layout)
-    count = 0
+    sights, weighting, count = problem.sights, problem.weighting, 0
     for number in np.flatnonzero(sights.used_share(inliers.points, inliers.curves) < _LOST):
         sight = sights[int(number)]
-        pose = _by_consensus(sight, estimate, weighting) if sight.key.placement in private else None
+        pose = _by_consensus(sight, estimate, weighting) if sight.key.placement in problem.private else None
         if pose is None:
             continue
         as_is, _ = placement_costs(sight, estimate, weighting, estimate.pose_stack(sight.keys))
         tried = [placement_costs(sight, estimate, weighting, p) for p in (pose, mirrored(sight, pose))]
-        cost, found = min(tried, key=lambda one: float(one[0][0]))
+        cost, best = min(tried, key=lambda one: float(one[0][0]))
         if cost[0] < 0.99 * as_is[0]:
-            estimate = estimate.with_placements(sight.keys, found)
+            estimate = estimate.with_placements(sight.keys, best)
             count += 1
     return estimate, count
 
@@ -58,6 +56,6 @@ def _by_consensus(sight: Sights, estimate: Estimate, weighting: Weighting) -> Ar
     homography = consensus_homography(points[:, :2], ideal, limit_px)
     if homography is None:
         return None
-    pose = polar_pose(np.diag([1.0 / camera.phi, 1.0 / camera.phi, 1.0]) @ homography)
+    pose = pose_from_homography(homography, camera.phi)
     translation = pose.translation - points[0, 2] * pose.rotation[:, 2]
     return np.column_stack([pose.rotation, translation])[None]

@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from ceres_cal.base.transforms import Array
-from ceres_cal.model.parameters import Estimate, Layout
-from ceres_cal.observations.sights import Rows, SightKey, Sights
-from ceres_cal.solve import Weighting, placement_costs, private_placements
+from ceres_cal.base.arrays import Array, Indices
+from ceres_cal.model.parameters import Estimate
+from ceres_cal.observations.sights import SightKey, Sights
+from ceres_cal.solve.bundle import placement_costs
+from ceres_cal.solve.problem import Problem, Weighting
 
 _DECIDED_SIGMA = 100.0  # perspective that bends a view by so many standard deviations leaves no doubt
 _SAME = 1e-3  # of rotations and metres
@@ -19,7 +20,7 @@ _MUCH_WORSE = 100.0  # squared standard deviations: ten of them decide, whatever
 
 
 def without_mirrored_poses(
-    sights: Sights, estimate: Estimate, layout: Layout, weighting: Weighting, among: frozenset[SightKey]
+    problem: Problem, estimate: Estimate, among: frozenset[SightKey]
 ) -> tuple[Estimate, int, frozenset[SightKey]]:
     """The estimate with private placements in the better one of their two poses.
 
@@ -29,19 +30,12 @@ def without_mirrored_poses(
     Returns:
         The estimate, how many placements were changed, and the keys of those whose other pose is not much worse.
     """
-    private = private_placements(sights, layout)
+    sights, weighting = problem.sights, problem.weighting
     changed, undecided = 0, frozenset[SightKey]()
     for camera in estimate.cameras:
-        own = np.array(
-            [
-                number
-                for number, key in enumerate(sights.keys)
-                if key.camera == camera and key.placement in private and key in among
-            ],
-            dtype=np.int64,
-        )
-        if len(own):
-            estimate, count, open_ones = _with_better_poses(sights.take(own), estimate, weighting)
+        own = [number for number in sights.numbers(camera, placements=problem.private) if sights.keys[number] in among]
+        if own:
+            estimate, count, open_ones = _with_better_poses(sights.take(np.array(own)), estimate, weighting)
             changed, undecided = changed + count, undecided | open_ones
     return estimate, changed, undecided
 
@@ -73,7 +67,7 @@ def _boxes(sights: Sights) -> tuple[Array, Array]:
     return 0.5 * (low + high), 0.5 * np.linalg.norm(high - low, axis=1)
 
 
-def _doubtful(sights: Sights, poses: Array, estimate: Estimate, weighting: Weighting) -> Rows:
+def _doubtful(sights: Sights, poses: Array, estimate: Estimate, weighting: Weighting) -> Indices:
     """Sights of points whose two poses differ by little: the bend that perspective adds, phi (size / depth)^2 sin(tilt)
     cos(tilt), against the noise.
     """

@@ -10,10 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ceres_cal.base.transforms import Array
+from ceres_cal.base.arrays import Array, Mask
+from ceres_cal.model.parameters import Options
 from ceres_cal.model.residuals import Residuals
 from ceres_cal.observations import Observations
-from ceres_cal.observations.sights import Mask
+from ceres_cal.observations.sights import Sights
 
 _LEAST_FREEDOM = 8.0  # spare equations below which a spread says nothing
 _USUAL_FREEDOM = 10.0  # spare equations that a scale seen before stands for
@@ -21,6 +22,31 @@ _ENOUGH = 5_000
 _LEAST_SCALE_PX = 1e-4  # no image is measured better than that
 _RAYLEIGH_MEDIAN = 1.177410022515474  # of the length of a two-dimensional standard normal
 _NORMAL_MEDIAN = 0.674489750196082  # of the absolute value of a standard normal
+
+
+@dataclass(frozen=True)
+class Redundancy:
+    """The share of the equations of points and of curves that is left over for the noise: 1 less the mean leverage."""
+
+    points: float
+    curves: float
+
+    @classmethod
+    def by_count(cls, equations: int, unknowns: int) -> Redundancy:
+        """As if every equation determined as much as any other."""
+        share = 1.0 - unknowns / max(equations, 1)
+        return cls(share, share)
+
+    @classmethod
+    def by_leverage(cls, sights: Sights, leverages: tuple[float, float]) -> Redundancy:
+        """As the observations in the sights determine the free numbers.
+
+        Args:
+            leverages: equations of points and of curves that the free numbers take up.
+        """
+        counts = 2 * len(sights.point_rows), len(sights.curve_rows)
+        points, curves = (1.0 - taken / max(count, 1) for taken, count in zip(leverages, counts, strict=True))
+        return cls(points, curves)
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +57,7 @@ class Inliers:
         points: (N,), curves: (M,) bool. point_scale, curve_scale: factors on the stated sigmas.
         point_sigmas, curve_sigmas: how many standard deviations each residual is long; infinite where the estimate
             cannot show the observation.
-        freedom: spare equations that the scales rest on; infinite where they are the stated ones.
+        degrees_of_freedom: spare equations that the scales rest on; infinite where they are the stated ones.
     """
 
     points: Mask
@@ -40,7 +66,7 @@ class Inliers:
     curve_scale: float
     point_sigmas: Array
     curve_sigmas: Array
-    freedom: float = np.inf
+    degrees_of_freedom: float = np.inf
 
     def same_as(self, other: Inliers, relative: float = 1e-2) -> bool:
         """Whether nothing worth another solve changed: the same rows, and scales by no more than `relative`."""
@@ -59,7 +85,7 @@ def relative_lengths(observations: Observations, residuals: Residuals) -> tuple[
     return np.where(np.isfinite(points), points, np.inf), np.where(np.isfinite(curves), curves, np.inf)
 
 
-def start_weights(observations: Observations, residuals: Residuals) -> Inliers:
+def visible_from(observations: Observations, residuals: Residuals) -> Inliers:
     """Everything that a start can show, at the scale of its median residual: what the first solve works with."""
     points, curves = relative_lengths(observations, residuals)
     shown_points, shown_curves = np.isfinite(points), np.isfinite(curves)
@@ -79,10 +105,8 @@ def _median_scale(lengths: Array, median_of_one: float) -> float:
 def judge(
     observations: Observations,
     residuals: Residuals,
-    unknowns: int,
-    reject_sigma: float,
-    *,
-    estimate_noise: bool,
+    redundancy: Redundancy,
+    options: Options,
     usual: tuple[float, float] | None = None,
 ) -> Inliers:
     """Noise scales and inliers at one estimate.
@@ -90,30 +114,30 @@ def judge(
     The median gives a first scale that half the data may not spoil, the inliers' own spread the final one.
 
     Args:
-        unknowns: free numbers; they use up equations in proportion.
-        reject_sigma: longer residuals are outliers. estimate_noise: else the stated sigmas hold (scale 1).
+        options: how far off an outlier is, and whether the stated sigmas hold (scale 1).
         usual: scales of points and curves seen before; they count as much as a few spare equations do.
     """
     points, curves = relative_lengths(observations, residuals)
-    if not estimate_noise:
+    reject_sigma = options.reject_sigma
+    if options.noise_scale == "stated":
         return Inliers(points <= reject_sigma, curves <= reject_sigma, 1.0, 1.0, points, curves)
     floor = usual or (0.0, 0.0)
     point_spread = _spread(points, _RAYLEIGH_MEDIAN, reject_sigma, floor[0])
     curve_spread = _spread(curves, _NORMAL_MEDIAN, reject_sigma, floor[1])
-    spare = 1.0 - unknowns / max(2.0 * point_spread.count + curve_spread.count, 1.0)
-    freedom = spare * (2.0 * point_spread.count + curve_spread.count)
+    spare = 2.0 * redundancy.points * point_spread.count, redundancy.curves * curve_spread.count
+    degrees = spare[0] + spare[1]
     if usual is not None:
-        p, c = point_spread.scale_from(usual[0], 2.0 * spare), curve_spread.scale_from(usual[1], spare)
-        freedom = max(freedom, 0.0) + _USUAL_FREEDOM
+        p, c = point_spread.scale_from(usual[0], spare[0]), curve_spread.scale_from(usual[1], spare[1])
+        degrees = max(degrees, 0.0) + _USUAL_FREEDOM
     else:
-        point_scale, curve_scale = point_spread.scale(2.0 * spare), curve_spread.scale(spare)
+        point_scale, curve_scale = point_spread.scale(spare[0]), curve_spread.scale(spare[1])
         # A kind with too few spare equations borrows the other's scale; if both have, the stated sigmas hold.
         known = [scale for scale in (point_scale, curve_scale) if scale is not None]
         fallback = known[0] if known else 1.0
         p = fallback if point_scale is None else point_scale
         c = fallback if curve_scale is None else curve_scale
-        freedom = freedom if known else np.inf
-    return Inliers(points <= reject_sigma * p, curves <= reject_sigma * c, p, c, points / p, curves / c, freedom)
+        degrees = degrees if known else np.inf
+    return Inliers(points <= reject_sigma * p, curves <= reject_sigma * c, p, c, points / p, curves / c, degrees)
 
 
 @dataclass(frozen=True)
@@ -123,16 +147,13 @@ class _Spread:
     count: int
     squares: float
 
-    def scale(self, freedom: float) -> float | None:
-        """Their scale, when each brings `freedom` spare equations; None where those are too few to tell."""
-        if self.count * freedom < _LEAST_FREEDOM:
-            return None
-        return max(float(np.sqrt(self.squares / (self.count * freedom))), _LEAST_SCALE_PX)
+    def scale(self, spare: float) -> float | None:
+        """Their scale, when they bring so many spare equations; None where those are too few to tell."""
+        return max(float(np.sqrt(self.squares / spare)), _LEAST_SCALE_PX) if spare >= _LEAST_FREEDOM else None
 
-    def scale_from(self, usual: float, freedom: float) -> float:
+    def scale_from(self, usual: float, spare: float) -> float:
         """Their scale, when the usual one counts as much as a few spare equations: few exact ones do not make it 0."""
-        equations = self.count * max(freedom, 0.0)
-        return float(np.sqrt((self.squares + _USUAL_FREEDOM * usual**2) / (equations + _USUAL_FREEDOM)))
+        return float(np.sqrt((self.squares + _USUAL_FREEDOM * usual**2) / (max(spare, 0.0) + _USUAL_FREEDOM)))
 
 
 def _spread(lengths: Array, median_of_one: float, reject_sigma: float, least: float) -> _Spread:

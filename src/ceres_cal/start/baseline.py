@@ -12,13 +12,14 @@ from itertools import combinations
 
 import numpy as np
 
+from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import DegenerateError
-from ceres_cal.base.transforms import Array, Pose
+from ceres_cal.base.transforms import Pose
 from ceres_cal.model.parameters import Estimate, Station
 from ceres_cal.observations.sights import Sights
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Radial
-from ceres_cal.start.closed_forms import fit_rings, homography_from_points, max_norm_pose
+from ceres_cal.start.closed_forms import fit_rings, homography_from_points, pose_from_homography
 from ceres_cal.start.planes import ring_radii
 
 
@@ -32,10 +33,9 @@ def four_point_baseline(sights: Sights, start: Estimate) -> Estimate:
     """
     cameras = {name: _with_rings(camera, name, sights) for name, camera in start.cameras.items()}
     stations, placements = dict(start.stations), dict(start.placements)
-    for number, key in enumerate(sights.keys):
-        if key.placement is None:
-            pose = _from_four_points(cameras[key.camera], sights[number])
-            stations[key.station] = Station(key.camera, pose)
+    for name, sight in sights.of_world.items():
+        camera = sight.key.camera
+        stations[name] = Station(camera, _from_four_points(cameras[camera], sight))
     for key in sights.keys:
         if key.placement is not None:  # stays where its station saw it
             seen = start.stations[key.station].cam_from_world @ start.placements[key.placement]
@@ -44,13 +44,8 @@ def four_point_baseline(sights: Sights, start: Estimate) -> Estimate:
 
 
 def _with_rings(camera: Camera, name: str, sights: Sights) -> Camera:
-    for number, key in enumerate(sights.keys):
-        sight = sights[number]
-        if (
-            key.camera == name
-            and isinstance(camera.lens, Radial)
-            and len(set(sight.track[sight.is_arc[sight.track]])) > 2
-        ):
+    for sight in sights.of_camera(name):
+        if isinstance(camera.lens, Radial) and len(set(sight.track[sight.is_arc[sight.track]])) > 2:
             radii = ring_radii(sight, camera)
             a1, *rest = fit_rings(radii.measured_px, radii.ring_m, (1, *camera.lens.powers))
             return replace(camera, lens=camera.lens.with_values(np.array(rest) / a1))
@@ -64,7 +59,7 @@ def _from_four_points(camera: Camera, sight: Sights) -> Pose:
         raise DegenerateError(f"{sight.key}: the paper's method needs four points of the floor, not {len(places)}")
     chosen = floor[first[_widest_four(places)]]
     rays = camera.rays(sight.pixels[chosen])
-    return max_norm_pose(homography_from_points(sight.points[chosen, :2], rays[:, :2] / rays[:, 2:]))
+    return pose_from_homography(homography_from_points(sight.points[chosen, :2], rays[:, :2] / rays[:, 2:]))
 
 
 def _widest_four(places: Array) -> list[int]:

@@ -12,19 +12,21 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.errors import DegenerateError
 from ceres_cal.base.threads import parts_of, run_parts
-from ceres_cal.base.transforms import Array, Pose, nearest_rotation
+from ceres_cal.base.transforms import Pose
 from ceres_cal.kernels import align_sights, alignment_errors, normalised_planes, plane_homographies, usual_by_radius
 
-Ints = NDArray[np.int64]
 _POINT_NS = 100.0  # that a point's share of a homography takes
+_NO_SECOND = 1e-6  # root of the second least eigenvalue: as small, and the null vector is one of many
+_SINGULAR = 1e-12
 
 
 @dataclass(frozen=True)
-class Profile:
+class RadialProfile:
     """w(r) = 1 + sum c_k r^(2k), r in units of `unit_px`."""
 
     coefficients: tuple[float, ...]
@@ -102,42 +104,32 @@ def facing(homography: Array, plane_points: Array, image_points: Array) -> Array
     return homography if np.median(agree) >= 0.0 else -homography
 
 
-def max_norm_pose(homography: Array) -> Pose:
-    """The paper's pose from H in normalised coordinates: lambda is the larger norm of h1 and h2 (section 3.5).
+def poses_from_homographies(homographies: Array, phi: float = 1.0) -> Array:
+    """[R t] (S, 3, 4) of each H (S, 3, 3), whose image points are offsets in px; phi 1 where they are normalised.
 
-    R's columns are h1 / lambda, h2 / lambda and their cross product: not orthonormal where the norms differ, which is
-    the paper's own error and what `polar_pose` mends. The translation is h3 / lambda = -R t.
+    lambda is the larger norm of h1 and h2 (paper, section 3.5) and t = h3 / lambda. R is the rotation nearest to
+    (h1, h2, h1 x h2), which is also the least of the paper's E = |h1 / lambda - r1|^2 + |h2 / lambda - r2|^2
+    (section 3.6) whatever lambda is: with B = [h1 h2] = U S V^T, [r1 r2] = U V^T = B (B^T B)^-1/2. The root of a 2 x 2
+    matrix M is (M + d) / s with d = (det M)^1/2 and s = (tr M + 2 d)^1/2; its inverse is (s - root) / d. Where H sends
+    the plane to a line there is none: NaN.
     """
-    h1, h2, h3 = homography.T
-    scale = max(np.linalg.norm(h1), np.linalg.norm(h2))
-    rotation = np.column_stack([h1 / scale, h2 / scale, np.cross(h1 / scale, h2 / scale)])
-    return Pose(nearest_rotation(rotation), h3 / scale)
-
-
-def polar_poses(homographies: Array) -> Array:
-    """[R t] (S, 3, 4) minimising the paper's E = |h1 / lambda - r1|^2 + |h2 / lambda - r2|^2 (section 3.6) for each H.
-
-    With [h1 h2] = U S V^T: [r1 r2] = U V^T and 1 / lambda = tr(S) / tr(S^2). U V^T is B (B^T B)^-1/2, and the root of a
-    2 x 2 matrix M is (M + d) / s with d = (det M)^1/2 and s = (tr M + 2 d)^1/2; its inverse is (s - root) / d. Where H
-    sends the plane to a line there is none: NaN.
-    """
-    b = homographies[:, :, :2]
+    h = homographies * np.array([[1.0 / phi], [1.0 / phi], [1.0]])
+    b = h[:, :, :2]
     m = np.swapaxes(b, 1, 2) @ b
-    trace = m[:, 0, 0] + m[:, 1, 1]
-    d = np.sqrt(np.maximum(m[:, 0, 0] * m[:, 1, 1] - m[:, 0, 1] ** 2, 0.0))
-    sum_s = np.sqrt(trace + 2.0 * d)
-    root = (m + d[:, None, None] * np.eye(2)) / sum_s[:, None, None]
+    d = np.sqrt(np.maximum(m[:, 0, 0] * m[:, 1, 1] - m[:, 0, 1] ** 2, 0.0))[:, None, None]
+    s = np.sqrt((m[:, 0, 0] + m[:, 1, 1])[:, None, None] + 2.0 * d)
+    root = (m + d * np.eye(2)) / s
     with np.errstate(divide="ignore", invalid="ignore"):
-        r = b @ ((sum_s[:, None, None] * np.eye(2) - root) / d[:, None, None])
+        r = b @ ((s * np.eye(2) - root) / d)
     first, second = r[:, :, 0].T, r[:, :, 1].T
     third = np.stack([first[i - 2] * second[i - 1] - first[i - 1] * second[i - 2] for i in range(3)], axis=1)
-    translation = homographies[:, :, 2] * (sum_s / trace)[:, None]
-    return np.concatenate([r, third[:, :, None], translation[:, :, None]], axis=2)
+    largest = np.sqrt(np.maximum(m[:, 0, 0], m[:, 1, 1]))
+    return np.concatenate([r, third[:, :, None], (h[:, :, 2] / largest[:, None])[:, :, None]], axis=2)
 
 
-def polar_pose(homography: Array) -> Pose:
-    """The pose of one homography in normalised coordinates: see `polar_poses`."""
-    (matrix,) = polar_poses(homography[None])
+def pose_from_homography(homography: Array, phi: float = 1.0) -> Pose:
+    """The pose of one homography: see `poses_from_homographies`."""
+    (matrix,) = poses_from_homographies(homography[None], phi)
     return Pose(matrix[:, :3], matrix[:, 3])
 
 
@@ -155,12 +147,12 @@ def fit_rings(measured_radius: ArrayLike, ring_radius: ArrayLike, powers: Sequen
     return np.asarray(solution / unit ** np.asarray(powers, dtype=float))
 
 
-def ring_profile(measured_radius: Array, ring_radius: Array, unit_px: float) -> tuple[Profile, float]:
+def ring_profile(measured_radius: Array, ring_radius: Array, unit_px: float) -> tuple[RadialProfile, float]:
     """Profile and magnification (px per metre at the centre) from rings: r = kappa R w(r), linear in kappa, kappa c."""
     squared = (measured_radius / unit_px) ** 2
     basis = np.column_stack([ring_radius, ring_radius * squared, ring_radius * squared**2])
     kappa, *rest = np.linalg.lstsq(basis, measured_radius, rcond=None)[0]
-    return Profile(tuple(float(c / kappa) for c in rest), unit_px), float(kappa)
+    return RadialProfile(tuple(float(c / kappa) for c in rest), unit_px), float(kappa)
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,7 +163,7 @@ class PlaneData:
         bounds: (S + 1,) where each sight begins. plane: (N, 2) m. offsets: (N, 2) px.
     """
 
-    bounds: Ints
+    bounds: Indices
     plane: Array
     offsets: Array
 
@@ -184,7 +176,7 @@ class RadialAlignment:
         error_px: (N,). relative_error: (N,) the same in units of what is usual at that distance from the centre.
     """
 
-    profile: Profile
+    profile: RadialProfile
     homographies: Array
     error_px: Array
     relative_error: Array
@@ -213,10 +205,12 @@ def radial_alignment(data: PlaneData, unit_px: float, terms: int, rounds: int) -
         usual = usual_by_radius(errors, radius)
         weights = 1.0 / (1.0 + (errors / (1.5 * usual)) ** 2)
     homographies = np.concatenate([h12.reshape(-1, 2, 3) * unit_px, h3[:, None, :]], axis=1) @ _restored(lifts)
-    return RadialAlignment(Profile(tuple(float(v) for v in c), unit_px), homographies, errors * unit_px, errors / usual)
+    return RadialAlignment(
+        RadialProfile(tuple(float(v) for v in c), unit_px), homographies, errors * unit_px, errors / usual
+    )
 
 
-def homographies_of_sights(data: PlaneData, profile: Profile) -> tuple[Array, Array]:
+def homographies_of_sights(data: PlaneData, profile: RadialProfile) -> tuple[Array, Array]:
     """H (S, 3, 3) of every sight under a known profile, and each point's error (N,) px.
 
     The normalised DLT, reweighted to distances in the image, and against wrong labels where some points do not fit.
@@ -241,34 +235,55 @@ def _restored(lifts: Array) -> Array:
     return restore
 
 
-def line_moments(lines: Array, offsets: Array, weights: Array, unit_px: float, terms: int) -> Array:
-    """(2 + terms + 1 groups of 3)^2 moment matrix of l . (g1 p_x + g2 p_y + g3 (1 + sum c_k r^2k)) = 0.
+def fit_lines(lines: Array, image_points: Array, rounds: int) -> tuple[Array | None, float]:
+    """H (3, 3) from the plane to image points d (N, 3) that are seen on lines l (N, 3) of it, all homogeneous.
 
-    Args:
-        lines: (N, 3) homogeneous lines of the (normalised) plane. offsets: (N, 2) px, seen on those lines. A point is
-            two lines that cross in it.
+    The DLT of points on lines, l . G d = 0 with G = H^-1 (design, section 7), reweighted to distances on the plane and
+    against wrong labels. A point of the plane is two lines that cross in it. The sign of H keeps what is seen in front.
+
+    Returns:
+        H, None where the lines cannot fix it; the median distance on the plane, in units of its size.
+    """
+    plane_scale = (1.0, 1.0, 1.0 / max(float(np.max(np.abs(lines[:, 2]))), 1e-9))
+    reach = float(np.max(np.abs(image_points[:, :2])))
+    image_scale = (1.0 / reach, 1.0 / reach, 1.0)
+    lines, image_points = lines * plane_scale, image_points * image_scale
+    rows = (lines[:, :, None] * image_points[:, None, :]).reshape(-1, 9)
+    weights = np.ones(len(lines))
+    for _ in range(rounds):
+        values, vectors = np.linalg.eigh((rows * weights[:, None]).T @ rows / len(rows))
+        inverse = vectors[:, 0].reshape(3, 3)
+        sent = image_points @ inverse.T
+        distance = np.abs(np.sum(lines * sent, axis=1)) / np.maximum(np.abs(sent[:, 2]), 1e-9)
+        typical = float(np.median(distance))
+        bound = max(3.0 * typical, 1e-9)
+        weights = 1.0 / (np.maximum(sent[:, 2] ** 2, 1e-9) * (1.0 + (distance / bound) ** 2))
+        weights /= weights.mean()
+    inverse *= np.copysign(1.0, np.median(sent[:, 2]))
+    # More than one G fits, or one that sends the image to a line.
+    if values[1] < _NO_SECOND**2 or abs(np.linalg.det(inverse)) < _SINGULAR:
+        return None, typical
+    return np.asarray(np.linalg.inv(np.diag(plane_scale) @ inverse @ np.diag(image_scale))), typical
+
+
+def point_lines(points: Array) -> Array:
+    """(2 N, 3) the lines x = const of points (N, 2), then their lines y = const, which cross in them."""
+    x, y = points.T
+    one, zero = np.ones(len(points)), np.zeros(len(points))
+    return np.vstack([np.column_stack([one, zero, -x]), np.column_stack([zero, one, -y])])
+
+
+def profile_from_lines(lines: Array, offsets: Array, unit_px: float, terms: int) -> tuple[float, ...]:
+    """Coefficients of the profile under which offsets (N, 2) px lie on lines (N, 3) of the plane.
+
+    l . (g1 p_x + g2 p_y + g3 (1 + sum c_k r^2k)) = 0 is linear in the nine numbers of G and its products g3 c_k: the
+    null vector holds g3 x (1, c), best rank one.
     """
     p = offsets / unit_px
     squared = np.sum(p * p, axis=1)
     factors = np.column_stack([p, *(squared**k for k in range(terms + 1))])
-    rows = (factors[:, :, None] * lines[:, None, :]).reshape(len(lines), -1) * np.sqrt(weights)[:, None]
-    return np.asarray(rows.T @ rows)
-
-
-def inverse_homography_from_moments(moments: Array, c: Sequence[float]) -> tuple[Array, float, float]:
-    """G (3, 3) = (g1 g2 g3) for a given profile: the null vector; with its residual and the next singular value."""
-    mix = np.zeros((9, len(moments)))
-    mix[:6, :6] = np.eye(6)
-    for k, factor in enumerate((1.0, *c)):
-        mix[6:, 6 + 3 * k : 9 + 3 * k] = factor * np.eye(3)
-    values, vectors = np.linalg.eigh(mix @ moments @ mix.T)
-    roots = np.sqrt(np.maximum(values, 0.0))
-    return vectors[:, 0].reshape(3, 3).T, float(roots[0]), float(roots[1])
-
-
-def profile_from_moments(moments: Array, terms: int) -> tuple[float, ...]:
-    """The profile of lines seen through an unknown lens: the null vector holds g3 x (1, c), best rank one."""
-    products = null_vector(moments)[6:].reshape(terms + 1, 3)
+    rows = (factors[:, :, None] * lines[:, None, :]).reshape(len(lines), -1)
+    products = null_vector(rows.T @ rows)[6:].reshape(terms + 1, 3)
     left = np.linalg.svd(products)[0][:, 0]
     return tuple(float(c / left[0]) for c in left[1:]) if abs(left[0]) > 1e-9 else (0.0,) * terms
 

@@ -11,21 +11,23 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.errors import DegenerateError
-from ceres_cal.base.transforms import Array, Pose, Poses, chained, inverted
+from ceres_cal.base.transforms import Pose, Poses, chained, inverted
 from ceres_cal.model.parameters import Estimate, Options, Station, anchored_stations
 from ceres_cal.model.structure import make_structure
 from ceres_cal.observations import Observations, Prior
-from ceres_cal.observations.sights import Rows, Sights
+from ceres_cal.observations.sights import Sights
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Brown, KannalaBrandt, Lens, Radial
-from ceres_cal.start.closed_forms import Profile, orthogonality_error, polar_poses
+from ceres_cal.start.closed_forms import RadialProfile, orthogonality_error, poses_from_homographies
 from ceres_cal.start.planes import Homographies, profile_and_homographies
 
 PHI_RANGE = (0.15, 15.0)
 """In half image diagonals: 163 to 8 degrees across the image's diagonal. What lies beyond is no lens over a field."""
-USUAL_PHI = 1.4
-"""In half image diagonals: 71 degrees across the diagonal, a usual lens."""
+USUAL_PHI, USUAL_PHI_FACTOR = 1.1, 1.4
+"""In half image diagonals: 85 degrees across the diagonal; 66 to 104 within the factor either way, a standard deviation
+of log phi. It decides where the image cannot, so it is that of usual cameras over a field or before a board."""
 _ENOUGH_VIEWS = 50  # for phi
 _GRID = np.geomspace(*PHI_RANGE, 120)
 _NEAR = np.geomspace(1.0 / 1.04, 1.04, 13)  # a grid step to either side
@@ -50,7 +52,7 @@ def initialise(observations: Observations, sights: Sights, options: Options) -> 
     numbers, poses = [], []
     priors = (*observations.priors, *options.priors)
     for name, image_size in observations.cameras.items():
-        own = np.array([number for number, key in enumerate(sights.keys) if key.camera == name], dtype=np.int64)
+        own = sights.numbers(camera=name)
         start = _start_camera(name, image_size, sights.take(own), options, priors)
         cameras[name], phi_from[name] = start.camera, start.phi_from
         numbers.append(own[start.sights])
@@ -67,7 +69,7 @@ def initialise(observations: Observations, sights: Sights, options: Options) -> 
 class _CameraStart:
     camera: Camera
     phi_from: str
-    sights: Rows
+    sights: Indices
     poses: Array
 
 
@@ -93,7 +95,7 @@ def _concerns(prior: Prior, camera: str, sights: Sights) -> bool:
 
 def _poses_at(homographies: Homographies, phi: float) -> Array:
     """cam_from_frame (K, 3, 4) of the homographies for one phi."""
-    matrices = polar_poses(homographies.matrices * np.array([[1.0 / phi], [1.0 / phi], [1.0]]))
+    matrices = poses_from_homographies(homographies.matrices, phi)
     matrices[:, :, 3] -= homographies.heights_m[:, None] * matrices[:, :, 2]
     return matrices
 
@@ -169,7 +171,7 @@ def _prior_cost(prior: Prior, phi: Array, sights: Sights, homographies: Homograp
     return np.asarray(((np.array(heights) - prior.value[-1]) / spread) ** 2)
 
 
-def _fit_lens(blank: Lens, profile: Profile, phi: float, reach_px: float, fixed: Mapping[str, float]) -> Lens:
+def _fit_lens(blank: Lens, profile: RadialProfile, phi: float, reach_px: float, fixed: Mapping[str, float]) -> Lens:
     """The lens nearest to the profile over the observed radii: every model is linear in its coefficients there."""
     r = np.linspace(0.02, 1.0, 50) * reach_px
     w = profile.lift(np.column_stack([r, np.zeros_like(r)]))[:, 2]
@@ -207,7 +209,7 @@ def _lens_equations(lens: Lens, r: Array, w: Array, phi: float) -> tuple[dict[st
 
 
 def _chain_poses(
-    observations: Observations, sights: Sights, numbers: Rows, poses: Array
+    observations: Observations, sights: Sights, numbers: Indices, poses: Array
 ) -> tuple[dict[str, Station], Poses]:
     """Stations and placements from the poses (K, 3, 4) of sights: best-seen first, each one extending what is known."""
     sizes = np.diff(sights.point_bounds) + np.diff(sights.curve_bounds)

@@ -11,20 +11,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ceres_cal.base.arrays import Array, Indices, Mask
 from ceres_cal.base.errors import DegenerateError
-from ceres_cal.base.transforms import Array
 from ceres_cal.kernels import grouped_scatter
-from ceres_cal.observations.sights import Mask, Rows, Sights, bounds_of, ranges
+from ceres_cal.observations.sights import Sights, bounds_of, ranges
 from ceres_cal.scene.camera import Camera
 from ceres_cal.start.closed_forms import (
     PlaneData,
-    Profile,
-    facing,
+    RadialProfile,
+    fit_lines,
     homographies_of_sights,
     homography_from_points,
-    inverse_homography_from_moments,
-    line_moments,
-    profile_from_moments,
+    point_lines,
+    profile_from_lines,
     radial_alignment,
     ring_profile,
 )
@@ -40,37 +39,42 @@ _NO_FIT = 0.01  # typical distance in a plane scaled to unit size; the fits are 
 
 @dataclass(frozen=True, eq=False)
 class PlaneSight:
-    """A sight's observations on its plane z = height: points and straight segments, offsets in px."""
+    """A sight's observations on its plane z = height_m: points, and lines with the pixel that is seen on each.
+
+    Attributes:
+        points: (N, 2) m. lines: (2 N + L, 3) two through each point, x = const first, then the segments'.
+        pixels: (2 N + L, 2).
+    """
 
     sight: Sights
     height_m: float
     points: Array
-    offsets: Array
     lines: Array
-    line_offsets: Array
+    pixels: Array
+
+    @property
+    def segments(self) -> int:
+        """Number of the straight lines of which something is seen."""
+        return len(np.unique(self.lines[2 * len(self.points) :], axis=0))
 
     @property
     def equations(self) -> int:
         """What the sight can say of a homography's eight numbers: two for each point, two for each line."""
-        return 2 * len(np.unique(self.points, axis=0)) + 2 * len(np.unique(self.lines, axis=0))
+        return 2 * len(np.unique(self.points, axis=0)) + 2 * self.segments
 
-    @property
-    def size_px(self) -> float:
+    def size_px(self, camera: Camera) -> float:
         """Spread of the observations over the image; 0 where there are none on the plane."""
-        every = np.vstack([self.offsets, self.line_offsets])
-        if not len(every):
+        offsets = camera.offsets(self.pixels[len(self.points) :])
+        if not len(offsets):
             return 0.0
-        return float(np.sqrt(np.mean(np.sum((every - every.mean(axis=0)) ** 2, axis=1))))
+        return float(np.sqrt(np.mean(np.sum((offsets - offsets.mean(axis=0)) ** 2, axis=1))))
 
 
-def _on_plane(sight: Sights, camera: Camera) -> PlaneSight:
-    """The observations on the plane that holds most of them, thinned where there are very many."""
+def plane_sight(sight: Sights, height_m: float | None = None) -> PlaneSight:
+    """The observations on a plane, by default the one that holds most of them; thinned where there are very many."""
     starts, along = sight.tracks[:, 0], sight.tracks[:, 1]
     level = np.abs(along[:, 2]) < 1e-12
-    on_level = np.flatnonzero(level[sight.track])
-    z = np.concatenate([sight.points[:, 2], starts[sight.track[on_level[:: max(1, len(on_level) // _MOST)]], 2]])
-    heights, votes = np.unique(z.round(9), return_counts=True)
-    height = float(heights[np.argmax(votes)]) if len(heights) else 0.0
+    height = _usual_height(sight, level) if height_m is None else height_m
     on = np.flatnonzero(np.abs(sight.points[:, 2] - height) < 1e-9)
     on = on[:: max(1, len(on) // _MOST)]
     usable = level & ~sight.is_arc & (np.abs(starts[:, 2] - height) < 1e-9)
@@ -78,14 +82,22 @@ def _on_plane(sight: Sights, camera: Camera) -> PlaneSight:
     straight = straight[:: max(1, len(straight) // _MOST)]
     c, a = starts[sight.track[straight], :2], along[sight.track[straight], :2]
     normal = np.column_stack([-a[:, 1], a[:, 0]]) / np.linalg.norm(a, axis=1, keepdims=True)
+    points = sight.points[on, :2]
     return PlaneSight(
         sight,
         height,
-        sight.points[on, :2],
-        camera.offsets(sight.pixels[on]),
-        np.column_stack([normal, -np.sum(normal * c, axis=1)]),
-        camera.offsets(sight.curve_pixels[straight]),
+        points,
+        np.vstack([point_lines(points), np.column_stack([normal, -np.sum(normal * c, axis=1)])]),
+        np.vstack([sight.pixels[on], sight.pixels[on], sight.curve_pixels[straight]]),
     )
+
+
+def _usual_height(sight: Sights, level: Mask) -> float:
+    """z at which most of the points and level curves lie, 0 where there are none."""
+    on_level = np.flatnonzero(level[sight.track])
+    starts = sight.tracks[sight.track[on_level[:: max(1, len(on_level) // _MOST)]], 0]
+    heights, votes = np.unique(np.concatenate([sight.points[:, 2], starts[:, 2]]).round(9), return_counts=True)
+    return float(heights[np.argmax(votes)]) if len(heights) else 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,39 +109,44 @@ class Homographies:
         heights_m: (K,) z of each plane. sizes_px: (K,) spread of its observations over the image.
     """
 
-    sights: Rows
+    sights: Indices
     matrices: Array
     heights_m: Array
     sizes_px: Array
 
 
-def profile_and_homographies(sights: Sights, camera: Camera, unit: float) -> tuple[Profile, Homographies]:
+def profile_and_homographies(sights: Sights, camera: Camera, unit: float) -> tuple[RadialProfile, Homographies]:
     """The camera's radial profile and the homography of each of its sights that can tell one."""
     pure = _flat_sights_of_points(sights)
     rest = np.delete(np.arange(len(sights)), pure)
-    planes = {int(i): _on_plane(sights[int(i)], camera) for i in rest}
-    found: dict[int, Array] = {}
-    profile: Profile | None = None
+    planes = {int(i): plane_sight(sights[int(i)]) for i in rest}
+    matrices: dict[int, Array] = {}
+    profile: RadialProfile | None = None
     board = sights.take(pure)
     if len(pure):
         data = _plane_data(board, _spread_rows(board.point_bounds), camera)
         profile = _profile_of_boards(board, data, camera, unit)
     for i, plane in planes.items():
         if plane.equations == 0 and len(sights[i].track) and sights[i].is_arc[sights[i].track].all():
-            ring, found[i] = _from_rings(sights[i], camera, unit)
+            ring, matrices[i] = _from_rings(sights[i], camera, unit)
             profile = profile or ring
     mixed = [i for i, plane in planes.items() if plane.equations >= 8]
+    offsets = {i: camera.offsets(planes[i].pixels) for i in mixed}
+    lined = [(planes[i].lines, offsets[i]) for i in mixed]
     # Boards in a corner of the image may say nothing of the rest of it.
-    if profile is None or any(_solve_plane(planes[i], profile, rounds=2)[1] > _NO_FIT for i in mixed):
-        profile = _profile_from_lines([planes[i] for i in mixed], unit)
-    found |= {i: _homography_of(planes[i], profile) for i in mixed}
-    parts = [Homographies(np.array([i]), h[None], *_extent(planes[i])) for i, h in found.items()]
+    if profile is None or any(fit_lines(seen, profile.lift(p), rounds=2)[1] > _NO_FIT for seen, p in lined):
+        profile = _profile_from_lines(lined, unit)
+    matrices |= {i: _homography_of(planes[i], profile.lift(offsets[i])) for i in mixed}
+    parts = [
+        Homographies(np.array([i]), h[None], np.array([planes[i].height_m]), np.array([planes[i].size_px(camera)]))
+        for i, h in matrices.items()
+    ]
     if len(pure):
         sizes = np.sqrt(np.trace(grouped_scatter(data.offsets, data.bounds), axis1=1, axis2=2))
         heights = board.points[board.point_bounds[:-1], 2]
-        matrices = _homographies_of_boards(board, data, camera, profile)
-        told = _spans(matrices)
-        parts.append(Homographies(pure[told], matrices[told], heights[told], sizes[told]))
+        stack = _homographies_of_boards(board, data, camera, profile)
+        posed = _spans(stack)
+        parts.append(Homographies(pure[posed], stack[posed], heights[posed], sizes[posed]))
     names = ("sights", "matrices", "heights_m", "sizes_px")
     if not parts:
         return profile, Homographies(np.empty(0, np.int64), np.empty((0, 3, 3)), np.empty(0), np.empty(0))
@@ -143,11 +160,7 @@ def _spans(homographies: Array) -> Mask:
     return np.asarray(np.linalg.det(m) > 1e-20 * np.trace(m, axis1=1, axis2=2) ** 2)
 
 
-def _extent(plane: PlaneSight) -> tuple[Array, Array]:
-    return np.array([plane.height_m]), np.array([plane.size_px])
-
-
-def _flat_sights_of_points(sights: Sights) -> Rows:
+def _flat_sights_of_points(sights: Sights) -> Indices:
     """Numbers of the sights that show at least six points of one plane, not on one line, and no curve."""
     few = (np.diff(sights.point_bounds) >= 6) & (np.diff(sights.curve_bounds) == 0)
     candidates = np.flatnonzero(few)
@@ -158,7 +171,7 @@ def _flat_sights_of_points(sights: Sights) -> Rows:
     return np.asarray(candidates[flat & (xx * yy - xy**2 > 1e-12 * (xx + yy) ** 2)])
 
 
-def _profile_of_boards(board: Sights, data: PlaneData, camera: Camera, unit: float) -> Profile:
+def _profile_of_boards(board: Sights, data: PlaneData, camera: Camera, unit: float) -> RadialProfile:
     """By radial alignment on some points of some sights; on all points of these, with more patience, where not all fit.
 
     A profile needs no more: every other homography follows from it.
@@ -177,7 +190,7 @@ def _profile_of_boards(board: Sights, data: PlaneData, camera: Camera, unit: flo
     return radial_alignment(_plane_data(some, np.arange(len(some.points)), camera), unit, terms, rounds=8).profile
 
 
-def _spread_rows(bounds: Rows) -> Rows:
+def _spread_rows(bounds: Indices) -> Indices:
     """Rows of about as many points of each sight as are enough.
 
     Steps of the golden ratio spread them evenly and never along one row of a board.
@@ -188,7 +201,7 @@ def _spread_rows(bounds: Rows) -> Rows:
     return np.flatnonzero(order[place] < np.repeat(_ENOUGH_POINTS / sizes, sizes))
 
 
-def _plane_data(board: Sights, rows: Rows, camera: Camera) -> PlaneData:
+def _plane_data(board: Sights, rows: Indices, camera: Camera) -> PlaneData:
     """Of some points of the sights, given by their rows there."""
     return PlaneData(
         np.searchsorted(rows, board.point_bounds),
@@ -197,78 +210,38 @@ def _plane_data(board: Sights, rows: Rows, camera: Camera) -> PlaneData:
     )
 
 
-def _as_lines(plane: PlaneSight, scale: float) -> tuple[Array, Array]:
-    """Every observation as pixels on lines of the plane scaled to unit size; a point is the crossing of two."""
-    x, y = scale * plane.points.T
-    one, zero = np.ones(len(x)), np.zeros(len(x))
-    lines = np.vstack(
-        [
-            np.column_stack([one, zero, -x]),
-            np.column_stack([zero, one, -y]),
-            plane.lines * (1.0, 1.0, scale),
-        ]
-    )
-    return lines, np.vstack([plane.offsets, plane.offsets, plane.line_offsets])
-
-
-def _scale_of(plane: PlaneSight) -> float:
-    reach = max(
-        float(np.max(np.abs(plane.points), initial=0.0)), float(np.max(np.abs(plane.lines[:, 2]), initial=0.0)), 1e-9
-    )
-    return 1.0 / reach
-
-
-def _solve_plane(plane: PlaneSight, profile: Profile, rounds: int) -> tuple[Array, float, float]:
-    """(G, typical distance in the scaled plane, distinctness): point-on-line DLT, reweighted against wrong labels."""
-    scale = _scale_of(plane)
-    lines, offsets = _as_lines(plane, scale)
-    lifted = profile.lift(offsets) / (profile.unit_px, profile.unit_px, 1.0)
-    weights = np.ones(len(lines))
-    inverse, typical, distinct = np.eye(3), np.inf, 0.0
-    for _ in range(rounds):
-        moments = line_moments(lines, offsets, weights, profile.unit_px, len(profile.coefficients))
-        inverse, _, distinct = inverse_homography_from_moments(moments / len(lines), profile.coefficients)
-        sent = lifted @ inverse.T
-        distance = np.abs(np.sum(lines * sent, axis=1)) / np.maximum(np.abs(sent[:, 2]), 1e-9)
-        typical = float(np.median(distance))
-        bound = max(3.0 * typical, 1e-9)
-        weights = 1.0 / (np.maximum(sent[:, 2] ** 2, 1e-9) * (1.0 + (distance / bound) ** 2))
-        weights /= weights.mean()
-    return np.diag([1.0, 1.0, scale]) @ inverse, typical, distinct
-
-
-def _homography_of(plane: PlaneSight, profile: Profile) -> Array:
+def _homography_of(plane: PlaneSight, lifted: Array) -> Array:
     """H of one sight: plane (x, y, 1) m to (p in px, w)."""
-    inverse, _, distinct = _solve_plane(plane, profile, rounds=6)
-    if distinct < 1e-6:
+    homography, _ = fit_lines(plane.lines, lifted, rounds=6)
+    if homography is None:
         raise DegenerateError(
-            f"{plane.sight.key}: its {len(plane.points)} points and {len(np.unique(plane.lines, axis=0))} lines "
+            f"{plane.sight.key}: its {len(plane.points)} points and {plane.segments} lines "
             "cannot fix the plane's pose (all on one line, or parallel): add points or lines in other directions"
         )
-    homography = np.diag([profile.unit_px, profile.unit_px, 1.0]) @ np.linalg.inv(inverse)
-    lifted = profile.lift(np.vstack([plane.offsets, plane.line_offsets]))
-    sent = lifted @ np.linalg.inv(homography).T
-    return facing(homography, sent[:, :2] / sent[:, 2:], lifted)
+    return homography
 
 
-def _profile_from_lines(planes: Sequence[PlaneSight], unit: float) -> Profile:
-    """The profile under which lines are straight and points in place: rank-one closed form, then a shrinking grid."""
-    candidates = [(0.0, 0.0)]
-    for plane in planes:
-        lines, offsets = _as_lines(plane, _scale_of(plane))
-        candidates.append(profile_from_moments(line_moments(lines, offsets, np.ones(len(lines)), unit, 2), 2))  # type: ignore[arg-type]
+def _profile_from_lines(planes: Sequence[tuple[Array, Array]], unit: float) -> RadialProfile:
+    """The profile under which lines are straight and points in place: rank-one closed form, then a shrinking grid.
+
+    Args:
+        planes: lines (N, 3) of each plane and the offsets (N, 2) px seen on them.
+    """
+    candidates: list[tuple[float, ...]] = [(0.0, 0.0)]
+    candidates += [profile_from_lines(lines, offsets, unit, 2) for lines, offsets in planes]
     candidates += [(c1, c2) for c1 in np.linspace(-1.0, 0.4, 8) for c2 in np.linspace(-0.6, 0.6, 5)]
 
     def misfit(c: tuple[float, ...]) -> float:
         if np.min(1.0 + c[0] * _RADII**2 + c[1] * _RADII**4) < -0.5:
             return np.inf
-        return sum(_solve_plane(plane, Profile(c, unit), rounds=2)[1] for plane in planes)
+        profile = RadialProfile(c, unit)
+        return sum(fit_lines(lines, profile.lift(offsets), rounds=2)[1] for lines, offsets in planes)
 
     best = min(candidates, key=misfit) if planes else candidates[0]
     for width in (0.1, 0.03, 0.01, 0.003) if planes else ():
         around = [(best[0] + i * width, best[1] + j * width) for i in (-1, 0, 1) for j in (-1, 0, 1)]
         best = min(around, key=misfit)
-    return Profile(best, unit)
+    return RadialProfile(best, unit)
 
 
 _RADII = np.linspace(0.0, 1.0, 21)
@@ -301,17 +274,17 @@ def ring_radii(sight: Sights, camera: Camera) -> RingRadii:
     return RingRadii(centre, np.linalg.norm(offsets - centre, axis=1), radii)
 
 
-def _from_rings(sight: Sights, camera: Camera, unit: float) -> tuple[Profile, Array]:
+def _from_rings(sight: Sights, camera: Camera, unit: float) -> tuple[RadialProfile, Array]:
     """Profile and homography of concentric rings seen about frontally."""
     radii = ring_radii(sight, camera)
     profile, kappa = ring_profile(radii.measured_px, radii.ring_m, unit)
     if len(np.unique(radii.ring_m)) < 3:
-        profile = Profile((0.0, 0.0), unit)
+        profile = RadialProfile((0.0, 0.0), unit)
     cx, cy = radii.centre
     return profile, np.array([[kappa, 0.0, cx], [0.0, kappa, cy], [0.0, 0.0, 1.0]])
 
 
-def _homographies_of_boards(board: Sights, data: PlaneData, camera: Camera, profile: Profile) -> Array:
+def _homographies_of_boards(board: Sights, data: PlaneData, camera: Camera, profile: RadialProfile) -> Array:
     """The homographies, by LO-RANSAC (pycolmap) where some points of a sight lie far off while most fit."""
     homographies, error_px = homographies_of_sights(data, profile)
     limit = max(_SUSPICIOUS * float(np.median(error_px)), 2.0)

@@ -1,10 +1,16 @@
 """How well a calibration is known: covariance, weak directions, bounds beyond the quadratic picture, maps in mm."""
 
 from ceres_cal.uncertainty.assess import assess
-from ceres_cal.uncertainty.files import PosteriorFile, lower_triangle, posterior_from_file, posterior_to_json, symmetric
+from ceres_cal.uncertainty.files import (
+    PosteriorFile,
+    information_from,
+    lower_triangle,
+    posterior_from_file,
+    posterior_to_file,
+)
 from ceres_cal.uncertainty.maps import FieldMap, PointSpread
 from ceres_cal.uncertainty.posterior import Posterior, make_posterior
-from ceres_cal.uncertainty.profile import Profile, Setting
+from ceres_cal.uncertainty.profile import PhiProfile
 from ceres_cal.uncertainty.seam import Disagreement, disagreement
 from ceres_cal.uncertainty.uncertainty import Uncertainty
 from ceres_cal.uncertainty.weak import Verdict, WeakDirection
@@ -12,19 +18,18 @@ from ceres_cal.uncertainty.weak import Verdict, WeakDirection
 __all__ = [
     "Disagreement",
     "FieldMap",
+    "PhiProfile",
     "PointSpread",
     "Posterior",
     "PosteriorFile",
-    "Profile",
-    "Setting",
     "Uncertainty",
     "Verdict",
     "WeakDirection",
     "assess",
     "disagreement",
+    "information_from",
     "lower_triangle",
     "make_posterior",
     "posterior_from_file",
-    "posterior_to_json",
-    "symmetric",
+    "posterior_to_file",
 ]

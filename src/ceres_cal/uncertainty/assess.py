@@ -9,14 +9,17 @@ import numpy as np
 
 from ceres_cal.model.parameters import Estimate, unit_px
 from ceres_cal.scene.camera import Camera
+from ceres_cal.solve import Problem, ReducedInformation, information
 from ceres_cal.start.initialise import PHI_RANGE, USUAL_PHI
 from ceres_cal.uncertainty.posterior import Posterior, make_posterior, student_95
-from ceres_cal.uncertainty.profile import Node, Setting, profile, valley
+from ceres_cal.uncertainty.profile import Node, profile, valley
 
 _BENT = 0.05  # relative sigma of phi above which the quadratic picture is left
 
 
-def assess(setting: Setting, estimate: Estimate, freedom: float) -> tuple[Estimate, Posterior]:
+def assess(
+    problem: Problem, estimate: Estimate, reduced: ReducedInformation, degrees_of_freedom: float
+) -> tuple[Estimate, Posterior]:
     """What is known at the estimate, and the estimate: another one where phi went astray.
 
     Nearly frontal views can be fitted a little better by a camera a hand's breadth over the floor, or in the clouds,
@@ -25,33 +28,28 @@ def assess(setting: Setting, estimate: Estimate, freedom: float) -> tuple[Estima
     posterior says that phi is unknown.
 
     Args:
-        freedom: spare equations behind the estimated noise, infinite where the sigmas were taken as stated.
+        reduced: what the problem says at the estimate.
+        degrees_of_freedom: spare equations behind the estimated noise, infinite where the sigmas were taken as stated.
 
     Raises:
         SolutionError: no possible lens fits.
     """
-    width, posterior = student_95(freedom), make_posterior(setting.told(estimate), freedom)
+    width, posterior = student_95(degrees_of_freedom), make_posterior(reduced, degrees_of_freedom)
     valleys: dict[str, tuple[Node, ...]] = {}
-    astray: list[str] = []
-    for name in [name for name, numbers in setting.layout.free.items() if 0 in numbers]:
+    astray = problem  # with phi held of the cameras that went astray, while others are looked at
+    for name in [name for name, numbers in problem.layout.free.items() if 0 in numbers]:
         camera = estimate.cameras[name]
         if _is_lens(camera) and posterior.sd_of("camera", name, "phi") <= _BENT * camera.phi:
             continue
-        nodes = valleys[name] = valley(name, _holding(setting, astray), estimate)
+        nodes = valleys[name] = valley(name, astray, estimate)
         rise = max(nodes[0].cost, nodes[-1].cost) - min(node.cost for node in nodes)
         if not _is_lens(camera) or rise < width**2:
             estimate = _usual(name, nodes, width)
-            astray.append(name)  # held at it while other cameras are looked at
-    if astray:
-        posterior = make_posterior(setting.told(estimate), freedom)
+            astray = astray.holding(name, 0)
+    if astray is not problem:
+        posterior = make_posterior(information(problem, estimate), degrees_of_freedom)
     profiles = {name: profile(name, nodes, estimate, width) for name, nodes in valleys.items()}
     return estimate, replace(posterior, profiles=profiles)
-
-
-def _holding(setting: Setting, cameras: Sequence[str]) -> Setting:
-    for name in cameras:
-        setting = setting.holding_phi(name)
-    return setting
 
 
 def _is_lens(camera: Camera) -> bool:

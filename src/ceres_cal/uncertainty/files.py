@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
 
 import msgspec
 import numpy as np
 
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.transforms import Array
-from ceres_cal.model.quantities import Key
+from ceres_cal.model.information import Information
+from ceres_cal.model.keys import Key, pose_keys
 from ceres_cal.uncertainty.posterior import Posterior
-from ceres_cal.uncertainty.profile import Profile
+from ceres_cal.uncertainty.profile import PhiProfile
 
 
 class ProfileFile(msgspec.Struct, forbid_unknown_fields=True):
@@ -36,29 +36,28 @@ class PosteriorFile(msgspec.Struct, forbid_unknown_fields=True):
     profiles: dict[str, ProfileFile]
 
 
-def posterior_to_json(posterior: Posterior) -> dict[str, Any]:
+def posterior_to_file(posterior: Posterior) -> PosteriorFile:
     """Lower triangles, row by row."""
-    rows, columns = np.tril_indices(6)
-    return {
-        "keys": [list(key) for key in posterior.keys],
-        "information": lower_triangle(posterior.information),
-        "placements": {name: matrix[rows, columns].tolist() for name, matrix in posterior.placements.items()},
-        "freedom": posterior.freedom if np.isfinite(posterior.freedom) else None,
-        "profiles": {name: _profile_to_json(profile) for name, profile in posterior.profiles.items()},
-    }
+    degrees = posterior.degrees_of_freedom
+    return PosteriorFile(
+        list(posterior.keys),
+        lower_triangle(posterior.information),
+        {name: lower_triangle(information) for name, information in posterior.placements.items()},
+        degrees if np.isfinite(degrees) else None,
+        {name: _profile_to_file(profile) for name, profile in posterior.profiles.items()},
+    )
 
 
-def _profile_to_json(profile: Profile) -> dict[str, Any]:
-    rows, columns = np.tril_indices(len(profile.keys) - 1)
-    return {
-        "keys": [list(key) for key in profile.keys],
-        "phi_px": profile.phi_px,
-        "steps": profile.steps.tolist(),
-        "rises": profile.rises.tolist(),
-        "information": profile.information[:, rows, columns].tolist(),
-        "open_below": profile.open_below,
-        "open_above": profile.open_above,
-    }
+def _profile_to_file(profile: PhiProfile) -> ProfileFile:
+    return ProfileFile(
+        list(profile.keys),
+        profile.phi_px,
+        profile.steps.tolist(),
+        profile.rises.tolist(),
+        [lower_triangle(information) for information in profile.across],
+        profile.open_below,
+        profile.open_above,
+    )
 
 
 def posterior_from_file(data: PosteriorFile) -> Posterior:
@@ -67,48 +66,50 @@ def posterior_from_file(data: PosteriorFile) -> Posterior:
     Raises:
         InputError: a matrix of the wrong size.
     """
+    placements = {
+        name: information_from(row, pose_keys("placement", name), f"posterior.placements.{name}")
+        for name, row in data.placements.items()
+    }
     return Posterior(
-        tuple(data.keys),
-        symmetric(data.information, len(data.keys), "posterior.information"),
-        {name: symmetric(row, 6, f"posterior.placements.{name}") for name, row in data.placements.items()},
+        information_from(data.information, data.keys, "posterior.information"),
+        placements,
         np.inf if data.freedom is None else data.freedom,
         {name: _profile_from_file(name, entry) for name, entry in data.profiles.items()},
     )
 
 
-def _profile_from_file(name: str, data: ProfileFile) -> Profile:
+def _profile_from_file(name: str, data: ProfileFile) -> PhiProfile:
     where, size = f"posterior.profiles.{name}", len(data.keys)
     counts = {len(data.steps), len(data.rises), len(data.information)}
     if len(counts) != 1 or any(len(row) != size for row in data.steps):
         raise InputError(f"{where}: steps, rises and information do not fit each other: calibrate again")
-    told = [symmetric(row, size - 1, f"{where}.information") for row in data.information]
-    return Profile(
+    return PhiProfile(
         name,
         tuple(data.keys),
         data.phi_px,
         np.array(data.steps),
         np.array(data.rises),
-        np.array(told),
+        tuple(information_from(row, data.keys[1:], f"{where}.information") for row in data.information),
         data.open_below,
         data.open_above,
     )
 
 
-def lower_triangle(matrix: Array) -> list[float]:
+def lower_triangle(information: Information) -> list[float]:
     """Row by row, the diagonal included."""
-    return list(matrix[np.tril_indices(len(matrix))].tolist())
+    return list(information.matrix[np.tril_indices(len(information.keys))].tolist())
 
 
-def symmetric(triangle: list[float], size: int, where: str) -> Array:
-    """The matrix of a lower triangle.
+def information_from(triangle: Sequence[float], keys: Sequence[Key], where: str) -> Information:
+    """Information about the keys from the lower triangle of its matrix.
 
     Raises:
         InputError: not as many numbers as it takes.
     """
-    rows, columns = np.tril_indices(size)
+    rows, columns = np.tril_indices(len(keys))
     if len(triangle) != len(rows):
         raise InputError(f"{where} has {len(triangle)} numbers, not {len(rows)}: calibrate again")
-    matrix = np.empty((size, size))
+    matrix = np.empty((len(keys), len(keys)))
     matrix[rows, columns] = triangle
     matrix[columns, rows] = triangle
-    return matrix
+    return Information(tuple(keys), matrix)

@@ -11,13 +11,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.spread import Spread
-from ceres_cal.base.transforms import Array
+from ceres_cal.model.keys import STATION_QUANTITIES, Key
 from ceres_cal.model.parameters import Estimate
-from ceres_cal.model.quantities import STATION_QUANTITIES, Key, camera_moved, moved, natural_sizes, sigma_limits
+from ceres_cal.model.quantities import camera_moved, moved, natural_sizes
 from ceres_cal.uncertainty.posterior import Posterior
-from ceres_cal.uncertainty.profile import Profile
+from ceres_cal.uncertainty.profile import PhiProfile
 
 _STEP = 1e-5  # of each number's natural size: the differences are good to 1e-9 of the slope
 _NORMAL_95 = 1.645  # one-sided
@@ -115,7 +115,7 @@ def spread_of_points(
     if profile is not None:
         return _by_profile(estimate, profile, posterior.half_width, station, pixels, height_m, located)
     slopes = np.zeros((len(pixels), 2, len(posterior.keys)))
-    slopes[:, :, [posterior.keys.index(key) for key in keys]] = locate_slopes(estimate, keys, station, pixels, height_m)
+    slopes[:, :, posterior.information.columns(keys)] = locate_slopes(estimate, keys, station, pixels, height_m)
     covariance = posterior.spread.through(slopes)
     variance = np.diagonal(covariance, axis1=1, axis2=2)
     reach = posterior.half_width * np.sqrt(variance)
@@ -124,15 +124,15 @@ def spread_of_points(
 
 
 def _by_profile(
-    estimate: Estimate, profile: Profile, width: float, station: str, pixels: Array, height_m: float, located: Array
+    estimate: Estimate, profile: PhiProfile, width: float, station: str, pixels: Array, height_m: float, located: Array
 ) -> PointSpread:
     """The same along the valley: where each of its places puts the points, and how sure it is of that."""
     offsets, covariances = [], []
-    for step, told in zip(profile.steps, profile.information, strict=True):
+    for step, across in zip(profile.steps, profile.across, strict=True):
         there = moved(estimate, profile.keys, step)
         offsets.append(there.camera_at(station).locate(pixels, height_m) - located)
         slopes = locate_slopes(there, profile.keys[1:], station, pixels, height_m)
-        covariances.append(Spread.of(told, sigma_limits(profile.keys[1:])).through(slopes))
+        covariances.append(across.spread.through(slopes))
     values, known = np.array(offsets), np.array(covariances)
     nowhere = np.asarray(np.isnan(values).any(axis=(0, 2)))  # from some place of the valley nothing is seen there
     sds = np.sqrt(np.diagonal(known, axis1=2, axis2=3))

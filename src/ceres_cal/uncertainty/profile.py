@@ -9,18 +9,18 @@ valley exactly, across it by the quadratic picture.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 
+from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import CalibrationError, SolutionError
-from ceres_cal.base.spread import known_inverses, without
-from ceres_cal.base.transforms import Array
-from ceres_cal.model.parameters import Estimate, Layout, Options, unit_px
-from ceres_cal.model.quantities import Key, difference, moved, sigma_limits
-from ceres_cal.observations.sights import Sights
-from ceres_cal.solve import Information, Weighting, information, solve
+from ceres_cal.model.information import Information
+from ceres_cal.model.keys import Key
+from ceres_cal.model.parameters import Estimate, unit_px
+from ceres_cal.model.quantities import difference, moved
+from ceres_cal.solve import Problem, information, solve
 from ceres_cal.start.initialise import PHI_RANGE
 
 _FAR = 9.0  # rise of twice the cost at which the valley is followed no further: three sigma
@@ -34,45 +34,21 @@ _SHRINKING = 0.75  # ratio of two changes over a factor two each: 1/2 of what go
 
 
 @dataclass(frozen=True, eq=False)
-class Setting:
-    """The last solve of a calibration, to be taken up again; `places` are the feet of the curve observations."""
-
-    sights: Sights
-    layout: Layout
-    weighting: Weighting
-    options: Options
-    places: Array | None = None
-
-    def holding_phi(self, camera: str) -> Setting:
-        """The same with phi of a camera held."""
-        free = {**self.layout.free, camera: self.layout.free[camera][self.layout.free[camera] != 0]}
-        return replace(self, layout=replace(self.layout, free=free))
-
-    def solved(self, estimate: Estimate) -> tuple[Estimate, float] | None:
-        """The least cost from there, doubled, and where it is; None where the solver does not get there."""
-        try:
-            solution = solve(self.sights, estimate, self.layout, self.weighting, self.options, places=self.places)
-        except CalibrationError:
-            return None
-        return None if solution.failed else (solution.estimate, 2.0 * solution.cost)
-
-    def told(self, estimate: Estimate) -> Information:
-        """What the observations say there."""
-        return information(self.sights, estimate, self.layout, self.weighting, self.places)
-
-
-@dataclass(frozen=True, eq=False)
 class Node:
-    """One place of the valley: phi held, everything else at its best."""
+    """One place of the valley: phi held, everything else at its best.
+
+    Attributes:
+        cost: twice the least cost there, with that of the priors on phi.
+        information: about everything shared, phi too, though it was held.
+    """
 
     estimate: Estimate
     cost: float
-    told: Information
-    """With phi among its keys, though it was held."""
+    information: Information
 
 
 @dataclass(frozen=True, eq=False)
-class Profile:
+class PhiProfile:
     """The valley of least cost along phi of one camera.
 
     Attributes:
@@ -80,7 +56,7 @@ class Profile:
         phi_px: where the estimate has it.
         steps: (N, K) from the estimate to each place, in the order of phi. rises: (N,) of twice the cost, from the
             lowest place.
-        information: (N, K - 1, K - 1) about all but phi, there, every other number integrated out.
+        across: (N) information about all of the keys but phi, there, every other number integrated out.
         open_below, open_above: the rise stays within the 95 % bound as far as PHI_RANGE goes.
     """
 
@@ -89,7 +65,7 @@ class Profile:
     phi_px: float
     steps: Array
     rises: Array
-    information: Array
+    across: tuple[Information, ...]
     open_below: bool = False
     open_above: bool = False
 
@@ -142,31 +118,30 @@ class Profile:
         return np.asarray(np.where(ratio < _SHRINKING, limit, going))
 
 
-def valley(camera: str, setting: Setting, estimate: Estimate) -> tuple[Node, ...]:
+def valley(camera: str, problem: Problem, estimate: Estimate) -> tuple[Node, ...]:
     """Follow the valley from the estimate both ways, until it is three sigma up or phi is no lens any more.
 
     Raises:
         SolutionError: the solve does not find back to where it ended.
     """
-    held = setting.holding_phi(camera)
     unit, phi = unit_px(estimate.cameras[camera]), estimate.cameras[camera].phi
-    first = _node(camera, held, setting, estimate)
+    first = _node(camera, problem, estimate)
     within = float(np.clip(phi, unit * PHI_RANGE[0], unit * PHI_RANGE[1]))
     while first is not None and phi != within:
         factor = within / phi
         phi = within if 0.5 <= factor <= 2.0 else phi * float(np.clip(factor, 0.5, 2.0))
-        first = _node(camera, held, setting, _ahead(camera, first, phi))
+        first = _node(camera, problem, _ahead(camera, first, phi))
     if first is None:
         raise SolutionError(
             f"camera {camera!r}: the least cost lies at phi {estimate.cameras[camera].phi:.1f} px, which is no lens: "
             "check labels and dimensions, add a prior on height_m or phi, or boards tilted by 20 degrees"
         )
-    down = list(_walk(camera, held, setting, first, -1))
-    up = list(_walk(camera, held, setting, first, +1))
+    down = list(_walk(camera, problem, first, -1))
+    up = list(_walk(camera, problem, first, +1))
     return (*down[::-1], first, *up)
 
 
-def profile(camera: str, nodes: Sequence[Node], estimate: Estimate, half_width: float) -> Profile:
+def profile(camera: str, nodes: Sequence[Node], estimate: Estimate, half_width: float) -> PhiProfile:
     """The valley as seen from the estimate.
 
     Args:
@@ -174,34 +149,39 @@ def profile(camera: str, nodes: Sequence[Node], estimate: Estimate, half_width: 
     """
     costs = np.array([node.cost for node in nodes])
     rises = costs - costs.min()
-    keys = _keys_of(camera, estimate, nodes[0].told.keys)
-    return Profile(
+    keys = _keys_of(camera, estimate, nodes[0].information.keys)
+    return PhiProfile(
         camera,
         keys,
         estimate.cameras[camera].phi,
         np.array([difference(node.estimate, estimate, keys) for node in nodes]),
         rises,
-        np.array([_others(node.told, keys) for node in nodes]),
+        tuple(_across(node.information, keys) for node in nodes),
         bool(rises[0] < half_width**2),
         bool(rises[-1] < half_width**2),
     )
 
 
-def _node(camera: str, held: Setting, setting: Setting, start: Estimate) -> Node | None:
-    found = held.solved(start)
-    if found is None:
+def _node(camera: str, problem: Problem, start: Estimate) -> Node | None:
+    """The least cost with phi held where the start has it; None where the solver does not get there."""
+    try:
+        solution = solve(problem.holding(camera, 0), start)
+    except CalibrationError:
         return None
-    estimate, cost = found
-    return Node(estimate, cost + _of_prior(camera, setting, estimate), setting.told(estimate))
+    if solution.failed:
+        return None
+    estimate = solution.estimate
+    cost = 2.0 * solution.cost + _cost_of_phi(camera, problem, estimate)
+    return Node(estimate, cost, information(problem, estimate).shared)
 
 
-def _of_prior(camera: str, setting: Setting, estimate: Estimate) -> float:
-    """What priors on phi itself add to twice the cost: a solve that holds phi leaves them out."""
-    priors = [p for p in setting.layout.priors if (p.owner, p.name, p.quantity) == ("camera", camera, "phi")]
-    return float(sum(((estimate.cameras[camera].phi - p.value[0]) / p.sigma[0]) ** 2 for p in priors))
+def _cost_of_phi(camera: str, problem: Problem, estimate: Estimate) -> float:
+    """What priors on phi alone add to twice the cost: a solve that holds phi leaves them out."""
+    own = [prior for prior in problem.priors if [key[:3] for key in prior.keys] == [("camera", camera, "phi")]]
+    return float(sum(np.sum(prior.residuals(estimate) ** 2) for prior in own))
 
 
-def _walk(camera: str, held: Setting, setting: Setting, first: Node, direction: int) -> Iterator[Node]:
+def _walk(camera: str, problem: Problem, first: Node, direction: int) -> Iterator[Node]:
     """Nodes on one side, each found from the one before by a step along the valley's slope."""
     unit = unit_px(first.estimate.cameras[camera])
     low, high = (unit * limit for limit in PHI_RANGE)
@@ -212,35 +192,34 @@ def _walk(camera: str, held: Setting, setting: Setting, first: Node, direction: 
         wanted = float(np.clip(phi * np.exp(direction * step), low, high))
         if node.cost - lowest > _FAR or direction * (wanted - phi) <= 0.0:
             return
-        found = _node(camera, held, setting, _ahead(camera, node, wanted))
-        change = np.inf if found is None else abs(found.cost - node.cost)
-        if found is None or (change > _MOST_RISE and node.cost - lowest < _FAR / 2.0 and step > _STEPS[0]):
+        following = _node(camera, problem, _ahead(camera, node, wanted))
+        change = np.inf if following is None else abs(following.cost - node.cost)
+        if following is None or (change > _MOST_RISE and node.cost - lowest < _FAR / 2.0 and step > _STEPS[0]):
             step *= 0.5  # too far to find, or to interpolate where the bounds will lie
             if step < 0.5 * _STEPS[0]:
                 return
             continue
         step = float(np.clip(step * (1.5 if change < 0.5 * _MOST_RISE else 1.0), *_STEPS))
-        node, lowest = found, min(lowest, found.cost)
+        node, lowest = following, min(lowest, following.cost)
         yield node
 
 
 def _first_step(camera: str, node: Node) -> float:
     """Half a standard deviation of log phi by the quadratic picture, within reason."""
-    place = _phi_place(camera, node.told.keys)
-    inverse = known_inverses(node.told.matrix, sigma_limits(node.told.keys))
-    sd = float(np.sqrt(inverse[place, place])) or np.inf
+    place = _phi_place(camera, node.information.keys)
+    sd = float(np.sqrt(node.information.inverse[place, place])) or np.inf
     return float(np.clip(0.5 * sd / node.estimate.cameras[camera].phi, *_STEPS))
 
 
 def _ahead(camera: str, node: Node, phi: float) -> Estimate:
     """The estimate with another phi, and everything shared moved along with it as the normal equations say."""
-    keys, matrix = node.told.keys, node.told.matrix
+    keys = node.information.keys
     place = _phi_place(camera, keys)
     others = np.delete(np.arange(len(keys)), place)
     step = np.zeros(len(keys))
     step[place] = phi - node.estimate.cameras[camera].phi
-    inverse = known_inverses(matrix[np.ix_(others, others)], sigma_limits([keys[i] for i in others]))
-    step[others] = -inverse @ matrix[others, place] * step[place]
+    held = node.information.given([keys[i] for i in others])
+    step[others] = -held.inverse @ node.information.matrix[others, place] * step[place]
     return moved(node.estimate, keys, step)
 
 
@@ -255,12 +234,7 @@ def _keys_of(camera: str, estimate: Estimate, keys: tuple[Key, ...]) -> tuple[Ke
     return (*own, *(key for key in keys if key.kind == "station" and key.owner in mine))
 
 
-def _others(told: Information, keys: tuple[Key, ...]) -> Array:
-    """Information about all of the keys but the first, which is held; what is not among them integrated out."""
-    at = np.array([told.keys.index(key) for key in keys])
-    rest = np.setdiff1d(np.arange(len(told.keys)), at)
-    here = told.matrix[np.ix_(at[1:], at[1:])]
-    if not len(rest):
-        return np.asarray(here)
-    limits = sigma_limits([told.keys[i] for i in rest])
-    return without(here, told.matrix[np.ix_(rest, at[1:])], told.matrix[np.ix_(rest, rest)], limits)
+def _across(information: Information, keys: tuple[Key, ...]) -> Information:
+    """About all of the keys but the first, which is held; what is not among them integrated out."""
+    held = information.given([key for key in information.keys if key != keys[0]])
+    return held.marginal(keys[1:])

@@ -6,9 +6,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ceres_cal.base.transforms import Array
+from ceres_cal.base.arrays import Array, Indices, Mask
 from ceres_cal.model.parameters import Estimate
 from ceres_cal.observations import Columns, Observations
 from ceres_cal.scene.targets import Target, along_track, nearest_on_track
@@ -54,7 +53,7 @@ def predicted(
         keys = station_keys(estimate, posterior, station)
         pixels = shown_pixels(estimate, station, places, height_m)
         shown &= np.isfinite(pixels[:, 0])
-        at = [posterior.keys.index(key) for key in keys]
+        at = posterior.information.columns(keys)
         slopes[:, :, at] += sign * locate_slopes(estimate, keys, station, pixels, height_m)
     found[shown] = posterior.spread.through(slopes[shown])
     return found
@@ -109,7 +108,7 @@ def disagreement(
     observations: Observations,
     estimate: Estimate,
     posterior: Posterior,
-    inliers: tuple[NDArray[np.bool_], NDArray[np.bool_]],
+    inliers: tuple[Mask, Mask],
     scales: tuple[float, float],
     first: str,
     second: str,
@@ -153,10 +152,10 @@ def _compare(here: _Sighting, there: _Sighting, covariance: Array, taken: float)
 
 
 def _rows(
-    observations: Observations, columns: Columns, station: str, inlier: NDArray[np.bool_]
-) -> Iterator[tuple[Target, int, NDArray[np.int64]]]:
+    observations: Observations, columns: Columns, station: str, inlier: Mask
+) -> Iterator[tuple[Target, int, Indices]]:
     """What a station saw of targets that lie in the world: the number of each feature, and its rows."""
-    rows: dict[str, list[NDArray[np.int64]]] = {}
+    rows: dict[str, list[Indices]] = {}
     for number, view in enumerate(observations.views):
         if view.station == station and view.placement is None:
             first, last = np.searchsorted(columns.view, [number, number + 1])
@@ -175,7 +174,7 @@ def _metres_per_px(estimate: Estimate, station: str, pixels: Array, height_m: fl
 
 
 def _points(
-    observations: Observations, estimate: Estimate, station: str, inlier: NDArray[np.bool_], scale: float
+    observations: Observations, estimate: Estimate, station: str, inlier: Mask, scale: float
 ) -> dict[_Thing, _Sighting]:
     found: dict[_Thing, _Sighting] = {}
     columns = observations.points
@@ -189,7 +188,7 @@ def _points(
 
 
 def _stretches(
-    observations: Observations, estimate: Estimate, station: str, inlier: NDArray[np.bool_], scale: float
+    observations: Observations, estimate: Estimate, station: str, inlier: Mask, scale: float
 ) -> dict[_Thing, _Sighting]:
     found: dict[_Thing, _Sighting] = {}
     columns = observations.curves

@@ -9,8 +9,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.transforms import Array
 from ceres_cal.model.parameters import Estimate
 from ceres_cal.scene.targets import MOVABLE, Target
 from ceres_cal.uncertainty.maps import FieldMap, PointSpread, field_map, spread_of_points

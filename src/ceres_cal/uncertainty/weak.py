@@ -7,10 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ceres_cal.base.transforms import Array
+from ceres_cal.base.arrays import Array
 from ceres_cal.base.words import two_digits
-from ceres_cal.model.parameters import Estimate, intrinsic_names, intrinsics_scales, intrinsics_vector
-from ceres_cal.model.quantities import PLACEMENT_QUANTITIES, Key, natural_sizes
+from ceres_cal.model.keys import PLACEMENT_QUANTITIES, Key
+from ceres_cal.model.parameters import Estimate
+from ceres_cal.model.quantities import natural_sizes, values_of
 from ceres_cal.uncertainty.posterior import Posterior
 
 KNOWN, WEAK = 0.01, 0.3
@@ -55,25 +56,6 @@ class WeakDirection:
     words: str
     relative: float
     shares: tuple[tuple[Key, float], ...]
-
-
-def values_of(estimate: Estimate, keys: Sequence[Key]) -> Array:
-    """(P,) the estimate's numbers in the units of the keys; 0 for a turn."""
-    found = np.zeros(len(keys))
-    for place, (kind, owner, quantity, unit) in enumerate(keys):
-        if kind == "camera":
-            camera = estimate.cameras[owner]
-            at = intrinsic_names(camera.lens).index(quantity)
-            found[place] = intrinsics_vector(camera)[at] / intrinsics_scales(camera)[at]
-        elif kind == "structure":
-            found[place] = estimate.structure.values[estimate.structure.names.index(f"{owner}/{quantity}")]
-        elif unit == "m":
-            if kind == "station":
-                position = estimate.stations[owner].cam_from_world.position
-            else:
-                position = estimate.placements[owner].translation
-            found[place] = position[{"x": 0, "y": 1}.get(quantity, 2)]
-    return found
 
 
 def verdicts(estimate: Estimate, posterior: Posterior) -> tuple[Verdict, ...]:

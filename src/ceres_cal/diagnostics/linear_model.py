@@ -8,24 +8,39 @@ the score test (Rao 1948) looks at the second part alone.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
-from ceres_cal.base.transforms import Array, skew
-from ceres_cal.diagnostics.equations import Equations, Ints
-from ceres_cal.model.parameters import Estimate, Layout, Station, intrinsics_vector
+from ceres_cal.base.arrays import Array, Indices, Mask
+from ceres_cal.diagnostics.equations import Equations
+from ceres_cal.model.keys import Key, columns_by_owner
+from ceres_cal.model.parameters import Estimate, intrinsic_names, intrinsics_scales
+from ceres_cal.model.quantities import free_keys, from_placement, from_station
 from ceres_cal.model.structure import Structure
-from ceres_cal.observations.sights import Mask
-from ceres_cal.solve import prior_on_intrinsics, private_placements
+from ceres_cal.solve import Problem
 
 _SINGULAR = 1e-12  # share of its own information that a number must keep beside the others
 
 
 @dataclass(frozen=True, eq=False)
-class Freedom:
+class Weights:
+    """How the E equations count.
+
+    Attributes:
+        inverse_sigma: (E,) 1 / standard deviation, px^-1. used: (E,) which take part. robust: (E,) rho' of each
+            equation's observation.
+    """
+
+    inverse_sigma: Array
+    used: Mask
+    robust: Array
+
+
+@dataclass(frozen=True, eq=False)
+class LinearModel:
     """Equations in standard deviations, and an orthonormal basis of what the free numbers do to them.
 
     Attributes:
@@ -33,7 +48,7 @@ class Freedom:
         score: (E,) robust residuals, in standard deviations; 0 where an equation is not used.
         private: (E, 6) basis of what each private placement does to its sight's equations, 0 elsewhere.
         shared: (E, P) basis of what shared numbers do beyond that; with priors of less than unit length.
-        pull: (P,) how far each direction of `shared` is from its best value, in standard deviations.
+        step: (P,) how far each direction of `shared` is from its best value, in standard deviations.
         unknowns: how many free numbers the equations determine. prior_equations: how many equations priors add.
     """
 
@@ -43,7 +58,7 @@ class Freedom:
     score: Array
     private: Array
     shared: Array
-    pull: Array
+    step: Array
     unknowns: int
     prior_equations: int
 
@@ -73,9 +88,9 @@ class Freedom:
     @cached_property
     def left_over(self) -> Array:
         """(E,) the residuals, in standard deviations, once every free number is at its best value; 0 where not used."""
-        return np.where(self.used, self.placed_score - self.shared @ self.pull, 0.0)
+        return np.where(self.used, self.placed_score - self.shared @ self.step, 0.0)
 
-    def with_columns(self, columns: Array) -> Freedom:
+    def with_columns(self, columns: Array) -> LinearModel:
         """The same model with more free numbers: columns (E, Q), in standard deviations, not yet projected."""
         rest = self.beyond_private(columns)
         inside = rest[self.used]
@@ -83,11 +98,11 @@ class Freedom:
         normal = inside.T @ inside - taken.T @ taken
         root = inverse_root(normal, np.sum(columns[self.used] ** 2, axis=0), 1e-7)
         basis = (rest - self.shared @ taken) @ root
-        pull = root.T @ (inside.T @ self.score[self.used] - taken.T @ self.pull)
+        step = root.T @ (inside.T @ self.score[self.used] - taken.T @ self.step)
         return replace(
             self,
             shared=np.hstack([self.shared, basis]),
-            pull=np.concatenate([self.pull, pull]),
+            step=np.concatenate([self.step, step]),
             unknowns=self.unknowns + root.shape[1],
         )
 
@@ -98,7 +113,15 @@ class Freedom:
         """
         return np.asarray(np.sum(self.private**2, axis=1) + np.sum(self.shared**2, axis=1))
 
-    def overlap(self, first: Ints, second: Ints) -> Array:
+    def spare_of(self, rows: Mask) -> float:
+        """How many of these equations (E,) are left over for the noise."""
+        return float(np.sum(1.0 - self.leverage[rows]))
+
+    def variance(self, rows: Mask) -> float:
+        """Mean square of what is left of these equations (E,), in squared standard deviations."""
+        return float(np.sum(self.left_over[rows] ** 2)) / max(self.spare_of(rows), 1e-9)
+
+    def overlap(self, first: Indices, second: Indices) -> Array:
         """Entries of the hat matrix between pairs of equations of one sight, (N,)."""
         private = np.sum(self.private[first] * self.private[second], axis=1)
         return np.asarray(private + np.sum(self.shared[first] * self.shared[second], axis=1))
@@ -116,20 +139,17 @@ def inverse_root(normal: Array, sizes: Array, least: float) -> Array:
     return np.asarray(scale[:, None] * vectors[:, kept] / np.sqrt(values[kept]))
 
 
-def make_freedom(
-    equations: Equations, estimate: Estimate, layout: Layout, weight: Array, used: Mask, robust: Array
-) -> Freedom:
-    """The linear model of a calibration.
-
-    Args:
-        weight: (E,) px^-1. used: (E,). robust: (E,) rho' of each equation's observation.
-    """
-    score = np.where(used, robust * weight * equations.residual, 0.0)
-    columns = _shared_columns(equations, estimate, layout) * weight[:, None]
-    private, count = _private_basis(equations, layout, weight, used)
-    blank = Freedom(equations, weight, used, score, private, np.zeros((len(equations), 0)), np.zeros(0), count, 0)
+def make_linear_model(problem: Problem, estimate: Estimate, equations: Equations, weights: Weights) -> LinearModel:
+    """The linear model of a calibration, its priors included."""
+    used, weight = weights.used, weights.inverse_sigma
+    score = np.where(used, weights.robust * weight * equations.residual, 0.0)
+    private, count = _private_basis(equations, problem, weight, used)
+    keys = free_keys(estimate, problem.layout, problem.private)
+    columns = shared_columns(equations, estimate, keys) * weight[:, None]
+    nothing = np.zeros((len(equations), 0))
+    blank = LinearModel(equations, weight, used, score, private, nothing, np.zeros(0), count, 0)
     rest = blank.beyond_private(columns)
-    prior_rows, prior_values = _prior_equations(estimate, layout, _places(estimate, layout, equations))
+    prior_rows, prior_values = _prior_equations(problem, estimate, keys)
     inside = rest[used]
     normal = inside.T @ inside + prior_rows.T @ prior_rows
     sizes = np.sum(columns[used] ** 2, axis=0) + np.sum(prior_rows**2, axis=0)
@@ -138,19 +158,16 @@ def make_freedom(
     return replace(
         blank,
         shared=rest @ root,
-        pull=root.T @ gradient,
+        step=root.T @ gradient,
         unknowns=count + root.shape[1],
         prior_equations=len(prior_rows),
     )
 
 
-def _private_basis(equations: Equations, layout: Layout, weight: Array, used: Mask) -> tuple[Array, int]:
-    """(E, 6) see `Freedom`, and how many numbers it stands for."""
+def _private_basis(equations: Equations, problem: Problem, weight: Array, used: Mask) -> tuple[Array, int]:
+    """(E, 6) see `LinearModel`, and how many numbers it stands for."""
     basis, count = np.zeros((len(equations), 6)), 0
-    private = private_placements(equations.sights, layout)
-    for number, key in enumerate(equations.sights.keys):
-        if key.placement not in private:
-            continue
+    for number in equations.sights.numbers(placements=problem.private):
         here = slice(equations.bounds[number], equations.bounds[number + 1])
         columns = equations.pose[here] * weight[here, None]
         inside = columns[used[here]]
@@ -161,72 +178,49 @@ def _private_basis(equations: Equations, layout: Layout, weight: Array, used: Ma
     return basis, count
 
 
-# ---- where shared numbers stand -------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class _Places:
-    """First column of each owner's numbers."""
-
-    cameras: Mapping[str, int]
-    stations: Mapping[str, int]
-    placements: Mapping[str, int]
-    structure: int
-    size: int
-
-
-def _places(estimate: Estimate, layout: Layout, equations: Equations) -> _Places:
-    shown = {key.placement for key in equations.sights.keys}
-    shared = (layout.placements & shown) - private_placements(equations.sights, layout)
-    at = 0
-    groups: list[dict[str, int]] = []
-    for names, sizes in (
-        (list(estimate.cameras), [len(layout.free[name]) for name in estimate.cameras]),
-        ([name for name in estimate.stations if name in layout.stations], None),
-        ([name for name in estimate.placements if name in shared], None),
-    ):
-        group = {}
-        for number, name in enumerate(names):
-            group[name] = at
-            at += 6 if sizes is None else sizes[number]
-        groups.append(group)
-    return _Places(groups[0], groups[1], groups[2], at, at + len(estimate.structure.values))
-
-
-def _shared_columns(equations: Equations, estimate: Estimate, layout: Layout) -> Array:
-    """(E, P) px per free intrinsic, left perturbation of a station or shared placement, and structure number."""
-    places = _places(estimate, layout, equations)
-    columns = np.zeros((len(equations), places.size))
+def shared_columns(equations: Equations, estimate: Estimate, keys: Sequence[Key]) -> Array:
+    """(E, P) px per unit of each key: what a step of the shared numbers does to every equation."""
+    columns, owned = np.zeros((len(equations), len(keys))), columns_by_owner(keys)
     for number, key in enumerate(equations.sights.keys):
         here = slice(equations.bounds[number], equations.bounds[number + 1])
-        free, at = layout.free[key.camera], places.cameras[key.camera]
-        columns[here, at : at + len(free)] = equations.intrinsics[here][:, free]
-        station = estimate.stations[key.station].cam_from_world
-        if key.station in places.stations:
-            # The camera turns about its own origin: what is moved by dw x (R_s t_p) comes on top.
-            lever = equations.poses[number, :, 3] - station.translation
-            at = places.stations[key.station]
-            columns[here, at : at + 6] = equations.pose[here]
-            columns[here, at : at + 3] += equations.motion[here] @ -skew(lever)
-        if key.placement is not None and key.placement in places.placements:
-            at = places.placements[key.placement]
-            columns[here, at : at + 3] = equations.pose[here, :3] @ station.rotation
-            columns[here, at + 3 : at + 6] = equations.motion[here] @ station.rotation
-    add_structure(equations, estimate.structure, columns[:, places.structure :])
+        camera, pose = estimate.cameras[key.camera], equations.poses[number : number + 1]
+        own = owned.get(("camera", key.camera), [])
+        at = [intrinsic_names(camera.lens).index(keys[column].quantity) for column in own]
+        columns[here, own] = equations.intrinsics[here][:, at] * intrinsics_scales(camera)[at]
+        world = estimate.stations[key.station].cam_from_world
+        if own := owned.get(("station", key.station), []):
+            columns[here, own] = equations.pose[here] @ from_station(pose, world)[0]
+        if own := owned.get(("placement", str(key.placement)), []):
+            columns[here, own] = equations.pose[here] @ from_placement(pose, world)[0]
+    structure = [column for column, key in enumerate(keys) if key.kind == "structure"]
+    if structure:
+        columns[:, structure[0] : structure[-1] + 1] += _structure_columns(equations, estimate.structure)
     return columns
 
 
-def add_structure(equations: Equations, structure: Structure, columns: Array) -> None:
-    """Add px per metre of each structure number into columns (E, Q)."""
-    if not len(structure.values):
-        return
+def _structure_columns(equations: Equations, structure: Structure) -> Array:
+    """(E, Q) px per metre of each structure number."""
+    columns = np.zeros((len(equations), len(structure.values)))
     slots, values = structure_columns(equations, structure)
     for k in range(slots.shape[1]):
         rows = np.flatnonzero(slots[:, k] >= 0)
         columns[rows, slots[rows, k]] += values[rows, k]
+    return columns
 
 
-def structure_columns(equations: Equations, structure: Structure) -> tuple[Ints, Array]:
+def _prior_equations(problem: Problem, estimate: Estimate, keys: Sequence[Key]) -> tuple[Array, Array]:
+    """What priors say of the shared numbers, as rows (K, P) and values (K,) in their sigmas."""
+    place = {key: column for column, key in enumerate(keys)}
+    rows, values = [np.zeros((0, len(keys)))], [np.zeros(0)]
+    for prior in problem.priors_at(estimate):
+        row = np.zeros((len(prior.information.root), len(keys)))
+        row[:, [place[key] for key in prior.keys]] = prior.information.root
+        rows.append(row)
+        values.append(prior.residuals(estimate))
+    return np.vstack(rows), np.concatenate(values)
+
+
+def structure_columns(equations: Equations, structure: Structure) -> tuple[Indices, Array]:
     """Which structure numbers move each equation, (E, 4), -1 for none, and by how many px per metre, (E, 4).
 
     Points: x, y, first and second bow. Curves: a segment's offset to the left, or an arc's centre and radius.
@@ -255,41 +249,3 @@ def structure_columns(equations: Equations, structure: Structure) -> tuple[Ints,
     values[curves, 1] = np.where(arc, axes[curves, 1], 0.0)
     values[curves, 2] = np.where(arc, along, 0.0)
     return slots, values
-
-
-# ---- priors ---------------------------------------------------------------------------------------------------------
-
-
-def _prior_equations(estimate: Estimate, layout: Layout, places: _Places) -> tuple[Array, Array]:
-    """What priors say of the shared numbers, as rows (K, P) and values (K,) in their sigmas."""
-    rows: list[Array] = [np.zeros((0, places.size))]
-    values: list[Array] = [np.zeros(0)]
-
-    def add(block: Array, at: int, value: Array) -> None:
-        row = np.zeros((len(block), places.size))
-        row[:, at : at + block.shape[1]] = block
-        rows.append(row)
-        values.append(value)
-
-    for prior in layout.priors:
-        if prior.owner == "station":
-            if prior.name in places.stations:
-                axes = [2] if prior.quantity == "height_m" else [0, 1, 2]
-                turning, sigma = _position_columns(estimate.stations[prior.name])[axes], np.asarray(prior.sigma)
-                off = estimate.stations[prior.name].cam_from_world.position[axes] - prior.value
-                add(turning / sigma[:, None], places.stations[prior.name], off / sigma)
-            continue
-        at, mean, sigma = prior_on_intrinsics(prior, estimate, layout.free)
-        free = layout.free[prior.name]
-        off = intrinsics_vector(estimate.cameras[prior.name])[free[at]] - mean
-        add(np.eye(len(free))[at] / sigma[:, None], places.cameras[prior.name], off / sigma)
-    structure = estimate.structure
-    if len(structure.values):
-        add(np.diag(1.0 / structure.sigma_m), places.structure, structure.values / structure.sigma_m)
-    return np.vstack(rows), np.concatenate(values)
-
-
-def _position_columns(station: Station) -> Array:
-    """(3, 6) how a left perturbation of cam_from_world moves the position -R^T t."""
-    pose = station.cam_from_world
-    return np.hstack([-pose.rotation.T @ skew(pose.translation), -pose.rotation.T])

@@ -1,0 +1,113 @@
+"""A prior's block: root (x - mean) over every camera, station and structure number that it speaks of."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import pyceres
+
+from ceres_cal.base.arrays import Array
+from ceres_cal.base.transforms import Pose, left_jacobian, rotation_exp, rotation_log, skew
+from ceres_cal.model.keys import STATION_QUANTITIES, columns_by_owner
+from ceres_cal.model.parameters import Estimate, Layout, intrinsic_names, intrinsics_scales
+from ceres_cal.model.priors import GaussianPrior
+from ceres_cal.solve.costs import Run
+
+
+class _Linear(NamedTuple):
+    """Numbers that stand in a solver's block themselves, one of them for each column of the prior."""
+
+    columns: list[int]
+    places: list[int]
+    scales: Array
+    size: int
+
+    def values(self, block: Array) -> Array:
+        """(n,) in the units of the keys."""
+        return np.asarray(block[self.places] * self.scales)
+
+    def slopes(self, block: Array) -> Array:
+        """(n, size) derivatives by the block."""
+        slopes = np.zeros((len(self.places), self.size))
+        slopes[np.arange(len(self.places)), self.places] = self.scales
+        return slopes
+
+
+class _Station(NamedTuple):
+    """A station's position, and its turn from the prior's rotation about its own axes."""
+
+    columns: list[int]
+    rows: list[int]
+    rotation: Array
+    size: int = 6
+
+    def values(self, block: Array) -> Array:
+        """(n,) in the units of the keys."""
+        pose = Pose.exp(block)
+        turn = rotation_log(pose.rotation @ self.rotation.T)
+        return np.concatenate([pose.position, turn])[self.rows]
+
+    def slopes(self, block: Array) -> Array:
+        """(n, 6) derivatives by the rotation vector and the translation."""
+        inverse, left = rotation_exp(block[:3]).T, left_jacobian(block[:3])
+        slopes = np.zeros((6, 6))
+        slopes[:3] = np.hstack([-inverse @ skew(block[3:]) @ left, -inverse])
+        turn = rotation_log(inverse.T @ self.rotation.T)
+        slopes[3:, :3] = np.linalg.solve(left_jacobian(turn), left)
+        return slopes[self.rows]
+
+
+class PriorCost(pyceres.CostFunction):
+    """root (x - mean), in standard deviations, of a prior on free numbers alone.
+
+    Attributes:
+        owners: whose blocks the solver hands over, as ("camera" or "station", name), or ("structure", "").
+    """
+
+    def __init__(self, run: Run, prior: GaussianPrior, estimate: Estimate, layout: Layout) -> None:
+        super().__init__()
+        self._run, self._root, self._mean = run, prior.information.root, prior.mean
+        parts = dict(_parts(prior, estimate, layout))
+        self._parts, self.owners = list(parts.values()), list(parts)
+        self.set_num_residuals(len(self._root))
+        self.set_parameter_block_sizes([part.size for part in self._parts])
+
+    def Evaluate(self, parameters: Sequence[Array], residuals: Array, jacobians: Sequence[Array] | None) -> bool:
+        try:
+            off = -self._mean
+            for part, block in zip(self._parts, parameters, strict=True):
+                off[part.columns] += part.values(block)
+            residuals[:] = self._root @ off
+            for jacobian, part, block in zip(jacobians or (), self._parts, parameters, strict=False):
+                jacobian[:] = (self._root[:, part.columns] @ part.slopes(block)).reshape(-1)
+        except BaseException as error:  # an exception must not travel through C++: the solve ends, then it is raised
+            self._run.failure = self._run.failure or error
+            return False
+        return True
+
+
+def _parts(
+    prior: GaussianPrior, estimate: Estimate, layout: Layout
+) -> Sequence[tuple[tuple[str, str], _Linear | _Station]]:
+    """The blocks that a prior depends on, by owner."""
+    parts: list[tuple[tuple[str, str], _Linear | _Station]] = []
+    for (kind, owner), columns in columns_by_owner(prior.keys).items():
+        quantities = [prior.keys[column].quantity for column in columns]
+        if kind == "camera":
+            camera, free = estimate.cameras[owner], layout.free[owner].tolist()
+            numbers = [intrinsic_names(camera.lens).index(quantity) for quantity in quantities]
+            places, scales = [free.index(number) for number in numbers], 1.0 / intrinsics_scales(camera)[numbers]
+            parts.append(((kind, owner), _Linear(columns, places, scales, len(free))))
+        elif kind == "station":
+            rows = [STATION_QUANTITIES.index(quantity) for quantity in quantities]
+            # Without turns among its numbers any rotation will do.
+            rotation = prior.rotations.get(owner, estimate.stations[owner].cam_from_world.rotation)
+            parts.append(((kind, owner), _Station(columns, rows, rotation)))
+    structure = [column for column, key in enumerate(prior.keys) if key.kind == "structure"]
+    if structure:
+        names = estimate.structure.names
+        places = [names.index(prior.keys[column].structure_name) for column in structure]
+        parts.append((("structure", ""), _Linear(structure, places, np.ones(len(places)), len(names))))
+    return parts

@@ -1,0 +1,91 @@
+"""The one least-squares problem: everything about it but the place where it stands."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+from ceres_cal.base.arrays import Array, Indices, Mask
+from ceres_cal.model.parameters import Estimate, Layout, Options
+from ceres_cal.model.priors import GaussianPrior
+from ceres_cal.model.quantities import free_keys
+from ceres_cal.observations.sights import Sights
+
+_CONVEX = ("trivial", "huber", "soft_l1")
+
+
+@dataclass(frozen=True)
+class Weighting:
+    """How residuals become costs.
+
+    Attributes:
+        point_scale, curve_scale: noise scales, factors on the stated sigmas.
+        loss, loss_scale: robust loss of each observation, its scale in standard deviations.
+    """
+
+    point_scale: float = 1.0
+    curve_scale: float = 1.0
+    loss: str = "huber"
+    loss_scale: float = 2.5
+
+    @property
+    def scales(self) -> tuple[float, float]:
+        """Noise scales of points and of curves."""
+        return self.point_scale, self.curve_scale
+
+    @property
+    def is_convex(self) -> bool:
+        """Whether the loss has one minimum."""
+        return self.loss in _CONVEX
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """What is minimised, over what, under what was known before.
+
+    Attributes:
+        sights: the observations that take part. layout: the numbers that are free.
+        priors: all that is known beforehand; of numbers that are held they say nothing.
+        weighting: of the observations. options: iterations and threads.
+        feet: (M,) where on its track each curve observation's foot is sought first (see `residuals`), by row.
+    """
+
+    sights: Sights
+    layout: Layout
+    priors: tuple[GaussianPrior, ...] = ()
+    weighting: Weighting = field(default_factory=Weighting)
+    options: Options = field(default_factory=Options)
+    feet: Array | None = None
+
+    @cached_property
+    def private(self) -> frozenset[str | None]:
+        """Free placements that a single sight shows: each can be eliminated by itself."""
+        return self.layout.placements & self.sights.seen_once
+
+    def priors_at(self, estimate: Estimate) -> list[GaussianPrior]:
+        """What the priors say of numbers that are free, with those that are held at their mean."""
+        free = set(free_keys(estimate, self.layout))
+        restricted = [prior.given(free) for prior in self.priors]
+        return [prior for prior in restricted if prior.keys]
+
+    def unknowns(self, estimate: Estimate) -> int:
+        """Number of free numbers that use up observations: what is known beforehand does not."""
+        known = sum(len(prior.information.root) for prior in self.priors_at(estimate))
+        return max(self.layout.size + len(estimate.structure.values) - known, 0)
+
+    def weighted(self, weighting: Weighting) -> Problem:
+        """The same with other weights."""
+        return replace(self, weighting=weighting)
+
+    def used(self, points: Mask, curves: Mask) -> Problem:
+        """The problem of these rows of the observations alone."""
+        return replace(self, sights=self.sights.used(points, curves))
+
+    def of_sights(self, numbers: Indices) -> Problem:
+        """The problem of some of the sights: no placement that they do not show is free."""
+        sights = self.sights.take(numbers)
+        return replace(self, sights=sights, layout=self.layout.of(sights.keys))
+
+    def holding(self, camera: str, number: int) -> Problem:
+        """The problem with one of a camera's intrinsics held, by its place in the solver's vector."""
+        return replace(self, layout=self.layout.holding(camera, number))

@@ -1,0 +1,174 @@
+"""Solve, judge the noise and the outliers, solve again, until nothing changes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ceres_cal.base.arrays import Indices
+from ceres_cal.base.errors import DegenerateError
+from ceres_cal.model.parameters import Estimate
+from ceres_cal.model.residuals import Residuals, residuals
+from ceres_cal.observations import Observations
+from ceres_cal.observations.sights import SightKey
+from ceres_cal.solve.bundle import Progress, Solution, solve, with_placements_at_best
+from ceres_cal.solve.information import ReducedInformation, information
+from ceres_cal.solve.lost import with_lost_boards_posed
+from ceres_cal.solve.mirrored import without_mirrored_poses
+from ceres_cal.solve.noise import Inliers, Redundancy, judge, visible_from
+from ceres_cal.solve.problem import Problem, Weighting
+
+_MOST_ROUNDS = 15
+_AT_REST, _AT_REST_AGAIN = 1e-2, 1e-5  # relative change of a noise scale that is no change
+_ENOUGH_PLACEMENTS = 20  # of a camera: with them it is known well enough to place all others
+_ROUGH = 1e-3  # relative change of the cost at which the first solve ends
+
+
+@dataclass(frozen=True, eq=False)
+class RobustSolution:
+    """The end of all rounds.
+
+    Attributes:
+        problem: as it was solved last, of the inliers alone and at their noise. solution: of it.
+        inliers, residuals: of all observations, at the end. rounds: how many solves there were.
+        reduced: what observations and priors say there; None where the rounds ran out.
+    """
+
+    problem: Problem
+    solution: Solution
+    inliers: Inliers
+    residuals: Residuals
+    rounds: int
+    reduced: ReducedInformation | None = None
+
+    def moved_to(self, estimate: Estimate, observations: Observations, problem: Problem) -> RobustSolution:
+        """The same with another estimate. `problem`: of all the observations."""
+        there = residuals(observations, problem.sights, estimate, self.residuals.feet)
+        return replace(self, solution=replace(self.solution, estimate=estimate), residuals=there)
+
+
+def solve_robustly(
+    problem: Problem,
+    observations: Observations,
+    estimate: Estimate,
+    usual: tuple[float, float] | None = None,
+    progress: Callable[[Progress], None] | None = None,
+) -> RobustSolution:
+    """The minimum over the inliers, at the noise that they show.
+
+    A start is off by more than the noise, so the first solve rejects nothing that the start can show: a redescending
+    loss at the residuals' median keeps gross errors from deciding.
+
+    Args:
+        problem: of all the observations; its weighting is not looked at.
+        usual: noise scales of points and curves that were seen before, where there are any.
+
+    Raises:
+        CalibrationError: see `solve`.
+    """
+    rounds = _Rounds(problem, observations, usual, progress)
+    state = rounds.first(estimate)
+    undecided = frozenset(state.problem.sights.keys)
+    before: Inliers | None = None
+    while state.rounds < _MOST_ROUNDS:
+        at_rest = before is not None and state.inliers.same_as(before, rounds.no_change)
+        if not at_rest and before is not None:
+            undecided = frozenset(state.problem.sights.keys)  # another lens had decided about mirrored poses
+        if at_rest or before is None:
+            state, changed, undecided = rounds.mended(state, undecided)
+            if at_rest and not changed:
+                state = rounds.with_leverages(state)
+                if state.reduced is not None:
+                    break
+        before, state = state.inliers, rounds.next(state)
+    return state
+
+
+class _Rounds:
+    """What the rounds of one robust solve have in common."""
+
+    def __init__(
+        self,
+        problem: Problem,
+        observations: Observations,
+        usual: tuple[float, float] | None,
+        progress: Callable[[Progress], None] | None,
+    ) -> None:
+        self._problem, self._observations, self._usual, self._progress = problem, observations, usual, progress
+        self._redundancy: Redundancy | None = None
+        self.no_change = _AT_REST if usual is None else _AT_REST_AGAIN
+
+    def first(self, estimate: Estimate) -> RobustSolution:
+        """The rough solve from a start, of few placements, which the others follow."""
+        start = residuals(self._observations, self._problem.sights, estimate)
+        visible = visible_from(self._observations, start)
+        # A line painted aside is an outlier to a redescending loss, but not to its tolerance.
+        loss = "huber" if len(estimate.structure.values) else "cauchy"
+        weighting = Weighting(visible.point_scale, visible.curve_scale, loss, loss_scale=1.0)
+        problem = replace(self._problem.used(visible.points, visible.curves), weighting=weighting, feet=start.feet)
+        if not len(problem.sights):
+            raise DegenerateError(
+                "the observations fix no pose that could show them: add points or lines of the targets"
+            )
+        few = problem.of_sights(_evenly(problem))
+        solution = solve(few, estimate, self._progress, precision=_ROUGH, is_near=False)
+        if len(few.sights) < len(problem.sights):
+            solution = replace(solution, estimate=with_placements_at_best(problem, solution.estimate))
+        return self._judged(solution, start, 1)
+
+    def next(self, state: RobustSolution) -> RobustSolution:
+        """One more solve, from where the last one ended, of what was judged to be inliers."""
+        solution = solve(state.problem, state.solution.estimate, self._progress)
+        return self._judged(solution, state.residuals, state.rounds + 1)
+
+    def mended(
+        self, state: RobustSolution, undecided: frozenset[SightKey]
+    ) -> tuple[RobustSolution, int, frozenset[SightKey]]:
+        """The state with lost boards posed again and mirrored poses turned over, how many there were of both, and which
+        sights' poses compete still.
+        """
+        weighting = state.problem.weighting
+        everything = self._problem.weighted(replace(weighting, loss="cauchy"))
+        estimate, lost = with_lost_boards_posed(everything, state.inliers, state.solution.estimate)
+        estimate, turned, undecided = without_mirrored_poses(state.problem, estimate, undecided)
+        if lost + turned:
+            state = self._judged(replace(state.solution, estimate=estimate), state.residuals, state.rounds)
+        return state, lost + turned, undecided
+
+    def with_leverages(self, state: RobustSolution) -> RobustSolution:
+        """The state with what its problem says there, where the noise is judged no other by the leverages; else judged
+        by them, for another round.
+        """
+        estimate = state.solution.estimate
+        reduced = information(state.problem, estimate)
+        self._redundancy = Redundancy.by_leverage(state.problem.sights, reduced.leverages)
+        anew = self._judged(state.solution, state.residuals, state.rounds)
+        if not anew.inliers.same_as(state.inliers, self.no_change):
+            return anew
+        degrees = anew.inliers.degrees_of_freedom
+        return replace(state, inliers=replace(state.inliers, degrees_of_freedom=degrees), reduced=reduced)
+
+    def _judged(self, solution: Solution, before: Residuals, rounds: int) -> RobustSolution:
+        """Noise and inliers where a solve ended, and the problem that they make."""
+        estimate, options = solution.estimate, self._problem.options
+        there = residuals(self._observations, self._problem.sights, estimate, before.feet)
+        redundancy = self._redundancy or Redundancy.by_count(
+            self._problem.sights.equations, self._problem.unknowns(estimate)
+        )
+        inliers = judge(self._observations, there, redundancy, options, self._usual)
+        weighting = Weighting(inliers.point_scale, inliers.curve_scale, options.loss, options.loss_scale)
+        problem = replace(self._problem.used(inliers.points, inliers.curves), weighting=weighting, feet=there.feet)
+        return RobustSolution(problem, solution, inliers, there, rounds)
+
+
+def _evenly(problem: Problem) -> Indices:
+    """Numbers of some sights that tell a camera well enough for a start: of private placements no more than enough."""
+    private = problem.private
+    chosen: list[int] = []
+    for camera in problem.sights.cameras:
+        boards = problem.sights.numbers(camera, placements=private).tolist()
+        chosen += boards[:: max(1, len(boards) // _ENOUGH_PLACEMENTS)]
+        chosen += set(problem.sights.numbers(camera).tolist()) - set(boards)
+    return np.array(sorted(chosen), dtype=np.int64)
