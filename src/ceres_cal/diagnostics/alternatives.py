@@ -178,15 +178,15 @@ def _frame_families(
         own = equations.of_sights(
             np.array([key.station == station for key in equations.sights.keys]) & (tied | several)
         )
-        shown, group = _numbered(frame, own)
-        if len(shown) < 2:
+        present, group = _numbered(frame, own)
+        if len(present) < 2:
             continue
         columns = motion_columns(equations, estimate)
-        names = tuple(f"{station}\n{tuple(frames)[number]}" for number in shown)
+        names = tuple(f"{station}\n{tuple(frames)[number]}" for number in present)
         units = ("rad",) * 3 + ("m",) * 3
         yield Family("moved after", columns, group, names, onwards=True, units=units)
-        if len(shown) > 2:  # the first or last alone is the same as from there on
-            inner = np.where((group > 0) & (group < len(shown) - 1), group, -1)
+        if len(present) > 2:  # the first or last alone is the same as from there on
+            inner = np.where((group > 0) & (group < len(present) - 1), group, -1)
             yield Family("moved in", columns, inner, names, units=units)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -25,7 +25,7 @@ from ceres_cal.model.parameters import Estimate
 from ceres_cal.model.residuals import Residuals, residuals
 from ceres_cal.observations import Observations
 from ceres_cal.solve import Problem
-from ceres_cal.solve.noise import Inliers, Redundancy, judge, relative_lengths
+from ceres_cal.solve.noise import USUAL_EQUATIONS, Inliers, Redundancy, judge, relative_lengths
 
 FALSE_ALARM_RATE = 0.01
 """Probability that a calibration of sound data gets any finding at all."""
@@ -91,6 +91,8 @@ def diagnose(
     equations = write_equations(observations, problem.sights, estimate, there)
     case = _Case(observations, problem, estimate, inliers, equations)
     model = make_linear_model(problem, estimate, equations, _weights(case))
+    if calibration.refitted is not None and not new_data:
+        model = replace(model, known_noise=USUAL_EQUATIONS)
     table = make_table(observations, inliers, model, _weights(case).robust, dict(estimate.cameras))
     findings, noise, tests = _judge_patterns(case, model, table, false_alarm_rate, calibration if new_data else None)
     return Diagnosis(
@@ -201,4 +203,5 @@ def _with_the_rejected(case: _Case, model: LinearModel, labels: Sequence[Mislabe
     if np.array_equal(used, model.used):
         return model
     robust = np.where(model.score != 0.0, model.score / (model.weight * case.equations.residual), 1.0)
-    return make_linear_model(case.problem, case.estimate, case.equations, Weights(model.weight, used, robust))
+    anew = make_linear_model(case.problem, case.estimate, case.equations, Weights(model.weight, used, robust))
+    return replace(anew, known_noise=model.known_noise)

@@ -228,9 +228,9 @@ def label_of(options: Options) -> str:
 
 def _frames(observations: Observations) -> tuple[tuple[str, ...], Array]:
     """Names of the frames that show anything, and the frame's number of each view (-1: shows nothing)."""
-    shown = np.union1d(observations.points.view, observations.curves.view)
+    showing = np.union1d(observations.points.view, observations.curves.view)
     order: dict[str, int] = {}
-    for view in shown:
+    for view in showing:
         order.setdefault(observations.views[int(view)].frame, len(order))
     return tuple(order), np.array([order.get(view.frame, -1) for view in observations.views])
 

@@ -50,6 +50,7 @@ class LinearModel:
         shared: (E, P) basis of what shared numbers do beyond that; with priors of less than unit length.
         step: (P,) how far each direction of `shared` is from its best value, in standard deviations.
         unknowns: how many free numbers the equations determine. prior_equations: how many equations priors add.
+        known_noise: equations that what was known of the noise before counts as.
     """
 
     equations: Equations
@@ -61,6 +62,7 @@ class LinearModel:
     step: Array
     unknowns: int
     prior_equations: int
+    known_noise: float = 0.0
 
     @property
     def spare(self) -> int:

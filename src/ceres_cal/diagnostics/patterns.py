@@ -73,7 +73,7 @@ def select(
 
 def amounts_of(model: LinearModel, columns: Array) -> tuple[Array, Array, float]:
     """Amounts (Q,) that mend most with columns (E, Q) px per unit, their standard deviations, and by how much the
-    squared residuals fall; 0 and infinite for what cannot be told.
+    squared residuals fall; 0 and infinite for what cannot be determined.
     """
     scaled = columns * model.weight[:, None]
     rest = model.beyond_private(scaled)[model.used]
@@ -91,9 +91,9 @@ def gains_of(model: LinearModel, columns: Array) -> Array:
     rest = model.beyond_private(scaled)[model.used]
     taken = model.shared[model.used].T @ rest
     left = np.sum(rest**2, axis=0) - np.sum(taken**2, axis=0)
-    told = left > LEAST_LEFT * np.sum(scaled[model.used] ** 2, axis=0)
+    determined = left > LEAST_LEFT * np.sum(scaled[model.used] ** 2, axis=0)
     slope = rest.T @ model.score[model.used] - taken.T @ model.step
-    return np.where(told, slope**2 / np.where(told, left, 1.0), 0.0)
+    return np.where(determined, slope**2 / np.where(determined, left, 1.0), 0.0)
 
 
 def beyond(model: LinearModel, column: Array) -> Array:

@@ -79,14 +79,14 @@ def score_all(model: LinearModel, families: Sequence[Family], inflation: float =
         normals, scores, sizes = _sums(model, family)
         for number in np.flatnonzero(sizes.max(axis=1) > 0.0):
             root = inverse_root(normals[number], sizes[number], LEAST_LEFT)
-            if root.shape[1]:
+            if root.shape[1] and model.spare + model.known_noise - root.shape[1] >= 1.0:
                 found.append((family, int(number), root, root.T @ scores[number], sizes[number]))
     if not found:
         return []
     ranks = np.array([root.shape[1] for _, _, root, _, _ in found])
     statistics = np.array([float(z @ z) for _, _, _, z, _ in found])
-    spare = np.maximum(model.spare - ranks, 1)
-    variance = np.maximum(squares - statistics, 1e-12 * squares) / spare
+    spare = model.spare + model.known_noise - ranks
+    variance = (np.maximum(squares - statistics, 1e-12 * squares) + model.known_noise) / spare
     log_p = log_f_tail(statistics / (inflation * ranks * np.maximum(variance, 1e-300)), ranks, spare)
     return [
         Score(

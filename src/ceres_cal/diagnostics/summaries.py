@@ -111,16 +111,16 @@ def _summary(table: ResidualTable, group: Indices, names: list[str]) -> Summary:
     numbers = np.where(table.is_curve, 1.0, 2.0)
     sigmas = table.distance_px / (table.sigma_px * table.scale * np.sqrt(numbers))
     numbers_of = (count(points), count(curves), count(~inlier))
-    shown = np.flatnonzero(sum(numbers_of))
+    filled = np.flatnonzero(sum(numbers_of))
     return Summary(
-        tuple(names[i] for i in shown),
-        numbers_of[0][shown],
-        numbers_of[1][shown],
-        numbers_of[2][shown],
-        rms(points, table.distance_px)[shown],
-        rms(curves, table.distance_px)[shown],
-        rms(inlier, table.error_mm)[shown],
-        rms(inlier, sigmas)[shown],
+        tuple(names[i] for i in filled),
+        numbers_of[0][filled],
+        numbers_of[1][filled],
+        numbers_of[2][filled],
+        rms(points, table.distance_px)[filled],
+        rms(curves, table.distance_px)[filled],
+        rms(inlier, table.error_mm)[filled],
+        rms(inlier, sigmas)[filled],
     )
 
 

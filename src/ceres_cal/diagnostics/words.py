@@ -230,7 +230,7 @@ def _moved(context: Context, others: LinearModel, score: Score, shift: Array, si
         (step_gain, f"shifted by {mm:.1f} ± {mm_sd:.1f} mm"),
     ]
     ways.sort(key=lambda way: -way[0])
-    told = " or ".join(f"{text} (explains {100.0 * min(gain / whole, 1.0):.0f} %)" for gain, text in ways)
+    explanation = " or ".join(f"{text} (explains {100.0 * min(gain / whole, 1.0):.0f} %)" for gain, text in ways)
     names = (*(f"turn about the camera's {axis}" for axis in "xyz"), *(f"shift along {axis}" for axis in "xyz"))
     scale, units = np.array([180.0 / np.pi] * 3 + [1e3] * 3), ["deg"] * 3 + ["mm"] * 3
     amounts = tuple(
@@ -240,7 +240,7 @@ def _moved(context: Context, others: LinearModel, score: Score, shift: Array, si
     advice = "give the frames after it a station of their own"
     if not score.family.onwards:
         advice = "leave this frame out, or give it a station of its own"
-    return _Said(f"station {station!r} moved {when}: {told}; {size}", advice, amounts, frame, station)
+    return _Said(f"station {station!r} moved {when}: {explanation}; {size}", advice, amounts, frame, station)
 
 
 def _length(vector: Array, sd: Array) -> tuple[float, float]:
@@ -280,12 +280,12 @@ def label_findings(context: Context, labels: Sequence[Mislabelled], log_level: f
         kind, offset = ("curve", len(context.observations.points)) if is_curve else ("point", 0)
         rows = np.concatenate([member.rows for member in members])
         frames = list(dict.fromkeys(context.observations.views[member.view].frame for member in members))
-        shown = ", ".join(map(repr, frames[:_MOST_NAMED])) + (" ..." if len(frames) > _MOST_NAMED else "")
+        listing = ", ".join(map(repr, frames[:_MOST_NAMED])) + (" ..." if len(frames) > _MOST_NAMED else "")
         away = float(np.mean(np.concatenate([member.distance_px for member in members])))
         own = np.abs(context.table.distance_px[rows + offset])
         mm = np.abs(context.table.error_mm[rows + offset])
         sentence = (
-            f"frame {shown}: {names[feature]!r} observed where {names[instead]!r} projects ({len(rows)} "
+            f"frame {listing}: {names[feature]!r} observed where {names[instead]!r} projects ({len(rows)} "
             f"{kind} observation{'s' if len(rows) > 1 else ''}, {away:.2f} px from it)"
         )
         yield Finding(

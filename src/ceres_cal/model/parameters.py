@@ -199,11 +199,11 @@ def make_layout(observations: Observations, options: Options) -> Layout:
     if not options.free_aspect:
         held |= {"aspect"}
     free = np.array([i for i, name in enumerate(names) if name not in held], dtype=np.int64)
-    shown = observations.shown_views
+    views = observations.shown_views
     return Layout(
         dict.fromkeys(observations.cameras, free),
-        frozenset(view.station for view in shown) - anchored_stations(observations),
-        frozenset(view.placement for view in shown if view.placement is not None),
+        frozenset(view.station for view in views) - anchored_stations(observations),
+        frozenset(view.placement for view in views if view.placement is not None),
     )
 
 
@@ -212,9 +212,9 @@ def anchored_stations(observations: Observations) -> frozenset[str]:
 
     Boards alone tell poses among themselves only; holding one station removes that freedom.
     """
-    shown = observations.shown_views
-    times = Counter([view.placement for view in shown])
-    group = {view.station: view.station for view in shown}
+    views = observations.shown_views
+    times = Counter([view.placement for view in views])
+    group = {view.station: view.station for view in views}
     first_seen: dict[str, str] = {}
     tied: set[str] = set()
 
@@ -223,7 +223,7 @@ def anchored_stations(observations: Observations) -> frozenset[str]:
             name = group[name]
         return name
 
-    for view in shown:
+    for view in views:
         if view.placement is None:
             tied.add(view.station)
         elif times[view.placement] > 1:

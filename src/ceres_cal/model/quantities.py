@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from dataclasses import replace
 
 import numpy as np
@@ -85,7 +85,7 @@ def intrinsic_keys(name: str, lens: Lens) -> list[Key]:
     return [Key("camera", name, quantity, unit) for quantity, unit in zip(intrinsic_names(lens), units, strict=True)]
 
 
-def free_keys(estimate: Estimate, layout: Layout, private: frozenset[str | None] = frozenset()) -> tuple[Key, ...]:
+def free_keys(estimate: Estimate, layout: Layout, private: Set[str | None] = frozenset()) -> tuple[Key, ...]:
     """Keys of everything free but the private placements: cameras, stations, placements, structure."""
     keys: list[Key] = []
     for name, camera in estimate.cameras.items():
@@ -93,8 +93,9 @@ def free_keys(estimate: Estimate, layout: Layout, private: frozenset[str | None]
         keys += [every[number] for number in layout.free[name]]
     for name in estimate.stations:
         keys += pose_keys("station", name) if name in layout.stations else []
-    for name in estimate.placements:
-        keys += pose_keys("placement", name) if name in layout.placements and name not in private else []
+    shared = layout.placements - private
+    for name in estimate.placements if shared else ():
+        keys += pose_keys("placement", name) if name in shared else []
     return (*keys, *map(Key.of_structure, estimate.structure.names))
 
 

@@ -293,8 +293,8 @@ def _field_grid(case: _Case, height_m: float) -> Array:
     grid = field_grid(case.calibration.targets)
     x, y = (part.ravel() for part in np.meshgrid(*grid))
     places_seen = np.column_stack([x, y])
-    shown = np.isfinite(shown_pixels(case.estimate, case.name, places_seen, height_m)[:, 0])
-    return np.column_stack([places_seen[shown], np.full(np.count_nonzero(shown), height_m)])
+    visible = np.isfinite(shown_pixels(case.estimate, case.name, places_seen, height_m)[:, 0])
+    return np.column_stack([places_seen[visible], np.full(np.count_nonzero(visible), height_m)])
 
 
 def _map_shift_mm(old: Camera, new: Camera, seen: Array, height_m: float) -> tuple[float, float]:

@@ -57,14 +57,14 @@ class StationComparison:
     @property
     def mean_mm(self) -> float:
         """Mean length over what a shows; NaN where it shows nothing."""
-        shown = self.length_mm[np.isfinite(self.length_mm)]
-        return float(np.mean(shown)) if len(shown) else np.nan
+        lengths = self.length_mm[np.isfinite(self.length_mm)]
+        return float(np.mean(lengths)) if len(lengths) else np.nan
 
     @property
     def worst_mm(self) -> float:
         """Largest length."""
-        shown = self.length_mm[np.isfinite(self.length_mm)]
-        return float(np.max(shown)) if len(shown) else np.nan
+        lengths = self.length_mm[np.isfinite(self.length_mm)]
+        return float(np.max(lengths)) if len(lengths) else np.nan
 
     @property
     def explained(self) -> bool | None:

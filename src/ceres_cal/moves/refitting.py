@@ -149,11 +149,11 @@ def _sought(plan: RefitPlan, search: PoseSearch) -> tuple[PoseSearch, Pose]:
 
 def _require_unique(search: PoseSearch, pose: Pose, old: list[Pose]) -> None:
     """Raise DegenerateError where so few features cannot tell a large move from another one."""
-    told = equations(search.sight)
-    if told >= _UNIQUE or any(_is_small(*movement(pose, before)) for before in old):
+    known = equations(search.sight)
+    if known >= _UNIQUE or any(_is_small(*movement(pose, before)) for before in old):
         return
     raise DegenerateError(
-        f"station {search.sight.key.station!r}: its points, lines and arcs give {told} equations, which tell a small "
+        f"station {search.sight.key.station!r}: its points, lines and arcs give {known} equations, which tell a small "
         f"move but not a large one for sure: show {_UNIQUE} (two a point or straight line, three an arc)"
     )
 

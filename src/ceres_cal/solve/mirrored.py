@@ -44,12 +44,12 @@ def _with_better_poses(
     sights: Sights, estimate: Estimate, weighting: Weighting
 ) -> tuple[Estimate, int, frozenset[SightKey]]:
     poses = estimate.pose_stack(sights.keys)
-    doubtful = _doubtful(sights, poses, estimate, weighting)
-    if not len(doubtful):
+    ambiguous = _ambiguous(sights, poses, estimate, weighting)
+    if not len(ambiguous):
         return estimate, 0, frozenset()
-    few = sights.take(doubtful)
-    twice = np.concatenate([poses[doubtful], mirrored(few, poses[doubtful])])
-    costs, found = placement_costs(sights.take(np.tile(doubtful, 2)), estimate, weighting, twice)
+    few = sights.take(ambiguous)
+    twice = np.concatenate([poses[ambiguous], mirrored(few, poses[ambiguous])])
+    costs, found = placement_costs(sights.take(np.tile(ambiguous, 2)), estimate, weighting, twice)
     (as_is, other), (found, turned) = np.split(costs, 2), np.split(found, 2)
     better = np.flatnonzero(other < as_is * (1.0 - 1e-6))
     two = np.max(np.abs(turned - found), axis=(1, 2)) > _SAME  # else the search came back from the mirrored pose
@@ -67,7 +67,7 @@ def _boxes(sights: Sights) -> tuple[Array, Array]:
     return 0.5 * (low + high), 0.5 * np.linalg.norm(high - low, axis=1)
 
 
-def _doubtful(sights: Sights, poses: Array, estimate: Estimate, weighting: Weighting) -> Indices:
+def _ambiguous(sights: Sights, poses: Array, estimate: Estimate, weighting: Weighting) -> Indices:
     """Sights of points whose two poses differ by little: the bend that perspective adds, phi (size / depth)^2 sin(tilt)
     cos(tilt), against the noise.
     """

@@ -16,8 +16,8 @@ from ceres_cal.model.residuals import Residuals
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights
 
-_LEAST_FREEDOM = 8.0  # spare equations below which a spread says nothing
-_USUAL_FREEDOM = 10.0  # spare equations that a scale seen before stands for
+_LEAST_SPARE = 8.0  # spare equations below which a spread says nothing
+USUAL_EQUATIONS = 10.0  # spare equations that a scale seen before stands for
 _ENOUGH = 5_000
 _LEAST_SCALE_PX = 1e-4  # no image is measured better than that
 _RAYLEIGH_MEDIAN = 1.177410022515474  # of the length of a two-dimensional standard normal
@@ -128,7 +128,7 @@ def judge(
     degrees = spare[0] + spare[1]
     if usual is not None:
         p, c = point_spread.scale_from(usual[0], spare[0]), curve_spread.scale_from(usual[1], spare[1])
-        degrees = max(degrees, 0.0) + _USUAL_FREEDOM
+        degrees = max(degrees, 0.0) + USUAL_EQUATIONS
     else:
         point_scale, curve_scale = point_spread.scale(spare[0]), curve_spread.scale(spare[1])
         # A kind with too few spare equations borrows the other's scale; if both have, the stated sigmas hold.
@@ -149,11 +149,11 @@ class _Spread:
 
     def scale(self, spare: float) -> float | None:
         """Their scale, when they bring so many spare equations; None where those are too few to tell."""
-        return max(float(np.sqrt(self.squares / spare)), _LEAST_SCALE_PX) if spare >= _LEAST_FREEDOM else None
+        return max(float(np.sqrt(self.squares / spare)), _LEAST_SCALE_PX) if spare >= _LEAST_SPARE else None
 
     def scale_from(self, usual: float, spare: float) -> float:
         """Their scale, when the usual one counts as much as a few spare equations: few exact ones do not make it 0."""
-        return float(np.sqrt((self.squares + _USUAL_FREEDOM * usual**2) / (max(spare, 0.0) + _USUAL_FREEDOM)))
+        return float(np.sqrt((self.squares + USUAL_EQUATIONS * usual**2) / (max(spare, 0.0) + USUAL_EQUATIONS)))
 
 
 def _spread(lengths: Array, median_of_one: float, reject_sigma: float, least: float) -> _Spread:

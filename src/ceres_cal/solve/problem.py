@@ -64,7 +64,9 @@ class Problem:
 
     def priors_at(self, estimate: Estimate) -> list[GaussianPrior]:
         """What the priors say of numbers that are free, with those that are held at their mean."""
-        free = set(free_keys(estimate, self.layout))
+        if not self.priors:
+            return []
+        free = set(free_keys(estimate, self.layout, self.layout.placements))  # of placements nothing is known before
         restricted = [prior.given(free) for prior in self.priors]
         return [prior for prior in restricted if prior.keys]
 

@@ -144,7 +144,7 @@ class _Rounds:
         estimate = state.solution.estimate
         reduced = information(state.problem, estimate)
         self._redundancy = Redundancy.by_leverage(state.problem.sights, reduced.leverages)
-        anew = self._judged(state.solution, state.residuals, state.rounds)
+        anew = self._weighted(state.solution, state.residuals, state.rounds)
         if not anew.inliers.same_as(state.inliers, self.no_change):
             return anew
         degrees = anew.inliers.degrees_of_freedom
@@ -152,10 +152,14 @@ class _Rounds:
 
     def _judged(self, solution: Solution, before: Residuals, rounds: int) -> RobustSolution:
         """Noise and inliers where a solve ended, and the problem that they make."""
-        estimate, options = solution.estimate, self._problem.options
-        there = residuals(self._observations, self._problem.sights, estimate, before.feet)
+        there = residuals(self._observations, self._problem.sights, solution.estimate, before.feet)
+        return self._weighted(solution, there, rounds)
+
+    def _weighted(self, solution: Solution, there: Residuals, rounds: int) -> RobustSolution:
+        """The same from the residuals there."""
+        options = self._problem.options
         redundancy = self._redundancy or Redundancy.by_count(
-            self._problem.sights.equations, self._problem.unknowns(estimate)
+            self._problem.sights.equations, self._problem.unknowns(solution.estimate)
         )
         inliers = judge(self._observations, there, redundancy, options, self._usual)
         weighting = Weighting(inliers.point_scale, inliers.curve_scale, options.loss, options.loss_scale)

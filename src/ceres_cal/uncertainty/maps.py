@@ -168,14 +168,14 @@ class FieldMap:
     @property
     def mean_mm(self) -> float:
         """Mean standard deviation over what the image shows; NaN where it shows nothing."""
-        shown = self.sd_mm[~np.isnan(self.sd_mm)]
-        return float(np.mean(shown)) if len(shown) else np.nan
+        visible = self.sd_mm[~np.isnan(self.sd_mm)]
+        return float(np.mean(visible)) if len(visible) else np.nan
 
     @property
     def worst_mm(self) -> float:
         """Largest standard deviation over what the image shows."""
-        shown = self.sd_mm[~np.isnan(self.sd_mm)]
-        return float(np.max(shown)) if len(shown) else np.nan
+        visible = self.sd_mm[~np.isnan(self.sd_mm)]
+        return float(np.max(visible)) if len(visible) else np.nan
 
     @property
     def worst_place_m(self) -> tuple[float, float]:
@@ -207,8 +207,8 @@ def field_map(
     """
     x, y = np.meshgrid(x_m, y_m)
     pixels = shown_pixels(estimate, station, np.column_stack([x.ravel(), y.ravel()]), height_m)
-    shown = np.isfinite(pixels[:, 0])
+    visible = np.isfinite(pixels[:, 0])
     sd, radius = np.full(len(pixels), np.nan), np.full(len(pixels), np.nan)
-    found = spread_of_points(estimate, posterior, station, pixels[shown], height_m)
-    sd[shown], radius[shown] = 1e3 * found.sd_m, 1e3 * found.radius_95_m
+    found = spread_of_points(estimate, posterior, station, pixels[visible], height_m)
+    sd[visible], radius[visible] = 1e3 * found.sd_m, 1e3 * found.radius_95_m
     return FieldMap(station, height_m, x_m, y_m, sd.reshape(x.shape), radius.reshape(x.shape))

@@ -48,14 +48,14 @@ def predicted(
 ) -> Array:
     """Covariances (N, 2, 2) m^2 of first less second about places (N, 2) m; NaN where not both see them."""
     found, slopes = np.full((len(places), 2, 2), np.nan), np.zeros((len(places), 2, len(posterior.keys)))
-    shown = np.ones(len(places), dtype=bool)
+    visible = np.ones(len(places), dtype=bool)
     for station, sign in ((first, 1.0), (second, -1.0)):
         keys = station_keys(estimate, posterior, station)
         pixels = shown_pixels(estimate, station, places, height_m)
-        shown &= np.isfinite(pixels[:, 0])
+        visible &= np.isfinite(pixels[:, 0])
         at = posterior.information.columns(keys)
         slopes[:, :, at] += sign * locate_slopes(estimate, keys, station, pixels, height_m)
-    found[shown] = posterior.spread.through(slopes[shown])
+    found[visible] = posterior.spread.through(slopes[visible])
     return found
 
 

@@ -128,8 +128,8 @@ def _words(estimate: Estimate, posterior: Posterior, keys: Sequence[Key], relati
         if ratio < _TOGETHER * relative:
             stations = ", ".join(repr(key.owner) for key in heights)
             whose = "its height" if stations == repr(phi.owner) else f"the height of {stations}"
-            told = f"only their ratio is known, to {two_digits(100.0 * ratio)} %"
-            return f"phi of {phi.owner!r} and {whose} trade off: {told}"
+            known = f"only their ratio is known, to {two_digits(100.0 * ratio)} %"
+            return f"phi of {phi.owner!r} and {whose} trade off: {known}"
     owners = dict.fromkeys(key.owner for key in keys)
     parts = [f"{' and '.join(key.quantity for key in keys if key.owner == o)} of {o!r}" for o in owners]
     many, names = len(keys) > 1, " and ".join(parts)
