@@ -8,18 +8,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 from accuracy_scenes import Problem
 
+from ceres_cal import solve
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import CalibrationError
 from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
 from ceres_cal.model import quantities
+from ceres_cal.model.information import Information
 from ceres_cal.model.keys import Key
-from ceres_cal.model.parameters import Estimate, Layout, Options, Station, make_layout
+from ceres_cal.model.parameters import Estimate, Options, Station, make_layout
+from ceres_cal.model.priors import gather_priors
 from ceres_cal.model.structure import make_structure
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights, gather_sights
 from ceres_cal.simulate import CLEAN, Disturbance, Simulation, simulate
-from ceres_cal.solve import Weighting, information, private_placements, solve
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,9 +35,19 @@ class Trial:
 
     observations: Observations
     truth: Estimate
-    layout: Layout
     clean: Observations
     used: Callable[[Sights], Sights]
+    options: Options
+
+    def problem(self, observations: Observations) -> solve.Problem:
+        """What somebody solves who knows every sigma, and which observations are wrong."""
+        return solve.Problem(
+            self.used(gather_sights(observations)),
+            make_layout(self.clean, self.options),
+            gather_priors(observations, self.options, self.truth.structure),
+            solve.Weighting(1.0, 1.0, "trivial"),
+            self.options,
+        )
 
 
 def make_trial(problem: Problem, disturbance: Disturbance, seed: int) -> Trial:
@@ -45,13 +57,12 @@ def make_trial(problem: Problem, disturbance: Disturbance, seed: int) -> Trial:
     drawn = tuple(
         replace(prior, value=tuple(rng.normal(prior.value, prior.sigma).tolist())) for prior in problem.priors
     )
-    clean = _without_noise(simulation)
     return Trial(
         replace(simulation.observations, priors=drawn),
         true_estimate(simulation, problem.options),
-        make_layout(replace(clean, priors=problem.priors), problem.options),
-        clean,
+        replace(_without_noise(simulation), priors=problem.priors),
         lambda sights: sights.used(simulation.points.flag == CLEAN, simulation.curves.flag == CLEAN),
+        problem.options,
     )
 
 
@@ -69,25 +80,21 @@ def true_estimate(simulation: Simulation, options: Options) -> Estimate:
     return Estimate(scene.cameras, stations, scene.placements, structure)
 
 
-def bound(trial: Trial) -> tuple[tuple[Key, ...], Array]:
-    """Keys and information (P, P), at the truth, of everything shared: the inverse of the Cramer-Rao bound."""
-    found = information(
-        trial.used(gather_sights(trial.clean)), trial.truth, trial.layout, Weighting(1.0, 1.0, "trivial")
-    )
-    return found.keys, found.matrix
+def bound(trial: Trial) -> Information:
+    """Information, at the truth, about everything shared: the inverse of the Cramer-Rao bound."""
+    return solve.information(trial.problem(trial.clean), trial.truth).shared
 
 
-def best(trial: Trial, options: Options) -> Estimate:
+def best(trial: Trial) -> Estimate:
     """What somebody reaches who knows the truth to start from, every sigma, and which observations are wrong."""
-    sights = trial.used(gather_sights(trial.observations))
-    layout = replace(trial.layout, priors=trial.observations.priors)
-    return solve(sights, trial.truth, layout, Weighting(1.0, 1.0, "trivial"), options).estimate
+    return solve.solve(trial.problem(trial.observations), trial.truth).estimate
 
 
 def difference(trial: Trial, estimate: Estimate) -> Array:
     """Estimate less truth (P,) in the order of `bound`'s keys."""
-    alone = private_placements(gather_sights(trial.clean), trial.layout)
-    return quantities.difference(estimate, trial.truth, shared_keys(trial.truth, trial.layout, alone))
+    problem = trial.problem(trial.clean)
+    keys = quantities.free_keys(trial.truth, problem.layout, problem.private)
+    return quantities.difference(estimate, trial.truth, keys)
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,10 +157,11 @@ def efficiency(problem: Problem, disturbance: Disturbance, seeds: Sequence[int])
     for trial, calibration in attempts(problem, disturbance, seeds):
         if calibration is None:
             continue
-        keys, matrix = bound(trial)
+        known = bound(trial)
+        keys, matrix = known.keys, known.matrix
         errors.append(difference(trial, calibration.estimate))
         squared.append(errors[-1] @ matrix @ errors[-1] / len(keys))
-        ideal = difference(trial, best(trial, problem.options))
+        ideal = difference(trial, best(trial))
         best_squared.append(ideal @ matrix @ ideal / len(keys))
         rejected.append(len(calibration.rejected))
     return Efficiency(

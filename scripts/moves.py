@@ -21,7 +21,7 @@ import numpy as np
 from accuracy import map_errors_mm
 from accuracy_scenes import FIELD, field_places
 from cases import Row, run
-from photographs import varied
+from photograph_shots import varied
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import CalibrationError

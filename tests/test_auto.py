@@ -6,7 +6,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import photographs as script
+import photograph_shots as script
 import photographs_auto as auto_script
 import pytest
 

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import photographs as script
+import photograph_shots as script
+import photographs
 import pytest
 
 from ceres_cal.base.errors import InputError
@@ -235,6 +236,6 @@ def test_the_real_photograph(real_data: Path) -> None:
 
 
 def test_the_script_prints_its_figures(capsys: pytest.CaptureFixture[str]) -> None:
-    assert script.main(["--case", "rings", "--runs", "1", "--json"]) == 0
+    assert photographs.main(["--case", "rings", "--runs", "1", "--json"]) == 0
     (row,) = json.loads(capsys.readouterr().out)
     assert row["verdict"] == "yes" and row["value"] < 0.3
