@@ -133,8 +133,8 @@ def map_errors_mm(truth: Camera, estimate: Camera, places: Array, height_m: floa
 def predicted_mm(problem: Problem, places: Array, height_m: float) -> Array:
     """The map error (DRAWS, N) that the Cramer-Rao bound lets expect, by differences of the true camera's map."""
     trial = make_trial(problem, SSL_NOISE, 0)
-    keys, information = bound(trial)
-    covariance = np.linalg.inv(information)
+    known = bound(trial)
+    keys, covariance = known.keys, np.linalg.inv(known.matrix)
     (name,) = trial.truth.stations
     truth = trial.truth.camera_at(name)
 
@@ -167,7 +167,7 @@ def ssl_vision_rows(name: str, problem: Problem, runs: int) -> Iterator[Row]:
     for trial, calibration in attempts(problem, SSL_NOISE, range(runs)):
         if calibration is not None:
             ours.append(calibration.station())
-            ideal.append(best(trial, problem.options).camera_at(*calibration.stations))
+            ideal.append(best(trial).camera_at(*calibration.stations))
     for height_m, others in zip(HEIGHTS_M, SSL_VISION_MM[name], strict=True):
         case = f"{name}, z = {1e3 * height_m:.0f} mm"
         limit = predicted_mm(problem, places, height_m)

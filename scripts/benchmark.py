@@ -242,8 +242,8 @@ def uncertainty_share(frames: int, repeat: int) -> float:
     from ceres_cal.calibrating import calibrate
     from ceres_cal.model.parameters import Options, make_layout
     from ceres_cal.observations.sights import gather_sights
-    from ceres_cal.solve import Weighting
-    from ceres_cal.uncertainty import Setting, assess
+    from ceres_cal.solve import Problem, Weighting, information
+    from ceres_cal.uncertainty import assess
 
     observations, options = corner_observations(wide_lens(frames).corners), Options(lens="brown", free_aspect=True)
     calibrate(observations, options)
@@ -252,8 +252,8 @@ def uncertainty_share(frames: int, repeat: int) -> float:
         start = time.perf_counter()
         calibration = calibrate(observations, options)
         middle = time.perf_counter()
-        setting = Setting(sights, layout, Weighting(calibration.fit.point_scale), options)
-        _, posterior = assess(setting, calibration.estimate, np.inf)
+        whole = Problem(sights, layout, (), Weighting(calibration.fit.point_scale), options)
+        _, posterior = assess(whole, calibration.estimate, information(whole, calibration.estimate), np.inf)
         assessed = time.perf_counter() - middle
         known = len(dict(posterior.placements))
         everything = time.perf_counter() - middle

@@ -34,7 +34,7 @@ from ceres_cal.model.parameters import Estimate
 from ceres_cal.model.quantities import difference
 from ceres_cal.model.structure import make_structure
 from ceres_cal.moves import check, refit
-from ceres_cal.moves.carried import layouts, make_plan
+from ceres_cal.moves.carried import make_plan, refit_problem
 from ceres_cal.observations import Observations, combine, taken
 from ceres_cal.observations.sights import gather_sights
 from ceres_cal.photographs import FieldOptions, check_photographs, detect_field
@@ -172,9 +172,10 @@ def bound_of(calibration: Calibration, clean: Observations, pose: Pose) -> tuple
     """Keys and covariance that data and prior together allow, at the truth."""
     truth = truth_of(calibration, pose)
     plan = make_plan(calibration, clean, "pose", None, False)
-    _, known = layouts(plan, "pose", truth, ())
-    found = information(gather_sights(plan.observations), truth, known, Weighting(1.0, 1.0, "trivial"))
-    return found.keys, np.asarray(np.linalg.inv(found.matrix), dtype=float)
+    problem, known = refit_problem(plan, "pose", gather_sights(plan.observations), truth)
+    problem = replace(problem, layout=known, weighting=Weighting(1.0, 1.0, "trivial"))
+    found = information(problem, truth).shared
+    return found.keys, np.asarray(np.linalg.inv(found.matrix))
 
 
 def bound_case(runs: int) -> Iterator[Row]:

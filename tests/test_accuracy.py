@@ -75,7 +75,8 @@ def test_bound_by_differences() -> None:
     """The information of the field is that of its residuals' differences, none of the package's derivatives in it."""
     problem = scenes.over_the_field()
     trial = limit.make_trial(problem, scenes.CLEAN_NOISE, 0)
-    keys, matrix = limit.bound(trial)
+    known = limit.bound(trial)
+    keys, matrix = known.keys, known.matrix
     sights = gather_sights(trial.clean)
     height = problem.priors[0].sigma[0]
 

@@ -15,7 +15,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from accuracy_bound import make_trial
-from accuracy_scenes import CLEAN_NOISE, FIELD, Problem, tilted, two_cameras
+from accuracy_scenes import CLEAN_NOISE, FIELD, tilted, two_cameras
+from accuracy_scenes import Problem as Case
 from advice import CASES, Kept, followed, promised_for
 
 from ceres_cal.advice import Advice, Errors, Measurement, Promise, advise, promised
@@ -26,16 +27,17 @@ from ceres_cal.base.errors import InputError
 from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
 from ceres_cal.cli import main
-from ceres_cal.model.parameters import Layout, Options, make_layout
+from ceres_cal.model.parameters import Options, make_layout
+from ceres_cal.model.priors import gather_priors
 from ceres_cal.model.structure import Tolerance, make_structure
 from ceres_cal.observations import Observations, combine
 from ceres_cal.observations.sights import gather_sights
 from ceres_cal.scene.targets import checkerboard, rings
 from ceres_cal.simulate import Disturbance, board_scene, simulate
-from ceres_cal.solve import Weighting, information
+from ceres_cal.solve import Problem, Weighting, information
 from ceres_cal.uncertainty import Uncertainty
 
-PROBLEMS: dict[str, Callable[[], Problem]] = {**CASES, "two cameras": two_cameras, "as built": partial(tilted, 8.0)}
+PROBLEMS: dict[str, Callable[[], Case]] = {**CASES, "two cameras": two_cameras, "as built": partial(tilted, 8.0)}
 
 
 @cache
@@ -73,7 +75,7 @@ def test_what_is_told_is_what_the_observations_would_tell(name: str) -> None:
     estimate, tolerances = calibration.estimate, calibration.options.tolerances
     ground = Ground(estimate, calibration.uncertainty.posterior.keys, calibration.targets, tolerances, weighting)
 
-    def told(seen: Observations, layout: Layout, more: Mapping[str, Tolerance], added: Measurement) -> Array:
+    def matrix(seen: Observations, options: Options, more: Mapping[str, Tolerance], added: Measurement) -> Array:
         structure = make_structure(seen.targets, {**tolerances, **more})
         values = dict(zip(estimate.structure.names, estimate.structure.values, strict=True))
         there = replace(
@@ -81,14 +83,15 @@ def test_what_is_told_is_what_the_observations_would_tell(name: str) -> None:
             structure=structure.with_values(np.array([values.get(n, 0.0) for n in structure.names])),
             placements={**estimate.placements, **added.placements},
         )
-        found = information(gather_sights(seen), there, layout, weighting)
-        at = [found.keys.index(key) for key in ground.keys]
-        rest = np.setdiff1d(np.arange(len(found.keys)), at)
-        whole = np.linalg.inv(found.matrix) if len(rest) else None
-        return found.matrix[np.ix_(at, at)] if whole is None else np.linalg.inv(whole[np.ix_(at, at)])
+        priors = gather_priors(seen, options, there.structure)
+        found = information(Problem(gather_sights(seen), make_layout(seen, options), priors, weighting), there).shared
+        at = found.columns(ground.keys)
+        if len(at) == len(found.keys):
+            return found.given(ground.keys).matrix
+        return np.asarray(np.linalg.inv(np.linalg.inv(found.matrix)[np.ix_(at, at)]))
 
     nothing = Measurement("tape", "")
-    before = told(observations, make_layout(observations, calibration.options), {}, nothing)
+    before = matrix(observations, calibration.options, {}, nothing)
     for kind, promise in first_of(advised(name)).items():
         added = promise.measurement
         seen = observations
@@ -97,10 +100,9 @@ def test_what_is_told_is_what_the_observations_would_tell(name: str) -> None:
                 replace(estimate, placements=added.placements), {**seen.targets, **added.targets}, added.views
             )
             seen = combine([observations, sight])
-        layout = make_layout(seen, replace(calibration.options, priors=added.priors))
-        after = told(seen, layout, added.tolerances, added)
+        after = matrix(seen, replace(calibration.options, priors=added.priors), added.tolerances, added)
         scale = 1.0 / np.sqrt(np.diag(after))
-        off = (after - before - ground.told_by(added)) * scale[:, None] * scale
+        off = (after - before - ground.information_of(added).matrix) * scale[:, None] * scale
         assert np.max(np.abs(off)) < 1e-6, kind  # 2e-8 measured, of phi and height by an inverse of an inverse
 
 
@@ -123,15 +125,16 @@ def test_the_best_of_a_pool_tell_together_what_each_tells() -> None:
         ]
         assert len(parts) == len(whole.steps)
         assert together(parts, whole.words).views == whole.views
-        one_by_one = np.sum([ground.told_by(part) for part in parts], axis=0)
-        assert ground.told_by(whole) == pytest.approx(one_by_one, rel=1e-6, abs=1e-9 * np.max(np.abs(one_by_one)))
+        one_by_one = np.sum([ground.information_of(part).matrix for part in parts], axis=0)
+        expected = pytest.approx(one_by_one, rel=1e-6, abs=1e-9 * np.max(np.abs(one_by_one)))
+        assert ground.information_of(whole).matrix == expected
 
 
 def test_what_the_camera_does_not_see_tells_nothing() -> None:
     ground, _ = _prepared(calibrated("whole field, 8 deg"), None, 0.15)
     pole = first_of(advised("whole field, 8 deg"))["pole"].measurement
     high = {name: replace(t, points={"top": (0.0, 0.0, 50.0)}) for name, t in pole.targets.items()}
-    assert not np.any(ground.told_by(replace(pole, targets=high)))
+    assert not np.any(ground.information_of(replace(pole, targets=high)).matrix)
 
 
 @pytest.mark.parametrize("name", ["whole field, 8 deg", "whole field, 1 deg, 6 boards", "two cameras"])
@@ -154,7 +157,7 @@ def test_what_would_be_left_is_the_map_of_what_would_be_known(name: str) -> None
     tolerances = calibration.options.tolerances
     ground = Ground(known.estimate, known.posterior.keys, calibration.targets, tolerances, weighting)
     for promise in first_of(advice).values():
-        more = known.posterior.information + ground.told_by(promise.measurement)
+        more = known.posterior.information + ground.information_of(promise.measurement)
         there = Uncertainty(known.estimate, replace(known.posterior, information=more), calibration.targets)
         expected = there.map_sd_mm(advice.station, 0.15)
         assert promise.after.worst_mm == pytest.approx(expected.worst_mm, rel=1e-6)

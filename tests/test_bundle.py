@@ -23,11 +23,12 @@ from ceres_cal.model.parameters import (
     make_layout,
     with_intrinsics,
 )
+from ceres_cal.model.priors import gather_priors
 from ceres_cal.model.residuals import residuals
 from ceres_cal.observations import Observations, Prior, taken
 from ceres_cal.observations.sights import gather_sights
 from ceres_cal.simulate import Disturbance, simulate
-from ceres_cal.solve import Progress, Weighting, solve
+from ceres_cal.solve import Problem, Progress, Weighting, solve
 from ceres_cal.start.initialise import initialise
 
 NOISE = Disturbance(points_sigma_px=0.3, curves_sigma_px=0.3, outliers=0.03, outlier_spread_px=5.0)
@@ -54,10 +55,15 @@ def start_of(name: str) -> Estimate:
     return replace(start, cameras=cameras, stations=stations, placements=placements)
 
 
+def problem_of(observations: Observations, options: Options, weighting: Weighting, start: Estimate) -> Problem:
+    priors = gather_priors(observations, options, start.structure)
+    return Problem(gather_sights(observations), make_layout(observations, options), priors, weighting, options)
+
+
 def solved(name: str, weighting: Weighting, start: Estimate | None = None, **more: Any) -> Any:
     observations, options = case(name)
-    layout = make_layout(observations, replace(options, **more))
-    return solve(gather_sights(observations), start or start_of(name), layout, weighting, replace(options, **more))
+    start = start or start_of(name)
+    return solve(problem_of(observations, replace(options, **more), weighting, start), start)
 
 
 def distance(a: Estimate, b: Estimate) -> float:
@@ -196,9 +202,9 @@ def test_noise_scales_weigh_points_against_curves() -> None:
     """Twice as sure of the curves: as if their sigmas were halved."""
     observations, options = case("radial-2-3/field-boards")
     sure = replace(observations, curves=replace(observations.curves, sigma_px=0.5 * observations.curves.sigma_px))
-    start, layout = start_of("radial-2-3/field-boards"), make_layout(observations, options)
-    by_scale = solve(gather_sights(observations), start, layout, Weighting(1.0, 0.5), options)
-    by_sigma = solve(gather_sights(sure), start, layout, Weighting(), options)
+    start = start_of("radial-2-3/field-boards")
+    by_scale = solve(problem_of(observations, options, Weighting(1.0, 0.5), start), start)
+    by_sigma = solve(problem_of(sure, options, Weighting(), start), start)
     assert distance(by_scale.estimate, by_sigma.estimate) < 1e-12
     assert distance(by_scale.estimate, solved("radial-2-3/field-boards", Weighting()).estimate) > 1e-5
 
@@ -225,7 +231,8 @@ def test_what_is_held_comes_back_as_it_was(held: str) -> None:
             held, whole.placements
         ),
     )
-    found = solve(gather_sights(observations), start, layout, Weighting(), options).estimate
+    problem = replace(problem_of(observations, options, Weighting(), start), layout=layout)
+    found = solve(problem, start).estimate
     for camera in start.cameras:
         assert (found.cameras[camera] == start.cameras[camera]) == (held in ("cameras", "all"))
     for station in start.stations:
@@ -241,18 +248,19 @@ def test_priors_on_what_is_held_are_no_contradiction() -> None:
     observations, options = case(name)
     options = replace(options, fixed={"cx": 651.3})
     prior = Prior("camera", "overhead", "principal_point", (600.0, 470.0), (0.1, 0.001))
-    layout = make_layout(observations, replace(options, priors=(prior,)))
     start = start_of(name)
-    camera = solve(gather_sights(observations), start, layout, Weighting(), options).estimate.cameras["overhead"]
+    problem = problem_of(observations, replace(options, priors=(prior,)), Weighting(), start)
+    camera = solve(problem, start).estimate.cameras["overhead"]
     assert camera.principal_point[0] == 651.3
     assert camera.principal_point[1] == pytest.approx(470.0, abs=0.001)
 
 
 def test_fewer_numbers_than_unknowns() -> None:
     observations, options = case("radial-2-3/corners")
-    sights = gather_sights(replace(observations, points=taken(observations.points, np.arange(5))))
+    few = replace(observations, points=taken(observations.points, np.arange(5)))
+    start = start_of("radial-2-3/corners")
     with pytest.raises(DegenerateError, match=r"10 measured numbers .* cannot determine 11 unknowns: add observations"):
-        solve(sights, start_of("radial-2-3/corners"), make_layout(observations, options), Weighting(), options)
+        solve(problem_of(few, options, Weighting(), start), start)
 
 
 # ---- how it ends ----------------------------------------------------------------------------------------------------
@@ -273,7 +281,7 @@ class EnoughError(Exception):
 def test_a_failure_in_progress_comes_out_and_nothing_is_left_behind(name: str) -> None:
     observations, options = case(name)
     start, before = start_of(name), start_of(name)
-    sights, layout = gather_sights(observations), make_layout(observations, options)
+    problem = problem_of(observations, options, Weighting(), start)
     calls: list[Progress] = []
 
     def progress(now: Progress) -> None:
@@ -284,10 +292,10 @@ def test_a_failure_in_progress_comes_out_and_nothing_is_left_behind(name: str) -
     for _ in range(20):  # a crash of the process would need more than one try to be seen
         calls.clear()
         with pytest.raises(EnoughError):
-            solve(sights, start, layout, Weighting(), options, progress)
+            solve(problem, start, progress)
         assert [now.iteration for now in calls] == [0, 1]
     assert distance(start, before) == 0.0
-    assert solve(sights, start, layout, Weighting(), options).converged
+    assert solve(problem, start).converged
 
 
 def test_a_start_that_shows_nothing_fails_without_a_crash() -> None:
@@ -298,5 +306,5 @@ def test_a_start_that_shows_nothing_fails_without_a_crash() -> None:
     away = Pose.exp([0.0, np.pi, 0.0, 0.0, 0.0, 0.0])
     stations = {key: Station(place.camera, away @ place.cam_from_world) for key, place in start.stations.items()}
     lost = replace(start, stations=stations)
-    found = solve(gather_sights(observations), lost, make_layout(observations, options), Weighting(), options)
+    found = solve(problem_of(observations, options, Weighting(), lost), lost)
     assert found.failed and not found.converged

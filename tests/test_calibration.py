@@ -52,8 +52,9 @@ def content(calibration: Calibration) -> dict[str, Any]:
         "phi_from": dict(calibration.phi_from),
         "versions": dict(calibration.versions),
         "targets": dict(calibration.targets),
-        "posterior": posterior and (posterior.keys, posterior.information.tolist(), posterior.freedom),
-        "placements known": posterior and {name: m.tolist() for name, m in posterior.placements.items()},
+        "posterior": posterior
+        and (posterior.keys, posterior.information.matrix.tolist(), posterior.degrees_of_freedom),
+        "placements known": posterior and {name: known.matrix.tolist() for name, known in posterior.placements.items()},
     }
 
 

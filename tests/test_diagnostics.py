@@ -11,7 +11,6 @@ import diagnostic_scenes as scenes
 import numpy as np
 import pytest
 import scenes as usual
-from ceres_cal.diagnostics.freedom import _shared_columns, make_freedom
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
@@ -22,7 +21,8 @@ from ceres_cal.cli import main
 from ceres_cal.detect.boards import BoardDetections
 from ceres_cal.diagnostics import Diagnosis, choose, cross_validate, diagnose
 from ceres_cal.diagnostics.equations import Equations, write_equations
-from ceres_cal.model.parameters import Options, intrinsics_vector, make_layout, with_intrinsics
+from ceres_cal.diagnostics.linear_model import Weights, make_linear_model
+from ceres_cal.model.parameters import Options, intrinsics_vector, with_intrinsics
 from ceres_cal.model.residuals import residuals
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.observations.sights import gather_sights
@@ -99,27 +99,28 @@ def test_leverage_is_the_diagonal_of_the_hat_matrix() -> None:
     prior = Prior("station", "overhead", "height_m", (4.02,), (0.005,))
     seen = replace(simulate(scenes.overhead(frames=2, boards=4), scenes.NOISE, 3).observations, priors=(prior,))
     calibration = calibrate(seen, PLAIN)
-    layout, equations = make_layout(seen, PLAIN), linearised(seen, calibration)
+    problem, equations = calibration.problem(seen), linearised(seen, calibration)
     count = len(equations)
-    freedom = make_freedom(
-        equations, calibration.estimate, layout, np.full(count, 2.0), np.ones(count, bool), np.ones(count)
-    )
+    weights = Weights(np.full(count, 2.0), np.ones(count, bool), np.ones(count))
+    model = make_linear_model(problem, calibration.estimate, equations, weights)
     private = [i for i, key in enumerate(equations.sights.keys) if key.placement is not None]
     boards = np.hstack([equations.pose * (equations.sight == i)[:, None] for i in private])
-    whole = 2.0 * np.hstack([_shared_columns(equations, calibration.estimate, layout), boards])
+    free = problem.layout.free["overhead"]
+    # In other coordinates than the model's: the solver's intrinsics, and a perturbation of the pose from the left.
+    whole = 2.0 * np.hstack([equations.intrinsics[:, free], equations.pose, boards])
     pose = calibration.estimate.stations["overhead"].cam_from_world
     of_prior = np.zeros((1, whole.shape[1]))
-    at = len(layout.free["overhead"])
+    at = len(free)
     x, y, z = pose.translation
     of_prior[0, at : at + 6] = np.hstack(
         [-pose.rotation.T @ [[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]], -pose.rotation.T]
     )[2]
     information = whole.T @ whole + of_prior.T @ of_prior / 0.005**2
     hat = np.einsum("ei,ij,ej->e", whole, np.linalg.inv(information), whole)
-    assert freedom.leverage == pytest.approx(hat, abs=1e-8)
-    assert freedom.unknowns == layout.size
-    # At the end of the solve nothing pulls any more.
-    assert np.max(np.abs(freedom.pull)) < 0.1
+    assert model.leverage == pytest.approx(hat, abs=1e-8)
+    assert model.unknowns == problem.layout.size
+    # At the end of the solve there is no step left to take.
+    assert np.max(np.abs(model.step)) < 0.1
 
 
 def test_leverage_foretells_the_residual_without_the_observation() -> None:

@@ -16,7 +16,7 @@ from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Brown
 from ceres_cal.scene.targets import checkerboard
 from ceres_cal.simulate import Disturbance, Scene, Station, board_scene, simulate
-from ceres_cal.solve import Weighting
+from ceres_cal.solve import Problem, Weighting
 from ceres_cal.solve.mirrored import mirrored, without_mirrored_poses
 
 OPTIONS = Options(lens="brown")
@@ -56,17 +56,17 @@ def test_mirrored_twice_is_the_same_pose() -> None:
 def test_mirrored_poses_are_mended(seed: int) -> None:
     _, observations = small_boards(seed)
     estimate = calibrate(observations, OPTIONS).estimate
-    layout, weighting = make_layout(observations, OPTIONS), Weighting(0.3, 0.3, "trivial")
     wrong = flipped(estimate, observations)
     assert max(turned_deg(wrong.placements[n], p) for n, p in estimate.placements.items()) > 25.0
-    sights = gather_sights(observations)
-    mended, count, undecided = without_mirrored_poses(sights, wrong, layout, weighting, frozenset(sights.keys))
+    sights, weighting = gather_sights(observations), Weighting(0.3, 0.3, "trivial")
+    problem = Problem(sights, make_layout(observations, OPTIONS), weighting=weighting, options=OPTIONS)
+    mended, count, undecided = without_mirrored_poses(problem, wrong, frozenset(sights.keys))
     assert count > 40  # 44 to 50 of 60: perspective leaves no doubt about the others, they are not tried
     changed = [name for name, pose in mended.placements.items() if pose != wrong.placements[name]]
     assert len(changed) == count
     for name in changed:
         assert turned_deg(mended.placements[name], estimate.placements[name]) < 0.5  # 0.01
-    again, none, _ = without_mirrored_poses(sights, mended, layout, weighting, undecided)
+    again, none, _ = without_mirrored_poses(problem, mended, undecided)
     assert none == 0 and again.placements.keys() == estimate.placements.keys()
 
 

@@ -28,7 +28,7 @@ from ceres_cal.model.parameters import (
     with_intrinsics,
 )
 from ceres_cal.model.structure import make_structure
-from ceres_cal.observations import Curves, Observations, Points, Prior, View
+from ceres_cal.observations import Curves, Observations, Points, View
 from ceres_cal.observations.sights import SightKey
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Brown, KannalaBrandt, Radial, make_lens
@@ -159,25 +159,6 @@ def test_layout_counts_every_pose_once() -> None:
     layout = make_layout(seen, Options())
     assert layout == Layout(layout.free, frozenset({"a1", "a2"}), frozenset({"p", "q"}))
     assert layout.size == 5 + 2 * 6 + 2 * 6
-
-
-def test_priors_of_file_and_options_come_together() -> None:
-    one, two = Prior("camera", "a", "phi", (800.0,), (5.0,)), Prior("station", "a", "height_m", (4.0,), (0.01,))
-    seen = replace(watched(("a", None)), priors=(one,))
-    assert make_layout(seen, Options(priors=(two,))).priors == (one, two)
-
-
-@pytest.mark.parametrize(
-    "prior, message",
-    [
-        (Prior("camera", "b", "phi", (800.0,), (5.0,)), "camera 'b'.*not there: there are 'a'"),
-        (Prior("station", "b", "height_m", (4.0,), (0.1,)), "station 'b'.*not there: there are 'a'"),
-        (Prior("camera", "a", "k1", (0.0,), (0.1,)), "camera 'a': it has no 'k1', only phi, aspect, cx, cy, a2, a3"),
-    ],
-)
-def test_priors_on_what_is_not_there(prior: Prior, message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        make_layout(watched(("a", None)), Options(priors=(prior,)))
 
 
 @pytest.mark.parametrize(

@@ -18,14 +18,16 @@ from ceres_cal.base.transforms import Pose, left_jacobian, skew
 from ceres_cal.calibrating import calibrate
 from ceres_cal.model.keys import Key, pose_keys
 from ceres_cal.model.parameters import Estimate, Layout, Options, intrinsics_scales, make_layout
-from ceres_cal.model.quantities import difference, moved
+from ceres_cal.model.priors import gather_priors
+from ceres_cal.model.quantities import difference, free_keys, moved
 from ceres_cal.model.structure import Tolerance
 from ceres_cal.observations import Prior
-from ceres_cal.observations.sights import Sights, gather_sights
+from ceres_cal.observations.sights import gather_sights
 from ceres_cal.simulate import Disturbance, simulate
-from ceres_cal.solve import Weighting, information, private_placements, solve
-from ceres_cal.solve.bundle import _Blocks, _prior_blocks
+from ceres_cal.solve import Problem, Weighting, information, solve
+from ceres_cal.solve.bundle import _Blocks
 from ceres_cal.solve.costs import Run, SightCost
+from ceres_cal.solve.prior_cost import PriorCost
 from ceres_cal.uncertainty import make_posterior
 from ceres_cal.uncertainty.posterior import student_95
 
@@ -33,7 +35,7 @@ NOISE = Disturbance(points_sigma_px=0.3, curves_sigma_px=0.3)
 WEIGHTING = Weighting(0.3, 0.3, "cauchy", 3.0)  # a loss whose bend the blocks leave out, as the posterior does
 
 
-def problem(name: str, **more: Any) -> tuple[Sights, Estimate, Layout]:
+def problem(name: str, **more: Any) -> tuple[Problem, Estimate]:
     """A scene solved, its height known to 10 mm, its camera's principal point to 2 px."""
     scene = SCENES[name]()
     lens = next(iter(scene.cameras.values())).lens
@@ -46,8 +48,9 @@ def problem(name: str, **more: Any) -> tuple[Sights, Estimate, Layout]:
     options = Options(lens=lens.kind, powers=getattr(lens, "powers", (2, 3)), priors=priors, **more)
     observations = simulate(scene, NOISE, 1).observations
     estimate = calibrate(observations, options).estimate
-    layout, sights = make_layout(observations, options), gather_sights(observations)
-    return sights, solve(sights, estimate, layout, WEIGHTING, options).estimate, layout
+    known = gather_priors(observations, options, estimate.structure)
+    whole = Problem(gather_sights(observations), make_layout(observations, options), known, WEIGHTING, options)
+    return whole, solve(whole, estimate).estimate
 
 
 # ---- against pyceres ------------------------------------------------------------------------------------------------
@@ -67,18 +70,21 @@ def step_of_block(kind: str, name: str, estimate: Estimate, layout: Layout) -> A
     return np.vstack([shift, pose.rotation.T @ turn])
 
 
-def covariance_of_pyceres(sights: Sights, estimate: Estimate, layout: Layout) -> dict[tuple[str, str], Array]:
+def covariance_of_pyceres(whole: Problem, estimate: Estimate) -> dict[tuple[str, str], Array]:
     """Covariance of each block by pyceres, nothing eliminated, no kernel of `information` in it."""
+    layout = whole.layout
     blocks = _Blocks.pack(estimate, layout, frozenset())
-    problem, run = pyceres.Problem(), Run()
-    costs = []
-    for number, key in enumerate(sights.keys):
-        cost = SightCost(run, sights[number], estimate, layout, WEIGHTING, None)
+    ceres, run = pyceres.Problem(), Run()
+    costs: list[tuple[Any, list[Array]]] = []
+    for number, key in enumerate(whole.sights.keys):
+        cost = SightCost(run, whole.sights[number], whole, estimate)
         costs.append((cost, blocks.of(key, cost.slots)))
-    costs += [(cost, [array]) for cost, array in _prior_blocks(layout, estimate, blocks)]
+    for prior in whole.priors_at(estimate):
+        block = PriorCost(run, prior, estimate, layout)
+        costs.append((block, [blocks.owned_by(*owner) for owner in block.owners]))
     for cost, arrays in costs:
         cost.evaluate(*arrays)
-        problem.add_residual_block(cost, None, arrays)
+        ceres.add_residual_block(cost, None, arrays)
     named = {("camera", name): array for name, array in blocks.cameras.items()}
     named |= {("station", name): blocks.stations[name] for name in layout.stations}
     named |= {("placement", name): blocks.placements[name] for name in layout.placements}
@@ -87,7 +93,7 @@ def covariance_of_pyceres(sights: Sights, estimate: Estimate, layout: Layout) ->
     options.algorithm_type = pyceres.CovarianceAlgorithmType.DENSE_SVD
     options.null_space_rank = 0
     covariance = pyceres.Covariance(options)
-    assert covariance.compute([(array, array) for array in named.values()], problem)
+    assert covariance.compute([(array, array) for array in named.values()], ceres)
     found = {}
     for (kind, name), array in named.items():
         step = step_of_block(kind, name, estimate, layout)
@@ -106,9 +112,9 @@ def covariance_of_pyceres(sights: Sights, estimate: Estimate, layout: Layout) ->
     ],
 )
 def test_covariance_is_that_of_pyceres(name: str, tolerances: dict[str, Tolerance]) -> None:
-    sights, estimate, layout = problem(name, **({"tolerances": tolerances} if tolerances else {}))
-    posterior = make_posterior(information(sights, estimate, layout, WEIGHTING), np.inf)
-    expected = covariance_of_pyceres(sights, estimate, layout)
+    whole, estimate = problem(name, **({"tolerances": tolerances} if tolerances else {}))
+    posterior = make_posterior(information(whole, estimate), np.inf)
+    expected = covariance_of_pyceres(whole, estimate)
     assert {kind for kind, _ in expected} >= {"camera"}
     for (kind, owner), block in expected.items():
         if kind == "placement":
@@ -125,8 +131,7 @@ def test_covariance_is_that_of_pyceres(name: str, tolerances: dict[str, Toleranc
 
 def test_the_roll_of_a_ring_sheet_is_unknown_and_nothing_else() -> None:
     """An exact null direction: turned about its axis a sheet of rings looks the same."""
-    sights, estimate, layout = problem("radial-2-3/rings-field")
-    posterior = make_posterior(information(sights, estimate, layout, WEIGHTING), np.inf)
+    posterior = make_posterior(information(*problem("radial-2-3/rings-field")), np.inf)
     sheet = posterior.placement("rings")
     assert np.isinf(sheet.sd[5]) and np.all(np.isfinite(sheet.sd[:5])) and np.all(sheet.sd[:5] > 1e-6)
     assert np.all(np.isfinite(posterior.sd))
@@ -156,22 +161,20 @@ def test_units_do_not_matter(scale: float) -> None:
 
 def test_placements_follow_what_their_station_does_not_know() -> None:
     """Boards before a station that nothing ties to the height: as unknown in the world as it is, not to each other."""
-    sights, estimate, layout = problem("radial-2-3/field-boards")
-    boards = sights.take(np.array([i for i, key in enumerate(sights.keys) if key.placement is not None]))
-    posterior = make_posterior(information(boards, estimate, replace(layout, priors=()), WEIGHTING), np.inf)
+    whole, estimate = problem("radial-2-3/field-boards")
+    boards = whole.of_sights(np.array([i for i, key in enumerate(whole.sights.keys) if key.placement is not None]))
+    posterior = make_posterior(information(replace(boards, priors=()), estimate), np.inf)
     assert np.all(np.isfinite(posterior.sd[:5]))  # the camera
     assert np.all(np.isinf(posterior.sd[5:]))  # its station
     assert np.all(np.isinf(posterior.placement("board_01").sd))
 
 
 def test_one_number_at_a_time() -> None:
-    sights, estimate, layout = problem("radial-2-3/field-boards")
-    posterior = make_posterior(information(sights, estimate, layout, WEIGHTING), np.inf)
+    posterior = make_posterior(information(*problem("radial-2-3/field-boards")), np.inf)
     assert posterior.sd_of("camera", "overhead", "phi") == pytest.approx(0.9, rel=0.9)  # px
     assert posterior.sd_of("station", "overhead", "height") < 0.01  # the prior alone
-    assert np.linalg.inv(posterior.marginal(np.array([0, 3]))) == pytest.approx(
-        posterior.covariance[np.ix_([0, 3], [0, 3])], rel=1e-9
-    )
+    two = posterior.information.marginal([posterior.keys[0], posterior.keys[3]])
+    assert np.linalg.inv(two.matrix) == pytest.approx(posterior.covariance[np.ix_([0, 3], [0, 3])], rel=1e-9)
     with pytest.raises(InputError, match="camera 'overhead' has no free number 'aspect'"):
         posterior.sd_of("camera", "overhead", "aspect")
     with pytest.raises(InputError, match="placement 'gone' has no free pose"):
@@ -187,8 +190,8 @@ def test_student(freedom: float) -> None:
 
 
 def test_a_step_and_back() -> None:
-    sights, estimate, layout = problem("brown/two-cameras", tolerances={"field": Tolerance(lines_m=0.01)})
-    keys = shared_keys(estimate, layout, private_placements(sights, layout))
+    whole, estimate = problem("brown/two-cameras", tolerances={"field": Tolerance(lines_m=0.01)})
+    keys = free_keys(estimate, whole.layout, whole.private)
     assert len(set(keys)) == len(keys)
     assert {key.kind for key in keys} == {"camera", "station", "placement", "structure"}
     assert Key("structure", "field", "CenterCircle.radius", "m") in keys
@@ -201,7 +204,7 @@ def test_a_step_and_back() -> None:
 
 def test_a_step_of_a_pose_near_half_a_turn() -> None:
     """Rotation vectors jump there, turns do not."""
-    _, estimate, _ = problem("radial-2-3/field-boards")
+    _, estimate = problem("radial-2-3/field-boards")
     station = replace(estimate.stations["overhead"], cam_from_world=Pose.exp([np.pi - 1e-4, 0.0, 0.0, 0.1, 0.2, 4.0]))
     here = replace(estimate, stations={"overhead": station})
     step = np.array([0.01, -0.02, 0.03, 2e-3, 1e-3, -1e-3])
@@ -222,7 +225,7 @@ def test_a_calibration_knows_how_well_it_is_known(noise_scale: str) -> None:
     assert told is not None and found.posterior is not None
     ratio = found.posterior.sd / told.sd
     assert ratio == pytest.approx(np.full(11, 0.25 * found.fit.curve_scale), rel=1e-3)
-    assert (found.posterior.freedom < np.inf) == (noise_scale == "estimate")
+    assert (found.posterior.degrees_of_freedom < np.inf) == (noise_scale == "estimate")
 
 
 def test_the_closed_form_alone_knows_nothing_of_it() -> None:

@@ -6,8 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from accuracy_scenes import FIELD
-from ceres_cal.model.joint import JointPrior
-from ceres_cal.solve.joint import JointPriorCost, offsets
 from moves import (
     CAMERA,
     CORNERS,
@@ -33,17 +31,20 @@ from ceres_cal.base.transforms import Pose, rotation_exp
 from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
 from ceres_cal.model.parameters import Layout, Options, Station
+from ceres_cal.model.priors import GaussianPrior
 from ceres_cal.model.quantities import difference, moved
 from ceres_cal.model.structure import Tolerance
 from ceres_cal.moves import refit
-from ceres_cal.moves.carried import make_plan, prior_for, without_keys
+from ceres_cal.moves.carried import carried_prior, make_plan
 from ceres_cal.moves.labels import MIRRORED, TURNED, relabelled
 from ceres_cal.moves.poses import movement
 from ceres_cal.observations import Observations, taken
 from ceres_cal.scene.lens import Radial
 from ceres_cal.scene.targets import ssl_field
 from ceres_cal.simulate import field_scene, overhead_pose, simulate
+from ceres_cal.solve.bundle import _Blocks
 from ceres_cal.solve.costs import Run
+from ceres_cal.solve.prior_cost import PriorCost
 
 FAR = overhead_pose(-2.3, -1.9, 3.9, tilt_y_deg=-25.0, yaw_deg=90.0)
 
@@ -78,37 +79,32 @@ def two_cameras() -> tuple[Calibration, dict[str, Station]]:
 # ---- the prior ------------------------------------------------------------------------------------------------------
 
 
-def test_the_joint_prior_says_what_its_matrix_says(two_cameras: tuple[Calibration, dict[str, Station]]) -> None:
+def test_the_prior_says_what_its_matrix_says(two_cameras: tuple[Calibration, dict[str, Station]]) -> None:
     """Residual and Jacobian of the block, against r = root (x - mean) by differences."""
     calibration, _ = two_cameras
     posterior, estimate = calibration.posterior, calibration.estimate
     assert posterior is not None
-    poses = {name: station.cam_from_world for name, station in estimate.stations.items()}
-    structure = dict(zip(estimate.structure.names, estimate.structure.values.tolist(), strict=True))
-    joint = JointPrior(posterior.keys, posterior.information, estimate.cameras, poses, structure)
-    scale = 1.0 / np.sqrt(np.diagonal(posterior.information))
-    told = scale[:, None] * (joint.root.T @ joint.root - posterior.information) * scale
-    assert np.max(np.abs(told)) < 1e-12  # 2e-15
+    prior = GaussianPrior.about(posterior.information, estimate)
+    root, matrix = prior.information.root, posterior.information.matrix
+    scale = 1.0 / np.sqrt(np.diagonal(matrix))
+    assert np.max(np.abs(scale[:, None] * (root.T @ root - matrix) * scale)) < 1e-12  # 2e-15
     free = {name: np.array([0, 2, 3, 4, 5]) for name in estimate.cameras}
-    layout = Layout(free, frozenset(poses), frozenset(), (), joint)
+    layout = Layout(free, frozenset(estimate.stations), frozenset())
     step = np.random.default_rng(0).normal(size=len(posterior.keys)) * 30.0 * posterior.sd
     away = moved(estimate, posterior.keys, step)
-    np.testing.assert_allclose(offsets(joint, away), step, rtol=1e-6, atol=1e-12)
-    cost = JointPriorCost(Run(), joint, away, layout)
-    from ceres_cal.solve.bundle import _Blocks
-
+    np.testing.assert_allclose(prior.offsets(away), step, rtol=1e-6, atol=1e-12)
+    cost = PriorCost(Run(), prior, away, layout)
     blocks = _Blocks.pack(away, layout, frozenset())
-    of = {"camera": blocks.cameras, "station": blocks.stations}
-    arrays = [of[kind][name] if kind in of else blocks.structure for kind, name in cost.owners]
+    arrays = [blocks.owned_by(*owner) for owner in cost.owners]
 
     def value(arrays: list[np.ndarray]) -> np.ndarray:
-        found = np.empty(joint.rank)
+        found = np.empty(len(root))
         assert cost.Evaluate(arrays, found, None)
         return found
 
-    np.testing.assert_allclose(value(arrays), joint.root @ step, rtol=1e-6, atol=1e-6)
-    slopes = [np.empty(joint.rank * len(array)) for array in arrays]
-    assert cost.Evaluate(arrays, np.empty(joint.rank), slopes)
+    np.testing.assert_allclose(value(arrays), root @ step, rtol=1e-6, atol=1e-6)
+    slopes = [np.empty(len(root) * len(array)) for array in arrays]
+    assert cost.Evaluate(arrays, np.empty(len(root)), slopes)
     for number, (array, slope) in enumerate(zip(arrays, slopes, strict=True)):
         for k in range(len(array)):
             size = 1e-6 * max(1.0, abs(array[k]))
@@ -118,21 +114,21 @@ def test_the_joint_prior_says_what_its_matrix_says(two_cameras: tuple[Calibratio
                 there[number][k] += sign * size
                 ends.append(value(there))
             numeric = (ends[0] - ends[1]) / (2.0 * size)
-            analytic = slope.reshape(joint.rank, -1)[:, k]
+            analytic = slope.reshape(len(root), -1)[:, k]
             np.testing.assert_allclose(analytic, numeric, rtol=1e-5, atol=1e-5 * max(np.abs(numeric).max(), 1.0))
 
 
 def test_integrating_out_is_the_inverse_of_the_covariance(calibration: Calibration, observations: Observations) -> None:
-    prior = prior_for(calibration, observations, frozenset())
+    prior = carried_prior(calibration, observations, frozenset())
     posterior = calibration.posterior
     assert posterior is not None
     kept = [i for i, key in enumerate(posterior.keys) if key.kind == "camera"]
-    covariance = np.linalg.inv(prior.information)
+    covariance = np.linalg.inv(prior.information.matrix)
     np.testing.assert_allclose(covariance, posterior.covariance[np.ix_(kept, kept)], rtol=1e-6)
     gone = [key for key in prior.keys if key[2] == "phi"]
     rest = [i for i, key in enumerate(prior.keys) if key not in gone]
-    left = without_keys(prior, gone)
-    np.testing.assert_allclose(np.linalg.inv(left.information), covariance[np.ix_(rest, rest)], rtol=1e-6)
+    left = prior.without(gone)
+    np.testing.assert_allclose(np.linalg.inv(left.information.matrix), covariance[np.ix_(rest, rest)], rtol=1e-6)
 
 
 def test_the_new_posterior_is_data_and_prior(calibration: Calibration, observations: Observations) -> None:

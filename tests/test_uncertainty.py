@@ -25,12 +25,13 @@ from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
 from ceres_cal.model.keys import Key, pose_keys
 from ceres_cal.model.parameters import Estimate, Options, make_layout, unit_px
-from ceres_cal.model.quantities import moved, natural_sizes
+from ceres_cal.model.priors import gather_priors
+from ceres_cal.model.quantities import intrinsic_keys, moved, natural_sizes
 from ceres_cal.model.structure import make_structure
 from ceres_cal.observations import Observations, Prior, combine
 from ceres_cal.observations.sights import gather_sights
 from ceres_cal.scene.targets import Segment
-from ceres_cal.solve import Weighting, solve
+from ceres_cal.solve import Problem, Weighting, solve
 from ceres_cal.start.initialise import PHI_RANGE
 from ceres_cal.uncertainty import Posterior, Uncertainty, Verdict
 from ceres_cal.uncertainty.maps import locate_slopes, radius_95, shown_pixels
@@ -85,7 +86,7 @@ def test_a_frontal_view_is_unknown_where_opencv_says_sd_nought() -> None:
 def exactly_frontal() -> Uncertainty:
     """The posterior at the truth of a camera that looks straight down."""
     trial = make_trial(tilted(0.0), CLEAN_NOISE, 0)
-    return Uncertainty(trial.truth, Posterior(*bound(trial)), trial.observations.targets)
+    return Uncertainty(trial.truth, Posterior(bound(trial)), trial.observations.targets)
 
 
 def test_straight_down_is_an_exact_null_direction() -> None:
@@ -124,12 +125,13 @@ def cost_at(calibration: Calibration, observations: Observations, phi: float | N
         place = pose.position * (1.0, 1.0, higher)
         station = replace(station, cam_from_world=Pose.looking(place, pose.rotation))
         estimate = replace(estimate, cameras={"overhead": camera}, stations={"overhead": station})
-    layout = make_layout(observations, options)
-    sights = gather_sights(observations)
     rows = np.ones(len(observations.curves), dtype=bool)
     rows[[entry.row for entry in calibration.rejected]] = False
-    used = sights.used(np.ones(len(observations.points), dtype=bool), rows)
-    return 2.0 * solve(used, estimate, layout, Weighting(fit.point_scale, fit.curve_scale), options).cost
+    used = gather_sights(observations).used(np.ones(len(observations.points), dtype=bool), rows)
+    priors = gather_priors(observations, options, estimate.structure)
+    weighting = Weighting(fit.point_scale, fit.curve_scale)
+    problem = Problem(used, make_layout(observations, options), priors, weighting, options)
+    return 2.0 * solve(problem, estimate).cost
 
 
 @pytest.mark.parametrize("tilt_deg", [3.0, 1.0])
@@ -249,11 +251,11 @@ def test_a_map_is_what_draws_from_the_posterior_do(height_m: float) -> None:
 @pytest.mark.parametrize("height_m", [0.0, 0.15])
 def test_slopes_of_a_map_are_those_of_its_differences(name: str, height_m: float) -> None:
     scene = SCENES[name]()
-    lens, station = next(iter(scene.cameras.values())).lens, list(scene.stations)[-1]
+    station = list(scene.stations)[-1]
     structure = make_structure(scene.targets, {})
     estimate = Estimate(scene.cameras, scene.stations, scene.placements, structure)
     owner = estimate.stations[station].camera
-    keys = [*camera_keys(owner, scene.cameras[owner], range(4 + len(lens.names))), *pose_keys("station", station)]
+    keys = [*intrinsic_keys(owner, scene.cameras[owner].lens), *pose_keys("station", station)]
     pixels = np.array([[200.0, 150.0], [640.0, 480.0], [1000.0, 700.0]])
     found = locate_slopes(estimate, keys, station, pixels, height_m)
     for k, step in enumerate(np.diag(1e-5 * natural_sizes(estimate, keys))):

@@ -1,0 +1,182 @@
+"""What is known beforehand, in one form: stated numbers, tolerances and posteriors."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scenes
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ceres_cal.base.errors import InputError
+from ceres_cal.base.transforms import Pose, rotation_exp
+from ceres_cal.model.information import Information
+from ceres_cal.model.keys import Key, pose_keys
+from ceres_cal.model.parameters import Estimate, Options, Station, make_layout
+from ceres_cal.model.priors import GaussianPrior, gather_priors, stated_prior, tolerances
+from ceres_cal.model.quantities import intrinsic_keys, moved
+from ceres_cal.model.structure import Tolerance, make_structure
+from ceres_cal.observations import Observations, Prior
+from ceres_cal.observations.sights import gather_sights
+from ceres_cal.scene.lens import Brown, Radial
+from ceres_cal.scene.targets import ssl_field
+from ceres_cal.simulate import Disturbance, simulate
+from ceres_cal.solve import Problem
+
+PHI = Key("camera", "overhead", "phi", "px")
+HEIGHT = Key("station", "overhead", "height", "m")
+FIELD = ssl_field("B")
+
+
+def observed() -> Observations:
+    return simulate(scenes.SCENES["radial-2-3/corners"](), Disturbance(), 0).observations
+
+
+def estimated(tolerances: dict[str, Tolerance] | None = None) -> Estimate:
+    scene = scenes.SCENES["radial-2-3/corners"]()
+    stations = {name: Station(place.camera, place.cam_from_world) for name, place in scene.stations.items()}
+    return Estimate(scene.cameras, stations, scene.placements, make_structure(scene.targets, tolerances or {}))
+
+
+# ---- stated ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "prior, quantities",
+    [
+        (Prior("camera", "overhead", "phi", (868.0,), (5.0,)), ["phi"]),
+        (Prior("camera", "overhead", "principal_point", (640.0, 480.0), (2.0, 3.0)), ["cx", "cy"]),
+        (Prior("camera", "overhead", "a2", (-5e-5,), (1e-6,)), ["a2"]),
+        (Prior("station", "overhead", "height_m", (4.0,), (0.01,)), ["height"]),
+        (Prior("station", "overhead", "position_m", (1.0, 2.0, 4.0), (0.1, 0.2, 0.01)), ["x", "y", "height"]),
+    ],
+)
+def test_a_stated_prior_is_its_numbers_and_sigmas(prior: Prior, quantities: list[str]) -> None:
+    stated = stated_prior(prior, Radial((0.0, 0.0)))
+    every = {"camera": intrinsic_keys("overhead", Radial((0.0, 0.0))), "station": pose_keys("station", "overhead")}
+    assert [key.quantity for key in stated.keys] == quantities
+    assert set(stated.keys) <= set(every[prior.owner])
+    assert stated.mean.tolist() == list(prior.value)
+    assert stated.information.spread.sd == pytest.approx(prior.sigma, rel=1e-12)
+    assert not stated.rotations
+
+
+def test_a_lens_without_such_a_number() -> None:
+    prior = Prior("camera", "overhead", "a2", (0.0,), (0.1,))
+    with pytest.raises(InputError, match=r"camera 'overhead': it has no 'a2', only phi, aspect, cx, cy, k1"):
+        stated_prior(prior, Brown((0.0,) * 5))
+
+
+def test_priors_of_file_and_options_come_together() -> None:
+    one = Prior("camera", "overhead", "phi", (800.0,), (5.0,))
+    two = Prior("station", "overhead", "height_m", (4.0,), (0.01,))
+    seen = replace(observed(), priors=(one,))
+    first, second = gather_priors(seen, Options(priors=(two,)), estimated().structure)
+    assert (first.keys, first.mean.tolist()) == ((PHI,), [800.0])
+    assert (second.keys, second.mean.tolist()) == ((HEIGHT,), [4.0])
+
+
+@pytest.mark.parametrize(
+    "prior, message",
+    [
+        (Prior("camera", "b", "phi", (800.0,), (5.0,)), "camera 'b'.*not there: there are 'overhead'"),
+        (Prior("station", "b", "height_m", (4.0,), (0.1,)), "station 'b'.*not there: there are 'overhead'"),
+        (Prior("camera", "overhead", "k1", (0.0,), (0.1,)), "it has no 'k1', only phi, aspect, cx, cy, a2, a3"),
+    ],
+)
+def test_priors_on_what_is_not_there(prior: Prior, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        gather_priors(observed(), Options(priors=(prior,)), estimated().structure)
+
+
+def test_tolerances_are_priors_of_mean_nought() -> None:
+    structure = make_structure({"field": FIELD}, {"field": Tolerance(lines_m=0.01)})
+    (prior,) = gather_priors(replace(observed(), targets={"field": FIELD}), Options(), structure)
+    assert [key.structure_name for key in prior.keys] == list(structure.names)
+    assert not np.any(prior.mean)
+    assert prior.information.spread.sd == pytest.approx(structure.sigma_m, rel=1e-12)
+    (rest,) = tolerances(structure, prior.keys[1:])
+    assert rest.keys == prior.keys[:1]
+    assert not list(tolerances(structure, prior.keys))
+    assert not list(tolerances(make_structure({"field": FIELD}, {})))
+
+
+# ---- offsets and residuals ------------------------------------------------------------------------------------------
+
+
+def known_prior(estimate: Estimate, seed: int = 0) -> GaussianPrior:
+    """Of everything free, all of it together."""
+    keys = [*intrinsic_keys("overhead", estimate.cameras["overhead"].lens), *pose_keys("station", "overhead")]
+    keys += [Key.of_structure(name) for name in estimate.structure.names]
+    rng = np.random.default_rng(seed)
+    rows = rng.standard_normal((2 * len(keys), len(keys))) / np.array([SIZES.get(key.unit, 1e-2) for key in keys])
+    return GaussianPrior.about(Information(tuple(keys), rows.T @ rows), estimate)
+
+
+SIZES = {"px": 1.0, "m": 1e-2, "rad": 1e-2, "px^-1": 1e-6, "px^-2": 1e-9}
+
+
+@given(st.integers(0, 2**31))
+def test_offsets_are_the_steps_from_the_mean(seed: int) -> None:
+    estimate = estimated({"field": Tolerance(lines_m=0.01)})
+    prior = known_prior(estimate)
+    sizes = np.array([SIZES.get(key.unit, 1e-2) for key in prior.keys])
+    step = sizes * np.random.default_rng(seed).standard_normal(len(prior.keys))
+    away = moved(estimate, prior.keys, step)
+    assert prior.offsets(away) / sizes == pytest.approx(step / sizes, abs=1e-8)
+    assert prior.residuals(away) == pytest.approx(prior.information.root @ step, abs=1e-6)
+    chi_squared = step @ prior.information.matrix @ step
+    assert np.sum(prior.residuals(away) ** 2) == pytest.approx(chi_squared, rel=1e-8)
+    assert np.max(np.abs(prior.residuals(estimate))) < 1e-6
+
+
+def test_turns_count_from_the_mean_even_near_half_a_turn() -> None:
+    """About the camera's own axes; rotation vectors jump there, turns do not."""
+    estimate = estimated()
+    pose = Pose.exp([np.pi - 1e-4, 0.0, 0.0, 0.1, 0.2, 4.0])
+    here = replace(estimate, stations={"overhead": Station("overhead", pose)})
+    prior = GaussianPrior.about(Information.of_sigmas(dict.fromkeys(pose_keys("station", "overhead")[3:], 1e-3)), here)
+    assert not np.any(prior.mean)
+    turn = np.array([2e-3, 1e-3, -1e-3])
+    turned = Pose.looking(pose.position + 0.5, rotation_exp(turn) @ pose.rotation)
+    there = replace(here, stations={"overhead": Station("overhead", turned)})
+    assert prior.offsets(there) == pytest.approx(turn, abs=1e-12)
+    assert prior.residuals(there) == pytest.approx(1e3 * turn, abs=1e-9)
+    one = prior.given(prior.keys[1:2])
+    assert one.offsets(there) == pytest.approx(turn[1:2], abs=1e-12)
+
+
+# ---- some of its numbers --------------------------------------------------------------------------------------------
+
+
+def test_given_and_without() -> None:
+    estimate = estimated()
+    prior = known_prior(estimate)
+    given, without = prior.given({PHI, HEIGHT}), prior.without({PHI, HEIGHT})
+    assert given.keys == (PHI, HEIGHT)
+    assert without.keys == tuple(key for key in prior.keys if key not in given.keys)
+    for part, information in (
+        (given, prior.information.given(given.keys)),
+        (without, prior.information.marginal(without.keys)),
+    ):
+        assert part.information.matrix == pytest.approx(information.matrix, rel=1e-12)
+        assert part.mean.tolist() == prior.mean[prior.information.columns(part.keys)].tolist()
+    assert prior.without([Key("camera", "another", "phi", "px")]) is prior
+    assert prior.given([]).keys == ()
+    assert prior.given([]).residuals(estimate).shape == (0,)
+
+
+def test_of_numbers_that_are_held_a_problem_hears_nothing() -> None:
+    """The other numbers of the prior still count, with those held at their mean; what is known uses up no equation."""
+    estimate, seen = estimated(), observed()
+    options = Options(fixed={"cx": 651.3})
+    prior = known_prior(estimate)
+    problem = Problem(gather_sights(seen), make_layout(seen, options), (prior,), options=options)
+    (heard,) = problem.priors_at(estimate)
+    assert [key.quantity for key in prior.keys if key not in heard.keys] == ["aspect", "cx"]
+    assert heard.information.matrix == pytest.approx(prior.information.given(heard.keys).matrix)
+    assert problem.unknowns(estimate) == problem.layout.size - len(heard.keys) == 0
+    nobody = GaussianPrior(Information.of_sigmas({Key("camera", "overhead", "cx", "px"): 1.0}), np.array([651.3]))
+    assert replace(problem, priors=(nobody,)).priors_at(estimate) == []
