@@ -45,17 +45,9 @@ def _run_board(args: Namespace) -> Answer:
     from ceres_cal.scene.targets import checkerboard
 
     board = checkerboard(args.columns, args.rows, args.square)
-    charuco = None if args.charuco is None else CharucoSpec(args.charuco, args.marker)
+    corners = args.corner_fit if args.charuco is None else CharucoSpec(args.charuco, args.marker)
     with progress_bar(args) as bar:
-        detections = detect_boards(
-            images,
-            board,
-            camera=args.camera,
-            station=args.station,
-            charuco=charuco,
-            corner_fit=args.corner_fit,
-            progress=bar.update,
-        )
+        detections = detect_boards(images, board, args.camera, args.station, corners, bar.update)
     with finishing():
         detections.observations.save(args.output)
     return Answer(_data(detections, args.output), lambda: _text(detections, args.output))

@@ -64,8 +64,7 @@ def detect_boards(
     board: Target,
     camera: str = "camera",
     station: str | None = None,
-    charuco: CharucoSpec | None = None,
-    corner_fit: str = "opencv",
+    corners: CharucoSpec | str = "opencv",
     progress: ImageProgress | None = None,
 ) -> BoardDetections:
     """Chessboard or ChArUco corners of one camera's images.
@@ -85,10 +84,10 @@ def detect_boards(
         board: a checkerboard target.
         camera: name of the camera.
         station: name of the station, that of the camera by default.
-        charuco: the markers, when the board has any. Boards may then be partly seen.
-        corner_fit: "opencv" measures with cornerSubPix, as the peers do, so that results compare; "saddle" fits a
-            blurred saddle to each corner: about four times more precise on rendered boards (0.005 px against 0.02),
-            and without cornerSubPix's pull towards the middle of its window. ChArUco corners are always saddles.
+        corners: the markers, when the board has any: boards may then be partly seen. Else one of CORNER_FITS: "opencv"
+            measures with cornerSubPix, as the peers do, so that results compare; "saddle" fits a blurred saddle to each
+            corner, as with markers always: about four times more precise on rendered boards (0.005 px against 0.02),
+            and without cornerSubPix's shift towards the middle of its window.
         progress: called after each image.
 
     Raises:
@@ -98,17 +97,17 @@ def detect_boards(
     """
     paths = [Path(path) for path in images]
     placements = _placement_names(paths)
-    size, found, missed = _find_all(paths, _finder(board, charuco, corner_fit), progress)
-    if not found:
+    size, grids, missed = _find_all(paths, _finder(board, corners), progress)
+    if not grids:
         raise NothingShownError(
             f"no board of {board.spec['columns']} x {board.spec['rows']} inner corners in any of {len(paths)} images "
             f"(count the corners between squares, not the squares); {missed[0][0]}: {missed[0][1]}",
             tuple(missed),
         )
-    views = tuple(View(path.stem, camera, station or camera, TARGET_NAME, placements[path]) for path in found)
-    points = _points(list(found.values()), board)
+    views = tuple(View(path.stem, camera, station or camera, TARGET_NAME, placements[path]) for path in grids)
+    points = _points(list(grids.values()), board)
     observations = Observations({TARGET_NAME: board}, {camera: size}, views, points, no_curves())
-    return BoardDetections(observations, tuple(map(str, found)), tuple(missed))
+    return BoardDetections(observations, tuple(map(str, grids)), tuple(missed))
 
 
 # ---- finding --------------------------------------------------------------------------------------------------------
@@ -122,7 +121,7 @@ def _find_all(
 ) -> tuple[tuple[int, int], dict[Path, Array], list[tuple[str, str]]]:
     """The images' (width, height), the grid in each image that shows the board, and (path, reason) of the others."""
     size = (0, 0)
-    found: dict[Path, Array] = {}
+    grids: dict[Path, Array] = {}
     missed: list[tuple[str, str]] = []
     for number, path in enumerate(paths, start=1):
         image = read_grey(path)
@@ -137,24 +136,24 @@ def _find_all(
         if isinstance(grid, str):
             missed.append((str(path), grid))
         else:
-            found[path] = grid
+            grids[path] = grid
         if progress is not None:
             progress(number, len(paths), path.name)
-    return size, found, missed
+    return size, grids, missed
 
 
-def _finder(board: Target, charuco: CharucoSpec | None, corner_fit: str) -> Finder:
-    if corner_fit not in CORNER_FITS:
-        raise InputError(f"unknown corner fit {corner_fit!r}: choose one of {', '.join(CORNER_FITS)}")
+def _finder(board: Target, corners: CharucoSpec | str) -> Finder:
+    if isinstance(corners, str) and corners not in CORNER_FITS:
+        raise InputError(f"unknown corner fit {corners!r}: choose one of {', '.join(CORNER_FITS)}")
     if board.kind != "checkerboard":
         raise InputError(f"target of kind {board.kind!r}: boards are detected with a target of kind 'checkerboard'")
     columns, rows = int(board.spec["columns"]), int(board.spec["rows"])
     if min(columns, rows) < 3:
         raise InputError(f"a board to be found in images needs 3 inner corners a side or more, not {columns} x {rows}")
-    if charuco is None:
-        return lambda image: _measured_chessboard(image, columns, rows, corner_fit)
-    detector = _charuco_detector(charuco, columns, rows, float(board.spec["square_m"]))
-    margin = 0.5 * (1.0 - charuco.marker_m / float(board.spec["square_m"]))  # white around a marker, in squares
+    if isinstance(corners, str):
+        return lambda image: _measured_chessboard(image, columns, rows, corners)
+    detector = _charuco_detector(corners, columns, rows, float(board.spec["square_m"]))
+    margin = 0.5 * (1.0 - corners.marker_m / float(board.spec["square_m"]))  # white around a marker, in squares
     return lambda image: _measured_charuco(image, detector, columns, rows, margin)
 
 

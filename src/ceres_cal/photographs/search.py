@@ -22,7 +22,7 @@ from ceres_cal.photographs.facing import (
 from ceres_cal.photographs.follow import Followed, follow
 from ceres_cal.photographs.judgement import detected_curves, dice, explained, objection, same_labels
 from ceres_cal.photographs.refit import PointHints
-from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.camera import Camera, in_image
 from ceres_cal.scene.targets import Target
 
 _SURE = 0.9  # of the strokes explained, by the first without an objection: no other is followed
@@ -109,9 +109,7 @@ def _turned(problem: FieldSearch, auto: Auto, camera: Camera) -> Camera:
 def _followed(problem: FieldSearch, camera: Camera) -> Followed:
     """The target's lines from a camera that is about right, held by the points that it puts into the picture."""
     pixels = camera.project(problem.target.point_array)
-    with np.errstate(invalid="ignore"):
-        inside = np.all((pixels > -0.5) & (pixels < np.array(camera.image_size) - 0.5), axis=1)
-    rows = np.flatnonzero(inside)
+    rows = np.flatnonzero(in_image(pixels, camera.image_size))
     hints = PointHints(rows.astype(np.int32), pixels[rows], np.full(len(rows), SIGMA_PX))
     free = unknown_optics(camera.image_size, camera.phi, hints)
     return follow(problem.grey, problem.target, [camera], problem.curves, free)

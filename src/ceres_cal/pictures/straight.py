@@ -14,7 +14,7 @@ from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.transforms import Pose
 from ceres_cal.pictures.warp import Warp, make_warp, require_size
-from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.camera import Camera, in_image
 from ceres_cal.scene.lens import Brown
 
 WIDEST_DEG = 150.0
@@ -122,7 +122,7 @@ def _share_shown(camera: Camera, straight: Camera, slope: float) -> float:
     step = max(1, int(np.sqrt(width * height / _COUNTED)))
     grid = np.meshgrid(np.arange(0.0, width, step), np.arange(0.0, height, step))
     there = _at_depth_1(camera, np.column_stack([part.ravel() for part in grid]), slope)
-    return float(np.mean(_inside(there * straight.phi + straight.principal_point, straight.image_size)))
+    return float(np.mean(in_image(there * straight.phi + straight.principal_point, straight.image_size)))
 
 
 # ---- what a photograph shows of the plane at depth 1 ----------------------------------------------------------------
@@ -147,11 +147,7 @@ class _Region:
         """(N,) whether the photograph shows these places (N, 2)."""
         pixels = self.camera.at(Pose.identity()).project(np.column_stack([places, np.ones(len(places))]))
         near = np.hypot(places[:, 0], places[:, 1]) <= self.slope
-        return np.asarray(near & _inside(pixels, self.camera.image_size))
-
-
-def _inside(pixels: Array, size: tuple[int, int]) -> Mask:
-    return np.asarray(np.all((pixels >= -0.5) & (pixels <= np.array(size) - 0.5), axis=1))  # False for NaN
+        return np.asarray(near & in_image(pixels, self.camera.image_size))
 
 
 def _at_depth_1(camera: Camera, pixels: Array, slope: float) -> Array:
@@ -169,7 +165,7 @@ def _region(camera: Camera, angle: float) -> _Region:
     turn = np.linspace(0.0, 2.0 * np.pi, _RIM_STEPS, endpoint=False)
     rim = slope * (1.0 - 1e-9) * np.column_stack([np.cos(turn), np.sin(turn)])
     pixels = camera.at(Pose.identity()).project(np.column_stack([rim, np.ones(len(rim))]))
-    rim = rim[_inside(pixels, camera.image_size)]
+    rim = rim[in_image(pixels, camera.image_size)]
     outline = np.concatenate([border[np.isfinite(border[:, 0])], rim])
     if not len(outline):
         raise InputError(

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ceres_cal.base.arrays import Array
+from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.errors import DegenerateError, InputError
 from ceres_cal.base.transforms import Pose
 from ceres_cal.scene.lens import Lens
@@ -152,3 +152,8 @@ class Camera:
         if abs(self.position[2] - height_m) < 1e-9:  # the determinant of H
             raise DegenerateError(f"the camera lies in the plane z = {height_m} m, edge-on: ask for another height")
         return np.asarray(np.linalg.inv(self.homography(height_m)))
+
+
+def in_image(pixels: Array, image_size: tuple[int, int]) -> Mask:
+    """(N,) whether pixels (N, 2) lie within half a pixel of one of the image's; False for NaN."""
+    return np.asarray(np.all((pixels >= -0.5) & (pixels <= np.array(image_size) - 0.5), axis=-1))
