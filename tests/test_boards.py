@@ -438,6 +438,6 @@ def test_no_board_at_all(tmp_path: Path, picture: Array) -> None:
     ],
 )
 def test_wrong_targets(board: Target, charuco_spec: CharucoSpec | None, message: str, tmp_path: Path) -> None:
+    black = write(tmp_path / "a.png", np.zeros((50, 50), np.uint8))
     with pytest.raises(InputError, match=message):
-        black = write(tmp_path / "a.png", np.zeros((50, 50), np.uint8))
         detect_boards([black], board, corners=charuco_spec or "opencv")
