@@ -10,7 +10,7 @@ from benchmark_peers import Corners
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.transforms import rotation_exp
-from ceres_cal.observations import Columns, Curves, Observations, Points, Prior, View
+from ceres_cal.observations import NO_CURVES, Columns, Curves, Observations, Points, Prior, View
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Brown, Radial
 from ceres_cal.scene.targets import checkerboard, ssl_field
@@ -69,7 +69,7 @@ def corner_observations(corners: Corners) -> Observations:
         {"camera": WIDE.image_size},
         tuple(View(str(frame), "camera", "camera", "board", str(frame)) for frame in range(corners.frames)),
         Points(corners.view, corners.feature, corners.pixels, np.ones(len(corners.view))),
-        Curves(*(np.empty(0, np.int32),) * 2, np.empty((0, 2)), np.empty(0), np.empty(0, np.int8)),
+        NO_CURVES,
     )
 
 

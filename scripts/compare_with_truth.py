@@ -19,9 +19,10 @@ from ceres_cal.base.transforms import Pose, euler_from_rotation
 from ceres_cal.calibration import Calibration
 from ceres_cal.observations import Observations
 from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.curves import curve_points
 from ceres_cal.scene.heights import HEIGHTS_M
 from ceres_cal.scene.lens import make_lens
-from ceres_cal.scene.targets import Arc, Target, along_track
+from ceres_cal.scene.targets import Target
 from ceres_cal.simulate.files import TRUTH_FORMAT, TRUTH_VERSION
 
 STEP_M = 0.1
@@ -62,7 +63,7 @@ def print_table(title: str, truth: Mapping[str, float], estimate: Mapping[str, f
 def outline(target: Target) -> Array:
     """x and y (N, 2) m of its points and of places along its curves."""
     curves = target.curves.values()
-    along = [along_track(c.track(), isinstance(c, Arc), np.linspace(*c.parameter_range, 25)) for c in curves]
+    along = [curve_points(curve, 0, 24) for curve in curves]
     return np.vstack([target.point_array, *along])[:, :2]
 
 

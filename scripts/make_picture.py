@@ -15,7 +15,7 @@ from ceres_cal import Calibration, Camera, Observations, calibrate
 from ceres_cal.base.arrays import Array
 from ceres_cal.model.residuals import residuals
 from ceres_cal.observations.sights import gather_sights
-from ceres_cal.scene.targets import along_track
+from ceres_cal.scene.curves import curve_points
 
 ROOT = Path(__file__).parents[1]
 ENLARGED = 25.0
@@ -44,8 +44,7 @@ def main() -> int:
 def field_lines(observations: Observations, camera: Camera) -> Iterator[str]:
     field = observations.targets["field"]
     for curve in field.curves.values():
-        s = np.linspace(*curve.parameter_range, 120)
-        pixels = camera.project(along_track(curve.track(), curve is field.curves["CenterCircle"], s))
+        pixels = camera.project(curve_points(curve, 0, 119))
         pixels = pixels[np.all(np.isfinite(pixels), axis=1)]
         path = " ".join(f"{x:.1f},{y:.1f}" for x, y in pixels)
         yield f'<polyline points="{path}" fill="none" stroke="{PAINT}" stroke-width="5"/>'

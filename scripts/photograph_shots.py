@@ -24,8 +24,9 @@ from ceres_cal.model.parameters import Options
 from ceres_cal.model.structure import Tolerance
 from ceres_cal.photographs import Clicks, FieldDetections, detect_field, follow
 from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.curves import along_track, nearest_on_track
 from ceres_cal.scene.lens import Brown, KannalaBrandt, Lens, Radial
-from ceres_cal.scene.targets import Target, nearest_on_track, ssl_field
+from ceres_cal.scene.targets import Target, ssl_field
 from ceres_cal.simulate import Photography, Scene, Station, built_in_scene, field_scene, overhead_pose
 from ceres_cal.simulate.photograph import Photograph, photograph
 
@@ -126,7 +127,7 @@ def distances_px(shot: Shot, curve: Indices32, pixels: Array) -> Array:
     tracks, is_arc = target.tracks[0][curve], target.is_arc[curve]
     s = nearest_on_track(tracks, is_arc, floor)
     first, second = np.where(is_arc, np.cos(s), s), np.where(is_arc, np.sin(s), 0.0)
-    foot = tracks[:, 0] + first[:, None] * tracks[:, 1] + second[:, None] * tracks[:, 2]
+    foot = along_track(tracks, is_arc, s)
     along = np.where(is_arc[:, None], -second[:, None] * tracks[:, 1] + first[:, None] * tracks[:, 2], tracks[:, 1])
     along /= np.linalg.norm(along, axis=1, keepdims=True)
     left = np.column_stack([-along[:, 1], along[:, 0], np.zeros(len(along))])

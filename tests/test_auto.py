@@ -17,12 +17,13 @@ from ceres_cal.detect.strokes import find_strokes
 from ceres_cal.observations import Observations
 from ceres_cal.photographs import Auto, Facing, detect_field
 from ceres_cal.photographs.candidates import candidates, prepare_search
-from ceres_cal.photographs.facing import agreeing_with_facing, nearest_to_before, side_of, turns_of
+from ceres_cal.photographs.facing import agreeing_with_facing, nearest_to_before, side_of
 from ceres_cal.photographs.grid import grid_of
 from ceres_cal.photographs.search import search
 from ceres_cal.photographs.upright import find_upright
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Radial
+from ceres_cal.scene.symmetry import turns_of
 from ceres_cal.scene.targets import Arc, Segment, Target, custom, ssl_field
 from ceres_cal.simulate import Scene, Station, field_scene, overhead_pose
 from ceres_cal.simulate.photograph import photograph

@@ -21,8 +21,9 @@ from ceres_cal.calibrating import calibrate
 from ceres_cal.model.parameters import Options, intrinsic_names, intrinsics_scales, intrinsics_vector, with_intrinsics
 from ceres_cal.observations import Curves, Observations, Points, Prior, View, combine
 from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.curves import along_track
 from ceres_cal.scene.lens import Brown, Radial
-from ceres_cal.scene.targets import Arc, Segment, Target, along_track, checkerboard, custom, ssl_field
+from ceres_cal.scene.targets import Arc, Segment, Target, checkerboard, custom, ssl_field
 from ceres_cal.simulate import (
     CLEAN,
     Disturbance,

@@ -22,11 +22,10 @@ import ceres_cal.calibrating
 from ceres_cal.calibration import Calibration
 from ceres_cal.cli import COMMANDS, main
 from ceres_cal.cli.progress import ProgressBar
-from ceres_cal.cli.targets import KINDS
 from ceres_cal.detect.boards import CORNER_FITS
 from ceres_cal.model.parameters import LOSSES, Options
 from ceres_cal.observations import Observations
-from ceres_cal.scene.lens import LENS_KINDS
+from ceres_cal.scene.lens import LENSES
 from ceres_cal.scene.targets import TARGET_KINDS, ssl_field
 from ceres_cal.simulate import scene_names
 
@@ -97,6 +96,7 @@ def test_help_lists_every_command(say: Say) -> None:
         "compare",
         "locate",
         "project",
+        "export",
         "export-table",
         "simulate",
         "targets",
@@ -175,11 +175,10 @@ def test_wrong_usage_is_one_line(say: Say, arguments: Sequence[object], words: s
 
 def test_choices_are_those_of_the_package() -> None:
     calibrate, detect = COMMANDS["calibrate"], COMMANDS["detect board"]
-    assert [calibrate.parse(["x", "--lens", lens]).lens for lens in LENS_KINDS] == list(LENS_KINDS)
+    assert [calibrate.parse(["x", "--lens", lens]).lens for lens in LENSES] == list(LENSES)
     assert [calibrate.parse(["x", "--loss", loss]).loss for loss in LOSSES] == list(LOSSES)
     board = ["x.png", "--columns", "4", "--rows", "3", "--square", "1", "-o", "y.json"]
     assert [detect.parse([*board, "--corner-fit", fit]).corner_fit for fit in CORNER_FITS] == list(CORNER_FITS)
-    assert set(KINDS) == set(TARGET_KINDS)
 
 
 # ---- calibrate ------------------------------------------------------------------------------------------------------

@@ -8,7 +8,7 @@ import pytest
 from test_cli import Say, refused, say
 
 from ceres_cal.calibration import Calibration
-from ceres_cal.scene.lookup import LookupTable
+from ceres_cal.formats import LookupTable
 
 __all__ = ["say"]
 

@@ -59,7 +59,7 @@ def linearised(observations: Observations, calibration: Calibration) -> Equation
 def test_rows_are_the_derivatives_of_the_residuals(lens: str) -> None:
     scene = usual.field_and_boards(lens)
     seen = simulate(scene, scenes.NOISE, 1).observations
-    options = Options(lens=usual.camera(lens).lens.kind, powers=usual.camera(lens).lens.radius_powers)
+    options = Options(lens=usual.camera(lens).lens.kind, powers=usual.camera(lens).lens.powers)
     calibration = calibrate(seen, replace(options, powers=options.powers if options.lens == "radial" else (2, 3)))
     equations, estimate = linearised(seen, calibration), calibration.estimate
     sights = gather_sights(seen)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
 
@@ -16,14 +16,19 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize_scalar
 
 from ceres_cal import kernels
-from ceres_cal.base.arrays import Array, Indices, Indices32, Mask
+from ceres_cal.base.arrays import Array, Indices, Indices32
 from ceres_cal.base.transforms import Pose, rotation_exp
-from ceres_cal.kernels.lenses import answer_limit, one_dimensional
-from ceres_cal.kernels.sight import working_space
-from ceres_cal.model.parameters import intrinsics_vector, unit_px, with_intrinsics
+from ceres_cal.kernels import CurveColumns, Loss, PointColumns, Unknowns
+from ceres_cal.kernels.lenses import prepared
+from ceres_cal.kernels.sight import normal_equations as sum_up
+from ceres_cal.kernels.sight import order_of_rows, working_space
+from ceres_cal.model.parameters import intrinsics_vector, with_intrinsics
+from ceres_cal.model.residuals import camera_optics
+from ceres_cal.model.structure import EXACT
 from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.curves import along_track
 from ceres_cal.scene.lens import Brown, KannalaBrandt, Radial
-from ceres_cal.scene.targets import Arc, Segment, along_track, custom
+from ceres_cal.scene.targets import Arc, Segment, custom
 from ceres_cal.simulate import overhead_pose
 
 LOSSES = {
@@ -48,38 +53,49 @@ TARGET = custom(
 )
 
 
-@dataclass(frozen=True, eq=False)
-class Seen:
-    """What one camera sees of one frame, as the kernels take it; `start`: where the search for the feet begins."""
+Shown = tuple[PointColumns, CurveColumns]
+"""What one camera sees of one frame, as the kernels take it; the feet are where their search begins."""
 
-    points: Array
-    pixels: Array
-    sigma_px: Array
-    track: Indices32
-    curve_pixels: Array
-    curve_sigma_px: Array
-    start: Array
-    tracks: Array = field(default_factory=lambda: TARGET.tracks.reshape(-1, 3, 3))
 
-    @property
-    def is_arc(self) -> Mask:
-        return np.tile(TARGET.is_arc, 3)
+def shown(
+    places: Array, pixels: Array, point_sigma_px: Array, track: Indices32, curve_pixels: Array,
+    curve_sigma_px: Array, feet: Array,
+) -> Shown:  # fmt: skip
+    tracks, is_arc = TARGET.tracks.reshape(-1, 3, 3), np.tile(TARGET.is_arc, 3)
+    points = np.array([0, len(pixels)]), places, pixels, 1.0 / point_sigma_px
+    curves = np.array([0, len(track)]), tracks, is_arc, track, curve_pixels, 1.0 / curve_sigma_px, feet
+    slots, bends, track_slots = EXACT.point_slots, EXACT.bends, EXACT.track_slots
+    return PointColumns(*points, slots, bends), CurveColumns(*curves, track_slots)
 
-    def take(self, points: Any = slice(0, 0), curves: Any = slice(0, 0)) -> Seen:
-        """Some of the points and some of the curve observations."""
-        columns = {name: getattr(self, name)[points] for name in ("points", "pixels", "sigma_px")}
-        names = ("track", "curve_pixels", "curve_sigma_px", "start")
-        return Seen(**columns, **{name: getattr(self, name)[curves] for name in names}, tracks=self.tracks)
 
-    @property
-    def singles(self) -> list[Seen]:
-        """Each observation alone."""
-        points = [self.take(points=slice(k, k + 1)) for k in range(len(self.points))]
-        return points + [self.take(curves=slice(k, k + 1)) for k in range(len(self.curve_pixels))]
+def take(seen: Shown, points: Any = slice(0, 0), curves: Any = slice(0, 0)) -> Shown:
+    """Some of the points and some of the curve observations of one frame on which nothing moves."""
+    columns = {name: getattr(seen[0], name)[points] for name in ("places", "pixels", "weights")}
+    lines = {name: getattr(seen[1], name)[curves] for name in ("track", "pixels", "weights", "feet")}
+    return (
+        seen[0]._replace(bounds=np.array([0, len(columns["pixels"])]), **columns),
+        seen[1]._replace(bounds=np.array([0, len(lines["track"])]), **lines),
+    )
+
+
+def singles(seen: Shown) -> list[Shown]:
+    """Each observation alone."""
+    points = [take(seen, points=slice(k, k + 1)) for k in range(len(seen[0].pixels))]
+    return points + [take(seen, curves=slice(k, k + 1)) for k in range(len(seen[1].pixels))]
+
+
+def with_points(seen: Shown, **columns: Any) -> Shown:
+    """Some other columns of the points."""
+    return seen[0]._replace(**columns), seen[1]
+
+
+def fresh(curves: CurveColumns) -> CurveColumns:
+    """Columns whose feet may be moved."""
+    return curves._replace(feet=curves.feet.copy())
 
 
 @cache
-def looked_at(lens: str) -> tuple[Camera, Seen]:
+def looked_at(lens: str) -> tuple[Camera, Shown]:
     """A leaning camera with pixels that are not square, and what it sees: points, lines and arcs, every side, 2 px off.
 
     About a hundred curve observations: more than one chunk, and not a whole number of them.
@@ -95,7 +111,7 @@ def looked_at(lens: str) -> tuple[Camera, Seen]:
     there = along_track(TARGET.tracks.reshape(-1, 3, 3)[number], np.tile(TARGET.is_arc, 3)[number], places)
     points, pixels = TARGET.point_array.copy(), camera.project(TARGET.point_array)
     curve_pixels = camera.project(there)
-    return camera, Seen(
+    return camera, shown(
         points,
         pixels + rng.normal(0.0, 2.0, pixels.shape),
         rng.uniform(0.7, 1.6, len(pixels)),
@@ -106,78 +122,45 @@ def looked_at(lens: str) -> tuple[Camera, Seen]:
     )
 
 
-def optics(camera: Camera) -> tuple[int, Array, Indices, float]:
-    powers = np.asarray(camera.lens.radius_powers, dtype=np.int64)
-    return kernels.LENS_CODES[camera.lens.kind], intrinsics_vector(camera), powers, unit_px(camera)
-
-
 def matrix(pose: Pose) -> Array:
     return np.column_stack([pose.rotation, pose.translation])
 
 
-@dataclass(frozen=True, eq=False)
-class Moves:
-    """Which structure numbers move what, as the kernels take it; nothing by default."""
-
-    count: int = 0
-    slots: Indices32 = field(default_factory=lambda: np.empty((0, 4), np.int32))
-    bends: Array = field(default_factory=lambda: np.empty((0, 2)))
-    track_slots: Indices32 = field(default_factory=lambda: np.empty((0, 3), np.int32))
-
-
-NOTHING_MOVES = Moves()
-
-
 def normal_equations(
-    camera: Camera, seen: Seen, loss: str = "trivial", scale: float = 1.0, *,
-    moves: Moves = NOTHING_MOVES, newton: bool = False,
-) -> tuple[float, Array]:  # fmt: skip
+    camera: Camera, seen: Shown, loss: str = "trivial", scale: float = 1.0, *, structure: int = 0, newton: bool = False
+) -> tuple[float, Array]:
     """Sum of rho, and A over [intrinsics | structure | 6 pose | residual], whole."""
-    count = len(intrinsics_vector(camera))
-    size = count + moves.count + 7
-    normal = np.zeros((size, size))
-    places = np.concatenate([np.arange(count), np.arange(count + moves.count, size)])
-    lens, intrinsics, powers, unit = optics(camera)
-    dense = one_dimensional(lens, intrinsics, powers)
-    cost = kernels.normal_equations(
-        lens, intrinsics, powers, dense, answer_limit(lens, dense), unit, matrix(camera.cam_from_world),
-        seen.points, seen.pixels, 1.0 / seen.sigma_px, moves.slots, moves.bends,
-        seen.tracks, seen.is_arc, seen.track, seen.curve_pixels, 1.0 / seen.curve_sigma_px, seen.start.copy(),
-        moves.track_slots, kernels.LOSS_CODES[loss], scale, newton, np.arange(count + 7), places, normal,
-        working_space(count, count + 7),
+    optics = camera_optics(camera)
+    optics = prepared(optics, optics.intrinsics)
+    count = len(optics.intrinsics)
+    order = order_of_rows(Unknowns(np.arange(count), structure), count)
+    normal = np.zeros((count + structure + 7, count + structure + 7))
+    cost = sum_up(
+        0, optics, matrix(camera.cam_from_world), seen[0], fresh(seen[1]), Loss(kernels.LOSS_CODES[loss], scale),
+        newton, order, normal, working_space(optics, count + 7),
     )  # fmt: skip
     lower = np.tril(normal)
     return float(cost), lower + np.tril(lower, -1).T
 
 
-def point_residuals(camera: Camera, seen: Seen) -> Array:
-    found, bounds = np.empty((len(seen.points), 2)), np.array([0, len(seen.points)])
-    kernels.point_residuals(
-        *optics(camera),
-        matrix(camera.cam_from_world)[None],
-        bounds,
-        seen.points,
-        seen.pixels,
-        np.arange(len(found)),
-        found,
-    )
+def point_residuals(camera: Camera, seen: Shown) -> Array:
+    found = np.empty((len(seen[0].pixels), 2))
+    poses = matrix(camera.cam_from_world)[None]
+    kernels.point_residuals(0, 1, camera_optics(camera), poses, seen[0], np.arange(len(found)), found)
     return found
 
 
-def curve_residuals(camera: Camera, seen: Seen) -> tuple[Array, Array]:
+def curve_residuals(camera: Camera, seen: Shown) -> tuple[Array, Array]:
     """Distances px, and the feet they were measured at."""
-    found, places, bounds = np.empty(len(seen.curve_pixels)), seen.start.copy(), np.array([0, len(seen.curve_pixels)])
-    kernels.curve_residuals(
-        *optics(camera), matrix(camera.cam_from_world)[None], bounds,
-        seen.tracks, seen.is_arc, seen.track, seen.curve_pixels, places, found,
-    )  # fmt: skip
-    return found, places
+    found, curves = np.empty(len(seen[1].pixels)), fresh(seen[1])
+    kernels.curve_residuals(camera_optics(camera), matrix(camera.cam_from_world)[None], curves, found)
+    return found, curves.feet
 
 
-def residual_vector(camera: Camera, seen: Seen) -> Array:
+def residual_vector(camera: Camera, seen: Shown) -> Array:
     """Every residual in its sigmas: x and y of the points, then the curves' distances."""
-    points = point_residuals(camera, seen) / seen.sigma_px[:, None]
-    return np.concatenate([points.ravel(), curve_residuals(camera, seen)[0] / seen.curve_sigma_px])
+    points = point_residuals(camera, seen) * seen[0].weights[:, None]
+    return np.concatenate([points.ravel(), curve_residuals(camera, seen)[0] * seen[1].weights])
 
 
 def moved(camera: Camera, change: Array) -> Camera:
@@ -214,15 +197,19 @@ def intrinsics_steps(camera: Camera) -> Array:
 def test_point_residuals_are_those_of_the_readable_lens(lens: str) -> None:
     camera, seen = looked_at(lens)
     found = point_residuals(camera, seen)
-    assert np.max(np.abs(found - (camera.project(seen.points) - seen.pixels))) < 1e-11  # 2e-13 px measured
+    assert np.max(np.abs(found - (camera.project(seen[0].places) - seen[0].pixels))) < 1e-11  # 2e-13 px measured
 
 
-def foot_by_search(camera: Camera, seen: Seen, row: int) -> tuple[float, float]:
+def foot_by_search(camera: Camera, seen: Shown, row: int) -> tuple[float, float]:
     """Signed distance from a pixel to its curve and the foot, by minimising over the projected curve alone."""
-    track, is_arc, start = seen.tracks[seen.track[row]], bool(seen.is_arc[seen.track[row]]), seen.start[row]
+    track, is_arc, start = (
+        seen[1].tracks[seen[1].track[row]],
+        bool(seen[1].is_arc[seen[1].track[row]]),
+        seen[1].feet[row],
+    )
 
     def away(s: float) -> Array:
-        return np.asarray((camera.project(along_track(track, is_arc, [s])) - seen.curve_pixels[row])[0])
+        return np.asarray((camera.project(along_track(track, is_arc, [s])) - seen[1].pixels[row])[0])
 
     reach = 0.3 if is_arc else 0.1
     bounds = (start - reach, start + reach)
@@ -245,12 +232,12 @@ def test_curve_residuals_are_true_distances(lens: str) -> None:
 def test_far_pixels_have_the_nearest_foot_too() -> None:
     """Gross errors: pixels tens of px off the centre circle, some of them on the far side of a sharp bend."""
     camera, seen = looked_at("radial-2-3")
-    rows = np.flatnonzero(seen.is_arc[seen.track])
-    seen = seen.take(curves=rows)
-    far = seen.curve_pixels + np.random.default_rng(0).normal(0.0, 25.0, (len(rows), 2))
-    distances, _ = curve_residuals(camera, replace(seen, curve_pixels=far))
+    rows = np.flatnonzero(seen[1].is_arc[seen[1].track])
+    seen = take(seen, curves=rows)
+    far = seen[1].pixels + np.random.default_rng(0).normal(0.0, 25.0, (len(rows), 2))
+    distances, _ = curve_residuals(camera, (seen[0], seen[1]._replace(pixels=far)))
     for row in range(len(rows)):
-        around = along_track(seen.tracks[seen.track[row]], True, np.linspace(0.0, 2.0 * np.pi, 7200))
+        around = along_track(seen[1].tracks[seen[1].track[row]], True, np.linspace(0.0, 2.0 * np.pi, 7200))
         nearest = np.min(np.linalg.norm(camera.project(around) - far[row], axis=1))
         assert abs(distances[row]) == pytest.approx(nearest, abs=0.01)  # the steps round the arc are 0.15 px long
 
@@ -258,19 +245,19 @@ def test_far_pixels_have_the_nearest_foot_too() -> None:
 # ---- derivatives ----------------------------------------------------------------------------------------------------
 
 
-def jacobian_by_gradients(camera: Camera, seen: Seen) -> Array:
+def jacobian_by_gradients(camera: Camera, seen: Shown) -> Array:
     """Jacobian (residuals, numbers) read off single observations: the last row of A is e J, whatever e is.
 
     A point's pixel is moved so that its residual is (1, 0), then (0, 1).
     """
     rows = []
-    for k in range(len(seen.points)):
+    for k in range(len(seen[0].places)):
         for unit in np.eye(2):
-            one = seen.take(points=slice(k, k + 1))
-            one = replace(one, pixels=camera.project(one.points) - unit, sigma_px=np.ones(1))
-            rows.append(normal_equations(camera, one)[1][-1, :-1] / seen.sigma_px[k])
-    for k in range(len(seen.curve_pixels)):
-        one = seen.take(curves=slice(k, k + 1))
+            one = take(seen, points=slice(k, k + 1))
+            one = with_points(one, pixels=camera.project(one[0].places) - unit, weights=np.ones(1))
+            rows.append(normal_equations(camera, one)[1][-1, :-1] * seen[0].weights[k])
+    for k in range(len(seen[1].pixels)):
+        one = take(seen, curves=slice(k, k + 1))
         rows.append(normal_equations(camera, one)[1][-1, :-1] / residual_vector(camera, one)[0])
     return np.array(rows)
 
@@ -282,15 +269,15 @@ def test_every_residual_knows_its_derivatives(lens: str) -> None:
     found = jacobian_by_gradients(camera, seen)
 
     def project(change: Array) -> Array:
-        return np.asarray((moved(camera, change).project(seen.points) / seen.sigma_px[:, None]).ravel())
+        return np.asarray((moved(camera, change).project(seen[0].places) * seen[0].weights[:, None]).ravel())
 
     def distance(change: Array) -> Array:
-        return residual_vector(moved(camera, change), seen.take(curves=slice(None)))
+        return residual_vector(moved(camera, change), take(seen, curves=slice(None)))
 
     steps = np.concatenate([intrinsics_steps(camera), POSE_STEPS])
     error = np.abs(found - np.vstack([derivative(project, steps), derivative(distance, steps)]))
     error /= np.max(np.abs(found), axis=0)
-    points = 2 * len(seen.points)
+    points = 2 * len(seen[0].places)
     assert np.max(error[:points]) < 5e-8  # 6e-9 measured
     assert np.max(error[points:]) < 1e-7  # 1e-8 measured
 
@@ -301,7 +288,7 @@ def test_normal_equations_sum_up_single_observations(lens: str, loss: str) -> No
     """The cost is sum rho and A is sum w [J e]^T [J e], over chunks whole and broken."""
     camera, seen = looked_at(lens)
     cost, normal = normal_equations(camera, seen, loss, 1.5)
-    parts = [normal_equations(camera, one, loss, 1.5) for one in seen.singles]
+    parts = [normal_equations(camera, one, loss, 1.5) for one in singles(seen)]
     assert cost == pytest.approx(sum(part[0] for part in parts), rel=1e-12)  # 1e-14 measured
     total = np.sum([part[1] for part in parts], axis=0)
     size = np.sqrt(np.outer(np.diag(total), np.diag(total)))
@@ -312,8 +299,8 @@ def test_normal_equations_sum_up_single_observations(lens: str, loss: str) -> No
 @pytest.mark.parametrize("count", [0, 1, 63, 64, 65, 128, 130])
 def test_chunks_of_any_length_count_every_row_once(count: int) -> None:
     camera, seen = looked_at("brown")
-    points, curves = (np.resize(np.arange(len(rows)), count) for rows in (seen.pixels, seen.curve_pixels))
-    for many in (seen.take(points, curves), seen.take(points), seen.take(curves=curves)):
+    points, curves = (np.resize(np.arange(len(rows)), count) for rows in (seen[0].pixels, seen[1].pixels))
+    for many in (take(seen, points, curves), take(seen, points), take(seen, curves=curves)):
         expected = float(np.sum(residual_vector(camera, many) ** 2))
         assert normal_equations(camera, many)[0] == pytest.approx(expected, rel=1e-12)  # 2e-15 measured
 
@@ -324,8 +311,8 @@ def test_chunks_of_any_length_count_every_row_once(count: int) -> None:
 def loss_of(loss: str, scale: float, length: float) -> tuple[float, float, float]:
     """rho, rho' s and s of one point whose residual has about that length."""
     camera, seen = looked_at("brown")
-    one = replace(seen.take(points=slice(0, 1)), sigma_px=np.ones(1))
-    one = replace(one, pixels=camera.project(one.points) + length * np.array([[0.6, -0.8]]))
+    one = with_points(take(seen, points=slice(0, 1)), weights=np.ones(1))
+    one = with_points(one, pixels=camera.project(one[0].places) + length * np.array([[0.6, -0.8]]))
     cost, normal = normal_equations(camera, one, loss, scale)
     return cost, float(normal[-1, -1]), float(np.sum(point_residuals(camera, one) ** 2))
 
@@ -371,7 +358,7 @@ def test_newtons_step_takes_the_bend_of_the_loss_along(lens: str, loss: str) -> 
     size = np.sqrt(np.diag(plain))
     assert np.max(np.abs(newton - plain)[-1, :-1] / size[:-1] / size[-1]) < 1e-12  # 3e-16 measured
     expected = plain[:-1, :-1].copy()
-    for one in seen.singles:
+    for one in singles(seen):
         part = normal_equations(camera, one, loss, 4.0)[1]
         whole = normal_equations(camera, one)[1]
         if part[-1, -1] > 0.0:
@@ -383,7 +370,10 @@ def test_newtons_step_takes_the_bend_of_the_loss_along(lens: str, loss: str) -> 
 def test_where_most_are_outliers_the_loss_stays_straight() -> None:
     """There its bend says nothing of where the minimum lies, and a step along it would be very long."""
     camera, seen = looked_at("brown")
-    far = replace(seen, pixels=seen.pixels + 50.0, curve_pixels=seen.curve_pixels + 50.0)
+    far = (
+        seen[0]._replace(pixels=seen[0].pixels + 50.0),
+        seen[1]._replace(pixels=seen[1].pixels + 50.0),
+    )
     plain, newton = (normal_equations(camera, far, "huber", 1.5, newton=newton)[1] for newton in (False, True))
     assert np.array_equal(plain, newton)
 
@@ -400,28 +390,26 @@ class Block:
 
 
 def evaluate_block(
-    camera: Camera, poses: tuple[Array, Array], seen: Seen, loss: str = "trivial", scale: float = 1.0, *,
-    free: Indices | None = None, held: tuple[str, ...] = (), moves: Moves = NOTHING_MOVES,
+    camera: Camera, poses: tuple[Array, Array], seen: Shown, loss: str = "trivial", scale: float = 1.0, *,
+    free: Indices | None = None, held: tuple[str, ...] = (), structure: int = 0,
 ) -> Block | None:  # fmt: skip
     """The block of a camera at station @ placement; None where the kernel says that there is no answer."""
-    code, vector, powers, unit = optics(camera)
-    free = np.arange(len(vector)) if free is None else free
-    rows = len(free) + moves.count + 7
-    sizes = {"camera": len(free), "station": 6, "placement": 6, "structure": moves.count}
+    optics = camera_optics(camera)
+    free = np.arange(len(optics.intrinsics)) if free is None else free
+    rows = len(free) + structure + 7
+    sizes = {"camera": len(free), "station": 6, "placement": 6, "structure": structure}
     outputs = {name: np.full(0 if name in held else rows * size, 7.0) for name, size in sizes.items()}
     residuals = np.full(rows, 7.0)
     good = kernels.evaluate_block(
-        code, vector, free, powers, unit, seen.pixels, 1.0 / seen.sigma_px, moves.slots, moves.bends,
-        seen.is_arc, seen.track, seen.curve_pixels, 1.0 / seen.curve_sigma_px, seen.start.copy(), moves.track_slots,
-        kernels.LOSS_CODES[loss], scale, seen.points, seen.tracks, moves.count,
-        vector[free], *poses, residuals, *outputs.values(),
+        optics, Unknowns(free, structure), seen[0], fresh(seen[1]), Loss(kernels.LOSS_CODES[loss], scale),
+        kernels.Blocks(optics.intrinsics[free], *poses, kernels.NOTHING), residuals, kernels.Blocks(**outputs),
     )  # fmt: skip
-    shown = [outputs[name].reshape(rows, size) for name, size in sizes.items() if name not in held and size]
-    return Block(residuals, np.hstack([np.empty((rows, 0)), *shown])) if good else None
+    kept = [outputs[name].reshape(rows, size) for name, size in sizes.items() if name not in held and size]
+    return Block(residuals, np.hstack([np.empty((rows, 0)), *kept])) if good else None
 
 
 def uncompressed(
-    camera: Camera, poses: tuple[Array, Array], seen: Seen, loss: str, scale: float
+    camera: Camera, poses: tuple[Array, Array], seen: Shown, loss: str, scale: float
 ) -> tuple[float, Array, Array]:
     """Sum of rho, Newton's matrix and J^T W e of the problem with one row per residual, its Jacobian by differences."""
     count = len(intrinsics_vector(camera))
@@ -433,7 +421,7 @@ def uncompressed(
 
     jacobian = derivative(residuals, np.concatenate([intrinsics_steps(camera), POSE_STEPS, POSE_STEPS]))
     e = residuals(np.zeros(count + 12))
-    pairs, alone = e[: 2 * len(seen.points)].reshape(-1, 2), e[2 * len(seen.points) :]
+    pairs, alone = e[: 2 * len(seen[0].places)].reshape(-1, 2), e[2 * len(seen[0].places) :]
     lengths = np.concatenate([np.linalg.norm(pairs, axis=1), np.abs(alone)])
     rho, weighted, s = np.array([loss_of(loss, scale, length) for length in lengths]).T
     slope = weighted / s
@@ -528,9 +516,9 @@ def test_blocks_of_less_than_full_rank(lens: str, what: str) -> None:
     """Zero pivots: fewer residuals than numbers, and a last column that is zero."""
     camera, seen = looked_at(lens)
     if what == "residuals of zero":
-        seen = replace(seen.take(points=slice(None)), pixels=camera.project(seen.points))
+        seen = with_points(take(seen, points=slice(None)), pixels=camera.project(seen[0].places))
     else:
-        seen = seen.take(points=slice(0, 1)) if what == "one point" else seen.take(curves=slice(4, 5))
+        seen = take(seen, points=slice(0, 1)) if what == "one point" else take(seen, curves=slice(4, 5))
     poses = split(camera, 0.7 * AXIS, turned="placement")
     block = evaluate_block(camera, poses, seen)
     assert block is not None
@@ -547,8 +535,8 @@ def test_blocks_of_less_than_full_rank(lens: str, what: str) -> None:
 def test_a_point_on_the_axis_moves_as_through_a_pinhole(lens: str) -> None:
     """Where the radius is 0 no lens bends anything: the coefficients' columns are 0 and nothing is divided by it."""
     camera = replace(scenes.camera(lens), aspect=1.03)
-    seen = replace(
-        looked_at(lens)[1].take(points=slice(0, 1)), points=np.array([[0.0, 0.0, 2.0]]), pixels=np.zeros((1, 2))
+    seen = with_points(
+        take(looked_at(lens)[1], points=slice(0, 1)), places=np.array([[0.0, 0.0, 2.0]]), pixels=np.zeros((1, 2))
     )
     block = evaluate_block(camera, (np.zeros(6), np.zeros(6)), seen, held=("placement",))
     assert block is not None
@@ -556,7 +544,7 @@ def test_a_point_on_the_axis_moves_as_through_a_pinhole(lens: str) -> None:
     x = np.array([0.0, 0.0, 1.0, 0.0, *[0.0] * count, 0.0, 2.0, 0.0, 1.0, 0.0, 0.0])
     y = np.array([0.0, 0.0, 0.0, 1.0, *[0.0] * count, -2.0, 0.0, 0.0, 0.0, 1.0, 0.0])
     x[-6:], y[-6:] = x[-6:] * camera.phi / 2.0, y[-6:] * 1.03 * camera.phi / 2.0
-    expected = (np.outer(x, x) + np.outer(y, y)) / seen.sigma_px[0] ** 2
+    expected = (np.outer(x, x) + np.outer(y, y)) * seen[0].weights[0] ** 2
     found = block.jacobian.T @ block.jacobian
     assert np.max(np.abs(found - expected)) < 1e-12 * np.max(expected)  # 2e-16 measured
 
@@ -564,54 +552,56 @@ def test_a_point_on_the_axis_moves_as_through_a_pinhole(lens: str) -> None:
 # ---- structure ------------------------------------------------------------------------------------------------------
 
 
-def everything_moves() -> Moves:
+def everything_moves(seen: Shown) -> tuple[Shown, int]:
     """A number for x and y of each point, two bows that all share, the offset of each segment, x, y, radius of arcs."""
     points = len(TARGET.points)
     slots = np.column_stack([np.arange(2 * points).reshape(-1, 2), np.tile([2 * points, 2 * points + 1], (points, 1))])
     first = 2 * points + 2
     tracks = np.array([[0, -1, -1], [1, -1, -1], [2, 3, 4], [5, 6, 7]])
-    tracks = np.where(tracks < 0, -1, tracks + first)
+    tracks = np.tile(np.where(tracks < 0, -1, tracks + first), (3, 1)).astype(np.int32)
     bends = np.random.default_rng(2).uniform(-1.0, 1.0, (points, 2))
-    return Moves(first + 8, slots.astype(np.int32), bends, np.tile(tracks, (3, 1)).astype(np.int32))
+    moving = seen[0]._replace(slots=slots.astype(np.int32), bends=bends), seen[1]._replace(slots=tracks)
+    return moving, first + 8
 
 
-def as_built(seen: Seen, moves: Moves, values: Array) -> Seen:
+def as_built(seen: Shown, values: Array) -> Shown:
     """The target with the structure numbers put in: points along x and y, their bows along z, segments to the left."""
-    shift = np.column_stack([values[moves.slots[:, :2]], np.sum(moves.bends * values[moves.slots[:, 2:]], axis=1)])
-    tracks = seen.tracks.copy()
-    for k, (first, second, third) in enumerate(moves.track_slots):
-        if seen.is_arc[k]:
+    slots = seen[0].slots
+    shift = np.column_stack([values[slots[:, :2]], np.sum(seen[0].bends * values[slots[:, 2:]], axis=1)])
+    tracks = seen[1].tracks.copy()
+    for k, (first, second, third) in enumerate(seen[1].slots):
+        if seen[1].is_arc[k]:
             tracks[k, 0, :2] += values[[first, second]]
             tracks[k, 1, 0] += values[third]
             tracks[k, 2, 1] += values[third]
         else:
             along = tracks[k, 1, :2] / np.linalg.norm(tracks[k, 1, :2])
             tracks[k, 0, :2] += values[first] * np.array([-along[1], along[0]])
-    return replace(seen, points=seen.points + shift, tracks=tracks)
+    return seen[0]._replace(places=seen[0].places + shift), seen[1]._replace(tracks=tracks)
 
 
 @each_lens
 def test_structure_knows_its_derivatives(lens: str) -> None:
     """J^T J and J^T e with the structure's numbers, against differences of every residual."""
     camera, seen = looked_at(lens)
-    moves = everything_moves()
-    count, total = len(intrinsics_vector(camera)), len(intrinsics_vector(camera)) + moves.count
+    seen, structure = everything_moves(seen)
+    count, total = len(intrinsics_vector(camera)), len(intrinsics_vector(camera)) + structure
 
     def residuals(change: Array) -> Array:
-        built = as_built(seen, moves, change[count:total])
+        built = as_built(seen, change[count:total])
         return residual_vector(moved(camera, np.concatenate([change[:count], change[total:]])), built)
 
-    steps = np.concatenate([intrinsics_steps(camera), np.full(moves.count, 3e-3), POSE_STEPS])
+    steps = np.concatenate([intrinsics_steps(camera), np.full(structure, 3e-3), POSE_STEPS])
     jacobian, e = derivative(residuals, steps), residuals(np.zeros(total + 6))
     both = np.column_stack([jacobian, e])
     expected = both.T @ both
-    found = normal_equations(camera, seen, moves=moves)[1]
+    found = normal_equations(camera, seen, structure=structure)[1]
     size = np.sqrt(np.diag(expected))
     assert np.max(np.abs(found - expected) / np.outer(size, size)) < 5e-8  # 6e-9 measured
     poses = split(camera, 0.7 * AXIS, turned="placement")
-    block = evaluate_block(camera, poses, seen, moves=moves)
+    block = evaluate_block(camera, poses, seen, structure=structure)
     assert block is not None
-    columns = [*range(count), *range(count + 12, count + 12 + moves.count)]
+    columns = [*range(count), *range(count + 12, count + 12 + structure)]
     normal = block.jacobian.T @ block.jacobian
     inside = range(total)
     assert (
@@ -627,35 +617,33 @@ def test_structure_knows_its_derivatives(lens: str) -> None:
 
 
 def eliminate(
-    camera: Camera, poses: list[Pose], parts: list[Seen], loss: str, tolerance: float
+    camera: Camera, poses: list[Pose], parts: list[Shown], loss: str, tolerance: float
 ) -> tuple[float, Array, list[Pose]]:
     """Sum of rho at the best poses, the complement over [intrinsics | residual], whole, and those poses."""
-    code, vector, powers, unit = optics(camera)
-    free, count = np.arange(len(vector)), len(vector)
+    optics = camera_optics(camera)
+    count = len(optics.intrinsics)
     stack, costs = np.stack([matrix(pose) for pose in poses]), np.empty(len(parts))
-    names = ("pixels", "points", "sigma_px", "track", "curve_pixels", "curve_sigma_px", "start")
-    columns = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
-    bounds, curve_bounds = (
-        np.cumsum([0, *(len(getattr(part, name)) for part in parts)]) for name in ("pixels", "curve_pixels")
+    points, curves = parts[0]
+    joined, lines = (
+        {name: np.concatenate([getattr(part[k], name) for part in parts]) for name in names}
+        for k, names in ((0, ("places", "pixels", "weights")), (1, ("track", "pixels", "weights", "feet")))
     )
-    reduced = np.zeros((count + 1, count + 1))
+    bounds, curve_bounds = (np.cumsum([0, *(len(part[k].pixels) for part in parts)]) for k in (0, 1))
+    sweep = kernels.Sweep(stack, np.zeros((len(parts), 6, count)), costs, np.zeros((count + 1, count + 1)))
     kernels.eliminate_placements(
-        0, len(parts), code, vector, free, powers, unit,
-        bounds, columns["pixels"], 1.0 / columns["sigma_px"], NOTHING_MOVES.slots, NOTHING_MOVES.bends,
-        parts[0].is_arc, curve_bounds, columns["track"], columns["curve_pixels"], 1.0 / columns["curve_sigma_px"],
-        columns["start"], NOTHING_MOVES.track_slots, kernels.LOSS_CODES[loss], 1.5, False,
-        columns["points"], parts[0].tracks, 0, tolerance, np.zeros(count), stack,
-        np.zeros((len(parts), 6, count)), costs, reduced,
+        0, len(parts), optics, Unknowns(np.arange(count), 0), points._replace(bounds=bounds, **joined),
+        curves._replace(bounds=curve_bounds, **lines), Loss(kernels.LOSS_CODES[loss], 1.5), False, tolerance,
+        np.zeros(count), sweep,
     )  # fmt: skip
-    lower = np.tril(reduced)
+    lower = np.tril(sweep.reduced)
     return float(costs.sum()), lower + np.tril(lower, -1).T, [Pose(pose[:, :3], pose[:, 3]) for pose in stack]
 
 
-def three_sights(lens: str) -> tuple[Camera, list[Pose], list[Seen]]:
+def three_sights(lens: str) -> tuple[Camera, list[Pose], list[Shown]]:
     """Thirds of the observations, as if of three placements whose poses are 10 mm and 10 mrad off."""
     camera, seen = looked_at(lens)
     rng = np.random.default_rng(8)
-    parts = [seen.take(points=slice(None), curves=slice(k, None, 3)) for k in range(3)]
+    parts = [take(seen, points=slice(None), curves=slice(k, None, 3)) for k in range(3)]
     starts = [Pose.exp(rng.normal(0.0, 0.01, 6)) @ camera.cam_from_world for _ in parts]
     return camera, starts, parts
 
@@ -741,7 +729,7 @@ def test_what_cannot_be_projected_has_no_residual(lens: str, hidden: str) -> Non
     bad = np.pi - 0.3 if hidden == "behind" else limit + 0.02
     camera, whole = before(lens), looked_at("brown")[1]
     points = rays(0.1, limit - 0.02, bad, 0.3)
-    seen = replace(whole.take(points=slice(0, 4)), points=points, pixels=np.zeros((4, 2)), sigma_px=np.ones(4))
+    seen = with_points(take(whole, points=slice(0, 4)), places=points, pixels=np.zeros((4, 2)), weights=np.ones(4))
     found = point_residuals(camera, seen)
     assert np.all(np.isnan(found[2]))
     assert np.all(np.isfinite(found[[0, 1, 3]]))  # each on its own
@@ -749,7 +737,7 @@ def test_what_cannot_be_projected_has_no_residual(lens: str, hidden: str) -> Non
     assert np.isnan(normal_equations(camera, seen)[0])
     poses = np.zeros(6), np.zeros(6)
     assert evaluate_block(camera, poses, seen) is None
-    assert evaluate_block(camera, poses, seen.take(points=[0, 1, 3])) is not None
+    assert evaluate_block(camera, poses, take(seen, points=[0, 1, 3])) is not None
 
 
 @pytest.mark.parametrize("lens", FOLDING)
@@ -757,7 +745,7 @@ def test_a_curve_that_cannot_be_projected_has_no_residual(lens: str) -> None:
     """A line that is wholly behind the camera or, for a fisheye, past its limit."""
     camera, whole = before(lens), looked_at("brown")[1]
     away = camera.at(Pose.exp([0.0, np.pi, 0.0, 0.0, 0.0, -2.0]))  # looks away from the target
-    seen = whole.take(curves=slice(0, 3))
+    seen = take(whole, curves=slice(0, 3))
     assert np.all(np.isnan(curve_residuals(away, seen)[0]))
     assert np.isnan(normal_equations(away, seen)[0])
 
@@ -766,5 +754,5 @@ def test_a_fisheye_sees_behind_itself() -> None:
     """130 degrees from the axis, as far as its polynomial grows."""
     camera = Camera((1280, 960), 200.0, (640.0, 480.0), KannalaBrandt((0.01, 0.0, 0.0, 0.0)))
     points = rays(np.deg2rad(130.0), -np.deg2rad(100.0))
-    seen = replace(looked_at("brown")[1].take(points=slice(0, 2)), points=points, pixels=np.zeros((2, 2)))
+    seen = with_points(take(looked_at("brown")[1], points=slice(0, 2)), places=points, pixels=np.zeros((2, 2)))
     assert np.max(np.abs(point_residuals(camera, seen) - camera.project(points))) < 1e-10

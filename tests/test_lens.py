@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
-from ceres_cal.scene.lens import LENS_KINDS, Brown, KannalaBrandt, Lens, Radial, make_lens
+from ceres_cal.scene.lens import LENSES, Brown, KannalaBrandt, Lens, Radial, make_lens
 
 quick = settings(deadline=None, max_examples=60)
 
@@ -38,7 +38,7 @@ def radial_in_units(values: tuple[float, ...], powers: tuple[int, ...], unit_px:
 def lenses(draw: st.DrawFn, decentring: float = 2e-3) -> tuple[Lens, float]:
     """A lens of any kind with its phi."""
     phi = draw(phis)
-    kind = draw(st.sampled_from(LENS_KINDS))
+    kind = draw(st.sampled_from(list(LENSES)))
     if kind == "radial":
         powers = draw(st.sampled_from([(2, 3), (3,), (3, 5), (2, 3, 4, 5)]))
         return radial_in_units(draw(coefficients(*[0.7] * len(powers))), powers, phi), phi
@@ -298,7 +298,7 @@ def test_lenses_by_name() -> None:
     assert make_lens("radial", (3, 5), {"a5": 1e-12}) == Radial((0.0, 1e-12), (3, 5))
     assert make_lens("brown", coefficients={"p2": 1e-3}) == Brown((0.0, 0.0, 0.0, 1e-3, 0.0))
     assert make_lens("kannala-brandt").coefficients == {"k1": 0.0, "k2": 0.0, "k3": 0.0, "k4": 0.0}
-    assert [make_lens(kind).kind for kind in LENS_KINDS] == list(LENS_KINDS)
+    assert [make_lens(kind).kind for kind in LENSES] == list(LENSES)
     assert Brown().with_values(np.arange(5.0)) == Brown((0.0, 1.0, 2.0, 3.0, 4.0))
 
 

@@ -28,7 +28,7 @@ from ceres_cal.model.parameters import (
     with_intrinsics,
 )
 from ceres_cal.model.structure import make_structure
-from ceres_cal.observations import Curves, Observations, Points, View
+from ceres_cal.observations import NO_CURVES, Observations, Points, View
 from ceres_cal.observations.sights import SightKey
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Brown, KannalaBrandt, Radial, make_lens
@@ -52,7 +52,7 @@ def watched(*views: tuple[str, str | None], cameras: dict[str, str] | None = Non
         {entry.camera: (640, 480) for entry in entries},
         entries,
         Points(np.arange(count, dtype=np.int32), np.zeros(count, np.int32), np.full((count, 2), 100.0), np.ones(count)),
-        Curves(np.empty(0), np.empty(0), np.empty((0, 2)), np.empty(0), np.empty(0)),  # type: ignore[arg-type]
+        NO_CURVES,
     )
 
 

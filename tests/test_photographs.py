@@ -15,6 +15,7 @@ from ceres_cal.base.transforms import Pose
 from ceres_cal.cli import main
 from ceres_cal.detect.images import read_grey
 from ceres_cal.detect.saddles import measure_saddles
+from ceres_cal.scene.curves import curve_points
 from ceres_cal.scene.heights import ROBOT_TOP_M
 from ceres_cal.scene.targets import checkerboard, custom, rings, ssl_field
 from ceres_cal.simulate import (
@@ -32,7 +33,7 @@ from ceres_cal.simulate import (
 )
 from ceres_cal.simulate.album import take_album
 from ceres_cal.simulate.photograph import frames, photograph
-from ceres_cal.simulate.render import SUBPIXELS, averaged, blank_canvas, curve_points, fill, paint_curves, print_sheet
+from ceres_cal.simulate.render import SUBPIXELS, averaged, blank_canvas, fill, paint_curves, print_sheet
 from ceres_cal.simulate.things import BALL_RADIUS_M, Ball, Robot, outline
 
 PLAIN = Photography(
@@ -75,7 +76,8 @@ def test_rings_have_the_size_that_the_model_says() -> None:
     sheet = rings([0.05, 0.1, 0.15])
     posed = camera("radial-2-3").at(Pose.exp((0.1, -0.05, 0.2, 0.01, 0.02, 0.4)))
     canvas = blank_canvas(posed.image_size)
-    print_sheet(canvas, sheet, posed)
+    assert sheet.paper is not None
+    print_sheet(canvas, sheet.paper, posed)
     printed = (0.9 - averaged(canvas).astype(float)) / (0.9 - 0.06)
     areas = []
     for curve in sheet.curves.values():

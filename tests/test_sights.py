@@ -12,8 +12,9 @@ from scipy.optimize import minimize_scalar
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.transforms import Pose
 from ceres_cal.observations import Observations
-from ceres_cal.observations.sights import SightKey, Sights, gather_sights, nearest_places
-from ceres_cal.scene.targets import Arc, Segment, along_track, checkerboard, custom
+from ceres_cal.observations.sights import SightKey, Sights, gather_sights, nearest_feet
+from ceres_cal.scene.curves import along_track
+from ceres_cal.scene.targets import Arc, Segment, checkerboard, custom
 from ceres_cal.simulate import Disturbance, Scene, Station, ViewPlan, overhead_pose, simulate
 
 NOISE = Disturbance(points_sigma_px=0.3, curves_sigma_px=0.5, hidden_points=0.2)
@@ -75,7 +76,7 @@ def assert_true_to(observations: Observations, sights: Sights) -> None:
             assert np.array_equal(place, target.points[observations.feature_name("point", row)])
             assert np.array_equal(pixel, observations.points.pixels[row])
             assert sigma == observations.points.sigma_px[row]
-        for row, track, pixel in zip(sight.curve_rows, sight.track, sight.curve_pixels, strict=True):
+        for row, track, pixel in zip(sight.curve_rows, sight.track_index, sight.curve_pixels, strict=True):
             view = observations.views[observations.curves.view[row]]
             assert (view.camera, view.station, view.placement) == key
             curve = observations.targets[view.target].curves[observations.feature_name("curve", row)]
@@ -130,7 +131,7 @@ def test_parts_make_the_whole() -> None:
     sight = gather_sights(seen())[0]
     parts = [sight.part(number, 3) for number in range(3)]
     assert all(part.keys == sight.keys for part in parts)
-    for name in ("point_rows", "points", "pixels", "curve_rows", "track", "curve_pixels", "curve_sigma_px"):
+    for name in ("point_rows", "points", "pixels", "curve_rows", "track_index", "curve_pixels", "curve_sigma_px"):
         assert np.array_equal(np.concatenate([getattr(part, name) for part in parts]), getattr(sight, name))
 
 
@@ -153,9 +154,9 @@ def test_nearest_places_are_where_the_ray_passes() -> None:
     for number in (0, 3):
         sight = sights[number]
         camera = scene.camera_at(sight.key.station)
-        found = nearest_places(sight, camera)
+        found = nearest_feet(sight, camera)
         rays = camera.rays(sight.curve_pixels) @ camera.cam_from_world.rotation
-        for place, track, ray in zip(found, sight.track, rays, strict=True):
+        for place, track, ray in zip(found, sight.track_index, rays, strict=True):
             is_arc = bool(sight.is_arc[track])
             best = nearest_to_ray(sight.tracks[track], is_arc, camera.position, ray, place)
             # On a line they are the same; on a circle the place is where the ray meets its plane, turned to the middle.
@@ -176,7 +177,7 @@ def nearest_to_ray(track: Array, is_arc: bool, origin: Array, ray: Array, start:
 def test_places_of_no_observation_at_all() -> None:
     sight = gather_sights(seen())[1]
     assert len(sight.curve_rows) == 0
-    assert nearest_places(sight, several().camera_at("right")).shape == (0,)
+    assert nearest_feet(sight, several().camera_at("right")).shape == (0,)
 
 
 def test_a_pixel_without_a_ray_has_a_place_all_the_same() -> None:
@@ -187,11 +188,9 @@ def test_a_pixel_without_a_ray_has_a_place_all_the_same() -> None:
     assert folding.folds
     far = replace(sight, curve_pixels=sight.curve_pixels + 900.0)
     assert np.all(np.isnan(folding.rays(far.curve_pixels)[:, 0]))
-    assert np.all(np.isfinite(nearest_places(far, folding)))
+    assert np.all(np.isfinite(nearest_feet(far, folding)))
     level = camera.at(Pose.looking((0.0, 0.0, 0.0), [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]))  # edge-on
-    assert np.all(
-        np.isfinite(nearest_places(replace(sight, curve_pixels=np.full_like(far.curve_pixels, 480.0)), level))
-    )
+    assert np.all(np.isfinite(nearest_feet(replace(sight, curve_pixels=np.full_like(far.curve_pixels, 480.0)), level)))
 
 
 def test_placements_seen_once() -> None:

@@ -459,7 +459,7 @@ def change(*path: Any, to: Any) -> Callable[[dict[str, Any]], None]:
         (change("views", 0, "curves", to=["HalfwayLine"] * 2), "view 0: a curve is named twice"),
         (change("views", 0, "spacing_m", to=0), "view 0: spacing_m must be a positive"),
         (change("views", 0, "side", to="top"), "view 0: side 'top' is unknown"),
-        (change("views", 0, "sharpness", to=1), "view 0: Object contains unknown field `sharpness`"),
+        (change("views", 0, "sharpness", to=1), "view 0: 'sharpness' is unknown: there are frames"),
         (change("disturbance", to={"noise": 1}), "disturbance: 'noise' is unknown"),
         (change("disturbance", to={"outliers": 1.5}), "disturbance: outliers is a share"),
         (change("disturbance", to={"outliers": 0.6, "wrong_labels": 0.6}), "at most 1 in all"),

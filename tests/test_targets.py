@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
+from ceres_cal.scene.curves import along_track, nearest_on_track
 from ceres_cal.scene.targets import (
     SIDES,
     TARGET_KINDS,
@@ -20,10 +21,8 @@ from ceres_cal.scene.targets import (
     Curve,
     Segment,
     Target,
-    along_track,
     checkerboard,
     custom,
-    nearest_on_track,
     rings,
     ssl_field,
     target_from_spec,

@@ -23,7 +23,7 @@ from ceres_cal.model.structure import EXACT, make_structure
 from ceres_cal.observations import Observations, prior_from_json, prior_to_json
 from ceres_cal.observations.sights import gather_sights
 from ceres_cal.scene.camera import Camera
-from ceres_cal.scene.lens import make_lens
+from ceres_cal.scene.files import CameraFile, PoseFile, Vector, camera_to_json, pose_to_json
 from ceres_cal.scene.targets import Target, target_from_spec
 from ceres_cal.solve import Problem, Weighting
 from ceres_cal.uncertainty import (
@@ -243,34 +243,10 @@ class Calibration:
             raise InputError(f"{path}: {error}") from None
 
 
-class _LensFile(msgspec.Struct, forbid_unknown_fields=True):
-    kind: str
-    coefficients: dict[str, float]
-    powers: tuple[int, ...] | None = None
-
-
-class _CameraFile(msgspec.Struct, forbid_unknown_fields=True):
-    image_size: tuple[int, int]
-    phi: float
-    aspect: float
-    principal_point: tuple[float, float]
-    lens: _LensFile
-
-
-_Vector = tuple[float, float, float]
-
-
-class _StationFile(msgspec.Struct, forbid_unknown_fields=True):
+class _StationFile(PoseFile, forbid_unknown_fields=True):
     camera: str
-    rotation: tuple[_Vector, _Vector, _Vector]
-    translation_m: _Vector
-    position_m: _Vector
-    euler_rad: _Vector
-
-
-class _PlacementFile(msgspec.Struct, forbid_unknown_fields=True):
-    rotation: tuple[_Vector, _Vector, _Vector]
-    translation_m: _Vector
+    position_m: Vector
+    euler_rad: Vector
 
 
 class _PriorFile(msgspec.Struct, forbid_unknown_fields=True):
@@ -279,9 +255,9 @@ class _PriorFile(msgspec.Struct, forbid_unknown_fields=True):
     keys: list[Key]
     information: list[float]
     mean: list[float] | None = None
-    rotations: dict[str, tuple[_Vector, _Vector, _Vector]] | None = None
-    cameras: dict[str, _CameraFile] | None = None
-    stations: dict[str, _PlacementFile] | None = None
+    rotations: dict[str, tuple[Vector, Vector, Vector]] | None = None
+    cameras: dict[str, CameraFile] | None = None
+    stations: dict[str, PoseFile] | None = None
     structure_m: dict[str, float] | None = None
 
 
@@ -299,9 +275,9 @@ class _CalibrationFile(msgspec.Struct, forbid_unknown_fields=True):
     version: int
     units: str
     pixel_origin: str
-    cameras: dict[str, _CameraFile]
+    cameras: dict[str, CameraFile]
     stations: dict[str, _StationFile]
-    placements: dict[str, _PlacementFile]
+    placements: dict[str, PoseFile]
     targets: dict[str, Any]
     structure_m: dict[str, float]
     fit: Fit
@@ -319,20 +295,6 @@ class _CalibrationFile(msgspec.Struct, forbid_unknown_fields=True):
     refitted: _RefittedFile | None = None
 
 
-def camera_to_json(camera: Camera) -> dict[str, Any]:
-    """A camera's intrinsics as the files have them."""
-    lens: dict[str, Any] = {"kind": camera.lens.kind, "coefficients": camera.lens.coefficients}
-    if camera.lens.kind == "radial":
-        lens["powers"] = list(camera.lens.radius_powers)
-    return {
-        "image_size": list(camera.image_size),
-        "phi": camera.phi,
-        "aspect": camera.aspect,
-        "principal_point": list(camera.principal_point),
-        "lens": lens,
-    }
-
-
 def calibration_to_json(calibration: Calibration) -> dict[str, Any]:
     """The calibration as its file has it. Position and Euler angles (the paper's) are there for people."""
     estimate, known = calibration.estimate, calibration.posterior
@@ -346,13 +308,13 @@ def calibration_to_json(calibration: Calibration) -> dict[str, Any]:
         "stations": {
             name: {
                 "camera": station.camera,
-                **_pose_to_json(station.cam_from_world),
+                **pose_to_json(station.cam_from_world),
                 "position_m": station.cam_from_world.position.tolist(),
                 "euler_rad": list(euler_from_rotation(station.cam_from_world.rotation)),
             }
             for name, station in estimate.stations.items()
         },
-        "placements": {name: _pose_to_json(pose) for name, pose in estimate.placements.items()},
+        "placements": {name: pose_to_json(pose) for name, pose in estimate.placements.items()},
         "targets": {name: target.spec for name, target in calibration.targets.items()},
         "structure_m": dict(zip(estimate.structure.names, estimate.structure.values.tolist(), strict=True)),
         "fit": asdict(calibration.fit),
@@ -400,35 +362,26 @@ def _prior_from_file(data: _PriorFile) -> GaussianPrior:
             raise InputError("refitted.prior.mean does not fit its keys: calibrate again")
         rotations = {name: np.array(rotation) for name, rotation in (data.rotations or {}).items()}
         return GaussianPrior(information, np.array(data.mean), rotations)
-    cameras = {name: _camera(entry) for name, entry in (data.cameras or {}).items()}
-    poses = {name: Pose(p.rotation, p.translation_m) for name, p in (data.stations or {}).items()}  # type: ignore[arg-type]
+    cameras = {name: entry.camera() for name, entry in (data.cameras or {}).items()}
+    stations = {name: Station("", entry.pose()) for name, entry in (data.stations or {}).items()}
     structure_m = data.structure_m or {}
     structure = replace(EXACT, names=tuple(structure_m), values=np.array(list(structure_m.values())))
-    around = Estimate(cameras, {name: Station("", pose) for name, pose in poses.items()}, {}, structure)
+    around = Estimate(cameras, stations, {}, structure)
     return GaussianPrior.about(information, around)
-
-
-def _pose_to_json(pose: Pose) -> dict[str, Any]:
-    return {"rotation": pose.rotation.tolist(), "translation_m": pose.translation.tolist()}
-
-
-def _camera(entry: _CameraFile) -> Camera:
-    lens = make_lens(entry.lens.kind, entry.lens.powers or (2, 3), entry.lens.coefficients)
-    return Camera(entry.image_size, entry.phi, entry.principal_point, lens, entry.aspect)
 
 
 def _from_file(data: _CalibrationFile) -> Calibration:
     cameras = {}
     for name, entry in data.cameras.items():
-        cameras[name] = _camera(entry)
-        if entry.lens.kind == "radial":  # the others may fold in corners that nobody saw: `locate` gives NaN there
+        cameras[name] = entry.camera()
+        if not cameras[name].lens.may_fold:  # others may, in corners that nobody saw: `locate` gives NaN there
             cameras[name].require_monotone(name)
     stations = {}
     for name, station in data.stations.items():
         if station.camera not in cameras:
             raise InputError(f"station {name!r} names camera {station.camera!r}, which is not there")
-        stations[name] = Station(station.camera, Pose(station.rotation, station.translation_m))  # type: ignore[arg-type]
-    placements = {name: Pose(p.rotation, p.translation_m) for name, p in data.placements.items()}  # type: ignore[arg-type]
+        stations[name] = Station(station.camera, station.pose())
+    placements = {name: entry.pose() for name, entry in data.placements.items()}
     settings = dict(data.options)
     settings["priors"] = tuple(prior_from_json(entry, "options.priors") for entry in settings.get("priors", []))
     options = convert(settings, Options, "options")

@@ -97,3 +97,13 @@ def convert(data: Any, kind: type[T], where: str) -> T:
 def write_json(path: str | Path, data: Any) -> None:
     """Data as readable JSON; numbers keep every digit."""
     write_bytes(path, msgspec.json.format(msgspec.json.encode(data), indent=1) + b"\n")
+
+
+def make_folder(folder: str | Path) -> Path:
+    """A folder, made where it is missing; InputError where it cannot be."""
+    folder = Path(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be made: {error.strerror}") from None
+    return folder

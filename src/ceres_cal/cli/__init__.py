@@ -19,17 +19,17 @@ from ceres_cal.cli.detect import COMMANDS as DETECT_BOARD
 from ceres_cal.cli.detect_field import COMMANDS as DETECT_FIELD
 from ceres_cal.cli.detect_rings import COMMANDS as DETECT_RINGS
 from ceres_cal.cli.diagnose import COMMANDS as DIAGNOSE
+from ceres_cal.cli.export import COMMANDS as EXPORT
 from ceres_cal.cli.locate import COMMANDS as LOCATE
 from ceres_cal.cli.refit import COMMANDS as REFIT
 from ceres_cal.cli.simulate import COMMANDS as SIMULATE
-from ceres_cal.cli.table import COMMANDS as TABLE
 from ceres_cal.cli.targets import COMMANDS as TARGETS
 from ceres_cal.cli.undistort import COMMANDS as UNDISTORT
 
 _GROUPS = (
     *(DETECT_BOARD, DETECT_RINGS, DETECT_FIELD),
     *(CALIBRATE, DIAGNOSE, ADVISE, REFIT, CHECK, COMPARE),
-    *(LOCATE, UNDISTORT, TABLE, SIMULATE, TARGETS),
+    *(LOCATE, UNDISTORT, EXPORT, SIMULATE, TARGETS),
 )
 COMMANDS = {command.name: command for group in _GROUPS for command in group}
 _BEGINNINGS = {"", *(name.partition(" ")[0] for name in COMMANDS if " " in name)}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from argparse import ArgumentParser, Namespace
+from argparse import ArgumentParser, ArgumentTypeError, Namespace
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING
 
@@ -28,6 +28,19 @@ if TYPE_CHECKING:
     from ceres_cal.solve import Progress
 
 
+_DEFAULT_LENS = "radial"
+
+
+def _lens_kind(name: str) -> str:
+    """A kind of lens that is in the table; the default is, and help and wrong usage need no table."""
+    if name != _DEFAULT_LENS:
+        from ceres_cal.scene.lens import LENSES
+
+        if name not in LENSES:
+            raise ArgumentTypeError(f"invalid choice: {name!r} (choose from {', '.join(map(repr, LENSES))})")
+    return name
+
+
 def _add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         "observations", nargs="+", metavar="OBS", help="files of observations (.json or .npz), taken together"
@@ -41,8 +54,9 @@ def _add_arguments(parser: ArgumentParser) -> None:
 
 def _add_camera(parser: ArgumentParser) -> None:
     add = parser.add_argument_group("the camera").add_argument
-    add("--lens", choices=("radial", "brown", "kannala-brandt"), default="radial", help="default: radial")
-    add("--powers", metavar="2,3", help="powers of the radial lens; default: 2,3, the paper's")
+    kinds = f"default: {_DEFAULT_LENS}, the paper's; `--lens ?` names all"
+    add("--lens", type=_lens_kind, metavar="KIND", default=_DEFAULT_LENS, help=kinds)
+    add("--powers", metavar="2,3", help="powers of a lens that leaves the choice; default: 2,3, the paper's")
     add(
         "--fix",
         action="append",
@@ -146,8 +160,11 @@ def _solve_progress(bar: ProgressBar, most: int) -> Callable[[Progress], None]:
 def _powers(args: Namespace) -> tuple[int, ...]:
     if args.powers is None:
         return (2, 3)
-    if args.lens != "radial":
-        raise InputError(f"--powers is for the radial lens, not for {args.lens}: leave it out")
+    from ceres_cal.scene.lens import LENSES
+
+    choosing = [kind for kind, lens in LENSES.items() if lens.trial_powers]
+    if args.lens not in choosing:
+        raise InputError(f"--powers is for the {' or '.join(choosing)} lens, not for {args.lens}: leave it out")
     try:
         return tuple(int(power) for power in args.powers.split(","))
     except ValueError:

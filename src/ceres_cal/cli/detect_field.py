@@ -46,8 +46,8 @@ def _add_start(parser: ArgumentParser) -> None:
     add(
         "--target",
         metavar="TARGET",
-        help="ssl-a, ssl-b, or a JSON file with a target ({'kind': ...}) or with a target named 'field'; "
-        "default: that of the calibration to start from",
+        help="a field by its name (such as ssl-a, ssl-b: `ceres-cal targets`), or a JSON file with a target "
+        "({'kind': ...}) or with a target named 'field'; default: that of the calibration to start from",
     )
     add("--start", metavar="FILE", type=Path, help="a calibration of before, or a file of corners (ceres-cal/corners)")
     add(
@@ -175,12 +175,13 @@ def _corners(specs: list[str]) -> Clicks:
 
 
 def _target(text: str) -> Target:
-    from ceres_cal.scene.targets import ssl_field, target_from_spec
+    from ceres_cal.scene.targets import target_from_spec, targets_by_name
 
-    if text in ("ssl-a", "ssl-b"):
-        return ssl_field(text[-1].upper())
+    by_name = targets_by_name()
+    if text in by_name:
+        return by_name[text]
     if not Path(text).exists():
-        raise InputError(f"--target {text!r}: neither ssl-a nor ssl-b, nor a file")
+        raise InputError(f"--target {text!r}: neither {' nor '.join(by_name)}, nor a file")
     content = _json(Path(text))
     named = content.get("targets")
     spec = named.get("field") if isinstance(named, dict) else content

@@ -129,9 +129,7 @@ def _intrinsics(name: str, camera: Camera, options: Options, phi_from: str, qual
     for coefficient, value in camera.lens.coefficients.items():
         rows.append((coefficient, f"{value!r}{_plus_minus(quality, name, coefficient)}{held(coefficient)}"))
     lines = [f"{title:16}{value}" for title, value in rows]
-    if camera.lens.kind == "radial" and camera.lens.radius_powers == (2, 3):
-        lines.append("these are the paper's, with its a1 = 1: another a1 goes with a1 a2, a1 a3 and a1 phi")
-    return lines
+    return [*lines, camera.lens.note] if camera.lens.note else lines
 
 
 def _of_camera(calibration: Calibration, station: str) -> str:

@@ -204,8 +204,8 @@ def _write(path: Path, picture: Image) -> None:
 
 
 def _straight(args: Namespace, calibration: Calibration) -> _PictureMaker:
-    from ceres_cal.calibration import camera_to_json
     from ceres_cal.pictures.straight import straighten
+    from ceres_cal.scene.files import camera_to_json
 
     name, station, camera = _camera(args, calibration)
     straight = straighten(

@@ -18,8 +18,8 @@ from ceres_cal.base.progress import ImageProgress
 from ceres_cal.detect.images import read_grey
 from ceres_cal.detect.saddles import REACH, measure_saddles
 from ceres_cal.detect.scatter import scatter_px
-from ceres_cal.observations import Observations, Points, View, no_curves
-from ceres_cal.scene.targets import Target
+from ceres_cal.observations import NO_CURVES, Observations, Points, View
+from ceres_cal.scene.targets import Grid, Target
 
 CORNER_FITS = ("opencv", "saddle")
 MIN_CORNERS = 6
@@ -96,17 +96,17 @@ def detect_boards(
         NothingShownError: no image shows the board.
     """
     paths = [Path(path) for path in images]
-    placements = _placement_names(paths)
-    size, grids, missed = _find_all(paths, _finder(board, corners), progress)
+    placements, squares = _placement_names(paths), _squares_of(board)
+    size, grids, missed = _find_all(paths, _finder(squares, corners), progress)
     if not grids:
         raise NothingShownError(
-            f"no board of {board.spec['columns']} x {board.spec['rows']} inner corners in any of {len(paths)} images "
+            f"no board of {squares.columns} x {squares.rows} inner corners in any of {len(paths)} images "
             f"(count the corners between squares, not the squares); {missed[0][0]}: {missed[0][1]}",
             tuple(missed),
         )
     views = tuple(View(path.stem, camera, station or camera, TARGET_NAME, placements[path]) for path in grids)
     points = _points(list(grids.values()), board)
-    observations = Observations({TARGET_NAME: board}, {camera: size}, views, points, no_curves())
+    observations = Observations({TARGET_NAME: board}, {camera: size}, views, points, NO_CURVES)
     return BoardDetections(observations, tuple(map(str, grids)), tuple(missed))
 
 
@@ -142,18 +142,23 @@ def _find_all(
     return size, grids, missed
 
 
-def _finder(board: Target, corners: CharucoSpec | str) -> Finder:
+def _squares_of(board: Target) -> Grid:
+    """How the squares of a checkerboard meet; InputError where it is none."""
+    if board.grid is None or not board.grid.checkered:
+        raise InputError(f"target of kind {board.kind!r}: boards are detected with a target of kind 'checkerboard'")
+    return board.grid
+
+
+def _finder(squares: Grid, corners: CharucoSpec | str) -> Finder:
     if isinstance(corners, str) and corners not in CORNER_FITS:
         raise InputError(f"unknown corner fit {corners!r}: choose one of {', '.join(CORNER_FITS)}")
-    if board.kind != "checkerboard":
-        raise InputError(f"target of kind {board.kind!r}: boards are detected with a target of kind 'checkerboard'")
-    columns, rows = int(board.spec["columns"]), int(board.spec["rows"])
+    columns, rows, square_m = squares.columns, squares.rows, squares.spacing_m
     if min(columns, rows) < 3:
         raise InputError(f"a board to be found in images needs 3 inner corners a side or more, not {columns} x {rows}")
     if isinstance(corners, str):
         return lambda image: _measured_chessboard(image, columns, rows, corners)
-    detector = _charuco_detector(corners, columns, rows, float(board.spec["square_m"]))
-    margin = 0.5 * (1.0 - corners.marker_m / float(board.spec["square_m"]))  # white around a marker, in squares
+    detector = _charuco_detector(corners, columns, rows, square_m)
+    margin = 0.5 * (1.0 - corners.marker_m / square_m)  # white around a marker, in squares
     return lambda image: _measured_charuco(image, detector, columns, rows, margin)
 
 

@@ -9,7 +9,8 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Indices32, Mask
 from ceres_cal.scene.camera import Camera
-from ceres_cal.scene.targets import Arc, Target, along_track, nearest_on_track
+from ceres_cal.scene.curves import Arc, along_curve, along_track, curve_points, nearest_on_curve
+from ceres_cal.scene.targets import Target
 
 _WIDEST_PX = 100.0
 _PIECES = 240  # of a curve, to measure its length in the image
@@ -65,7 +66,7 @@ def _places(target: Target, camera: Camera, number: int, spacing_px: float, marg
     """The curve's number and the parameters of its places."""
     curve = target.curves[target.curve_names[number]]
     s = np.linspace(*curve.parameter_range, _PIECES + 1)
-    pixels = camera.project(along_track(target.tracks[0, number], isinstance(curve, Arc), s))
+    pixels = camera.project(along_curve(curve, s))
     size = np.array(camera.image_size)
     with np.errstate(invalid="ignore"):
         near = np.all((pixels > -0.5 * size) & (pixels < 1.5 * size), axis=1)
@@ -76,7 +77,7 @@ def _places(target: Target, camera: Camera, number: int, spacing_px: float, marg
         return number, np.empty(0)
     even = (np.arange(count) + 0.5) * (length[-1] / count)
     chosen = np.interp(even, length, s)
-    there = camera.project(along_track(target.tracks[0, number], isinstance(curve, Arc), chosen))
+    there = camera.project(along_curve(curve, chosen))
     with np.errstate(invalid="ignore"):
         inside = np.all((there > margin_px - 0.5) & (there < size - 0.5 - margin_px), axis=1)
     return number, chosen[inside]
@@ -108,18 +109,13 @@ def clear_px(target: Target, camera: Camera, course: Course, curves: Collection[
     places = along_track(target.tracks[0][number], target.is_arc[number], s)
     clear = np.full(len(places), np.inf)
     for other, (name, curve) in enumerate(target.curves.items()):
-        low, high = curve.parameter_range
         own = number == other
         if not isinstance(curve, Arc):
-            for end in (low, high):
-                end_px = camera.project(along_track(target.tracks[0, other], False, np.array([end])))
+            for end_px in camera.project(curve_points(curve, 0, 1)):
                 clear[own] = np.fmin(clear[own], np.linalg.norm(pixels[own] - end_px, axis=1))
         if name not in curves or curve.width_m <= 0.0:
             continue
         rows = np.flatnonzero(~own)
-        track = np.broadcast_to(target.tracks[0, other], (len(rows), 3, 3))
-        foot = nearest_on_track(track, np.full(len(rows), isinstance(curve, Arc)), places[rows])
-        foot = low + np.mod(foot - low, 2.0 * np.pi) if isinstance(curve, Arc) else foot
-        there = camera.project(along_track(track, isinstance(curve, Arc), np.clip(foot, low, high)))
+        there = camera.project(along_curve(curve, nearest_on_curve(curve, places[rows])))
         clear[rows] = np.fmin(clear[rows], np.linalg.norm(pixels[rows] - there, axis=1))
     return clear

@@ -10,7 +10,8 @@ from ceres_cal.base.arrays import Array, Indices, Indices32, Mask
 from ceres_cal.detect.courses import course_at
 from ceres_cal.detect.lines import Lines
 from ceres_cal.scene.camera import Camera, in_image
-from ceres_cal.scene.targets import Arc, Target, along_track, nearest_on_track
+from ceres_cal.scene.curves import distance_to_curve, nearest_on_curve
+from ceres_cal.scene.targets import Target
 
 _ON_CURVE_M = 1e-6
 _EACH_WAY, _ONE_WAY, _FEWEST = 3, 8, 3  # places of a branch that goes on, of one that ends, and at least
@@ -51,9 +52,12 @@ def find_crossings(target: Target, camera: Camera, lines: Lines) -> Crossings:
     """
     used = np.zeros(len(lines.course), dtype=bool)
     features, pixels, sigmas = [], [], []
-    seen = np.unique(lines.course.curve[lines.found])
+    seen = [
+        (int(number), target.curves[target.curve_names[number]])
+        for number in np.unique(lines.course.curve[lines.found])
+    ]
     for number, point in enumerate(target.point_array):
-        curves = [int(curve) for curve in seen if _passes(target, int(curve), point)]
+        curves = [curve for curve, shape in seen if distance_to_curve(shape, point[None])[0] < _ON_CURVE_M]
         branches = [b for curve in curves if (b := _branch(target, camera, lines, curve, point, used)) is not None]
         met = _met(branches)
         if met is None:
@@ -68,23 +72,10 @@ def find_crossings(target: Target, camera: Camera, lines: Lines) -> Crossings:
     return Crossings(np.array(features, np.int32), np.reshape(pixels, (-1, 2)), np.array(sigmas, float), used)
 
 
-def _foot(target: Target, curve: int, point: Array) -> float:
-    own = target.curves[target.curve_names[curve]]
-    low, high = own.parameter_range
-    foot = float(nearest_on_track(target.tracks[0, [curve]], target.is_arc[[curve]], point[None])[0])
-    if isinstance(own, Arc):
-        foot = low + float(np.mod(foot - low, 2.0 * np.pi))
-    return float(np.clip(foot, low, high))
-
-
-def _passes(target: Target, curve: int, point: Array) -> bool:
-    there = along_track(target.tracks[0, curve], bool(target.is_arc[curve]), np.array([_foot(target, curve, point)]))
-    return bool(np.linalg.norm(there[0] - point) < _ON_CURVE_M)
-
-
 def _branch(target: Target, camera: Camera, lines: Lines, curve: int, point: Array, used: Mask) -> _Branch | None:
     course = lines.course
-    here = course_at(target, camera, np.array([curve], np.int32), np.array([_foot(target, curve, point)]))
+    foot = nearest_on_curve(target.curves[target.curve_names[curve]], point[None])
+    here = course_at(target, camera, np.array([curve], np.int32), foot)
     rows = np.flatnonzero(lines.found & ~used & (course.curve == curve))
     away = course.pixels[rows] - here.pixels[0]
     along = away @ np.array([here.normals[0, 1], -here.normals[0, 0]])

@@ -19,20 +19,28 @@ from ceres_cal.base.errors import InputError
 from ceres_cal.detect.images import read_grey
 from ceres_cal.detect.profiles import Windows, cut_windows, fit_profiles, fit_shape
 from ceres_cal.detect.ring_centre import ring_centre
-from ceres_cal.observations import Curves, Observations, View, no_points
+from ceres_cal.observations import NO_POINTS, Curves, Observations, View
 from ceres_cal.scene.targets import Target, rings
 
 TARGET_NAME = "rings"
 RAYS = 360
 _STEP_PX = 0.5
-_FEWEST_RAYS = 0.25  # share of the rays on which a ring must be seen (of those that reach it inside the image)
+# Share of the rays on which a ring must be seen (of those that reach it inside the image). Nothing changes from half
+# to double.
+_FEWEST_RAYS = 0.25
 _HARMONICS = 3  # of a ring's radius over its angle: what tilt and a centre beside the axis make of it
 _HALF_LENGTH_PX, _HALF_WIDTH_PX = 5.0, 2
 _LEAST_SPACING_PX = 3.0
-_LEAST_CONTRAST = 8.0  # times the noise
-_NOISY = 3.0  # times the usual misfit of a window: something else is in it
-_FAR = 5.0  # times the usual distance from the ring's smooth course
-_MOST_MISFIT = 0.004  # of the largest radius; rings counted wrongly by one make more of it
+# Times the noise. Nothing changes from half to double.
+_LEAST_CONTRAST = 8.0
+# Times the usual misfit of a window: something else is in it. Half of it takes out 0.5 % of the edges, double none
+# fewer.
+_NOISY = 3.0
+# Times the usual distance from the ring's smooth course. Half of it takes out 3 % of the edges, double next to none
+# fewer.
+_FAR = 5.0
+# Of the largest radius; rings counted wrongly by one make more of it. Nothing changes from half to double.
+_MOST_MISFIT = 0.004
 
 
 @dataclass(frozen=True, eq=False)
@@ -327,6 +335,6 @@ def _observations(edges: _Edges, sheet: Target, grey: Array32, frame: str, camer
         {TARGET_NAME: sheet},
         {camera: size},
         (View(frame, camera, station, TARGET_NAME, frame),),
-        no_points(),
+        NO_POINTS,
         Curves(np.zeros(count, np.int32), edges.ring, edges.pixels, edges.sigma_px, np.zeros(count, np.int8)),
     )

@@ -34,8 +34,11 @@ REACH = 0.6
 
 _SMOOTHING_PX = 0.7
 _RADIUS_PX = (3.0, 20.0)
-_LOST = 0.5  # a corner that moved further, as a part of that distance, followed something else
-_FAINT = 0.2  # a contrast below this part of the usual one shows something else: a sticker, a finger
+# A corner that moved further, as a part of that distance, followed something else. Nothing changes from 0.33 to 0.67.
+_LOST = 0.5
+# A contrast below this part of the usual one shows something else: a sticker, a finger. Nothing changes from half to
+# double.
+_FAINT = 0.2
 _SHARPNESS = (0.05, 3.0)  # 1 / px; the smoothing alone makes it 1.1
 _STEPS = 20
 _SETTLED_PX = 1e-3  # the steps shrink quadratically: the last one is smaller by far than the noise

@@ -18,9 +18,11 @@ from ceres_cal.scene.targets import Target
 from ceres_cal.solve import Problem
 
 _RADIAL_BASIS = 3  # powers of the radius past those of the lens: enough for any smooth trend that one more power mends
-_POWERS = {"radial": (2, 3, 4, 5, 6, 7)}  # of the others' polynomials: odd ones
-_ODD_POWERS = (3, 5, 7, 9, 11)
+# Observations that say whether a curve lies aside: three numbers of an arc, and as many left to contradict them.
+# Nothing changes from half to double.
 _FEWEST_ON_CURVE = 8
+# Observations that say whether a point lies aside: one could be an outlier that was just not taken out. Nothing
+# changes from half to double.
 _FEWEST_OF_POINT = 2
 
 
@@ -69,9 +71,8 @@ def missing_powers(estimate: Estimate, layout: Layout, camera: str) -> list[int]
     """Powers of the radius that the lens does not solve for, lowest first."""
     lens = estimate.cameras[camera].lens
     free = [int(i) - 4 for i in layout.free[camera] if i >= 4]
-    own = (3, 5, None, None, 7) if lens.kind == "brown" else lens.radius_powers
-    solved = {own[i] for i in free}
-    return [power for power in _POWERS.get(lens.kind, _ODD_POWERS) if power not in solved]
+    solved = {lens.orders[i] for i in free if lens.names[i] not in lens.decentring}
+    return [power for power in lens.missing_powers if power not in solved]
 
 
 def _offsets(equations: Equations, estimate: Estimate, camera: str) -> Array:
@@ -86,18 +87,13 @@ def radial_column(equations: Equations, estimate: Estimate, camera: str, power: 
     offsets = _offsets(equations, estimate, camera)
     radius = np.maximum(np.linalg.norm(offsets, axis=1), 1e-12)
     outward = np.sum(equations.direction * offsets * (1.0, one.aspect), axis=1) / radius
-    if one.lens.kind == "radial":  # the ideal radius grows by r^k: the measured one shrinks by the polynomial's slope
-        scaled = np.asarray(one.lens.values) * one.lens.scales(unit_px(one))
-        slope = 1.0 + sum(k * a * radius ** (k - 1) for k, a in zip(one.lens.radius_powers, scaled, strict=True))
-        return np.asarray(unit_px(one) * outward * radius**power / np.maximum(slope, 0.05))
-    rays = np.nan_to_num(one.rays(equations.pixel))
-    across = np.linalg.norm(rays[:, :2], axis=1)
-    own = across / np.maximum(rays[:, 2], 0.05) if one.lens.kind == "brown" else np.arctan2(across, rays[:, 2])
-    return np.asarray(one.phi * outward * own**power)
+    growth = one.lens.radial_change(one.offsets(equations.pixel), one.phi, unit_px(one), power)
+    return np.asarray(outward * growth)
 
 
 def _has_decentring(estimate: Estimate, layout: Layout, camera: str) -> bool:
-    return estimate.cameras[camera].lens.kind == "brown" and bool({6, 7} <= set(layout.free[camera].tolist()))
+    lens, free = estimate.cameras[camera].lens, layout.free[camera].tolist()
+    return bool(lens.decentring) and all(4 + lens.names.index(name) in free for name in lens.decentring)
 
 
 def _decentring_columns(equations: Equations, estimate: Estimate, camera: str) -> Array:
@@ -136,7 +132,7 @@ def target_families(
 
 
 def _everything(target: Target) -> Tolerance:
-    return Tolerance(1.0, 1.0, 1.0 if target.kind == "checkerboard" else 0.0)
+    return Tolerance(1.0, 1.0, 1.0 if target.bows else 0.0)
 
 
 def _feature_of(name: str) -> str:

@@ -159,7 +159,7 @@ def _weights(case: _Case) -> Weights:
     )
     lengths = np.concatenate([inliers.point_sigmas, inliers.curve_sigmas])
     squared = np.where(np.isfinite(lengths), lengths, 0.0) ** 2
-    robust = kernels.loss_weights(kernels.LOSS_CODES[options.loss], options.loss_scale, squared)
+    robust = kernels.loss_weights(kernels.Loss(kernels.LOSS_CODES[options.loss], options.loss_scale), squared)
     inlier, at = np.concatenate([inliers.points, inliers.curves]), case.equations.observation
     return Weights(1.0 / sigma[at], inlier[at], robust[at])
 

@@ -16,10 +16,10 @@ from ceres_cal import kernels
 from ceres_cal.base.arrays import AnyArray, Array, Indices, Mask
 from ceres_cal.base.errors import SolutionError
 from ceres_cal.model.parameters import Estimate
-from ceres_cal.model.residuals import Residuals, lens_arguments
+from ceres_cal.model.residuals import Residuals, camera_optics, curve_columns, point_columns
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights
-from ceres_cal.scene.targets import along_track
+from ceres_cal.scene.curves import along_track
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +30,7 @@ class Equations:
         sights: what can be shown, S of them; none is empty. poses: (S, 3, 4) cam_from_frame. bounds: (S + 1,) where
             each sight's equations begin. sight: (E,).
         observation: (E,) number of the observation: points by row, then curves by row. view: (E,) of the observation.
-        is_curve: (E,). feature: (E,) number among the points, or among the curves, of all targets.
+        is_curve: (E,). feature: (E,) its `point_index` or, of a curve, its `track_index` (see `Sights`).
         residual: (E,) px. direction: (E, 2) the image direction it is taken along. pixel: (E, 2) where it should lie.
         intrinsics: (E, K) px per solver's unit of [phi, aspect, cx, cy, coefficients], 0 past a camera's own.
         pose: (E, 6) px per left perturbation of cam_from_frame. motion: (E, 3) px per metre that the point or foot
@@ -101,42 +101,40 @@ def _of_camera(
 ) -> Iterator[dict[str, AnyArray]]:
     """The columns of one camera's points, then of its curve observations."""
     own = sights.take(numbers)
-    optics = lens_arguments(estimate.cameras[own.keys[0].camera])
-    size = len(optics[1])
+    optics = camera_optics(estimate.cameras[own.keys[0].camera])
+    size = len(optics.intrinsics)
     rows = np.empty((len(own.point_rows), 2, size + 6))
-    places = estimate.structure.points(own)
-    kernels.point_rows(*optics, poses[numbers], own.point_bounds, places, rows)
+    points = point_columns(own, estimate.structure)
+    kernels.point_rows(optics, poses[numbers], points, rows)
     yield {
         "sight": np.repeat(numbers[_sight_of(own.point_bounds)], 2),
         "observation": np.repeat(own.point_rows, 2),
         "view": np.repeat(observations.points.view[own.point_rows].astype(np.int64), 2),
         "is_curve": np.zeros(2 * len(rows), dtype=bool),
-        "feature": np.repeat(own.feature, 2),
+        "feature": np.repeat(own.point_index, 2),
         "residual": found.points[own.point_rows].ravel(),
         "direction": np.tile(np.eye(2), (len(rows), 1)),
         "pixel": np.repeat(own.pixels + found.points[own.point_rows], 2, axis=0),
         "intrinsics": rows[:, :, :size].reshape(-1, size),
         "pose": rows[:, :, size:].reshape(-1, 6),
-        "place": np.repeat(places, 2, axis=0),
+        "place": np.repeat(points.places, 2, axis=0),
     }
-    tracks, feet = estimate.structure.tracks(own), found.feet[own.curve_rows]
+    curves = curve_columns(own, estimate.structure, found.feet[own.curve_rows])
     rows, normals = np.empty((len(own.curve_rows), size + 6)), np.empty((len(own.curve_rows), 2))
-    kernels.curve_rows(
-        *optics, poses[numbers], own.curve_bounds, tracks, own.is_arc, own.track, own.curve_pixels, feet, rows, normals
-    )
+    kernels.curve_rows(optics, poses[numbers], curves, rows, normals)
     distance = found.curves[own.curve_rows]
     yield {
         "sight": numbers[_sight_of(own.curve_bounds)],
         "observation": len(observations.points) + own.curve_rows,
         "view": observations.curves.view[own.curve_rows].astype(np.int64),
         "is_curve": np.ones(len(rows), dtype=bool),
-        "feature": own.track.astype(np.int64),
+        "feature": own.track_index.astype(np.int64),
         "residual": distance,
         "direction": normals,
         "pixel": own.curve_pixels + distance[:, None] * normals,
         "intrinsics": rows[:, :size],
         "pose": rows[:, size:],
-        "place": along_track(tracks[own.track], own.is_arc[own.track], feet),
+        "place": along_track(curves.tracks[own.track_index], own.on_arc, curves.feet),
     }
 
 

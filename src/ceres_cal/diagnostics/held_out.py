@@ -31,8 +31,6 @@ FOLDS = 5
 MOST_OBSERVATIONS = 10_000
 _FEWEST_FRAMES = 40
 _UNSEEN_SIGMA = 10.0  # what an observation counts that the fold's camera cannot show at all
-_RADIAL = ((3,), (2, 3), (3, 5), (2, 3, 4), (2, 3, 4, 5))
-_COEFFICIENTS = {"brown": ("k1", "k2", "k3"), "kannala-brandt": ("k1", "k2", "k3", "k4")}
 _FEWEST_COEFFICIENTS = 2
 
 
@@ -200,13 +198,14 @@ def _decide(found: Sequence[HeldOut]) -> tuple[int, int]:
 
 def candidates(options: Options) -> list[Options]:
     """Options with every sensible lens of the same kind, fewest coefficients first; the given one is among them."""
-    if options.lens == "radial":
-        powers = sorted({*_RADIAL, options.powers}, key=lambda p: (len(p), p))
-        own = set(options.blank_lens.names) & set(options.fixed)
-        if own:  # a held coefficient belongs to its own powers alone
+    lens = options.blank_lens
+    if lens.powers:
+        powers = sorted({*lens.trial_powers, options.powers}, key=lambda p: (len(p), p))
+        if set(lens.names) & set(options.fixed):  # a held coefficient belongs to its own powers alone
             powers = [options.powers]
         return [replace(options, powers=one) for one in powers]
-    names = _COEFFICIENTS[options.lens]
+    by_order = sorted(zip(lens.orders, lens.names, strict=True))
+    names = [name for _, name in by_order if name not in lens.decentring]
     held = {name: value for name, value in options.fixed.items() if name not in names}
     found = []
     for count in range(_FEWEST_COEFFICIENTS, len(names) + 1):
@@ -218,8 +217,8 @@ def candidates(options: Options) -> list[Options]:
 
 def label_of(options: Options) -> str:
     """How a lens is called: "radial 2,3" or "brown k1 k2 p1 p2"."""
-    if options.lens == "radial":
-        return "radial " + ",".join(map(str, options.powers))
+    if options.blank_lens.powers:
+        return f"{options.lens} {','.join(map(str, options.powers))}"
     return " ".join([options.lens, *(name for name in options.blank_lens.names if name not in options.fixed)])
 
 

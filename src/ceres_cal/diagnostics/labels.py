@@ -15,11 +15,14 @@ from ceres_cal import kernels
 from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.tails import log_binomial_tail
 from ceres_cal.model.parameters import Estimate
-from ceres_cal.model.residuals import lens_arguments
+from ceres_cal.model.residuals import camera_optics
+from ceres_cal.model.structure import EXACT
 from ceres_cal.observations import Curves, Observations, Points
 from ceres_cal.scene.camera import Camera
-from ceres_cal.scene.targets import SIDES, Target, along_track, nearest_on_track
+from ceres_cal.scene.curves import Arc, Curve, curve_points, nearest_to_rays, turned_on
+from ceres_cal.scene.targets import Target
 
+_PIECES = 199  # of a curve, to measure its length in the image
 _MOST = 20_000  # rejected observations looked at: of more, evenly spread ones
 
 
@@ -83,8 +86,7 @@ class _Sight:
     @cached_property
     def length_px(self) -> float:
         """Length of all its curves within the image."""
-        tracks = zip(self.target.curves.values(), self.target.tracks[0], self.target.is_arc, strict=True)
-        return sum(_visible_length_px(self.camera, curve.parameter_range, track, arc) for curve, track, arc in tracks)
+        return sum(_visible_length_px(self.camera, curve) for curve in self.target.curves.values())
 
     def chance(self, is_curve: bool, distance_px: float) -> float:
         """The share of the image that lies within a distance of any feature."""
@@ -122,8 +124,8 @@ def _of_view(sight: _Sight, column: Points | Curves, view: int, rows: Indices, b
     return found
 
 
-def _visible_length_px(camera: Camera, parameter_range: tuple[float, float], track: Array, arc: bool) -> float:
-    pixels = camera.project(along_track(track, arc, np.linspace(*parameter_range, 200)))
+def _visible_length_px(camera: Camera, curve: Curve) -> float:
+    pixels = camera.project(curve_points(curve, 0, _PIECES))
     inside = np.all((pixels >= 0.0) & (pixels <= np.array(camera.image_size)), axis=1)
     steps = np.linalg.norm(np.diff(pixels, axis=0), axis=1)
     return float(np.sum(steps[inside[1:] & inside[:-1]]))
@@ -131,27 +133,23 @@ def _visible_length_px(camera: Camera, parameter_range: tuple[float, float], tra
 
 def _curve_distances(target: Target, camera: Camera, pixels: Array) -> Array:
     """(N, C) distances to each curve's centre between its ends, px."""
-    located = camera.rays(pixels) @ camera.cam_from_world.rotation
+    rays = np.nan_to_num(camera.rays(pixels) @ camera.cam_from_world.rotation)
     answer = np.full((len(pixels), len(target.curves)), np.inf)
-    for number in range(len(target.curves)):
-        track, arc = target.tracks[SIDES["centre"], number], bool(target.is_arc[number])
-        with np.errstate(divide="ignore", invalid="ignore"):
-            reach = (track[0, 2] - camera.position[2]) / located[:, 2]
-            places = np.nan_to_num(camera.position + reach[:, None] * located)
-        s = nearest_on_track(np.tile(track, (len(pixels), 1, 1)), np.full(len(pixels), arc), places)
-        low, high = list(target.curves.values())[number].parameter_range
-        s = low + np.mod(s - low, 2.0 * np.pi) if arc else s
+    for number, curve in enumerate(target.curves.values()):
+        low, high = curve.parameter_range
+        s = turned_on(curve, nearest_to_rays(curve.track(), isinstance(curve, Arc), camera.position, rays))
         inside = (s >= low) & (s <= high)
-        distance = _signed_distances(camera, track, arc, pixels, s)
+        distance = _signed_distances(camera, curve.track(), isinstance(curve, Arc), pixels, s)
         answer[inside, number] = np.abs(distance)[inside]
     return answer
 
 
 def _signed_distances(camera: Camera, track: Array, arc: bool, pixels: Array, s: Array) -> Array:
     pose = np.column_stack([camera.cam_from_world.rotation, camera.cam_from_world.translation])[None]
-    distance, feet = np.empty(len(pixels)), s.copy()
-    kernels.curve_residuals(
-        *lens_arguments(camera), pose, np.array([0, len(pixels)]), track[None], np.array([arc]),
-        np.zeros(len(pixels), np.int32), np.ascontiguousarray(pixels), feet, distance,
+    distance, count = np.empty(len(pixels)), len(pixels)
+    curves = kernels.CurveColumns(
+        np.array([0, count]), track[None], np.array([arc]), np.zeros(count, np.int32), np.ascontiguousarray(pixels),
+        np.ones(count), s.copy(), EXACT.track_slots,
     )  # fmt: skip
+    kernels.curve_residuals(camera_optics(camera), pose, curves, distance)
     return distance

@@ -21,6 +21,7 @@ from ceres_cal.diagnostics.scores import Score
 from ceres_cal.diagnostics.table import ResidualTable, plane_shift
 from ceres_cal.model.parameters import Estimate, Layout
 from ceres_cal.observations import Observations
+from ceres_cal.scene.lens import LENSES
 from ceres_cal.scene.targets import Arc, Segment
 
 _LN_10 = float(np.log(10.0))
@@ -90,8 +91,6 @@ def pattern_finding(context: Context, selection: Selection, number: int) -> Find
 
 # ---- the lens -------------------------------------------------------------------------------------------------------
 
-_COEFFICIENTS = {"brown": {3: "k1", 5: "k2", 7: "k3"}, "kannala-brandt": {3: "k1", 5: "k2", 7: "k3", 9: "k4"}}
-
 
 def _most(context: Context, shift: Array) -> float:
     """The largest displacement (px) of an observation that took part."""
@@ -113,23 +112,26 @@ def _radius(context: Context, others: LinearModel, score: Score, shift: Array, s
         f"camera {name!r}: residuals follow the radius, up to {most:.2f} px ({size}): the radial polynomial {judged}; "
         f"one more power, r^{power}, explains {share:.0f} % of it"
     )
-    coefficient = _COEFFICIENTS.get(lens.kind, {}).get(power)
-    if lens.kind == "radial":
-        advice = f"calibrate with --powers {','.join(map(str, sorted({*lens.radius_powers, power})))}"
-    elif coefficient is not None:
-        advice = f"let {coefficient} free (no --fix {coefficient}=...)"
+    held = [key for key, order in zip(lens.names, lens.orders, strict=True) if order == power]
+    held = [key for key in held if key not in lens.decentring]
+    if lens.powers:
+        advice = f"calibrate with --powers {','.join(map(str, sorted({*lens.powers, power})))}"
+    elif held:
+        advice = f"let {held[0]} free (no --fix {held[0]}=...)"
     else:
-        advice = f"the {lens.kind} lens has no such power: try another lens or the radial one with more powers"
+        growing = " or ".join(kind for kind, other in LENSES.items() if other.trial_powers)
+        advice = f"the {lens.kind} lens has no such power: try another lens or the {growing} one with more powers"
     return _Said(sentence, advice, ())
 
 
 def _decentring(context: Context, others: LinearModel, score: Score, shift: Array, size: str, ratio: float) -> _Said:
     name = score.family.names[score.number]
     most = _most(context, shift)
-    fixed = context.estimate.cameras[name].lens.kind == "brown"
+    own = context.estimate.cameras[name].lens.decentring
+    kind, names = next((kind, lens.decentring) for kind, lens in LENSES.items() if lens.decentring)
     return _Said(
         f"camera {name!r}: its lens is not centred: a tangential displacement of up to {most:.2f} px ({size})",
-        "let p1 and p2 free" if fixed else "calibrate with --lens brown, which has p1 and p2",
+        f"let {' and '.join(own)} free" if own else f"calibrate with --lens {kind}, which has {' and '.join(names)}",
         (),
     )
 

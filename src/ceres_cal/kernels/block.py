@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from ceres_cal.kernels.arguments import Blocks, CurveColumns, Loss, Optics, PointColumns, Unknowns
 from ceres_cal.kernels.jit import jit
-from ceres_cal.kernels.lenses import answer_limit, one_dimensional
-from ceres_cal.kernels.sight import layout_of_rows, normal_equations, working_space
+from ceres_cal.kernels.lenses import prepared
+from ceres_cal.kernels.sight import normal_equations, order_of_rows, working_space
 
 ROUNDING = 1e-9  # of a cost
 
@@ -148,40 +149,31 @@ def _copy_chained(upper: Any, first: int, chain: Any, jacobian: Any) -> None:
 
 @jit
 def evaluate_block(
-    lens: int, fixed_intrinsics: Any, free: Any, powers: Any, unit: float, pixels: Any, weights: Any,
-    slots: Any, bends: Any, is_arc: Any, track: Any, curve_pixels: Any, curve_weights: Any, s: Any, track_slots: Any,
-    loss: int, scale: float, points: Any, tracks: Any, structure: int,
-    camera: Any, station: Any, placement: Any, residuals: Any,
-    camera_jacobian: Any, station_jacobian: Any, placement_jacobian: Any, structure_jacobian: Any,
+    optics: Optics, unknowns: Unknowns, points: PointColumns, curves: CurveColumns, loss: Loss, at: Blocks,
+    residuals: Any, jacobians: Blocks,
 ) -> bool:  # fmt: skip
     """What Ceres asks of the block of one sight (design, section 6); False where an observation cannot be projected.
 
     Args:
-        fixed_intrinsics: the whole intrinsics vector; `camera` replaces its entries `free`.
-        points, tracks: as built, with the `structure` numbers of the moment put in.
-        station, placement: 6-vectors of cam_from_world and world_from_target.
+        optics: `at.camera` replaces the free entries of its intrinsics. points, curves: of this sight alone.
+        at: the free intrinsics, and the 6-vectors of cam_from_world and world_from_target; its structure is already in
+            the columns.
         residuals: (free + structure + 7,): the rows of U, then what is missing from the robust cost.
-        *_jacobian: row-major, as many rows x the block's size; empty where that block is held.
+        jacobians: row-major, as many rows x the block's size.
     """
-    count = len(free)
+    count, structure = len(unknowns.free), unknowns.structure
     shared = count + structure
-    intrinsics = fixed_intrinsics.copy()
+    intrinsics = optics.intrinsics.copy()
     for k in range(count):
-        intrinsics[free[k]] = camera[k]
+        intrinsics[unknowns.free[k]] = at.camera[k]
     pose, to_station, to_placement = np.empty((3, 4)), np.empty((6, 6)), np.empty((6, 6))
-    _chain(station, placement, pose, to_station, to_placement)
-    rows, places = layout_of_rows(free, len(intrinsics), structure)
-    dense = one_dimensional(lens, intrinsics, powers)
-    limit = answer_limit(lens, dense)
-    normal = np.empty((shared + 7, shared + 7))
-    space = working_space(len(intrinsics), len(rows))
-    upper = np.empty((shared + 7, shared + 7))
+    _chain(at.station, at.placement, pose, to_station, to_placement)
+    optics, order = prepared(optics, intrinsics), order_of_rows(unknowns, len(intrinsics))
+    normal, upper = np.empty((shared + 7, shared + 7)), np.empty((shared + 7, shared + 7))
+    space = working_space(optics, len(order.rows))
     last = shared + 6
     for newton in (True, False):
-        cost = normal_equations(
-            lens, intrinsics, powers, dense, limit, unit, pose, points, pixels, weights, slots, bends, tracks, is_arc,
-            track, curve_pixels, curve_weights, s, track_slots, loss, scale, newton, rows, places, normal, space,
-        )  # fmt: skip
+        cost = normal_equations(0, optics, pose, points, curves, loss, newton, order, normal, space)
         if not np.isfinite(cost):
             return False
         cholesky(normal, upper)
@@ -192,8 +184,8 @@ def evaluate_block(
         if missing > -ROUNDING * cost:  # else Newton's step promises more than there is
             break
     residuals[last] = np.sqrt(max(missing, 0.0))
-    _copy_plain(upper, 0, count, camera_jacobian)
-    _copy_plain(upper, count, structure, structure_jacobian)
-    _copy_chained(upper, shared, to_station, station_jacobian)
-    _copy_chained(upper, shared, to_placement, placement_jacobian)
+    _copy_plain(upper, 0, count, jacobians.camera)
+    _copy_plain(upper, count, structure, jacobians.structure)
+    _copy_chained(upper, shared, to_station, jacobians.station)
+    _copy_chained(upper, shared, to_placement, jacobians.placement)
     return True

@@ -11,10 +11,11 @@ from typing import Any
 
 import numpy as np
 
+from ceres_cal.kernels.arguments import CurveColumns, Loss, Optics, PointColumns, Sweep, Unknowns
 from ceres_cal.kernels.block import rotation
 from ceres_cal.kernels.jit import jit
-from ceres_cal.kernels.lenses import answer_limit, one_dimensional
-from ceres_cal.kernels.sight import layout_of_rows, normal_equations, working_space
+from ceres_cal.kernels.lenses import prepared
+from ceres_cal.kernels.sight import normal_equations, order_of_rows, working_space
 
 _MOST_STEPS = 50
 _NOTHING_LEFT = 1e-14  # squared standard deviations
@@ -62,35 +63,26 @@ def _solve_pose(normal: Any, count: int, damping: float, lower: Any, gain: Any) 
 
 @jit
 def eliminate_placements(
-    first: int, last: int, lens: int, intrinsics: Any, free: Any, powers: Any, unit: float,
-    bounds: Any, pixels: Any, weights: Any, slots: Any, bends: Any,
-    is_arc: Any, curve_bounds: Any, track: Any, curve_pixels: Any, curve_weights: Any, s: Any, track_slots: Any,
-    loss: int, scale: float, newton: bool, points: Any, tracks: Any, structure: int, tolerance: float, change: Any,
-    poses: Any, gains: Any, costs: Any, reduced: Any,
+    first: int, last: int, optics: Optics, unknowns: Unknowns, points: PointColumns, curves: CurveColumns, loss: Loss,
+    newton: bool, tolerance: float, change: Any, sweep: Sweep,
 ) -> None:  # fmt: skip
     """The sights first to last at their best poses: their costs, and what they say of the free intrinsics.
 
     Args:
-        intrinsics, free, powers, unit, loss, scale, newton and the observations: see `normal_equations`; bounds and
-            curve_bounds (S + 1,) say where each sight's rows begin.
+        newton: see `normal_equations`.
         tolerance: how much of a sight's cost a step of its pose may still promise when it is left to the complement.
-        points, tracks: as built, with the `structure` numbers of the moment put in.
-        change: (free + structure,) by how much these have moved since `poses` and `gains` were made.
-        poses: (S, 3, 4) [R t] of cam_from_target, moved. gains: (S, 6, free + structure), their effect, renewed.
-        costs: (S,) sum of rho of each sight; infinite, its pose left alone, where an observation cannot be projected.
-        reduced: (free + structure + 1,) squared, lower triangle: the complement with the residual's row last, added up.
+        change: (free + structure,) by how much these have moved since the poses and gains of `sweep` were made.
+        sweep: poses, moved (left alone where an observation cannot be projected), gains, renewed, costs, filled, and
+            reduced, the complement, added up.
     """
-    count = len(free) + structure
-    rows, places = layout_of_rows(free, len(intrinsics), structure)
-    dense = one_dimensional(lens, intrinsics, powers)
-    limit = answer_limit(lens, dense)
+    poses, gains, costs, reduced = sweep.poses, sweep.gains, sweep.costs, sweep.reduced
+    count = len(unknowns.free) + unknowns.structure
+    optics, order = prepared(optics, optics.intrinsics), order_of_rows(unknowns, len(optics.intrinsics))
     normal, trial = np.empty((count + 7, count + 7)), np.empty((count + 7, count + 7))
-    space = working_space(len(intrinsics), len(rows))
+    space = working_space(optics, len(order.rows))
     lower, gain = np.empty((6, 6)), np.empty((6, count + 1))
     turned, step, pose, moved = np.empty((3, 3)), np.empty(6), np.empty((3, 4)), np.empty((3, 4))
     for v in range(first, last):
-        p, c = slice(bounds[v], bounds[v + 1]), slice(curve_bounds[v], curve_bounds[v + 1])
-        moving = p if len(slots) > 0 else slice(0, 0)
         for k in range(6):
             step[k] = 0.0
             for j in range(count):
@@ -98,11 +90,7 @@ def eliminate_placements(
         _move(poses[v], step, turned, moved)
         cost, promise, damping = np.inf, np.inf, 0.0
         for _ in range(_MOST_STEPS):
-            moved_cost = normal_equations(
-                lens, intrinsics, powers, dense, limit, unit, moved, points[p], pixels[p], weights[p], slots[moving],
-                bends[moving], tracks, is_arc, track[c], curve_pixels[c], curve_weights[c], s[c], track_slots, loss,
-                scale, newton, rows, places, trial, space,
-            )  # fmt: skip
+            moved_cost = normal_equations(v, optics, moved, points, curves, loss, newton, order, trial, space)
             if moved_cost <= cost:
                 pose, moved, normal, trial, cost, damping = moved, pose, trial, normal, moved_cost, 0.1 * damping
             elif not np.isfinite(cost) or promise <= 1e-12 * cost:

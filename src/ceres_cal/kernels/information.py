@@ -6,39 +6,29 @@ from typing import Any
 
 import numpy as np
 
+from ceres_cal.kernels.arguments import CurveColumns, Loss, Optics, PointColumns, Unknowns
 from ceres_cal.kernels.jit import jit
-from ceres_cal.kernels.lenses import answer_limit, one_dimensional
-from ceres_cal.kernels.sight import layout_of_rows, normal_equations, working_space
+from ceres_cal.kernels.lenses import prepared
+from ceres_cal.kernels.sight import normal_equations, order_of_rows, working_space
 
 
 @jit
 def sight_normals(
-    first: int, last: int, lens: int, intrinsics: Any, free: Any, powers: Any, unit: float,
-    bounds: Any, pixels: Any, weights: Any, slots: Any, bends: Any,
-    is_arc: Any, curve_bounds: Any, track: Any, curve_pixels: Any, curve_weights: Any, s: Any, track_slots: Any,
-    loss: int, scale: float, newton: bool, points: Any, tracks: Any, structure: int, poses: Any, units: Any,
-    normals: Any,
+    first: int, last: int, optics: Optics, unknowns: Unknowns, points: PointColumns, curves: CurveColumns, loss: Loss,
+    poses: Any, units: Any, normals: Any,
 ) -> bool:  # fmt: skip
     """False where an observation cannot be projected; else J^T W J of the sights first to last, each by itself.
 
     Args:
+        poses: (S, 3, 4) [R t] of cam_from_frame.
         normals: (last - first, n, n) with n = free + structure + 6: free intrinsics, structure, left perturbation of
-            the pose, each multiplied with its one of `units` (n,). Everything else as in
-            `elimination.eliminate_placements`.
+            the pose, each multiplied with its one of `units` (n,); an observation has its robust weight rho'.
     """
-    size = len(free) + structure + 6
-    rows, places = layout_of_rows(free, len(intrinsics), structure)
-    dense = one_dimensional(lens, intrinsics, powers)
-    limit = answer_limit(lens, dense)
-    normal, space = np.empty((size + 1, size + 1)), working_space(len(intrinsics), len(rows))
+    size = len(units)
+    optics, order = prepared(optics, optics.intrinsics), order_of_rows(unknowns, len(optics.intrinsics))
+    normal, space = np.empty((size + 1, size + 1)), working_space(optics, len(order.rows))
     for v in range(first, last):
-        p, c = slice(bounds[v], bounds[v + 1]), slice(curve_bounds[v], curve_bounds[v + 1])
-        moving = p if len(slots) > 0 else slice(0, 0)
-        cost = normal_equations(
-            lens, intrinsics, powers, dense, limit, unit, poses[v], points[p], pixels[p], weights[p], slots[moving],
-            bends[moving], tracks, is_arc, track[c], curve_pixels[c], curve_weights[c], s[c], track_slots, loss, scale,
-            newton, rows, places, normal, space,
-        )  # fmt: skip
+        cost = normal_equations(v, optics, poses[v], points, curves, loss, False, order, normal, space)
         if not np.isfinite(cost):
             return False
         for i in range(size):

@@ -7,22 +7,31 @@ in a folder named after all their sources: change one line of one of them and al
 from __future__ import annotations
 
 import hashlib
+import inspect
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from types import FunctionType
 from typing import Any
 
-from numba import config, njit
+from numba import cfunc, config, njit
 
 _CONFIG: Any = config  # numba makes its settings at import; no stub knows them
+_NJIT: Any = njit  # nor `_nrt`: whether references are counted
+_CFUNC: Any = cfunc
 
 
 def _cache_folder() -> Path:
     base = _CONFIG.CACHE_DIR or os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(base) / "ceres-cal" / _digest(Path(__file__).parent.glob("*.py"))
+
+
+def _digest(paths: Iterable[Path]) -> str:
     sources = hashlib.sha256()
-    for path in sorted(Path(__file__).parent.glob("*.py")):
+    for path in sorted(paths):
         sources.update(path.read_bytes())
-    return Path(base) / "ceres-cal" / sources.hexdigest()[:16]
+    return sources.hexdigest()[:16]
 
 
 CACHE_FOLDER = _cache_folder()
@@ -39,14 +48,51 @@ def _is_writable(folder: Path) -> bool:
 _CACHED = _is_writable(CACHE_FOLDER)
 
 
-def jit(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compile without the GIL; reassoc and contract let sums be vectorised, NaN and infinity keep their meaning."""
+_OPTIONS: dict[str, Any] = {"error_model": "numpy", "fastmath": {"reassoc", "contract", "nsz"}}
+
+
+@contextmanager
+def _cached_in(folder: Path) -> Iterator[None]:
     others = _CONFIG.CACHE_DIR
-    _CONFIG.CACHE_DIR = str(CACHE_FOLDER)
+    _CONFIG.CACHE_DIR = str(folder)
     try:
-        compiled: Callable[..., Any] = njit(
-            cache=_CACHED, nogil=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"}
-        )(function)
+        yield
     finally:
         _CONFIG.CACHE_DIR = others
+
+
+def jit(function: Callable[..., Any], counted: bool = True) -> Callable[..., Any]:
+    """Compile without the GIL; reassoc and contract let sums be vectorised, NaN and infinity keep their meaning."""
+    with _cached_in(CACHE_FOLDER):
+        compiled: Callable[..., Any] = _NJIT(cache=_CACHED, nogil=True, _nrt=counted, **_OPTIONS)(function)
     return compiled
+
+
+def borrowing(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The same of what makes no array: its callers keep all of them, and to count references to every array of every
+    tuple would take a tenth of the time.
+    """
+    return jit(function, counted=False)
+
+
+def compile_callback(function: Callable[..., Any], signature: Any) -> Any:
+    """A plain function, and the plain functions that it calls, compiled for calls by address; kept like the kernels.
+
+    Its arrays are its callers': it makes none.
+    """
+    files: set[Path] = set()
+    whole = _with_callees(function, files)
+    readable = all(path.is_file() for path in files)  # what was typed into an interpreter is compiled each time
+    with _cached_in(CACHE_FOLDER / _digest(files) if readable else CACHE_FOLDER):
+        return _CFUNC(signature, cache=_CACHED and readable, _nrt=False, **_OPTIONS)(whole)
+
+
+def _with_callees(function: Any, files: set[Path]) -> FunctionType:
+    """The function with compiled ones in place of the plain functions that it names; `files` are where they all are."""
+    files.add(Path(inspect.getfile(function)))
+    known = function.__globals__
+    plain = {name: known[name] for name in function.__code__.co_names if isinstance(known.get(name), FunctionType)}
+    compiled = {name: _NJIT(_nrt=False, **_OPTIONS)(_with_callees(one, files)) for name, one in plain.items()}
+    whole = FunctionType(function.__code__, {**known, **compiled}, function.__name__, None, function.__closure__)
+    whole.__qualname__ = function.__qualname__
+    return whole

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ceres_cal.kernels.arguments import Loss
 from ceres_cal.kernels.jit import jit
 
 LOSS_CODES = {"trivial": 0, "huber": 1, "soft_l1": 2, "cauchy": 3, "tukey": 4}
@@ -13,8 +14,9 @@ _STRAIGHT = 0.1  # in place of 0, where a loss has no curvature left
 
 
 @jit
-def robust_loss(code: int, scale: float, squared: float) -> tuple[float, float]:
+def robust_loss(loss: Loss, squared: float) -> tuple[float, float]:
     """rho and its derivative at the squared residual, as Ceres defines its losses."""
+    code, scale = loss.code, loss.scale
     b = scale * scale
     if code == _TRIVIAL:
         return squared, 1.0
@@ -35,14 +37,15 @@ def robust_loss(code: int, scale: float, squared: float) -> tuple[float, float]:
 
 
 @jit
-def bend(code: int, scale: float, squared: float) -> float:
+def bend(loss: Loss, squared: float) -> float:
     """sqrt(1 + 2 s rho'' / rho') at the squared residual s: how the loss' own bend shortens the Jacobian along the
     residual (Triggs et al., Bundle Adjustment - A Modern Synthesis, section 4.3).
 
     1 for the redescending losses: along their bend a step may climb.
     """
-    if code == _HUBER and squared > scale * scale:
+    scale = loss.scale
+    if loss.code == _HUBER and squared > scale * scale:
         return _STRAIGHT
-    if code == _SOFT_L1:
+    if loss.code == _SOFT_L1:
         return 1.0 / np.sqrt(1.0 + squared / (scale * scale))
     return 1.0

@@ -7,13 +7,14 @@ from __future__ import annotations
 
 from typing import Any
 
-from ceres_cal.kernels.jit import jit
+from ceres_cal.kernels.arguments import Loss
+from ceres_cal.kernels.jit import borrowing
 from ceres_cal.kernels.losses import bend
 
 _FLAT, _MOSTLY_FLAT = 0.7, 0.5  # a bend; share of a chunk beyond which it says nothing of where the minimum lies
 
 
-@jit
+@borrowing
 def add_products(n: int, count: int, panel: Any, products: Any) -> None:
     """products += P P^T over the panel's first n columns, lower triangle; four rows by four, to read each one less.
 
@@ -60,16 +61,16 @@ def add_products(n: int, count: int, panel: Any, products: Any) -> None:
             products[k + 3, j + 3] += s33
 
 
-@jit
-def bend_rows(n: int, components: int, loss: int, scale: float, squared: Any, last: int, panel: Any) -> None:
+@borrowing
+def bend_rows(n: int, components: int, loss: Loss, squared: Any, last: int, panel: Any) -> None:
     """Take the second derivative of rho into the panel's rows: Newton's step on the loss, its gradient unchanged."""
     flat = 0
     for i in range(n):
-        flat += bend(loss, scale, squared[i]) < _FLAT
+        flat += bend(loss, squared[i]) < _FLAT
     if flat > _MOSTLY_FLAT * n:
         return
     for i in range(n):
-        left = bend(loss, scale, squared[i])
+        left = bend(loss, squared[i])
         if left == 1.0:
             continue
         length2 = 0.0
@@ -85,16 +86,15 @@ def bend_rows(n: int, components: int, loss: int, scale: float, squared: Any, la
             panel[last, c * n + i] /= left
 
 
-@jit
-def add_structure(
-    i: int, n: int, components: int, slots: Any, directions: Any, pose: Any, places: Any, panel: Any, columns: Any,
-    normal: Any,
-) -> None:  # fmt: skip
+@borrowing
+def add_structure(i: int, n: int, components: int, slots: Any, pose: Any, places: Any, space: Any, normal: Any) -> None:
     """The share of the chunk's observation i in the rows of the structure numbers `slots` (-1: none) that move it.
 
-    Moving the target along a direction moves the point by R times it in the camera frame: the pose's translation rows
-    of the panel say what that does. Structure numbers stand between the free intrinsics and the pose.
+    Moving the target along one of the workspace's directions, a slot each, moves the point by R times it in the camera
+    frame: the pose's translation rows of the panel say what that does. Structure numbers stand between the free
+    intrinsics and the pose.
     """
+    panel, directions, columns = space.panel, space.directions, space.columns
     base, translation = len(places) - 7, len(places) - 4
     for a in range(len(slots)):
         if slots[a] < 0:

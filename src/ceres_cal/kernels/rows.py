@@ -6,85 +6,66 @@ from typing import Any
 
 import numpy as np
 
+from ceres_cal.kernels.arguments import CurveColumns, Loss, Optics, PointColumns
 from ceres_cal.kernels.jit import jit
-from ceres_cal.kernels.lenses import answer_limit, distort, intrinsics_rows, one_dimensional
+from ceres_cal.kernels.lenses import prepared
 from ceres_cal.kernels.losses import robust_loss
-from ceres_cal.kernels.sight import CHUNK, feet, pose_rows, to_camera
+from ceres_cal.kernels.sight import CHUNK, jacobian_rows, move_to_feet, shown_points, working_space
 
 
 @jit
-def point_rows(
-    lens: int, intrinsics: Any, powers: Any, unit: float, poses: Any, bounds: Any, points: Any, rows: Any
-) -> bool:
+def point_rows(optics: Optics, poses: Any, points: PointColumns, rows: Any) -> bool:
     """d project(X) / d [intrinsics | 6 pose] into `rows` (N, 2, intrinsics + 6); False where one cannot be projected.
 
     Args:
         See `point_residuals`. The pose columns are left perturbations in the camera frame: (dw x R X) + dt.
     """
-    size = len(intrinsics)
-    jacobian, scratch = np.empty((size + 6, 2, CHUNK)), np.empty((21, CHUNK))
-    local, rotated, rays, image, work = scratch[:3], scratch[3:6], scratch[6:9], scratch[9:16], scratch[16:21]
-    dense = one_dimensional(lens, intrinsics, powers)
-    limit = answer_limit(lens, dense)
+    optics = prepared(optics, optics.intrinsics)
+    space = working_space(optics, 0)
+    jacobian = space.jacobian
     for v in range(len(poses)):
-        for start in range(bounds[v], bounds[v + 1], CHUNK):
-            n = min(CHUNK, bounds[v + 1] - start)
-            for i in range(n):
-                for j in range(3):
-                    local[j, i] = points[start + i, j]
-            to_camera(n, poses[v], local, rotated, rays)
-            if not distort(lens, n, intrinsics, dense, unit, limit, rays, image, work):
+        for start in range(points.bounds[v], points.bounds[v + 1], CHUNK):
+            n = min(CHUNK, points.bounds[v + 1] - start)
+            if not shown_points(n, start, optics, poses[v], points, space):
                 return False
-            intrinsics_rows(lens, n, intrinsics, powers, unit, image, work, jacobian)
-            pose_rows(n, size, intrinsics[1], rotated, image, jacobian)
+            jacobian_rows(n, optics, space, False)
             for i in range(n):
                 for c in range(2):
-                    for k in range(size + 6):
+                    for k in range(len(jacobian)):
                         rows[start + i, c, k] = jacobian[k, c, i]
     return True
 
 
 @jit
-def curve_rows(
-    lens: int, intrinsics: Any, powers: Any, unit: float, poses: Any, bounds: Any, tracks: Any, is_arc: Any,
-    track: Any, pixels: Any, s: Any, rows: Any, normals: Any,
-) -> bool:  # fmt: skip
+def curve_rows(optics: Optics, poses: Any, curves: CurveColumns, rows: Any, normals: Any) -> bool:
     """The same of the signed distance to the curve, into `rows` (M, intrinsics + 6), by the envelope theorem.
 
     Args:
         See `curve_residuals`; s is moved to the foot. normals: (M, 2), filled with the image normal there: the foot
             lies at the pixel plus the signed distance along it.
     """
-    size = len(intrinsics)
-    jacobian, scratch = np.empty((size + 6, 2, CHUNK)), np.empty((32, CHUNK))
-    local, rotated, rays, image, work, foot = (
-        scratch[:3], scratch[3:6], scratch[6:9], scratch[9:16], scratch[16:21], scratch[21:],
-    )  # fmt: skip
-    dense = one_dimensional(lens, intrinsics, powers)
-    limit = answer_limit(lens, dense)
+    optics = prepared(optics, optics.intrinsics)
+    space = working_space(optics, 0)
+    jacobian, foot = space.jacobian, space.foot
     for v in range(len(poses)):
-        for start in range(bounds[v], bounds[v + 1], CHUNK):
-            n = min(CHUNK, bounds[v + 1] - start)
-            if not feet(
-                lens, n, start, intrinsics, dense, unit, limit, poses[v], tracks, is_arc, track, pixels, s,
-                local, rotated, rays, image, work, foot,
-            ):  # fmt: skip
+        for start in range(curves.bounds[v], curves.bounds[v + 1], CHUNK):
+            n = min(CHUNK, curves.bounds[v + 1] - start)
+            if not move_to_feet(n, start, optics, poses[v], curves, space):
                 return False
-            intrinsics_rows(lens, n, intrinsics, powers, unit, image, work, jacobian)
-            pose_rows(n, size, intrinsics[1], rotated, image, jacobian)
+            jacobian_rows(n, optics, space, False)
             for i in range(n):
                 length = np.sqrt(foot[7, i])
                 nx, ny = -foot[1, i] / length, foot[0, i] / length
                 normals[start + i, 0], normals[start + i, 1] = nx, ny
-                for k in range(size + 6):
+                for k in range(len(jacobian)):
                     rows[start + i, k] = nx * jacobian[k, 0, i] + ny * jacobian[k, 1, i]
     return True
 
 
 @jit
-def loss_weights(loss: int, scale: float, squared: Any) -> Any:
+def loss_weights(loss: Loss, squared: Any) -> Any:
     """rho' at each squared residual, (N,): the weight an observation has in the solve."""
     weights = np.empty(len(squared))
     for i in range(len(squared)):
-        weights[i] = robust_loss(loss, scale, squared[i])[1]
+        weights[i] = robust_loss(loss, squared[i])[1]
     return weights

@@ -34,12 +34,8 @@ def natural_sizes(estimate: Estimate, keys: Sequence[Key]) -> Array:
     for (kind, owner), places in columns_by_owner(keys).items():
         if kind == "camera":
             camera = estimate.cameras[owner]
-            radius = unit_px(camera) if camera.lens.kind == "radial" else unit_px(camera) / camera.phi
-            powers = {"p1": 2, "p2": 2} | dict(
-                zip([n for n in camera.lens.names if n[0] != "p"], camera.lens.radius_powers, strict=True)
-            )
             known = {"phi": camera.phi, "cx": camera.phi, "cy": camera.phi, "aspect": 1.0}
-            known |= {name: radius ** (1 - power) for name, power in powers.items()}
+            known |= zip(camera.lens.names, camera.lens.natural_sizes(camera.phi, unit_px(camera)), strict=True)
             sizes[places] = [known[keys[place].quantity] for place in places]
         elif kind == "structure":
             names = [f"{owner}/{keys[place].quantity}" for place in places]
@@ -80,8 +76,7 @@ def values_of(estimate: Estimate, keys: Sequence[Key]) -> Array:
 
 def intrinsic_keys(name: str, lens: Lens) -> list[Key]:
     """Keys of all intrinsics of a camera, in the order of the solver's vector."""
-    powers = lens.radius_powers if lens.kind == "radial" else (1,) * len(lens.names)
-    units = ("px", "1", "px", "px", *("1" if power == 1 else f"px^{1 - power}" for power in powers))
+    units = ("px", "1", "px", "px", *lens.units)
     return [Key("camera", name, quantity, unit) for quantity, unit in zip(intrinsic_names(lens), units, strict=True)]
 
 

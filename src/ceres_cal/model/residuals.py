@@ -11,8 +11,9 @@ from ceres_cal import kernels
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.threads import parts_of, run_parts
 from ceres_cal.model.parameters import Estimate, intrinsics_vector, unit_px
+from ceres_cal.model.structure import Structure
 from ceres_cal.observations import Observations
-from ceres_cal.observations.sights import Sights, nearest_places
+from ceres_cal.observations.sights import Sights, nearest_feet
 from ceres_cal.scene.camera import Camera
 
 _POINT_NS = 10.0
@@ -38,13 +39,45 @@ class Residuals:
         return np.sqrt(x * x + y * y), np.abs(self.curves)
 
 
-def lens_arguments(camera: Camera) -> tuple[int, Array, Array, float]:
-    """(code, intrinsics, powers, unit) as the kernels take a camera's optics."""
-    return (
-        kernels.LENS_CODES[camera.lens.kind],
+def camera_optics(camera: Camera) -> kernels.Optics:
+    """A camera's optics as the kernels take them."""
+    lens = camera.lens
+    prepare, distort, differentiate = kernels.lens_functions(lens.prepare, lens.distort_chunk, lens.differentiate_chunk)
+    return kernels.Optics(
+        prepare.address,
+        distort.address,
+        differentiate.address,
         intrinsics_vector(camera),
-        np.asarray(camera.lens.radius_powers, dtype=np.int64),
         unit_px(camera),
+        lens.state,
+        lens.work_rows,
+    )
+
+
+def point_columns(sights: Sights, structure: Structure, noise_scale: float = 1.0) -> kernels.PointColumns:
+    """The point observations of some sights as the kernels take them."""
+    moved = sights.point_index if len(structure.values) else sights.point_index[:0]
+    return kernels.PointColumns(
+        sights.point_bounds,
+        structure.points(sights),
+        sights.pixels,
+        1.0 / (noise_scale * sights.sigma_px),
+        structure.point_slots[moved],
+        structure.bends[moved],
+    )
+
+
+def curve_columns(sights: Sights, structure: Structure, feet: Array, noise_scale: float = 1.0) -> kernels.CurveColumns:
+    """The curve observations of some sights as the kernels take them, which move the feet (M of the sights,)."""
+    return kernels.CurveColumns(
+        sights.curve_bounds,
+        structure.tracks(sights),
+        sights.is_arc,
+        sights.track_index,
+        sights.curve_pixels,
+        1.0 / (noise_scale * sights.curve_sigma_px),
+        feet,
+        structure.track_slots,
     )
 
 
@@ -61,27 +94,23 @@ def residuals(observations: Observations, sights: Sights, estimate: Estimate, fe
     for name in sights.cameras:
         numbers = sights.numbers(camera=name)
         own = sights.take(numbers)
-        optics = lens_arguments(estimate.cameras[name])
-        _point_residuals(optics, poses[numbers], own, estimate.structure.points(own), points)
+        optics = camera_optics(estimate.cameras[name])
+        _point_residuals(optics, poses[numbers], own, estimate.structure, points)
         if len(own.curve_rows):
             distances = np.empty(len(own.curve_rows))
-            starts = starting_feet(own, estimate, feet)
-            kernels.curve_residuals(
-                *optics, poses[numbers], own.curve_bounds, estimate.structure.tracks(own), own.is_arc, own.track,
-                own.curve_pixels, starts, distances,
-            )  # fmt: skip
-            curves[own.curve_rows], ends[own.curve_rows] = distances, starts
+            columns = curve_columns(own, estimate.structure, starting_feet(own, estimate, feet))
+            kernels.curve_residuals(optics, poses[numbers], columns, distances)
+            curves[own.curve_rows], ends[own.curve_rows] = distances, columns.feet
     return Residuals(points, curves, ends)
 
 
-def _point_residuals(
-    optics: tuple[int, Array, Array, float], poses: Array, sights: Sights, points: Array, found: Array
-) -> None:
-    def part(first: int, last: int) -> None:
-        bounds = sights.point_bounds[first : last + 1]
-        kernels.point_residuals(*optics, poses[first:last], bounds, points, sights.pixels, sights.point_rows, found)
+def _point_residuals(optics: kernels.Optics, poses: Array, sights: Sights, structure: Structure, found: Array) -> None:
+    columns = point_columns(sights, structure)
 
-    run_parts(part, parts_of(len(sights), len(points), _POINT_NS))
+    def part(first: int, last: int) -> None:
+        kernels.point_residuals(first, last, optics, poses, columns, sights.point_rows, found)
+
+    run_parts(part, parts_of(len(sights), len(sights.points), _POINT_NS))
 
 
 def starting_feet(sights: Sights, estimate: Estimate, feet: Array | None) -> Array:
@@ -93,5 +122,5 @@ def starting_feet(sights: Sights, estimate: Estimate, feet: Array | None) -> Arr
         if np.all(np.isfinite(known)):
             return known
     seen = [sights[int(number)] for number in np.flatnonzero(np.diff(sights.curve_bounds))]
-    nearest = [nearest_places(s, estimate.camera_at(s.key.station, s.key.placement)) for s in seen]
+    nearest = [nearest_feet(s, estimate.camera_at(s.key.station, s.key.placement)) for s in seen]
     return np.concatenate(nearest)

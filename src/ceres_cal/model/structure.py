@@ -74,7 +74,7 @@ class Structure:
 
     def points(self, sights: Sights) -> Array:
         """(N, 3) where the observed points of the sights lie, m."""
-        return self._points(sights.points, sights.feature)
+        return self._points(sights.points, sights.point_index)
 
     def tracks(self, sights: Sights) -> Array:
         """(T, 3, 3) the tracks of all targets as built."""
@@ -130,7 +130,7 @@ def make_structure(targets: Mapping[str, Target], tolerances: Mapping[str, Toler
     """The corrections that the tolerances free, all 0.
 
     Raises:
-        InputError: a tolerance names a target that is not there, or a warp of a target that is no checkerboard.
+        InputError: a tolerance names a target that is not there, or a warp of a target that does not bow.
     """
     for name in tolerances:
         if name not in targets:
@@ -173,9 +173,11 @@ def make_structure(targets: Mapping[str, Target], tolerances: Mapping[str, Toler
 
 def _bends(target: Target, name: str, tolerance: Tolerance) -> Array:
     """1 - x^2 and 1 - y^2 over the board, x and y from -1 to 1 between its edges."""
-    if tolerance.warp_m > 0.0 and target.kind != "checkerboard":
-        raise InputError(f"a warp is for checkerboards: target {name!r} is of kind {target.kind!r}")
-    if not len(target.points) or target.kind != "checkerboard":
+    if tolerance.warp_m > 0.0 and not target.bows:
+        raise InputError(
+            f"a warp is for checkerboards and boards like them: target {name!r}, of kind {target.kind!r}, does not bow"
+        )
+    if not target.bows or not target.points:
         return np.zeros((len(target.points), 2))
     flat = target.point_array[:, :2]
     half = 0.5 * np.ptp(flat, axis=0)

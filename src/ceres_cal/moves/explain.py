@@ -17,18 +17,29 @@ from ceres_cal.calibration import Calibration
 from ceres_cal.model.parameters import Estimate
 from ceres_cal.model.residuals import residuals
 from ceres_cal.moves.carried import RefitPlan
-from ceres_cal.moves.labels import MIRRORED, TURNED, other_divisions, relabelled
+from ceres_cal.moves.labels import MIRRORED, TURNED, mistaken_targets, relabelled
 from ceres_cal.moves.poses import Place, PoseSearch, misfit, movement, places
 from ceres_cal.observations import Observations, taken
 from ceres_cal.observations.sights import gather_sights
 
 _ZOOMS = 15
+# Share of the observations that another zoom must explain to be looked at. Nothing changes from 0.33 to 0.67.
 _HALF = 0.5
-_FEW = 0.2  # share of observations that may be taken out
-_RARE = 1e-4  # how often an unchanged lens is doubted
-_NOISIER = 1.5  # times the noise of the old calibration, from where on the lens is doubted
-_TOO_NOISY = 4.0  # from where on nothing is explained
-_SUPPORTED = 10.0  # nats by which another explanation must be better
+# Share of observations that may be taken out where another lens is said to explain the rest. Nothing changes from
+# half to double.
+_FEW = 0.2
+# How often an unchanged lens is doubted; a doubt costs only time, other explanations must be supported besides.
+# Nothing changes from half to double.
+_RARE = 1e-4
+# Times the noise of the old calibration, from where on the lens is doubted. Below 1 nothing is quiet enough to be
+# named; at double nothing changes.
+_NOISIER = 1.5
+# Times the noise of the old calibration, from where on nothing is explained. Nothing changes from half to double.
+_TOO_NOISY = 4.0
+# Nats by which another explanation must be better: a factor of 20 000. Nothing changes from half to double.
+_SUPPORTED = 10.0
+# A camera whose labels are turned seems to have moved farther than the first (m); with labels turned back it stands
+# within the second of where it was (m), turned by less than the third (rad). Nothing changes from half to double.
 _FAR_M, _NEAR_M, _NEAR_RAD = 1.5, 1.0, np.pi / 4.0
 _TURN = Pose(np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
 
@@ -99,7 +110,7 @@ def _others(plan: RefitPlan, search: PoseSearch) -> Iterator[str]:
     mirrored = relabelled(search.observations, MIRRORED)
     if mirrored is not None and _fits(_seen_as(search, mirrored), old):
         yield "with mirrored labels they do: left and right are swapped, or the image is flipped: correct that"
-    for name, observations in other_divisions(search.observations).items():
+    for name, observations in mistaken_targets(search.observations).items():
         if _fits(_seen_as(search, observations), old):
             yield f"on {name} they do: this is the wrong field: correct the target's dimensions"
     zoomed = zoomed_place(search, old)

@@ -23,11 +23,17 @@ from ceres_cal.solve import Weighting, placement_costs
 from ceres_cal.start.closed_forms import fit_lines, pose_from_homography
 from ceres_cal.start.planes import plane_sight
 
-_WIDE = (60.0, 12.0)  # standard deviations: scale of the loss while a candidate is far off
+# Standard deviations: scale of the loss while a candidate is far off, 20 px and 4 px at 0.3 px of noise.
+_WIDE = (60.0, 12.0)
 _FARTHEST_M = 1e3
 _GRID_DEG = (-24.0, 0.0, 24.0)  # of turns about each axis of the camera; neighbours' basins overlap
-_STRAY = 0.05  # share of observations that may be anywhere in the image
-_ALIKE = (0.02, 0.01)  # m and rad: candidates nearer than this are one
+# Share of observations that may be anywhere in the image: as many as are wrong in the simulated days of
+# scripts/moves.py.
+_STRAY = 0.05
+# m and rad: candidates nearer than this end in one minimum.
+_ALIKE = (0.02, 0.01)
+# A pose fits where that share of the observations lies within so many standard deviations, at a noise of at most so
+# many times that of the calibration: up to 40 % may be wrong.
 _FITS_SHARE, _FITS_SIGMA, _FITS_SCALE = 0.6, 5.0, 4.0
 _ROUNDS = 4  # of the closed form's reweighting
 
@@ -124,7 +130,7 @@ def equations(sight: Sights) -> int:
     """What a sight can say of a pose's six numbers and more: two for each point and straight line, three for each arc,
     but no more than its observations.
     """
-    tracks, counts = np.unique(sight.track, return_counts=True)
+    tracks, counts = np.unique(sight.track_index, return_counts=True)
     most = np.where(sight.is_arc[tracks], 3, 2)
     return 2 * len(np.unique(sight.points, axis=0)) + int(np.sum(np.minimum(counts, most)))
 

@@ -1,4 +1,4 @@
-"""After a move: the poses anew, everything else under what was known of it (design, sections 3 and 8).
+"""After a move: the poses anew, everything else under what was known of it (design, section 10).
 
 The same path as `calibrate`, from the old calibration's closed form with a known lens to solve, reject, solve, assess;
 the old posterior is one more prior, as a full matrix.
@@ -26,8 +26,11 @@ from ceres_cal.solve import Progress
 from ceres_cal.start.initialise import Start
 
 LABELS = ("check", "as-given", "turned")
+# Poses whose likelihoods differ by less compete: a factor of 20 000 decides. Nothing changes from half to double.
 _NATS_ALIKE = 10.0
-_UNIQUE = 8  # equations with which a pose is the only one
+# Equations with which a pose is the only one: six numbers, and two that contradict a wrong one. Nothing changes at
+# half of it; at double four corners are refused.
+_UNIQUE = 8
 _SMALL = (0.3, np.deg2rad(15.0))
 
 

@@ -1,11 +1,17 @@
-"""Observations: what the frames show, as columns, in memory and in files."""
+"""Observations: what the frames show, as columns, in memory and in files; and `sights`, as the method takes them.
 
-from ceres_cal.observations.columns import Columns, Curves, Points, Prior, View, no_curves, no_points, taken
+A view is what one frame shows of one target; a sight is what one camera at one station sees of one rigid frame, over
+all its views, and so what one pose projects (see `observations.sights`).
+"""
+
+from ceres_cal.observations.columns import NO_CURVES, NO_POINTS, Columns, Curves, Points, Prior, View, taken
 from ceres_cal.observations.files import FORMAT, VERSION, prior_from_json, prior_to_json
 from ceres_cal.observations.observations import Observations, combine
 
 __all__ = [
     "FORMAT",
+    "NO_CURVES",
+    "NO_POINTS",
     "VERSION",
     "Columns",
     "Curves",

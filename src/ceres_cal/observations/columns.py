@@ -98,16 +98,9 @@ class Curves:
         return len(self.view)
 
 
-def no_points() -> Points:
-    """Columns without any row."""
-    return Points(np.empty(0, np.int32), np.empty(0, np.int32), np.empty((0, 2)), np.empty(0))
-
-
-def no_curves() -> Curves:
-    """Columns without any row."""
-    return Curves(**vars(no_points()), side=np.empty(0, np.int8))
-
-
+_NOBODY, _NOWHERE = np.empty(0, np.int32), np.empty((0, 2))
+NO_POINTS = Points(_NOBODY, _NOBODY, _NOWHERE, np.empty(0))
+NO_CURVES = Curves(_NOBODY, _NOBODY, _NOWHERE, np.empty(0), np.empty(0, np.int8))
 Columns = Points | Curves
 C = TypeVar("C")
 
@@ -117,11 +110,11 @@ def taken(columns: C, rows: Indices | Indices32 | Mask) -> C:
     return type(columns)(**{name: column[rows] for name, column in vars(columns).items()})
 
 
-def place_of(number: int, views: Sequence[View]) -> str:
+def view_label(number: int, views: Sequence[View]) -> str:
     """How messages name a view."""
     return f"view {number} (frame {views[number].frame!r})"
 
 
-def listed(names: Iterable[str]) -> str:
+def choices(names: Iterable[str]) -> str:
     """How messages say what there is."""
     return "there are " + (", ".join(map(repr, names)) or "none")

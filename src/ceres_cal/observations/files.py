@@ -11,10 +11,10 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
-from ceres_cal.base.arrays import AnyArray
+from ceres_cal.base.arrays import AnyArray, Codes
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import check_header, convert, parse_json, read_bytes, write_bytes
-from ceres_cal.observations.columns import TYPES, Curves, Points, Prior, View, listed, place_of
+from ceres_cal.observations.columns import NO_CURVES, NO_POINTS, TYPES, Curves, Points, Prior, View, choices, view_label
 from ceres_cal.scene.targets import SIDES, Target, target_from_spec
 
 FORMAT, VERSION = "ceres-cal/observations", 1
@@ -27,9 +27,9 @@ class Content(NamedTuple):
     targets: Mapping[str, Target]
     cameras: Mapping[str, tuple[int, int]]
     views: tuple[View, ...]
-    points: Points
-    curves: Curves
-    priors: tuple[Prior, ...]
+    points: Points = NO_POINTS
+    curves: Curves = NO_CURVES
+    priors: tuple[Prior, ...] = ()
 
 
 class _PointsFile(msgspec.Struct, forbid_unknown_fields=True):
@@ -38,36 +38,46 @@ class _PointsFile(msgspec.Struct, forbid_unknown_fields=True):
     sigma_px: float | list[float] = 1.0
 
 
-class _CurvesFile(msgspec.Struct, forbid_unknown_fields=True):
-    features: list[str]
-    pixels: list[tuple[float, float]]
-    sigma_px: float | list[float] = 1.0
-    side: str | list[str] = "centre"
+class _CurvesFile(_PointsFile, forbid_unknown_fields=True):
+    side: str | list[str] | msgspec.UnsetType = msgspec.UNSET
 
 
-class _ViewFile(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True):
+class _ViewFile(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True, kw_only=True):
     frame: str
     camera: str
-    target: str
     station: str | None = None
+    target: str
     placement: str | None = None
     points: _PointsFile | None = None
     curves: _CurvesFile | None = None
+
+    def view(self) -> View:
+        station = self.camera if self.station is None else self.station
+        return View(self.frame, self.camera, station, self.target, self.placement)
 
 
 class _CameraFile(msgspec.Struct, forbid_unknown_fields=True):
     image_size: tuple[int, int]
 
 
-class _ObservationsFile(msgspec.Struct, forbid_unknown_fields=True):
+class _ObservationsFile(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
     format: str
     version: int
+    units: str = "metres, radians, pixels"
+    pixel_origin: str = "centre of the top-left pixel"
     targets: dict[str, Any]
     cameras: dict[str, _CameraFile]
     views: list[_ViewFile]
     priors: list[dict[str, Any]] = []
-    units: str = "metres, radians, pixels"
-    pixel_origin: str = "centre of the top-left pixel"
+
+    def content(self) -> Content:
+        """All but the columns; InputError naming the place."""
+        return Content(
+            {name: target_from_spec(spec, f"target {name!r}") for name, spec in self.targets.items()},
+            {name: camera.image_size for name, camera in self.cameras.items()},
+            tuple(entry.view() for entry in self.views),
+            priors=tuple(prior_from_json(entry, f"prior {i}") for i, entry in enumerate(self.priors)),
+        )
 
 
 def read_content(path: Path) -> Content:
@@ -86,27 +96,16 @@ def write_content(content: Content, path: Path) -> None:
         raise InputError(f"{path}: observations are written as .json or .npz: give one of these endings")
 
 
-def header_of(content: Content) -> dict[str, Any]:
+def header_of(content: Content) -> _ObservationsFile:
     """Everything but the columns, as a file has it."""
-    return {
-        "format": FORMAT,
-        "version": VERSION,
-        "units": "metres, radians, pixels",
-        "pixel_origin": "centre of the top-left pixel",
-        "targets": {name: target.spec for name, target in content.targets.items()},
-        "cameras": {name: {"image_size": list(size)} for name, size in content.cameras.items()},
-        "views": [
-            {
-                "frame": view.frame,
-                "camera": view.camera,
-                "station": view.station,
-                "target": view.target,
-                **({"placement": view.placement} if view.placement is not None else {}),
-            }
-            for view in content.views
-        ],
-        "priors": [prior_to_json(prior) for prior in content.priors],
-    }
+    return _ObservationsFile(
+        format=FORMAT,
+        version=VERSION,
+        targets={name: target.spec for name, target in content.targets.items()},
+        cameras={name: _CameraFile(size) for name, size in content.cameras.items()},
+        views=[_ViewFile(**vars(view)) for view in content.views],
+        priors=[prior_to_json(prior) for prior in content.priors],
+    )
 
 
 def prior_to_json(prior: Prior) -> dict[str, Any]:
@@ -147,18 +146,6 @@ def _numbers(value: Any, size: int, where: str, *, spread: bool = False) -> tupl
     return tuple(numbers)
 
 
-def _read_header(data: dict[str, Any]) -> tuple[dict[str, Target], dict[str, tuple[int, int]], tuple[Prior, ...]]:
-    targets = {name: target_from_spec(spec, f"target {name!r}") for name, spec in data["targets"].items()}
-    cameras = {name: tuple(entry["image_size"]) for name, entry in data["cameras"].items()}
-    priors = tuple(prior_from_json(entry, f"prior {i}") for i, entry in enumerate(data.get("priors", [])))
-    return targets, cameras, priors
-
-
-def _view(entry: _ViewFile) -> View:
-    station = entry.camera if entry.station is None else entry.station
-    return View(entry.frame, entry.camera, station, entry.target, entry.placement)
-
-
 def _from_json(content: bytes, where: str) -> Content:
     try:
         data = msgspec.json.decode(content, type=_ObservationsFile)  # several times faster than by way of plain data
@@ -166,26 +153,21 @@ def _from_json(content: bytes, where: str) -> Content:
         plain = check_header(parse_json(content, where), where, FORMAT, VERSION)
         data = convert(plain, _ObservationsFile, where)
     check_header({"format": data.format, "version": data.version}, where, FORMAT, VERSION)
-    cameras = {name: {"image_size": entry.image_size} for name, entry in data.cameras.items()}
-    targets, sizes, priors = _read_header({"targets": data.targets, "cameras": cameras, "priors": data.priors})
-    views = tuple(_view(entry) for entry in data.views)
+    header = data.content()
+    targets, views = header.targets, header.views
     for number, view in enumerate(views):
         if view.target not in targets:
             raise InputError(
-                f"{place_of(number, views)} names target {view.target!r}, which is not there: {listed(targets)}"
+                f"{view_label(number, views)} names target {view.target!r}, which is not there: {choices(targets)}"
             )
     points = [(i, entry.points) for i, entry in enumerate(data.views) if entry.points is not None]
     curves = [(i, entry.curves) for i, entry in enumerate(data.views) if entry.curves is not None]
     point_index = {name: {f: i for i, f in enumerate(target.point_names)} for name, target in targets.items()}
     curve_index = {name: {f: i for i, f in enumerate(target.curve_names)} for name, target in targets.items()}
-    sides = [_sides(entry, place_of(i, views)) for i, entry in curves]
-    return Content(
-        targets,
-        sizes,
-        views,
-        Points(**_columns(points, views, point_index, "point")),
-        Curves(**_columns(curves, views, curve_index, "curve"), side=_concatenate(sides, np.int8)),
-        priors,
+    sides = [_sides(entry, view_label(i, views)) for i, entry in curves]
+    return header._replace(
+        points=Points(**_columns(points, views, point_index, "point")),
+        curves=Curves(**_columns(curves, views, curve_index, "curve"), side=_concatenate(sides, np.int8)),
     )
 
 
@@ -194,7 +176,7 @@ def _concatenate(parts: Sequence[Any], dtype: Any) -> AnyArray:
 
 
 def _columns(
-    entries: Sequence[tuple[int, _PointsFile | _CurvesFile]],
+    entries: Sequence[tuple[int, _PointsFile]],
     views: Sequence[View],
     index: Mapping[str, Mapping[str, int]],
     kind: str,
@@ -203,7 +185,7 @@ def _columns(
     view, feature, sigma = [], [], []
     pixels: list[tuple[float, float]] = []
     for number, entry in entries:
-        here, count = place_of(number, views), len(entry.features)
+        here, count = view_label(number, views), len(entry.features)
         if len(entry.pixels) != count:
             raise InputError(f"{here}: {count} {kind} features but {len(entry.pixels)} pixels")
         names = index[views[number].target]
@@ -228,7 +210,8 @@ def _columns(
 
 
 def _sides(entry: _CurvesFile, here: str) -> list[int]:
-    names = entry.side if isinstance(entry.side, list) else [entry.side] * len(entry.features)
+    side = entry.side or "centre"
+    names = side if isinstance(side, list) else [side] * len(entry.features)
     if len(names) != len(entry.features):
         raise InputError(f"{here}: {len(entry.features)} curve features but {len(names)} sides")
     for name in names:
@@ -243,27 +226,37 @@ def _same_or_list(values: AnyArray) -> Any:
 
 def _to_json(content: Content) -> bytes:
     data = header_of(content)
-    for kind, column in (("points", content.points), ("curves", content.curves)):
-        order = np.argsort(column.view, kind="stable")
-        bounds = np.searchsorted(column.view[order], np.arange(len(content.views) + 1))
-        for number, entry in enumerate(data["views"]):
-            rows = order[bounds[number] : bounds[number + 1]]
-            if not len(rows):
-                continue
-            target = content.targets[entry["target"]]
-            names = target.point_names if kind == "points" else target.curve_names
-            entry[kind] = {
-                "features": [names[i] for i in column.feature[rows]],
-                "pixels": column.pixels[rows].tolist(),
-                "sigma_px": _same_or_list(column.sigma_px[rows]),
-            }
-            if isinstance(column, Curves) and np.any(column.side[rows]):
-                side = _same_or_list(column.side[rows])
-                entry[kind]["side"] = [_SIDE_NAMES[s] for s in side] if isinstance(side, list) else _SIDE_NAMES[side]
-    views = data.pop("views")
-    head = msgspec.json.format(msgspec.json.encode(data), indent=1).rstrip(b"}\n")
-    lines = b",\n  ".join(msgspec.json.encode(entry) for entry in views)
+    for rows, entry in zip(_rows_by_view(content.points, len(data.views)), data.views, strict=True):
+        if len(rows):
+            entry.points = _PointsFile(*_features(content.points, rows, content.targets[entry.target].point_names))
+    for rows, entry in zip(_rows_by_view(content.curves, len(data.views)), data.views, strict=True):
+        if len(rows):
+            side = _side_names(content.curves.side[rows])
+            names = content.targets[entry.target].curve_names
+            entry.curves = _CurvesFile(*_features(content.curves, rows, names), side)
+    plain = msgspec.structs.asdict(data)
+    del plain["views"]
+    head = msgspec.json.format(msgspec.json.encode(plain), indent=1).rstrip(b"}\n")
+    lines = b",\n  ".join(msgspec.json.encode(entry) for entry in data.views)
     return head + b',\n "views": [\n  ' + lines + b"\n ]\n}\n"
+
+
+def _rows_by_view(columns: Points | Curves, views: int) -> list[AnyArray]:
+    order = np.argsort(columns.view, kind="stable")
+    return np.split(order, np.searchsorted(columns.view[order], np.arange(1, views)))
+
+
+def _features(columns: Points | Curves, rows: AnyArray, names: Sequence[str]) -> tuple[Any, Any, Any]:
+    """Names, pixels and sigmas as files have them."""
+    features = [names[i] for i in columns.feature[rows]]
+    return features, columns.pixels[rows].tolist(), _same_or_list(columns.sigma_px[rows])
+
+
+def _side_names(sides: Codes) -> str | list[str] | msgspec.UnsetType:
+    if not np.any(sides):
+        return msgspec.UNSET
+    side = _same_or_list(sides)
+    return [_SIDE_NAMES[s] for s in side] if isinstance(side, list) else _SIDE_NAMES[side]
 
 
 def _to_npz(content: Content) -> bytes:
@@ -290,7 +283,7 @@ def _arrays(content: bytes, where: str) -> dict[str, AnyArray]:
 
 def _taken(arrays: dict[str, AnyArray], kind: str, names: Sequence[str], where: str) -> dict[str, Any]:
     """The columns of one kind, taken out of the arrays."""
-    found = {}
+    columns = {}
     for name in names:
         array, dtype, ndim = arrays.pop(f"{kind}_{name}", None), np.dtype(TYPES[name]), 2 if name == "pixels" else 1
         if array is None:
@@ -299,21 +292,20 @@ def _taken(arrays: dict[str, AnyArray], kind: str, names: Sequence[str], where: 
             raise InputError(
                 f"{where}: column {kind}_{name} must be {dtype} in {ndim} dimensions, not {array.dtype} in {array.ndim}"
             )
-        found[name] = array
-    return found
+        columns[name] = array
+    return columns
 
 
-def _from_npz(content: bytes, where: str) -> Content:
-    arrays = _arrays(content, where)
+def _from_npz(packed: bytes, where: str) -> Content:
+    arrays = _arrays(packed, where)
     header = arrays.pop("header", None)
     if header is None or header.dtype != np.uint8:
         raise InputError(f"{where}: no header: this is not a file of observations")
     plain = check_header(parse_json(header.tobytes(), where), where, FORMAT, VERSION)
-    typed = convert(plain, _ObservationsFile, where)
-    targets, cameras, priors = _read_header(plain)
+    content = convert(plain, _ObservationsFile, where).content()
     names = ("view", "feature", "pixels", "sigma_px")
     points = Points(**_taken(arrays, "points", names, where))
     curves = Curves(**_taken(arrays, "curves", (*names, "side"), where))
     if arrays:
         raise InputError(f"{where}: unknown column {min(arrays)!r}")
-    return Content(targets, cameras, tuple(_view(entry) for entry in typed.views), points, curves, priors)
+    return content._replace(points=points, curves=curves)

@@ -16,7 +16,7 @@ import msgspec
 import numpy as np
 
 from ceres_cal.base.errors import InputError
-from ceres_cal.observations.columns import Columns, Curves, Points, Prior, View, listed, place_of
+from ceres_cal.observations.columns import Columns, Curves, Points, Prior, View, choices, view_label
 from ceres_cal.observations.files import Content, header_of, read_content, write_content
 from ceres_cal.scene.targets import Target
 
@@ -96,8 +96,8 @@ class Observations:
     @cached_property
     def shown_views(self) -> tuple[View, ...]:
         """The views with observations; what the others name is not there for the solve."""
-        shown = sum(np.bincount(column.view, minlength=len(self.views)) for column in (self.points, self.curves))
-        return tuple(self.views[number] for number in np.flatnonzero(shown))
+        counts = sum(np.bincount(column.view, minlength=len(self.views)) for column in (self.points, self.curves))
+        return tuple(self.views[number] for number in np.flatnonzero(counts))
 
     @property
     def stations(self) -> dict[str, str]:
@@ -125,11 +125,11 @@ class Observations:
         owner: dict[str, str] = {}
         placed: dict[str, str] = {}
         for number, view in enumerate(self.views):
-            here = place_of(number, self.views)
+            here = view_label(number, self.views)
             if view.camera not in self.cameras:
-                raise InputError(f"{here} names camera {view.camera!r}, which is not there: {listed(self.cameras)}")
+                raise InputError(f"{here} names camera {view.camera!r}, which is not there: {choices(self.cameras)}")
             if view.target not in self.targets:
-                raise InputError(f"{here} names target {view.target!r}, which is not there: {listed(self.targets)}")
+                raise InputError(f"{here} names target {view.target!r}, which is not there: {choices(self.targets)}")
             if owner.setdefault(view.station, view.camera) != view.camera:
                 raise InputError(f"{here}: station {view.station!r} belongs to camera {owner[view.station]!r} already")
             if view.placement is not None and placed.setdefault(view.placement, view.target) != view.target:
@@ -154,7 +154,7 @@ class Observations:
         known = np.array([len(target.points if kind == "point" else target.curves) for target in targets])
         if np.any(wrong := (column.feature < 0) | (column.feature >= known[column.view])):
             row = int(np.argmax(wrong))
-            here, target = place_of(column.view[row], self.views), self.views[column.view[row]].target
+            here, target = view_label(column.view[row], self.views), self.views[column.view[row]].target
             raise InputError(
                 f"{here}: {kind} feature number {column.feature[row]} is unknown in target {target!r}, "
                 f"which has {known[column.view[row]]}"
@@ -170,14 +170,14 @@ class Observations:
         ):
             if np.any(bad):
                 row = int(np.argmax(bad))
-                here = place_of(column.view[row], self.views)
+                here = view_label(column.view[row], self.views)
                 raise InputError(f"{here}, {kind} {self.feature_name(kind, row)!r}: {what}: correct or remove it")
 
     def require_owner(self, prior: Prior) -> None:
         """Raise InputError where a prior names a camera or station that is not there."""
         names: Iterable[str] = self.cameras if prior.owner == "camera" else self.stations
         if prior.name not in names:
-            raise InputError(f"a prior names {prior.owner} {prior.name!r}, which is not there: {listed(names)}")
+            raise InputError(f"a prior names {prior.owner} {prior.name!r}, which is not there: {choices(names)}")
 
 
 def combine(parts: Sequence[Observations]) -> Observations:

@@ -1,7 +1,15 @@
-"""Sights: what one camera at one station sees of one rigid frame, gathered over all its views.
+"""Sights: the observations as the method takes them, sorted by the pose that they depend on.
 
-The frame is the world or a placement. A static camera's many frames of a field are one sight; each board frame is one
-of its own. Rows are kept so that residuals find their way back to the observations' permanent ids.
+A view is what one frame shows of one target. A *sight* is what one camera at one station sees of one rigid frame, over
+all its views; the frame is the world or a placement. All observations of a sight are projected by one pose,
+cam_from_frame, so a sight is a block of rows of the least-squares problem: a static camera's thousand frames of a field
+are one sight, a board held at twenty places is twenty. Nearly everything that follows runs over sights, and rows are
+kept so that residuals find their way back to the observations' permanent ids.
+
+Features are numbered in two ways. Observations number them within their target, in the order of its names (`feature` of
+`Points` and `Curves`). Sights number them across all targets, one target after the other: `point_index` is a row of all
+points; `track_index` is a row of all tracks, three sets for each target: of the curves' centres, of their left borders
+and of their right ones.
 """
 
 from __future__ import annotations
@@ -18,6 +26,7 @@ from numpy.typing import ArrayLike
 from ceres_cal.base.arrays import AnyArray, Array, Indices, Indices32, Mask
 from ceres_cal.observations import Columns, Observations
 from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.curves import nearest_to_rays
 
 _BLOCK = 1 << 16  # rows worked on at once: memory stays small beside the observations
 
@@ -40,24 +49,24 @@ class Sights(Sequence["Sights"]):
     Attributes:
         keys: of each of the S sights. views: numbers of the views that each sight gathers.
         point_bounds: (S + 1,) where each sight's points begin. point_rows: (N,) rows of the observations' columns.
-        feature: (N,) number of each point among those of all targets. points: (N, 3) m in the sight's frame.
+        point_index: (N,) number among the points of all targets. points: (N, 3) m in the sight's frame.
         pixels: (N, 2). sigma_px: (N,).
         curve_bounds, curve_rows, curve_pixels, curve_sigma_px: the same of the M curve observations.
-        track: (M,) index into tracks (T, 3, 3) and is_arc (T,): every curve and side of every target (see
-            `targets.along_track`).
+        track_index: (M,) number among tracks (T, 3, 3) and is_arc (T,): every side and curve of every target (see
+            `curves.along_track`).
     """
 
     keys: tuple[SightKey, ...]
     views: tuple[tuple[int, ...], ...]
     point_bounds: Indices
     point_rows: Indices
-    feature: Indices
+    point_index: Indices
     points: Array
     pixels: Array
     sigma_px: Array
     curve_bounds: Indices
     curve_rows: Indices
-    track: Indices32
+    track_index: Indices32
     curve_pixels: Array
     curve_sigma_px: Array
     tracks: Array
@@ -92,6 +101,11 @@ class Sights(Sequence["Sights"]):
         """Placements that a single one of the sights shows."""
         times = Counter([key.placement for key in self.keys])
         return frozenset(name for name, count in times.items() if count == 1)
+
+    @property
+    def on_arc(self) -> Mask:
+        """(M,) whether each curve observation is one of an arc, not of a straight line."""
+        return np.asarray(self.is_arc[self.track_index])
 
     @property
     def equations(self) -> int:
@@ -188,13 +202,13 @@ class Sights(Sequence["Sights"]):
             tuple(self.views[i] for i in numbers),
             bounds_of(point_sizes),
             _at(self.point_rows, p),
-            _at(self.feature, p),
+            _at(self.point_index, p),
             _at(self.points, p),
             _at(self.pixels, p),
             _at(self.sigma_px, p),
             bounds_of(curve_sizes),
             _at(self.curve_rows, c),
-            _at(self.track, c),
+            _at(self.track_index, c),
             _at(self.curve_pixels, c),
             _at(self.curve_sigma_px, c),
             self.tracks,
@@ -238,21 +252,21 @@ def gather_sights(observations: Observations) -> Sights:
     points, curves = observations.points, observations.curves
     p, point_bounds = _grouped(points, sight_of_view, len(order))
     c, curve_bounds = _grouped(curves, sight_of_view, len(order))
-    feature = first_point[points.view[p]] + points.feature[p]
+    point_index = first_point[points.view[p]] + points.feature[p]
     side = curves.side[c] % 3  # -1 is the last of a target's three sets of tracks
-    track = first_track[curves.view[c]] + side * curve_count[curves.view[c]] + curves.feature[c]
+    track_index = first_track[curves.view[c]] + side * curve_count[curves.view[c]] + curves.feature[c]
     every = Sights(
         tuple(order),
         tuple(tuple(views) for views in views_of),
         point_bounds,
         np.arange(len(points))[p],
-        feature,
-        np.concatenate([t.point_array for t in targets]).take(feature, axis=0),
+        point_index,
+        np.concatenate([t.point_array for t in targets]).take(point_index, axis=0),
         _at(points.pixels, p),
         _at(points.sigma_px, p),
         curve_bounds,
         np.arange(len(curves))[c],
-        track.astype(np.int32),
+        track_index.astype(np.int32),
         _at(curves.pixels, c),
         _at(curves.sigma_px, c),
         np.concatenate([t.tracks.reshape(-1, 3, 3) for t in targets]),
@@ -271,7 +285,7 @@ def _grouped(columns: Columns, sight_of_view: Indices, count: int) -> tuple[Indi
     return order, np.searchsorted(sight[order], np.arange(count + 1))
 
 
-def nearest_places(sight: Sights, camera: Camera) -> Array:
+def nearest_feet(sight: Sights, camera: Camera) -> Array:
     """Where on its track each curve observation's ray passes nearest, (M,): the start of the search for the foot.
 
     `camera` stands in the frame of the single sight (cam_from_frame). Where the lens has no ray the track's origin is
@@ -283,14 +297,5 @@ def nearest_places(sight: Sights, camera: Camera) -> Array:
 
 def _nearest(sight: Sights, camera: Camera, rows: slice) -> Array:
     rays = np.nan_to_num(camera.rays(sight.curve_pixels[rows]) @ camera.cam_from_world.rotation)
-    track = sight.track[rows]
-    tracks, is_arc = sight.tracks[track], sight.is_arc[track]
-    c, a = tracks[:, 0], tracks[:, 1]
-    away = camera.position - c
-    # Arc: where the ray meets the arc's plane. Segment: the common perpendicular of ray and line.
-    with np.errstate(divide="ignore", invalid="ignore"):
-        on_plane = away - (away[:, 2] / rays[:, 2])[:, None] * rays
-        turned = np.arctan2(on_plane[:, 1], on_plane[:, 0])
-        aa, ar, rr = np.sum(a * a, 1), np.sum(a * rays, 1), np.sum(rays * rays, 1)
-        straight = (np.sum(a * away, 1) * rr - np.sum(rays * away, 1) * ar) / (aa * rr - ar * ar)
-    return np.nan_to_num(np.where(is_arc, turned, straight), posinf=0.0, neginf=0.0)
+    track = sight.track_index[rows]
+    return nearest_to_rays(sight.tracks[track], sight.on_arc[rows], camera.position, rays)

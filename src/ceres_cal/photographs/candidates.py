@@ -11,18 +11,21 @@ from ceres_cal.base.arrays import Array32
 from ceres_cal.base.transforms import Pose, rotation_log
 from ceres_cal.detect.registration import nearness_to
 from ceres_cal.detect.strokes import drawn, find_strokes
-from ceres_cal.photographs.facing import turns_of
 from ceres_cal.photographs.grid import Grid, grid_of, offsets_of
 from ceres_cal.photographs.matching import FloorLines, Match, StrokeMap, lines_seen, match
 from ceres_cal.photographs.upright import Upright, find_upright
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Radial
+from ceres_cal.scene.symmetry import turns_of
 from ceres_cal.scene.targets import Target
 
 _UPRIGHTS = 4  # answers for lens and tilt, at most, that are matched
-_SURE = 0.88  # the score of a match after which no other lens and tilt is tried
+# The score of a match after which no other lens and tilt is tried: it only saves time. Nothing changes from 0.79 to
+# 0.94.
+_SURE = 0.88
 _POWERS = (2, 3, 4, 5)
-_COMPARABLE, _ALIKE = 0.75, 0.9  # of the best match's score: another's, and that of another way to take the picture
+# Of the best match's score: another's, and that of another way to take the picture. Nothing changes from 0.6 to 0.86.
+_COMPARABLE, _ALIKE = 0.75, 0.9
 _MOST, _MOST_ALIKE = 3, 5
 _SAME_PLACE, _SAME_TURN = 0.08, 0.1  # in heights, rad
 

@@ -23,12 +23,14 @@ from ceres_cal.start.closed_forms import homography_from_points, orthogonality_e
 from ceres_cal.start.initialise import USUAL_PHI, USUAL_PHI_FACTOR
 
 FORMAT, VERSION = "ceres-cal/corners", 1
+# How far off a click on a corner is, twice as far as a careful one. Nothing changes from half to double.
 SIGMA_PX = 15.0
 FEWEST = 4
 _STRETCHES = (1.0, 1.06, 1.14, 1.25, 1.4)  # of the image's corner by the lens
 _PHI = np.geomspace(0.5, 3.0, 40)  # in half image diagonals
 _FREED = ("a3", "phi", "a2", "cx", "cy", "a4", "a5")
-_SQUARE = 0.02  # how square clicks are good to make the axes
+# How square clicks are good to make the axes. Nothing changes from half to double.
+_SQUARE = 0.02
 
 
 @dataclass(frozen=True)

@@ -9,9 +9,11 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.transforms import Pose, rotation_exp, rotation_log
+from ceres_cal.base.transforms import rotation_log
 from ceres_cal.scene.camera import Camera
-from ceres_cal.scene.targets import Arc, Target, along_track, nearest_on_track
+from ceres_cal.scene.curves import curve_points
+from ceres_cal.scene.symmetry import middle_of, size_of
+from ceres_cal.scene.targets import Target
 
 SIDES = {
     "left": (-1.0, 0.0),
@@ -23,11 +25,12 @@ SIDES = {
     "bottom-left": (-1.0, 1.0),
     "bottom-right": (1.0, 1.0),
 }
-_FACES = 0.3  # cosine of the angle between a side of the picture and a feature that lies towards it, at least
-_AS_WELL = 0.2  # a cosine less by no more than this is no worse
-_NEARER_DEG = 30.0  # by which an old calibration must be nearer to one turn than to the next
-_MOST_TURNS = 12
-_SAME_M = 1e-6
+# Cosine of the angle between a side of the picture and a feature that lies towards it, at least: within 73 degrees.
+_FACES = 0.3
+# A cosine less by no more than this is no worse.
+_AS_WELL = 0.2
+# By which an old calibration must be nearer to one turn than to the next: quarters are 90 degrees apart.
+_NEARER_DEG = 30.0
 _MIDDLE = 0.02  # of the target's size: nearer to its middle a feature lies on no side
 
 
@@ -49,31 +52,16 @@ class Facing:
             raise InputError(f"facing {self.feature}={self.side}: a side of the picture is one of {', '.join(SIDES)}")
 
 
-def turns_of(target: Target, curves: Collection[str]) -> list[Pose]:
-    """The turns about the upright through its middle that put the painted curves onto themselves; the first is none."""
-    middle, samples = _middle(target, curves), _samples(target, curves)
-    for count in range(_MOST_TURNS, 1, -1):
-        turn = _turn(2.0 * np.pi / count, middle)
-        if _all_on(target, curves, turn.transform(samples)):
-            return [_turn(2.0 * np.pi * number / count, middle) for number in range(count)]
-    return [Pose.identity()]
-
-
-def _turn(angle_rad: float, middle: Array) -> Pose:
-    rotation = rotation_exp([0.0, 0.0, angle_rad])
-    return Pose(rotation, middle - rotation @ middle)
-
-
 def require_sides(facings: Sequence[Facing], target: Target, curves: Collection[str]) -> None:
     """Raise InputError for a feature that the target does not have, or that lies in its middle."""
-    size = float(np.max(np.ptp(_samples(target, curves), axis=0)))
+    size, middle = size_of(target, curves), middle_of(target, curves)[:2]
     for one in facings:
         if one.feature not in target.points and one.feature not in target.curves:
             raise InputError(
                 f"facing {one.feature}={one.side}: the target has no line, arc or point {one.feature!r}: "
                 "`ceres-cal targets` lists the names"
             )
-        if np.linalg.norm(_place(one.feature, target) - _middle(target, curves)[:2]) < _MIDDLE * size:
+        if np.linalg.norm(_place(one.feature, target) - middle) < _MIDDLE * size:
             raise InputError(
                 f"facing {one.feature}={one.side}: {one.feature} lies in the middle of the field, towards no side: "
                 "name another line or point"
@@ -82,7 +70,7 @@ def require_sides(facings: Sequence[Facing], target: Target, curves: Collection[
 
 def facing_cosine(facing: Facing, camera: Camera, target: Target, curves: Collection[str]) -> float:
     """Cosine of the angle, on the floor, between the side of the picture and the way from the middle to the feature."""
-    way = _place(facing.feature, target) - _middle(target, curves)[:2]
+    way = _place(facing.feature, target) - middle_of(target, curves)[:2]
     x, y = SIDES[facing.side]
     towards = (x * camera.cam_from_world.rotation[0] + y * camera.cam_from_world.rotation[1])[:2]
     return float(way @ towards / np.linalg.norm(way) / max(float(np.linalg.norm(towards)), 1e-9))
@@ -115,46 +103,12 @@ def side_of(feature: str, camera: Camera, target: Target, curves: Collection[str
 
 def distinguishing_feature(target: Target, curves: Collection[str]) -> str:
     """The painted curve whose middle lies farthest from the target's: to say by it which way round the target is."""
-    middle = _middle(target, curves)[:2]
+    middle = middle_of(target, curves)[:2]
     return max(curves, key=lambda name: round(float(np.linalg.norm(_place(name, target) - middle)), 6))
-
-
-# ---- geometry -------------------------------------------------------------------------------------------------------
 
 
 def _place(feature: str, target: Target) -> Array:
     """(2,) a point, or the middle of a curve."""
     if feature in target.points:
         return np.array(target.points[feature][:2])
-    curve = target.curves[feature]
-    return np.asarray(along_track(curve.track(), isinstance(curve, Arc), np.linspace(*curve.parameter_range, 3))[1, :2])
-
-
-def _samples(target: Target, curves: Collection[str]) -> Array:
-    """(N, 3) places on the painted curves."""
-    parts = []
-    for name, curve in target.curves.items():
-        if name in curves and curve.width_m > 0.0:
-            s = np.linspace(*curve.parameter_range, 33)
-            parts.append(along_track(curve.track(), isinstance(curve, Arc), s))
-    return np.concatenate(parts)
-
-
-def _middle(target: Target, curves: Collection[str]) -> Array:
-    samples = _samples(target, curves)
-    return np.asarray(0.5 * (samples.min(axis=0) + samples.max(axis=0)))
-
-
-def _all_on(target: Target, curves: Collection[str], places: Array) -> bool:
-    """Whether every place (N, 3) lies on a painted curve."""
-    nearest = np.full(len(places), np.inf)
-    for name, curve in target.curves.items():
-        if name not in curves or curve.width_m <= 0.0:
-            continue
-        is_arc, (low, high) = isinstance(curve, Arc), curve.parameter_range
-        tracks = np.broadcast_to(curve.track(), (len(places), 3, 3))
-        foot = nearest_on_track(tracks, np.full(len(places), is_arc), places)
-        foot = low + np.mod(foot - low, 2.0 * np.pi) if is_arc else foot
-        there = along_track(tracks, is_arc, np.clip(foot, low, high))
-        nearest = np.minimum(nearest, np.linalg.norm(places - there, axis=1))
-    return bool(np.max(nearest) < _SAME_M * max(1.0, float(np.max(np.abs(places)))))
+    return np.asarray(curve_points(target.curves[feature], 0, 2)[1, :2])

@@ -14,7 +14,7 @@ from ceres_cal.base.progress import ImageProgress
 from ceres_cal.detect.crossings import find_crossings
 from ceres_cal.detect.images import read_grey
 from ceres_cal.detect.lines import Lines
-from ceres_cal.observations import Curves, Observations, Points, View, combine, no_points
+from ceres_cal.observations import NO_POINTS, Curves, Observations, Points, View, combine
 from ceres_cal.photographs.clicks import Clicks, starts_from_clicks
 from ceres_cal.photographs.follow import Followed, FreeIntrinsics, follow
 from ceres_cal.photographs.judgement import why_missed
@@ -151,7 +151,7 @@ def _starts(
 def _observations(frame: str, followed: Followed, target: Target, options: FieldOptions) -> Observations:
     """One image's view: what its lines and crossings are, each pixel counted once."""
     camera, lines = followed.camera, followed.lines
-    points, used = no_points(), np.zeros(len(lines.found), dtype=bool)
+    points, used = NO_POINTS, np.zeros(len(lines.found), dtype=bool)
     if options.points:
         met = find_crossings(target, camera, lines)
         points, used = Points(np.zeros(len(met.feature), np.int32), met.feature, met.pixels, met.sigma_px), met.used

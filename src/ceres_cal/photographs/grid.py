@@ -9,8 +9,9 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.errors import InputError
-from ceres_cal.photographs.facing import turns_of
-from ceres_cal.scene.targets import Arc, Segment, Target, along_track
+from ceres_cal.scene.curves import Arc, Segment, curve_points
+from ceres_cal.scene.symmetry import turns_of
+from ceres_cal.scene.targets import Target
 
 _AXIS = 1e-6  # sine of the angle to the main direction of a line that is parallel to it
 _DIGITS = 6  # of metres, after which two offsets are one
@@ -54,9 +55,9 @@ def places_along(grid: Grid, count: int) -> Places:
     spacing = sum(curve.length_m for curve in painted) / count
     places, first = [], []
     for curve in painted:
-        s = np.linspace(*curve.parameter_range, max(int(curve.length_m / spacing), 2) + 1)
-        places.append(along_track(curve.track(), isinstance(curve, Arc), s)[:, :2] @ grid.turn)
-        first.append(np.arange(len(s)) == 0)
+        there = curve_points(curve, 0, max(int(curve.length_m / spacing), 2))
+        places.append(there[:, :2] @ grid.turn)
+        first.append(np.arange(len(there)) == 0)
     return Places(np.concatenate(places).astype(np.float32), np.concatenate(first))
 
 

@@ -13,12 +13,20 @@ from ceres_cal.scene.targets import Target
 from ceres_cal.start.initialise import PHI_RANGE
 
 _COURSE_PX = 3.0
-_NEAR_PX = 6.0  # of the target: a stroke that lies on it
-_EXPLAINED = 0.8  # of the strokes inside the target's outline, the share that must lie on it
+# Of the target: a stroke that lies on it. Wide paint's edge is that far from its middle. Nothing changes from half to
+# double.
+_NEAR_PX = 6.0
+# Of the strokes inside the target's outline, the share that must lie on it. Nothing changes from 0.67 to 0.89.
+_EXPLAINED = 0.8
 _RIM = 0.02  # of its size
-_FEWEST_PLACES, _FEWEST_CURVES = 5, 3  # found on a curve, and curves of which so many were
-_LEAST_UPRIGHT = 0.42  # cosine of the tilt: 65 degrees
-_SAME_FLOOR = 0.1  # of the extent of what is seen
+# Found on a curve, and curves of which so many were: fewer could be any lines. Nothing changes from half to double.
+_FEWEST_PLACES, _FEWEST_CURVES = 5, 3
+# Cosine of the tilt: 65 degrees, 20 more than is promised. Nothing changes at half of it; at double, 33 degrees,
+# tilted views are missed.
+_LEAST_UPRIGHT = 0.42
+# Of the extent of what is seen: cameras that put it nearer together than that name it alike. Nothing changes from
+# half to double.
+_SAME_FLOOR = 0.1
 
 
 def why_missed(followed: Followed, target: Target, *, started: bool) -> str:

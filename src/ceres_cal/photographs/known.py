@@ -78,7 +78,7 @@ def detect_known(
     paths, posed = [Path(path) for path in images], calibration.station(station)
     name = station or next(iter(calibration.stations))
     names = calibration.estimate.stations[name].camera, name
-    wanted = {what: t for what, t in calibration.targets.items() if is_painted(t) or (boards and _is_board(t))}
+    wanted = {what: t for what, t in calibration.targets.items() if is_painted(t) or (boards and _is_chessboard(t))}
     if not wanted:
         raise InputError(
             f"the calibration's targets ({', '.join(calibration.targets)}) have no painted lines"
@@ -149,8 +149,8 @@ def is_painted(target: Target) -> bool:
     return any(curve.width_m > 0.0 for curve in target.curves.values())
 
 
-def _is_board(target: Target) -> bool:
-    return target.kind == "checkerboard"
+def _is_chessboard(target: Target) -> bool:
+    return target.grid is not None and target.grid.checkered
 
 
 def _counted(images: int) -> str:

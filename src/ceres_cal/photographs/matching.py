@@ -19,13 +19,17 @@ from ceres_cal.detect.strokes import Strokes
 from ceres_cal.photographs.grid import Grid, Places, places_along
 from ceres_cal.photographs.upright import Upright
 
-_PEAK = 0.012  # of lines on the floor, in camera heights
+# Of lines on the floor, in camera heights: how well a straightened stroke tells its place.
+_PEAK = 0.012
 _MOST_PEAKS, _LEAST_PEAK = 9, 0.015  # of lines in one direction; of all strokes, in one line
-_PARALLEL = 0.15  # sine of the angle by which a stroke may be off the direction of its line
-_CELL = 0.03  # within which two hypotheses are one, in camera heights
+# Sine of the angle by which a stroke may be off the direction of its line: 9 degrees, as lens and tilt are rough yet.
+_PARALLEL = 0.15
+# Within which two hypotheses are one, in camera heights.
+_CELL = 0.03
 _FEW, _MANY = 60, 300  # places on the target at which all, and the best, are tried
 _KEPT = 800
-_LEAST_IN_VIEW = 0.03  # of the places on the target: a camera nearer than that sees too little of it
+# Of the places on the target: a camera nearer than that sees too little of it.
+_LEAST_IN_VIEW = 0.03
 _BLOCK = 2000
 _QUARTERS = np.array([[[c, -s, 0], [s, c, 0], [0, 0, 1]] for c, s in ((1, 0), (0, 1), (-1, 0), (0, -1))], dtype=float)
 

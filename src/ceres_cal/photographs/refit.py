@@ -11,7 +11,7 @@ from ceres_cal.base.errors import CalibrationError
 from ceres_cal.model.parameters import Estimate, Layout, Options, Station, intrinsic_names
 from ceres_cal.model.priors import stated_prior
 from ceres_cal.model.structure import make_structure
-from ceres_cal.observations import Curves, Observations, Points, Prior, View, no_points
+from ceres_cal.observations import NO_POINTS, Curves, Observations, Points, Prior, View
 from ceres_cal.observations.sights import gather_sights
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.targets import Target
@@ -40,7 +40,7 @@ def observations_of(
 ) -> Observations:
     """One view of a field in the world: pixels (N, 2) on curves (N,), and points."""
     count = len(curve)
-    points = no_points()
+    points = NO_POINTS
     if hints is not None:
         points = Points(np.zeros(len(hints.feature), np.int32), hints.feature, hints.pixels, hints.sigma_px)
     return Observations(

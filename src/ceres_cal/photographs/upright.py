@@ -22,16 +22,20 @@ from ceres_cal.start.initialise import USUAL_PHI, USUAL_PHI_FACTOR
 BENDS = (0.05, -0.05, -0.15, -0.25, -0.35, -0.45)
 PHIS = (0.8, 1.15, 1.6)
 _USUAL_BEND, _BEND_SIGMA = -0.15, 0.2
-_USUAL_TILT = 0.5  # rad
-_PRIOR_WEIGHT = 0.03  # of all strokes, at one standard deviation
+# rad: a standard deviation of the tilts that cameras over fields have.
+_USUAL_TILT = 0.5
+# Of all strokes, at one standard deviation: it decides only where strokes do not.
+_PRIOR_WEIGHT = 0.03
 _RINGS_DEG = ((0.0, 1), (11.0, 6), (22.0, 12), (33.0, 16), (44.0, 20), (54.0, 24))  # tilt, directions of it
 _ROLL_DEG = 5.0
 _ROUGH, _FINE = 0.06, 0.015  # sine of the angle by which a stroke may be off
 _ROUNDS = 12
-_LEAST_SHARE = 0.06  # of the strokes, in the direction that has fewer
+# Of the strokes, in the direction that has fewer: a floor needs both.
+_LEAST_SHARE = 0.06
 _DOWN = np.diag([1.0, -1.0, -1.0])
 _FROM_EACH, _REFINED = 2, 14  # of each lens and focal length, and of all
-_APART = 0.1  # of two answers' uprights, rad
+# Of two answers' uprights, rad: nearer ones count as one.
+_APART = 0.1
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,6 @@ from ceres_cal.calibration import Calibration
 from ceres_cal.observations import Observations
 from ceres_cal.pictures.model import Model, model_seen
 from ceres_cal.pictures.overlay import TAKEN_OUT, USED, Marks
-from ceres_cal.scene.targets import MOVABLE
 
 Shown = tuple[tuple[str, str | None], ...]
 """Target and placement of each thing that a frame shows."""
@@ -53,7 +52,7 @@ def frame_by_name(calibration: Calibration, station: str, name: str) -> Frame:
     Raises:
         InputError: there is neither.
     """
-    movable = [target for target, one in calibration.targets.items() if one.kind in MOVABLE]
+    movable = [target for target, one in calibration.targets.items() if one.movable]
     shown: list[tuple[str, str | None]] = [(target, None) for target in calibration.targets if target not in movable]
     if name in calibration.placements and len(movable) == 1:
         shown.append((movable[0], name))

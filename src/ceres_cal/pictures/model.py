@@ -12,7 +12,8 @@ from ceres_cal.base.transforms import Pose
 from ceres_cal.model.parameters import Estimate
 from ceres_cal.model.structure import Built
 from ceres_cal.scene.camera import Camera, in_image
-from ceres_cal.scene.targets import Target, along_track
+from ceres_cal.scene.curves import along_track
+from ceres_cal.scene.targets import Target
 
 _STEPS = 240  # along a curve
 _BETWEEN = 12  # steps from one corner of a board to the next
@@ -92,8 +93,8 @@ def _lines(built: Built, camera: Camera) -> Iterator[Line]:
         width = np.linalg.norm(left - right, axis=1)[in_image(middle, camera.image_size)]
         wide = len(width) > 0 and float(np.median(width)) >= _WIDE_PX
         yield Line(middle, (left, right) if wide else ())
-    if target.kind == "checkerboard":
-        grid = built.points.reshape(int(target.spec["rows"]), -1, 3)
+    if target.grid is not None:
+        grid = built.points.reshape(target.grid.rows, -1, 3)
         yield from (Line(camera.project(_between(row))) for row in (*grid, *grid.swapaxes(0, 1)))
 
 

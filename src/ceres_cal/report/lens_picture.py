@@ -39,8 +39,8 @@ def distortion(material: Material, name: str) -> Figure:
     ideal = ideal_radii(camera, radii)
     seen = table.radius_px[material.of_camera(name) & table.inlier]
     reach = float(seen.max()) if len(seen) else 0.0
-    polynomial = {"radial": "r' = r + " + " + ".join(powered(f"a{p}r^{p}") for p in camera.lens.radius_powers)}
-    model = polynomial.get(camera.lens.kind, f"the {camera.lens.kind} lens")
+    terms = [powered(term) for term in camera.lens.formula.split(" ")]
+    model = " ".join(terms) if camera.lens.formula else f"the {camera.lens.kind} lens"
 
     def draw(axes: Axes, width_in: float) -> None:
         axes.plot(radii, radii, color=QUIET, linewidth=0.9, dashes=(4, 3), label="no distortion")

@@ -17,7 +17,6 @@ from ceres_cal.report.canvas import INK, OUTLIER, QUIET, RAMP, Drawing
 from ceres_cal.report.material import Material, image_border, paint_of
 from ceres_cal.report.page import Figure, Table
 from ceres_cal.scene.heights import at_height
-from ceres_cal.scene.targets import MOVABLE
 from ceres_cal.uncertainty import FieldMap
 
 if TYPE_CHECKING:
@@ -184,7 +183,7 @@ def evenly(count: int, most: int) -> list[int]:
 def comparison_svg(comparison: StationComparison, before: Calibration) -> str:
     """The map of one station's differences as a file of its own, over the field as the first calibration sees it."""
     camera = before.stations[comparison.station]
-    fields = [target for target in before.targets.values() if target.kind not in MOVABLE]
+    fields = [target for target in before.targets.values() if not target.movable]
     where = at_height(comparison.height_m)
     map_drawing = MapDrawing(
         comparison.x_m,

@@ -19,10 +19,11 @@ from ceres_cal.model.residuals import residuals
 from ceres_cal.observations.sights import gather_sights
 from ceres_cal.report.quality import Quality, Seam
 from ceres_cal.scene.camera import Camera
-from ceres_cal.scene.targets import Target, along_track
+from ceres_cal.scene.curves import curve_points
+from ceres_cal.scene.targets import Target
 from ceres_cal.uncertainty import FieldMap
 
-_CURVE_STEPS = 96
+_CURVE_PIECES = 95
 _FINER = 2  # than the maps' own grid, where that is quick
 _BORDER_STEPS = 60
 _MOST_SEAMS = 6
@@ -117,8 +118,7 @@ class Material(Quality):
 def paint_of(targets: Iterable[Target]) -> Iterator[Array]:
     """Each curve of targets that lie in the world as a polyline (S, 3) m."""
     for target in targets:
-        for curve, is_arc in zip(target.curves.values(), target.is_arc, strict=True):
-            yield along_track(curve.track(), bool(is_arc), np.linspace(*curve.parameter_range, _CURVE_STEPS))
+        yield from (curve_points(curve, 0, _CURVE_PIECES) for curve in target.curves.values())
 
 
 def image_border(camera: Camera, height_m: float) -> Array:

@@ -51,8 +51,9 @@ def _camera(material: Material, name: str) -> Table:
 
 def _named(camera: Camera, quantity: str) -> str:
     words = {"cx": "principal point x", "cy": "principal point y", "aspect": "aspect fy / fx"}
-    if quantity in camera.lens.names and camera.lens.kind == "radial" and quantity != "a1":
-        return f"{quantity}, {powered(f'px^{1 - int(quantity[1:])}')}"
+    unit = dict(zip(camera.lens.names, camera.lens.units, strict=True)).get(quantity, "1")
+    if unit != "1":
+        return f"{quantity}, {powered(unit)}"
     return words.get(quantity, quantity)
 
 

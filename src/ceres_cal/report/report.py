@@ -124,7 +124,7 @@ def _about(material: Material) -> str:
 
 def _foot(calibration: Calibration) -> str:
     options = calibration.options
-    powers = f" with powers {', '.join(map(str, options.powers))}" if options.lens == "radial" else ""
+    powers = f" with powers {', '.join(map(str, options.powers))}" if options.blank_lens.powers else ""
     versions = ", ".join(f"{name} {version}" for name, version in calibration.versions.items())
     return (
         f"Solved with the {options.lens} lens{powers}, {options.loss} loss from {options.loss_scale:g} sigma, outliers "

@@ -12,9 +12,9 @@ import numpy as np
 
 from ceres_cal.base.arrays import Indices32, Mask
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.files import write_bytes
+from ceres_cal.base.files import make_folder, write_bytes
 from ceres_cal.observations import taken
-from ceres_cal.simulate.files import make_folder, write_simulation
+from ceres_cal.simulate.files import write_simulation
 from ceres_cal.simulate.photograph import Photograph, frames, photograph
 from ceres_cal.simulate.photography import Photography
 from ceres_cal.simulate.simulation import Simulation, Truth

@@ -14,11 +14,11 @@ from numpy.typing import ArrayLike
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.files import check_header, convert, read_json, write_json
+from ceres_cal.base.files import check_header, convert, make_folder, read_json, write_json
 from ceres_cal.base.transforms import Pose, euler_from_rotation, rotation_exp, rotation_from_euler, rotation_log
 from ceres_cal.model.parameters import Station
 from ceres_cal.scene.camera import Camera
-from ceres_cal.scene.lens import Radial, make_lens
+from ceres_cal.scene.files import CameraFile, Vector, camera_to_json
 from ceres_cal.scene.targets import target_from_spec
 from ceres_cal.simulate.photography import Photography
 from ceres_cal.simulate.scene import Disturbance, Scene, ViewPlan
@@ -28,22 +28,7 @@ SCENE_FORMAT, SCENE_VERSION = "ceres-cal/scene", 1
 TRUTH_FORMAT, TRUTH_VERSION = "ceres-cal/truth", 1
 UNITS = "metres, radians, pixels"
 
-Vector = tuple[float, float, float]
-Settings = TypeVar("Settings", Disturbance, Photography)
-
-
-class _LensFile(msgspec.Struct, forbid_unknown_fields=True):
-    kind: str
-    powers: tuple[int, ...] = (2, 3)
-    coefficients: dict[str, float] = {}
-
-
-class _CameraFile(msgspec.Struct, forbid_unknown_fields=True):
-    image_size: tuple[int, int]
-    phi: float
-    principal_point: tuple[float, float]
-    lens: _LensFile
-    aspect: float = 1.0
+Settings = TypeVar("Settings", Disturbance, Photography, ViewPlan)
 
 
 class _RotationFile(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
@@ -60,24 +45,13 @@ class _PlacementFile(_RotationFile, forbid_unknown_fields=True, kw_only=True):
     translation_m: Vector
 
 
-class _ViewFile(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True):
-    frames: tuple[str, ...]
-    station: str
-    target: str
-    placement: str | None = None
-    points: tuple[str, ...] | None = None
-    curves: tuple[str, ...] | None = None
-    spacing_m: float = 0.1
-    side: str = "centre"
-
-
 class _SceneFile(msgspec.Struct, forbid_unknown_fields=True):
     format: str
     version: int
     targets: dict[str, Any]
     cameras: dict[str, Any]
     stations: dict[str, Any]
-    views: list[Any]
+    views: list[dict[str, Any]]
     placements: dict[str, Any] = {}
     disturbance: dict[str, Any] = {}
     photography: dict[str, Any] | None = None
@@ -126,17 +100,16 @@ def scene_from_json(data: Mapping[str, Any], where: str) -> tuple[Scene, Disturb
             {name: _camera(entry, f"camera {name!r}") for name, entry in file.cameras.items()},
             {name: _station(entry, f"station {name!r}") for name, entry in file.stations.items()},
             {name: _placement(entry, f"placement {name!r}") for name, entry in file.placements.items()},
-            tuple(_plan(entry, f"view {number}") for number, entry in enumerate(file.views)),
+            tuple(_named(ViewPlan, entry, f"view {number}") for number, entry in enumerate(file.views)),
             None if file.photography is None else _named(Photography, file.photography, "photography"),
         )
         return scene, _named(Disturbance, file.disturbance, "disturbance")
 
 
 def _camera(entry: Any, here: str) -> Camera:
-    file = convert(entry, _CameraFile, here)
+    file = convert(entry, CameraFile, here)
     with _naming(here):
-        lens = make_lens(file.lens.kind, file.lens.powers, file.lens.coefficients)
-        return Camera(file.image_size, file.phi, file.principal_point, lens, file.aspect)
+        return file.camera()
 
 
 def _rotation(file: _RotationFile, here: str) -> Array:
@@ -157,12 +130,8 @@ def _placement(entry: Any, here: str) -> Pose:
     return Pose(_rotation(file, here), np.array(file.translation_m))
 
 
-def _plan(entry: Any, here: str) -> ViewPlan:
-    return ViewPlan(**msgspec.structs.asdict(convert(entry, _ViewFile, here)))
-
-
 def _named(kind: type[Settings], entry: dict[str, Any], here: str) -> Settings:
-    """The disturbance or the photography that a file describes."""
+    """The disturbance, the photography or the view that a file describes."""
     known = [field.name for field in fields(kind)]
     for name in entry:
         if name not in known:
@@ -175,13 +144,12 @@ def _named(kind: type[Settings], entry: dict[str, Any], here: str) -> Settings:
 
 def scene_to_json(scene: Scene, disturbance: Disturbance | None = None) -> dict[str, Any]:
     """A scene and its disturbance as a file has them; poses come back to rounding, everything else exactly."""
-    views = [_ViewFile(**vars(plan)) for plan in scene.views]
     return {
         "format": SCENE_FORMAT,
         "version": SCENE_VERSION,
         "units": UNITS,
         "targets": {name: dict(target.spec) for name, target in scene.targets.items()},
-        "cameras": {name: _camera_to_json(camera) for name, camera in scene.cameras.items()},
+        "cameras": {name: camera_to_json(camera) for name, camera in scene.cameras.items()},
         "stations": {
             name: {
                 "camera": station.camera,
@@ -197,25 +165,14 @@ def scene_to_json(scene: Scene, disturbance: Disturbance | None = None) -> dict[
             }
             for name, pose in scene.placements.items()
         },
-        "views": msgspec.to_builtins(views),
+        "views": [_without_defaults(plan) for plan in scene.views],
         "disturbance": vars(disturbance or Disturbance()).copy(),
         **({} if scene.photography is None else {"photography": vars(scene.photography).copy()}),
     }
 
 
-def _camera_to_json(camera: Camera) -> dict[str, Any]:
-    lens = camera.lens
-    return {
-        "image_size": list(camera.image_size),
-        "phi": camera.phi,
-        "principal_point": list(camera.principal_point),
-        "aspect": camera.aspect,
-        "lens": {
-            "kind": lens.kind,
-            **({"powers": list(lens.powers)} if isinstance(lens, Radial) else {}),
-            "coefficients": lens.coefficients,
-        },
-    }
+def _without_defaults(plan: ViewPlan) -> dict[str, Any]:
+    return {one.name: value for one in fields(plan) if (value := getattr(plan, one.name)) != one.default}
 
 
 def truth_to_json(simulations: Mapping[str, Simulation]) -> dict[str, Any]:
@@ -237,7 +194,7 @@ def truth_to_json(simulations: Mapping[str, Simulation]) -> dict[str, Any]:
     }
     for file_name, simulation in simulations.items():
         scene = simulation.scene
-        truth["cameras"] |= {name: _camera_to_json(camera) for name, camera in scene.cameras.items()}
+        truth["cameras"] |= {name: camera_to_json(camera) for name, camera in scene.cameras.items()}
         truth["stations"] |= {name: _station_truth(station) for name, station in scene.stations.items()}
         truth["placements"] |= {name: _placement_truth(pose) for name, pose in scene.placements.items()}
         truth["files"][file_name] = {
@@ -291,13 +248,3 @@ def write_simulation(simulation: Simulation, folder: str | Path, more_truth: Map
     folder = make_folder(folder)
     simulation.observations.save(folder / "observations.json")
     write_json(folder / "truth.json", truth_to_json({"observations.json": simulation}) | dict(more_truth or {}))
-
-
-def make_folder(folder: str | Path) -> Path:
-    """A folder, made where it is missing; InputError where it cannot be."""
-    folder = Path(folder)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{folder}: cannot be made: {error.strerror}") from None
-    return folder

@@ -10,7 +10,8 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, Array32, Image8, Mask
 from ceres_cal.scene.camera import Camera
-from ceres_cal.scene.targets import Target, along_track
+from ceres_cal.scene.curves import along_curve, curve_points
+from ceres_cal.scene.targets import Target
 from ceres_cal.simulate import render
 from ceres_cal.simulate.photography import Photography
 from ceres_cal.simulate.scene import Scene
@@ -161,11 +162,11 @@ def _painted(scene: Scene, shown: Mapping[str, str | None], camera: Camera) -> t
     """The canvas of paint and print, and the mask (height, width) of pixels that paper covers."""
     canvas = render.blank_canvas(camera.image_size)
     paper = np.zeros((camera.image_size[1], camera.image_size[0]), np.uint8)
-    for name, placement in sorted(shown.items(), key=lambda item: render.is_sheet(scene.targets[item[0]])):
+    for name, placement in sorted(shown.items(), key=lambda item: scene.targets[item[0]].paper is not None):
         target = scene.targets[name]
         before = camera.at(camera.cam_from_world @ scene.world_from_target(placement))
-        if render.is_sheet(target):
-            paper |= render.print_sheet(canvas, target, before)
+        if target.paper is not None:
+            paper |= render.print_sheet(canvas, target.paper, before)
         else:
             render.paint_curves(canvas, target, before)
     return canvas, paper
@@ -262,12 +263,11 @@ def _hidden_stretches(target: Target, name: str, camera: Camera, cover: Image8) 
     if not cover.any():
         return ()
     curve = target.curves[name]
-    rough = camera.project(render.curve_points(curve, 0, 200))
+    rough = camera.project(curve_points(curve, 0, 200))
     length_px = float(np.nansum(np.linalg.norm(np.diff(rough, axis=0), axis=1)))
     places = np.linspace(0.0, 1.0, max(int(min(length_px, 1e5) / _TRACE_PX), 200) + 1)
     low, high = curve.parameter_range
-    number = target.curve_names.index(name)
-    points = along_track(target.tracks[0, number], bool(target.is_arc[number]), low + places * (high - low))
+    points = along_curve(curve, low + places * (high - low))
     under = np.concatenate([[False], _covered(cover, camera.project(points)), [False]])
     begins, ends = np.flatnonzero(~under[:-1] & under[1:]), np.flatnonzero(under[:-1] & ~under[1:]) - 1
     length = curve.length_m

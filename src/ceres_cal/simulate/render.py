@@ -15,7 +15,9 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, Array32, Image8, Indices
 from ceres_cal.scene.camera import Camera
-from ceres_cal.scene.targets import Arc, Curve, Segment, Target, along_track
+from ceres_cal.scene.curves import Arc, Curve, Segment, curve_points
+from ceres_cal.scene.targets import Target
+from ceres_cal.scene.targets.paper import Footprints, Paper, share_inside
 
 Canvas = Array32
 """(height, width) times SUBPIXELS: the share of each small square that is paint, or the brightness of paper there."""
@@ -29,24 +31,11 @@ _BLOCK = 1 << 16
 
 
 @dataclass(frozen=True, eq=False)
-class _Squares:
-    """Small squares on the target's plane z = const.
-
-    Attributes:
-        rows, columns: (M,) their places on the canvas. plane: (M, 2) their middles, m.
-        along_x, along_y: (M, 2) what a step of one square to the right and down is on the plane, m.
-    """
+class _Squares(Footprints):
+    """Small squares on the target's plane z = const; `rows`, `columns` (M,) are their places on the canvas."""
 
     rows: Indices
     columns: Indices
-    plane: Array
-    along_x: Array
-    along_y: Array
-
-    def step_m(self, direction: Array) -> Array:
-        """(M,) how far the place moves along a direction (M, 2) over one square, m."""
-        across = np.sum(self.along_x * direction, axis=1), np.sum(self.along_y * direction, axis=1)
-        return np.asarray(np.maximum(np.hypot(*across), 1e-12))
 
 
 def blank_canvas(image_size: tuple[int, int]) -> Canvas:
@@ -90,12 +79,6 @@ def _height_m(curve: Curve) -> float:
     return curve.start[2] if isinstance(curve, Segment) else curve.centre[2]
 
 
-def curve_points(curve: Curve, side: int, pieces: int) -> Array:
-    """(pieces + 1, 3) m, evenly along a curve."""
-    low, high = curve.parameter_range
-    return along_track(curve.track(side), isinstance(curve, Arc), np.linspace(low, high, pieces + 1))
-
-
 def _near(curve: Curve, camera: Camera) -> Image8:
     """The pixels that a curve's paint may touch, as a mask (height, width)."""
     width, height = camera.image_size
@@ -133,17 +116,12 @@ def _divided(pixels: Indices, middle: Array, along_x: Array, along_y: Array) -> 
     place = middle[:, None] + _STEPS[i][:, None] * along_x[:, None] + _STEPS[j][:, None] * along_y[:, None]
     times = len(i)
     return _Squares(
-        (pixels[:, 1, None] * SUBPIXELS + j).ravel(),
-        (pixels[:, 0, None] * SUBPIXELS + i).ravel(),
         place.reshape(-1, 2),
         np.repeat(along_x / SUBPIXELS, times, axis=0),
         np.repeat(along_y / SUBPIXELS, times, axis=0),
+        (pixels[:, 1, None] * SUBPIXELS + j).ravel(),
+        (pixels[:, 0, None] * SUBPIXELS + i).ravel(),
     )
-
-
-def _inside(distance: Array, step: Array) -> Array:
-    """The share of a square that lies on the positive side of a straight border, from the middle's distance to it."""
-    return np.clip(distance / step + 0.5, 0.0, 1.0)
 
 
 def _strip(curve: Curve, squares: _Squares) -> Array:
@@ -158,13 +136,13 @@ def _strip(curve: Curve, squares: _Squares) -> Array:
         lengthwise = away @ unit - 0.5 * length
         steps = squares.step_m(np.broadcast_to([-unit[1], unit[0]], away.shape))
         ends, end_steps = 0.5 * length + half, squares.step_m(np.broadcast_to(unit, away.shape))
-        within = _inside(ends - np.abs(lengthwise), end_steps)
+        within = share_inside(ends - np.abs(lengthwise), end_steps)
     else:
         away = squares.plane - curve.centre[:2]
         radius = np.maximum(np.hypot(away[:, 0], away[:, 1]), 1e-12)
         across, steps = radius - curve.radius_m, squares.step_m(away / radius[:, None])
         within = _within_arc(curve, away)
-    share = _inside(across + half, steps) - _inside(across - half, steps)
+    share = share_inside(across + half, steps) - share_inside(across - half, steps)
     return np.asarray(share * within)
 
 
@@ -176,43 +154,28 @@ def _within_arc(arc: Arc, away: Array) -> Array:
     return (turned <= span).astype(float)
 
 
-# ---- boards and sheets of rings -------------------------------------------------------------------------------------
+# ---- printed sheets -------------------------------------------------------------------------------------------------
 
 
-def is_sheet(target: Target) -> bool:
-    """Whether a target is printed on paper, which hides the floor, and not painted on the floor."""
-    return target.kind in ("checkerboard", "rings")
-
-
-def sheet_outline(target: Target) -> Array:
-    """(N, 3) m: the border of the rectangular paper, white or dark beyond the last square or ring."""
-    if target.kind == "checkerboard":
-        square, columns, rows = (target.spec[name] for name in ("square_m", "columns", "rows"))
-        low, high = np.full(2, -2.0 * square), np.array([columns + 1, rows + 1]) * square
-    else:
-        high = np.full(2, 1.05 * target.spec["radii_m"][-1])
-        low = -high
-    corners = np.array([low, (high[0], low[1]), high, (low[0], high[1])])
+def sheet_outline(paper: Paper) -> Array:
+    """(N, 3) m: the border of the rectangular paper."""
+    (left, bottom), (right, top) = paper.low_m, paper.high_m
+    corners = np.array([(left, bottom), (right, bottom), (right, top), (left, top)])
     share = np.linspace(0.0, 1.0, 50, endpoint=False)[None, :, None]
     border = (corners[:, None] * (1.0 - share) + np.roll(corners, -1, axis=0)[:, None] * share).reshape(-1, 2)
     return np.column_stack([border, np.zeros(len(border))])
 
 
-def print_sheet(canvas: Canvas, target: Target, camera: Camera) -> Image8:
-    """Print a board or a sheet of rings onto a canvas, and the mask (height, width) of the pixels it covers.
-
-    The disc inside the first ring is dark, and from then on every other ring. The square between a board's corners
-    "0,0" and "1,1" is dark.
-    """
+def print_sheet(canvas: Canvas, paper: Paper, camera: Camera) -> Image8:
+    """Print a sheet onto a canvas, and the mask (height, width) of the pixels it covers."""
     width, height = camera.image_size
     mask = np.zeros((height, width), np.uint8)
-    border = camera.project(sheet_outline(target))
+    border = camera.project(sheet_outline(paper))
     if not np.all(np.isfinite(border)):
         return mask
     fill(mask, border)
     for squares in _squares(mask, camera, 0.0):
-        dark = _dark_squares(target, squares) if target.kind == "checkerboard" else _dark_rings(target, squares)
-        canvas[squares.rows, squares.columns] = PAPER + (INK - PAPER) * dark
+        canvas[squares.rows, squares.columns] = PAPER + (INK - PAPER) * paper.dark(squares)
     return mask
 
 
@@ -221,25 +184,3 @@ def fill(mask: Image8, outline: Array, value: int | Sequence[int] = 1) -> None:
     limit = 4 * max(mask.shape)
     rounded = np.round(np.clip(outline, -limit, limit) * 2**SHIFT).astype(np.int32)
     cv2.fillPoly(mask, [rounded], value, cv2.LINE_8, SHIFT)
-
-
-def _dark_rings(target: Target, squares: _Squares) -> Array:
-    radii = np.array(target.spec["radii_m"])
-    away = np.maximum(np.hypot(squares.plane[:, 0], squares.plane[:, 1]), 1e-12)
-    step = squares.step_m(squares.plane / away[:, None])
-    inner = np.searchsorted(0.5 * (radii[1:] + radii[:-1]), away)  # the nearest edge
-    outside = _inside(away - radii[inner], step)
-    return np.where(inner % 2 == 0, 1.0 - outside, outside)
-
-
-def _dark_squares(target: Target, squares: _Squares) -> Array:
-    square = float(target.spec["square_m"])
-    sign, within = np.full(len(squares.plane), 1.0), np.full(len(squares.plane), 1.0)
-    for axis, count in enumerate((target.spec["columns"], target.spec["rows"])):
-        place = squares.plane[:, axis] / square
-        step = np.hypot(squares.along_x[:, axis], squares.along_y[:, axis]) / square
-        line = np.round(place)
-        wave = 2.0 * _inside(place - line, step) - 1.0
-        sign *= np.where(line % 2 == 0, wave, -wave)
-        within *= _inside(place + 1.0, step) * _inside(count - place, step)
-    return np.asarray(within * (0.5 + 0.5 * sign))

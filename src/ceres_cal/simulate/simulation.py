@@ -10,7 +10,8 @@ import numpy as np
 from ceres_cal.base.arrays import Array, Codes, Indices, Indices32, Mask
 from ceres_cal.observations import Curves, Observations, Points, View
 from ceres_cal.scene.camera import Camera, in_image
-from ceres_cal.scene.targets import SIDES, Arc, Target, along_track, nearest_on_track
+from ceres_cal.scene.curves import SIDES, along_curve, distance_to_curve
+from ceres_cal.scene.targets import Target
 from ceres_cal.simulate.scene import Disturbance, Scene, ViewPlan
 
 CLEAN, OUTLIER, WRONG_LABEL = 0, 1, 2
@@ -141,9 +142,7 @@ def _curves_in_view(scene: Scene, plan: ViewPlan, camera: Camera) -> _InView:
         pieces = max(1, round(curve.length_m / plan.spacing_m))
         share = (np.arange(pieces) + 0.5) / pieces
         low, high = curve.parameter_range
-        places.append(
-            along_track(target.tracks[SIDES[plan.side], i], isinstance(curve, Arc), low + share * (high - low))
-        )
+        places.append(along_curve(curve, low + share * (high - low), SIDES[plan.side]))
         positions.append(start + share * curve.length_m)
         features.append(np.full(pieces, i, dtype=np.int32))
         start += curve.length_m
@@ -159,15 +158,7 @@ def _neighbours(target: Target, feature: Indices32, places: Array) -> Indices32:
     """For each place (N, 3) on a curve, the nearest other curve of the target; the same one where there is no other."""
     nearest, distance = feature.copy(), np.full(len(places), np.inf)
     for i, curve in enumerate(target.curves.values()):
-        track, is_arc = target.tracks[0, i], isinstance(curve, Arc)
-        low, high = sorted(curve.parameter_range)
-        s = nearest_on_track(np.broadcast_to(track, (len(places), 3, 3)), np.full(len(places), is_arc), places)
-        if is_arc:
-            s = low + np.mod(s - low, 2.0 * np.pi)
-            # Past its end an arc is left over by the nearer of its two ends.
-            s = np.where(s <= high, s, np.where(s - high < low + 2.0 * np.pi - s, high, low))
-        there = along_track(track, is_arc, np.clip(s, low, high))
-        away = np.linalg.norm(places - there, axis=1)
+        away = distance_to_curve(curve, places)
         nearer = (away < distance) & (feature != i)
         nearest[nearer], distance[nearer] = i, away[nearer]
     return nearest

@@ -23,7 +23,8 @@ from ceres_cal.solve.problem import Problem, Weighting
 _AT_REST = 10  # iterations
 _NOTHING_LEFT = "Nothing left to gain."
 _SUCCESS = (pyceres.TerminationType.CONVERGENCE, pyceres.TerminationType.USER_SUCCESS)
-_POSED = 1e-2  # relative change of a placement's cost that a start may leave
+# Relative change of a placement's cost that a start may leave. Nothing changes from half to double.
+_POSED = 1e-2
 _DENSE_LIMIT = 600  # numbers that stay after the Schur complement; above it a sparse factorisation is faster
 
 

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
 
 import numpy as np
 import pyceres
-from numpy.typing import NDArray
 
 from ceres_cal import kernels
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.threads import parts_of, run_parts
 from ceres_cal.model.parameters import Estimate
-from ceres_cal.model.residuals import lens_arguments, starting_feet
+from ceres_cal.model.residuals import camera_optics, curve_columns, point_columns, starting_feet
 from ceres_cal.model.structure import Structure
 from ceres_cal.observations.sights import SightKey, Sights
 from ceres_cal.solve.problem import Problem, Weighting
@@ -22,8 +20,9 @@ from ceres_cal.solve.problem import Problem, Weighting
 ROWS_WORTH_A_THREAD = 20_000
 NORMAL_NS = 60.0
 """That an observation's share of the normal equations takes."""
-_NOTHING = np.empty(0)
-_LEFT_TO_THE_COMPLEMENT = 1e-2  # of a sight's cost, by the step its pose would take
+# Of a sight's cost, by the step its pose would take: the complement takes that along exactly, to second order. From
+# half to double the answer moves by under 1 % of its error.
+_LEFT_TO_THE_COMPLEMENT = 1e-2
 
 
 @dataclass(eq=False)
@@ -46,17 +45,15 @@ class SightCost(pyceres.CostFunction):
         super().__init__()
         self._run, self._sight, self._structure = run, sight, estimate.structure
         key, layout, weighting = sight.key, problem.layout, problem.weighting
-        code, vector, powers, unit = lens_arguments(estimate.cameras[key.camera])
-        free = layout.free[key.camera]
-        self._static = (
-            code, vector, free, powers, unit, *kernel_columns(sight, estimate.structure, weighting),
-            starting_feet(sight, estimate, problem.feet),
-            estimate.structure.track_slots, kernels.LOSS_CODES[weighting.loss], weighting.loss_scale,
-        )  # fmt: skip
+        free, count = layout.free[key.camera], len(estimate.structure.values)
+        feet = starting_feet(sight, estimate, problem.feet)
+        self._optics, self._unknowns = camera_optics(estimate.cameras[key.camera]), kernels.Unknowns(free, count)
+        self._points = point_columns(sight, estimate.structure, weighting.point_scale)
+        self._curves = curve_columns(sight, estimate.structure, feet, weighting.curve_scale)
+        self._loss = kernel_loss(weighting)
         self._poses = [estimate.stations[key.station].cam_from_world.log(), np.zeros(6)]
         if key.placement is not None:
             self._poses[1] = estimate.placements[key.placement].log()
-        count = len(estimate.structure.values)
         sizes = (len(free), 6, 6, count)
         is_free = (len(free) > 0, key.station in layout.stations, key.placement in layout.placements, count > 0)
         self.slots = [slot for slot in range(4) if is_free[slot]]
@@ -82,52 +79,36 @@ class SightCost(pyceres.CostFunction):
 
     def _evaluated(self, at: Array, parameters: Sequence[Array]) -> tuple[Array, Array, list[Array]] | None:
         """(place, residuals, flat Jacobians), or None where an observation cannot be projected from there."""
-        arguments, outputs = [_NOTHING, *self._poses, _NOTHING], [_NOTHING] * 4
+        numbers, jacobians = [kernels.NOTHING, *self._poses, kernels.NOTHING], [kernels.NOTHING] * 4
         rows = self.num_residuals()
         for place, slot in enumerate(self.slots):
-            arguments[slot], outputs[slot] = parameters[place], np.empty(rows * len(parameters[place]))
+            numbers[slot], jacobians[slot] = parameters[place], np.empty(rows * len(parameters[place]))
         residuals = np.empty(rows)
-        built = self._structure.with_values(arguments[3])
+        points, curves = as_built(self._points, self._curves, self._sight, self._structure.with_values(numbers[3]))
         answered = kernels.evaluate_block(
-            *self._static, built.points(self._sight), built.tracks(self._sight), len(built.values), *arguments[:3],
-            residuals, *outputs,
+            self._optics, self._unknowns, points, curves, self._loss, kernels.Blocks(*numbers), residuals,
+            kernels.Blocks(*jacobians),
         )  # fmt: skip
-        return (at, residuals, [outputs[slot] for slot in self.slots]) if answered else None
+        return (at, residuals, [jacobians[slot] for slot in self.slots]) if answered else None
 
 
-def kernel_columns(sights: Sights, structure: Structure, weighting: Weighting) -> tuple[NDArray[Any], ...]:
-    """The observations as the kernels take them, but for points and tracks, which the structure moves."""
-    moves = len(structure.values) > 0
-    feature = sights.feature if moves else sights.feature[:0]
-    return (
-        sights.pixels,
-        1.0 / (weighting.point_scale * sights.sigma_px),
-        structure.point_slots[feature],
-        structure.bends[feature],
-        sights.is_arc,
-        sights.track,
-        sights.curve_pixels,
-        1.0 / (weighting.curve_scale * sights.curve_sigma_px),
-    )
+def kernel_loss(weighting: Weighting) -> kernels.Loss:
+    """The loss as the kernels take it."""
+    return kernels.Loss(kernels.LOSS_CODES[weighting.loss], weighting.loss_scale)
 
 
-class _Sweep(NamedTuple):
-    """Placements at their best for given shared numbers.
-
-    Attributes:
-        poses: (S, 3, 4) cam_from_target. gains: (S, 6, shared) how they follow the shared numbers. costs: (S,).
-        reduced: lower triangle of the normal equations that are left, the residual's row last.
-    """
-
-    poses: Array
-    gains: Array
-    costs: Array
-    reduced: Array
+def as_built(
+    points: kernels.PointColumns, curves: kernels.CurveColumns, sights: Sights, structure: Structure
+) -> tuple[kernels.PointColumns, kernels.CurveColumns]:
+    """The columns with points and tracks where the structure has them."""
+    if not len(structure.values):
+        return points, curves
+    return points._replace(places=structure.points(sights)), curves._replace(tracks=structure.tracks(sights))
 
 
 @dataclass(frozen=True, eq=False)
 class _Evaluation:
-    """An EliminatedCost in one place: its numbers `at`, what Ceres is told, poses and gains (see `_Sweep`)."""
+    """An EliminatedCost in one place: its numbers `at`, what Ceres is told, poses and gains (see `kernels.Sweep`)."""
 
     at: Array
     residuals: Array
@@ -143,22 +124,18 @@ class EliminatedCost(pyceres.CostFunction):
         super().__init__()
         self.camera, weighting = sights.keys[0].camera, problem.weighting
         self._run, self._sights, self._structure = run, sights, estimate.structure
-        self._optics = lens_arguments(estimate.cameras[self.camera])
-        self._free = problem.layout.free[self.camera]
-        pixels, weights, slots, bends, is_arc, track, curve_pixels, curve_weights = kernel_columns(
-            sights, estimate.structure, weighting
-        )
-        self._observations = (
-            sights.point_bounds, pixels, weights, slots, bends, is_arc, sights.curve_bounds, track, curve_pixels,
-            curve_weights, starting_feet(sights, estimate, problem.feet), estimate.structure.track_slots,
-        )  # fmt: skip
-        self._loss = (kernels.LOSS_CODES[weighting.loss], weighting.loss_scale)
-        sizes = (len(self._free), len(estimate.structure.values))
+        free, count = problem.layout.free[self.camera], len(estimate.structure.values)
+        feet = starting_feet(sights, estimate, problem.feet)
+        self._optics, self._unknowns = camera_optics(estimate.cameras[self.camera]), kernels.Unknowns(free, count)
+        self._points = point_columns(sights, estimate.structure, weighting.point_scale)
+        self._curves = curve_columns(sights, estimate.structure, feet, weighting.curve_scale)
+        self._loss = kernel_loss(weighting)
+        sizes = (len(free), count)
         self._size = sum(sizes)
-        start = np.concatenate([self._optics[1][self._free], estimate.structure.values])
+        start = np.concatenate([self._optics.intrinsics[free], estimate.structure.values])
         poses, gains = estimate.pose_stack(sights.keys), np.zeros((len(sights), 6, self._size))
         # Every step starts from the poses of the last accepted one: a rejected step may have led them astray.
-        self._accepted = _Evaluation(start, _NOTHING, _NOTHING, poses, gains)
+        self._accepted = _Evaluation(start, kernels.NOTHING, kernels.NOTHING, poses, gains)
         self._known: _Evaluation | None = None
         self._parts = parts_of(len(sights), len(sights.points) + len(sights.curve_pixels), NORMAL_NS)
         self.slots = [slot for slot, size in zip((0, 3), sizes, strict=True) if size]
@@ -203,25 +180,25 @@ class EliminatedCost(pyceres.CostFunction):
         upper[-1] = 0.0
         return _Evaluation(at, residuals, upper[:, :-1], swept.poses, swept.gains)
 
-    def _swept(self, at: Array, tolerance: float, newton: bool = True) -> _Sweep:
+    def _swept(self, at: Array, tolerance: float, newton: bool = True) -> kernels.Sweep:
         """Every placement brought to its best in a place, from the last accepted one."""
-        count = len(self._free)
-        code, intrinsics, powers, unit = self._optics
-        intrinsics = intrinsics.copy()
-        intrinsics[self._free] = at[:count]
-        built = self._structure.with_values(at[count:])
-        points, tracks = built.points(self._sights), built.tracks(self._sights)
+        free = self._unknowns.free
+        intrinsics = self._optics.intrinsics.copy()
+        intrinsics[free] = at[: len(free)]
+        optics = self._optics._replace(intrinsics=intrinsics)
+        built = self._structure.with_values(at[len(free) :])
+        points, curves = as_built(self._points, self._curves, self._sights, built)
+        change, size = at - self._accepted.at, self._size + 1
         poses, gains, costs = self._accepted.poses.copy(), self._accepted.gains.copy(), np.empty(len(self._sights))
 
         def part(first: int, last: int) -> Array:
-            reduced = np.zeros((self._size + 1, self._size + 1))
+            sweep = kernels.Sweep(poses, gains, costs, np.zeros((size, size)))
             kernels.eliminate_placements(
-                first, last, code, intrinsics, self._free, powers, unit, *self._observations, *self._loss, newton,
-                points, tracks, self._size - count, tolerance, at - self._accepted.at, poses, gains, costs, reduced,
-            )  # fmt: skip
-            return reduced
+                first, last, optics, self._unknowns, points, curves, self._loss, newton, tolerance, change, sweep
+            )
+            return sweep.reduced
 
-        return _Sweep(poses, gains, costs, np.sum(run_parts(part, self._parts), axis=0))
+        return kernels.Sweep(poses, gains, costs, np.sum(run_parts(part, self._parts), axis=0))
 
     def from_poses(self, poses: Array, tolerance: float) -> tuple[Array, Array]:
         """Costs (S,) and poses (S, 3, 4) that the search for each placement ends with when it starts from `poses`,
@@ -233,7 +210,7 @@ class EliminatedCost(pyceres.CostFunction):
 
     def converged(self, parameters: Sequence[Array]) -> tuple[tuple[SightKey, ...], Array]:
         """The sights' keys and their cam_from_target, (S, 3, 4), at their best for these numbers."""
-        at = np.concatenate([_NOTHING, *parameters])
+        at = np.concatenate([kernels.NOTHING, *parameters])
         # At rest they have come to rest as well; elsewhere, or where Ceres had nothing to move, they are sought.
         if not len(self._accepted.residuals) or not np.array_equal(self._accepted.at, at):
             self._accepted = self._evaluated(at, 1e-14) or self._accepted

@@ -22,9 +22,9 @@ from ceres_cal.model.information import Information
 from ceres_cal.model.keys import Key, columns_by_owner, pose_keys, sigma_limits
 from ceres_cal.model.parameters import Estimate, intrinsics_scales
 from ceres_cal.model.quantities import free_keys, from_placement, from_station
-from ceres_cal.model.residuals import lens_arguments, starting_feet
+from ceres_cal.model.residuals import camera_optics, curve_columns, point_columns, starting_feet
 from ceres_cal.observations.sights import SightKey, Sights
-from ceres_cal.solve.costs import NORMAL_NS, kernel_columns
+from ceres_cal.solve.costs import NORMAL_NS, kernel_loss
 from ceres_cal.solve.problem import Problem
 
 _BATCH = 2_000_000  # numbers of normal equations worked on at once
@@ -204,21 +204,19 @@ class _Normals:
 
     def __init__(self, sights: Sights, problem: Problem, estimate: Estimate) -> None:
         camera = estimate.cameras[sights.keys[0].camera]
-        code, vector, powers, unit = lens_arguments(camera)
         free, structure, weighting = problem.layout.free[sights.keys[0].camera], estimate.structure, problem.weighting
-        pixels, weights, slots, bends, is_arc, track, curve_pixels, curve_weights = kernel_columns(
-            sights, structure, weighting
-        )
         self._size = len(free) + len(structure.values) + 6
         units = np.ones(self._size)
         units[: len(free)] = intrinsics_scales(camera)[free]
         self._arguments = (
-            code, vector, free, powers, unit, sights.point_bounds, pixels, weights, slots, bends, is_arc,
-            sights.curve_bounds, track, curve_pixels, curve_weights, starting_feet(sights, estimate, problem.feet),
-            structure.track_slots, kernels.LOSS_CODES[weighting.loss], weighting.loss_scale, False,
-            structure.points(sights), structure.tracks(sights), len(structure.values),
-            estimate.pose_stack(sights.keys), units,
-        )  # fmt: skip
+            camera_optics(camera),
+            kernels.Unknowns(free, len(structure.values)),
+            point_columns(sights, structure, weighting.point_scale),
+            curve_columns(sights, structure, starting_feet(sights, estimate, problem.feet), weighting.curve_scale),
+            kernel_loss(weighting),
+            estimate.pose_stack(sights.keys),
+            units,
+        )
 
     def of(self, first: int, last: int) -> Array:
         """(n, K, K) of the sights from one number to another.

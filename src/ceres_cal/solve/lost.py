@@ -18,7 +18,9 @@ from ceres_cal.solve.problem import Problem, Weighting
 from ceres_cal.start.closed_forms import pose_from_homography
 from ceres_cal.start.planes import consensus_homography
 
-_LOST = 0.5  # share of a sight's observations; with less of them in use its pose was not understood
+# Share of a sight's observations; with less of them in use its pose was not understood.
+_LOST = 0.5
+# Points that a consensus is sought among: four make a pose, two more agree by chance hardly ever.
 _FEWEST = 6
 
 

@@ -14,9 +14,14 @@ from ceres_cal.observations.sights import SightKey, Sights
 from ceres_cal.solve.bundle import placement_costs
 from ceres_cal.solve.problem import Problem, Weighting
 
-_DECIDED_SIGMA = 100.0  # perspective that bends a view by so many standard deviations leaves no doubt
-_SAME = 1e-3  # of rotations and metres
-_MUCH_WORSE = 100.0  # squared standard deviations: ten of them decide, whatever the lens still does
+# Perspective that bends a view by so many standard deviations leaves no doubt. Of 200 small boards none stays
+# mirrored from 12 to 200, four do at 0; of 20 000, six did at 50.
+_DECIDED_SIGMA = 100.0
+# Of rotations and metres: the two minima of a plane are degrees apart, rounding is not. Nothing changes from half to
+# double.
+_SAME = 1e-3
+# Squared standard deviations: ten of them decide, whatever the lens still does. Nothing changes from half to double.
+_MUCH_WORSE = 100.0
 
 
 def without_mirrored_poses(

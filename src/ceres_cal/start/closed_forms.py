@@ -170,7 +170,7 @@ class PlaneData:
 
 @dataclass(frozen=True, eq=False)
 class RadialAlignment:
-    """What `radial_alignment` found: the profile, H (S, 3, 3) of every sight, and each point's error.
+    """Answer of `radial_alignment`: the profile, H (S, 3, 3) of every sight, and each point's error.
 
     Attributes:
         error_px: (N,). relative_error: (N,) the same in units of what is usual at that distance from the centre.
@@ -218,11 +218,11 @@ def homographies_of_sights(data: PlaneData, profile: RadialProfile) -> tuple[Arr
     homographies, errors = np.empty((len(data.bounds) - 1, 3, 3)), np.empty(len(data.plane))
     coefficients = np.array(profile.coefficients)
 
-    def part(first: int, last: int) -> None:
-        bounds, found = data.bounds[first : last + 1], homographies[first:last]
-        plane_homographies(bounds, data.plane, data.offsets, coefficients, profile.unit_px, found, errors)
+    def solve(first: int, last: int) -> None:
+        bounds, part = data.bounds[first : last + 1], homographies[first:last]
+        plane_homographies(bounds, data.plane, data.offsets, coefficients, profile.unit_px, part, errors)
 
-    run_parts(part, parts_of(len(homographies), len(errors), _POINT_NS))
+    run_parts(solve, parts_of(len(homographies), len(errors), _POINT_NS))
     return np.array([[profile.unit_px], [profile.unit_px], [1.0]]) * homographies, errors * profile.unit_px
 
 

@@ -14,12 +14,12 @@ import numpy as np
 from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.errors import DegenerateError
 from ceres_cal.base.transforms import Pose, Poses, chained, inverted
-from ceres_cal.model.parameters import Estimate, Options, Station, anchored_stations
+from ceres_cal.model.parameters import Estimate, Options, Station, anchored_stations, unit_px
 from ceres_cal.model.structure import make_structure
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.observations.sights import Sights
 from ceres_cal.scene.camera import Camera
-from ceres_cal.scene.lens import Brown, KannalaBrandt, Lens, Radial
+from ceres_cal.scene.lens import Lens
 from ceres_cal.start.closed_forms import RadialProfile, orthogonality_error, poses_from_homographies
 from ceres_cal.start.planes import Homographies, profile_and_homographies
 
@@ -45,7 +45,7 @@ def initialise(observations: Observations, sights: Sights, options: Options) -> 
     """A start for everything the observations show.
 
     Raises:
-        DegenerateError: naming the sight whose pose the observations cannot tell.
+        DegenerateError: naming the sight whose pose the observations do not determine.
     """
     cameras: dict[str, Camera] = {}
     phi_from: dict[str, str] = {}
@@ -77,9 +77,9 @@ def _start_camera(
     name: str, image_size: tuple[int, int], sights: Sights, options: Options, priors: Sequence[Prior]
 ) -> _CameraStart:
     blank = _blank_camera(name, image_size, options, priors)
-    if set(blank.lens.names) <= set(options.fixed) and blank.lens.kind == "radial":
+    if set(blank.lens.names) <= set(options.fixed) and not blank.lens.may_fold:
         blank.require_monotone(name)
-    unit = 0.5 * float(np.hypot(*image_size))
+    unit = unit_px(blank)
     profile, homographies = profile_and_homographies(sights, blank, unit)
     phi, phi_from = _choose_phi(sights, homographies, unit, options, [p for p in priors if _concerns(p, name, sights)])
     reach = sights.reach_px(blank)
@@ -128,7 +128,7 @@ def _choose_phi(
 ) -> tuple[float, str]:
     """phi from r1 . r2 = 0 and |r1| = |r2| over all sights, with what is known beforehand, by a one-dimensional search.
 
-    Where no view is tilted enough to tell and nothing is known, a usual field of view is guessed; the bundle then says
+    Where no view is tilted enough and nothing is known, a usual field of view is guessed; the bundle then says
     how little is known.
     """
     if "phi" in options.fixed:
@@ -148,9 +148,9 @@ def _choose_phi(
     flat = acceptable[-1] > 1.6 * acceptable[0]
     middle = min(acceptable, key=lambda phi: abs(np.log(phi / (USUAL_PHI * unit)))) if flat else grid[np.argmin(values)]
     for _ in range(0 if flat else 6):
-        place = int(np.argmin(cost(middle * _NEAR)))
-        middle *= _NEAR[place]
-        if 0 < place < len(_NEAR) - 1:
+        step = int(np.argmin(cost(middle * _NEAR)))
+        middle *= _NEAR[step]
+        if 0 < step < len(_NEAR) - 1:
             break
     source = "guess" if flat else ("prior" if known else "views")
     return float(middle), source
@@ -175,7 +175,9 @@ def _fit_lens(blank: Lens, profile: RadialProfile, phi: float, reach_px: float, 
     """The lens nearest to the profile over the observed radii: every model is linear in its coefficients there."""
     r = np.linspace(0.02, 1.0, 50) * reach_px
     w = profile.lift(np.column_stack([r, np.zeros_like(r)]))[:, 2]
-    columns, right = _lens_equations(blank, r, w, phi)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ideal = np.where(w > 0.02, r / w, np.nan)
+    columns, right = blank.start_equations(r, ideal, np.arctan2(r, phi * w), phi)
     free = [i for i, name in enumerate(blank.names) if name in columns and name not in fixed]
     ahead = np.isfinite(right)
     right = right - sum(
@@ -189,20 +191,6 @@ def _fit_lens(blank: Lens, profile: RadialProfile, phi: float, reach_px: float, 
         if lens.monotone_radius(phi) > 1.05 * reach_px:
             return lens
     return blank
-
-
-def _lens_equations(lens: Lens, r: Array, w: Array, phi: float) -> tuple[dict[str, Array], Array]:
-    """Columns by coefficient name and right side of the model at measured radii r whose rays are (r, phi w)."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ideal = np.where(w > 0.02, r / w, np.nan)
-    if isinstance(lens, Radial):
-        return {name: r**power for name, power in zip(lens.names, lens.powers, strict=True)}, ideal - r
-    if isinstance(lens, Brown):
-        u = ideal / phi
-        return {name: u**power for name, power in (("k1", 3), ("k2", 5), ("k3", 7))}, r / phi - u
-    assert isinstance(lens, KannalaBrandt)
-    angle = np.arctan2(r, phi * w)
-    return {name: angle**power for name, power in zip(lens.names, lens.radius_powers, strict=True)}, r / phi - angle
 
 
 # ---- stations and placements ----------------------------------------------------------------------------------------
@@ -224,13 +212,13 @@ def _chain_poses(
             if key.station not in stations and key.placement in placements:
                 stations[key.station] = chained(pose, inverted(placements[key.placement]))
         fresh: dict[str | None, int] = {}
-        for place, key in enumerate(keys):
+        for row, key in enumerate(keys):
             if key.placement not in placements and key.station in stations:
-                fresh.setdefault(key.placement, place)
+                fresh.setdefault(key.placement, row)
         if fresh:
-            places = list(fresh.values())
-            world_from_cam = inverted(np.array([stations[keys[place].station] for place in places]))
-            placements |= dict(zip(fresh, chained(world_from_cam, seen[places]), strict=True))
+            rows = list(fresh.values())
+            world_from_cam = inverted(np.array([stations[keys[row].station] for row in rows]))
+            placements |= dict(zip(fresh, chained(world_from_cam, seen[rows]), strict=True))
     _require_all(observations, sights, stations, placements)
     cameras = observations.stations
     named = [name for name in placements if name is not None]
@@ -250,6 +238,6 @@ def _require_all(
         frames = ", ".join(repr(observations.views[i].frame) for i in sight.views[0][:3])
         raise DegenerateError(
             f"frame {frames} ({key}): {len(sight.point_rows)} points and {len(sight.curve_rows)} curve observations "
-            f"(on {len(np.unique(sight.track))} curves) cannot fix its pose: give at least four points, not on one "
-            "line, or straight lines in two directions, two of each, or remove the view"
+            f"(on {len(np.unique(sight.track_index))} curves) cannot fix its pose: give at least four points, "
+            "not on one line, or straight lines in two directions, two of each, or remove the view"
         )

@@ -1,6 +1,6 @@
 """Sights as planes: the radial profile of a camera, and each sight's homography, from any mix of points and lines.
 
-The steps of design section 7, 1 and 2, on top of `closed_forms`: which sights can tell what, reweighting and LO-RANSAC
+The steps of design section 7, 1 and 2, on top of `closed_forms`: which sights determine what, reweighting and LO-RANSAC
 against wrong labels.
 """
 
@@ -32,9 +32,14 @@ _MOST = 1500  # observations of one kind in a sight beyond which a start learns 
 _ENOUGH_BOARDS = 24  # for a profile
 _ENOUGH_POINTS = 40.0  # of a board
 _GOLDEN = 0.6180339887498949
-_ROUGH_PX = 1.0  # a median beyond it may be no fit at all, however even
-_SUSPICIOUS = 8.0  # medians: no clean residual is that long
-_NO_FIT = 0.01  # typical distance in a plane scaled to unit size; the fits are 20 times better
+# A median beyond it may be no fit at all, however even: corners are detected to a tenth of it. Nothing changes from
+# half to double.
+_ROUGH_PX = 1.0
+# Medians: no clean residual is that long, nine standard deviations. From half to double the answer moves by under 1 %
+# of its error.
+_SUSPICIOUS = 8.0
+# Typical distance in a plane scaled to unit size; the fits are 20 times better. Nothing changes from half to double.
+_NO_FIT = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,9 +83,9 @@ def plane_sight(sight: Sights, height_m: float | None = None) -> PlaneSight:
     on = np.flatnonzero(np.abs(sight.points[:, 2] - height) < 1e-9)
     on = on[:: max(1, len(on) // _MOST)]
     usable = level & ~sight.is_arc & (np.abs(starts[:, 2] - height) < 1e-9)
-    straight = np.flatnonzero(usable[sight.track])
+    straight = np.flatnonzero(usable[sight.track_index])
     straight = straight[:: max(1, len(straight) // _MOST)]
-    c, a = starts[sight.track[straight], :2], along[sight.track[straight], :2]
+    c, a = starts[sight.track_index[straight], :2], along[sight.track_index[straight], :2]
     normal = np.column_stack([-a[:, 1], a[:, 0]]) / np.linalg.norm(a, axis=1, keepdims=True)
     points = sight.points[on, :2]
     return PlaneSight(
@@ -94,15 +99,15 @@ def plane_sight(sight: Sights, height_m: float | None = None) -> PlaneSight:
 
 def _usual_height(sight: Sights, level: Mask) -> float:
     """z at which most of the points and level curves lie, 0 where there are none."""
-    on_level = np.flatnonzero(level[sight.track])
-    starts = sight.tracks[sight.track[on_level[:: max(1, len(on_level) // _MOST)]], 0]
+    on_level = np.flatnonzero(level[sight.track_index])
+    starts = sight.tracks[sight.track_index[on_level[:: max(1, len(on_level) // _MOST)]], 0]
     heights, votes = np.unique(np.concatenate([sight.points[:, 2], starts[:, 2]]).round(9), return_counts=True)
     return float(heights[np.argmax(votes)]) if len(heights) else 0.0
 
 
 @dataclass(frozen=True, eq=False)
 class Homographies:
-    """The homographies that a camera's sights could tell.
+    """The homographies that a camera's sights determine.
 
     Attributes:
         sights: (K,) numbers of the sights. matrices: (K, 3, 3), plane (x, y, 1) m to (p px, w), see `closed_forms`.
@@ -115,8 +120,11 @@ class Homographies:
     sizes_px: Array
 
 
+_NONE = Homographies(np.empty(0, np.int64), np.empty((0, 3, 3)), np.empty(0), np.empty(0))
+
+
 def profile_and_homographies(sights: Sights, camera: Camera, unit: float) -> tuple[RadialProfile, Homographies]:
-    """The camera's radial profile and the homography of each of its sights that can tell one."""
+    """The camera's radial profile and the homography of each of its sights that determines one."""
     pure = _flat_sights_of_points(sights)
     rest = np.delete(np.arange(len(sights)), pure)
     planes = {int(i): plane_sight(sights[int(i)]) for i in rest}
@@ -127,7 +135,7 @@ def profile_and_homographies(sights: Sights, camera: Camera, unit: float) -> tup
         data = _plane_data(board, _spread_rows(board.point_bounds), camera)
         profile = _profile_of_boards(board, data, camera, unit)
     for i, plane in planes.items():
-        if plane.equations == 0 and len(sights[i].track) and sights[i].is_arc[sights[i].track].all():
+        if plane.equations == 0 and len(sights[i].on_arc) and sights[i].on_arc.all():
             ring, matrices[i] = _from_rings(sights[i], camera, unit)
             profile = profile or ring
     mixed = [i for i, plane in planes.items() if plane.equations >= 8]
@@ -137,27 +145,29 @@ def profile_and_homographies(sights: Sights, camera: Camera, unit: float) -> tup
     if profile is None or any(fit_lines(seen, profile.lift(p), rounds=2)[1] > _NO_FIT for seen, p in lined):
         profile = _profile_from_lines(lined, unit)
     matrices |= {i: _homography_of(planes[i], profile.lift(offsets[i])) for i in mixed}
-    parts = [
-        Homographies(np.array([i]), h[None], np.array([planes[i].height_m]), np.array([planes[i].size_px(camera)]))
-        for i, h in matrices.items()
-    ]
+    parts = [_NONE, *(_of_plane(i, planes[i], camera, matrix) for i, matrix in matrices.items())]
     if len(pure):
-        sizes = np.sqrt(np.trace(grouped_scatter(data.offsets, data.bounds), axis1=1, axis2=2))
-        heights = board.points[board.point_bounds[:-1], 2]
-        stack = _homographies_of_boards(board, data, camera, profile)
-        posed = _spans(stack)
-        parts.append(Homographies(pure[posed], stack[posed], heights[posed], sizes[posed]))
+        parts.append(_of_boards(pure, board, data, camera, profile))
     names = ("sights", "matrices", "heights_m", "sizes_px")
-    if not parts:
-        return profile, Homographies(np.empty(0, np.int64), np.empty((0, 3, 3)), np.empty(0), np.empty(0))
     return profile, Homographies(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
 
-def _spans(homographies: Array) -> Mask:
-    """Which homographies (K, 3, 3) send the plane to more than a point or a line."""
-    b = homographies[:, :, :2]
+def _of_plane(number: int, plane: PlaneSight, camera: Camera, matrix: Array) -> Homographies:
+    height, size = np.array([plane.height_m]), np.array([plane.size_px(camera)])
+    return Homographies(np.array([number]), matrix[None], height, size)
+
+
+def _of_boards(
+    numbers: Indices, board: Sights, data: PlaneData, camera: Camera, profile: RadialProfile
+) -> Homographies:
+    """The homographies of sights of points that send the plane to more than a point or a line."""
+    matrices = _homographies_of_boards(board, data, camera, profile)
+    sizes = np.sqrt(np.trace(grouped_scatter(data.offsets, data.bounds), axis1=1, axis2=2))
+    heights = board.points[board.point_bounds[:-1], 2]
+    b = matrices[:, :, :2]
     m = np.swapaxes(b, 1, 2) @ b
-    return np.asarray(np.linalg.det(m) > 1e-20 * np.trace(m, axis1=1, axis2=2) ** 2)
+    posed = np.linalg.det(m) > 1e-20 * np.trace(m, axis1=1, axis2=2) ** 2
+    return Homographies(numbers[posed], matrices[posed], heights[posed], sizes[posed])
 
 
 def _flat_sights_of_points(sights: Sights) -> Indices:
@@ -260,12 +270,12 @@ class RingRadii:
 
 def ring_radii(sight: Sights, camera: Camera) -> RingRadii:
     """Radii of the observed rings around their own centre, which need not be the principal point (paper, section 2)."""
-    on_ring = sight.is_arc[sight.track]
+    on_ring = sight.on_arc
     offsets = camera.offsets(sight.curve_pixels)[on_ring]
-    radii = np.linalg.norm(sight.tracks[sight.track[on_ring], 1], axis=1)
+    radii = np.linalg.norm(sight.tracks[sight.track_index[on_ring], 1], axis=1)
     _, ring = np.unique(radii, return_inverse=True)
     centre = offsets.mean(axis=0)
-    for _ in range(10):  # each ring's own mean radius, so that stretches that are not seen do not pull the centre
+    for _ in range(10):  # each ring's own mean radius, so that stretches that are not seen do not shift the centre
         away = offsets - centre
         radius = np.linalg.norm(away, axis=1)
         mean = np.bincount(ring, radius) / np.bincount(ring)
@@ -292,9 +302,9 @@ def _homographies_of_boards(board: Sights, data: PlaneData, camera: Camera, prof
     sizes = np.diff(data.bounds)
     for number in np.flatnonzero((far > 0.1 * sizes) & (sizes >= 8)):
         sight = board[int(number)]
-        found = consensus_homography(sight.points[:, :2], profile.lift(camera.offsets(sight.pixels)), limit)
-        if found is not None:
-            homographies[number] = found
+        homography = consensus_homography(sight.points[:, :2], profile.lift(camera.offsets(sight.pixels)), limit)
+        if homography is not None:
+            homographies[number] = homography
     return homographies
 
 
@@ -309,10 +319,10 @@ def consensus_homography(plane: Array, lifted: Array, limit_px: float) -> Array 
     options = pycolmap.RANSACOptions()
     options.max_error = limit_px
     options.random_seed = 0
-    found = pycolmap.estimate_homography_matrix(plane, lifted[:, :2] / lifted[:, 2:], options)
-    if found is None:
+    consensus = pycolmap.estimate_homography_matrix(plane, lifted[:, :2] / lifted[:, 2:], options)
+    if consensus is None:
         return None
-    inliers = np.asarray(found["inlier_mask"], dtype=bool)
+    inliers = np.asarray(consensus["inlier_mask"], dtype=bool)
     try:
         return homography_from_points(plane[inliers], lifted[inliers])
     except DegenerateError:

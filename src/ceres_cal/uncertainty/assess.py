@@ -14,7 +14,8 @@ from ceres_cal.start.initialise import PHI_RANGE, USUAL_PHI
 from ceres_cal.uncertainty.posterior import Posterior, make_posterior, student_95
 from ceres_cal.uncertainty.profile import Node, profile, valley
 
-_BENT = 0.05  # relative sigma of phi above which the quadratic picture is left
+# Relative sigma of phi above which the quadratic picture is left. Nothing changes from half to double.
+_BENT = 0.05
 
 
 def assess(

@@ -23,14 +23,20 @@ from ceres_cal.model.quantities import difference, moved
 from ceres_cal.solve import Problem, information, solve
 from ceres_cal.start.initialise import PHI_RANGE
 
-_FAR = 9.0  # rise of twice the cost at which the valley is followed no further: three sigma
+# Rise of twice the cost at which the valley is followed no further: three sigma, well beyond any 95 % bound. Nothing
+# changes from half to double.
+_FAR = 9.0
 _STEPS = (0.02, 0.35)  # of log phi
 _MOST_RISE = 1.5  # from one place to the next
 _MOST_NODES = 60
 _FINE = 16  # places interpolated between two
 _TWICE = (np.log(2.0), np.log(4.0))
-_SETTLED = 1.0  # standard deviation across: what changes by less over the last factor two of phi is bounded by the data
-_SHRINKING = 0.75  # ratio of two changes over a factor two each: 1/2 of what goes with phi towards 0
+# Standard deviation across: what changes by less over the last factor two of phi is bounded by the data. Straight
+# from above 32 % of the intervals are open, 55 % at half of it, 18 % at double; the truth is in all of them.
+_SETTLED = 1.0
+# Ratio of two changes over a factor two each: 1/2 of what goes with phi towards 0, 1 of what goes on for ever.
+# Nothing changes from 0.6 to 0.86.
+_SHRINKING = 0.75
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,7 +10,8 @@ import numpy as np
 from ceres_cal.base.arrays import Array, Indices, Mask
 from ceres_cal.model.parameters import Estimate
 from ceres_cal.observations import Columns, Observations
-from ceres_cal.scene.targets import Target, along_track, nearest_on_track
+from ceres_cal.scene.curves import along_track, nearest_on_track
+from ceres_cal.scene.targets import Target
 from ceres_cal.uncertainty.maps import FieldMap, field_map, locate_slopes, radius_95, shown_pixels, station_keys
 from ceres_cal.uncertainty.posterior import Posterior
 

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.model.parameters import Estimate
-from ceres_cal.scene.targets import MOVABLE, Target
+from ceres_cal.scene.targets import Target
 from ceres_cal.uncertainty.maps import FieldMap, PointSpread, field_map, spread_of_points
 from ceres_cal.uncertainty.posterior import Posterior
 from ceres_cal.uncertainty.seam import seam_map
@@ -130,7 +130,7 @@ def field_grid(targets: Mapping[str, Target]) -> tuple[Array, Array]:
     Raises:
         InputError: there is nothing that does not move.
     """
-    box = [_corners(target) for target in targets.values() if target.kind not in MOVABLE]
+    box = [_corners(target) for target in targets.values() if not target.movable]
     if not box:
         raise InputError("no field to draw a map of: give x_m and y_m")
     low, high = np.min([b[0] for b in box], axis=0), np.max([b[1] for b in box], axis=0)

@@ -18,8 +18,10 @@ KNOWN, WEAK = 0.01, 0.3
 """Relative sigmas: up to the first a number is known (phi of 868 px to 9 px, a height of 4 m to 40 mm, a turn to 0.6
 degrees), up to the second it is weak, beyond it, or with a bound that is open, unknown."""
 _LEARNT = 0.5  # of a tolerance's sigma: what the data must add to call the offset of a line known
-_IN_WORDS = 0.3  # of the largest share: smaller ones are not named
-_TOGETHER = 0.1  # a ratio that is so much better known than its parts is worth a sentence
+# Of the largest share: smaller ones are not named. Nothing changes from half to double.
+_IN_WORDS = 0.3
+# A ratio that is so much better known than its parts is worth a sentence. Nothing changes from half to double.
+_TOGETHER = 0.1
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,9 @@ the third column of the paper's H makes (section 4), exact for every height. So 
 from __future__ import annotations
 
 import io
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,10 +17,14 @@ from numpy.typing import ArrayLike
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import read_bytes, write_bytes
-from ceres_cal.scene.camera import Camera
+from ceres_cal.formats.export_format import Exported, ExportFormat, ExportRequest, Loss
+from ceres_cal.formats.loss import field_error_mm
 from ceres_cal.scene.heights import HEIGHTS_M
 
-FORMAT, VERSION = "ceres-cal/table", 1
+if TYPE_CHECKING:
+    from ceres_cal.scene.camera import Camera
+
+FILE_FORMAT, VERSION = "ceres-cal/table", 1
 _STEPS_PX = (64, 32, 16, 8, 4, 2, 1)
 
 
@@ -59,13 +64,13 @@ class LookupTable:
         lower = (1.0 - u) * nodes[row + 1, column] + u * nodes[row + 1, column + 1]
         return np.where(inside[:, None], (1.0 - v) * upper + v * lower, np.nan)
 
-    def save(self, path: str | Path) -> None:
-        """Write it as NPZ."""
+    def to_bytes(self) -> bytes:
+        """The content of its NPZ file."""
         stream = io.BytesIO()
         errors = [(height_m, *error) for height_m, error in self.error_mm.items()]
         np.savez_compressed(
             stream,
-            format=np.array(FORMAT),
+            format=np.array(FILE_FORMAT),
             version=np.array(VERSION),
             station=np.array(self.station),
             image_size=np.array(self.image_size),
@@ -78,7 +83,11 @@ class LookupTable:
             homography=self.homography,
             third_column=self.third_column,
         )
-        write_bytes(path, stream.getvalue())
+        return stream.getvalue()
+
+    def save(self, path: str | Path) -> None:
+        """Write it as NPZ."""
+        write_bytes(path, self.to_bytes())
 
     @classmethod
     def load(cls, path: str | Path) -> LookupTable:
@@ -89,7 +98,7 @@ class LookupTable:
         """
         try:
             with np.load(io.BytesIO(read_bytes(path)), allow_pickle=False) as data:
-                if str(data["format"]) != FORMAT or int(data["version"]) != VERSION:
+                if str(data["format"]) != FILE_FORMAT or int(data["version"]) != VERSION:
                     raise InputError(f"{path}: is no table of version {VERSION}: export it again")
                 width, height = (int(size) for size in data["image_size"])
                 return cls(
@@ -108,7 +117,7 @@ class LookupTable:
             raise InputError(f"{path}: is no table ({error}): export it again") from None
 
 
-def make_table(
+def make_lookup_table(
     camera: Camera, station: str, x_m: Array, y_m: Array, error_mm: float = 0.1, step_px: int | None = None
 ) -> LookupTable:
     """The table of a camera; without a step, the widest grid whose largest error keeps to `error_mm`.
@@ -148,7 +157,7 @@ def _table(camera: Camera, station: str, step: int, x_m: Array, y_m: Array) -> L
     )
     pixels = np.column_stack([part.ravel() for part in np.meshgrid(x[:-1] + 0.5 * step, y[:-1] + 0.5 * step)])
     inside = np.all((pixels >= -0.5) & (pixels <= np.array(camera.image_size) - 0.5), axis=1)
-    errors = {height_m: _error_mm(camera, plain, pixels[inside], x_m, y_m, height_m) for height_m in HEIGHTS_M}
+    errors = field_error_mm(camera, plain.locate, pixels[inside], (x_m, y_m), HEIGHTS_M)
     return replace(plain, error_mm=errors)
 
 
@@ -161,16 +170,36 @@ def _rays(camera: Camera, x: Array, y: Array) -> tuple[Array, Array]:
     return floor.reshape(shape), slope.reshape(shape)
 
 
-def _error_mm(
-    camera: Camera, table: LookupTable, pixels: Array, x_m: Array, y_m: Array, height_m: float
-) -> tuple[float, float]:
-    """Root mean square and largest error where it is largest, half way between nodes, over the box."""
-    true = camera.locate(pixels, height_m)
-    low, high = (np.array([end(x_m), end(y_m)]) for end in (np.min, np.max))
-    with np.errstate(invalid="ignore"):
-        on_field = np.all((true >= low) & (true <= high), axis=1)
-    if not on_field.any():
-        return np.inf, np.inf
-    off = 1e3 * np.linalg.norm(table.locate(pixels[on_field], height_m) - true[on_field], axis=1)
-    off = np.where(np.isfinite(off), off, np.inf)
-    return float(np.sqrt(np.mean(off**2))), float(np.max(off))
+# ---- as an export format --------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class LookupOptions:
+    """How fine the table is: see `make_lookup_table`."""
+
+    error_mm: float = field(default=0.1, metadata={"help": "largest interpolation error on the field; default: 0.1"})
+    step_px: int | None = field(
+        default=None, metadata={"help": "distance of the nodes; default: the widest that keeps to the error"}
+    )
+
+    def __post_init__(self) -> None:
+        if not self.error_mm > 0.0:
+            raise InputError(f"error_mm must be above 0, not {self.error_mm:g}")
+
+
+def _export(request: ExportRequest) -> Exported:
+    from ceres_cal.uncertainty.uncertainty import field_grid  # not for the command line's help
+
+    (station,) = request.stations
+    box, options = field_grid(request.calibration.targets), request.options
+    table = make_lookup_table(request.calibration.station(station), station, *box, options.error_mm, options.step_px)
+    nodes = (len(table.x_px), len(table.y_px))
+    return Exported(
+        table.to_bytes(),
+        (Loss(station, table.error_mm),),
+        f"{nodes[0]} x {nodes[1]} nodes every {table.step_px} px",
+        {"station": station, "step_px": table.step_px, "nodes": nodes},
+    )
+
+
+FORMAT = ExportFormat("table", "a look-up table from pixels to the field", (".npz",), _export, options=LookupOptions)

@@ -1,0 +1,216 @@
+"""What the constants that decide something decide: python scripts/constants.py [--help]
+
+Each is halved and doubled (a share of one half and more by its odds, a whole number to the nearest one), and small,
+fast scenes are measured again: false alarms and findings of `diagnose`, refusals, boards mirrored or lost, the error
+over the Cramer-Rao bound, false alarms and power of `check`, moves refitted, fields, boards and rings found. One
+row for each constant and factor says which figures change; "nothing" where none does in the digits shown.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import inspect
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+HALF, TWICE = 0.5, 2.0
+Value = float | int | tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Constant:
+    """A constant that decides something.
+
+    Attributes:
+        module: below `ceres_cal`. name: there; "Class.field" for a default of a dataclass. figures: what it may touch.
+    """
+
+    module: str
+    name: str
+    figures: tuple[str, ...]
+
+    def __str__(self) -> str:
+        return f"{self.module}.{self.name}"
+
+    @property
+    def value(self) -> Value:
+        owner = importlib.import_module(f"ceres_cal.{self.module}")
+        if "." in self.name:
+            cls, field = self.name.split(".")
+            value: Value = inspect.signature(getattr(owner, cls)).parameters[field].default
+        else:
+            value = getattr(owner, self.name)
+        return value
+
+    def set(self, value: Value) -> None:
+        """Change it for this process, where others have copied it too."""
+        owner, old = importlib.import_module(f"ceres_cal.{self.module}"), self.value
+        if "." in self.name:
+            cls, field = self.name.split(".")
+            make = getattr(owner, cls).__init__
+            names = [name for name, one in inspect.signature(make).parameters.items() if one.default is not one.empty]
+            defaults = list(make.__defaults__)
+            defaults[names.index(field)] = value
+            make.__defaults__ = tuple(defaults)
+            return
+        for module in [module for name, module in sys.modules.items() if name.startswith("ceres_cal")]:
+            if vars(module).get(self.name) is old:
+                setattr(module, self.name, value)
+
+
+def _of(module: str, names: str, *figures: str) -> list[Constant]:
+    return [Constant(module, name, figures) for name in names.split()]
+
+
+DECIDING: tuple[Constant, ...] = (
+    *_of("model.parameters", "Options.loss_scale Options.reject_sigma", "calibrate", "diagnose"),
+    *_of("calibrating", "_NO_FIT", "calibrate"),
+    *_of("solve.robust", "_AT_REST _ENOUGH_PLACEMENTS", "calibrate"),
+    *_of("solve.robust", "_AT_REST_AGAIN", "refit"),
+    *_of("solve.noise", "_LEAST_SPARE", "calibrate"),
+    *_of("solve.noise", "USUAL_EQUATIONS", "refit"),
+    *_of("solve.lost", "_LOST _FEWEST", "calibrate"),
+    *_of("solve.mirrored", "_DECIDED_SIGMA _SAME _MUCH_WORSE", "calibrate"),
+    *_of("solve.bundle", "_POSED", "calibrate"),
+    *_of("solve.costs", "_LEFT_TO_THE_COMPLEMENT", "calibrate"),
+    *_of("start.initialise", "USUAL_PHI", "calibrate", "verdicts"),
+    *_of("start.planes", "_ROUGH_PX _SUSPICIOUS _NO_FIT", "calibrate"),
+    *_of("kernels.planes", "_WRONG", "calibrate"),
+    *_of("uncertainty.assess", "_BENT", "verdicts"),
+    *_of("uncertainty.profile", "_FAR _SETTLED _SHRINKING", "verdicts"),
+    *_of("uncertainty.weak", "KNOWN WEAK _IN_WORDS _TOGETHER", "verdicts"),
+    *_of("advice.ranking", "_WORTH _LARGER _LESS", "advice"),
+    *_of("advice.candidates", "_MARKED", "advice"),
+    *_of("diagnostics.findings", "SMALL", "diagnose"),
+    *_of("diagnostics.leftover", "LARGER _FEWEST_PAIRS", "diagnose"),
+    *_of("diagnostics.patterns", "_LEAST_SHARE _FEWEST_AGREE _FAR_M", "diagnose"),
+    *_of("diagnostics.alternatives", "_FEWEST_ON_CURVE _FEWEST_OF_POINT", "diagnose"),
+    *_of("moves.checking", "_INLIER_SIGMA _LEAST_SHARE _NOISY _WILL_DO", "check"),
+    *_of("moves.comparison", "_DOUBTFUL", "check"),
+    *_of("moves.poses", "_FITS_SHARE _FITS_SIGMA _FITS_SCALE _STRAY _ALIKE _WIDE", "check", "refit"),
+    *_of("moves.refitting", "_NATS_ALIKE _UNIQUE", "refit"),
+    *_of("moves.explain", "_HALF _FEW _RARE _NOISIER _TOO_NOISY _SUPPORTED _FAR_M _NEAR_M _NEAR_RAD", "refit"),
+    *_of("detect.lines", "_LEAST_CLARITY _LEAST_CONTRAST _OF_NEARBY _NOISY _WANDERING _FAR", "lines"),
+    *_of("detect.strokes", "_LEAST_PX _STRAIGHT_PX _NOISE _OF_BRIGHTEST", "auto"),
+    *_of("detect.saddles", "_LOST _FAINT", "boards"),
+    *_of("detect.rings", "_FEWEST_RAYS _LEAST_CONTRAST _NOISY _FAR _MOST_MISFIT", "rings"),
+    *_of("photographs.clicks", "SIGMA_PX _SQUARE", "clicks"),
+    *_of("photographs.follow", "LEAST_SHARE _SURE_SHARE _ABSENT _MOST_ABSENT", "lines", "auto"),
+    *_of("photographs.facing", "_FACES _AS_WELL _NEARER_DEG", "auto"),
+    *_of("photographs.candidates", "_SURE _COMPARABLE _ALIKE", "auto"),
+    *_of("photographs.judgement", "_NEAR_PX _EXPLAINED _FEWEST_PLACES _FEWEST_CURVES", "auto"),
+    *_of("photographs.judgement", "_LEAST_UPRIGHT _SAME_FLOOR", "auto"),
+    *_of("photographs.matching", "_PEAK _LEAST_PEAK _PARALLEL _CELL _LEAST_IN_VIEW", "auto"),
+    *_of("photographs.search", "_SURE _AS_GOOD", "auto"),
+    *_of("photographs.upright", "_USUAL_TILT _PRIOR_WEIGHT _LEAST_SHARE _APART", "auto"),
+)  # fmt: skip
+"""Those that say what is an outlier, a lost board, a competing pose, a move, a finding, a found field and the like."""
+
+
+def scaled(value: Value, factor: float) -> Value:
+    """The value times the factor; a share from one half on by its odds, a whole number rounded, at least 1."""
+    if isinstance(value, tuple):
+        return tuple(factor * part for part in value)
+    if isinstance(value, int):
+        return max(round(factor * value), 1)
+    if 0.5 <= value < 1.0:
+        odds = factor * value / (1.0 - value)
+        return odds / (1.0 + odds)
+    return factor * value
+
+
+# ---- measuring ------------------------------------------------------------------------------------------------------
+
+
+def measured(
+    figures: str, runs: int, folder: Path, constant: Constant | None = None, value: Value = 0
+) -> dict[str, str]:
+    """The figures, as they are printed, with a constant set to another value in a process of its own."""
+    setting = [] if constant is None else ["--set", str(constant), json.dumps(value)]
+    command = [sys.executable, __file__, "--measure", figures, str(folder), "--runs", str(runs), *setting]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    if constant is not None and constant.module.startswith("kernels"):  # it is part of the machine code
+        environment["NUMBA_CACHE_DIR"] = str(folder / f"kernels {constant} {value}")
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
+    if done.returncode:
+        return {"error": done.stderr.strip().rpartition("\n")[2]}
+    found: dict[str, float] = json.loads(done.stdout.splitlines()[-1])
+    return {name: f"{number:.0f}" if float(number).is_integer() else f"{number:.3g}" for name, number in found.items()}
+
+
+def changes(now: dict[str, str], then: dict[str, str]) -> str:
+    """What is different, in words."""
+    if "error" in then:
+        return then["error"]
+    found = [f"{name} {now.get(name)} -> {then[name]}" for name in then if then[name] != now.get(name)]
+    return "; ".join(found) or "nothing"
+
+
+def rows(chosen: Sequence[Constant], runs: int, folder: Path) -> Iterator[tuple[str, str, str, str]]:
+    """Constant, value, what it is set to, what changes; two for each constant, after what is measured as it is."""
+    now: dict[str, dict[str, str]] = {}
+    for constant in chosen:
+        for name in constant.figures:
+            if name not in now:
+                now[name] = measured(name, runs, folder)
+                yield name, "", "", "; ".join(f"{what} {value}" for what, value in now[name].items())
+        for factor in (HALF, TWICE):
+            value = scaled(constant.value, factor)
+            found = [changes(now[name], measured(name, runs, folder, constant, value)) for name in constant.figures]
+            told = "; ".join(each for each in found if each != "nothing") or "nothing"
+            yield str(constant), short(constant.value), short(value), told
+
+
+def short(value: Value) -> str:
+    return ", ".join(f"{part:.3g}" for part in (value if isinstance(value, tuple) else (value,)))
+
+
+def _measure(figures: str, folder: Path, runs: int, setting: Sequence[str] | None) -> int:
+    """In the process that `measured` starts: set the constant, then measure; the last line printed is the answer."""
+    from constants_figures import FIGURES  # with it, everything that copies constants
+
+    if setting is not None:
+        constant = next(one for one in DECIDING if str(one) == setting[0])
+        value: Any = json.loads(setting[1])
+        constant.set(tuple(value) if isinstance(value, list) else value)
+    print(json.dumps(FIGURES[figures](runs, folder)))
+    return 0
+
+
+def main(arguments: Sequence[str]) -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--runs", type=int, default=10, help="simulations or photographs of each kind; default: 10")
+    parser.add_argument("--only", nargs="+", metavar="NAME", help="only constants with one of these in their names")
+    parser.add_argument("--json", type=Path, help="write the rows there, too")
+    parser.add_argument("--measure", nargs=2, metavar=("FIGURES", "FOLDER"), help=argparse.SUPPRESS)
+    parser.add_argument("--set", nargs=2, metavar=("NAME", "VALUE"), help=argparse.SUPPRESS)
+    given = parser.parse_args(arguments)
+    if given.measure:
+        return _measure(given.measure[0], Path(given.measure[1]), given.runs, given.set)
+    chosen = [one for one in DECIDING if not given.only or any(part in str(one) for part in given.only)]
+    if not chosen:
+        parser.error(f"no constant has {' or '.join(given.only)} in its name")
+    every = []
+    with tempfile.TemporaryDirectory() as folder:
+        for row in rows(chosen, given.runs, Path(folder)):
+            every.append(row)
+            name, value, other, told = row
+            print(f"{name:38} {value + ' -> ' + other if other else 'as it is':26} {told}", flush=True)
+    if given.json:
+        keys = ("constant", "value", "set to", "changes")
+        given.json.write_text(
+            json.dumps([dict(zip(keys, row, strict=True)) for row in every], indent=1), encoding="utf-8"
+        )
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

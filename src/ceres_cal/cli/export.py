@@ -1,0 +1,134 @@
+"""`ceres-cal export` and, for look-up tables, `export-table`: a calibration in a format that others read."""
+
+from __future__ import annotations
+
+from argparse import ArgumentParser, Namespace
+from collections.abc import Collection
+from typing import TYPE_CHECKING, Any
+
+from ceres_cal.base.errors import InputError
+from ceres_cal.cli.arguments import add_calibration, add_output
+from ceres_cal.cli.command import Answer, Command
+from ceres_cal.cli.inputs import read_calibration
+from ceres_cal.cli.outputs import finishing, require_output
+
+if TYPE_CHECKING:
+    from ceres_cal.formats import Exported, ExportFormat
+
+_OPTION = "option "  # before the names of a format's options: theirs may be those of the command's own arguments
+
+
+def _add_arguments(parser: ArgumentParser) -> None:
+    from ceres_cal.formats import EXPORT_FORMATS
+
+    forms = EXPORT_FORMATS.values()
+    listed = "; ".join(f"{one.name}: {one.description} ({', '.join(one.endings) or 'a folder'})" for one in forms)
+    parser.add_argument("--to", metavar="FORMAT", required=True, help=(listed or "there is none").replace("%", "%%"))
+    _add_shared_arguments(parser, forms)
+
+
+def _add_table_arguments(parser: ArgumentParser) -> None:
+    from ceres_cal.formats import export_format
+
+    parser.set_defaults(to="table")
+    _add_shared_arguments(parser, [export_format("table")])
+
+
+def _add_shared_arguments(parser: ArgumentParser, forms: Collection[ExportFormat]) -> None:
+    add = parser.add_argument
+    add_calibration(parser)
+    add_output(parser, "the export; its ending is one of the format's", required=True)
+    add(
+        "--station",
+        metavar="NAME",
+        action="append",
+        help="which station; may be left out where there is only one, or the format holds all; repeatable",
+    )
+    for name, helps in _options_of(forms).items():
+        add(_flag(name), dest=_OPTION + name, metavar="VALUE", help="; ".join(helps))
+
+
+def _options_of(forms: Collection[ExportFormat]) -> dict[str, list[str]]:
+    """Every option of the formats, with what it means to each of them."""
+    from dataclasses import fields
+
+    every: dict[str, list[str]] = {}
+    for form in forms:
+        for one in fields(form.options):
+            every.setdefault(one.name, []).append(f"{form.name}: {one.metadata.get('help', '')}")
+    return every
+
+
+def _flag(name: str) -> str:
+    return f"--{name.replace('_', '-')}"
+
+
+def _run(args: Namespace) -> Answer:
+    from ceres_cal.formats import export_format, prepare_export
+
+    form = export_format(args.to)
+    if form.endings:
+        require_output(args.output, [args.calibration])
+    options = _options(args, form)
+    exported = prepare_export(read_calibration(args), form.name, args.output, args.station, options)
+    with finishing():
+        exported.save(args.output)
+    return Answer(_data(exported, args), lambda: _text(exported, args))
+
+
+def _options(args: Namespace, form: ExportFormat) -> dict[str, Any]:
+    """What was given of the format's options, of the types that they have."""
+    from typing import get_type_hints
+
+    import msgspec
+
+    given = {name.removeprefix(_OPTION): text for name, text in vars(args).items() if name.startswith(_OPTION)}
+    types, options = get_type_hints(form.options), {}
+    for name, text in given.items():
+        if text is None:
+            continue
+        if name not in types:
+            raise InputError(f"{_flag(name)} is no option of format {form.name}")
+        try:
+            options[name] = msgspec.convert(text, types[name], strict=False)
+        except msgspec.ValidationError:
+            raise InputError(f"{_flag(name)}: {text!r} is not the number or word that it takes") from None
+    return options
+
+
+def _data(exported: Exported, args: Namespace) -> dict[str, Any]:
+    return {
+        "format": args.to,
+        "output": str(args.output),
+        **exported.facts,
+        "errors": [
+            {"station": loss.station, "height_m": height_m, "rms_mm": rms, "worst_mm": worst}
+            for loss in exported.losses
+            for height_m, (rms, worst) in loss.field_mm.items()
+        ],
+        "errors_px": [
+            {"station": loss.station, "rms_px": loss.image_px[0], "worst_px": loss.image_px[1]}
+            for loss in exported.losses
+            if loss.image_px is not None
+        ],
+        "warnings": list(exported.warnings),
+    }
+
+
+def _text(exported: Exported, args: Namespace) -> str:
+    lines = [f"{args.to:10}{exported.words}, written to {args.output}"]
+    for loss in exported.losses:
+        of = f"{loss.station}: " if len(exported.losses) > 1 else ""
+        if loss.image_px is not None:
+            rms, worst = loss.image_px
+            lines.append(f"{'error':10}{of}{rms:.4f} px rms, {worst:.4f} px at most, over the image")
+        for height_m, (rms, worst) in loss.field_mm.items():
+            where = f"{1e3 * height_m:.0f} mm above the floor"
+            lines.append(f"{'error':10}{of}{rms:.4f} mm rms, {worst:.4f} mm at most, {where}")
+    return "\n".join([*lines, *(f"{'warning':10}{warning}" for warning in exported.warnings)])
+
+
+COMMANDS = (
+    Command("export", "a calibration in a format that others read, and what that loses", _add_arguments, _run),
+    Command("export-table", "a look-up table from pixels to the field (NPZ)", _add_table_arguments, _run),
+)

@@ -1,0 +1,12 @@
+"""The lens models, each in a file of its own."""
+
+from ceres_cal.scene.lens.base import LENSES, Lens, lens_class, make_lens, register
+from ceres_cal.scene.lens.brown import Brown
+from ceres_cal.scene.lens.kannala_brandt import KannalaBrandt
+from ceres_cal.scene.lens.radial import Radial
+
+__all__ = ["LENSES", "Brown", "KannalaBrandt", "Lens", "Radial", "lens_class", "make_lens", "register"]
+
+register(Radial)
+register(Brown)
+register(KannalaBrandt)

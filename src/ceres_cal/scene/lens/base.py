@@ -1,0 +1,250 @@
+"""What a lens model is: between the direction a ray comes from and the place where it is measured.
+
+Everything here is about one camera's optics and knows neither pose nor principal point. Rays are (N, 3) directions in
+the camera frame (x right, y down, z forward; any length), offsets are (N, 2) measured pixels from the principal point
+on a sensor with square pixels, and phi is the focal length in pixels. Where a model has no answer (behind the camera,
+past its monotone radius) the array functions return NaN.
+
+Every model has its map twice: in arrays, as one reads it, and as loops with derivatives, for the solve.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ceres_cal.base.arrays import Array
+from ceres_cal.base.errors import InputError
+
+LinearEquations = tuple[dict[str, Array], Array]
+_BLOCK = 16384  # rows at a time, so that what is worked on stays in the cache
+
+
+def _in_blocks(function: Callable[[Array, float], Array], rows: ArrayLike, phi: float, columns: int) -> Array:
+    """A lens's map over rows of any number; NaN in the whole row where the answer is not finite."""
+    rows = np.asarray(rows, dtype=float)
+    answer = np.empty((len(rows), columns))
+    with np.errstate(all="ignore"):  # what overflows or divides by zero on the way ends as NaN
+        for start in range(0, len(rows), _BLOCK):
+            block = function(rows[start : start + _BLOCK], phi)
+            block[~np.isfinite(np.sum(block, axis=1))] = np.nan
+            answer[start : start + _BLOCK] = block
+    return answer
+
+
+def ahead(rays: Array) -> Array:
+    """Depths (N, 1) of the rays, NaN behind the camera."""
+    return np.where(rays[:, 2:] > 0.0, rays[:, 2:], np.nan)
+
+
+def unit_rays(across: Array, depth: Array | float) -> Array:
+    """(N, 3) directions of unit length from their x and y (N, 2) and their z."""
+    rays = np.column_stack([across, np.broadcast_to(depth, len(across))])
+    return np.asarray(rays / np.hypot(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2])[:, None])
+
+
+@dataclass(frozen=True)
+class Lens(ABC):
+    """A lens model with its coefficients. A kind of its own is a subclass under `register`: nothing else is to be told.
+
+    Attributes:
+        values: the coefficients, in the order of `names` and in the units of the files and reports.
+        kind: how files and options call it.
+        acts_on_pixels: whether the coefficients act on radii in pixels, not on directions.
+        may_fold: whether the model may fold in a corner of the image that nobody observed.
+        decentring: names of the coefficients that displace tangentially.
+        trial_powers: of the kinds that leave the choice of powers: those worth a trial, the plainest first.
+        missing_powers: of the radius that a diagnosis tries, lowest first.
+        work_rows: how many numbers per observation `distort_chunk` keeps for `differentiate_chunk`.
+    """
+
+    values: tuple[float, ...] = ()
+    kind: ClassVar[str]
+    acts_on_pixels: ClassVar[bool] = False
+    may_fold: ClassVar[bool] = True
+    decentring: ClassVar[tuple[str, ...]] = ()
+    trial_powers: ClassVar[tuple[tuple[int, ...], ...]] = ()
+    missing_powers: ClassVar[tuple[int, ...]] = (3, 5, 7, 9, 11)
+    work_rows: ClassVar[int] = 5
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "values", tuple(float(v) for v in self.values))
+        if len(self.values) != len(self.names):
+            raise InputError(
+                f"lens {self.kind!r} has coefficients {', '.join(self.names)}: give {len(self.names)} numbers, "
+                f"not {len(self.values)}"
+            )
+
+    @property
+    @abstractmethod
+    def names(self) -> tuple[str, ...]:
+        """Names of the coefficients."""
+
+    @property
+    @abstractmethod
+    def orders(self) -> tuple[int, ...]:
+        """The power of the radius (or of the angle) with which the effect of each coefficient grows."""
+
+    @property
+    def powers(self) -> tuple[int, ...]:
+        """The powers that it was chosen by; empty where its kind leaves no choice."""
+        return ()
+
+    @classmethod
+    def blank(cls, powers: Sequence[int]) -> Lens:
+        """The model with every coefficient 0; powers are for the kinds that leave the choice."""
+        return cls()
+
+    @property
+    def coefficients(self) -> dict[str, float]:
+        """The coefficients by name, in the units of the files: for `radial` the paper's pixels."""
+        return dict(zip(self.names, self.values, strict=True))
+
+    def with_values(self, values: ArrayLike) -> Lens:
+        """The same model with other coefficients."""
+        return replace(self, values=tuple(float(v) for v in np.asarray(values, dtype=float)))
+
+    def distort(self, rays: ArrayLike, phi: float) -> Array:
+        """Rays (N, 3) -> measured offsets (N, 2) px; NaN where the model has no answer."""
+        return _in_blocks(self._distort, rays, phi, 2)
+
+    def undistort(self, offsets: ArrayLike, phi: float) -> Array:
+        """Measured offsets (N, 2) px -> rays (N, 3) of unit length; NaN where the model has no answer."""
+        return _in_blocks(self._undistort, offsets, phi, 3)
+
+    @abstractmethod
+    def _distort(self, rays: Array, phi: float) -> Array: ...
+
+    @abstractmethod
+    def _undistort(self, offsets: Array, phi: float) -> Array: ...
+
+    @abstractmethod
+    def monotone_radius(self, phi: float) -> float:
+        """Measured radius (px) up to which the model is monotone and so has one answer; infinity where it always has.
+
+        Where it is not the same all around, that of the direction in which it is least.
+        """
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """The unit of each coefficient."""
+        return tuple(f"px^{1 - order}" if self.acts_on_pixels and order != 1 else "1" for order in self.orders)
+
+    @property
+    def formula(self) -> str:
+        """The model in a line, for the report; empty where a line does not hold it."""
+        return ""
+
+    @property
+    def note(self) -> str:
+        """What a calibration's summary says of the coefficients; empty where they speak for themselves."""
+        return ""
+
+    def scales(self, unit_px: float) -> Array:
+        """What to multiply each coefficient with so that it is of order one, for the solver (design, section 4)."""
+        if not self.acts_on_pixels:
+            return np.ones(len(self.names))
+        return np.asarray(float(unit_px) ** (np.asarray(self.orders) - 1.0))
+
+    def natural_sizes(self, phi: float, unit_px: float) -> list[float]:
+        """The size of each coefficient that moves a pixel `unit_px` from the middle by as much."""
+        radius = unit_px if self.acts_on_pixels else unit_px / phi
+        return [radius ** (1 - order) for order in self.orders]
+
+    def start_equations(self, measured: Array, ideal: Array, angle: Array, phi: float) -> LinearEquations:
+        """Columns by coefficient name and the right side of equations that are linear in the coefficients.
+
+        Without columns the solve starts from a lens that does not distort.
+
+        Args:
+            measured: (N,) radii, px. ideal: (N,) phi times the tangent of the ray's angle to the axis, px, NaN from
+                about 90 degrees on; angle: (N,) itself.
+        """
+        return {}, np.zeros_like(measured)
+
+    def radial_change(self, offsets: Array, phi: float, unit_px: float, power: int) -> Array:
+        """(N,) px by which offsets (N, 2) grow with one more term of the power, of a size of order one."""
+        return np.asarray(unit_px * (np.hypot(offsets[:, 0], offsets[:, 1]) / unit_px) ** power)
+
+    # ---- for the solve: a chunk of rays at a time; the kernels compile these and the plain functions that they call
+
+    @property
+    @abstractmethod
+    def state(self) -> Array:
+        """Working numbers of `distort_chunk`: what the model is chosen by, and room for what `prepare` derives."""
+
+    @staticmethod
+    @abstractmethod
+    def prepare(intrinsics: Any, unit: float, state: Any) -> None:
+        """Fill the state.
+
+        Args:
+            intrinsics: phi, aspect, cx, cy, then the coefficients times their `scales`. unit: half the image diagonal,
+                px, for which these are.
+        """
+
+    @staticmethod
+    @abstractmethod
+    def distort_chunk(n: int, intrinsics: Any, unit: float, state: Any, rays: Any, image: Any, work: Any) -> bool:
+        """Fill the first n columns of `image` and `work`; False where any ray has no answer.
+
+        Args:
+            rays: (3, n). image: (7, n) the offset in px, x and y, its derivatives xx, xy = yx, yy with respect to the
+                ray's x and y, and xz, yz with respect to its z. work: (work_rows, n).
+        """
+
+    @staticmethod
+    @abstractmethod
+    def differentiate_chunk(
+        n: int, intrinsics: Any, unit: float, state: Any, image: Any, work: Any, jacobian: Any
+    ) -> None:
+        """Fill rows 4 and on of `jacobian` (intrinsics + 6, 2, n): derivatives of the pixel's x and y (its y is aspect
+        times the offset's) with respect to each coefficient as the solver has it, and row 0, phi's, where the offset is
+        not proportional to phi.
+        """
+
+
+_L = TypeVar("_L", bound=Lens)
+LENSES: dict[str, type[Lens]] = {}
+"""Every kind of lens, by its name: options, files, diagnosis and command line offer what is here."""
+
+
+def register(lens: type[_L]) -> type[_L]:
+    """Add a kind of lens to the table: a decorator.
+
+    Raises:
+        InputError: the table has another lens of that name.
+    """
+    if LENSES.setdefault(lens.kind, lens) is not lens:
+        raise InputError(f"there is a lens {lens.kind!r} already: give the new one a kind of its own")
+    return lens
+
+
+def lens_class(kind: str) -> type[Lens]:
+    """The model of a name.
+
+    Raises:
+        InputError: there is none.
+    """
+    if kind not in LENSES:
+        raise InputError(f"unknown lens {kind!r}: choose one of {', '.join(LENSES)}")
+    return LENSES[kind]
+
+
+def make_lens(kind: str, powers: Sequence[int] = (2, 3), coefficients: Mapping[str, float] | None = None) -> Lens:
+    """A lens by the name of its model; coefficients that are not named are 0.
+
+    Raises:
+        InputError: unknown kind, unknown coefficient name, or powers that make no lens.
+    """
+    given = dict(coefficients or {})
+    blank = lens_class(kind).blank(powers)
+    for name in given:
+        if name not in blank.names:
+            raise InputError(f"lens {kind!r} has no coefficient {name!r}: it has {', '.join(blank.names)}")
+    return blank.with_values([given.get(name, 0.0) for name in blank.names])

@@ -1,0 +1,120 @@
+"""Polynomials along a radius with value 0 and slope 1 at 0: their end, and their inverse."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from ceres_cal.base.arrays import Array
+
+STEPS = 60  # a safeguard: Newton needs 4 to 8, bisection 53
+_FAR_STEPS = 96
+
+
+def horner(polynomial: Array, x: Array) -> Array:
+    """sum c_k x^k, lowest power first."""
+    total = np.full_like(x, polynomial[-1])
+    for coefficient in polynomial[-2::-1]:
+        total *= x
+        if coefficient != 0.0:  # every other one is, in most lenses
+            total += coefficient
+    return total
+
+
+def derivative(polynomial: Array) -> Array:
+    """Its derivative's coefficients, lowest power first."""
+    return np.asarray(polynomial[1:] * np.arange(1, len(polynomial)))
+
+
+def monotone_limit(polynomial: Array) -> float:
+    """Where a polynomial with slope 1 at 0 (lowest power first) stops growing; infinity where it never does."""
+    rising = derivative(polynomial)
+    if not np.all(np.isfinite(rising)):
+        return np.nan
+    # The roots of the reversed polynomial are 1 / x: its leading coefficient is 1, however small the last ones are.
+    inverse = np.roots(rising)
+    size = np.abs(inverse)
+    real = (np.abs(inverse.imag) <= 1e-9 * size) & (inverse.real > 1e-15 * np.max(size, initial=0.0))
+    return 1.0 / float(np.max(inverse.real[real])) if np.any(real) else np.inf
+
+
+def _reach(polynomial: Array, target: Array, limit: float) -> Array:
+    """An x (N,) where the polynomial is not below its target: the limit or, without one, found by doubling."""
+    if np.isfinite(limit):
+        return np.full_like(target, limit)
+    high = target.copy()
+    for _ in range(STEPS):
+        short = horner(polynomial, high) < target
+        if not np.any(short):
+            break
+        high[short] *= 2.0
+    return high
+
+
+def invert_increasing(polynomial: Array, target: Array, limit: float) -> Array:
+    """x in [0, limit] with polynomial(x) = target (N,), by Newton safeguarded with bisection; NaN where there is none.
+
+    The polynomial must increase on [0, limit], with value 0 and slope 1 at 0.
+    """
+    rising = derivative(polynomial)
+    high = _reach(polynomial, target, limit)
+    answer = np.full_like(target, np.nan)
+    rows = np.flatnonzero((target >= 0.0) & np.isfinite(target) & (target <= horner(polynomial, high)))
+    target, high = target[rows], high[rows]
+    low, x, last = np.zeros_like(high), np.minimum(target, high), np.full_like(high, np.inf)
+    for _ in range(STEPS):
+        error = horner(polynomial, x) - target
+        low, high = np.where(error < 0.0, x, low), np.where(error > 0.0, x, high)
+        move = -error / horner(rising, x)
+        # A step that does not halve the last one may run in a circle.
+        good = (x + move >= low) & (x + move <= high) & (np.abs(move) <= 0.5 * last)
+        move = np.where(good, move, 0.5 * (low + high) - x)
+        move = np.where(np.abs(error) > 1e-15 * target, move, 0.0)
+        last, x = np.abs(move), x + move
+        moving = last > 1e-13 * x
+        answer[rows[~moving]] = x[~moving]
+        if not np.any(moving):
+            break
+        rows = rows[moving]
+        target, low, high, x, last = (column[moving] for column in (target, low, high, x, last))
+    return answer
+
+
+def dense_polynomial(values: Sequence[float], powers: Sequence[int]) -> Array:
+    """x + sum values_k x^powers_k as a polynomial, lowest power first."""
+    polynomial = np.zeros(max(powers) + 1)
+    polynomial[1] = 1.0
+    polynomial[list(powers)] = values
+    return polynomial
+
+
+# ---- for the solve: plain numbers and loops, which the kernels compile ----------------------------------------------
+
+
+def radial_slope(dense: Any, x: float) -> float:
+    """d/dx of x (d_0 + d_1 x + d_2 x^2 ...)."""
+    total = 0.0
+    for k in range(len(dense) - 1, -1, -1):
+        total = total * x + (k + 1) * dense[k]
+    return total
+
+
+def growing_until(dense: Any, far: float) -> float:
+    """Where x (d_0 + d_1 x + d_2 x^2 ...) first stops growing, or `far`, the end of what can be observed."""
+    step = far / _FAR_STEPS
+    low, high = 0.0, far
+    for i in range(1, _FAR_STEPS + 1):
+        if radial_slope(dense, i * step) <= 0.0:
+            low, high = (i - 1) * step, i * step
+            break
+        low = i * step
+    if high < far or radial_slope(dense, far) <= 0.0:
+        for _ in range(50):
+            middle = 0.5 * (low + high)
+            if radial_slope(dense, middle) > 0.0:
+                low = middle
+            else:
+                high = middle
+    return low

@@ -1,0 +1,205 @@
+"""The paper's lens."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ceres_cal.base.arrays import Array
+from ceres_cal.base.errors import InputError
+from ceres_cal.scene.lens.base import Lens, LinearEquations, ahead, unit_rays
+from ceres_cal.scene.lens.polynomials import dense_polynomial, growing_until, horner, invert_increasing, monotone_limit
+
+_FAR = 6.0  # half image diagonals: nothing is observed farther out
+_TINY = 1e-150  # its square is still a number
+
+
+@dataclass(frozen=True)
+class Radial(Lens):
+    """The paper's lens: r' = r + sum a_k r^k from the measured radius r to the ideal one r', both in pixels.
+
+    Section 2 of the paper, with a1 = 1: scaling a1, a2, a3 and phi together changes nothing, so phi is the focal length
+    at the centre. `powers` (2, 3) is the paper's own choice, (3,) is ssl-vision's model with a3 = distortion / phi^2.
+    The coefficient of power k is named a<k> and has the unit px^(1-k).
+    """
+
+    powers: tuple[int, ...] = (2, 3)
+    kind: ClassVar[str] = "radial"
+    acts_on_pixels: ClassVar[bool] = True
+    may_fold: ClassVar[bool] = False  # the paper's polynomial can be had without a fold
+    trial_powers: ClassVar[tuple[tuple[int, ...], ...]] = ((3,), (2, 3), (3, 5), (2, 3, 4), (2, 3, 4, 5))
+    missing_powers: ClassVar[tuple[int, ...]] = (2, 3, 4, 5, 6, 7)
+
+    def __post_init__(self) -> None:
+        powers = tuple(int(p) for p in self.powers)
+        if not powers or min(powers) < 2 or len(set(powers)) != len(powers) or powers != tuple(self.powers):
+            raise InputError(f"powers of the radial lens must be different whole numbers from 2 on, not {self.powers}")
+        object.__setattr__(self, "powers", powers)
+        super().__post_init__()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(f"a{p}" for p in self.powers)
+
+    @property
+    def orders(self) -> tuple[int, ...]:
+        return self.powers
+
+    @classmethod
+    def blank(cls, powers: Sequence[int]) -> Radial:
+        return cls((0.0,) * len(tuple(powers)), tuple(powers))
+
+    @property
+    def formula(self) -> str:
+        return "r' = r + " + " + ".join(f"a{p}r^{p}" for p in self.powers)
+
+    @property
+    def note(self) -> str:
+        if self.powers != (2, 3):
+            return ""
+        return "these are the paper's, with its a1 = 1: another a1 goes with a1 a2, a1 a3 and a1 phi"
+
+    @classmethod
+    def from_paper(cls, a1: float, a2: float, a3: float, phi: float) -> tuple[Radial, float]:
+        """The paper's triple with its own a1 and its phi, as (lens, phi) in the gauge a1 = 1.
+
+        Raises:
+            InputError: a1 is not positive.
+        """
+        if not a1 > 0.0:
+            raise InputError(f"a1 of the paper's polynomial must be positive, not {a1}")
+        return cls((a2 / a1, a3 / a1)), phi / a1
+
+    def paper_coefficients(self, a1: float) -> tuple[float, ...]:
+        """(a1, a2, a3, ...) in the paper's scaling; it goes with phi * a1."""
+        return (a1, *(a1 * v for v in self.values))
+
+    @property
+    def _polynomial(self) -> Array:
+        """The map along a radius, lowest power first: r + sum a_k r^k."""
+        return dense_polynomial(self.values, self.powers)
+
+    @cached_property
+    def _limit(self) -> float:
+        """Where that map stops growing; infinity where it never does."""
+        return monotone_limit(self._polynomial)
+
+    def ideal_radius(self, measured_radius: ArrayLike) -> Array:
+        """r' of r, both in px (paper, section 2); no check of the monotone radius."""
+        return horner(self._polynomial, np.asarray(measured_radius, dtype=float))
+
+    def measured_radius(self, ideal_radius: ArrayLike) -> Array:
+        """r of r', both in px: the inverse of `ideal_radius` up to the monotone radius, NaN beyond."""
+        ideal = np.asarray(ideal_radius, dtype=float)
+        with np.errstate(all="ignore"):
+            return invert_increasing(self._polynomial, ideal.ravel(), self._limit).reshape(ideal.shape)
+
+    def _distort(self, rays: Array, phi: float) -> Array:
+        ideal = phi * rays[:, :2] / ahead(rays)
+        radius = np.hypot(ideal[:, 0], ideal[:, 1])
+        shrink = np.where(radius > 0.0, self.measured_radius(radius) / radius, 1.0)
+        return np.asarray(ideal * shrink[:, None])
+
+    def _undistort(self, offsets: Array, phi: float) -> Array:
+        radius = np.hypot(offsets[:, 0], offsets[:, 1])
+        stretch = np.where(radius <= self._limit, horner(self._polynomial[1:], radius), np.nan)
+        return unit_rays(offsets * stretch[:, None], phi)
+
+    def monotone_radius(self, phi: float) -> float:
+        return self._limit
+
+    def start_equations(self, measured: Array, ideal: Array, angle: Array, phi: float) -> LinearEquations:
+        return {name: measured**power for name, power in zip(self.names, self.powers, strict=True)}, ideal - measured
+
+    def radial_change(self, offsets: Array, phi: float, unit_px: float, power: int) -> Array:
+        # The ideal radius grows by r^k: the measured one shrinks by the polynomial's slope.
+        radius = np.hypot(offsets[:, 0], offsets[:, 1]) / unit_px
+        scaled = np.asarray(self.values) * self.scales(unit_px)
+        slope = 1.0 + sum(k * a * radius ** (k - 1) for k, a in zip(self.powers, scaled, strict=True))
+        return np.asarray(unit_px * radius**power / np.maximum(slope, 0.05))
+
+    @property
+    def state(self) -> Array:
+        """The limit, the powers, then the map s (d_0 + d_1 s + ...) of the radius s in half image diagonals."""
+        return np.array([0.0, *self.powers, *[0.0] * max(self.powers)])
+
+    @staticmethod
+    def prepare(intrinsics: Any, unit: float, state: Any) -> None:
+        count = len(intrinsics) - 4
+        dense = state[1 + count :]
+        dense[:] = 0.0
+        dense[0] = 1.0
+        for k in range(count):
+            dense[int(state[1 + k]) - 1] += intrinsics[4 + k]
+        state[0] = growing_until(dense, _FAR)
+
+    @staticmethod
+    def distort_chunk(n: int, intrinsics: Any, unit: float, state: Any, rays: Any, image: Any, work: Any) -> bool:
+        """s (1 + c_2 s + ...) = phi |u| / unit solved for the radius s, in half image diagonals."""
+        limit, dense = state[0], state[len(intrinsics) - 3 :]
+        phi = intrinsics[0]
+        ideal, value, slope = image[0], image[1], image[2]
+        for i in range(n):
+            u, v = rays[0, i] / rays[2, i], rays[1, i] / rays[2, i]
+            m = np.sqrt(u * u + v * v) + _TINY
+            work[0, i], work[1, i], work[2, i] = u, v, m
+            ideal[i] = phi * m / unit
+            work[3, i] = min(ideal[i], limit)
+        worst = 1.0
+        for _ in range(25):
+            worst = _newton_step(n, dense, limit, ideal, work[3], value, slope)
+            if worst < 1e-8:  # the step just taken has squared this
+                break
+        good = worst < 1e-8
+        for i in range(n):
+            work[4, i] = 1.0 / slope[i]
+            good &= (rays[2, i] > 0.0) & (slope[i] > 0.0) & (work[3, i] < limit)
+        for i in range(n):
+            u, v, m, iz = work[0, i], work[1, i], work[2, i], 1.0 / rays[2, i]
+            stretch = unit * work[3, i] / m  # px per unit of the ideal point
+            bend = (phi * work[4, i] - stretch) / (m * m)
+            xx, xy, yy = (stretch + bend * u * u) * iz, bend * u * v * iz, (stretch + bend * v * v) * iz
+            image[0, i], image[1, i] = stretch * u, stretch * v
+            image[2, i], image[3, i], image[4, i] = xx, xy, yy
+            image[5, i], image[6, i] = -(xx * u + xy * v), -(xy * u + yy * v)
+        return good
+
+    @staticmethod
+    def differentiate_chunk(
+        n: int, intrinsics: Any, unit: float, state: Any, image: Any, work: Any, jacobian: Any
+    ) -> None:
+        aspect = intrinsics[1]
+        for i in range(n):
+            jacobian[0, 0, i], jacobian[0, 1, i] = work[0, i] * work[4, i], aspect * work[1, i] * work[4, i]
+        for k in range(len(intrinsics) - 4):
+            row = 4 + k
+            for i in range(n):
+                jacobian[row, 0, i] = -unit * work[4, i] / work[2, i]
+            for _ in range(int(state[1 + k])):
+                for i in range(n):
+                    jacobian[row, 0, i] *= work[3, i]
+            for i in range(n):
+                d = jacobian[row, 0, i]
+                jacobian[row, 0, i], jacobian[row, 1, i] = d * work[0, i], aspect * d * work[1, i]
+
+
+def _newton_step(n: int, dense: Any, limit: float, ideal: Any, s: Any, value: Any, slope: Any) -> float:
+    """One Newton step from s towards s (d_0 + d_1 s + ...) = ideal for a chunk; how far the farthest one went."""
+    top = len(dense) - 1
+    for i in range(n):
+        value[i], slope[i] = dense[top], (top + 1) * dense[top]
+    for k in range(top - 1, -1, -1):
+        for i in range(n):
+            value[i] = value[i] * s[i] + dense[k]
+            slope[i] = slope[i] * s[i] + (k + 1) * dense[k]
+    worst = 0.0
+    for i in range(n):
+        moved = max(0.0, min(s[i] - (value[i] * s[i] - ideal[i]) / slope[i], limit))
+        worst = max(worst, abs(moved - s[i]))
+        s[i] = moved
+    return worst

@@ -1,0 +1,88 @@
+"""What a target looks like turned or mirrored: which of its features lie on which, and how often it can be turned."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+
+import numpy as np
+
+from ceres_cal.base.arrays import Array, Codes, Indices32
+from ceres_cal.base.transforms import Pose, rotation_exp
+from ceres_cal.scene.curves import Arc, Curve, curve_points, distance_to_curve
+from ceres_cal.scene.targets import Target
+
+_SAME_M = 1e-6
+_PIECES = 32  # of a curve, whose ends have to lie on another one
+_MOST_TURNS = 12
+
+
+# ---- feature by feature ---------------------------------------------------------------------------------------------
+
+
+def counterparts(target: Target, image: Array) -> tuple[Indices32, Indices32, Codes]:
+    """For each point and each curve the one that x, y, z times `image` (3,) sends it to (-1: none), and 1 or -1 for
+    the curve's side.
+    """
+    places = target.point_array
+    to_point = np.full(len(places), -1, dtype=np.int32)
+    for number, sent in enumerate(places * image):
+        near = np.flatnonzero(np.all(np.abs(places - sent) < _SAME_M, axis=1))
+        to_point[number] = near[0] if len(near) else -1
+    curves = list(target.curves.values())
+    to_curve, flips = np.full(len(curves), -1, dtype=np.int32), np.ones(len(curves), dtype=np.int8)
+    mirrored = np.sign(image[0] * image[1])
+    for number, curve in enumerate(curves):
+        sent = curve_points(curve, 0, _PIECES) * image
+        for other, candidate in enumerate(curves):
+            if _is_along(curve, sent, candidate):
+                same_way = np.allclose(sent[0], curve_points(candidate, 0, 1)[0], atol=_SAME_M)
+                to_curve[number] = other
+                flips[number] = 1 if isinstance(curve, Arc) else mirrored * (1 if same_way else -1)
+                break
+    return to_point, to_curve, flips
+
+
+def _is_along(curve: Curve, sent: Array, other: Curve) -> bool:
+    """Whether a curve, its places sent to (N, 3), runs all along another one, either way."""
+    as_long = type(curve) is type(other) and abs(curve.length_m - other.length_m) < _SAME_M
+    return as_long and bool(np.max(distance_to_curve(other, sent)) < _SAME_M)
+
+
+# ---- as painted -----------------------------------------------------------------------------------------------------
+
+
+def turns_of(target: Target, curves: Collection[str]) -> list[Pose]:
+    """The turns about the upright through its middle that put the painted curves onto themselves; the first is none."""
+    painted = _painted(target, curves)
+    middle, samples = middle_of(target, curves), _samples(painted)
+    for count in range(_MOST_TURNS, 1, -1):
+        sent = _turn(2.0 * np.pi / count, middle).transform(samples)
+        away = np.min([distance_to_curve(curve, sent) for curve in painted], axis=0)
+        if np.max(away) < _SAME_M * max(1.0, float(np.max(np.abs(sent)))):
+            return [_turn(2.0 * np.pi * number / count, middle) for number in range(count)]
+    return [Pose.identity()]
+
+
+def middle_of(target: Target, curves: Collection[str]) -> Array:
+    """(3,) m: the middle of the box around the painted curves."""
+    samples = _samples(_painted(target, curves))
+    return np.asarray(0.5 * (samples.min(axis=0) + samples.max(axis=0)))
+
+
+def size_of(target: Target, curves: Collection[str]) -> float:
+    """Longest side of the box around the painted curves, m."""
+    return float(np.max(np.ptp(_samples(_painted(target, curves)), axis=0)))
+
+
+def _painted(target: Target, curves: Collection[str]) -> list[Curve]:
+    return [curve for name, curve in target.curves.items() if name in curves and curve.width_m > 0.0]
+
+
+def _samples(curves: Collection[Curve]) -> Array:
+    """(N, 3) places on the curves."""
+    return np.concatenate([curve_points(curve, 0, _PIECES) for curve in curves])
+
+
+def _turn(angle_rad: float, middle: Array) -> Pose:
+    rotation = rotation_exp([0.0, 0.0, angle_rad])
+    return Pose(rotation, middle - rotation @ middle)

@@ -1,0 +1,16 @@
+"""Targets: rigid things of known geometry, one module for each kind of them, and the table of the kinds."""
+
+from ceres_cal.scene.curves import SIDES as SIDES
+from ceres_cal.scene.curves import Arc as Arc
+from ceres_cal.scene.curves import Curve as Curve
+from ceres_cal.scene.curves import Segment as Segment
+from ceres_cal.scene.targets.checkerboards import checkerboard as checkerboard
+from ceres_cal.scene.targets.custom_targets import custom as custom
+from ceres_cal.scene.targets.registry import TARGET_KINDS as TARGET_KINDS
+from ceres_cal.scene.targets.registry import target_from_spec as target_from_spec
+from ceres_cal.scene.targets.registry import targets_by_name as targets_by_name
+from ceres_cal.scene.targets.ring_sheets import rings as rings
+from ceres_cal.scene.targets.ssl_fields import ssl_field as ssl_field
+from ceres_cal.scene.targets.target import Grid as Grid
+from ceres_cal.scene.targets.target import Target as Target
+from ceres_cal.scene.targets.target import TargetKind as TargetKind

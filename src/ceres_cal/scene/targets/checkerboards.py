@@ -1,0 +1,71 @@
+"""Checkerboards: their inner corners, and how they are printed."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from ceres_cal.base.arrays import Array
+from ceres_cal.base.errors import InputError
+from ceres_cal.base.files import convert
+from ceres_cal.scene.targets.paper import Footprints, Paper, share_inside
+from ceres_cal.scene.targets.target import Grid, Target, TargetKind
+
+
+def checkerboard(columns: int, rows: int, square_m: float) -> Target:
+    """The inner corners of a checkerboard: feature "c,r" lies at (c, r, 0) squares, c < columns, r < rows.
+
+    Raises:
+        InputError: fewer than 2 corners a side, or a square that is not a positive number of metres.
+    """
+    if columns < 2 or rows < 2:
+        raise InputError(f"checkerboard: columns and rows count inner corners, at least 2, not {columns} and {rows}")
+    if not (np.isfinite(square_m) and square_m > 0.0):
+        raise InputError(f"checkerboard: square_m must be a positive number of metres, not {square_m}")
+    grid = Grid(int(columns), int(rows), float(square_m), checkered=True)
+    spec = {"kind": "checkerboard", "columns": grid.columns, "rows": grid.rows, "square_m": grid.spacing_m}
+    points = {f"{c},{r}": (c * square_m, r * square_m, 0.0) for r in range(rows) for c in range(columns)}
+    paper = Paper(
+        (-2.0 * grid.spacing_m, -2.0 * grid.spacing_m),
+        ((grid.columns + 1) * grid.spacing_m, (grid.rows + 1) * grid.spacing_m),
+        partial(_dark_squares, grid),
+    )
+    return Target(spec, points, {}, movable=True, bows=True, grid=grid, paper=paper)
+
+
+def _dark_squares(grid: Grid, footprints: Footprints) -> Array:
+    """The square between "0,0" and "1,1" is dark, and so is, beyond the outer corners, one more square each way."""
+    sign, within = np.full(len(footprints.plane), 1.0), np.full(len(footprints.plane), 1.0)
+    for axis, count in enumerate((grid.columns, grid.rows)):
+        place = footprints.plane[:, axis] / grid.spacing_m
+        step = np.hypot(footprints.along_x[:, axis], footprints.along_y[:, axis]) / grid.spacing_m
+        line = np.round(place)
+        wave = 2.0 * share_inside(place - line, step) - 1.0
+        sign *= np.where(line % 2 == 0, wave, -wave)
+        within *= share_inside(place + 1.0, step) * share_inside(count - place, step)
+    return np.asarray(within * (0.5 + 0.5 * sign))
+
+
+class _Spec(msgspec.Struct, forbid_unknown_fields=True):
+    kind: str
+    columns: int
+    rows: int
+    square_m: float
+
+
+def _from_spec(spec: dict[str, Any], where: str) -> Target:
+    board = convert(spec, _Spec, where)
+    return checkerboard(board.columns, board.rows, board.square_m)
+
+
+KIND = TargetKind(
+    "checkerboard",
+    "the inner corners of a checkerboard",
+    "columns and rows (inner corners), square_m",
+    'points "c,r" at (c, r, 0) squares, c from 0 to columns - 1, r from 0 to rows - 1',
+    lambda: {"checkerboard": checkerboard(9, 6, 0.025)},
+    _from_spec,
+)

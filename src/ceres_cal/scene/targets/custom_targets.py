@@ -1,0 +1,70 @@
+"""Targets given in full: whatever has points, segments and arcs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from ceres_cal.base.errors import InputError
+from ceres_cal.base.files import convert
+from ceres_cal.scene.curves import Arc, Curve, Segment, xyz
+from ceres_cal.scene.targets.target import Target, TargetKind
+
+
+class _Spec(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True):
+    kind: str
+    points: dict[str, tuple[float, float, float]] = {}
+    segments: dict[str, Segment] = {}
+    arcs: dict[str, Arc] = {}
+
+
+def custom(
+    points: Mapping[str, tuple[float, float, float]] | None = None, curves: Mapping[str, Curve] | None = None
+) -> Target:
+    """A target given in full.
+
+    Raises:
+        InputError: no features at all, a number that is not finite, a curve without length, or paint that covers the
+            centre of its arc.
+    """
+    points, curves = {name: xyz(place) for name, place in (points or {}).items()}, dict(curves or {})
+    if not points and not curves:
+        raise InputError("custom target: give at least one point, segment or arc")
+    for name, place in points.items():
+        if not np.all(np.isfinite(place)):
+            raise InputError(f"custom target: point {name!r} must have three finite numbers, not {place}")
+    for name, curve in curves.items():
+        numbers = np.hstack(msgspec.structs.astuple(curve))
+        if not np.all(np.isfinite(numbers)) or curve.length_m <= 0.0 or curve.width_m < 0.0:
+            raise InputError(f"custom target: curve {name!r} needs finite numbers, a length and a width_m from 0 on")
+        if isinstance(curve, Arc) and not curve.radius_m > 0.5 * curve.width_m:
+            raise InputError(f"custom target: arc {name!r} must have a radius of more than half its width")
+    segments = {name: curve for name, curve in curves.items() if isinstance(curve, Segment)}
+    arcs = {name: curve for name, curve in curves.items() if isinstance(curve, Arc)}
+    spec = msgspec.to_builtins(_Spec("custom", points, segments, arcs))
+    return Target(spec, points, {**segments, **arcs})  # in the order in which a file would give them back
+
+
+def _from_spec(spec: dict[str, Any], where: str) -> Target:
+    given = convert(spec, _Spec, where)
+    if both := given.segments.keys() & given.arcs.keys():
+        raise InputError(f"two curves are named {min(both)!r}")
+    return custom(given.points, {**given.segments, **given.arcs})
+
+
+def _example() -> dict[str, Target]:
+    edge, circle = Segment((0, 0, 0), (4, 0, 0), 0.01), Arc((0, 0, 0), 0.5, width_m=0.01)
+    return {"custom": custom({"pole_top": (1.0, 2.0, 1.0)}, {"edge": edge, "circle": circle})}
+
+
+KIND = TargetKind(
+    "custom",
+    "anything flat or not, given in full",
+    "points (name: x, y, z), segments (from, to, width_m), arcs (centre, radius_m, from_rad, to_rad, width_m)",
+    "as named there",
+    _example,
+    _from_spec,
+)

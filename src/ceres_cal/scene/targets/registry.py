@@ -1,0 +1,39 @@
+"""The table of all kinds of targets, and the target that a file describes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from ceres_cal.base.errors import InputError
+from ceres_cal.scene.targets import checkerboards, custom_targets, ring_sheets, ssl_fields
+from ceres_cal.scene.targets.target import Target, TargetKind
+
+TARGET_KINDS: dict[str, TargetKind] = {
+    kind.name: kind for kind in (ssl_fields.KIND, checkerboards.KIND, ring_sheets.KIND, custom_targets.KIND)
+}
+
+
+def target_from_spec(spec: Any, where: str) -> Target:
+    """The target that a file describes.
+
+    Args:
+        spec: `{"kind": ..., ...}`.
+        where: how to name the place in messages, such as 'obs.json: target "field"'.
+
+    Raises:
+        InputError: unknown kind, or a description that does not fit its kind.
+    """
+    kind = spec.get("kind") if isinstance(spec, dict) else None
+    if not isinstance(kind, str) or kind not in TARGET_KINDS:
+        raise InputError(f"{where}: unknown kind {kind!r}: choose one of {', '.join(TARGET_KINDS)}")
+    try:
+        return TARGET_KINDS[kind].from_spec(spec, where)
+    except InputError as error:
+        text = str(error)
+        raise InputError(text if text.startswith(where) else f"{where}: {text}") from None
+
+
+def targets_by_name() -> dict[str, Target]:
+    """The targets of any kind that exist in the world, such as ssl-a."""
+    every = ((kind, *example) for kind in TARGET_KINDS.values() for example in kind.examples().items())
+    return {name: target for kind, name, target in every if name != kind.name}

@@ -1,0 +1,55 @@
+"""The paper's concentric circles on a sheet."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+
+import msgspec
+import numpy as np
+
+from ceres_cal.base.arrays import Array
+from ceres_cal.base.errors import InputError
+from ceres_cal.base.files import convert
+from ceres_cal.scene.curves import Arc, Curve
+from ceres_cal.scene.targets.paper import Footprints, Paper, share_inside
+from ceres_cal.scene.targets.target import Target, TargetKind
+
+
+def rings(radii_m: Sequence[float]) -> Target:
+    """The paper's concentric circles (section 2): edges "ring_1", "ring_2", ... from the inside out, point "centre".
+
+    Raises:
+        InputError: no radius, or radii that do not increase from above 0.
+    """
+    radii = [float(r) for r in radii_m]
+    if not radii or not np.all(np.isfinite(radii)) or np.any(np.diff([0.0, *radii]) <= 0.0):
+        raise InputError(f"rings: radii_m must increase and be positive, not {radii}")
+    arcs: dict[str, Curve] = {f"ring_{i}": Arc((0.0, 0.0, 0.0), r) for i, r in enumerate(radii, start=1)}
+    border = 1.05 * radii[-1]
+    paper = Paper((-border, -border), (border, border), partial(_dark_rings, np.array(radii)))
+    return Target({"kind": "rings", "radii_m": radii}, {"centre": (0.0, 0.0, 0.0)}, arcs, movable=True, paper=paper)
+
+
+def _dark_rings(radii: Array, footprints: Footprints) -> Array:
+    """The disc inside the first ring is dark, and from then on every other ring."""
+    away = np.maximum(np.hypot(footprints.plane[:, 0], footprints.plane[:, 1]), 1e-12)
+    step = footprints.step_m(footprints.plane / away[:, None])
+    inner = np.searchsorted(0.5 * (radii[1:] + radii[:-1]), away)  # the nearest edge
+    outside = share_inside(away - radii[inner], step)
+    return np.where(inner % 2 == 0, 1.0 - outside, outside)
+
+
+class _Spec(msgspec.Struct, forbid_unknown_fields=True):
+    kind: str
+    radii_m: list[float]
+
+
+KIND = TargetKind(
+    "rings",
+    "concentric circles",
+    "radii_m, from the inside out",
+    'curves "ring_1", "ring_2", ... from the inside out, point "centre"',
+    lambda: {"rings": rings((0.05, 0.1, 0.15))},
+    lambda spec, where: rings(convert(spec, _Spec, where).radii_m),
+)

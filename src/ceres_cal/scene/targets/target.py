@@ -1,0 +1,113 @@
+"""What a target is: a rigid thing of known geometry with named points and named curves; and what a kind of them is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from ceres_cal.base.arrays import Array, Mask
+from ceres_cal.scene.curves import Arc, Curve
+from ceres_cal.scene.targets.paper import Paper
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Points at even distances in columns (along x) and rows (along y), listed row by row.
+
+    Attributes:
+        checkered: whether they are where the squares of a checkerboard meet, which `detect.boards` finds.
+    """
+
+    columns: int
+    rows: int
+    spacing_m: float
+    checkered: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Target:
+    """A rigid thing of known geometry, in a frame of its own, in metres; a field's frame is the world.
+
+    Attributes:
+        spec: what a file says of it, `{"kind": ..., ...}`; two targets are equal when their specs are and their
+            features come in the same order (observations number them).
+        points: name -> (x, y, z) m.
+        curves: name -> Segment or Arc.
+        movable: whether it lies where somebody put it; what is not movable is the world.
+        bows: whether it is a board that may be bent: then a tolerance may have a warp.
+        grid: how its points stand in columns and rows; None where they do not.
+        paper: the sheet that it is printed on; None for what is painted on the floor.
+        mistaken_for: in words -> spec of another target that has features of the same names.
+    """
+
+    spec: Mapping[str, Any]
+    points: Mapping[str, tuple[float, float, float]]
+    curves: Mapping[str, Curve]
+    movable: bool = False
+    bows: bool = False
+    grid: Grid | None = None
+    paper: Paper | None = None
+    mistaken_for: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+
+    def __eq__(self, other: object) -> bool:
+        return (
+            isinstance(other, Target)
+            and self.spec == other.spec
+            and self.point_names == other.point_names
+            and self.curve_names == other.curve_names
+        )
+
+    __hash__ = None  # type: ignore[assignment]
+
+    @property
+    def kind(self) -> str:
+        return str(self.spec["kind"])
+
+    @cached_property
+    def point_names(self) -> tuple[str, ...]:
+        return tuple(self.points)
+
+    @cached_property
+    def curve_names(self) -> tuple[str, ...]:
+        return tuple(self.curves)
+
+    @cached_property
+    def point_array(self) -> Array:
+        """(P, 3) m, in the order of `point_names`."""
+        return np.array(list(self.points.values()), dtype=float).reshape(-1, 3)
+
+    @cached_property
+    def tracks(self) -> Array:
+        """(3, C, 3, 3): for side 0, +1 and -1 (index it with the side itself) the track of each curve."""
+        return np.array(
+            [[curve.track(side) for curve in self.curves.values()] for side in (0, 1, -1)], dtype=float
+        ).reshape(3, -1, 3, 3)
+
+    @cached_property
+    def is_arc(self) -> Mask:
+        """(C,) whether each curve is an arc."""
+        return np.array([isinstance(curve, Arc) for curve in self.curves.values()], dtype=bool)
+
+
+@dataclass(frozen=True)
+class TargetKind:
+    """A kind of target: all that the package knows of it.
+
+    Attributes:
+        name: as files have it. what, parameters, features: for people, what it is, what a file gives, how its features
+            are named.
+        examples: makes targets by name. One that is not named like its kind exists in the world, such as ssl-a, and may
+            be asked for by that name.
+        from_spec: makes the target that a file describes; the text names the place in messages. Raises InputError.
+    """
+
+    name: str
+    what: str
+    parameters: str
+    features: str
+    examples: Callable[[], dict[str, Target]]
+    from_spec: Callable[[dict[str, Any], str], Target]
