@@ -77,7 +77,7 @@ class Upright:
 
 def find_upright(ends: Array, weights: Array, most: int) -> list[Upright]:
     """The best answers for strokes with these ends (N, 2, 2), in half image diagonals from the middle, best first."""
-    found: list[tuple[float, Upright]] = []
+    scored: list[tuple[float, Upright]] = []
     rotations = _rotations()
     lean = _PRIOR_WEIGHT * (np.arccos(np.clip(-rotations[:, 2, 2], -1.0, 1.0)) / _USUAL_TILT) ** 2
     for bend in BENDS:
@@ -86,9 +86,9 @@ def find_upright(ends: Array, weights: Array, most: int) -> list[Upright]:
             value = _score(_normals(optics, ends), weights, rotations, _ROUGH) - lean
             for best in np.argsort(-value)[:_FROM_EACH]:
                 turned = replace(optics, rotation=rotations[best].astype(float))
-                found.append((float(value[best]) - _penalty(optics), turned))
-    found.sort(key=lambda one: -one[0])
-    refined = [_refined(one, ends, weights) for _, one in found[:_REFINED]]
+                scored.append((float(value[best]) - _penalty(optics), turned))
+    scored.sort(key=lambda one: -one[0])
+    refined = [_refined(one, ends, weights) for _, one in scored[:_REFINED]]
     refined.sort(key=lambda one: -(one.share - _penalty(one)))
     chosen: list[Upright] = []
     for one in refined:
@@ -100,12 +100,12 @@ def find_upright(ends: Array, weights: Array, most: int) -> list[Upright]:
 def _rotations() -> Array:
     """(B, 3, 3) every way to look at the floor, but for quarter turns about the upright."""
     rolls = np.deg2rad(np.arange(-45.0, 45.0, _ROLL_DEG))
-    found = []
+    rotations = []
     for tilt, count in _RINGS_DEG:
         for direction in 2.0 * np.pi * np.arange(count) / count:
             lean = rotation_exp(np.deg2rad(tilt) * np.array([np.cos(direction), np.sin(direction), 0.0]))
-            found += [lean @ _DOWN @ rotation_exp([0.0, 0.0, roll]) for roll in rolls]
-    return np.array(found, dtype=np.float32)
+            rotations += [lean @ _DOWN @ rotation_exp([0.0, 0.0, roll]) for roll in rolls]
+    return np.array(rotations, dtype=np.float32)
 
 
 def _normals(optics: Upright, ends: Array) -> Array:
