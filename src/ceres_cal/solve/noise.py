@@ -81,6 +81,10 @@ class Inliers:
             and abs(self.curve_scale - other.curve_scale) <= relative * other.curve_scale
         )
 
+    def much_below(self, other: Inliers, share: float) -> bool:
+        """Whether a scale fell to less than a share of what it was."""
+        return self.point_scale < share * other.point_scale or self.curve_scale < share * other.curve_scale
+
 
 def relative_lengths(observations: Observations, residuals: Residuals) -> tuple[Array, Array]:
     """Lengths of the residuals of points and of curves in their stated sigmas; infinite where there is none."""

@@ -28,6 +28,10 @@ _AT_REST, _AT_REST_AGAIN = 1e-2, 1e-5
 # Nothing changes from half to double.
 _ENOUGH_PLACEMENTS = 20
 _ROUGH = 1e-3  # relative change of the cost at which the first solve ends
+_MOST_ROUGH = 4
+_MUCH_LESS = 0.3
+"""Share of the residuals' scale that a rough solve must leave for another one at the new scale: what a start blurs (a line
+painted aside, a wrong label) is told from noise only at a scale near the noise's own."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,13 +109,24 @@ class _Rounds:
         self.no_change = _AT_REST if usual is None else _AT_REST_AGAIN
 
     def first(self, estimate: Estimate) -> RobustSolution:
-        """The rough solve from a start, of few placements, which the others follow."""
-        start = residuals(self._observations, self._problem.sights, estimate)
-        visible = visible_from(self._observations, start)
+        """Rough solves from a start, each at the scale of the residuals that the one before left."""
+        there = residuals(self._observations, self._problem.sights, estimate)
+        visible = visible_from(self._observations, there)
+        for _ in range(_MOST_ROUGH):
+            solution = self._rough(estimate, there, visible)
+            estimate, before = solution.estimate, visible
+            there = residuals(self._observations, self._problem.sights, estimate, there.feet)
+            visible = visible_from(self._observations, there)
+            if not visible.much_below(before, _MUCH_LESS):
+                break
+        return self._weighted(solution, there, 1)
+
+    def _rough(self, estimate: Estimate, there: Residuals, visible: Inliers) -> Solution:
+        """A solve of few placements, which the others follow, that gross errors do not decide."""
         # A line painted aside is an outlier to a redescending loss, but not to its tolerance.
         loss = "huber" if len(estimate.structure.values) else "cauchy"
         weighting = Weighting(visible.point_scale, visible.curve_scale, loss, loss_scale=1.0)
-        problem = replace(self._problem.used(visible.points, visible.curves), weighting=weighting, feet=start.feet)
+        problem = replace(self._problem.used(visible.points, visible.curves), weighting=weighting, feet=there.feet)
         if not len(problem.sights):
             raise DegenerateError(
                 "the observations fix no pose that could show them: add points or lines of the targets"
@@ -120,7 +135,7 @@ class _Rounds:
         solution = solve(few, estimate, self._progress, precision=_ROUGH, is_near=False)
         if len(few.sights) < len(problem.sights):
             solution = replace(solution, estimate=with_placements_at_best(problem, solution.estimate))
-        return self._judged(solution, start, 1)
+        return solution
 
     def next(self, state: RobustSolution) -> RobustSolution:
         """One more solve, from where the last one ended, of what was judged to be inliers."""
