@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from math import hypot
 
+import msgspec
 import numpy as np
 
 from ceres_cal.base.arrays import Array
@@ -205,7 +206,7 @@ def _paint(seed: int) -> tuple[dict[str, Curve], dict[str, float]]:
             x, y, radius = PAINT_SIGMA_M * rng.standard_normal(3)
             offsets |= {f"{name}.x": x, f"{name}.y": y, f"{name}.radius": radius}
             middle = (curve.centre[0] + x, curve.centre[1] + y, 0.0)
-            curves[name] = replace(curve, centre=middle, radius_m=curve.radius_m + radius)
+            curves[name] = msgspec.structs.replace(curve, centre=middle, radius_m=curve.radius_m + radius)
         else:
             offsets[name] = PAINT_SIGMA_M * rng.standard_normal()
             along = np.subtract(curve.end, curve.start)

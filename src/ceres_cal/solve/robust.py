@@ -29,9 +29,9 @@ _AT_REST, _AT_REST_AGAIN = 1e-2, 1e-5
 _ENOUGH_PLACEMENTS = 20
 _ROUGH = 1e-3  # relative change of the cost at which the first solve ends
 _MOST_ROUGH = 4
+# Share of the residuals' scale; a rough solve that leaves less is followed by another one at the new scale. What a start
+# blurs (a line painted aside, a wrong label) is told from noise only at a scale near the noise's own.
 _MUCH_LESS = 0.3
-"""Share of the residuals' scale that a rough solve must leave for another one at the new scale: what a start blurs (a line
-painted aside, a wrong label) is told from noise only at a scale near the noise's own."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +119,10 @@ class _Rounds:
             visible = visible_from(self._observations, there)
             if not visible.much_below(before, _MUCH_LESS):
                 break
-        return self._weighted(solution, there, 1)
+        state = self._weighted(solution, there, 1)
+        # Of one kind of observations without priors the leverages add up to the count.
+        mixed = bool(self._problem.priors) or all(kind.equations for kind in self._problem.sights.by_kind)
+        return self._by_leverages(state)[0] if mixed and len(state.problem.sights) else state
 
     def _rough(self, estimate: Estimate, there: Residuals, visible: Inliers) -> Solution:
         """A solve of few placements, which the others follow, that gross errors do not decide."""
@@ -160,14 +163,17 @@ class _Rounds:
         """The state with what its problem says there, where the noise is judged no other by the leverages; else judged
         by them, for another round.
         """
-        estimate = state.solution.estimate
-        reduced = information(state.problem, estimate)
-        self._redundancy = Redundancy.by_leverage(state.problem.sights, reduced.leverages)
-        anew = self._weighted(state.solution, state.residuals, state.rounds)
+        anew, reduced = self._by_leverages(state)
         if not anew.inliers.same_as(state.inliers, self.no_change):
             return anew
         degrees = anew.inliers.degrees_of_freedom
         return replace(state, inliers=replace(state.inliers, degrees_of_freedom=degrees), reduced=reduced)
+
+    def _by_leverages(self, state: RobustSolution) -> tuple[RobustSolution, ReducedInformation]:
+        """The state judged by the leverages there, and what they were taken from."""
+        reduced = information(state.problem, state.solution.estimate)
+        self._redundancy = Redundancy.by_leverage(state.problem.sights, reduced.leverages)
+        return self._weighted(state.solution, state.residuals, state.rounds), reduced
 
     def _judged(self, solution: Solution, before: Residuals, rounds: int) -> RobustSolution:
         """Noise and inliers where a solve ended, and the problem that they make."""
