@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Mask
-from ceres_cal.base.digits import two_digits
+from ceres_cal.base.words import two_digits
 from ceres_cal.diagnostics.alternatives import missing_powers, radial_column
 from ceres_cal.diagnostics.equations import Equations
 from ceres_cal.diagnostics.findings import SMALL, Amount, Finding

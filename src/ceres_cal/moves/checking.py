@@ -24,8 +24,9 @@ from ceres_cal.moves.poses import PoseCandidate, PoseSearch, in_sigmas, movement
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights, gather_sights
 from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.heights import HEIGHTS_M
 from ceres_cal.solve import Problem, Weighting, information, solve
-from ceres_cal.uncertainty.maps import HEIGHTS_M, Grid, visible_pixels
+from ceres_cal.uncertainty.maps import Grid, visible_pixels
 from ceres_cal.uncertainty.uncertainty import field_grid
 
 FALSE_ALARMS = 0.01

@@ -28,6 +28,10 @@ _AT_REST, _AT_REST_AGAIN = 1e-2, 1e-5
 # Nothing changes from half to double.
 _ENOUGH_PLACEMENTS = 20
 _ROUGH = 1e-3  # relative change of the cost at which the first solve ends
+_MOST_ROUGH = 4
+# Share of the residuals' scale; a rough solve that leaves less is followed by another one at the new scale. What a start
+# blurs (a line painted aside, a wrong label) is told from noise only at a scale near the noise's own.
+_MUCH_LESS = 0.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,13 +109,27 @@ class _Rounds:
         self.no_change = _AT_REST if usual is None else _AT_REST_AGAIN
 
     def first(self, estimate: Estimate) -> RobustSolution:
-        """The rough solve from a start, of few placements, which the others follow."""
-        start = residuals(self._observations, self._problem.sights, estimate)
-        visible = visible_from(self._observations, start)
+        """Rough solves from a start, each at the scale of the residuals that the one before left."""
+        there = residuals(self._observations, self._problem.sights, estimate)
+        visible = visible_from(self._observations, there)
+        for _ in range(_MOST_ROUGH):
+            solution = self._rough(estimate, there, visible)
+            estimate, before = solution.estimate, visible
+            there = residuals(self._observations, self._problem.sights, estimate, there.feet)
+            visible = visible_from(self._observations, there)
+            if not visible.much_below(before, _MUCH_LESS):
+                break
+        state = self._weighted(solution, there, 1)
+        # Of one kind of observations without priors the leverages add up to the count.
+        mixed = bool(self._problem.priors) or all(kind.equations for kind in self._problem.sights.by_kind)
+        return self._by_leverages(state)[0] if mixed and len(state.problem.sights) else state
+
+    def _rough(self, estimate: Estimate, there: Residuals, visible: Inliers) -> Solution:
+        """A solve of few placements, which the others follow, that gross errors do not decide."""
         # A line painted aside is an outlier to a redescending loss, but not to its tolerance.
         loss = "huber" if len(estimate.structure.values) else "cauchy"
         weighting = Weighting(visible.point_scale, visible.curve_scale, loss, loss_scale=1.0)
-        problem = replace(self._problem.used(visible.points, visible.curves), weighting=weighting, feet=start.feet)
+        problem = replace(self._problem.used(visible.points, visible.curves), weighting=weighting, feet=there.feet)
         if not len(problem.sights):
             raise DegenerateError(
                 "the observations fix no pose that could show them: add points or lines of the targets"
@@ -120,7 +138,7 @@ class _Rounds:
         solution = solve(few, estimate, self._progress, precision=_ROUGH, is_near=False)
         if len(few.sights) < len(problem.sights):
             solution = replace(solution, estimate=with_placements_at_best(problem, solution.estimate))
-        return self._judged(solution, start, 1)
+        return solution
 
     def next(self, state: RobustSolution) -> RobustSolution:
         """One more solve, from where the last one ended, of what was judged to be inliers."""
@@ -145,14 +163,17 @@ class _Rounds:
         """The state with what its problem says there, where the noise is judged no other by the leverages; else judged
         by them, for another round.
         """
-        estimate = state.solution.estimate
-        reduced = information(state.problem, estimate)
-        self._redundancy = Redundancy.by_leverage(state.problem.sights, reduced.leverages)
-        anew = self._weighted(state.solution, state.residuals, state.rounds)
+        anew, reduced = self._by_leverages(state)
         if not anew.inliers.same_as(state.inliers, self.no_change):
             return anew
         degrees = anew.inliers.degrees_of_freedom
         return replace(state, inliers=replace(state.inliers, degrees_of_freedom=degrees), reduced=reduced)
+
+    def _by_leverages(self, state: RobustSolution) -> tuple[RobustSolution, ReducedInformation]:
+        """The state judged by the leverages there, and what they were taken from."""
+        reduced = information(state.problem, state.solution.estimate)
+        self._redundancy = Redundancy.by_leverage(state.problem.sights, reduced.leverages)
+        return self._weighted(state.solution, state.residuals, state.rounds), reduced
 
     def _judged(self, solution: Solution, before: Residuals, rounds: int) -> RobustSolution:
         """Noise and inliers where a solve ended, and the problem that they make."""

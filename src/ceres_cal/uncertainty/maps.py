@@ -19,8 +19,6 @@ from ceres_cal.model.parameters import Estimate
 from ceres_cal.model.quantities import camera_moved, moved, natural_sizes
 from ceres_cal.uncertainty.posterior import Posterior
 
-HEIGHTS_M = (0.0, 0.15)
-"""Heights of interest: the floor, and a robot's top."""
 _STEP = 1e-5  # of each number's natural size: the differences are good to 1e-9 of the slope
 
 
