@@ -103,9 +103,9 @@ def heights(station: str, camera: Camera) -> Iterator[Measurement]:
     for sigma in HEIGHT_SIGMAS_M:
         prior = Prior("station", station, "height_m", (height,), (sigma,))
         yield Measurement("tape", f"measure the camera's height to {1e3 * sigma:.0f} mm", priors=(prior,))
-    place = Prior("station", station, "position_m", (x, y, height), (POSITION_SIGMA_M,) * 3)
+    position = Prior("station", station, "position_m", (x, y, height), (POSITION_SIGMA_M,) * 3)
     words = f"measure the camera's x, y and height to {1e3 * POSITION_SIGMA_M:.0f} mm each"
-    yield Measurement("tape", words, priors=(place,))
+    yield Measurement("tape", words, priors=(position,))
 
 
 # ---- poles ----------------------------------------------------------------------------------------------------------

@@ -18,7 +18,7 @@ from ceres_cal.uncertainty import FieldMap, PhiProfile, Posterior
 from ceres_cal.uncertainty.maps import locate_slopes, station_keys, visible_pixels
 
 BENT = 0.05  # relative sigma of phi up to which the quadratic picture holds (`uncertainty.assess` leaves it there)
-_PLACES = 7  # of a valley at which a promise is worked out
+_NODES = 7  # of a valley at which a promise is worked out
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,8 +85,8 @@ class Outlook:
     def _phi_sd(self, estimate: Estimate, known: Spread) -> float:
         """Relative standard deviation of phi by what is known of the K numbers; 0 where it is held."""
         camera = estimate.stations[self.today.station].camera
-        place = next((i for i, key in enumerate(self.keys) if key[:3] == ("camera", camera, "phi")), None)
-        return 0.0 if place is None else float(known.sd[place]) / estimate.cameras[camera].phi
+        column = next((i for i, key in enumerate(self.keys) if key[:3] == ("camera", camera, "phi")), None)
+        return 0.0 if column is None else float(known.sd[column]) / estimate.cameras[camera].phi
 
     def _known(self, added: Information) -> Spread:
         """What is known of the K numbers with information added."""
@@ -102,13 +102,13 @@ class Outlook:
 
     @cached_property
     def possible(self) -> tuple[tuple[int, Estimate], ...]:
-        """Some places of the valley within its 95 % bounds, by number; none where phi is not followed."""
+        """Some nodes of the valley within its 95 % bounds, by number; none where phi is not followed."""
         if self.profile is None:
             return ()
         keys, steps = self.profile.keys, self.profile.steps
         within = np.flatnonzero(self.profile.rises <= self.posterior.half_width**2)
-        some = within[np.unique(np.linspace(0, len(within) - 1, _PLACES).round().astype(int))]
-        return tuple((int(place), moved(self.estimate, keys, steps[place])) for place in some)
+        some = within[np.unique(np.linspace(0, len(within) - 1, _NODES).round().astype(int))]
+        return tuple((int(node), moved(self.estimate, keys, steps[node])) for node in some)
 
     def along_valley(self, information_at: Callable[[Estimate], Information]) -> Iterator[tuple[float, float, Errors]]:
         """phi (px), its relative standard deviation and the errors if that is what it is and the information there is
@@ -121,19 +121,19 @@ class Outlook:
         assert profile is not None
         tangents = np.gradient(profile.steps[:, 1:], profile.steps[:, 0], axis=0)
         bend = max(float(np.polyfit(np.log(profile.phi), profile.rises, 2)[0]), 0.0) if len(profile.phi) > 2 else 0.0
-        for place, there in self.possible:
+        for node, there in self.possible:
             added = information_at(there).given(profile.keys)
             if not np.any(added.matrix):
-                yield float(profile.phi[place]), np.inf, Errors(np.inf, np.inf)
+                yield float(profile.phi[node]), np.inf, Errors(np.inf, np.inf)
                 continue
-            across, along = profile.across[place].matrix, tangents[place]
+            across, along = profile.across[node].matrix, tangents[node]
             coupling = -across @ along
-            phi = along @ across @ along + bend / profile.phi[place] ** 2
+            phi = along @ across @ along + bend / profile.phi[node] ** 2
             matrix = np.block([[np.atleast_2d(phi), coupling[None]], [coupling[:, None], across]])
             whole = Information(profile.keys, matrix) + added
             known = _part(whole.spread, whole.columns(self.keys))
             errors = _errors(known, _slopes(there, self.today, self.keys))
-            yield float(profile.phi[place]), self._phi_sd(there, known), errors
+            yield float(profile.phi[node]), self._phi_sd(there, known), errors
 
 
 def _part(known: Spread, at: Indices) -> Spread:
@@ -149,6 +149,5 @@ def _errors(known: Spread, slopes: Array) -> Errors:
 
 def _slopes(estimate: Estimate, grid: FieldMap, keys: tuple[Key, ...]) -> Array:
     """(N, 2, K) of the N places of the grid that the image shows."""
-    x, y = np.meshgrid(grid.x_m, grid.y_m)
-    pixels = visible_pixels(estimate, grid.station, np.column_stack([x.ravel(), y.ravel()]), grid.height_m)
+    pixels = visible_pixels(estimate, grid.station, grid.places, grid.height_m)
     return locate_slopes(estimate, keys, grid.station, pixels[np.isfinite(pixels[:, 0])], grid.height_m)

@@ -22,9 +22,9 @@ from ceres_cal.uncertainty import Posterior
 _LARGER, _LESS = 0.5, 0.2
 """Less work is nearly as good as the best where the error that it leaves is larger by no more than the first share of
 the best's, and what it takes off smaller by no more than the second share of the best's."""
-# Of today's worst error; what leaves more is not worth doing: less than a tenth is within what advice is off by.
+# Of today's worst error; what leaves more is not advised: less than a tenth is within what advice is off by.
 # Nothing changes from 0.82 to 0.95.
-_WORTH = 0.9
+_MUST_LEAVE = 0.9
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +58,7 @@ class Advice:
     Attributes:
         station: whose map. height_m: at which height. before: its errors today; worst_place_m: where they are largest.
         promises: best first. best: the one to follow, with the least work of those that are nearly as good as the best;
-            None where nothing is worth doing. then: what to do after it, with what both together leave.
+            None where nothing brings enough. then: what to do after it, with what both together leave.
         good_enough_mm: what the worst error may be; None where nobody said.
     """
 
@@ -156,8 +156,8 @@ def _of_camera(posterior: Posterior, estimate: Estimate, camera: str) -> Posteri
 def _weighting(fit: Fit) -> Weighting:
     """Noise in px of points and curves, as the fit found it; of a kind that nobody observed that of the other."""
     spare = max(1.0 - fit.unknowns / max(2 * fit.points + fit.curves, 1), 1e-3)
-    found = [fit.points_rms_px / np.sqrt(2.0 * spare), fit.curves_rms_px / np.sqrt(spare)]
-    points, curves = (float(mine or other) for mine, other in (found, found[::-1]))
+    noise_px = [fit.points_rms_px / np.sqrt(2.0 * spare), fit.curves_rms_px / np.sqrt(spare)]
+    points, curves = (float(mine or other) for mine, other in (noise_px, noise_px[::-1]))
     if not points > 0.0:
         raise InputError("the calibration found no noise at all: advice would promise miracles")
     return Weighting(points, curves, "trivial")
@@ -199,7 +199,7 @@ def _chosen(promises: Sequence[Promise], before: Errors, enough_mm: float) -> in
     """Number of the one with the least work that is good enough whatever phi is, or nearly as good as the best."""
     worst = np.array([promise.after.worst_mm for promise in promises])
     least = float(np.min(worst))
-    if before.worst_mm <= enough_mm or not least < _WORTH * before.worst_mm:
+    if before.worst_mm <= enough_mm or not least < _MUST_LEAVE * before.worst_mm:
         return None
     surely = np.array([promise.worst_range_mm[1] for promise in promises])
     nearly = least + min(_LARGER * least, _LESS * (before.worst_mm - least))

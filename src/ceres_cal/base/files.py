@@ -36,10 +36,10 @@ def write_bytes(path: str | Path, content: bytes) -> None:
         InputError: the folder is missing or cannot be written.
     """
     try:
-        place = Path(path).resolve()  # behind a symbolic link, which stays
-        if place.exists() and not place.is_file():
+        target = Path(path).resolve()  # behind a symbolic link, which stays
+        if target.exists() and not target.is_file():
             raise InputError(f"{path}: cannot be written: it is a folder or a device")
-        handle, beside = tempfile.mkstemp(dir=place.parent, prefix=f".{place.name}.", suffix=".part")
+        handle, beside = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.", suffix=".part")
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {error.strerror}") from None
     try:
@@ -48,7 +48,7 @@ def write_bytes(path: str | Path, content: bytes) -> None:
             stream.flush()
             os.fsync(stream.fileno())
         Path(beside).chmod(0o644)
-        Path(beside).replace(place)
+        Path(beside).replace(target)
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {error.strerror}") from None
     finally:
@@ -77,12 +77,13 @@ def parse_json(content: bytes, where: str) -> Any:
 
 def check_header(data: Any, where: str, format_name: str, version: int) -> dict[str, Any]:
     """The same data once its "format" and "version" are known to be ours; InputError naming `where` otherwise."""
-    found = data.get("format") if isinstance(data, dict) else None
-    if found != format_name:
-        raise InputError(f'{where}: "format" must be "{format_name}", not {found!r}')
+    stated = data.get("format") if isinstance(data, dict) else None
+    if stated != format_name:
+        raise InputError(f'{where}: "format" must be "{format_name}", not {stated!r}')
     if data.get("version") != version:
-        found = data.get("version")
-        raise InputError(f"{where}: version {found!r} is not known here, only {version}: update ceres-cal")
+        raise InputError(
+            f"{where}: version {data.get('version')!r} is not known here, only {version}: update ceres-cal"
+        )
     return dict(data)
 
 

@@ -17,7 +17,7 @@ NOTHING = 2e-14
 """Eigenvalue of an information matrix with unit diagonal below which a direction counts as unknown: rounding reaches
 1e-15 for each ten numbers, and a sigma millions of times larger than what each number would have alone is infinite."""
 _REGULAR = 1e6  # the inverse of such an eigenvalue; plain inverses are good to 1e-9 there
-_RESIDUE = 1e-11  # what a Schur complement leaves of a direction that is not told, relative to what went in
+_RESIDUE = 1e-11  # what a Schur complement leaves of a direction that is unknown, relative to what went in
 
 
 def _nothing(count: int) -> float:
@@ -27,15 +27,15 @@ def _nothing(count: int) -> float:
 def _scaled(information: Array, limits: Array) -> tuple[Array, Array]:
     """Scale (..., n) that makes the diagonal one, and the information (..., n, n) in it."""
     diagonal = np.diagonal(information, axis1=-2, axis2=-1)
-    told = diagonal > limits**-2.0
-    scale = np.where(told, 1.0 / np.sqrt(np.where(told, diagonal, 1.0)), 1.0)
-    # What is not told at all has rounding on its diagonal, which must not be scaled up.
-    information = np.where(told[..., :, None] & told[..., None, :], information, 0.0)
+    known = diagonal > limits**-2.0
+    scale = np.where(known, 1.0 / np.sqrt(np.where(known, diagonal, 1.0)), 1.0)
+    # What is not known at all has rounding on its diagonal, which must not be scaled up.
+    information = np.where(known[..., :, None] & known[..., None, :], information, 0.0)
     return scale, information * scale[..., :, None] * scale[..., None, :]
 
 
 def known_inverses(information: Array, limits: Array) -> Array:
-    """Inverses (..., n, n) of information matrices over what they tell; unknown directions are left out.
+    """Inverses (..., n, n) of information matrices over what is known; unknown directions are left out.
 
     Args:
         limits: (n,) see `Spread.of`.
@@ -45,8 +45,8 @@ def known_inverses(information: Array, limits: Array) -> Array:
     if inverse is not None:
         return np.asarray(inverse * scale[..., :, None] * scale[..., None, :])
     values, vectors = np.linalg.eigh(scaled)
-    told = values > _nothing(values.shape[-1])
-    kept = np.where(told, 1.0 / np.where(told, values, 1.0), 0.0)
+    known = values > _nothing(values.shape[-1])
+    kept = np.where(known, 1.0 / np.where(known, values, 1.0), 0.0)
     half = vectors * np.sqrt(kept)[..., None, :] * scale[..., :, None]
     return np.asarray(half @ np.swapaxes(half, -1, -2))
 
@@ -115,13 +115,14 @@ class Spread:
         """Covariances (..., m, m) of functions with derivatives (..., m, n); infinite variance where they depend on an
         unknown direction, NaN as their covariance with others.
         """
-        found = jacobian @ self.covariance @ np.swapaxes(jacobian, -1, -2)
+        covariances = jacobian @ self.covariance @ np.swapaxes(jacobian, -1, -2)
         lost = self.depends(jacobian)
         if np.any(lost):
-            found = np.where(np.logical_or(lost[..., :, None], lost[..., None, :]), np.nan, found)
-            places = np.arange(found.shape[-1])
-            found[..., places, places] = np.where(lost, np.inf, found[..., places, places])
-        return np.asarray(found)
+            variances = np.where(lost, np.inf, np.diagonal(covariances, axis1=-2, axis2=-1))
+            covariances = np.where(np.logical_or(lost[..., :, None], lost[..., None, :]), np.nan, covariances)
+            diagonal = np.arange(covariances.shape[-1])
+            covariances[..., diagonal, diagonal] = variances
+        return np.asarray(covariances)
 
     @property
     def matrix(self) -> Array:

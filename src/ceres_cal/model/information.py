@@ -76,10 +76,10 @@ class Information:
 
     def over(self, keys: Sequence[Key]) -> Information:
         """The same over other keys, which have all of its own among them."""
-        matrix, place = np.zeros((len(keys), len(keys))), {key: column for column, key in enumerate(keys)}
-        at = np.array([place[key] for key in self.keys], dtype=np.int64)
-        matrix[np.ix_(at, at)] = self.matrix
-        return Information(tuple(keys), matrix)
+        whole = Information.nothing(keys)
+        at = whole.columns(self.keys)
+        whole.matrix[np.ix_(at, at)] = self.matrix
+        return whole
 
     def __add__(self, other: Information) -> Information:
         """Both together, over the keys of either."""

@@ -31,18 +31,18 @@ def natural_sizes(estimate: Estimate, keys: Sequence[Key]) -> Array:
     with the one that moves a pixel half an image diagonal from the middle by as much; structure with its tolerance.
     """
     sizes = np.ones(len(keys))
-    for (kind, owner), places in columns_by_owner(keys).items():
+    for (kind, owner), columns in columns_by_owner(keys).items():
         if kind == "camera":
             camera = estimate.cameras[owner]
             known = {"phi": camera.phi, "cx": camera.phi, "cy": camera.phi, "aspect": 1.0}
             known |= zip(camera.lens.names, camera.lens.natural_sizes(camera.phi, unit_px(camera)), strict=True)
-            sizes[places] = [known[keys[place].quantity] for place in places]
+            sizes[columns] = [known[keys[column].quantity] for column in columns]
         elif kind == "structure":
-            names = [f"{owner}/{keys[place].quantity}" for place in places]
-            sizes[places] = estimate.structure.sigma_m[[estimate.structure.names.index(name) for name in names]]
+            names = [f"{owner}/{keys[column].quantity}" for column in columns]
+            sizes[columns] = estimate.structure.sigma_m[[estimate.structure.names.index(name) for name in names]]
         else:
             distance = _distance_m(estimate, kind, owner)
-            sizes[places] = [distance if keys[place].unit == "m" else 1.0 for place in places]
+            sizes[columns] = [distance if keys[column].unit == "m" else 1.0 for column in columns]
     return sizes
 
 
@@ -57,21 +57,21 @@ def _distance_m(estimate: Estimate, kind: str, owner: str) -> float:
 
 def values_of(estimate: Estimate, keys: Sequence[Key]) -> Array:
     """(P,) the estimate's numbers in the units of the keys; 0 for a turn."""
-    found = np.zeros(len(keys))
-    for place, (kind, owner, quantity, unit) in enumerate(keys):
+    values = np.zeros(len(keys))
+    for column, (kind, owner, quantity, unit) in enumerate(keys):
         if kind == "camera":
             camera = estimate.cameras[owner]
             at = intrinsic_names(camera.lens).index(quantity)
-            found[place] = intrinsics_vector(camera)[at] / intrinsics_scales(camera)[at]
+            values[column] = intrinsics_vector(camera)[at] / intrinsics_scales(camera)[at]
         elif kind == "structure":
-            found[place] = estimate.structure.values[estimate.structure.names.index(f"{owner}/{quantity}")]
+            values[column] = estimate.structure.values[estimate.structure.names.index(f"{owner}/{quantity}")]
         elif unit == "m":
             if kind == "station":
                 position = estimate.stations[owner].cam_from_world.position
             else:
                 position = estimate.placements[owner].translation
-            found[place] = position[{"x": 0, "y": 1}.get(quantity, 2)]
-    return found
+            values[column] = position[{"x": 0, "y": 1}.get(quantity, 2)]
+    return values
 
 
 def intrinsic_keys(name: str, lens: Lens) -> list[Key]:
@@ -133,16 +133,16 @@ def moved(estimate: Estimate, keys: Sequence[Key], step: Array) -> Estimate:
     """
     cameras, stations, placements = dict(estimate.cameras), dict(estimate.stations), dict(estimate.placements)
     values = estimate.structure.values.copy()
-    for (kind, owner), places in columns_by_owner(keys).items():
-        names = [keys[place].quantity for place in places]
+    for (kind, owner), columns in columns_by_owner(keys).items():
+        names = [keys[column].quantity for column in columns]
         if kind == "camera":
-            cameras[owner] = camera_moved(cameras[owner], names, step[places])
+            cameras[owner] = camera_moved(cameras[owner], names, step[columns])
         elif kind == "structure":
-            values[[estimate.structure.names.index(f"{owner}/{name}") for name in names]] += step[places]
+            values[[estimate.structure.names.index(f"{owner}/{name}") for name in names]] += step[columns]
         else:
             change = np.zeros(6)
             quantities = STATION_QUANTITIES if kind == "station" else PLACEMENT_QUANTITIES
-            change[[quantities.index(name) for name in names]] = step[places]
+            change[[quantities.index(name) for name in names]] = step[columns]
             if kind == "station":
                 old = stations[owner].cam_from_world
                 pose = Pose.looking(old.position + change[:3], rotation_exp(change[3:]) @ old.rotation)
@@ -161,11 +161,11 @@ def moved(estimate: Estimate, keys: Sequence[Key], step: Array) -> Estimate:
 
 def difference(estimate: Estimate, reference: Estimate, keys: Sequence[Key]) -> Array:
     """The step (P,) along the keys that leads from the reference to the estimate."""
-    found = np.empty(len(keys))
-    for (kind, owner), places in columns_by_owner(keys).items():
-        values = _differences(kind, owner, estimate, reference)
-        found[places] = [values[keys[place].quantity] for place in places]
-    return found
+    step = np.empty(len(keys))
+    for (kind, owner), columns in columns_by_owner(keys).items():
+        changes = _differences(kind, owner, estimate, reference)
+        step[columns] = [changes[keys[column].quantity] for column in columns]
+    return step
 
 
 def _differences(kind: str, owner: str, estimate: Estimate, reference: Estimate) -> dict[str, float]:

@@ -104,11 +104,13 @@ def residuals(observations: Observations, sights: Sights, estimate: Estimate, fe
     return Residuals(points, curves, ends)
 
 
-def _point_residuals(optics: kernels.Optics, poses: Array, sights: Sights, structure: Structure, found: Array) -> None:
+def _point_residuals(
+    optics: kernels.Optics, poses: Array, sights: Sights, structure: Structure, offsets: Array
+) -> None:
     columns = point_columns(sights, structure)
 
     def part(first: int, last: int) -> None:
-        kernels.point_residuals(first, last, optics, poses, columns, sights.point_rows, found)
+        kernels.point_residuals(first, last, optics, poses, columns, sights.point_rows, offsets)
 
     run_parts(part, parts_of(len(sights), len(sights.points), _POINT_NS))
 

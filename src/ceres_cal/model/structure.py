@@ -86,12 +86,12 @@ class Structure:
         tracks = np.concatenate([target.tracks.reshape(-1, 3, 3) for target in targets.values()])
         is_arc = np.concatenate([np.tile(target.is_arc, 3) for target in targets.values()])
         points, tracks = self._points(points, np.arange(len(points))), self._tracks(tracks, is_arc)
-        found = {}
+        built = {}
         for name, target in targets.items():
             own, points = np.split(points, [len(target.points)])
             curves, tracks = np.split(tracks, [3 * len(target.curves)])
-            found[name] = Built(target, own, curves.reshape(3, -1, 3, 3))
-        return found
+            built[name] = Built(target, own, curves.reshape(3, -1, 3, 3))
+        return built
 
     def _points(self, points: Array, feature: Indices) -> Array:
         if not len(self.values):

@@ -36,7 +36,7 @@ class Eliminated:
 
     Attributes:
         names: (S). own: (S, 6, 6) information about each with everything shared held; inverses: (S, 6, 6) of that,
-            over what is known. rank: directions of all of them that are known.
+            over what is known.
         gains: (S, 6, K); a step d of the shared numbers `keys` (K) takes each placement along by -gains d.
     """
 

@@ -54,10 +54,10 @@ def _with_better_poses(
         return estimate, 0, frozenset()
     few = sights.take(ambiguous)
     twice = np.concatenate([poses[ambiguous], mirrored(few, poses[ambiguous])])
-    costs, found = placement_costs(sights.take(np.tile(ambiguous, 2)), estimate, weighting, twice)
-    (as_is, other), (found, turned) = np.split(costs, 2), np.split(found, 2)
+    costs, poses = placement_costs(sights.take(np.tile(ambiguous, 2)), estimate, weighting, twice)
+    (as_is, other), (posed, turned) = np.split(costs, 2), np.split(poses, 2)
     better = np.flatnonzero(other < as_is * (1.0 - 1e-6))
-    two = np.max(np.abs(turned - found), axis=(1, 2)) > _SAME  # else the search came back from the mirrored pose
+    two = np.max(np.abs(turned - posed), axis=(1, 2)) > _SAME  # else the search came back from the mirrored pose
     close = np.flatnonzero(two & (np.abs(other - as_is) < _MUCH_WORSE))
     undecided = frozenset(few.keys[i] for i in close)
     if not len(better):

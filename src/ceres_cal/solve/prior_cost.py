@@ -20,18 +20,18 @@ class _Linear(NamedTuple):
     """Numbers that stand in a solver's block themselves, one of them for each column of the prior."""
 
     columns: list[int]
-    places: list[int]
+    slots: list[int]
     scales: Array
     size: int
 
     def values(self, block: Array) -> Array:
         """(n,) in the units of the keys."""
-        return np.asarray(block[self.places] * self.scales)
+        return np.asarray(block[self.slots] * self.scales)
 
     def slopes(self, block: Array) -> Array:
         """(n, size) derivatives by the block."""
-        slopes = np.zeros((len(self.places), self.size))
-        slopes[np.arange(len(self.places)), self.places] = self.scales
+        slopes = np.zeros((len(self.slots), self.size))
+        slopes[np.arange(len(self.slots)), self.slots] = self.scales
         return slopes
 
 
@@ -98,8 +98,8 @@ def _parts(
         if kind == "camera":
             camera, free = estimate.cameras[owner], layout.free[owner].tolist()
             numbers = [intrinsic_names(camera.lens).index(quantity) for quantity in quantities]
-            places, scales = [free.index(number) for number in numbers], 1.0 / intrinsics_scales(camera)[numbers]
-            parts.append(((kind, owner), _Linear(columns, places, scales, len(free))))
+            slots, scales = [free.index(number) for number in numbers], 1.0 / intrinsics_scales(camera)[numbers]
+            parts.append(((kind, owner), _Linear(columns, slots, scales, len(free))))
         elif kind == "station":
             rows = [STATION_QUANTITIES.index(quantity) for quantity in quantities]
             # Without turns among its numbers any rotation will do.
@@ -108,6 +108,6 @@ def _parts(
     structure = [column for column, key in enumerate(prior.keys) if key.kind == "structure"]
     if structure:
         names = estimate.structure.names
-        places = [names.index(prior.keys[column].structure_name) for column in structure]
-        parts.append((("structure", ""), _Linear(structure, places, np.ones(len(places)), len(names))))
+        slots = [names.index(prior.keys[column].structure_name) for column in structure]
+        parts.append((("structure", ""), _Linear(structure, slots, np.ones(len(slots)), len(names))))
     return parts
