@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -11,8 +11,9 @@ from ceres_cal.base.errors import InputError
 from ceres_cal.base.transforms import Pose
 from ceres_cal.model.information import Information
 from ceres_cal.model.keys import Key
-from ceres_cal.model.parameters import Estimate, Layout, intrinsic_names
+from ceres_cal.model.parameters import Estimate
 from ceres_cal.model.priors import stated_prior, tolerances
+from ceres_cal.model.quantities import layout_of
 from ceres_cal.model.structure import Tolerance, make_structure
 from ceres_cal.observations import Curves, Observations, Points, Prior
 from ceres_cal.observations.sights import gather_sights
@@ -86,7 +87,7 @@ class Ground:
         targets = {**self.targets, **measurement.targets}
         estimate = self._with(measurement, targets)
         observations = replace(_observed(estimate, targets, measurement.views), targets=targets)
-        layout = _layout(estimate, self.keys, measurement.placements)
+        layout = layout_of(self.keys, estimate, measurement.placements)
         lenses = {name: camera.lens for name, camera in estimate.cameras.items()}
         stated = (stated_prior(prior, lenses[estimate.stations[prior.name].camera]) for prior in measurement.priors)
         priors = (*stated, *tolerances(estimate.structure, self.keys))
@@ -96,25 +97,12 @@ class Ground:
     def _with(self, measurement: Measurement, targets: Mapping[str, Target]) -> Estimate:
         """The estimate with what the measurement brings along; of the placements those that are still free."""
         structure = make_structure(targets, {**self.tolerances, **measurement.tolerances})
-        known = dict(zip(self.estimate.structure.names, self.estimate.structure.values.tolist(), strict=True))
         shared = dict.fromkeys(key.owner for key in self.keys if key.kind == "placement")
         return replace(
             self.estimate,
             placements={**{name: self.estimate.placements[name] for name in shared}, **measurement.placements},
-            structure=structure.with_values(np.array([known.get(name, 0.0) for name in structure.names])),
+            structure=structure.carrying(self.estimate.structure),
         )
-
-
-def _layout(estimate: Estimate, keys: Sequence[Key], placements: Iterable[str]) -> Layout:
-    """The layout whose shared numbers are the keys, and the new placements."""
-    free = {
-        name: np.array(
-            [intrinsic_names(camera.lens).index(k.quantity) for k in keys if k[:2] == ("camera", name)], dtype=np.int64
-        )
-        for name, camera in estimate.cameras.items()
-    }
-    owners = {kind: frozenset(k.owner for k in keys if k.kind == kind) for kind in ("station", "placement")}
-    return Layout(free, owners["station"], owners["placement"] | frozenset(placements))
 
 
 def _observed(estimate: Estimate, targets: Mapping[str, Target], views: tuple[ViewPlan, ...]) -> Observations:

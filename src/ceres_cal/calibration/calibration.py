@@ -113,8 +113,7 @@ class Calibration:
         used = replace(
             observations, points=taken(observations.points, points), curves=taken(observations.curves, curves)
         )
-        known, scales = self.uncertainty, (self.fit.point_scale, self.fit.curve_scale)
-        return disagreement(used, known.estimate, known.posterior, scales, (first, second))
+        return disagreement(used, self.estimate, self.uncertainty.posterior, self.fit.scales, (first, second))
 
     def inlier_masks(self, observations: Observations) -> tuple[Mask, Mask]:
         """(N,) of points and (M,) of curve observations: which rows took part."""
@@ -131,7 +130,7 @@ class Calibration:
         """
         sights, options = gather_sights(observations), self.options
         prior = None if self.refitted is None else self.refitted.prior
-        weighting = Weighting(self.fit.point_scale, self.fit.curve_scale, options.loss, options.loss_scale)
+        weighting = Weighting(*self.fit.scales, options.loss, options.loss_scale)
         if new_data or prior is None or self.posterior is None:
             priors = gather_priors(observations, options, self.estimate.structure)
             return Problem(sights, make_layout(observations, options), priors, weighting, options)

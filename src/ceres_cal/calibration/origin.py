@@ -42,6 +42,11 @@ class Fit:
     unknowns: int
 
     @property
+    def scales(self) -> tuple[float, float]:
+        """Noise scales of points and of curves."""
+        return self.point_scale, self.curve_scale
+
+    @property
     def rms_px(self) -> float:
         """Root mean square residual over points and curves together."""
         total = self.points * self.points_rms_px**2 + self.curves * self.curves_rms_px**2

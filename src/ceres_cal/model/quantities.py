@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence, Set
+from collections.abc import Iterable, Sequence, Set
 from dataclasses import replace
 
 import numpy as np
@@ -111,6 +111,17 @@ def from_placement(cam_from_target: Array, cam_from_world: Pose) -> Array:
     chain[:, :3, 3:] = cam_from_target[:, :, :3]
     chain[:, 3:, :3] = cam_from_world.rotation
     return chain
+
+
+def layout_of(keys: Sequence[Key], estimate: Estimate, placements: Iterable[str] = ()) -> Layout:
+    """The layout of the problem whose shared numbers are the keys, and of placements besides."""
+    free = {}
+    for name, camera in estimate.cameras.items():
+        names = intrinsic_names(camera.lens)
+        numbers = sorted(names.index(key.quantity) for key in keys if key[:2] == ("camera", name))
+        free[name] = np.array(numbers, dtype=np.int64)
+    stations, shared = (frozenset(key.owner for key in keys if key.kind == kind) for kind in ("station", "placement"))
+    return Layout(free, stations, shared | frozenset(placements))
 
 
 def camera_moved(camera: Camera, quantities: Sequence[str], step: Array) -> Camera:

@@ -72,6 +72,11 @@ class Structure:
         """The same corrections with other numbers."""
         return replace(self, values=np.array(values, dtype=float)) if len(self.values) else self
 
+    def carrying(self, other: Structure) -> Structure:
+        """The same corrections with the numbers that others have for them; 0 where those have none."""
+        known = dict(zip(other.names, other.values.tolist(), strict=True))
+        return self.with_values(np.array([known.get(name, 0.0) for name in self.names]))
+
     def points(self, sights: Sights) -> Array:
         """(N, 3) where the observed points of the sights lie, m."""
         return self._points(sights.points, sights.point_index)

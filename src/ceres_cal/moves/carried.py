@@ -82,8 +82,6 @@ def make_plan(
     """
     if what not in WHAT:
         raise InputError(f"what={what!r} is unknown: choose one of {', '.join(WHAT)}")
-    if calibration.posterior is None:
-        raise InputError("the calibration does not say how well it is known: calibrate again")
     require_same_things(calibration, observations)
     stations = observations.stations
     chosen = frozenset(stations if moved is None else moved)
@@ -98,13 +96,17 @@ def make_plan(
     same = calibration.digest == observations.digest  # then the question is the same, too
     options = replace(calibration.options, priors=priors or (calibration.options.priors if same else ()))
     prior = carried_prior(calibration, observations, stays)
-    fit, before = calibration.fit, calibration.refitted
-    scales = before.scales if same and before is not None else (fit.point_scale, fit.curve_scale)
+    before = calibration.refitted
+    scales = before.scales if same and before is not None else calibration.fit.scales
     return RefitPlan(calibration, observed, options, what, stations, chosen, stays, hold_others, prior, scales)
 
 
 def require_same_things(calibration: Calibration, observations: Observations) -> None:
-    """Raise an error where cameras, image sizes or targets are not those that were calibrated."""
+    """Raise an error where cameras, image sizes or targets are not those that were calibrated, or nothing is known of
+    how well they were.
+    """
+    if calibration.posterior is None:
+        raise InputError("the calibration does not say how well it is known: calibrate again")
     for name, size in observations.cameras.items():
         if name not in calibration.cameras:
             known = ", ".join(map(repr, calibration.cameras))
@@ -137,15 +139,12 @@ def carried_prior(calibration: Calibration, observations: Observations, stays: f
         before = calibration.refitted.prior if calibration.refitted is not None else None
         before = before or GaussianPrior(Information.nothing(), np.empty(0))
         return before.without([key for key in before.keys if not _is_kept(key, stays)])
-    posterior = calibration.posterior
-    assert posterior is not None
-    return posterior_of(calibration, [key for key in posterior.keys if _is_kept(key, stays)])
+    return posterior_of(calibration, [k for k in calibration.uncertainty.posterior.keys if _is_kept(k, stays)])
 
 
 def posterior_of(calibration: Calibration, keys: Sequence[Key]) -> GaussianPrior:
     """What the posterior says of some numbers, all others integrated out, as the prior of the next solve."""
-    assert calibration.posterior is not None
-    return GaussianPrior.about(calibration.posterior.information.marginal(keys), calibration.estimate)
+    return GaussianPrior.about(calibration.uncertainty.posterior.information.marginal(keys), calibration.estimate)
 
 
 def _is_kept(key: Key, stays: frozenset[str]) -> bool:
@@ -154,10 +153,7 @@ def _is_kept(key: Key, stays: frozenset[str]) -> bool:
 
 def refit_problem(plan: RefitPlan, what: str, sights: Sights, start: Estimate) -> tuple[Problem, Layout]:
     """What is solved, and the layout of what is known at all: the posterior speaks of everything, held or not."""
-    calibration = plan.calibration
-    posterior = calibration.posterior
-    assert posterior is not None
-    everything = posterior.layout(calibration.estimate)
+    everything = plan.calibration.uncertainty.posterior.layout(plan.calibration.estimate)
     free, stations = everything.free, plan.moved | (plan.stays & everything.stations)
     known = Layout(free, stations, frozenset(start.placements))
     held = {name for name in free if what == "pose-only" or (plan.hold_others and name not in plan.moved_cameras)}
@@ -184,9 +180,7 @@ def first_estimate(plan: RefitPlan, poses: dict[str, Pose], placements: dict[str
 
 def with_structure(old: Estimate, observations: Observations, options: Options) -> Structure:
     """The targets as they were found built, in the order of the observations' targets; new ones as drawn."""
-    structure = make_structure(observations.targets, options.tolerances)
-    known = dict(zip(old.structure.names, old.structure.values.tolist(), strict=True))
-    return structure.with_values(np.array([known.get(name, 0.0) for name in structure.names]))
+    return make_structure(observations.targets, options.tolerances).carrying(old.structure)
 
 
 def _ordered(stations: dict[str, Station], names: Sequence[str]) -> dict[str, Station]:

@@ -17,8 +17,9 @@ from ceres_cal.base.tails import upper_tail
 from ceres_cal.base.transforms import Pose
 from ceres_cal.calibration import Calibration
 from ceres_cal.model.keys import Key
-from ceres_cal.model.parameters import Estimate, Layout, intrinsic_names
+from ceres_cal.model.parameters import Estimate
 from ceres_cal.model.priors import GaussianPrior, tolerances
+from ceres_cal.model.quantities import layout_of
 from ceres_cal.moves.carried import posterior_of, require_same_things, with_structure
 from ceres_cal.moves.poses import PoseCandidate, PoseSearch, in_sigmas, movement, pose_candidates
 from ceres_cal.observations import Observations
@@ -113,8 +114,6 @@ def check(calibration: Calibration, observations: Observations, false_alarms: fl
     """
     if not 0.0 < false_alarms < 1.0:
         raise InputError(f"false_alarms must be a probability between 0 and 1, not {false_alarms}")
-    if calibration.posterior is None:
-        raise InputError("the calibration does not say how well it is known: calibrate again")
     require_same_things(calibration, observations)
     for name in observations.stations:
         if name not in calibration.estimate.stations:
@@ -149,12 +148,9 @@ class _Case:
 
     def problem(self, used: Sights, prior: GaussianPrior) -> Problem:
         """The station's pose and its camera's intrinsics from what is used, under a prior."""
-        names = intrinsic_names(self.estimate.cameras[self.sight.key.camera].lens)
-        free = sorted(names.index(key.quantity) for key in self.prior.keys if key.kind == "camera")
-        layout = Layout({self.sight.key.camera: np.array(free, dtype=np.int64)}, frozenset([self.name]), frozenset())
+        layout = layout_of(self.prior.keys, self.estimate)
         fresh = tolerances(self.estimate.structure, self.prior.keys)
-        fit = self.calibration.fit
-        weighting = Weighting(fit.point_scale, fit.curve_scale, "trivial")
+        weighting = Weighting(*self.calibration.fit.scales, "trivial")
         return Problem(used, layout, (prior, *fresh), weighting, self.calibration.options)
 
     def least(self, used: Sights, prior: GaussianPrior, pose: Pose) -> tuple[float, Estimate] | None:
@@ -169,8 +165,7 @@ class _Case:
 
 
 def _case(calibration: Calibration, observed: Observations, sight: Sights) -> _Case:
-    key, old, posterior = sight.key, calibration.estimate, calibration.posterior
-    assert posterior is not None
+    key, old, posterior = sight.key, calibration.estimate, calibration.uncertainty.posterior
     own = posterior.keys_of(old, key.station)
     if not posterior.knows_station(key.station):
         raise InputError(f"station {key.station!r} was held as the world: it cannot be said to have moved")
@@ -195,8 +190,8 @@ class _Test:
 
 
 def _checked(calibration: Calibration, observed: Observations, sight: Sights, level: float) -> StationCheck:
-    case, fit = _case(calibration, observed, sight), calibration.fit
-    search = PoseSearch(observed, sight, case.estimate, (fit.point_scale, fit.curve_scale))
+    case = _case(calibration, observed, sight)
+    search = PoseSearch(observed, sight, case.estimate, calibration.fit.scales)
     near = pose_candidates(search, [case.estimate.stations[case.name].cam_from_world], patience=0)
     used = sight.used(*_inliers(search, near[0])) if near else sight[:0]
     inside, count = (len(s.point_rows) + len(s.curve_rows) for s in (used, sight))

@@ -13,9 +13,11 @@ import numpy as np
 from ceres_cal.base.errors import CalibrationError, SolutionError
 from ceres_cal.base.tails import upper_tail
 from ceres_cal.base.transforms import Pose
+from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
 from ceres_cal.model.parameters import Estimate
 from ceres_cal.model.residuals import residuals
+from ceres_cal.model.structure import make_structure
 from ceres_cal.moves.carried import RefitPlan
 from ceres_cal.moves.labels import MIRRORED, TURNED, mistaken_targets, relabelled
 from ceres_cal.moves.poses import PoseCandidate, PoseSearch, misfit, movement, pose_candidates
@@ -118,8 +120,6 @@ def _others(plan: RefitPlan, search: PoseSearch) -> Iterator[str]:
         phi = zoomed[0].camera.phi
         before = search.camera.phi
         yield f"with phi {phi:.0f} px in place of {before:.0f} they do: {WORDS['zoom']}: refit with --what zoom"
-    from ceres_cal.calibrating import calibrate
-
     try:
         fresh = calibrate(_of_camera(search), replace(plan.options, priors=()))
     except CalibrationError:
@@ -141,8 +141,6 @@ def _good(candidate: PoseCandidate) -> bool:
 
 def _seen_as(search: PoseSearch, observations: Observations) -> PoseSearch:
     """The search with its observations renamed or its targets exchanged; structure is left out of it."""
-    from ceres_cal.model.structure import make_structure
-
     sights = gather_sights(observations)
     number = sights.keys.index(search.sight.key)
     estimate = replace(search.estimate, structure=make_structure(observations.targets, {}))

@@ -203,8 +203,8 @@ def _placements(plan: RefitPlan, sights: Sights, estimate: Estimate) -> dict[str
 
 def _require_known(plan: RefitPlan, result: Calibration) -> None:
     """Raise DegenerateError where the observations leave a pose open."""
-    assert result.posterior is not None
-    for key, sd in zip(result.posterior.keys, result.posterior.sd.tolist(), strict=True):
+    posterior = result.uncertainty.posterior
+    for key, sd in zip(posterior.keys, posterior.sd.tolist(), strict=True):
         if key.kind == "station" and key.owner in plan.moved and not np.isfinite(sd):
             raise DegenerateError(
                 f"station {key.owner!r}: the observations do not tell its {key.quantity.replace('_', ' ')}: "

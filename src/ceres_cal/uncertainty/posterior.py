@@ -14,7 +14,8 @@ from ceres_cal.base.spread import Spread, without
 from ceres_cal.base.tails import NORMAL_95
 from ceres_cal.model.information import Information
 from ceres_cal.model.keys import Key, pose_keys, sigma_limits
-from ceres_cal.model.parameters import Estimate, Layout, intrinsic_names
+from ceres_cal.model.parameters import Estimate, Layout
+from ceres_cal.model.quantities import layout_of
 from ceres_cal.solve import Eliminated, ReducedInformation
 from ceres_cal.uncertainty.profile import PhiProfile
 
@@ -76,15 +77,7 @@ class Posterior:
 
     def layout(self, estimate: Estimate) -> Layout:
         """The layout of everything that it speaks of."""
-        free = {}
-        for name, camera in estimate.cameras.items():
-            names = intrinsic_names(camera.lens)
-            own = [names.index(key.quantity) for key in self.keys if key[:2] == ("camera", name)]
-            free[name] = np.array(sorted(own), dtype=np.int64)
-        stations, placements = (
-            frozenset(key.owner for key in self.keys if key.kind == kind) for kind in ("station", "placement")
-        )
-        return Layout(free, stations, placements | frozenset(self.placements))
+        return layout_of(self.keys, estimate, self.placements)
 
     def keys_of(self, estimate: Estimate, station: str) -> tuple[Key, ...]:
         """Keys of a station and of its camera."""
