@@ -19,8 +19,8 @@ from ceres_cal.observations.sights import Sights
 # Spare equations below which a spread says nothing: its own error is 25 % at 8. At 4 the errors of fits to ten points
 # are 1.46 of their stated sigmas, at 16 they are 0.8 (1.16 at 8), because the stated sigmas are then taken.
 _LEAST_SPARE = 8.0
-# Spare equations that the other kind's noise counts as: a handful of points beside many curve observations, which the fit
-# nearly goes through, must not seem exact (without it their scale fell to 0.04 of the truth and less).
+# Spare equations that the other kind's noise counts as: a handful of points beside many curve observations, which the
+# fit nearly goes through, must not seem exact (without it their scale fell to 0.04 of the truth and less).
 _BORROWED = 4.0
 # Spare equations that a scale seen before stands for: few exact ones must not make it 0. Nothing changes from half to
 # double.

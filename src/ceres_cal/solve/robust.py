@@ -28,9 +28,9 @@ _AT_REST, _AT_REST_AGAIN = 1e-2, 1e-5
 # Nothing changes from half to double.
 _ENOUGH_PLACEMENTS = 20
 _ROUGH = 1e-3  # relative change of the cost at which the first solve ends
-_MOST_ROUGH = 4
-# Share of the residuals' scale; a rough solve that leaves less is followed by another one at the new scale. What a start
-# blurs (a line painted aside, a wrong label) is told from noise only at a scale near the noise's own.
+_MOST_REFINED = 3
+# Share of the residuals' scale: a rough solve that leaves less is followed by another one at the new scale. A line that
+# is painted aside is told from noise only at a scale near the noise's own.
 _MUCH_LESS = 0.3
 
 
@@ -86,6 +86,8 @@ def solve_robustly(
             undecided = frozenset(state.problem.sights.keys)  # another lens had decided about mirrored poses
         if at_rest or before is None:
             state, changed, undecided = rounds.mended(state, undecided)
+            if before is None:
+                state = rounds.refined(state)
             if at_rest and not changed:
                 state = rounds.with_leverages(state)
                 if state.reduced is not None:
@@ -106,26 +108,28 @@ class _Rounds:
     ) -> None:
         self._problem, self._observations, self._usual, self._progress = problem, observations, usual, progress
         self._redundancy: Redundancy | None = None
+        self._visible: Inliers
         self.no_change = _AT_REST if usual is None else _AT_REST_AGAIN
 
     def first(self, estimate: Estimate) -> RobustSolution:
-        """Rough solves from a start, each at the scale of the residuals that the one before left."""
+        """The rough solve from a start."""
         there = residuals(self._observations, self._problem.sights, estimate)
-        visible = visible_from(self._observations, there)
-        for _ in range(_MOST_ROUGH):
-            solution = self._rough(estimate, there, visible)
-            estimate, before = solution.estimate, visible
-            there = residuals(self._observations, self._problem.sights, estimate, there.feet)
-            visible = visible_from(self._observations, there)
-            if not visible.much_below(before, _MUCH_LESS):
+        return self._rough(estimate, there, visible_from(self._observations, there), 1)
+
+    def refined(self, state: RobustSolution) -> RobustSolution:
+        """Further rough solves, each at the scale of the residuals that the one before left, while that falls."""
+        for _ in range(_MOST_REFINED):
+            visible = visible_from(self._observations, state.residuals)
+            if not visible.much_below(self._visible, _MUCH_LESS):
                 break
-        state = self._weighted(solution, there, 1)
+            state = self._rough(state.solution.estimate, state.residuals, visible, state.rounds + 1)
         # Of one kind of observations without priors the leverages add up to the count.
         mixed = bool(self._problem.priors) or all(kind.equations for kind in self._problem.sights.by_kind)
         return self._by_leverages(state)[0] if mixed and len(state.problem.sights) else state
 
-    def _rough(self, estimate: Estimate, there: Residuals, visible: Inliers) -> Solution:
+    def _rough(self, estimate: Estimate, there: Residuals, visible: Inliers, rounds: int) -> RobustSolution:
         """A solve of few placements, which the others follow, that gross errors do not decide."""
+        self._visible = visible
         # A line painted aside is an outlier to a redescending loss, but not to its tolerance.
         loss = "huber" if len(estimate.structure.values) else "cauchy"
         weighting = Weighting(visible.point_scale, visible.curve_scale, loss, loss_scale=1.0)
@@ -138,7 +142,7 @@ class _Rounds:
         solution = solve(few, estimate, self._progress, precision=_ROUGH, is_near=False)
         if len(few.sights) < len(problem.sights):
             solution = replace(solution, estimate=with_placements_at_best(problem, solution.estimate))
-        return solution
+        return self._judged(solution, there, rounds)
 
     def next(self, state: RobustSolution) -> RobustSolution:
         """One more solve, from where the last one ended, of what was judged to be inliers."""
