@@ -11,6 +11,7 @@ from ceres_cal.base.tails import log_chi2_tail
 from ceres_cal.diagnostics.linear_model import LinearModel
 from ceres_cal.observations import Observations
 from ceres_cal.scene.curves import nearest_on_track
+from ceres_cal.solve.noise import Inliers
 
 # Noise within so much of what was stated is as stated: sigmas are guessed to a tenth or two. Below 1 every sound
 # scene is a finding; at 2.3 noise of twice the stated one is missed.
@@ -50,19 +51,19 @@ class Noise:
 
 
 def measure_noise(
-    observations: Observations, model: LinearModel, before: LinearModel, scales: tuple[float, float]
+    observations: Observations, model: LinearModel, before: LinearModel, inliers: Inliers
 ) -> tuple[Noise, ...]:
     """The noise of points and of curves, where there are any.
 
     Args:
-        model: with the named causes taken off. before: the calibration's own. scales: its noise scales.
+        model: with the named causes taken off. before: the calibration's own. inliers: with its noise scales.
     """
     answer = []
-    for is_curve, kind in ((False, "points"), (True, "curves")):
+    for is_curve, kind, scale in ((False, "points", inliers.point_scale), (True, "curves", inliers.curve_scale)):
         rows = model.used & (model.equations.is_curve == is_curve)
         if np.any(rows):
             own = before.variance(before.used & (before.equations.is_curve == is_curve))
-            answer.append(_noise_of(observations, model, kind, rows, scales[is_curve], own))
+            answer.append(_noise_of(observations, model, kind, rows, scale, own))
     return tuple(answer)
 
 

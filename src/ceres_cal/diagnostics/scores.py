@@ -13,12 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices
+from ceres_cal.base.arrays import Array, Indices, Mask
 from ceres_cal.base.tails import log_f_tail
-from ceres_cal.diagnostics.linear_model import LinearModel, inverse_root
-
-LEAST_LEFT = 1e-7
-"""Share of an alternative's squared length that the free numbers must leave for it to be testable."""
+from ceres_cal.diagnostics.linear_model import LEAST_LEFT, LinearModel, inverse_root
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,25 +23,32 @@ class Family:
     """Alternatives of one kind.
 
     Attributes:
-        kind: what they say, a key of `words`.
+        kind: of the diagnostic that they are of.
         columns: (E, Q) px per unit of the Q amounts, for every equation.
         group: (E,) which alternative's amounts move each equation, -1 for none.
-        names: of each alternative.
+        subjects: what each alternative is about. frames: at which frame; empty where all are about all frames.
         onwards: whether alternative g moves the groups after g instead of group g itself.
-        units: of the Q amounts, for people.
     """
 
     kind: str
     columns: Array
     group: Indices
-    names: tuple[str, ...]
+    subjects: tuple[str, ...]
+    frames: tuple[str, ...] = ()
     onwards: bool = False
-    units: tuple[str, ...] = ()
 
     def of(self, number: int) -> Array:
         """(E, Q) columns of one alternative over all equations."""
         moved = self.group > number if self.onwards else self.group == number
         return np.asarray(self.columns * moved[:, None])
+
+
+def grouped(values: Indices, rows: Mask) -> tuple[Indices, Indices]:
+    """The different values in the chosen rows, and which of them each row (N,) has, -1 for the others."""
+    numbers, inverse = np.unique(values[rows], return_inverse=True)
+    group = np.full(len(values), -1)
+    group[rows] = inverse
+    return numbers, group
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,6 +69,19 @@ class Score:
     amount: Array
     sd: Array
 
+    @property
+    def subject(self) -> str:
+        return self.family.subjects[self.number]
+
+    @property
+    def frame(self) -> str | None:
+        return self.family.frames[self.number] if self.family.frames else None
+
+    @property
+    def columns(self) -> Array:
+        """(E, Q) px per unit of its amounts."""
+        return self.family.of(self.number)
+
 
 def score_all(model: LinearModel, families: Sequence[Family], inflation: float = 1.0) -> list[Score]:
     """The tests of every alternative that the free numbers leave testable.
@@ -74,17 +91,17 @@ def score_all(model: LinearModel, families: Sequence[Family], inflation: float =
     """
     squares = float(model.left_over @ model.left_over)
     slope = _robust_slope(model)
-    found: list[tuple[Family, int, Array, Array, Array]] = []
+    testable: list[tuple[Family, int, Array, Array, Array]] = []
     for family in families:
         normals, scores, sizes = _sums(model, family)
         for number in np.flatnonzero(sizes.max(axis=1) > 0.0):
             root = inverse_root(normals[number], sizes[number], LEAST_LEFT)
             if root.shape[1] and model.spare + model.known_noise - root.shape[1] >= 1.0:
-                found.append((family, int(number), root, root.T @ scores[number], sizes[number]))
-    if not found:
+                testable.append((family, int(number), root, root.T @ scores[number], sizes[number]))
+    if not testable:
         return []
-    ranks = np.array([root.shape[1] for _, _, root, _, _ in found])
-    statistics = np.array([float(z @ z) for _, _, _, z, _ in found])
+    ranks = np.array([root.shape[1] for _, _, root, _, _ in testable])
+    statistics = np.array([float(z @ z) for _, _, _, z, _ in testable])
     spare = model.spare + model.known_noise - ranks
     variance = (np.maximum(squares - statistics, 1e-12 * squares) + model.known_noise) / spare
     log_p = log_f_tail(statistics / (inflation * ranks * np.maximum(variance, 1e-300)), ranks, spare)
@@ -93,7 +110,7 @@ def score_all(model: LinearModel, families: Sequence[Family], inflation: float =
             family, number, float(statistics[i] / variance[i]), int(ranks[i]), float(log_p[i]), -root @ z / slope,
             _spread(root, sizes, float(np.sqrt(variance[i] * inflation)) / slope),
         )
-        for i, (family, number, root, z, sizes) in enumerate(found)
+        for i, (family, number, root, z, sizes) in enumerate(testable)
     ]  # fmt: skip
 
 
@@ -111,7 +128,7 @@ def _sums(model: LinearModel, family: Family) -> tuple[Array, Array, Array]:
     """Of each alternative: X'X (G, Q, Q), X'r (G, Q), and the squared lengths (G, Q) before any projection."""
     rows = np.flatnonzero((family.group >= 0) & model.used)
     rows = rows[np.argsort(family.group[rows], kind="stable")]
-    group, count = family.group[rows], len(family.names)
+    group, count = family.group[rows], len(family.subjects)
     columns = family.columns[rows] * model.weight[rows, None]
     size = columns.shape[1]
     rest = model.placed_score[rows]
@@ -150,7 +167,7 @@ def _private_overlaps(model: LinearModel, family: Family, rows: Indices, columns
     held = np.flatnonzero(np.any(basis != 0.0, axis=1))
     if not len(held):
         return []
-    size, count = columns.shape[1], len(family.names)
+    size, count = columns.shape[1], len(family.subjects)
     sight, group = model.equations.sight[rows[held]], family.group[rows[held]]
     order = np.lexsort((group, sight))
     products = (columns[held, :, None] * basis[held, None, :]).reshape(len(held), -1)[order]

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask
+from ceres_cal.diagnostics.diagnostic import Case
 from ceres_cal.diagnostics.linear_model import LinearModel
 from ceres_cal.diagnostics.table import ResidualTable
-from ceres_cal.observations import Observations
 from ceres_cal.scene.camera import Camera
 
 REGIONS = (6, 4)
@@ -69,10 +69,9 @@ class Summaries:
     trends: tuple[RadiusTrend, ...]
 
 
-def summarise(
-    observations: Observations, table: ResidualTable, model: LinearModel, cameras: Mapping[str, Camera]
-) -> Summaries:
+def summarise(case: Case) -> Summaries:
     """All summaries of a table."""
+    observations, table, cameras = case.observations, case.table, case.estimate.cameras
     several = len(observations.stations) > 1
     labels = [f"{view.station} {view.frame}" if several else view.frame for view in observations.views]
     frames = list(dict.fromkeys(labels))
@@ -86,7 +85,7 @@ def summarise(
         _summary(table, table.feature, list(table.features)),
         _summary(table, region, region_names),
         _summary(table, ring, radius_names),
-        tuple(_trend(model, cameras[name], name, camera == i, edges[i]) for i, name in enumerate(camera_names)),
+        tuple(_trend(case.model, cameras[name], name, camera == i, edges[i]) for i, name in enumerate(camera_names)),
     )
 
 

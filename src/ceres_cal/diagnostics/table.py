@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -135,7 +136,7 @@ def _plain(column: AnyArray) -> list[Any]:
 
 
 def make_table(
-    observations: Observations, inliers: Inliers, model: LinearModel, weight: Array, cameras: dict[str, Camera]
+    observations: Observations, inliers: Inliers, model: LinearModel, weight: Array, cameras: Mapping[str, Camera]
 ) -> ResidualTable:
     """The table of all observations.
 
@@ -255,7 +256,7 @@ def _standardised(model: LinearModel, count: int) -> Array:
     return answer
 
 
-def _radii(observations: Observations, view: Indices, pixel: Array, cameras: dict[str, Camera]) -> Array:
+def _radii(observations: Observations, view: Indices, pixel: Array, cameras: Mapping[str, Camera]) -> Array:
     owner = np.array([one.camera for one in observations.views])[view]
     radii = np.full(len(view), np.nan)
     for name in observations.cameras:

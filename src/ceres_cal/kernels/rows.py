@@ -7,15 +7,25 @@ from typing import Any
 import numpy as np
 
 from ceres_cal.kernels.arguments import CurveColumns, Loss, Optics, PointColumns
-from ceres_cal.kernels.jit import jit
+from ceres_cal.kernels.jit import borrowing, jit
 from ceres_cal.kernels.lenses import prepared
 from ceres_cal.kernels.losses import robust_loss
-from ceres_cal.kernels.sight import CHUNK, jacobian_rows, move_to_feet, shown_points, working_space
+from ceres_cal.kernels.panel import moved_along
+from ceres_cal.kernels.sight import (
+    CHUNK,
+    curve_directions,
+    jacobian_rows,
+    move_to_feet,
+    point_directions,
+    shown_points,
+    working_space,
+)
 
 
 @jit
 def point_rows(optics: Optics, poses: Any, points: PointColumns, rows: Any) -> bool:
-    """d project(X) / d [intrinsics | 6 pose] into `rows` (N, 2, intrinsics + 6); False where one cannot be projected.
+    """d project(X) / d [intrinsics | 6 pose | x, y, first and second bow] into `rows` (N, 2, intrinsics + 10); False
+    where one cannot be projected.
 
     Args:
         See `point_residuals`. The pose columns are left perturbations in the camera frame: (dw x R X) + dt.
@@ -30,15 +40,19 @@ def point_rows(optics: Optics, poses: Any, points: PointColumns, rows: Any) -> b
                 return False
             jacobian_rows(n, optics, space, False)
             for i in range(n):
+                point_directions(start + i, points, space.directions)
                 for c in range(2):
+                    row = rows[start + i, c]
                     for k in range(len(jacobian)):
-                        rows[start + i, c, k] = jacobian[k, c, i]
+                        row[k] = jacobian[k, c, i]
+                    _add_built(poses[v], space.directions, row)
     return True
 
 
 @jit
 def curve_rows(optics: Optics, poses: Any, curves: CurveColumns, rows: Any, normals: Any) -> bool:
-    """The same of the signed distance to the curve, into `rows` (M, intrinsics + 6), by the envelope theorem.
+    """The same of the signed distance to the curve, into `rows` (M, intrinsics + 10), by the envelope theorem; the last
+    columns are of a segment's offset to the left, or of an arc's x, y and radius, and 0.
 
     Args:
         See `curve_residuals`; s is moved to the foot. normals: (M, 2), filled with the image normal there: the foot
@@ -57,9 +71,20 @@ def curve_rows(optics: Optics, poses: Any, curves: CurveColumns, rows: Any, norm
                 length = np.sqrt(foot[7, i])
                 nx, ny = -foot[1, i] / length, foot[0, i] / length
                 normals[start + i, 0], normals[start + i, 1] = nx, ny
+                row = rows[start + i]
                 for k in range(len(jacobian)):
-                    rows[start + i, k] = nx * jacobian[k, 0, i] + ny * jacobian[k, 1, i]
+                    row[k] = nx * jacobian[k, 0, i] + ny * jacobian[k, 1, i]
+                curve_directions(i, curves.track[start + i], curves, space.tangents, space.directions)
+                _add_built(poses[v], space.directions, row)
     return True
+
+
+@borrowing
+def _add_built(pose: Any, directions: Any, row: Any) -> None:
+    """A row's last four columns, the target moved along each direction; the three before are the pose's translation."""
+    first = len(row) - 4
+    for a in range(4):
+        row[first + a] = moved_along(pose, directions[a], row[first - 3 : first])
 
 
 @jit
