@@ -91,7 +91,7 @@ DECIDING: tuple[Constant, ...] = (
     *_of("advice.candidates", "_MARKED", "advice"),
     *_of("diagnostics.findings", "SMALL", "diagnose"),
     *_of("diagnostics.leftover", "LARGER _FEWEST_PAIRS", "diagnose"),
-    *_of("diagnostics.patterns", "_LEAST_SHARE", "diagnose"),
+    *_of("diagnostics.scores", "_LEAST_SHARE", "diagnose"),
     *_of("diagnostics.of_target", "_FEWEST_ON_CURVE _FEWEST_OF_POINT _FEWEST_AGREE _FAR_M", "diagnose"),
     *_of("moves.checking", "_INLIER_SIGMA _LEAST_SHARE _NOISY _WILL_DO", "check"),
     *_of("moves.comparison", "_DOUBTFUL", "check"),

@@ -15,10 +15,10 @@ from ceres_cal.diagnostics.findings import Finding
 from ceres_cal.diagnostics.labels import find_mislabelled
 from ceres_cal.diagnostics.leftover import Noise, measure_noise
 from ceres_cal.diagnostics.linear_model import Weights, make_linear_model
-from ceres_cal.diagnostics.new_data import with_newcomers_placed
-from ceres_cal.diagnostics.patterns import select
-from ceres_cal.diagnostics.recalled import recalled
+from ceres_cal.diagnostics.of_new_data import with_newcomers_placed
+from ceres_cal.diagnostics.of_target import recalled
 from ceres_cal.diagnostics.registry import DIAGNOSTICS, all_families
+from ceres_cal.diagnostics.scores import select
 from ceres_cal.diagnostics.summaries import Summaries, summarise
 from ceres_cal.diagnostics.table import ResidualTable, make_table
 from ceres_cal.model.parameters import Options

@@ -18,8 +18,7 @@ from ceres_cal.diagnostics.findings import Amount, Finding, Wrong
 from ceres_cal.diagnostics.labels import Mislabelling
 from ceres_cal.diagnostics.leftover import Noise
 from ceres_cal.diagnostics.linear_model import LinearModel
-from ceres_cal.diagnostics.patterns import Selection
-from ceres_cal.diagnostics.scores import Family, Score
+from ceres_cal.diagnostics.scores import Family, Score, Selection
 from ceres_cal.diagnostics.table import ResidualTable, plane_shift
 from ceres_cal.model.parameters import Estimate
 from ceres_cal.observations import Observations
@@ -160,11 +159,9 @@ class ScoreTest(Diagnostic):
 
     Attributes:
         absorbed: whether its effect is what the calibration's free numbers could not have taken up of it.
-        recalled: whether observations that were taken out may speak for it, see `recalled`.
     """
 
     absorbed: ClassVar[bool] = False
-    recalled: ClassVar[bool] = False
 
     @abstractmethod
     def families(self, case: Case) -> Iterator[Family]:

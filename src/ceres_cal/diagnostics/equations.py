@@ -2,7 +2,7 @@
 
 A point gives two equations, one for each image axis, a curve observation one, along the image normal at its foot. Any
 alternative to the model is a column over these equations: what it moves in the image goes in by `direction`, what it
-moves on a target by `motion`.
+moves on a target by `built`, the camera by `pose`.
 """
 
 from __future__ import annotations
@@ -67,11 +67,6 @@ class Equations:
     def of_sights(self, chosen: Mask) -> Mask:
         """(E,) the equations of the chosen sights."""
         return np.asarray(chosen[self.sight])
-
-    def moved_along(self, directions: Array) -> Array:
-        """(E,) px per metre of moving what is seen along a direction (E, 3) of its sight's frame."""
-        turned = np.einsum("eij,ej->ei", self.poses[self.sight, :, :3], directions)
-        return np.asarray(np.sum(self.motion * turned, axis=1))
 
     def slots(self, structure: Structure) -> Indices:
         """(E, 4) which of the structure's numbers are those of `built`, -1 for none."""

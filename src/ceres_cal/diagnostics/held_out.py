@@ -8,7 +8,7 @@ below that of a field, by the same share whatever the lens.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -49,16 +49,16 @@ class HeldOut:
 
     label: str
     coefficients: int
-    folds: int
-    failed_folds: int
-    points_rms_px: float
-    curves_rms_px: float
-    rms_px: float
-    rms_mm: float
-    fit_rms_px: float
-    frames: tuple[str, ...]
-    frame_squares: Array
-    frame_counts: Array
+    folds: int = 0
+    failed_folds: int = 0
+    points_rms_px: float = np.nan
+    curves_rms_px: float = np.nan
+    rms_px: float = np.nan
+    rms_mm: float = np.nan
+    fit_rms_px: float = np.nan
+    frames: tuple[str, ...] = ()
+    frame_squares: Array = field(default_factory=lambda: np.empty(0))
+    frame_counts: Array = field(default_factory=lambda: np.empty(0))
     failed: str = ""
 
 
@@ -159,12 +159,12 @@ def choose(observations: Observations, options: Options, k: int = FOLDS, *, most
     errors = []
     for one, whole in zip(tried, wholes, strict=True):
         if isinstance(whole, str):
-            errors.append(_failure(one, whole))
+            errors.append(HeldOut(label_of(one), _coefficients(one), failed=whole))
             continue
         try:
             errors.append(cross_validate(few, one, k, calibration=whole, counted=counted))
         except CalibrationError as error:
-            errors.append(_failure(one, str(error)))
+            errors.append(HeldOut(label_of(one), _coefficients(one), failed=str(error)))
     best, chosen = _decide(errors)
     share = (len(few.points) + len(few.curves)) / (len(observations.points) + len(observations.curves))
     current = next(i for i, one in enumerate(tried) if label_of(one) == label_of(options))
@@ -296,11 +296,6 @@ def _errors(observations: Observations, rows: Mask, estimate: Estimate) -> Array
     px = np.concatenate([np.linalg.norm(there.points, axis=1), np.abs(there.curves)])
     px = np.where(np.isfinite(px), px, _UNSEEN_SIGMA * _columns(observations, "sigma_px"))
     return np.column_stack([px, np.abs(error_mm(equations, equations.residual, len(px)))])
-
-
-def _failure(options: Options, why: str) -> HeldOut:
-    nothing, nan = np.empty(0), float("nan")
-    return HeldOut(label_of(options), _coefficients(options), 0, 0, nan, nan, nan, nan, nan, (), nothing, nothing, why)
 
 
 def _coefficients(options: Options) -> int:

@@ -13,7 +13,7 @@ from ceres_cal.base.transforms import skew
 from ceres_cal.diagnostics.diagnostic import Case, Evidence, ScoreTest, Words
 from ceres_cal.diagnostics.findings import amounts
 from ceres_cal.diagnostics.scores import Family, grouped
-from ceres_cal.observations import Observations
+from ceres_cal.diagnostics.table import numbers_of
 
 
 class _Moved(ScoreTest):
@@ -27,17 +27,18 @@ class _Moved(ScoreTest):
         """(E,) the frames of `count` that are tested."""
 
     def families(self, case: Case) -> Iterator[Family]:
-        equations, order = case.equations, _frame_order(case.observations)
-        frame = np.array([order[view.station][view.frame] for view in case.observations.views])[equations.view]
+        equations = case.equations
+        frames = [(view.station, view.frame) for view in case.observations.views]
+        known = list(dict.fromkeys(frames))
+        frame = numbers_of(frames, known)[equations.view]
         bounds = zip(equations.bounds, equations.bounds[1:], strict=False)
         several = np.array([bool(np.any(frame[start:stop] != frame[start])) for start, stop in bounds])
         tied = np.array([key.placement not in case.problem.private for key in equations.sights.keys])
-        stations = np.array([key.station for key in equations.sights.keys])
+        of_station = np.array([key.station for key in equations.sights.keys])
         columns = motion_columns(case)
-        for station, frames in order.items():
-            own = equations.of_sights((stations == station) & (tied | several))
-            present, group = grouped(frame, own)
-            group, names = self.groups(group, len(present)), tuple(tuple(frames)[number] for number in present)
+        for station in case.observations.stations:
+            present, group = grouped(frame, equations.of_sights((of_station == station) & (tied | several)))
+            group, names = self.groups(group, len(present)), tuple(known[number][1] for number in present)
             if np.any(group >= 0):
                 yield Family(self.kind, columns, group, (station,) * len(names), names, self.onwards)
 
@@ -85,15 +86,6 @@ class MovedIn(_Moved):
 
     def groups(self, group: Indices, count: int) -> Indices:
         return np.where((group > 0) & (group < count - 1), group, -1)  # the first or last is the same as from there on
-
-
-def _frame_order(observations: Observations) -> dict[str, dict[str, int]]:
-    """Station -> its frames in order of appearance, numbered."""
-    order: dict[str, dict[str, int]] = {}
-    for view in observations.views:
-        frames = order.setdefault(view.station, {})
-        frames.setdefault(view.frame, len(frames))
-    return order
 
 
 def motion_columns(case: Case) -> Array:

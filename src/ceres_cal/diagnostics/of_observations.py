@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections import defaultdict
 from collections.abc import Iterator
 from typing import ClassVar
@@ -9,7 +10,7 @@ from typing import ClassVar
 import numpy as np
 
 from ceres_cal.base.arrays import Array
-from ceres_cal.diagnostics.diagnostic import Case, Diagnostic, Tested
+from ceres_cal.diagnostics.diagnostic import Case, Diagnostic, Tested, Words
 from ceres_cal.diagnostics.findings import Amount, Finding, Wrong
 from ceres_cal.diagnostics.labels import Mislabelled
 from ceres_cal.diagnostics.leftover import Noise
@@ -62,60 +63,58 @@ def _mean(values: Array) -> float:
     return float(np.mean(known)) if len(known) else float("nan")
 
 
-class LargerNoise(Diagnostic):
-    """Noise of points or of curves beyond what was stated."""
+class _OfNoise(Diagnostic):
+    """What the noise of points and of curves is like."""
 
-    kind = "noise"
     wrong: ClassVar[Wrong] = "observations"
 
     def tests(self, case: Case) -> int:
         return 2
 
+    @abstractmethod
+    def about(self, noise: Noise) -> tuple[float, float, Words]:
+        """log P of as much by chance, px that it is of, and its words."""
+
     def findings(self, tested: Tested) -> Iterator[Finding]:
-        for one in tested.noise:
-            if one.log_p <= tested.selection.log_level:
-                sentence = (
-                    f"the noise of {one.kind} is {one.scale:.2f} times what was stated: {one.sigma_px:.3f} px, not "
-                    f"{one.sigma_px / one.scale:.3f}"
-                )
-                amount = Amount("scale", one.scale, one.scale / float(np.sqrt(2.0 * one.observations)), "")
-                advice = "state the larger sigma where sigmas are taken as stated; the estimated scale is right already"
+        case = tested.case
+        for noise in tested.noise:
+            log_p, px, words = self.about(noise)
+            if log_p <= tested.selection.log_level:
+                rows = case.model.used & (case.equations.is_curve == (noise.kind == "curves"))
+                all_px, all_mm, _ = case.effect(case.equations.residual, rows)
+                mm = px * all_mm / all_px if all_px > 0.0 else float("nan")
                 yield Finding(
-                    self.kind, self.wrong, one.kind, None, sentence, advice, one.sigma_px,
-                    one.sigma_px * _mm_per_px(tested, one), 1.0, (amount,), tested.log10_p(one.log_p),
-                    one.observations,
+                    self.kind, self.wrong, noise.kind, None, words.sentence, words.advice, px, mm, px / noise.sigma_px,
+                    words.amounts, tested.log10_p(log_p), noise.observations,
                 )  # fmt: skip
 
 
-class Correlated(Diagnostic):
+class LargerNoise(_OfNoise):
+    """Noise beyond what was stated."""
+
+    kind = "noise"
+
+    def about(self, noise: Noise) -> tuple[float, float, Words]:
+        sentence = (
+            f"the noise of {noise.kind} is {noise.scale:.2f} times what was stated: {noise.sigma_px:.3f} px, not "
+            f"{noise.sigma_px / noise.scale:.3f}"
+        )
+        amount = Amount("scale", noise.scale, noise.scale / float(np.sqrt(2.0 * noise.observations)), "")
+        advice = "state the larger sigma where sigmas are taken as stated; the estimated scale is right already"
+        return noise.log_p, noise.sigma_px, Words(sentence, advice, (amount,))
+
+
+class Correlated(_OfNoise):
     """Neighbouring residuals that agree."""
 
     kind = "correlated"
-    wrong: ClassVar[Wrong] = "observations"
 
-    def tests(self, case: Case) -> int:
-        return 2
-
-    def findings(self, tested: Tested) -> Iterator[Finding]:
-        for one in tested.noise:
-            if one.correlation_log_p <= tested.selection.log_level:
-                sentence = (
-                    f"neighbouring residuals of {one.kind} agree (correlation {one.correlation:.2f}): "
-                    f"{one.observations} observations say as much as {one.effective:.0f} independent ones"
-                )
-                shared = one.sigma_px * float(np.sqrt(max(one.correlation, 0.0)))
-                advice = "take every standard deviation of the calibration larger by the square root of that ratio"
-                amount = Amount("correlation", one.correlation, 1.0 / float(np.sqrt(one.observations)), "")
-                yield Finding(
-                    self.kind, self.wrong, one.kind, None, sentence, advice, shared,
-                    shared * _mm_per_px(tested, one), shared / one.sigma_px, (amount,),
-                    tested.log10_p(one.correlation_log_p), one.observations,
-                )  # fmt: skip
-
-
-def _mm_per_px(tested: Tested, noise: Noise) -> float:
-    """What residuals of its kind are on the targets' planes."""
-    case = tested.case
-    rows = case.model.used & (case.equations.is_curve == (noise.kind == "curves"))
-    px, mm, _ = case.effect(case.equations.residual, rows)
-    return mm / px if px > 0.0 else float("nan")
+    def about(self, noise: Noise) -> tuple[float, float, Words]:
+        sentence = (
+            f"neighbouring residuals of {noise.kind} agree (correlation {noise.correlation:.2f}): "
+            f"{noise.observations} observations say as much as {noise.effective:.0f} independent ones"
+        )
+        amount = Amount("correlation", noise.correlation, 1.0 / float(np.sqrt(noise.observations)), "")
+        advice = "take every standard deviation of the calibration larger by the square root of that ratio"
+        shared_px = noise.sigma_px * float(np.sqrt(max(noise.correlation, 0.0)))
+        return noise.correlation_log_p, shared_px, Words(sentence, advice, (amount,))

@@ -19,7 +19,7 @@ DIAGNOSTICS: dict[str, Diagnostic] = {
 }  # fmt: skip
 
 
-def all_families(case: Case, recalled: bool = False) -> list[Family]:
-    """Every alternative to the model; or those alone for which observations that were taken out may speak."""
-    tests = [one for one in DIAGNOSTICS.values() if isinstance(one, ScoreTest)]
-    return [family for test in tests if test.recalled or not recalled for family in test.families(case)]
+def all_families(case: Case) -> list[Family]:
+    """Every alternative to the model."""
+    tests = (one for one in DIAGNOSTICS.values() if isinstance(one, ScoreTest))
+    return [family for test in tests for family in test.families(case)]

@@ -10,7 +10,7 @@ import numpy as np
 from ceres_cal.base.arrays import Array, Indices, Mask
 from ceres_cal.diagnostics.diagnostic import Case
 from ceres_cal.diagnostics.linear_model import LinearModel
-from ceres_cal.diagnostics.table import ResidualTable
+from ceres_cal.diagnostics.table import ResidualTable, numbers_of
 from ceres_cal.scene.camera import Camera
 
 REGIONS = (6, 4)
@@ -75,9 +75,9 @@ def summarise(case: Case) -> Summaries:
     several = len(observations.stations) > 1
     labels = [f"{view.station} {view.frame}" if several else view.frame for view in observations.views]
     frames = list(dict.fromkeys(labels))
-    frame_of_view = _numbers(labels, frames)
+    frame_of_view = numbers_of(labels, frames)
     camera_names = list(observations.cameras)
-    camera = _numbers([view.camera for view in observations.views], camera_names)[table.view]
+    camera = numbers_of([view.camera for view in observations.views], camera_names)[table.view]
     region_names, region = _regions(table, camera, camera_names, cameras)
     radius_names, ring, edges = _rings(table, camera, camera_names, cameras)
     return Summaries(
@@ -87,11 +87,6 @@ def summarise(case: Case) -> Summaries:
         _summary(table, ring, radius_names),
         tuple(_trend(case.model, cameras[name], name, camera == i, edges[i]) for i, name in enumerate(camera_names)),
     )
-
-
-def _numbers(labels: list[str], known: list[str]) -> Indices:
-    order = {name: number for number, name in enumerate(known)}
-    return np.array([order[label] for label in labels], dtype=np.int64)
 
 
 def _summary(table: ResidualTable, group: Indices, names: list[str]) -> Summary:

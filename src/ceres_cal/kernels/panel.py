@@ -87,18 +87,6 @@ def bend_rows(n: int, components: int, loss: Loss, squared: Any, last: int, pane
 
 
 @borrowing
-def moved_along(pose: Any, direction: Any, motion: Any) -> float:
-    """What moving along a direction of the frame does where the camera's axes do `motion` (3,)."""
-    total = 0.0
-    for j in range(3):
-        turned = 0.0
-        for k in range(3):
-            turned += pose[j, k] * direction[k]
-        total += motion[j] * turned
-    return total
-
-
-@borrowing
 def add_structure(i: int, n: int, components: int, slots: Any, pose: Any, places: Any, space: Any, normal: Any) -> None:
     """The share of the chunk's observation i in the rows of the structure numbers `slots` (-1: none) that move it.
 
@@ -112,7 +100,12 @@ def add_structure(i: int, n: int, components: int, slots: Any, pose: Any, places
         if slots[a] < 0:
             continue
         for c in range(components):
-            columns[a, c] = moved_along(pose, directions[a], panel[translation : translation + 3, c * n + i])
+            columns[a, c] = 0.0
+            for j in range(3):
+                turned = 0.0
+                for k in range(3):
+                    turned += pose[j, k] * directions[a, k]
+                columns[a, c] += panel[translation + j, c * n + i] * turned
         for k in range(len(places)):
             value = 0.0
             for c in range(components):

@@ -10,13 +10,11 @@ from ceres_cal.kernels.arguments import CurveColumns, Loss, Optics, PointColumns
 from ceres_cal.kernels.jit import borrowing, jit
 from ceres_cal.kernels.lenses import prepared
 from ceres_cal.kernels.losses import robust_loss
-from ceres_cal.kernels.panel import moved_along
 from ceres_cal.kernels.sight import (
     CHUNK,
     curve_directions,
     jacobian_rows,
     move_to_feet,
-    point_directions,
     shown_points,
     working_space,
 )
@@ -32,7 +30,7 @@ def point_rows(optics: Optics, poses: Any, points: PointColumns, rows: Any) -> b
     """
     optics = prepared(optics, optics.intrinsics)
     space = working_space(optics, 0)
-    jacobian = space.jacobian
+    jacobian, directions = space.jacobian, np.eye(4, 3)
     for v in range(len(poses)):
         for start in range(points.bounds[v], points.bounds[v + 1], CHUNK):
             n = min(CHUNK, points.bounds[v + 1] - start)
@@ -40,12 +38,12 @@ def point_rows(optics: Optics, poses: Any, points: PointColumns, rows: Any) -> b
                 return False
             jacobian_rows(n, optics, space, False)
             for i in range(n):
-                point_directions(start + i, points, space.directions)
+                directions[2, 2], directions[3, 2] = points.bends[start + i, 0], points.bends[start + i, 1]
                 for c in range(2):
                     row = rows[start + i, c]
                     for k in range(len(jacobian)):
                         row[k] = jacobian[k, c, i]
-                    _add_built(poses[v], space.directions, row)
+                    _add_built(poses[v], directions, row)
     return True
 
 
@@ -60,7 +58,7 @@ def curve_rows(optics: Optics, poses: Any, curves: CurveColumns, rows: Any, norm
     """
     optics = prepared(optics, optics.intrinsics)
     space = working_space(optics, 0)
-    jacobian, foot = space.jacobian, space.foot
+    jacobian, foot, directions = space.jacobian, space.foot, space.directions
     for v in range(len(poses)):
         for start in range(curves.bounds[v], curves.bounds[v + 1], CHUNK):
             n = min(CHUNK, curves.bounds[v + 1] - start)
@@ -74,8 +72,11 @@ def curve_rows(optics: Optics, poses: Any, curves: CurveColumns, rows: Any, norm
                 row = rows[start + i]
                 for k in range(len(jacobian)):
                     row[k] = nx * jacobian[k, 0, i] + ny * jacobian[k, 1, i]
-                curve_directions(i, curves.track[start + i], curves, space.tangents, space.directions)
-                _add_built(poses[v], space.directions, row)
+                track = curves.track[start + i]
+                directions[:] = 0.0
+                directions[1, 1] = 1.0 if curves.is_arc[track] else 0.0
+                curve_directions(i, track, curves, space.tangents, directions)
+                _add_built(poses[v], directions, row)
     return True
 
 
@@ -84,7 +85,10 @@ def _add_built(pose: Any, directions: Any, row: Any) -> None:
     """A row's last four columns, the target moved along each direction; the three before are the pose's translation."""
     first = len(row) - 4
     for a in range(4):
-        row[first + a] = moved_along(pose, directions[a], row[first - 3 : first])
+        row[first + a] = 0.0
+        for j in range(3):
+            for k in range(3):
+                row[first + a] += row[first - 3 + j] * pose[j, k] * directions[a, k]
 
 
 @jit

@@ -232,29 +232,24 @@ def _add_points(
             bend_rows(n, 2, loss, squared, last, panel)
         add_products(2 * n, len(rows), panel, space.products)
         if len(points.slots) > 0:
+            directions = space.directions
+            directions[:] = 0.0
+            directions[0, 0], directions[1, 1] = 1.0, 1.0
             for i in range(n):
-                point_directions(start + i, points, space.directions)
-                add_structure(i, n, 2, points.slots[start + i], pose, order.places, space, normal)
+                directions[2, 2], directions[3, 2] = points.bends[start + i, 0], points.bends[start + i, 1]
+                slots = points.slots[start + i]
+                add_structure(i, n, 2, slots, pose, order.places, space, normal)
     return cost
-
-
-@borrowing
-def point_directions(row: int, points: PointColumns, directions: Any) -> None:
-    """Where x, y and both bows of its target move a point."""
-    directions[:] = 0.0
-    directions[0, 0], directions[1, 1] = 1.0, 1.0
-    directions[2, 2], directions[3, 2] = points.bends[row, 0], points.bends[row, 1]
 
 
 @borrowing
 def curve_directions(i: int, k: int, curves: CurveColumns, tangents: Any, directions: Any) -> None:
     """Where the foot on track k goes: to the left of a segment; with the centre and outwards on an arc."""
-    directions[:] = 0.0
     if curves.is_arc[k]:
-        directions[0, 0], directions[1, 1] = 1.0, 1.0
+        directions[0, 0], directions[0, 1] = 1.0, 0.0
         # The tangent's right side is outside; turned by a quarter it is the radius' own direction.
         length = np.sqrt(tangents[0, i] * tangents[0, i] + tangents[1, i] * tangents[1, i])
-        directions[2, 0], directions[2, 1] = tangents[1, i] / length, -tangents[0, i] / length
+        directions[2, 0], directions[2, 1], directions[2, 2] = tangents[1, i] / length, -tangents[0, i] / length, 0.0
     else:
         x, y = curves.tracks[k, 1, 0], curves.tracks[k, 1, 1]
         length = np.sqrt(x * x + y * y) + 1e-300
@@ -297,9 +292,12 @@ def _add_curves(
             bend_rows(n, 1, loss, local[2], last, panel)
         add_products(n, len(rows), panel, space.products)
         if len(curves.slots) > 0:
+            directions = space.directions
+            directions[:] = 0.0
+            directions[0, 0], directions[1, 1], directions[2, 2] = 1.0, 1.0, 1.0
             for i in range(n):
                 k = track[start + i]
-                curve_directions(i, k, curves, space.tangents, space.directions)
+                curve_directions(i, k, curves, space.tangents, directions)
                 add_structure(i, n, 1, curves.slots[k], pose, order.places, space, normal)
     return cost
 
