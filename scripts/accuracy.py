@@ -38,12 +38,12 @@ from ceres_cal.model.structure import Tolerance
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import gather_sights
 from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.heights import HEIGHTS_M
 from ceres_cal.scene.targets import Arc, Target
 from ceres_cal.simulate import Disturbance, simulate
 from ceres_cal.solve import Weighting, placement_costs
 
 MOST_SIGMA = 4.0  # a mean farther from 0 than so many of its own standard errors is a bias
-HEIGHTS_M = (0.0, 0.15)  # the floor, and the top of a robot
 LEAST_GAIN = 1e-6  # share of a pose's cost; what a better pose must save to be another pose
 DIVERGED = 5.0  # times the expected mean error; no bad luck goes so far
 TOLERANCES = {"field": Tolerance(lines_m=0.010)}

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from math import hypot
 
+import msgspec
 import numpy as np
 
 from ceres_cal.base.arrays import Array
@@ -16,7 +17,17 @@ from ceres_cal.observations import Observations, Prior
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Brown, Lens, Radial
 from ceres_cal.scene.targets import Arc, Curve, Segment, checkerboard, custom, ssl_field
-from ceres_cal.simulate import Disturbance, Scene, Station, board_scene, field_scene, join, overhead_pose, simulate
+from ceres_cal.simulate import (
+    Disturbance,
+    Held,
+    Scene,
+    Station,
+    board_scene,
+    field_scene,
+    join,
+    overhead_pose,
+    simulate,
+)
 
 FIELD = ssl_field("B")
 CLEAN_NOISE = Disturbance(points_sigma_px=0.3, curves_sigma_px=0.3)
@@ -51,7 +62,7 @@ def boards(phi: float, lens: Lens) -> Problem:
     """A board at 20 places before one camera."""
     cameras = {"camera": Camera((1280, 960), phi, (646.5, 473.8), lens)}
     stations = {"camera": Station("camera", Pose.identity())}
-    scene = board_scene(checkerboard(9, 6, 0.05), cameras, stations, count=20, seed=3, distance_m=(0.5, 1.5))
+    scene = board_scene(checkerboard(9, 6, 0.05), cameras, stations, count=20, seed=3, held=Held((0.5, 1.5)))
     return Problem(scene, Options(lens=lens.kind))
 
 
@@ -72,7 +83,7 @@ def two_cameras() -> Problem:
     }
     field = field_scene(FIELD, cameras, stations, spacing_m=_SPACING_M)
     board = checkerboard(9, 6, 0.1)
-    both = board_scene(board, cameras, stations, count=6, seed=2, distance_m=(3.0, 5.0), tilt_deg=(20.0, 50.0))
+    both = board_scene(board, cameras, stations, count=6, seed=2, held=Held((3.0, 5.0), (20.0, 50.0)))
     return Problem(join(field, both), Options())
 
 
@@ -94,7 +105,7 @@ def tilted(tilt_deg: float, height_sigma_m: float | None = None, boards: int = 0
     stations = {"overhead": Station("overhead", pose)}
     scene = field_scene(FIELD, cameras, stations, points=(), spacing_m=spacing_m)
     if boards:
-        shown = board_scene(checkerboard(9, 6, 0.1), cameras, stations, boards, seed=5, distance_m=(1.0, 2.0))
+        shown = board_scene(checkerboard(9, 6, 0.1), cameras, stations, boards, seed=5, held=Held((1.0, 2.0)))
         scene = join(scene, shown)
     priors = () if height_sigma_m is None else (_height(scene, "overhead", height_sigma_m),)
     return Problem(scene, Options(), priors)
@@ -108,7 +119,7 @@ def small_boards(count: int, seed: int) -> Scene:
     cameras = {"camera": Camera((1280, 960), 600.0, (645.0, 470.0), Brown((-0.28, 0.07, 0.0, 0.0, 0.0)))}
     stations = {"camera": Station("camera", Pose.identity())}
     board = checkerboard(6, 5, 0.06)
-    return board_scene(board, cameras, stations, count, seed, distance_m=(0.7, 2.5), tilt_deg=(15.0, 40.0))
+    return board_scene(board, cameras, stations, count, seed, held=Held((0.7, 2.5), (15.0, 40.0)))
 
 
 # ---- ssl-vision's table ---------------------------------------------------------------------------------------------
@@ -195,7 +206,7 @@ def _paint(seed: int) -> tuple[dict[str, Curve], dict[str, float]]:
             x, y, radius = PAINT_SIGMA_M * rng.standard_normal(3)
             offsets |= {f"{name}.x": x, f"{name}.y": y, f"{name}.radius": radius}
             middle = (curve.centre[0] + x, curve.centre[1] + y, 0.0)
-            curves[name] = replace(curve, centre=middle, radius_m=curve.radius_m + radius)
+            curves[name] = msgspec.structs.replace(curve, centre=middle, radius_m=curve.radius_m + radius)
         else:
             offsets[name] = PAINT_SIGMA_M * rng.standard_normal()
             along = np.subtract(curve.end, curve.start)

@@ -27,10 +27,10 @@ from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
 from ceres_cal.model.parameters import Options, Station
 from ceres_cal.observations import Observations, combine
+from ceres_cal.scene.heights import ROBOT_TOP_M
 from ceres_cal.scene.targets import custom
 from ceres_cal.simulate import Scene, field_scene, overhead_pose, simulate
 
-HEIGHT_M = 0.15
 WITHIN = 0.1
 LEAST_IN_RANGE = 0.9
 OTHER_NOISE = 1_000_000  # added to a seed: what is measured besides has noise of its own
@@ -115,7 +115,7 @@ class Kept:
         """What one run brought."""
         (name,) = scene.stations
         camera = scene.stations[name].camera
-        stated = found.uncertainty.map_sd_mm(name, HEIGHT_M)
+        stated = found.uncertainty.map_sd_mm(name, ROBOT_TOP_M)
         self.promised.append(promised_for(promise, found.cameras[camera].phi))
         self.stated.append((stated.worst_mm, stated.mean_mm))
         self.at_truth.append(promised_for(promise, scene.cameras[camera].phi))
@@ -169,13 +169,13 @@ def promised_for(promise: Promise, phi_px: float) -> tuple[float, float]:
 
 
 def errors_m(calibration: Calibration, scene: Scene, places: Array) -> Array:
-    """(N, 2) by how much the calibration locates places at HEIGHT_M amiss; NaN where the true camera sees none."""
+    """(N, 2) by how much the calibration locates places at ROBOT_TOP_M amiss; NaN where the true camera sees none."""
     (name,) = scene.stations
     camera, truth = calibration.station(name), scene.camera_at(name)
-    pixels = truth.project(np.column_stack([places, np.full(len(places), HEIGHT_M)]))
+    pixels = truth.project(np.column_stack([places, np.full(len(places), ROBOT_TOP_M)]))
     with np.errstate(invalid="ignore"):
         shown = np.all((pixels >= -0.5) & (pixels <= np.array(truth.image_size) - 0.5), axis=1)
-    return np.asarray(np.where(shown[:, None], camera.locate(pixels, HEIGHT_M) - places, np.nan))
+    return np.asarray(np.where(shown[:, None], camera.locate(pixels, ROBOT_TOP_M) - places, np.nan))
 
 
 def rows(case: str, make: Callable[[], Problem], runs: int) -> Iterator[Row]:
@@ -192,10 +192,10 @@ def rows(case: str, make: Callable[[], Problem], runs: int) -> Iterator[Row]:
         here = calibration.stations[name].cam_from_world
         if not measurements:
             first = here
-            measurements = [promise.measurement for promise in advise(calibration, name, HEIGHT_M).promises]
+            measurements = [promise.measurement for promise in advise(calibration, name, ROBOT_TOP_M).promises]
             kept = [(Kept(), Kept()) for _ in measurements]
         now = [measurement.before(first, here) for measurement in measurements]
-        for ones, promise in zip(kept, promised(calibration, now, name, HEIGHT_M), strict=True):
+        for ones, promise in zip(kept, promised(calibration, now, name, ROBOT_TOP_M), strict=True):
             try:
                 found = followed(promise.measurement, calibration, trial.observations, problem.scene, seed)
             except CalibrationError as error:

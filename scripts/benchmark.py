@@ -37,6 +37,7 @@ from benchmark_problems import (
     wide_lens,
 )
 
+from ceres_cal.scene.heights import ROBOT_TOP_M
 from ceres_cal.scene.lens import KannalaBrandt
 from ceres_cal.simulate import overhead_pose
 
@@ -45,7 +46,7 @@ MODULES = {OURS: "ceres_cal.calibrating", "opencv": "cv2", "pycolmap": "pycolmap
 MRCAL_PYTHON = "/usr/bin/python3"  # Debian's mrcal belongs to the system's Python
 MIRRORED_DEG = 5.0  # that far off the truth, a pose is the other one of the two that a plane's picture allows
 WARM_UP_LINE_POINTS, WARM_UP_S = 1000, 0.3
-PIXELS, ROBOT_M = 1_000_000, 0.15
+PIXELS = 1_000_000
 LAST_DECADES = 2.0  # over which growth is told
 
 Solver = Callable[[Corners], Answer]
@@ -327,9 +328,9 @@ def pixel_rows(repeat: int) -> list[dict[str, Any]]:
         one, there, back = replace(camera, lens=lens), [], []
         for _ in range(repeat):
             start = time.perf_counter()
-            places = one.locate(pixels, ROBOT_M)
+            places = one.locate(pixels, ROBOT_TOP_M)
             middle = time.perf_counter()
-            one.project(np.column_stack([places, np.full(len(places), ROBOT_M)]))
+            one.project(np.column_stack([places, np.full(len(places), ROBOT_TOP_M)]))
             there.append(middle - start)
             back.append(time.perf_counter() - middle)
         rows.append({"lens": lens.kind, "locate": median(there), "project": median(back)})
@@ -386,7 +387,7 @@ def measure(chosen: argparse.Namespace) -> dict[str, Any]:
         print_growth("growth with the line points of a static camera over a field, ours", report["field"])
     report["pixels"] = pixel_rows(chosen.repeat)
     print_table(
-        f"{PIXELS:,} pixels located at {1e3 * ROBOT_M:.0f} mm, and projected back", PIXELS_TOLD, report["pixels"]
+        f"{PIXELS:,} pixels located at {1e3 * ROBOT_TOP_M:.0f} mm, and projected back", PIXELS_TOLD, report["pixels"]
     )
     report["environment"]["load after"] = round(os.getloadavg()[0], 2)
     print(f"\nload after {report['environment']['load after']}")

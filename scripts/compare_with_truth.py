@@ -20,11 +20,11 @@ from ceres_cal.calibration import Calibration
 from ceres_cal.observations import Observations
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.curves import curve_points
+from ceres_cal.scene.heights import HEIGHTS_M
 from ceres_cal.scene.lens import make_lens
 from ceres_cal.scene.targets import Target
 from ceres_cal.simulate.files import TRUTH_FORMAT, TRUTH_VERSION
 
-HEIGHTS_M = (0.0, 0.15)  # the floor, and the top of a robot
 STEP_M = 0.1
 MOST_MM = 5.0
 

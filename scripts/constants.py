@@ -105,7 +105,7 @@ DECIDING: tuple[Constant, ...] = (
     *_of("photographs.clicks", "SIGMA_PX _SQUARE", "clicks"),
     *_of("photographs.follow", "LEAST_SHARE _SURE_SHARE _ABSENT _MOST_ABSENT", "lines", "auto"),
     *_of("photographs.facing", "_FACES _AS_WELL _NEARER_DEG", "auto"),
-    *_of("photographs.candidates", "_SURE _WORTH_A_LOOK _ALIKE", "auto"),
+    *_of("photographs.candidates", "_SURE _COMPARABLE _ALIKE", "auto"),
     *_of("photographs.judgement", "_NEAR_PX _EXPLAINED _FEWEST_PLACES _FEWEST_CURVES", "auto"),
     *_of("photographs.judgement", "_LEAST_UPRIGHT _SAME_FLOOR", "auto"),
     *_of("photographs.matching", "_PEAK _LEAST_PEAK _PARALLEL _CELL _LEAST_IN_VIEW", "auto"),

@@ -34,7 +34,7 @@ from moves import (
     thinned,
     truth_of,
 )
-from photographs import Shot, clicks, distances_px, floor_error_mm, hidden_places, off_by, take, turned, varied
+from photograph_shots import Shot, clicks, distances_px, floor_error_mm, hidden_places, off_by, take, turned, varied
 from photographs_auto import FACING, VIEWS, near, outcome, searched, take_view
 
 from ceres_cal.advice import advise
@@ -53,7 +53,7 @@ from ceres_cal.photographs.clicks import starts_from_clicks
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import KannalaBrandt, Radial
 from ceres_cal.scene.targets import checkerboard
-from ceres_cal.simulate import Station, board_scene, built_in_scene, overhead_pose, simulate
+from ceres_cal.simulate import Held, Station, board_scene, built_in_scene, overhead_pose, simulate
 from ceres_cal.simulate.photograph import frames, photograph
 
 Figures = dict[str, float]
@@ -105,7 +105,7 @@ def _lost(seed: int) -> int:
     cameras = {"camera": Camera((1280, 960), 400.0, (646.5, 473.8), KannalaBrandt((-0.012, 0.004, -0.003, 0.0006)))}
     stations = {"camera": Station("camera", Pose.identity())}
     board = checkerboard(9, 6, 0.05)
-    scene = board_scene(board, cameras, stations, 40, seed, distance_m=(0.3, 2.5), tilt_deg=(0.0, 60.0))
+    scene = board_scene(board, cameras, stations, 40, seed, held=Held((0.3, 2.5), (0.0, 60.0)))
     seen_boards = simulate(scene, replace(NOISE, outliers=0.3), seed).observations
     try:
         posed = calibrate(seen_boards, Options(lens="kannala-brandt")).estimate.placements
@@ -412,7 +412,7 @@ def rings(runs: int, folder: Path) -> Figures:
             found = detect_rings(path, radii)
             solved = np.power.outer(radius, [1, 2, 3]) @ (found.polynomial / found.polynomial[0])
             worst.append(float(np.max(np.abs(solved - camera.lens.ideal_radius(radius)))))
-            counts.append(found.found)
+            counts.append(found.rings)
             edges.append(len(found.observations.curves))
     return {
         "sheets read": len(worst),

@@ -13,7 +13,6 @@ from dataclasses import dataclass, field
 from functools import partial
 
 import numpy as np
-from accuracy import HEIGHTS_M
 from accuracy_bound import Trial, attempts
 from accuracy_scenes import CLEAN_NOISE, GROSS_NOISE, PROBLEMS, Problem, tilted
 from cases import Row, run
@@ -22,6 +21,7 @@ from ceres_cal.base.arrays import Mask
 from ceres_cal.calibration import Calibration
 from ceres_cal.model.keys import pose_keys
 from ceres_cal.model.quantities import difference
+from ceres_cal.scene.heights import HEIGHTS_M
 from ceres_cal.simulate import Disturbance
 from ceres_cal.uncertainty.maps import shown_pixels
 

@@ -16,6 +16,7 @@ from ceres_cal.scene.lens import Brown, KannalaBrandt, Lens, Radial
 from ceres_cal.scene.targets import Segment, checkerboard, custom, ssl_field
 from ceres_cal.simulate import (
     Disturbance,
+    Held,
     Scene,
     Station,
     board_scene,
@@ -48,7 +49,7 @@ def held_boards(lens: Lens, phi: float = 868.0, count: int = 12) -> Scene:
     """A board held before one camera."""
     cameras = {"camera": Camera((1280, 960), phi, (646.5, 473.8), lens)}
     stations = {"camera": Station("camera", Pose.identity())}
-    return board_scene(checkerboard(9, 6, 0.05), cameras, stations, count=count, seed=3, distance_m=(0.5, 1.5))
+    return board_scene(checkerboard(9, 6, 0.05), cameras, stations, count=count, seed=3, held=Held((0.5, 1.5)))
 
 
 @dataclass(frozen=True)

@@ -18,10 +18,10 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from accuracy import HEIGHTS_M, map_errors_mm
+from accuracy import map_errors_mm
 from accuracy_scenes import FIELD, field_places
 from cases import Row, run
-from photographs import varied
+from photograph_shots import varied
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import CalibrationError
@@ -37,8 +37,9 @@ from ceres_cal.moves import check, refit
 from ceres_cal.moves.carried import make_plan, refit_problem
 from ceres_cal.observations import Observations, combine, taken
 from ceres_cal.observations.sights import gather_sights
-from ceres_cal.photographs import check_photographs, detect_field
+from ceres_cal.photographs import FieldOptions, check_photographs, detect_field
 from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.heights import HEIGHTS_M
 from ceres_cal.scene.lens import Radial
 from ceres_cal.scene.targets import checkerboard
 from ceres_cal.simulate import (
@@ -291,7 +292,7 @@ def _from_photographs(folder: Path, seed: int) -> Calibration:
     boards = board_scene(BOARD, {"overhead": CAMERA}, stations, BOARD_SHOTS, seed=seed)
     shown = [_saved(folder, boards, frame, 100 * seed + i) for i, (_, frame) in enumerate(frames(boards))]
     fields = [_field_photograph(folder, HOME, 10_000 + 100 * seed + i) for i in range(FIELD_SHOTS)]
-    lines = detect_field(fields, FIELD, CAMERA.at(HOME), camera="overhead").observations
+    lines = detect_field(fields, FIELD, CAMERA.at(HOME), options=FieldOptions("overhead")).observations
     return calibrate(combine([lines, detect_boards(shown, BOARD, "overhead").observations]))
 
 

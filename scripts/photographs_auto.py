@@ -13,11 +13,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 from cases import Row
-from photographs import LENSES, NOT_PAINTED, Shot, distances_px, real_target, take, varied
+from photograph_shots import LENSES, NOT_PAINTED, Shot, distances_px, real_target, take, varied
 
 from ceres_cal.base.arrays import Array32
 from ceres_cal.base.errors import InputError
-from ceres_cal.detect.boards import read_grey
+from ceres_cal.detect.images import read_grey
 from ceres_cal.photographs import Auto, Facing
 from ceres_cal.photographs.search import search
 from ceres_cal.scene.camera import Camera

@@ -25,12 +25,12 @@ from typing import Any
 
 import ceres_cal as cc
 from ceres_cal.base.files import read_bytes, write_bytes
-from ceres_cal.cli.detect import IMAGE_ENDINGS
-from ceres_cal.detect.boards import read_grey
+from ceres_cal.cli.inputs import IMAGE_ENDINGS
+from ceres_cal.detect.images import read_grey
 from ceres_cal.moves import FALSE_ALARMS, Check, movements
 from ceres_cal.photographs import check_photographs
+from ceres_cal.scene.heights import ROBOT_TOP_M
 
-ROBOT_M = 0.15
 PATIENCE = 3  # times that a file is read before it counts as unreadable: it may still be on its way
 
 
@@ -51,7 +51,7 @@ def handle(place: Path, source: Path, given: argparse.Namespace) -> dict[str, An
         if observations is None:
             return {**event, "event": "refused", "reason": "; ".join(told(found).values())}
         new = cc.refit(old, observations, given.what)
-        worst = {name: new.uncertainty.map_sd_mm(name, ROBOT_M).worst_mm for name in observations.stations}
+        worst = {name: new.uncertainty.map_sd_mm(name, ROBOT_TOP_M).worst_mm for name in observations.stations}
         event["sd_mm_at_robot_height"] = worst
         if not all(value <= given.limit_mm for value in worst.values()):
             reason = f"known to {max(worst.values()):.1f} mm at robot height only, asked for are {given.limit_mm:g} mm"

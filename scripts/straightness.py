@@ -21,7 +21,8 @@ from cases import Row
 from ceres_cal.base.arrays import Array, Image, Image8
 from ceres_cal.base.transforms import Pose
 from ceres_cal.calibrating import calibrate
-from ceres_cal.detect.boards import BoardDetections, detect_boards, read_colour
+from ceres_cal.detect.boards import BoardDetections, detect_boards
+from ceres_cal.detect.images import read_colour
 from ceres_cal.model.parameters import Options
 from ceres_cal.pictures.straight import Straight, straighten
 from ceres_cal.scene.camera import Camera

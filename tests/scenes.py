@@ -10,7 +10,7 @@ from ceres_cal.base.transforms import Pose
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Brown, KannalaBrandt, Lens, Radial
 from ceres_cal.scene.targets import Segment, Target, checkerboard, custom, rings, ssl_field
-from ceres_cal.simulate import Scene, Station, board_scene, field_scene, join, overhead_pose, rings_scene
+from ceres_cal.simulate import Held, Scene, Station, board_scene, field_scene, join, overhead_pose, rings_scene
 
 # phi, lens, and the height (m) from which the image just holds a division B field.
 _LENSES: dict[str, tuple[float, Lens, float]] = {
@@ -131,7 +131,7 @@ def two_cameras(lens: str) -> Scene:
     cameras = {"west": west, "east": east}
     field = field_scene(ssl_field("B"), cameras, stations, spacing_m=_SPACING_M)
     distance_m = (0.5 * height, 0.9 * height)
-    return join(field, board_scene(_BOARD, cameras, stations, count=4, seed=12, distance_m=distance_m))
+    return join(field, board_scene(_BOARD, cameras, stations, count=4, seed=12, held=Held(distance_m)))
 
 
 def several_stations(lens: str) -> Scene:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import photographs as script
+import photograph_shots as script
 import photographs_auto as auto_script
 import pytest
 
@@ -16,8 +16,8 @@ from ceres_cal.cli import main
 from ceres_cal.detect.strokes import find_strokes
 from ceres_cal.observations import Observations
 from ceres_cal.photographs import Auto, Facing, detect_field
-from ceres_cal.photographs.candidates import candidates, see
-from ceres_cal.photographs.facing import settled_by_before, settled_by_facing, side_of
+from ceres_cal.photographs.candidates import candidates, prepare_search
+from ceres_cal.photographs.facing import agreeing_with_facing, nearest_to_before, side_of
 from ceres_cal.photographs.grid import grid_of
 from ceres_cal.photographs.search import search
 from ceres_cal.photographs.upright import find_upright
@@ -81,8 +81,8 @@ def test_strokes_lie_on_paint(shot: script.Shot) -> None:
 
 
 def test_strokes_tell_how_the_camera_looks(shot: script.Shot) -> None:
-    seen = see(shot.grey, FIELD, NAMES)
-    upright = find_upright(seen.picture.ends, seen.picture.strokes.length_px, 3)[0]
+    seen = prepare_search(shot.grey, FIELD, NAMES)
+    upright = find_upright(seen.stroke_map.ends, seen.stroke_map.strokes.length_px, 3)[0]
     rotation = shot.camera.cam_from_world.rotation
     assert upright.rotation[:, 2] @ rotation[:, 2] > np.cos(np.deg2rad(1.5))  # 0.4 degrees
     assert np.max(np.abs(upright.rotation[:, :2].T @ rotation[:, 0])) > 0.999
@@ -117,9 +117,9 @@ def test_what_lies_towards_which_side() -> None:
     assert [side_of("LeftGoalLine", way, FIELD, NAMES) for way in ways] == ["top", "bottom"]
     assert [side_of("TopTouchLine", way, FIELD, NAMES) for way in ways] == ["right", "left"]
     for side, left in (("top", [0]), ("bottom", [1]), ("top-right", [0]), ("left", []), ("right", [])):
-        assert settled_by_facing(ways, [Facing("LeftGoalLine", side)], FIELD, NAMES) == left, side
+        assert agreeing_with_facing(ways, [Facing("LeftGoalLine", side)], FIELD, NAMES) == left, side
     both = [Facing("LeftGoalLine", "top"), Facing("TopTouchLine", "left")]
-    assert settled_by_facing(ways, both, FIELD, NAMES) == []
+    assert agreeing_with_facing(ways, both, FIELD, NAMES) == []
     # Mirrored it is no way: no turn has the left goal at the top and the top touch line at the left.
     with pytest.raises(InputError, match="a side of the picture is one of left, right"):
         Facing("LeftGoalLine", "up")
@@ -130,7 +130,7 @@ def test_an_old_calibration_settles_unless_it_lies_across() -> None:
     ways = [camera.at(camera.cam_from_world @ turn) for turn in turns_of(FIELD, NAMES)]
     for yaw, left in ((10.0, [0]), (-50.0, [0]), (170.0, [1]), (-130.0, [1]), (100.0, [0, 1]), (-75.0, [0, 1])):
         before = camera.at(overhead_pose(1.0, 2.0, 3.0, 8.0, 0.0, yaw))
-        assert settled_by_before(ways, before) == left, yaw
+        assert nearest_to_before(ways, before) == left, yaw
 
 
 def test_targets_without_lines_at_right_angles() -> None:
@@ -182,7 +182,7 @@ def test_a_field_that_looks_alike_in_no_turn(mirrored: bool) -> None:
     if mirrored:  # no camera that looks down sees it so
         assert found.followed is None and found.reason
     else:
-        assert found.followed is not None and (found.ways, found.settled_by) == (1, "")
+        assert found.followed is not None and (found.ways, found.chosen_by) == (1, "")
         truth = scene.camera_at("overhead")
         corner = [target.points["corner"]]
         assert np.allclose(found.followed.camera.project(corner), truth.project(corner), atol=0.5)
@@ -221,7 +221,7 @@ def test_from_a_photograph_alone_to_a_calibration(tmp_path: Path, shot: script.S
     cv2.imwrite(str(again), photograph(shot.scene, "overhead", "0001", seed=77).image)
     found = detect_field([path, again], FIELD, TOP)
     assert list(found.found) == [str(path), str(again)]
-    assert {name: (one.ways, one.settled_by) for name, one in found.searched.items()} == {str(path): (2, "facing")}
+    assert {name: (one.ways, one.chosen_by) for name, one in found.searched.items()} == {str(path): (2, "facing")}
     calibration = calibrate(found.observations, script.OPTIONS[shot.camera.lens.kind])
     assert np.mean(script.floor_error_mm(shot, calibration.station())) < 1.0  # 0.2 mm
 

@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from ceres_cal.base.arrays import AnyArray, Array, Image8
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.transforms import Pose
-from ceres_cal.detect.boards import BoardDetections, CharucoSpec, detect_boards, read_grey, right_handed
+from ceres_cal.detect.boards import BoardDetections, CharucoSpec, detect_boards, right_handed
+from ceres_cal.detect.images import read_grey
 from ceres_cal.detect.saddles import measure_saddles
 from ceres_cal.observations import Observations
 from ceres_cal.scene.camera import Camera
@@ -100,7 +101,7 @@ def write(path: Path, image: AnyArray) -> Path:
 
 def test_corners_are_good_to_a_hundredth_of_a_pixel(tmp_path: Path, picture: Array, truth: Array) -> None:
     path = write(tmp_path / "a.png", photograph(picture))
-    points = detect_boards([path], BOARD, corner_fit="saddle").observations.points
+    points = detect_boards([path], BOARD, corners="saddle").observations.points
     assert np.array_equal(points.feature, np.arange(42))
     error = points.pixels - truth
     assert np.all(np.abs(error.mean(axis=0)) < 0.003)  # (0.0000, 0.0007)
@@ -207,7 +208,7 @@ def calibrated(detections: BoardDetections, flags: int) -> tuple[float, Array, A
 )
 def test_sony_photographs(real_data: Path, corner_fit: str, most_px: float, phi: float) -> None:
     images = sorted((real_data / "boofcv_sony_chess").glob("*.jpg"))
-    detections = detect_boards(images, checkerboard(4, 6, 0.03), corner_fit=corner_fit)
+    detections = detect_boards(images, checkerboard(4, 6, 0.03), corners=corner_fit)
     assert len(detections.found) == 13 and not detections.missed
     assert len(detections.observations.points) == 13 * 24
     rms_px, matrix, sigma = calibrated(detections, cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K3)
@@ -298,7 +299,7 @@ def test_depth_and_colour_change_nothing(tmp_path: Path, picture: Array) -> None
     }
     paths = [write(tmp_path / f"{name}.png", image) for name, image in images.items()]
     assert read_grey(paths[3]).dtype == np.uint16
-    pixels = detect_boards(paths, BOARD, corner_fit="saddle").observations.points.pixels.reshape(4, 42, 2)
+    pixels = detect_boards(paths, BOARD, corners="saddle").observations.points.pixels.reshape(4, 42, 2)
     assert np.max(np.abs(pixels - pixels[0])) < 0.001  # 0.00005
 
 
@@ -321,14 +322,14 @@ def test_a_noted_rotation_is_ignored(tmp_path: Path, picture: Array) -> None:
 def test_any_size_of_image(width: int, limit: float, picture: Array, truth: Array, tmp_path: Path) -> None:
     how = cv2.INTER_AREA if width < 480 else cv2.INTER_CUBIC
     path = write(tmp_path / "a.png", cv2.resize(photograph(picture), (width, width * 3 // 4), interpolation=how))
-    points = detect_boards([path], BOARD, corner_fit="saddle").observations.points
+    points = detect_boards([path], BOARD, corners="saddle").observations.points
     assert np.max(np.abs(points.pixels - ((truth + 0.5) * width / 480 - 0.5))) < limit
 
 
 def test_dark_images(tmp_path: Path, picture: Array, truth: Array) -> None:
     """Eleven grey levels in all: OpenCV's newer detector is blind there, the older one is not."""
     path = write(tmp_path / "a.png", photograph(picture) // 16)
-    points = detect_boards([path], BOARD, corner_fit="saddle").observations.points
+    points = detect_boards([path], BOARD, corners="saddle").observations.points
     assert rms(points.pixels - truth) < 0.03  # 0.009
 
 
@@ -358,7 +359,7 @@ def charuco() -> tuple[Image8, Array]:
 
 def test_charuco_corners(tmp_path: Path, charuco: tuple[Image8, Array]) -> None:
     image, truth = charuco
-    points = detect_boards([write(tmp_path / "a.png", image)], CHARUCO_BOARD, charuco=CHARUCO).observations.points
+    points = detect_boards([write(tmp_path / "a.png", image)], CHARUCO_BOARD, corners=CHARUCO).observations.points
     assert np.array_equal(points.feature, np.arange(35))
     assert rms(points.pixels - truth) < 0.02  # 0.009; OpenCV's own corners 0.05
 
@@ -367,7 +368,7 @@ def test_charuco_may_be_partly_seen(tmp_path: Path, charuco: tuple[Image8, Array
     image, truth = charuco
     image = image.copy()
     image[:, 330:] = 128
-    observations = detect_boards([write(tmp_path / "a.png", image)], CHARUCO_BOARD, charuco=CHARUCO).observations
+    observations = detect_boards([write(tmp_path / "a.png", image)], CHARUCO_BOARD, corners=CHARUCO).observations
     points = observations.points
     assert 10 <= len(points) < 25  # 15
     assert {"0,0", "0,4"} <= set(corner_names(observations)) and "6,0" not in corner_names(observations)
@@ -388,7 +389,7 @@ def test_charuco_too_little_seen(
     whole = write(tmp_path / "a.png", charuco[0])
     part = np.full_like(charuco[0], 128)
     part[:below, :right] = charuco[0][:below, :right]
-    detections = detect_boards([write(tmp_path / "b.png", part), whole], CHARUCO_BOARD, charuco=CHARUCO)
+    detections = detect_boards([write(tmp_path / "b.png", part), whole], CHARUCO_BOARD, corners=CHARUCO)
     assert detections.found == (str(whole),)
     assert detections.missed == ((str(tmp_path / "b.png"), reason),)
 
@@ -437,5 +438,6 @@ def test_no_board_at_all(tmp_path: Path, picture: Array) -> None:
     ],
 )
 def test_wrong_targets(board: Target, charuco_spec: CharucoSpec | None, message: str, tmp_path: Path) -> None:
+    black = write(tmp_path / "a.png", np.zeros((50, 50), np.uint8))
     with pytest.raises(InputError, match=message):
-        detect_boards([write(tmp_path / "a.png", np.zeros((50, 50), np.uint8))], board, charuco=charuco_spec)
+        detect_boards([black], board, corners=charuco_spec or "opencv")

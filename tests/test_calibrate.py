@@ -27,6 +27,7 @@ from ceres_cal.scene.targets import Arc, Segment, Target, checkerboard, custom, 
 from ceres_cal.simulate import (
     CLEAN,
     Disturbance,
+    Held,
     Scene,
     Simulation,
     Station,
@@ -200,7 +201,7 @@ def test_no_board_is_left_in_its_mirrored_pose(
     camera = Camera((1280, 960), phi, (650.0, 470.0), lens)
     stations = {"camera": Station("camera", Pose.identity())}
     board = checkerboard(9, 6, 0.05)
-    scene = board_scene(board, {"camera": camera}, stations, 60, seed=5, distance_m=(nearest_m, farthest_m))
+    scene = board_scene(board, {"camera": camera}, stations, 60, seed=5, held=Held((nearest_m, farthest_m)))
     calibration = calibrate(simulate(scene, NOISE, seed).observations, options_for(scene))
     assert calibration.rejected == ()
     assert not any("placement" in warning for warning in calibration.warnings)  # phi may well have started from a guess
@@ -646,7 +647,7 @@ def test_a_lens_that_folds_inside_the_image_is_no_solution() -> None:
     """Pincushion that turns at 716 px, boards out to 566 px, and an image that reaches 801 px."""
     camera = Camera((1280, 960), 900.0, (640.0, 480.0), Radial((0.0, -6.5e-7)))
     stations = {"camera": Station("camera", Pose.identity())}
-    scene = board_scene(checkerboard(9, 6, 0.05), {"camera": camera}, stations, 8, seed=3, distance_m=(0.8, 1.2))
+    scene = board_scene(checkerboard(9, 6, 0.05), {"camera": camera}, stations, 8, seed=3, held=Held((0.8, 1.2)))
     with pytest.raises(
         SolutionError, match=r"camera 'camera'.*radial lens folds 7\d\d px.*corner at 801 px.*fewer"
     ) as caught:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import photographs as script
+import photograph_shots as script
 import pytest
 from test_cli import Say, refused, say
 

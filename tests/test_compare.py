@@ -10,7 +10,8 @@ from moves import calibrated as calibrated_at_home
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.calibration import Calibration
-from ceres_cal.moves import compare, picture, refit
+from ceres_cal.moves import compare, refit
+from ceres_cal.report.maps import comparison_svg
 
 
 @pytest.fixture(scope="module")
@@ -68,8 +69,9 @@ def test_the_picture_is_svg(calibration: Calibration) -> None:
     moved = replace(calibration.estimate.cameras["overhead"], phi=1.01 * CAMERA.phi)
     zoomed = replace(calibration, estimate=replace(calibration.estimate, cameras={"overhead": moved}))
     (found,) = compare(calibration, zoomed)
-    root = ElementTree.fromstring(picture(found, calibration.targets))
-    tags = [child.tag.rpartition("}")[2] for child in root]
-    shown = np.count_nonzero(np.isfinite(found.length_mm))
-    assert tags.count("rect") == 1 + shown + 8
-    assert tags.count("polyline") == len(calibration.targets["field"].curves)
+    root = ElementTree.fromstring(comparison_svg(found, calibration))
+    assert root.tag.endswith("svg")
+    paths = [path for path in root.iter("{http://www.w3.org/2000/svg}path") if "stroke" in path.get("style", "")]
+    assert len(paths) > 2 * len(calibration.targets["field"].curves)  # each on a lighter ground
+    texts = " ".join("".join(text.itertext()) for text in root.iter("{http://www.w3.org/2000/svg}text"))
+    assert "overhead, on the floor: difference, mm" in texts and f"{found.mean_mm:.2f} on average" in texts

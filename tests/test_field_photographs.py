@@ -6,7 +6,8 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import photographs as script
+import photograph_shots as script
+import photographs
 import pytest
 
 from ceres_cal.base.errors import InputError
@@ -16,7 +17,7 @@ from ceres_cal.detect.courses import clear_px, predict
 from ceres_cal.detect.crossings import find_crossings
 from ceres_cal.detect.lines import SPACING_PX, measure, window_px
 from ceres_cal.observations import Observations
-from ceres_cal.photographs import Clicks, detect_field, follow, load_clicks
+from ceres_cal.photographs import Clicks, FieldOptions, detect_field, follow, load_clicks
 from ceres_cal.photographs.clicks import FORMAT, clicks_from_json
 from ceres_cal.scene.targets import ssl_field
 from ceres_cal.simulate.photograph import photograph
@@ -115,8 +116,8 @@ def test_from_clicks_to_a_calibration(tmp_path: Path, seed: int) -> None:
 
 def test_edges_say_the_same_as_middles(tmp_path: Path, shot: script.Shot) -> None:
     path = saved(shot, tmp_path)
-    middle = detect_field([path], FIELD, shot.camera, with_points=False).observations
-    edges = detect_field([path], FIELD, shot.camera, with_points=False, edges=True).observations
+    middle = detect_field([path], FIELD, shot.camera, options=FieldOptions(points=False)).observations
+    edges = detect_field([path], FIELD, shot.camera, options=FieldOptions(points=False, edges=True)).observations
     half = len(middle.curves)
     assert len(edges.curves) == 2 * half and len(middle.points) == 0
     assert np.unique(edges.curves.side).tolist() == [-1, 1]
@@ -235,6 +236,6 @@ def test_the_real_photograph(real_data: Path) -> None:
 
 
 def test_the_script_prints_its_figures(capsys: pytest.CaptureFixture[str]) -> None:
-    assert script.main(["--case", "rings", "--runs", "1", "--json"]) == 0
+    assert photographs.main(["--case", "rings", "--runs", "1", "--json"]) == 0
     (row,) = json.loads(capsys.readouterr().out)
     assert row["verdict"] == "yes" and row["value"] < 0.3

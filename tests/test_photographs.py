@@ -13,11 +13,13 @@ from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.transforms import Pose
 from ceres_cal.cli import main
-from ceres_cal.detect.boards import read_grey
+from ceres_cal.detect.images import read_grey
 from ceres_cal.detect.saddles import measure_saddles
 from ceres_cal.scene.curves import curve_points
+from ceres_cal.scene.heights import ROBOT_TOP_M
 from ceres_cal.scene.targets import checkerboard, custom, rings, ssl_field
 from ceres_cal.simulate import (
+    Held,
     Photography,
     Scene,
     Station,
@@ -32,7 +34,7 @@ from ceres_cal.simulate import (
 from ceres_cal.simulate.album import take_album
 from ceres_cal.simulate.photograph import frames, photograph
 from ceres_cal.simulate.render import SUBPIXELS, averaged, blank_canvas, fill, paint_curves, print_sheet
-from ceres_cal.simulate.things import BALL_RADIUS_M, ROBOT_HEIGHT_M, Ball, Robot, outline
+from ceres_cal.simulate.things import BALL_RADIUS_M, Ball, Robot, outline
 
 PLAIN = Photography(
     blur_px=0.0, vignetting=0.0, unevenness=0.0, carpet_texture=0.0, read_noise=0.0, shot_noise=0.0, carpet=0.2
@@ -92,7 +94,7 @@ def test_rings_have_the_size_that_the_model_says() -> None:
 def test_board_corners_lie_where_the_model_says() -> None:
     board = checkerboard(9, 6, 0.05)
     stations = {"camera": Station("camera", Pose.identity())}
-    scene = board_scene(board, {"camera": camera("radial-2-3")}, stations, 3, seed=4, distance_m=(0.6, 1.0))
+    scene = board_scene(board, {"camera": camera("radial-2-3")}, stations, 3, seed=4, held=Held((0.6, 1.0)))
     errors = []
     for plan in scene.views:
         image = cv2.cvtColor(
@@ -144,7 +146,7 @@ def test_covers_are_seen_at_their_height() -> None:
     posed = camera("radial-3").at(overhead_pose(height_m=4.0))
     robot = outline(Robot(2.0, 0.0, 0.0, 0), posed)
     away = np.hypot(*(robot - posed.principal_point).T)
-    assert away.max() == pytest.approx(posed.project([[2.09, 0.0, ROBOT_HEIGHT_M]])[0, 0] - posed.principal_point[0])
+    assert away.max() == pytest.approx(posed.project([[2.09, 0.0, ROBOT_TOP_M]])[0, 0] - posed.principal_point[0])
     assert away.min() == pytest.approx(posed.project([[1.91, 0.0, 0.0]])[0, 0] - posed.principal_point[0], abs=0.01)
     ball = outline(Ball(0.0, 0.0), posed) - posed.principal_point
     assert np.hypot(*ball.T) == pytest.approx(posed.phi * BALL_RADIUS_M / (4.0 - BALL_RADIUS_M), rel=1e-3)

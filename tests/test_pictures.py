@@ -8,7 +8,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import photographs as script
+import photograph_shots as script
 import pytest
 import straightness
 from hypothesis import given
@@ -19,16 +19,17 @@ from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.transforms import Pose
 from ceres_cal.calibrating import calibrate
-from ceres_cal.detect.boards import BoardDetections, read_grey
+from ceres_cal.detect.boards import BoardDetections
+from ceres_cal.detect.images import encoded, read_grey
 from ceres_cal.model.parameters import Estimate, Options
 from ceres_cal.model.parameters import Station as Posed
 from ceres_cal.model.structure import Tolerance, make_structure
-from ceres_cal.pictures.files import encoded, jpeg_of_at_most
+from ceres_cal.pictures.files import jpeg_of_at_most
 from ceres_cal.pictures.frames import Frame, frame_by_name, frames_of, marks_of, model_of, photographs_by_frame
 from ceres_cal.pictures.model import model_seen
 from ceres_cal.pictures.overlay import AFTER, BEFORE, Layer, Marks, draw_overlay
 from ceres_cal.pictures.straight import Straight, straighten
-from ceres_cal.pictures.top_view import Plan, make_plan, top_view
+from ceres_cal.pictures.top_view import TopViewGrid, make_grid, top_view
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Brown, KannalaBrandt, Lens, Radial
 from ceres_cal.simulate import overhead_pose
@@ -76,13 +77,13 @@ def test_a_straight_pixel_shows_what_its_pinhole_looks_at(lens: str, whole: bool
 @pytest.mark.parametrize("lens", LENSES)
 def test_whole_has_every_pixel_and_crop_no_black_one(lens: str) -> None:
     whole, crop = straight_of(lens, True), straight_of(lens, False)
-    assert whole.shown == 1.0 or (whole.limit_deg == 75.0 and whole.shown > 0.96)  # kannala-brandt: 0.966
+    assert whole.share == 1.0 or (whole.limit_deg == 75.0 and whole.share > 0.96)  # kannala-brandt: 0.966
     assert crop.warp.black == 0 and crop.warp.seen.all()
-    assert crop.shown < 1.0 and crop.camera.phi >= whole.camera.phi
+    assert crop.share < 1.0 and crop.camera.phi >= whole.camera.phi
     original = seen(lens)
     corners = np.array([[0.0, 0.0], [1279.0, 0.0], [0.0, 959.0], [1279.0, 959.0]])
     there = whole.camera.at(Pose.identity()).project(original.rays(corners))
-    assert whole.shown < 1.0 or np.all((there >= -0.5) & (there <= [1279.5, 959.5]))
+    assert whole.share < 1.0 or np.all((there >= -0.5) & (there <= [1279.5, 959.5]))
     if crop.limit_deg is None:
         grown = replace(crop.camera, phi=crop.camera.phi * 0.99)  # 1 % more of the plane does not fit any more
         edge = np.concatenate([np.column_stack([np.full(960, x), np.arange(960.0)]) for x in (-0.5, 1279.5)])
@@ -147,7 +148,7 @@ def test_lines_that_get_thinner_than_a_pixel_do_not_break() -> None:
 
 def test_a_fisheye_ends_before_180_degrees() -> None:
     whole, crop = straighten(FISHEYE, whole=True), straighten(FISHEYE)
-    assert whole.limit_deg == 75.0 and whole.shown < 0.6 and whole.warp.black > 0
+    assert whole.limit_deg == 75.0 and whole.share < 0.6 and whole.warp.black > 0
     assert crop.warp.black == 0 and crop.limit_deg is not None and 55.0 < crop.limit_deg < 62.0
     narrow = straighten(FISHEYE, whole=True, angle_deg=90.0)
     assert min(narrow.view_deg) == pytest.approx(90.0, abs=0.1) and narrow.camera.phi > 2.0 * whole.camera.phi
@@ -159,7 +160,7 @@ def test_a_fisheye_ends_before_180_degrees() -> None:
 def test_nothing_is_shown_past_a_fold() -> None:
     whole = straighten(FOLDING, whole=True)
     assert whole.limit_deg == pytest.approx(np.degrees(np.arctan((3 * 0.35) ** -0.5)), abs=0.01)  # where 1 = 3 |k1| r^2
-    assert whole.shown < 0.5
+    assert whole.share < 0.5
     x, y = whole.warp.x[whole.warp.seen], whole.warp.y[whole.warp.seen]
     radius = np.hypot(x - 646.0, y - 474.0)
     assert np.max(radius) <= FOLDING.lens.monotone_radius(FOLDING.phi) + 1e-3
@@ -194,13 +195,13 @@ def test_gopro_boards_come_out_straight(real_data: Path, gopro_boards: BoardDete
 @pytest.mark.parametrize("height_m", [0.0, 0.15])
 @pytest.mark.parametrize("lens", LENSES)
 def test_a_top_view_s_pixel_shows_its_place(lens: str, height_m: float) -> None:
-    plan, original = make_plan((-4.6, -3.1, 0.3, 3.1), 0.01, height_m), seen(lens)
-    warp = top_view(original, plan)
-    assert warp.fine <= 2 and plan.size == (490, 620)
+    grid, original = make_grid((-4.6, -3.1, 0.3, 3.1), 0.01, height_m), seen(lens)
+    warp = top_view(original, grid)
+    assert warp.fine <= 2 and grid.size == (490, 620)
     rows, columns = np.nonzero(warp.seen)
     chosen = np.random.default_rng(1).integers(0, len(rows), 500)
     row, column = rows[chosen], columns[chosen]
-    places = plan.places((np.column_stack([column, row]) + 0.5) / warp.fine - 0.5)
+    places = grid.places((np.column_stack([column, row]) + 0.5) / warp.fine - 0.5)
     expected = original.project(np.column_stack([places, np.full(500, height_m)]))
     found = np.column_stack([warp.x[row, column], warp.y[row, column]])
     assert np.max(np.abs(found - expected)) < 0.02  # 0.001: between neighbours where squares are finer than pixels
@@ -212,15 +213,15 @@ def test_a_top_view_s_pixel_shows_its_place(lens: str, height_m: float) -> None:
     corner=st.tuples(st.floats(-9.0, 9.0), st.floats(-9.0, 9.0)),
 )
 def test_plans_go_there_and_back(place: tuple[float, float], mm_per_px: float, corner: tuple[float, float]) -> None:
-    plan = Plan(corner, (100, 80), mm_per_px / 1000.0, 0.0)
-    assert plan.places(plan.pixels([place])) == pytest.approx(np.array([place]), abs=1e-9)
-    x0, y0, x1, y1 = plan.area_m
-    assert plan.pixels([(x0, y1), (x1, y0)]) == pytest.approx(np.array([(-0.5, -0.5), (99.5, 79.5)]), abs=1e-6)
+    grid = TopViewGrid(corner, (100, 80), mm_per_px / 1000.0, 0.0)
+    assert grid.places(grid.pixels([place])) == pytest.approx(np.array([place]), abs=1e-9)
+    x0, y0, x1, y1 = grid.area_m
+    assert grid.pixels([(x0, y1), (x1, y0)]) == pytest.approx(np.array([(-0.5, -0.5), (99.5, 79.5)]), abs=1e-6)
 
 
 def test_a_top_view_of_a_photograph_has_the_field_where_it_is(shot: script.Shot) -> None:
-    plan = make_plan((-4.6, -3.1, 0.1, 3.1), 0.005)
-    picture = top_view(shot.camera, plan).apply(shot.picture.image)
+    grid = make_grid((-4.6, -3.1, 0.1, 3.1), 0.005)
+    picture = top_view(shot.camera, grid).apply(shot.picture.image)
     grey = cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY).astype(float)
     for x, y, across in (
         (-2.0, 3.0, (0.0, 1.0)),
@@ -230,7 +231,7 @@ def test_a_top_view_of_a_photograph_has_the_field_where_it_is(shot: script.Shot)
     ):
         steps = np.arange(-0.06, 0.0601, 0.0025)
         places = np.array([x, y]) + steps[:, None] * np.array(across)
-        bright = _levels(grey, plan.pixels(places))
+        bright = _levels(grey, grid.pixels(places))
         weight = np.maximum(bright - np.median(bright), 0.0)
         if weight.max() > 40.0:  # a robot may stand there, and worn paint is dark
             assert np.sum(weight * steps) / np.sum(weight) == pytest.approx(0.0, abs=0.004)  # 1 mm
@@ -244,9 +245,9 @@ def test_top_views_that_cannot_be() -> None:
         ((0.0, 0.0, 1e4, 1e4), 0.001, "for more mm per pixel"),
     ):
         with pytest.raises(InputError, match=message):
-            make_plan(area, scale)
+            make_grid(area, scale)
     with pytest.raises(InputError, match="sees nothing of x 50 to 51 m"):
-        top_view(seen("brown"), make_plan((50.0, 50.0, 51.0, 51.0), 0.01))
+        top_view(seen("brown"), make_grid((50.0, 50.0, 51.0, 51.0), 0.01))
 
 
 # ---- overlays -------------------------------------------------------------------------------------------------------
@@ -348,5 +349,5 @@ def test_image_files_keep_to_their_bytes() -> None:
 def test_a_straight_photograph_stays_as_it_is(lens: Lens) -> None:
     photograph = np.random.default_rng(0).integers(0, 255, (96, 128), dtype=np.uint8)
     straight = straighten(Camera((128, 96), 100.0, (60.0, 50.0), lens))
-    assert straight.camera.phi == pytest.approx(100.0, abs=0.01) and straight.shown == 1.0
+    assert straight.camera.phi == pytest.approx(100.0, abs=0.01) and straight.share == 1.0
     assert np.mean(straight.warp.apply(photograph) == photograph) > 0.95

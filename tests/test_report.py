@@ -19,6 +19,7 @@ from scenes import SCENES, camera
 from ceres_cal import Calibration, Observations, Options, Pose, calibrate, write_report
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.transforms import rotation_exp
+from ceres_cal.base.words import at_precision, short
 from ceres_cal.cli import main
 from ceres_cal.diagnostics import diagnose
 from ceres_cal.report import make_report
@@ -26,9 +27,8 @@ from ceres_cal.report.grounds import level_of, worst
 from ceres_cal.report.lens_picture import ideal_radii
 from ceres_cal.report.maps import levels_of
 from ceres_cal.report.material import Material
-from ceres_cal.report.residual_pictures import telling_means
-from ceres_cal.report.verdict import verdict
-from ceres_cal.report.words import at_precision, short
+from ceres_cal.report.residual_pictures import significant_means
+from ceres_cal.report.verdict import verdict_chapter
 from ceres_cal.scene.lens import Radial
 from ceres_cal.scene.targets import ssl_field
 from ceres_cal.simulate import Disturbance, Scene, Station, built_in_scene, field_scene, overhead_pose, simulate
@@ -224,7 +224,7 @@ def test_the_closed_form_alone_is_not_to_be_used() -> None:
 def test_a_solve_that_did_not_come_to_rest_is_not_trusted() -> None:
     calibration, observations = sample()
     material = Material(replace(calibration, converged=False), observations, diagnose(calibration, observations))
-    chapter = verdict(material)
+    chapter = verdict_chapter(material)
     assert chapter.level == "no" and chapter.title.startswith("Do not trust this calibration")
 
 
@@ -257,7 +257,7 @@ def test_neighbours_that_agree_make_every_sigma_larger() -> None:
     found = diagnose(calibration, observations)
     noise = tuple(replace(one, effective=one.observations / 4.0) for one in found.noise)
     agree = replace(found.findings[0], kind="correlated")
-    chapter = verdict(Material(calibration, observations, replace(found, findings=(agree,), noise=noise)))
+    chapter = verdict_chapter(Material(calibration, observations, replace(found, findings=(agree,), noise=noise)))
     assert chapter.level == "care"
     assert "take every standard deviation 2 times as large" in "".join(piece.html() for piece in chapter.pieces)
 
@@ -269,15 +269,15 @@ def test_means_of_regions_tell_a_shift_from_noise() -> None:
     calibration, observations = sample()
     table = diagnose(calibration, observations).table
     rows, seen = np.flatnonzero(table.inlier), calibration.cameras["overhead"]
-    assert len(telling_means(table, rows, seen)[0]) <= 1
+    assert len(significant_means(table, rows, seen).places) <= 1
     left = table.pixel[:, 0] < 640.0
     shift = np.array([0.8, -0.6])
     across = table.residual_px / np.linalg.norm(table.residual_px, axis=1, keepdims=True)
     along = np.where(table.is_curve[:, None], across * np.sum(across * shift, axis=1, keepdims=True), shift)
     moved = replace(table, residual_px=table.residual_px + left[:, None] * along)
-    places, means, cells = telling_means(moved, rows, seen)
-    assert len(places) > 15 and np.all(places[:, 0] < 680.0) and cells > 60
-    assert np.mean(means, axis=0) == pytest.approx(shift, abs=0.15)  # 0.05 measured
+    means = significant_means(moved, rows, seen)
+    assert len(means.places) > 15 and np.all(means.places[:, 0] < 680.0) and means.regions > 60
+    assert np.mean(means.vectors, axis=0) == pytest.approx(shift, abs=0.15)  # 0.05 measured
 
 
 def test_the_distortion_curve_is_the_papers_polynomial() -> None:
@@ -294,7 +294,7 @@ def test_colours_of_maps_cover_what_there_is(low: float, high: float) -> None:
     found = sample()[0].uncertainty.map_sd_mm(height_m=0.0)
     values = np.full(found.sd_mm.shape, low)
     values[0, 0], values[1, 1], values[2, 2] = high, np.inf, np.nan
-    levels = levels_of((replace(found, sd_mm=values),))
+    levels = levels_of(values)
     assert levels[0] <= low and levels[-1] >= high and 3 <= len(levels) <= 20
     assert np.all(np.diff(levels) > 0.0)
 

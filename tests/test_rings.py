@@ -60,7 +60,7 @@ def polynomial_error_px(found: RingsDetection) -> float:
 @pytest.mark.parametrize("how", [Photography(), HARSH], ids=["good light", "bad light"])
 def test_the_papers_rings(tmp_path: Path, how: Photography) -> None:
     found = detect_rings(taken(tmp_path, how), RADII)
-    assert found.found == 36 and len(found.observations.curves) > 4000
+    assert found.rings == 36 and len(found.observations.curves) > 4000
     assert polynomial_error_px(found) < 0.3  # 0.13 and 0.14 px
     error = errors_px(found.observations)
     pull = error / found.observations.curves.sigma_px
@@ -92,7 +92,7 @@ def test_few_wide_rings_through_a_fisheye(tmp_path: Path) -> None:
     scene, frame = shifted_rings(rings(radii))
     cv2.imwrite(str(tmp_path / "few.png"), photograph(scene, "overhead", frame, Photography(blur_px=0.8)).image)
     found = detect_rings(tmp_path / "few.png", radii)
-    assert found.found == 6
+    assert found.rings == 6
     posed = camera("kannala-brandt").at(scene.camera_at("overhead").cam_from_world @ scene.placements["rings"])
     place = posed.locate(found.observations.curves.pixels)
     error_m = np.hypot(*place.T) - np.array(radii)[found.observations.curves.feature]
@@ -107,7 +107,7 @@ def test_a_hand_in_the_picture_shifts_no_ring(tmp_path: Path) -> None:
     cv2.imwrite(str(path), image)
     found = detect_rings(path, RADII)
     error = errors_px(found.observations)
-    assert found.found == 36 and np.max(np.abs(error)) < 0.5  # 0.2 px, where the hand ends
+    assert found.rings == 36 and np.max(np.abs(error)) < 0.5  # 0.2 px, where the hand ends
     assert polynomial_error_px(found) < 0.3
 
 

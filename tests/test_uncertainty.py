@@ -20,6 +20,7 @@ from scenes import SCENES
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.transforms import Pose
+from ceres_cal.base.words import bounds_text
 from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
 from ceres_cal.model.keys import Key, pose_keys
@@ -32,7 +33,7 @@ from ceres_cal.observations.sights import gather_sights
 from ceres_cal.scene.targets import Segment
 from ceres_cal.solve import Problem, Weighting, solve
 from ceres_cal.start.initialise import PHI_RANGE
-from ceres_cal.uncertainty import Posterior, Uncertainty, Verdict, bounds_text
+from ceres_cal.uncertainty import Posterior, Uncertainty, Verdict
 from ceres_cal.uncertainty.maps import locate_slopes, radius_95, shown_pixels
 from ceres_cal.uncertainty.seam import predicted
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from ceres_cal.base.errors import SolutionError
 from ceres_cal.base.threads import at_most, meanwhile, single_threaded_blas
+from ceres_cal.base.words import bounds_text
 from ceres_cal.calibration import Calibration, Fit, Rejected
 from ceres_cal.model.parameters import Layout, Options, make_layout
 from ceres_cal.model.priors import gather_priors
@@ -20,7 +21,7 @@ from ceres_cal.solve import Problem, Progress, RobustSolution, Solution, informa
 from ceres_cal.solve.noise import Inliers, visible_from
 from ceres_cal.start.baseline import four_point_baseline
 from ceres_cal.start.initialise import Start, initialise
-from ceres_cal.uncertainty import Posterior, Uncertainty, assess, bounds_text
+from ceres_cal.uncertainty import Posterior, Uncertainty, assess
 
 # Of the image's diagonal, 24 px of 1600: half of a camera's observations farther off is no calibration, while a lens
 # that is too simple stays below a few pixels. Nothing changes from half to double.

@@ -169,7 +169,8 @@ def boards(search: Search) -> Iterator[Measurement]:
                 pixel = np.round(size * (column, row))
                 for tilt in _BOARD_TILTS_DEG:
                     for quarter, edge in enumerate(_NEARER):
-                        pose = board_pose(board, camera, pixel, distance, np.deg2rad(tilt), 0.5 * np.pi * quarter)
+                        turn = (np.deg2rad(tilt), 0.5 * np.pi * quarter, 0.0)
+                        pose = board_pose(board, camera, pixel, distance, turn)
                         held = camera.cam_from_world.inverse @ pose
                         corners = held.transform(board.point_array)
                         if np.min(corners[:, 2]) < _LEAST_HEIGHT_M or not np.all(well_inside(camera, corners)):

@@ -14,6 +14,7 @@ from ceres_cal.base.errors import InputError
 from ceres_cal.calibration import Calibration, Fit
 from ceres_cal.model.information import Information
 from ceres_cal.model.parameters import Estimate
+from ceres_cal.scene.heights import ROBOT_TOP_M
 from ceres_cal.scene.targets import Target
 from ceres_cal.solve import Weighting
 from ceres_cal.uncertainty import Posterior
@@ -74,7 +75,7 @@ class Advice:
 def advise(
     calibration: Calibration,
     station: str | None = None,
-    height_m: float = 0.15,
+    height_m: float = ROBOT_TOP_M,
     good_enough_mm: float | None = None,
     board: Target | None = None,
 ) -> Advice:
@@ -117,7 +118,10 @@ def advise(
 
 
 def promised(
-    calibration: Calibration, measurements: Sequence[Measurement], station: str | None = None, height_m: float = 0.15
+    calibration: Calibration,
+    measurements: Sequence[Measurement],
+    station: str | None = None,
+    height_m: float = ROBOT_TOP_M,
 ) -> tuple[Promise, ...]:
     """What measurements of one's own would bring, each by itself.
 

@@ -107,15 +107,15 @@ def _choose(arguments: list[str]) -> tuple[Command, list[str]]:
 
 def _overview(beginning: str) -> str:
     """Help on all commands that begin so."""
-    shown = {name: command.summary for name, command in COMMANDS.items() if name.startswith(beginning)}
-    width = max(map(len, shown))
+    summaries = {name: command.summary for name, command in COMMANDS.items() if name.startswith(beginning)}
+    width = max(map(len, summaries))
     return "\n".join(
         [
             "usage: ceres-cal COMMAND ... [--json]",
             "",
             "Calibrate an overhead camera from corners, lines and arcs of a flat field.",
             "",
-            *(f"  {name:{width}}  {summary}" for name, summary in shown.items()),
+            *(f"  {name:{width}}  {summary}" for name, summary in summaries.items()),
             "",
             "`ceres-cal COMMAND --help` tells how. Every command prints one JSON object with --json.",
             "Exit codes: 0 success, 1 the answer is no, 2 bad usage or bad input, 3 no usable solution.",

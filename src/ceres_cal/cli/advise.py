@@ -4,25 +4,25 @@ from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
 from collections.abc import Iterator
-from pathlib import Path
-from textwrap import wrap
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from ceres_cal.base.errors import InputError
-from ceres_cal.cli.command import Answer, Command, parse_number
+from ceres_cal.cli.arguments import add_calibration, add_station, height_m, parse_number
+from ceres_cal.cli.command import Answer, Command
+from ceres_cal.cli.inputs import read_calibration, station_of
+from ceres_cal.cli.outputs import section, wrapped
 
 if TYPE_CHECKING:
-    from ceres_cal.advice import Advice, Errors, Measurement, Promise
+    from ceres_cal.advice import Advice, Measurement, Promise
     from ceres_cal.scene.targets import Target
-
-_WIDTH = 100
 
 
 def _add_arguments(parser: ArgumentParser) -> None:
     add = parser.add_argument
-    add("calibration", metavar="CALIBRATION", type=Path, help="file that `ceres-cal calibrate` wrote")
+    add_calibration(parser)
     add("--height-mm", default="150", metavar="MM", help="height of what is to be located; default: 150, a robot's top")
-    add("--station", help="whose map; may be left out where there is only one")
+    add_station(parser, "whose map; may be left out where there is only one")
     add("--good-enough-mm", metavar="MM", help="the worst error that will do; nothing is advised where it is reached")
     add(
         "--board",
@@ -33,25 +33,21 @@ def _add_arguments(parser: ArgumentParser) -> None:
 
 
 def _run(args: Namespace) -> Answer:
-    height_m = parse_number(args.height_mm, "--height-mm") / 1000.0
+    height = height_m(args)
     enough = None if args.good_enough_mm is None else parse_number(args.good_enough_mm, "--good-enough-mm")
     if enough is not None and not enough > 0.0:
         raise InputError(f"--good-enough-mm {args.good_enough_mm}: give a number of millimetres above 0")
     board = None if args.board is None else _board(args.board)
     from ceres_cal.advice import advise
-    from ceres_cal.calibration import Calibration
 
-    calibration = Calibration.load(args.calibration)
-    if args.station is None and len(calibration.stations) > 1:
-        raise InputError(
-            f"{args.calibration} has several stations, name one: --station {' or '.join(calibration.stations)}"
-        )
+    calibration = read_calibration(args)
+    station = station_of(args, calibration)
     try:
-        found = advise(calibration, args.station, height_m, enough, board)
+        advice = advise(calibration, station, height, enough, board)
     except InputError as error:
         raise InputError(f"{args.calibration}: {error}") from None
     weak = [direction.words for direction in calibration.uncertainty.weak_directions]
-    return Answer(_data(found, weak), lambda: _text(found, weak))
+    return Answer(_data(advice, weak), lambda: _text(advice, weak))
 
 
 COMMANDS = (Command("advise", "what to measure next, and what it would bring in mm", _add_arguments, _run),)
@@ -74,10 +70,11 @@ def _text(advice: Advice, weak: list[str]) -> str:
     before, height = advice.before, f"{1e3 * advice.height_m:.0f} mm"
     where = f" at ({x:.1f}, {y:.1f} m)" if before.worst_mm < float("inf") else ""
     today = f"station {advice.station!r} at {height}: worst {_mm(before.worst_mm)}{where}, mean {_mm(before.mean_mm)}"
-    lines = [*_section("advice", _verdict(advice)), *_section("today", [today, *weak[:1]])]
+    lines = [section("advice", wrapped(*_verdict(advice))), section("today", wrapped(today, *weak[:1]))]
     lines += ["", f"{'worst':>9}  {'mean':>9}  would be left at {height} if you"]
     for promise in advice.promises:
-        lines.append(f"{_mm(promise.after.worst_mm):>9}  {_mm(promise.after.mean_mm):>9}  {_headline(promise)}")
+        after, words = promise.after, f"{promise.measurement.words}{_range(promise)}"
+        lines.append(f"{_mm(after.worst_mm):>9}  {_mm(after.mean_mm):>9}  {words}")
         lines += [f"{'':24}{step}" for step in promise.measurement.steps]
     return "\n".join(lines)
 
@@ -93,7 +90,8 @@ def _verdict(advice: Advice) -> Iterator[str]:
             left = _mm(advice.promises[0].after.worst_mm)
             yield f"none of this is worth the work: {worst} is {_mm(before.worst_mm)}, and {left} at best afterwards"
         return
-    yield f"{best.measurement.words}: {worst} falls from {_fall(before, best.after)}{_range(best)}"
+    fall = f"{_mm(before.worst_mm).removesuffix(' mm')} to {_mm(best.after.worst_mm)}"
+    yield f"{best.measurement.words}: {worst} falls from {fall}{_range(best)}"
     yield from (f"  {step}" for step in best.measurement.steps)
     if advice.then is not None:
         yield f"and then {advice.then.measurement.words}: it falls to {_mm(advice.then.after.worst_mm)}"
@@ -101,10 +99,6 @@ def _verdict(advice: Advice) -> Iterator[str]:
     last = advice.then or best
     if enough is not None and last.after.worst_mm > enough:
         yield f"that is still more than the {enough:g} mm asked for: do more than one of these"
-
-
-def _headline(promise: Promise) -> str:
-    return f"{promise.measurement.words}{_range(promise)}"
 
 
 def _range(promise: Promise) -> str:
@@ -115,20 +109,10 @@ def _range(promise: Promise) -> str:
     return f" ({_mm(low)} to {_mm(high)} over what phi may be)" if high > 1.1 * low else ""
 
 
-def _fall(before: Errors, after: Errors) -> str:
-    start = _mm(before.worst_mm)
-    return f"{start.removesuffix(' mm')} to {_mm(after.worst_mm)}"
-
-
 def _mm(value: float) -> str:
     if value == float("inf"):
         return "unknown"
     return f"{value:.1f} mm" if value >= 0.95 else f"{value:.2f} mm"
-
-
-def _section(title: str, texts: list[str] | Iterator[str]) -> Iterator[str]:
-    lines = [line for text in texts for line in wrap(text, _WIDTH)]
-    return (f"{'' if number else title:10}{line}" for number, line in enumerate(lines))
 
 
 # ---- for scripts ----------------------------------------------------------------------------------------------------
@@ -160,8 +144,6 @@ def _promise_data(promise: Promise) -> dict[str, Any]:
 
 def _measurement_data(measurement: Measurement) -> dict[str, Any]:
     """The measurement as files of observations have its parts."""
-    from dataclasses import asdict
-
     from ceres_cal.observations import prior_to_json
 
     return {

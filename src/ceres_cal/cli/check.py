@@ -8,17 +8,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ceres_cal.base.errors import InputError
-from ceres_cal.cli.command import Answer, Command, parse_number
-from ceres_cal.cli.moved import (
-    add_inputs,
-    not_painted,
-    photographs_data,
-    photographs_in,
-    photographs_text,
-    progress_bar,
-    read_calibration,
-    read_observations,
-)
+from ceres_cal.cli.arguments import parse_names, parse_number
+from ceres_cal.cli.command import Answer, Command
+from ceres_cal.cli.inputs import read_calibration, read_observations
+from ceres_cal.cli.outputs import section
+from ceres_cal.cli.photographs import add_inputs, photographs_data, photographs_in, photographs_text
+from ceres_cal.cli.progress import progress_bar
 
 if TYPE_CHECKING:
     from ceres_cal.moves import Check, StationCheck
@@ -38,23 +33,23 @@ def _add_arguments(parser: ArgumentParser) -> None:
 def _run(args: Namespace) -> Answer:
     level = _share(args.false_alarms)
     images = photographs_in(args)
-    found, seen = _photographed(args, images, level) if images else (_observed(args, level), None)
-    return Answer(_data(found) | photographs_data(seen), lambda: _text(found, seen), 0 if found.holds else 1)
+    answer, detections = _photographed(args, images, level) if images else (_observed(args, level), None)
+    data = _data(answer) | photographs_data(detections)
+    return Answer(data, lambda: _text(answer, detections), 0 if answer.holds else 1)
 
 
 def _observed(args: Namespace, level: float) -> Check:
     from ceres_cal.moves import check
 
-    return check(read_calibration(args), read_observations(args), level)
+    return check(read_calibration(args), read_observations(args.inputs), level)
 
 
 def _photographed(args: Namespace, images: list[Path], level: float) -> tuple[Check, KnownDetections]:
     from ceres_cal.photographs import check_photographs
 
+    calibration, not_painted = read_calibration(args), parse_names(args.not_painted)
     with progress_bar(args) as bar:
-        return check_photographs(
-            read_calibration(args), images, args.station, level, not_painted=not_painted(args), progress=bar.update
-        )
+        return check_photographs(calibration, images, args.station, level, not_painted=not_painted, progress=bar.update)
 
 
 COMMANDS = (Command("check", "does a calibration still hold? exit code 0 yes, 1 no", _add_arguments, _run),)
@@ -68,35 +63,33 @@ def _share(text: str) -> float:
     return value
 
 
-def _data(found: Check) -> dict[str, Any]:
-    stations = {name: _station_data(one) for name, one in found.stations.items()}
-    return {"holds": found.holds, "false_alarms": found.false_alarms, "stations": stations}
+def _data(answer: Check) -> dict[str, Any]:
+    stations = {name: _station_data(one) for name, one in answer.stations.items()}
+    return {"holds": answer.holds, "false_alarms": answer.false_alarms, "stations": stations}
 
 
-def _station_data(found: StationCheck) -> dict[str, Any]:
-    """The fields; null where nothing could be told."""
-    plain = {name: value if _told(value) else None for name, value in vars(found).items() if name != "shift_mm"}
-    maps = [
-        {"height_m": height_m, "mean_mm": mean if _told(mean) else None, "worst_mm": worst if _told(worst) else None}
-        for height_m, (mean, worst) in found.shift_mm.items()
+def _station_data(one: StationCheck) -> dict[str, Any]:
+    maps = [{"height_m": h, "mean_mm": mean, "worst_mm": worst} for h, (mean, worst) in one.shift_mm.items()]
+    return {**vars(one), "shift_mm": maps}
+
+
+def _text(answer: Check, detections: KnownDetections | None) -> str:
+    holds = f"{'yes' if answer.holds else 'no'} ({100.0 * answer.false_alarms:g} % false alarms)"
+    stations = (section("station", _station_lines(one)) for one in answer.stations.values())
+    return "\n".join([section("check", [holds]), *photographs_text(detections), *stations])
+
+
+def _station_lines(one: StationCheck) -> list[str]:
+    first = f"{one.station} {one.words}"
+    if not math.isfinite(one.statistic) and not one.degrees:
+        return [first]
+    size = f"picture {one.shift_px:.3f} px rms, phi {100.0 * one.phi_change:+.3f} %"
+    return [
+        first,
+        f"{one.used} observations, {one.outliers} outliers, noise {one.noise:.2f} times as before",
+        f"moved {one.moved_mm:.1f} mm, turned {one.turned_deg:.4f} deg, {size}",
+        *(
+            f"map at {1e3 * height_m:.0f} mm: {mean:.2f} mm on average, {worst:.2f} mm at most"
+            for height_m, (mean, worst) in one.shift_mm.items()
+        ),
     ]
-    return {**plain, "shift_mm": maps}
-
-
-def _told(value: object) -> bool:
-    return not isinstance(value, float) or math.isfinite(value)
-
-
-def _text(found: Check, seen: KnownDetections | None) -> str:
-    lines = [f"{'check':10}{'yes' if found.holds else 'no'} ({100.0 * found.false_alarms:g} % false alarms)"]
-    lines += photographs_text(seen)
-    for name, one in found.stations.items():
-        lines.append(f"{'station':10}{name} {one.words}")
-        if not _told(one.statistic) and not one.degrees:
-            continue
-        lines.append(f"{'':10}{one.used} observations, {one.outliers} outliers, noise {one.noise:.2f} times as before")
-        size = f"picture {one.shift_px:.3f} px rms, phi {100.0 * one.phi_change:+.3f} %"
-        lines.append(f"{'':10}moved {one.moved_mm:.1f} mm, turned {one.turned_deg:.4f} deg, {size}")
-        for height_m, (mean, worst) in one.shift_mm.items():
-            lines.append(f"{'':10}map at {1e3 * height_m:.0f} mm: {mean:.2f} mm on average, {worst:.2f} mm at most")
-    return "\n".join(lines)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from argparse import ArgumentParser, Namespace
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -10,9 +9,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ceres_cal.base.errors import InputError
-from ceres_cal.cli.command import Answer, Command, add_output, finishing, parse_numbers, plural, require_output
-from ceres_cal.cli.detect import image_files, parse_names, require_observations_file
-from ceres_cal.cli.progress import ProgressBar
+from ceres_cal.base.words import plural
+from ceres_cal.cli.arguments import add_output, add_quiet, add_station, parse_names, parse_numbers
+from ceres_cal.cli.command import Answer, Command
+from ceres_cal.cli.inputs import image_files
+from ceres_cal.cli.outputs import finishing, require_observations_output
+from ceres_cal.cli.photographs import missed_data
+from ceres_cal.cli.progress import progress_bar
 
 if TYPE_CHECKING:
     from ceres_cal.photographs import Auto, Clicks, Facing, FieldDetections
@@ -28,6 +31,18 @@ def _add_arguments(parser: ArgumentParser) -> None:
     add(
         "images", nargs="+", metavar="IMAGE", help="photographs that one camera took at one station, or folders of them"
     )
+    _add_start(parser)
+    add("--not-painted", default="", metavar="NAME,...", help="lines of the target that this field does not have")
+    add("--edges", action="store_true", help="both edges of each line instead of its middle")
+    add("--lines-only", action="store_true", help="no corners and crossings")
+    add("--camera", metavar="NAME", help="name of the camera; default: that of the calibration, or camera")
+    add_station(parser, "name of the station, to start from and to write; default: likewise")
+    add_output(parser, "the observations (.json or .npz)", required=True)
+    add_quiet(parser)
+
+
+def _add_start(parser: ArgumentParser) -> None:
+    add = parser.add_argument
     add(
         "--target",
         metavar="TARGET",
@@ -56,54 +71,42 @@ def _add_arguments(parser: ArgumentParser) -> None:
         f"right, top, bottom, top-left, ...) that a line or point lies towards, such as {_FACING}; it need not be in "
         "the picture; repeatable",
     )
-    add("--not-painted", default="", metavar="NAME,...", help="lines of the target that this field does not have")
-    add("--edges", action="store_true", help="both edges of each line instead of its middle")
-    add("--lines-only", action="store_true", help="no corners and crossings")
-    add("--camera", metavar="NAME", help="name of the camera; default: that of the calibration, or camera")
-    add("--station", metavar="NAME", help="name of the station, to start from and to write; default: likewise")
-    add_output(parser, "the observations (.json or .npz)", required=True)
-    add("--quiet", action="store_true", help="no progress")
 
 
 def _run(args: Namespace) -> Answer:
-    images = list(image_files(args.images))
-    require_output(args.output, [*images, *([args.start] if args.start else [])])
-    require_observations_file(args.output)
+    images = image_files(args.images)
+    require_observations_output(args.output, [*images, *([args.start] if args.start else [])])
+    _require_fitting(args)
+    from ceres_cal.photographs import FieldOptions, detect_field
+
+    start = _start(args)
+    target = start.target if args.target is None else _target(args.target)
+    if target is None:
+        raise InputError("name the field with --target, such as --target ssl-b")
+    not_painted = parse_names(args.not_painted)
+    if unknown := sorted(set(not_painted) - target.curves.keys()):
+        raise InputError(f"--not-painted: curve {unknown[0]!r} is not one of the target's: see `ceres-cal targets`")
+    painted = [name for name in target.curves if name not in not_painted]
+    options = FieldOptions(start.camera, start.station, points=not args.lines_only, edges=args.edges)
+    with progress_bar(args) as bar:
+        detections = detect_field(images, target, start.start, painted, options, bar.update)
+    with finishing():
+        detections.observations.save(args.output)
+    data = _data(detections, args.output)
+    return Answer(data, lambda: _text(data))
+
+
+COMMANDS = (Command("detect field", "painted lines and crossings of a field in photographs", _add_arguments, _run),)
+
+
+def _require_fitting(args: Namespace) -> None:
+    """Raise InputError unless exactly one way to start was chosen."""
     if (args.start is not None) + bool(args.corner) != 1 and not (args.auto and not args.corner):
         raise InputError(f"say where to start: --start FILE, or --corner {_CORNER} four times, or --auto")
     if args.auto and args.corner:
         raise InputError("--corner says where to start and --auto to do without: give one of them")
     if args.facing and not args.auto:
         raise InputError("--facing goes with --auto: a start says which way round the field is")
-    os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")  # what it warns of in an image, we say ourselves
-    from ceres_cal.photographs import detect_field
-
-    start = _start(args)
-    target = start.target if args.target is None else _target(args.target)
-    if target is None:
-        raise InputError("name the field with --target, such as --target ssl-b")
-    left_out = parse_names(args.not_painted)
-    if unknown := sorted(set(left_out) - target.curves.keys()):
-        raise InputError(f"--not-painted: curve {unknown[0]!r} is not one of the target's: see `ceres-cal targets`")
-    with ProgressBar(silent=args.quiet or args.json) as bar:
-        found = detect_field(
-            images,
-            target,
-            start.start,
-            [name for name in target.curves if name not in left_out],
-            camera=start.camera,
-            station=start.station,
-            with_points=not args.lines_only,
-            edges=args.edges,
-            progress=bar.update,
-        )
-    with finishing():
-        found.observations.save(args.output)
-    data = _data(found, args.output)
-    return Answer(data, lambda: _text(data))
-
-
-COMMANDS = (Command("detect field", "painted lines and crossings of a field in photographs", _add_arguments, _run),)
 
 
 # ---- where to start -------------------------------------------------------------------------------------------------
@@ -119,10 +122,9 @@ class _Start:
 
 def _start(args: Namespace) -> _Start:
     camera = args.camera or "camera"
-    if args.start is None and args.auto:
-        return _Start(_auto(args.facing, None), camera, args.station or camera, None)
     if args.start is None:
-        return _Start(_corners(args.corner), camera, args.station or camera, None)
+        start = _auto(args.facing, None) if args.auto else _corners(args.corner)
+        return _Start(start, camera, args.station or camera, None)
     from ceres_cal.calibration import FORMAT, Calibration
     from ceres_cal.photographs.clicks import load_clicks
     from ceres_cal.photographs.known import is_painted
@@ -136,8 +138,9 @@ def _start(args: Namespace) -> _Start:
     station = args.station or next(iter(calibration.stations))
     fields = [target for target in calibration.targets.values() if is_painted(target)]
     name = args.camera or calibration.estimate.stations[station].camera
-    start = _auto(args.facing, posed) if args.auto else posed
-    return _Start(start, name, station, fields[0] if len(fields) == 1 else None)
+    return _Start(
+        _auto(args.facing, posed) if args.auto else posed, name, station, fields[0] if len(fields) == 1 else None
+    )
 
 
 def _auto(facing: list[str], before: Camera | None) -> Auto:
@@ -199,36 +202,37 @@ def _json(path: Path) -> Mapping[str, Any]:
 # ---- the answer -----------------------------------------------------------------------------------------------------
 
 
-def _data(found: FieldDetections, output: Path) -> dict[str, Any]:
-    images = []
-    for path, followed in found.found.items():
-        lines = followed.lines
-        images.append(
-            {
-                "image": path,
-                "places": len(lines.found),
-                "found": int(lines.found.sum()),
-                "sigma_px": float(sorted(lines.sigma_px[lines.found])[int(lines.found.sum()) // 2]),
-                "blur_px": lines.blur_px,
-                "width_factor": lines.stretch,
-            }
-        )
-        if path in found.searched:
-            ways, settled_by = found.searched[path].ways, found.searched[path].settled_by
-            images[-1]["searched"] = {"ways": ways, "settled_by": settled_by or None}
+def _data(detections: FieldDetections, output: Path) -> dict[str, Any]:
     return {
         "output": str(output),
-        "points": len(found.observations.points),
-        "curves": len(found.observations.curves),
-        "found": images,
-        "missed": [{"image": path, "reason": reason} for path, reason in found.missed],
+        "points": len(detections.observations.points),
+        "curves": len(detections.observations.curves),
+        "found": [_image_data(path, detections) for path in detections.found],
+        "missed": missed_data(detections.missed),
     }
 
 
+def _image_data(path: str, detections: FieldDetections) -> dict[str, Any]:
+    lines = detections.found[path].lines
+    sigmas = sorted(lines.sigma_px[lines.found])
+    data = {
+        "image": path,
+        "places": len(lines.found),
+        "found": len(sigmas),
+        "sigma_px": float(sigmas[len(sigmas) // 2]),
+        "blur_px": lines.blur_px,
+        "width_factor": lines.stretch,
+    }
+    if path in detections.searched:
+        searched = detections.searched[path]
+        data["searched"] = {"ways": searched.ways, "settled_by": searched.chosen_by or None}
+    return data
+
+
 def _text(data: dict[str, Any]) -> str:
-    shown, every = len(data["found"]), len(data["found"]) + len(data["missed"])
+    number, every = len(data["found"]), len(data["found"]) + len(data["missed"])
     lines = [
-        f"{shown} of {every} images show the field: {plural(data['curves'], 'line observation')}, "
+        f"{number} of {every} images show the field: {plural(data['curves'], 'line observation')}, "
         f"{plural(data['points'], 'corner')} and crossings"
     ]
     lines += [

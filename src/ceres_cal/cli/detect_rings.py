@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import os
 from argparse import ArgumentParser, Namespace
 from typing import TYPE_CHECKING, Any
 
 from ceres_cal.base.errors import InputError
-from ceres_cal.cli.command import Answer, Command, add_output, finishing, parse_number, parse_numbers, require_output
-from ceres_cal.cli.detect import require_observations_file
+from ceres_cal.cli.arguments import add_detection, parse_number, parse_numbers
+from ceres_cal.cli.command import Answer, Command
+from ceres_cal.cli.inputs import quiet_opencv
+from ceres_cal.cli.outputs import finishing, require_observations_output
 
 if TYPE_CHECKING:
     from ceres_cal.detect.rings import RingsDetection
@@ -26,22 +27,19 @@ def _add_arguments(parser: ArgumentParser) -> None:
         help="radii in metres of all edges between dark and bright, from the inside out; FROM:TO:STEP for even ones, "
         "such as 0.01:0.36:0.01",
     )
-    add("--camera", default="camera", metavar="NAME", help="name of the camera; default: camera")
-    add("--station", metavar="NAME", help="name of the station; default: that of the camera")
-    add_output(parser, "the observations (.json or .npz)", required=True)
+    add_detection(parser)
 
 
 def _run(args: Namespace) -> Answer:
-    require_output(args.output, [args.image])
-    require_observations_file(args.output)
+    require_observations_output(args.output, [args.image])
     radii = _radii(args.radii)
-    os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")  # what it warns of in an image, we say ourselves
+    quiet_opencv()
     from ceres_cal.detect.rings import detect_rings
 
-    found = detect_rings(args.image, radii, args.camera, args.station)
+    detection = detect_rings(args.image, radii, args.camera, args.station)
     with finishing():
-        found.observations.save(args.output)
-    data = _data(found, args, len(radii))
+        detection.observations.save(args.output)
+    data = _data(detection, args, len(radii))
     return Answer(data, lambda: _text(data))
 
 
@@ -61,19 +59,19 @@ def _radii(text: str) -> tuple[float, ...]:
     return tuple(first + i * step for i in range(round((last - first) / step) + 1))
 
 
-def _data(found: RingsDetection, args: Namespace, given: int) -> dict[str, Any]:
-    a1, a2, a3 = found.polynomial.tolist()
+def _data(detection: RingsDetection, args: Namespace, given: int) -> dict[str, Any]:
+    a1, a2, a3 = detection.polynomial.tolist()
     return {
         "image": args.image,
         "output": str(args.output),
-        "rings": found.found,
+        "rings": detection.rings,
         "radii_given": given,
-        "observations": len(found.observations.curves),
-        "centre": found.centre.tolist(),
+        "observations": len(detection.observations.curves),
+        "centre": detection.centre.tolist(),
         "polynomial": {"a1": a1, "a2": a2, "a3": a3},
         "lens": {"a2": a2 / a1, "a3": a3 / a1},
-        "rms_px": found.rms_px,
-        "blur_px": found.blur_px,
+        "rms_px": detection.rms_px,
+        "blur_px": detection.blur_px,
     }
 
 

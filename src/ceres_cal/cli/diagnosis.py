@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
+from argparse import Namespace
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict
-from pathlib import Path
-from textwrap import wrap
 from typing import Any
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array
-from ceres_cal.cli.command import plural, written
-from ceres_cal.cli.summary import section
+from ceres_cal.base.words import chance, plural
+from ceres_cal.cli.outputs import WIDTH, section, wrapped, written, written_data
 from ceres_cal.diagnostics import Choice, Diagnosis, Finding, HeldOut, Noise, ResidualTable, Summary
+from ceres_cal.report.findings import choice_marks, chosen_lens
 
-_WIDTH = 100
 _MOST_ROWS = 8
 _MOST_SAID = 3  # amounts that the sentence of a finding says itself
 _MODEL_ERROR = (
@@ -25,29 +24,23 @@ _MODEL_ERROR = (
 )
 
 
-def diagnosis_data(
-    diagnosis: Diagnosis, choice: Choice | None, output: Path | None, report: Path | None = None
-) -> dict[str, Any]:
-    """Everything but the table of single observations, for --json; what is unknown is null."""
+def diagnosis_data(diagnosis: Diagnosis, choice: Choice | None, args: Namespace) -> dict[str, Any]:
+    """Everything but the table of single observations, for --json."""
     summaries = diagnosis.summaries
-    data: dict[str, Any] = _plain(
-        {
-            "verdict": _verdict(diagnosis),
-            "model_error": diagnosis.model_error,
-            "new_data": diagnosis.new_data,
-            "tests": diagnosis.tests,
-            "false_alarm_rate": diagnosis.false_alarm_rate,
-            "findings": [asdict(finding) for finding in diagnosis.findings],
-            "noise": [asdict(noise) for noise in diagnosis.noise],
-            "rejected": dict(_rejected(diagnosis.table)),
-            "summaries": {name: vars(getattr(summaries, name)) for name in ("frames", "features", "regions", "radii")},
-            "radius_trend": [vars(trend) for trend in summaries.trends],
-            "held_out": None if choice is None else _choice_data(choice),
-            "output": None if output is None else str(output),
-            "report": None if report is None else str(report),
-        }
-    )
-    return data
+    return {
+        "verdict": _verdict(diagnosis),
+        "model_error": diagnosis.model_error,
+        "new_data": diagnosis.new_data,
+        "tests": diagnosis.tests,
+        "false_alarm_rate": diagnosis.false_alarm_rate,
+        "findings": [asdict(finding) for finding in diagnosis.findings],
+        "noise": [asdict(noise) for noise in diagnosis.noise],
+        "rejected": _rejected(diagnosis.table),
+        "summaries": {name: vars(getattr(summaries, name)) for name in ("frames", "features", "regions", "radii")},
+        "radius_trend": [vars(trend) for trend in summaries.trends],
+        "held_out": None if choice is None else _choice_data(choice),
+        **written_data(args),
+    }
 
 
 def _choice_data(choice: Choice) -> dict[str, Any]:
@@ -60,21 +53,10 @@ def _choice_data(choice: Choice) -> dict[str, Any]:
     }
 
 
-def _plain(value: Any) -> Any:
-    """The same of plain numbers, lists and names; null for what is not finite."""
-    if isinstance(value, dict):
-        return {name: _plain(entry) for name, entry in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(entry) for entry in value]
-    if isinstance(value, np.ndarray):
-        return _plain(value.tolist())
-    return None if isinstance(value, float) and not np.isfinite(value) else value
-
-
-def diagnosis_text(diagnosis: Diagnosis, choice: Choice | None, output: Path | None, report: Path | None = None) -> str:
+def diagnosis_text(diagnosis: Diagnosis, choice: Choice | None, args: Namespace) -> str:
     """A page: the verdict, the findings by size, then tables."""
     table, summaries = diagnosis.table, diagnosis.summaries
-    sections = [section("verdict", [line for part in _verdict(diagnosis) for line in wrap(part, _WIDTH)])]
+    sections = [section("verdict", wrapped(*_verdict(diagnosis)))]
     sections += [
         section(f"finding {number}", _finding(finding)) for number, finding in enumerate(diagnosis.findings, start=1)
     ]
@@ -90,9 +72,7 @@ def diagnosis_text(diagnosis: Diagnosis, choice: Choice | None, output: Path | N
     ):
         sections.append(section(title, _summary(summary, by_size)))
     sections.append(section("leverage", _leverage(table)))
-    if files := written(output, report):
-        sections.append(section("written", files))
-    return "\n".join(sections)
+    return "\n".join([*sections, *written(args)])
 
 
 def _verdict(diagnosis: Diagnosis) -> list[str]:
@@ -113,12 +93,9 @@ def _verdict(diagnosis: Diagnosis) -> list[str]:
 
 
 def _finding(finding: Finding) -> list[str]:
-    chance = f"false alarm: 1 in 10^{-finding.log10_p:.0f}" if finding.log10_p < -3.0 else (
-        f"false alarm: {100.0 * 10.0**finding.log10_p:.2g} %"
-    )  # fmt: skip
-    lines = [*wrap(finding.sentence, _WIDTH), *wrap(f"-> {finding.advice}", _WIDTH)]
+    lines = wrapped(finding.sentence, f"-> {finding.advice}")
     size = f"{finding.effect_px:.2f} px, {_mm(finding.effect_mm)} mm; {plural(finding.observations, 'observation')}"
-    lines.append(f"   {size}; {chance}")
+    lines.append(f"   {size}; false alarm: {chance(finding.log10_p)}")
     if len(finding.amounts) > _MOST_SAID:
         lines += [f"   {one.name:28}{one.value:9.3f} ± {one.sd:.3f} {one.unit}" for one in finding.amounts]
     return lines
@@ -137,24 +114,17 @@ def _noise(noise: Noise) -> str:
 def _choice(choice: Choice) -> list[str]:
     lines = [f"{'':24}held-out px      mm   fit px"]
     for number, one in enumerate(choice.candidates):
-        marks = [
-            word
-            for word, index in (("now", choice.current), ("least error", choice.best), ("chosen", choice.chosen))
-            if index == number
-        ]
-        lines.append(f"{one.label:24}{_errors(one)}  {', '.join(marks)}".rstrip())
-    chosen = choice.candidates[choice.chosen]
+        lines.append(f"{one.label:24}{_errors(one)}  {choice_marks(choice, number)}".rstrip())
     parts = max(one.folds for one in choice.candidates)
     rule = f"{parts} parts of the frames; chosen: the fewest coefficients within one standard error of the least error"
     if choice.thinned < 1.0:
         rule += f"; on {100.0 * choice.thinned:.0f} % of the observations"
-    said = "the calibration's lens is the one to take" if choice.chosen == choice.current else f"take {chosen.label}"
-    return [*lines, rule, said]
+    return [*lines, rule, chosen_lens(choice)]
 
 
 def _errors(one: HeldOut) -> str:
     if one.failed:
-        return f"none: {one.failed}"[: _WIDTH - 24]
+        return f"none: {one.failed}"[: WIDTH - 24]
     text = f"{one.rms_px:11.4f}{one.rms_mm:9.3f}{one.fit_rms_px:9.4f}"
     return text + (f" without {plural(one.failed_folds, 'part')} that failed" if one.failed_folds else "")
 

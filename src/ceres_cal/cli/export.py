@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
 from collections.abc import Collection
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ceres_cal.base.errors import InputError
-from ceres_cal.cli.command import Answer, Command, add_output, finishing, require_output
+from ceres_cal.cli.arguments import add_calibration, add_output
+from ceres_cal.cli.command import Answer, Command
+from ceres_cal.cli.inputs import read_calibration
+from ceres_cal.cli.outputs import finishing, require_output
 
 if TYPE_CHECKING:
     from ceres_cal.formats import Exported, ExportFormat
@@ -34,7 +36,7 @@ def _add_table_arguments(parser: ArgumentParser) -> None:
 
 def _add_shared_arguments(parser: ArgumentParser, forms: Collection[ExportFormat]) -> None:
     add = parser.add_argument
-    add("calibration", metavar="CALIBRATION", type=Path, help="file that `ceres-cal calibrate` or `refit` wrote")
+    add_calibration(parser)
     add_output(parser, "the export; its ending is one of the format's", required=True)
     add(
         "--station",
@@ -68,10 +70,7 @@ def _run(args: Namespace) -> Answer:
     if form.endings:
         require_output(args.output, [args.calibration])
     options = _options(args, form)
-    from ceres_cal.calibration import Calibration
-
-    calibration = Calibration.load(args.calibration)
-    exported = prepare_export(calibration, form.name, args.output, args.station, options)
+    exported = prepare_export(read_calibration(args), form.name, args.output, args.station, options)
     with finishing():
         exported.save(args.output)
     return Answer(_data(exported, args), lambda: _text(exported, args))

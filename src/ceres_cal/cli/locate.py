@@ -5,12 +5,13 @@ from __future__ import annotations
 import sys
 from argparse import ArgumentParser, Namespace
 from collections.abc import Iterable, Iterator
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
-from ceres_cal.cli.command import Answer, Command, parse_number
+from ceres_cal.cli.arguments import add_calibration, add_station, parse_number
+from ceres_cal.cli.command import Answer, Command
+from ceres_cal.cli.inputs import read_calibration, station_of
 
 if TYPE_CHECKING:
     from ceres_cal.base.arrays import Array
@@ -18,12 +19,12 @@ if TYPE_CHECKING:
 
 
 def _add_common(parser: ArgumentParser, rows: str, example: str) -> None:
-    parser.add_argument("calibration", metavar="CALIBRATION", type=Path, help="file that `ceres-cal calibrate` wrote")
+    add_calibration(parser)
     parser.add_argument(
         "rows", nargs="*", metavar=rows, help=f"such as {example}; - reads lines of these from standard input"
     )
     parser.add_argument("--file", metavar="CSV", help="read lines of these from a file instead")
-    parser.add_argument("--station", help="which station; may be left out where there is only one")
+    add_station(parser)
 
 
 def _add_locate(parser: ArgumentParser) -> None:
@@ -69,15 +70,9 @@ def _height_m(args: Namespace) -> float:
 
 
 def _station(args: Namespace) -> tuple[str, Camera]:
-    from ceres_cal.calibration import Calibration
-
-    calibration = Calibration.load(args.calibration)
-    if args.station is None and len(calibration.stations) > 1:
-        raise InputError(
-            f"{args.calibration} has several stations, name one: --station {' or '.join(calibration.stations)}"
-        )
-    camera = calibration.station(args.station)
-    return args.station or next(iter(calibration.stations)), camera
+    calibration = read_calibration(args)
+    name = station_of(args, calibration)
+    return name, calibration.stations[name]
 
 
 # ---- reading --------------------------------------------------------------------------------------------------------

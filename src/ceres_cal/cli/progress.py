@@ -6,6 +6,7 @@ import os
 import shutil
 import sys
 import time
+from argparse import Namespace
 from collections.abc import Callable
 from types import TracebackType
 from typing import TextIO
@@ -14,6 +15,11 @@ _REDRAW_S = 0.1
 _FIRST_LINE_S = 3.0  # where there is no terminal; each further line waits twice as long
 _BAR_COLUMNS = 24
 _CLEAR = "\r\x1b[K"
+
+
+def progress_bar(args: Namespace) -> ProgressBar:
+    """The bar of a command: nothing with --quiet or --json."""
+    return ProgressBar(silent=args.quiet or args.json)
 
 
 class ProgressBar:

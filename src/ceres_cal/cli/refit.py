@@ -6,23 +6,16 @@ from argparse import ArgumentParser, Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ceres_cal.base.errors import InputError
-from ceres_cal.cli.album import album_of
-from ceres_cal.cli.command import Answer, Command, add_output, add_report, finishing, parse_numbers, require_outputs
-from ceres_cal.cli.moved import (
-    add_inputs,
-    not_painted,
-    photographs_data,
-    photographs_in,
-    photographs_text,
-    progress_bar,
-    read_calibration,
-    read_observations,
-)
+from ceres_cal.cli.arguments import PriorNames, add_output, add_report, parse_names, parse_prior
+from ceres_cal.cli.command import Answer, Command
+from ceres_cal.cli.inputs import read_calibration, read_observations
+from ceres_cal.cli.outputs import report_page, report_photographs, require_outputs, section, write_results
+from ceres_cal.cli.photographs import add_inputs, photographs_data, photographs_in, photographs_text
+from ceres_cal.cli.progress import progress_bar
 
 if TYPE_CHECKING:
     from ceres_cal.calibration import Calibration
-    from ceres_cal.observations import Observations, Prior
+    from ceres_cal.observations import Observations
     from ceres_cal.photographs import KnownDetections
 
 _HELP = {
@@ -61,15 +54,13 @@ def _add_arguments(parser: ArgumentParser) -> None:
 def _run(args: Namespace) -> Answer:
     images = photographs_in(args)
     # To replace the old calibration is what many want.
-    require_outputs(args.output, args.report, images or args.inputs)
+    require_outputs(args, images or args.inputs)
     calibration = read_calibration(args)
-    found = _photographed(args, calibration, images) if images else None
-    observations = read_observations(args) if found is None else found.require()
-    from ceres_cal.base.files import write_bytes
+    detections = _photographed(args, calibration, images) if images else None
+    observations = read_observations(args.inputs) if detections is None else detections.require()
     from ceres_cal.moves import refit
 
-    album = album_of(args, observations, calibration, images)
-    priors = tuple(_height(spec, observations) for spec in args.prior)
+    photographs = report_photographs(args, observations, calibration, images)
     result = refit(
         calibration,
         observations,
@@ -77,71 +68,39 @@ def _run(args: Namespace) -> Answer:
         moved=args.moved,
         hold_others=args.hold_others,
         labels=args.labels,
-        priors=priors,
+        priors=tuple(parse_prior(spec, observations, PriorNames(("height_m",))) for spec in args.prior),
     )
-    page = ""
-    if args.report is not None:
-        from ceres_cal.report import make_report
-
-        page = make_report(result, observations, album=album)
-    with finishing():
-        if args.output is not None:
-            result.save(args.output)
-        if args.report is not None:
-            write_bytes(args.report, page.encode())
-    data = _data(result, calibration, observations, args) | photographs_data(found)
-    return Answer(data, lambda: _text(result, observations, found, args))
+    write_results(args, result.save, report_page(args, result, observations, photographs))
+    data = _data(result, calibration, observations, args) | photographs_data(detections)
+    return Answer(data, lambda: _text(result, observations, detections, args))
 
 
 def _photographed(args: Namespace, calibration: Calibration, images: list[Path]) -> KnownDetections:
     from ceres_cal.photographs import detect_known
 
+    not_painted = parse_names(args.not_painted)
     with progress_bar(args) as bar:
-        return detect_known(calibration, images, args.station, not_painted=not_painted(args), progress=bar.update)
+        return detect_known(calibration, images, args.station, not_painted=not_painted, progress=bar.update)
 
 
 COMMANDS = (Command("refit", "after a move: poses anew, everything else under what was known", _add_arguments, _run),)
-
-
-def _height(spec: str, observations: Observations) -> Prior:
-    """The prior of `--prior [STATION.]height_m=VALUE:SIGMA`."""
-    from ceres_cal.observations import prior_from_json
-
-    where = f"--prior {spec!r}"
-    left, equals, right = spec.rpartition("=")
-    value, colon, sigma = right.partition(":")
-    owner, _, quantity = left.strip().rpartition(".")
-    stations = tuple(observations.stations)
-    if not (equals and colon) or quantity != "height_m":
-        raise InputError(f"{where}: write STATION.height_m=VALUE:SIGMA, such as overhead.height_m=4.02:0.01")
-    if not owner and len(stations) == 1:
-        owner = stations[0]
-    if owner not in stations:
-        raise InputError(f"{where}: name one station before the dot: {', '.join(stations)}")
-    numbers = (*parse_numbers(value, where), *parse_numbers(sigma, f"{where}: sigma"))
-    if len(numbers) != 2 or numbers[1] <= 0.0:
-        raise InputError(f"{where}: give one height and one sigma above 0")
-    return prior_from_json({"station": owner, "height_m": numbers[0], "sigma_m": numbers[1]}, where)
 
 
 def _data(result: Calibration, before: Calibration, observations: Observations, args: Namespace) -> dict[str, Any]:
     from ceres_cal.cli.summary import calibration_data
     from ceres_cal.moves import movements
 
-    found = calibration_data(result, observations, args.inputs, args.output, args.report)
-    moves = {
-        name: {"mm": 1e3 * shift_m, "deg": turn_deg} for name, (shift_m, turn_deg) in movements(before, result).items()
-    }
+    moves = {name: {"mm": 1e3 * shift_m, "deg": deg} for name, (shift_m, deg) in movements(before, result).items()}
     refitted = result.refitted
     assert refitted is not None
-    return {**found, "what": refitted.what, "explanation": refitted.explanation, "moved": moves}
+    summary = calibration_data(result, observations, args.inputs, args)
+    return {**summary, "what": refitted.what, "explanation": refitted.explanation, "moved": moves}
 
 
-def _text(result: Calibration, observations: Observations, found: KnownDetections | None, args: Namespace) -> str:
+def _text(result: Calibration, observations: Observations, detections: KnownDetections | None, args: Namespace) -> str:
     from ceres_cal.cli.summary import calibration_text
 
-    refitted = result.refitted
-    assert refitted is not None
-    told = "\n".join(f"{'' if i else 'refit':10}{line}" for i, line in enumerate(refitted.explanation.split("; ")))
-    summary = calibration_text(result, observations, args.inputs, args.output, args.report)
-    return "\n".join([told, *photographs_text(found), summary])
+    assert result.refitted is not None
+    explanation = section("refit", result.refitted.explanation.split("; "))
+    summary = calibration_text(result, observations, args.inputs, args)
+    return "\n".join([explanation, *photographs_text(detections), summary])

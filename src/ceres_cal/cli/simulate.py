@@ -7,8 +7,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ceres_cal.base.errors import InputError
-from ceres_cal.cli.command import Answer, Command, finishing, plural
-from ceres_cal.cli.progress import ProgressBar
+from ceres_cal.base.words import plural
+from ceres_cal.cli.arguments import add_quiet
+from ceres_cal.cli.command import Answer, Command
+from ceres_cal.cli.outputs import finishing
+from ceres_cal.cli.progress import progress_bar
 
 if TYPE_CHECKING:
     from ceres_cal.simulate import Simulation
@@ -24,7 +27,7 @@ def _add_arguments(parser: ArgumentParser) -> None:
         choices=("png", "jpg"),
         help="take photographs too, into photographs/ beside the observations; what robots hide there is not observed",
     )
-    add("--quiet", action="store_true", help="no progress")
+    add_quiet(parser)
     add("--list", action="store_true", help="list the built-in scenes")
 
 
@@ -50,7 +53,7 @@ def _run(args: Namespace) -> Answer:
     if args.images is not None:
         from ceres_cal.simulate.album import take_album
 
-        with ProgressBar(silent=args.quiet or args.json) as bar:
+        with progress_bar(args) as bar:
             album = take_album(simulation, args.images, bar.update)
         simulation, images = album.simulation, [str(args.output / name) for name in album.images]
     with finishing():

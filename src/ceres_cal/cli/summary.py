@@ -2,23 +2,26 @@
 
 from __future__ import annotations
 
+from argparse import Namespace
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
-from pathlib import Path
-from textwrap import wrap
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
-from ceres_cal.base.transforms import Pose, euler_from_rotation
+from ceres_cal.base.transforms import euler_from_rotation
+from ceres_cal.base.words import bounds_text, plural, two_digits
 from ceres_cal.calibration import Calibration, calibration_to_json
-from ceres_cal.cli.command import plural, written
-from ceres_cal.cli.trust import Trust, with_sd
+from ceres_cal.cli.outputs import section, wrapped, written, written_data
 from ceres_cal.model.parameters import Options, anchored_stations
 from ceres_cal.observations import Observations
+from ceres_cal.report.quality import Quality
 from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.heights import at_height
+from ceres_cal.uncertainty import FieldMap, Verdict
 
-_MOST_FEATURES = 6
+_MOST_FEATURES, _MOST_DIRECTIONS = 6, 4
 _MANY_OUTLIERS, _LARGE_SCALE = 0.3, 4.0  # from where on a warning is due
 _PHI_FROM = {
     "fixed": "held",
@@ -29,70 +32,45 @@ _PHI_FROM = {
 }
 
 
-def tilt_deg(cam_from_world: Pose) -> float:
-    """Angle between the camera's axis and straight down."""
-    x, y, z = cam_from_world.rotation[2]
-    return float(np.degrees(np.arctan2(np.hypot(x, y), -z)))
-
-
 def calibration_data(
-    calibration: Calibration,
-    observations: Observations,
-    inputs: Sequence[str],
-    output: Path | None,
-    report: Path | None = None,
+    calibration: Calibration, observations: Observations, inputs: Sequence[str], args: Namespace
 ) -> dict[str, Any]:
     """Everything, for --json."""
     return {
         "calibration": calibration_to_json(calibration),
         "inputs": list(inputs),
-        "output": None if output is None else str(output),
-        "report": None if report is None else str(report),
+        **written_data(args),
         "counts": _counts(observations),
         "rms_px": calibration.rms_px,
-        "tilt_deg": {name: tilt_deg(camera.cam_from_world) for name, camera in calibration.stations.items()},
-        "uncertainty": Trust(calibration, observations).data(),
+        "tilt_deg": {name: camera.tilt_deg for name, camera in calibration.stations.items()},
+        "uncertainty": _uncertainty_data(Quality(calibration, observations)),
         "outliers": dict(_outliers(calibration).most_common()),
         "warnings": list(_warnings(calibration, observations)),
     }
 
 
 def calibration_text(
-    calibration: Calibration,
-    observations: Observations,
-    inputs: Sequence[str],
-    output: Path | None,
-    report: Path | None = None,
+    calibration: Calibration, observations: Observations, inputs: Sequence[str], args: Namespace
 ) -> str:
     """A short table for people."""
-    anchored, trust = anchored_stations(observations), Trust(calibration, observations)
+    anchored, quality = anchored_stations(observations), Quality(calibration, observations)
     sections = [
         section("read", [", ".join(map(str, inputs)), *_counted(observations)]),
         section("fit", _fit(calibration)),
     ]
     for name, camera in calibration.cameras.items():
-        lines = _intrinsics(name, camera, calibration.options, calibration.phi_from.get(name, ""), trust)
+        lines = _intrinsics(name, camera, calibration.options, calibration.phi_from.get(name, ""), quality)
         sections.append(section("camera", [f"{name}, {camera.image_size[0]} x {camera.image_size[1]} px", *lines]))
     for name, camera in calibration.stations.items():
-        sections.append(
-            section(
-                "station", [f"{name}{_of_camera(calibration, name)}", *_pose(name, camera, name in anchored, trust)]
-            )
-        )
+        pose = _pose(name, camera, name in anchored, quality)
+        sections.append(section("station", [f"{name}{_of_camera(calibration, name)}", *pose]))
     if len(calibration.estimate.structure.names):
         sections.append(section("as built", _structure(calibration)))
-    sections += [section(title, lines) for title, lines in trust.sections()]
+    sections += [section(title, lines) for title, lines in _uncertainty_lines(quality)]
     sections.append(section("outliers", _outlier_lines(calibration)))
     sections.append(section("stopped", _stop(calibration)))
-    sections.extend(section("warning", wrap(text, 100)) for text in _warnings(calibration, observations))
-    if files := written(output, report):
-        sections.append(section("written", files))
-    return "\n".join(sections)
-
-
-def section(title: str, lines: Iterable[str]) -> str:
-    """A title beside its lines."""
-    return "\n".join(f"{'' if number else title:10}{line}" for number, line in enumerate(lines))
+    sections.extend(section("warning", wrapped(text)) for text in _warnings(calibration, observations))
+    return "\n".join([*sections, *written(args)])
 
 
 def _counts(observations: Observations) -> dict[str, int]:
@@ -135,21 +113,21 @@ def _structure(calibration: Calibration) -> list[str]:
     return [*lines, f"and {plural(rest, 'smaller correction')}"] if rest else lines
 
 
-def _intrinsics(name: str, camera: Camera, options: Options, phi_from: str, trust: Trust) -> list[str]:
+def _intrinsics(name: str, camera: Camera, options: Options, phi_from: str, quality: Quality) -> list[str]:
     def held(*names: str) -> str:
         return " (held)" if all(name in options.fixed for name in names) else ""
 
     def known(quantity: str, value: float, unit: str = "px") -> str:
-        return with_sd(value, unit, trust.verdict("camera", name, quantity))
+        return with_sd(value, unit, quality.verdicts.get(("camera", name, quantity)))
 
     cx, cy = camera.principal_point
     centre = held("cx", "cy") if options.free_principal_point else " (held)"
     rows = [("phi", f"{known('phi', camera.phi)} ({_PHI_FROM.get(phi_from, phi_from)})")]
     if options.free_aspect or camera.aspect != 1.0:
-        rows.append(("aspect", f"{camera.aspect:.7f}{_plus_minus(trust, name, 'aspect')}{held('aspect')}"))
+        rows.append(("aspect", f"{camera.aspect:.7f}{_plus_minus(quality, name, 'aspect')}{held('aspect')}"))
     rows.append(("principal point", f"{known('cx', cx)}, {known('cy', cy)}{centre}"))
     for coefficient, value in camera.lens.coefficients.items():
-        rows.append((coefficient, f"{value!r}{_plus_minus(trust, name, coefficient)}{held(coefficient)}"))
+        rows.append((coefficient, f"{value!r}{_plus_minus(quality, name, coefficient)}{held(coefficient)}"))
     lines = [f"{title:16}{value}" for title, value in rows]
     return [*lines, camera.lens.note] if camera.lens.note else lines
 
@@ -159,27 +137,27 @@ def _of_camera(calibration: Calibration, station: str) -> str:
     return "" if camera == station else f", camera {camera}"
 
 
-def _plus_minus(trust: Trust, camera: str, quantity: str) -> str:
-    verdict = trust.verdict("camera", camera, quantity)
+def _plus_minus(quality: Quality, camera: str, quantity: str) -> str:
+    verdict = quality.verdicts.get(("camera", camera, quantity))
     return "" if verdict is None else f" ± {verdict.sd:.2g}" if np.isfinite(verdict.sd) else ", unknown"
 
 
-def _pose(name: str, camera: Camera, anchored: bool, trust: Trust) -> list[str]:
+def _pose(name: str, camera: Camera, anchored: bool, quality: Quality) -> list[str]:
     if anchored:
         return ["held as the world: boards alone do not tell where it stands"]
     x, y, z = camera.position
     alpha, beta, gamma = np.degrees(euler_from_rotation(camera.cam_from_world.rotation))
     position = [
-        f"{q} {with_sd(value, 'm', trust.verdict('station', name, q))}"
+        f"{q} {with_sd(value, 'm', quality.verdicts.get(('station', name, q)))}"
         for q, value in (("x", x), ("y", y), ("height", z))
     ]
-    turns = [trust.verdict("station", name, f"turn_{axis}") for axis in "xyz"]
-    told = [f"{np.degrees(turn.sd):.2g}" if np.isfinite(turn.sd) else "unknown" for turn in turns if turn is not None]
+    turns = [quality.verdicts.get(("station", name, f"turn_{axis}")) for axis in "xyz"]
+    sds = [f"{np.degrees(turn.sd):.2g}" if np.isfinite(turn.sd) else "unknown" for turn in turns if turn is not None]
     return [
         f"{'position':16}{', '.join(position)}",
         f"{'angles':16}alpha {alpha:.4f}, beta {beta:.4f}, gamma {gamma:.4f} deg (the paper's)",
-        f"{'tilt':16}{tilt_deg(camera.cam_from_world):.3f} deg from straight down",
-        *([f"{'turns':16}± {', '.join(told)} deg about the camera's x, y and z"] if told else []),
+        f"{'tilt':16}{camera.tilt_deg:.3f} deg from straight down",
+        *([f"{'turns':16}± {', '.join(sds)} deg about the camera's x, y and z"] if sds else []),
     ]
 
 
@@ -226,3 +204,100 @@ def _warnings(calibration: Calibration, observations: Observations) -> Iterator[
             f"the residuals are {scale:.0f} times the stated sigmas: the lens may not suit the camera, or labels and "
             "target dimensions may be wrong"
         )
+
+
+# ---- how well it is known -------------------------------------------------------------------------------------------
+
+
+def with_sd(value: float, unit: str, verdict: Verdict | None) -> str:
+    """A number and how well it is known: "868.96 ± 1.4 px", "4.022 m ± 6.6 mm", "745 px, unknown: below 1209 px".
+
+    Without a verdict it was held, or nothing was minimised.
+    """
+    if verdict is None:
+        return f"{value:.{3 if unit == 'm' else 4}f} {unit}"
+    if verdict.by_profile and verdict.verdict != "known":
+        bounds = bounds_text(verdict.low, verdict.high, unit)
+        return f"{value:.{3 if unit == 'm' else 0}f} {unit}, {verdict.verdict}: {bounds}"
+    word = "" if verdict.verdict == "known" else f", {verdict.verdict}"
+    if not np.isfinite(verdict.sd):
+        return f"{value:.{3 if unit == 'm' else 0}f} {unit}{word}"
+    if unit == "m":
+        return f"{value:.3f} m ± {two_digits(1e3 * verdict.sd)} mm{word}"
+    places = int(np.clip(2 - np.floor(np.log10(verdict.sd)), 0, 9))
+    return f"{value:.{places}f} ± {two_digits(verdict.sd)} {unit}{word}"
+
+
+def _uncertainty_lines(quality: Quality) -> Iterator[tuple[str, list[str]]]:
+    """Title and lines of what people should know before they use it."""
+    if quality.uncertainty is None:
+        return
+    if quality.maps:
+        yield "located", [f"{name}: {_sd_at_heights(maps)}" for name, maps in quality.maps.items()]
+    seams = []
+    for seam in quality.each_seam():
+        rms, expected, count = seam.measured.rms_mm, seam.measured.expected_rms_mm, len(seam.measured.what)
+        seams.append(f"{' - '.join(seam.stations)}: {_sd_at_heights(seam.predicted)}")
+        if count:
+            measured = f"found {two_digits(rms)} mm where {two_digits(expected)} were expected"
+            seams.append(f"{measured} (rms of {count} points and stretches that both observed)")
+    if seams:
+        yield "seam", seams
+    weak = [direction.words for direction in quality.uncertainty.weak_directions]
+    if weak:
+        more = [f"and {len(weak) - _MOST_DIRECTIONS} more (--json)"] if len(weak) > _MOST_DIRECTIONS else []
+        yield "weak", weak[:_MOST_DIRECTIONS] + more
+    unknown = quality.uncertainty.unknown_placements
+    if unknown:
+        name, quantities = next(iter(unknown.items()))
+        rest = f", and of {len(unknown) - 1} more placements" if len(unknown) > 1 else ""
+        yield "unknown", [f"{', '.join(quantities)} of placement {name!r}{rest}"]
+
+
+def _sd_at_heights(maps: Sequence[FieldMap]) -> str:
+    parts = []
+    for m in maps:
+        x, y = m.worst_place_m
+        mean = f"± {two_digits(m.mean_mm)} mm" if np.isfinite(m.mean_mm) else "unknown"
+        worst = f" (worst {two_digits(m.worst_mm)} at {x:.1f}, {y:.1f} m)" if np.isfinite(m.worst_mm) else ""
+        parts.append(f"{mean} {at_height(m.height_m)}{worst}")
+    return ", ".join(parts)
+
+
+def _uncertainty_data(quality: Quality) -> dict[str, Any] | None:
+    """Everything, for --json."""
+    uncertainty = quality.uncertainty
+    if uncertainty is None:
+        return None
+    return {
+        "numbers": [{**asdict(v), "key": v.key._asdict()} for v in uncertainty.verdicts],
+        "weak_directions": [
+            {"words": d.words, "relative": d.relative, "shares": [[*key[:3], share] for key, share in d.shares]}
+            for d in uncertainty.weak_directions
+        ],
+        "unknown_placements": uncertainty.unknown_placements,
+        "maps": {name: [_map_data(m) for m in maps] for name, maps in quality.maps.items()},
+        "seams": [
+            {
+                "stations": seam.stations,
+                "predicted": [_map_data(m) for m in seam.predicted],
+                "found_mm": seam.measured.rms_mm,
+                "expected_mm": seam.measured.expected_rms_mm,
+                "compared": len(seam.measured.what),
+            }
+            for seam in quality.each_seam()
+        ],
+    }
+
+
+def _map_data(m: FieldMap) -> dict[str, Any]:
+    return {
+        "height_m": m.height_m,
+        "mean_sd_mm": m.mean_mm,
+        "worst_sd_mm": m.worst_mm,
+        "worst_place_m": m.worst_place_m,
+        "x_m": m.x_m,
+        "y_m": m.y_m,
+        "sd_mm": m.sd_mm,
+        "radius_95_mm": m.radius_95_mm,
+    }

@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
-import os
 from argparse import ArgumentParser, Namespace
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ceres_cal.base.arrays import Image
 from ceres_cal.base.errors import InputError
-from ceres_cal.cli.command import Answer, Command, finishing, parse_number, parse_numbers
-from ceres_cal.cli.detect import image_files
-from ceres_cal.cli.progress import ProgressBar
+from ceres_cal.cli.arguments import add_calibration, add_quiet, add_station, height_m, parse_number, parse_numbers
+from ceres_cal.cli.command import Answer, Command
+from ceres_cal.cli.inputs import image_files, read_calibration
+from ceres_cal.cli.outputs import finishing
+from ceres_cal.cli.progress import progress_bar
 
 if TYPE_CHECKING:
     from ceres_cal.base.arrays import Image
     from ceres_cal.calibration import Calibration
+    from ceres_cal.pictures.straight import Straight
     from ceres_cal.scene.camera import Camera
 
 _MARGIN_M = 0.3  # around the field in a top view
@@ -30,13 +31,13 @@ _OF_OVERLAY = ("before", "observations")
 
 def _add_arguments(parser: ArgumentParser) -> None:
     add = parser.add_argument
-    add("calibration", metavar="CALIBRATION", type=Path, help="file that `ceres-cal calibrate` or `refit` wrote")
+    add_calibration(parser)
     add("images", nargs="+", metavar="IMAGE", help="photographs of one camera, or folders of them")
     add("-o", "--output", metavar="FOLDER", type=Path, required=True, help="for the pictures; made if missing")
     add("--camera", metavar="NAME", help="which camera; may be left out where there is only one")
-    add("--station", metavar="NAME", help="which station; may be left out where there is only one")
+    add_station(parser)
     add("--format", choices=("png", "jpg"), default="png", help="default: png, which loses nothing")
-    add("--quiet", action="store_true", help="no progress")
+    add_quiet(parser)
     group = parser.add_argument_group("straight images (default)")
     either = group.add_mutually_exclusive_group()
     either.add_argument("--crop", action="store_true", help="the largest rectangle without black (default)")
@@ -60,24 +61,23 @@ def _add_arguments(parser: ArgumentParser) -> None:
 
 def _run(args: Namespace) -> Answer:
     require_fitting(args)
-    images = list(image_files(args.images))
+    images = image_files(args.images)
     kind = "top" if args.top_view else "overlay" if args.overlay else "straight"
     outputs = _outputs(images, args.output, f"-{kind}.{args.format}", f"{kind}.json")
-    os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")  # what it warns of in an image, we say ourselves
     from ceres_cal.base.files import write_json
-    from ceres_cal.calibration import Calibration
 
-    calibration = Calibration.load(args.calibration)
+    calibration = read_calibration(args)
     make = {"top": _top_view, "overlay": _overlay, "straight": _straight}[kind](args, calibration)
     args.output.mkdir(parents=True, exist_ok=True)
-    told: dict[str, str] = {}
+    lines: list[str] = []
     written: list[dict[str, Any]] = []
     about = args.output / f"{kind}.json"
     try:
-        with ProgressBar(silent=args.quiet or args.json) as bar:
+        with progress_bar(args) as bar:
             for number, (path, output) in enumerate(outputs.items(), start=1):
-                picture, facts, told[str(output)] = make.picture(path)
+                picture, facts, line = make.picture(path)
                 _write(output, picture)
+                lines.append(f"{output}: {line}")
                 written.append({"image": str(path), "output": str(output), **facts})
                 bar.update(number, len(outputs), path.name)
     except KeyboardInterrupt:
@@ -86,8 +86,9 @@ def _run(args: Namespace) -> Answer:
     data = {"format": _FORMAT, "version": _VERSION, "calibration": str(args.calibration), "kind": kind, **make.facts}
     with finishing():
         write_json(about, {**data, "pictures": written})
-    lines = [*(f"{output}: {text}" for output, text in told.items()), f"{about}: {make.about}"]
-    return Answer({**data, "pictures": written, "output": str(about)}, lambda: "\n".join(lines))
+    return Answer(
+        {**data, "pictures": written, "output": str(about)}, lambda: "\n".join([*lines, f"{about}: {make.about}"])
+    )
 
 
 COMMANDS = (
@@ -144,10 +145,6 @@ def _area(text: str) -> tuple[float, float, float, float]:
     return numbers[0], numbers[1], numbers[2], numbers[3]
 
 
-def _height_m(args: Namespace) -> float:
-    return 0.0 if args.height_mm is None else parse_number(args.height_mm, "--height-mm") / 1000.0
-
-
 def _station(args: Namespace, calibration: Calibration) -> str:
     """The station that took the photographs; --camera is enough where it stood at one only."""
     stations = calibration.estimate.stations
@@ -155,16 +152,16 @@ def _station(args: Namespace, calibration: Calibration) -> str:
         calibration.station(args.station)  # or says which there are
     if args.camera is not None and args.camera not in calibration.cameras:
         raise InputError(f"camera {args.camera!r} is not there: there are {', '.join(map(repr, calibration.cameras))}")
-    found = [
+    fitting = [
         name
         for name, station in stations.items()
         if args.station in (None, name) and args.camera in (None, station.camera)
     ]
-    if not found:
+    if not fitting:
         raise InputError(f"station {args.station!r} is of camera {stations[args.station].camera!r}: leave out --camera")
-    if len(found) > 1:
-        raise InputError(f"there are several stations, name one: --station {' or '.join(found)}")
-    return found[0]
+    if len(fitting) > 1:
+        raise InputError(f"there are several stations, name one: --station {' or '.join(fitting)}")
+    return fitting[0]
 
 
 def _camera(args: Namespace, calibration: Calibration) -> tuple[str, str | None, Camera]:
@@ -182,7 +179,7 @@ def _camera(args: Namespace, calibration: Calibration) -> tuple[str, str | None,
 
 
 @dataclass(frozen=True)
-class _Making:
+class _PictureMaker:
     """How each picture is made: from a path to picture, facts and a line about it; facts on all, and what they are."""
 
     picture: Callable[[Path], tuple[Image, dict[str, Any], str]]
@@ -198,48 +195,52 @@ def _read(path: Path, camera: Camera, name: str) -> Image:
 
 def _write(path: Path, picture: Image) -> None:
     from ceres_cal.base.files import write_bytes
-    from ceres_cal.pictures.files import encoded
+    from ceres_cal.detect.images import encoded
+    from ceres_cal.pictures.overlay import in_8_bit_colour
 
+    content = encoded(in_8_bit_colour(picture) if path.suffix == ".jpg" else picture, path.suffix, _JPEG_QUALITY)
     with finishing():
-        write_bytes(path, encoded(picture, path.suffix, _JPEG_QUALITY))
+        write_bytes(path, content)
 
 
-def _straight(args: Namespace, calibration: Calibration) -> _Making:
+def _straight(args: Namespace, calibration: Calibration) -> _PictureMaker:
     from ceres_cal.pictures.straight import straighten
     from ceres_cal.scene.files import camera_to_json
 
     name, station, camera = _camera(args, calibration)
-    found = straighten(
+    straight = straighten(
         camera,
         whole=args.whole,
         size=None if args.size is None else _size(args.size),
         phi=None if args.phi is None else parse_number(args.phi, "--phi"),
         angle_deg=None if args.angle is None else parse_number(args.angle, "--angle"),
     )
-    straight, black = found.camera, found.warp.black
     facts = {
         "camera": name,
         "station": station,
-        "matrix": straight.matrix.tolist(),
-        **camera_to_json(straight),
-        **({} if station is None else _pose(straight)),
-        "view_deg": list(found.view_deg),
-        "shown": found.shown,
-        "limit_deg": found.limit_deg,
-        "black_px": black,
+        "matrix": straight.camera.matrix.tolist(),
+        **camera_to_json(straight.camera),
+        **({} if station is None else _pose(straight.camera)),
+        "view_deg": list(straight.view_deg),
+        "shown": straight.share,
+        "limit_deg": straight.limit_deg,
+        "black_px": straight.warp.black,
     }
-    across, down = found.view_deg
-    line = (
-        f"{straight.image_size[0]} x {straight.image_size[1]} px, phi {straight.phi:.2f} px, "
-        f"{across:.1f} x {down:.1f} degrees, "
-        f"{100.0 * found.shown:.1f} % of the photograph, {_black(found.warp.size, black)}"
-    )
-    if args.whole and found.limit_deg is not None:
-        line += f"; nothing from {found.limit_deg:.1f} degrees off the axis on"
-    return _Making(
-        lambda path: (found.warp.apply(_read(path, camera, name)), {}, line),
+    line = _straight_line(straight)
+    if args.whole and straight.limit_deg is not None:
+        line += f"; nothing from {straight.limit_deg:.1f} degrees off the axis on"
+    return _PictureMaker(
+        lambda path: (straight.warp.apply(_read(path, camera, name)), {}, line),
         facts,
         "the straight image's camera: its matrix K, no distortion" + ("" if station is None else ", its pose"),
+    )
+
+
+def _straight_line(straight: Straight) -> str:
+    (width, height), (across, down) = straight.camera.image_size, straight.view_deg
+    return (
+        f"{width} x {height} px, phi {straight.camera.phi:.2f} px, {across:.1f} x {down:.1f} degrees, "
+        f"{100.0 * straight.share:.1f} % of the photograph, {_black(straight.warp.size, straight.warp.black)}"
     )
 
 
@@ -256,31 +257,31 @@ def _black(size: tuple[int, int], count: int) -> str:
     return "nothing black" if count == 0 else f"{count} px ({100.0 * count / (size[0] * size[1]):.1f} %) black"
 
 
-def _top_view(args: Namespace, calibration: Calibration) -> _Making:
-    from ceres_cal.pictures.top_view import make_plan, top_view
+def _top_view(args: Namespace, calibration: Calibration) -> _PictureMaker:
+    from ceres_cal.pictures.top_view import make_grid, top_view
 
     station = _station(args, calibration)
     camera, name = calibration.stations[station], calibration.estimate.stations[station].camera
     area = _field(calibration) if args.area is None else _area(args.area)
     mm_per_px = 5.0 if args.mm_per_px is None else parse_number(args.mm_per_px, "--mm-per-px")
-    plan = make_plan(area, mm_per_px / 1000.0, _height_m(args))
-    warp = top_view(camera, plan)
-    x0, y0, x1, y1 = plan.area_m
+    grid = make_grid(area, mm_per_px / 1000.0, height_m(args))
+    warp = top_view(camera, grid)
+    x0, y0, x1, y1 = grid.area_m
     facts = {
         "camera": name,
         "station": station,
-        "image_size": list(plan.size),
+        "image_size": list(grid.size),
         "mm_per_px": mm_per_px,
         "area_m": [x0, y0, x1, y1],
-        "height_m": plan.height_m,
-        "top_left_pixel_m": plan.places([[0.0, 0.0]])[0].tolist(),
+        "height_m": grid.height_m,
+        "top_left_pixel_m": grid.places([[0.0, 0.0]])[0].tolist(),
         "black_px": warp.black,
     }
     line = (
-        f"{plan.size[0]} x {plan.size[1]} px of {mm_per_px:g} mm, x {x0:g} to {x1:g} m, y {y0:g} to {y1:g} m "
-        f"at {1e3 * plan.height_m:g} mm, {_black(plan.size, warp.black)}"
+        f"{grid.size[0]} x {grid.size[1]} px of {mm_per_px:g} mm, x {x0:g} to {x1:g} m, y {y0:g} to {y1:g} m "
+        f"at {1e3 * grid.height_m:g} mm, {_black(grid.size, warp.black)}"
     )
-    return _Making(
+    return _PictureMaker(
         lambda path: (warp.apply(_read(path, camera, name)), {}, line), facts, "scale and area: x right, y up"
     )
 
@@ -298,13 +299,13 @@ def _field(calibration: Calibration) -> tuple[float, float, float, float]:
     return x0, y0, x1, y1
 
 
-def _overlay(args: Namespace, calibration: Calibration) -> _Making:
+def _overlay(args: Namespace, calibration: Calibration) -> _PictureMaker:
     from ceres_cal.calibration import Calibration as File
     from ceres_cal.observations import Observations
     from ceres_cal.pictures.frames import Frame, frame_by_name, frames_of, marks_of, model_of
     from ceres_cal.pictures.overlay import AFTER, BEFORE, LIFTED, Layer, draw_overlay
 
-    station, height_m = _station(args, calibration), _height_m(args)
+    station, height = _station(args, calibration), height_m(args)
     camera, name = calibration.stations[station], calibration.estimate.stations[station].camera
     before = None if args.before is None else File.load(args.before)
     observations = None if args.observations is None else Observations.load(args.observations)
@@ -313,8 +314,8 @@ def _overlay(args: Namespace, calibration: Calibration) -> _Making:
     def layers(frame: Frame) -> Iterator[Layer]:
         if before is not None:
             yield Layer(model_of(before, frame), f"before: {args.before.name}", BEFORE)
-        if height_m:
-            yield Layer(model_of(calibration, frame, height_m), f"{1e3 * height_m:g} mm above", LIFTED)
+        if height:
+            yield Layer(model_of(calibration, frame, height), f"{1e3 * height:g} mm above", LIFTED)
         yield Layer(model_of(calibration, frame), args.calibration.name, AFTER)
 
     def picture(path: Path) -> tuple[Image, dict[str, Any], str]:
@@ -332,4 +333,4 @@ def _overlay(args: Namespace, calibration: Calibration) -> _Making:
             line += f"; {moved[0]:.2f} px from before in the median, {moved[1]:.2f} px at most"
         return draw_overlay(image, drawn, marks), facts, line
 
-    return _Making(picture, {"camera": name, "station": station}, "what was drawn")
+    return _PictureMaker(picture, {"camera": name, "station": station}, "what was drawn")

@@ -14,13 +14,12 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, Image, Image8
 from ceres_cal.base.errors import InputError, NothingShownError
-from ceres_cal.base.files import read_bytes
+from ceres_cal.base.progress import ImageProgress
+from ceres_cal.detect.images import read_grey
 from ceres_cal.detect.saddles import REACH, measure_saddles
 from ceres_cal.detect.scatter import scatter_px
 from ceres_cal.observations import NO_CURVES, Observations, Points, View
 from ceres_cal.scene.targets import Grid, Target
-
-Progress = Callable[[int, int, str], None]
 
 CORNER_FITS = ("opencv", "saddle")
 MIN_CORNERS = 6
@@ -65,9 +64,8 @@ def detect_boards(
     board: Target,
     camera: str = "camera",
     station: str | None = None,
-    charuco: CharucoSpec | None = None,
-    corner_fit: str = "opencv",
-    progress: Progress | None = None,
+    corners: CharucoSpec | str = "opencv",
+    progress: ImageProgress | None = None,
 ) -> BoardDetections:
     """Chessboard or ChArUco corners of one camera's images.
 
@@ -86,11 +84,11 @@ def detect_boards(
         board: a checkerboard target.
         camera: name of the camera.
         station: name of the station, that of the camera by default.
-        charuco: the markers, when the board has any. Boards may then be partly seen.
-        corner_fit: "opencv" measures with cornerSubPix, as the peers do, so that results compare; "saddle" fits a
-            blurred saddle to each corner: about four times more precise on rendered boards (0.005 px against 0.02),
-            and without cornerSubPix's pull towards the middle of its window. ChArUco corners are always saddles.
-        progress: called after each image with (images done, images in all, file name).
+        corners: the markers, when the board has any: boards may then be partly seen. Else one of CORNER_FITS: "opencv"
+            measures with cornerSubPix, as the peers do, so that results compare; "saddle" fits a blurred saddle to each
+            corner, as with markers always: about four times more precise on rendered boards (0.005 px against 0.02),
+            and without cornerSubPix's shift towards the middle of its window.
+        progress: called after each image.
 
     Raises:
         InputError: an image cannot be read or has another size (each named), the target is no checkerboard or too
@@ -99,40 +97,17 @@ def detect_boards(
     """
     paths = [Path(path) for path in images]
     placements, squares = _placement_names(paths), _squares_of(board)
-    size, found, missed = _find_all(paths, _finder(squares, charuco, corner_fit), progress)
-    if not found:
+    size, grids, missed = _find_all(paths, _finder(squares, corners), progress)
+    if not grids:
         raise NothingShownError(
             f"no board of {squares.columns} x {squares.rows} inner corners in any of {len(paths)} images "
             f"(count the corners between squares, not the squares); {missed[0][0]}: {missed[0][1]}",
             tuple(missed),
         )
-    views = tuple(View(path.stem, camera, station or camera, TARGET_NAME, placements[path]) for path in found)
-    points = _points(list(found.values()), board)
+    views = tuple(View(path.stem, camera, station or camera, TARGET_NAME, placements[path]) for path in grids)
+    points = _points(list(grids.values()), board)
     observations = Observations({TARGET_NAME: board}, {camera: size}, views, points, NO_CURVES)
-    return BoardDetections(observations, tuple(map(str, found)), tuple(missed))
-
-
-def read_grey(path: str | Path) -> Image:
-    """An image as (height, width) grey levels of its own depth, its pixels as stored (any noted rotation ignored).
-
-    Raises:
-        InputError: the file is missing or no image.
-    """
-    return _decoded(path, cv2.IMREAD_GRAYSCALE)
-
-
-def read_colour(path: str | Path) -> Image:
-    """An image as (height, width) grey levels or (height, width, 3) blue, green and red; otherwise as `read_grey`."""
-    return _decoded(path, cv2.IMREAD_ANYCOLOR)
-
-
-def _decoded(path: str | Path, channels: int) -> Image:
-    content = np.frombuffer(read_bytes(path), np.uint8)
-    flags = channels | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
-    image = cv2.imdecode(content, flags) if content.size else None
-    if image is None:
-        raise InputError(f"{path}: not an image that OpenCV can read (cut short?): convert it to PNG or leave it out")
-    return image
+    return BoardDetections(observations, tuple(map(str, grids)), tuple(missed))
 
 
 # ---- finding --------------------------------------------------------------------------------------------------------
@@ -142,11 +117,11 @@ Finder = Callable[[Image], Array | str]
 
 
 def _find_all(
-    paths: Sequence[Path], find: Finder, progress: Progress | None
+    paths: Sequence[Path], find: Finder, progress: ImageProgress | None
 ) -> tuple[tuple[int, int], dict[Path, Array], list[tuple[str, str]]]:
     """The images' (width, height), the grid in each image that shows the board, and (path, reason) of the others."""
     size = (0, 0)
-    found: dict[Path, Array] = {}
+    grids: dict[Path, Array] = {}
     missed: list[tuple[str, str]] = []
     for number, path in enumerate(paths, start=1):
         image = read_grey(path)
@@ -161,10 +136,10 @@ def _find_all(
         if isinstance(grid, str):
             missed.append((str(path), grid))
         else:
-            found[path] = grid
+            grids[path] = grid
         if progress is not None:
             progress(number, len(paths), path.name)
-    return size, found, missed
+    return size, grids, missed
 
 
 def _squares_of(board: Target) -> Grid:
@@ -174,16 +149,16 @@ def _squares_of(board: Target) -> Grid:
     return board.grid
 
 
-def _finder(squares: Grid, charuco: CharucoSpec | None, corner_fit: str) -> Finder:
-    if corner_fit not in CORNER_FITS:
-        raise InputError(f"unknown corner fit {corner_fit!r}: choose one of {', '.join(CORNER_FITS)}")
+def _finder(squares: Grid, corners: CharucoSpec | str) -> Finder:
+    if isinstance(corners, str) and corners not in CORNER_FITS:
+        raise InputError(f"unknown corner fit {corners!r}: choose one of {', '.join(CORNER_FITS)}")
     columns, rows, square_m = squares.columns, squares.rows, squares.spacing_m
     if min(columns, rows) < 3:
         raise InputError(f"a board to be found in images needs 3 inner corners a side or more, not {columns} x {rows}")
-    if charuco is None:
-        return lambda image: _measured_chessboard(image, columns, rows, corner_fit)
-    detector = _charuco_detector(charuco, columns, rows, square_m)
-    margin = 0.5 * (1.0 - charuco.marker_m / square_m)  # white around a marker, in squares
+    if isinstance(corners, str):
+        return lambda image: _measured_chessboard(image, columns, rows, corners)
+    detector = _charuco_detector(corners, columns, rows, square_m)
+    margin = 0.5 * (1.0 - corners.marker_m / square_m)  # white around a marker, in squares
     return lambda image: _measured_charuco(image, detector, columns, rows, margin)
 
 

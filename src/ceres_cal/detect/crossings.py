@@ -9,7 +9,7 @@ import numpy as np
 from ceres_cal.base.arrays import Array, Indices, Indices32, Mask
 from ceres_cal.detect.courses import course_at
 from ceres_cal.detect.lines import Lines
-from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.camera import Camera, in_image
 from ceres_cal.scene.curves import distance_to_curve, nearest_on_curve
 from ceres_cal.scene.targets import Target
 
@@ -63,7 +63,7 @@ def find_crossings(target: Target, camera: Camera, lines: Lines) -> Crossings:
         if met is None:
             continue
         pixel = camera.project(point[None])[0] + met[0]
-        if np.all((pixel >= -0.5) & (pixel <= np.array(camera.image_size) - 0.5)):
+        if in_image(pixel, camera.image_size):
             features.append(number)
             pixels.append(pixel)
             sigmas.append(met[1])

@@ -16,9 +16,10 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, Array32, Indices32, Mask
 from ceres_cal.base.errors import InputError
-from ceres_cal.detect.boards import read_grey
+from ceres_cal.detect.images import read_grey
 from ceres_cal.detect.profiles import Windows, cut_windows, fit_profiles, fit_shape
-from ceres_cal.observations import Curves, Observations, Points, View
+from ceres_cal.detect.ring_centre import ring_centre
+from ceres_cal.observations import NO_POINTS, Curves, Observations, View
 from ceres_cal.scene.targets import Target, rings
 
 TARGET_NAME = "rings"
@@ -49,7 +50,7 @@ class RingsDetection:
     Attributes:
         observations: one view, its edges as curve observations.
         centre: (2,) px, where the rings' common centre is seen.
-        found: number of rings, from the inside out; those beyond are outside the image.
+        rings: how many, from the inside out; those beyond are outside the image.
         polynomial: (3,) the paper's a1, a2, a3 (section 2), r' in units of the first ring's measured radius per its
             real one: r' = a1 r + a2 r^2 + a3 r^3 px.
         rms_px: of the rings' radii about that polynomial, in measured pixels.
@@ -58,7 +59,7 @@ class RingsDetection:
 
     observations: Observations
     centre: Array
-    found: int
+    rings: int
     polynomial: Array
     rms_px: float
     blur_px: float
@@ -82,7 +83,7 @@ def detect_rings(
     sheet = rings(radii_m)
     grey = read_grey(image).astype(np.float32)
     try:
-        centre = _centre(grey)
+        centre = ring_centre(grey)
         tracks = _follow(grey, centre, len(radii_m))
         edges, blur = _measured(grey, centre, tracks)
         _require_all_seen(grey, centre, tracks, len(radii_m))
@@ -93,43 +94,6 @@ def detect_rings(
     # The first ring's own middle: farther out, tilt makes the gradients miss the centre.
     own = tracks[0].series[[1, 1 + _HARMONICS]]
     return RingsDetection(observations, centre + own, len(tracks), polynomial, rms, blur)
-
-
-# ---- the centre -----------------------------------------------------------------------------------------------------
-
-
-def _centre(grey: Array32) -> Array:
-    """Where the gradients' lines meet, (2,) px: by votes on a grid, then by least squares."""
-    soft = cv2.GaussianBlur(grey, (0, 0), 1.5)
-    gradient = np.dstack([cv2.Sobel(soft, cv2.CV_32F, 1, 0), cv2.Sobel(soft, cv2.CV_32F, 0, 1)]).astype(float)
-    strength = np.hypot(gradient[..., 0], gradient[..., 1])
-    strong = np.argwhere(strength > 0.3 * np.quantile(strength, 0.99))
-    if not len(strong) or strength.max() < 1e-3:
-        raise InputError("no rings found: the picture has no edges: take it in better light")
-    chosen = strong[np.random.default_rng(0).permutation(len(strong))[:20_000]]
-    places = chosen[:, ::-1].astype(float)
-    direction = gradient[chosen[:, 0], chosen[:, 1]] / strength[chosen[:, 0], chosen[:, 1], None]
-    normal = np.column_stack([-direction[:, 1], direction[:, 0]])
-    centre = _voted(places[:2000], normal[:2000], grey.shape)
-    for scale in (20.0, 10.0, 5.0, 3.0, 3.0, 3.0, 3.0):
-        away = np.sum((places - centre) * normal, axis=1)
-        weight = 1.0 / (1.0 + (away / scale) ** 2) ** 2
-        weighted = normal * weight[:, None]
-        centre = centre + np.linalg.solve(weighted.T @ normal + 1e-9 * np.eye(2), weighted.T @ away)
-    share = float(np.mean(np.abs(np.sum((places - centre) * normal, axis=1)) < 6.0))
-    if share < 0.3:
-        raise InputError(
-            "no concentric rings found: edges point to no common centre: let the rings fill most of the picture"
-        )
-    return np.asarray(centre)
-
-
-def _voted(places: Array, normal: Array, shape: tuple[int, ...]) -> Array:
-    step = max(shape) / 60.0
-    y, x = np.mgrid[0.0 : shape[0] : step, 0.0 : shape[1] : step]
-    grid = np.column_stack([x.ravel(), y.ravel()])
-    away = np.abs(grid @ normal.T - np.sum(places * normal, axis=1))
-    return np.asarray(grid[np.argmax(np.sum(away < step, axis=1))])
 
 
 # ---- following ring after ring --------------------------------------------------------------------------------------
@@ -366,12 +330,11 @@ def _polynomial(edges: _Edges, centre: Array, radii_m: Array) -> tuple[Array, fl
 
 def _observations(edges: _Edges, sheet: Target, grey: Array32, frame: str, camera: str, station: str) -> Observations:
     count = len(edges.ring)
-    none = np.empty(0, dtype=np.int32)
     size = (int(grey.shape[1]), int(grey.shape[0]))
     return Observations(
         {TARGET_NAME: sheet},
         {camera: size},
         (View(frame, camera, station, TARGET_NAME, frame),),
-        Points(none, none, np.empty((0, 2)), np.empty(0)),
+        NO_POINTS,
         Curves(np.zeros(count, np.int32), edges.ring, edges.pixels, edges.sigma_px, np.zeros(count, np.int8)),
     )

@@ -168,7 +168,7 @@ def _first_guess(patches: _Patches, corners: Array, along_row: Array, along_colu
 
 
 def _model(params: Array, patches: _Patches) -> tuple[Array, Array]:
-    """Grey levels (n, pixels) and their derivatives (n, pixels, 11) by the parameters (n, 11)."""
+    """Array32 levels (n, pixels) and their derivatives (n, pixels, 11) by the parameters (n, 11)."""
     dx, dy = patches.x - params[:, _X, None], patches.y - params[:, _Y, None]
     sharp = params[:, _SHARP, None]
     contrast = _plane(params, _CONTRAST, dx, dy)

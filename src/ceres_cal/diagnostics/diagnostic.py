@@ -11,7 +11,7 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask
-from ceres_cal.base.digits import two_digits
+from ceres_cal.base.words import two_digits
 from ceres_cal.calibration import Calibration
 from ceres_cal.diagnostics.equations import Equations
 from ceres_cal.diagnostics.findings import Amount, Finding, Wrong

@@ -19,12 +19,12 @@ from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import read_bytes, write_bytes
 from ceres_cal.formats.export_format import Exported, ExportFormat, ExportRequest, Loss
 from ceres_cal.formats.loss import field_error_mm
+from ceres_cal.scene.heights import HEIGHTS_M
 
 if TYPE_CHECKING:
     from ceres_cal.scene.camera import Camera
 
 FILE_FORMAT, VERSION = "ceres-cal/table", 1
-HEIGHTS_M = (0.0, 0.15)  # at which the error is stated
 _STEPS_PX = (64, 32, 16, 8, 4, 2, 1)
 
 

@@ -2,7 +2,6 @@
 
 from ceres_cal.moves.checking import FALSE_ALARMS, Check, StationCheck, check
 from ceres_cal.moves.comparison import StationComparison, compare
-from ceres_cal.moves.picture import picture
 from ceres_cal.moves.refitting import movements, refit
 
 __all__ = [
@@ -13,6 +12,5 @@ __all__ = [
     "check",
     "compare",
     "movements",
-    "picture",
     "refit",
 ]

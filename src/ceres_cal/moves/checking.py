@@ -24,12 +24,12 @@ from ceres_cal.moves.poses import Place, PoseSearch, movement, places
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights, gather_sights
 from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.heights import HEIGHTS_M
 from ceres_cal.solve import Problem, Weighting, information, solve
 from ceres_cal.uncertainty.maps import shown_pixels
 from ceres_cal.uncertainty.uncertainty import field_grid
 
 FALSE_ALARMS = 0.01
-HEIGHTS_M = (0.0, 0.15)
 # Of 2000 clean distances to a curve one is longer. At half of it too many good ones go, and false alarms rise (0.05
 # -> 0.075 of 80 cases); at double nothing changes.
 _INLIER_SIGMA = 3.5

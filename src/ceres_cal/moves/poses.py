@@ -23,17 +23,19 @@ from ceres_cal.solve import Weighting, placement_costs
 from ceres_cal.start.closed_forms import fit_lines, pose_from_homography
 from ceres_cal.start.planes import plane_sight
 
-# Standard deviations: scale of the loss while a candidate is far off, 20 px and 4 px at 0.3 px of noise.
+# Standard deviations: scale of the loss while a candidate is far off, 20 px and 4 px at 0.3 px of noise. Nothing
+# changes from half to double.
 _WIDE = (60.0, 12.0)
 _FARTHEST_M = 1e3
 _GRID_DEG = (-24.0, 0.0, 24.0)  # of turns about each axis of the camera; neighbours' basins overlap
 # Share of observations that may be anywhere in the image: as many as are wrong in the simulated days of
-# scripts/moves.py.
+# scripts/moves.py. Nothing changes from half to double.
 _STRAY = 0.05
-# m and rad: candidates nearer than this end in one minimum.
+# m and rad: candidates nearer than this end in one minimum. Nothing changes from half to double.
 _ALIKE = (0.02, 0.01)
 # A pose fits where that share of the observations lies within so many standard deviations, at a noise of at most so
-# many times that of the calibration: up to 40 % may be wrong.
+# many times that of the calibration: up to 40 % may be wrong. Nothing changes but at a noise of twice: another iris
+# then fits no pose, and is not named.
 _FITS_SHARE, _FITS_SIGMA, _FITS_SCALE = 0.6, 5.0, 4.0
 _ROUNDS = 4  # of the closed form's reweighting
 

@@ -2,10 +2,10 @@
 
 from ceres_cal.photographs.clicks import Clicks, load_clicks
 from ceres_cal.photographs.facing import SIDES, Facing
-from ceres_cal.photographs.field import FieldDetections, detect_field
+from ceres_cal.photographs.field import FieldDetections, FieldOptions, detect_field
 from ceres_cal.photographs.follow import Followed, follow
 from ceres_cal.photographs.known import KnownDetections, check_photographs, detect_known
-from ceres_cal.photographs.search import Auto, Searched
+from ceres_cal.photographs.search import Auto, SearchResult
 
 __all__ = [
     "SIDES",
@@ -13,9 +13,10 @@ __all__ = [
     "Clicks",
     "Facing",
     "FieldDetections",
+    "FieldOptions",
     "Followed",
     "KnownDetections",
-    "Searched",
+    "SearchResult",
     "check_photographs",
     "detect_field",
     "detect_known",

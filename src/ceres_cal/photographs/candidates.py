@@ -12,7 +12,7 @@ from ceres_cal.base.transforms import Pose, rotation_log
 from ceres_cal.detect.registration import nearness_to
 from ceres_cal.detect.strokes import drawn, find_strokes
 from ceres_cal.photographs.grid import Grid, grid_of, offsets_of
-from ceres_cal.photographs.matching import FloorLines, Match, Picture, lines_seen, match
+from ceres_cal.photographs.matching import FloorLines, Match, StrokeMap, lines_seen, match
 from ceres_cal.photographs.upright import Upright, find_upright
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Radial
@@ -25,13 +25,13 @@ _UPRIGHTS = 4  # answers for lens and tilt, at most, that are matched
 _SURE = 0.88
 _POWERS = (2, 3, 4, 5)
 # Of the best match's score: another's, and that of another way to take the picture. Nothing changes from 0.6 to 0.86.
-_WORTH_A_LOOK, _ALIKE = 0.75, 0.9
+_COMPARABLE, _ALIKE = 0.75, 0.9
 _MOST, _MOST_ALIKE = 3, 5
 _SAME_PLACE, _SAME_TURN = 0.08, 0.1  # in heights, rad
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class FieldSearch:
     """A photograph and the target that it may show.
 
     Attributes:
@@ -39,7 +39,7 @@ class Seen:
     """
 
     grey: Array32
-    picture: Picture
+    stroke_map: StrokeMap
     grid: Grid
     turns: tuple[Pose, ...]
 
@@ -53,7 +53,7 @@ class Seen:
         return self.grid.curves
 
 
-def see(grey: Array32, target: Target, curves: Collection[str]) -> Seen:
+def prepare_search(grey: Array32, target: Target, curves: Collection[str]) -> FieldSearch:
     """The strokes of a photograph, beside what they are to be taken for.
 
     Raises:
@@ -62,35 +62,36 @@ def see(grey: Array32, target: Target, curves: Collection[str]) -> Seen:
     grid = grid_of(target, curves)
     size = (int(grey.shape[1]), int(grey.shape[0]))
     strokes = find_strokes(grey)
-    picture = Picture(strokes, nearness_to(drawn(strokes, size)), size, 0.5 * (np.array(size) - 1.0))
-    return Seen(grey, picture, grid, tuple(turns_of(target, curves)))
+    stroke_map = StrokeMap(strokes, nearness_to(drawn(strokes, size)), size, 0.5 * (np.array(size) - 1.0))
+    return FieldSearch(grey, stroke_map, grid, tuple(turns_of(target, curves)))
 
 
-def candidates(seen: Seen) -> list[Camera]:
+def candidates(search: FieldSearch) -> list[Camera]:
     """Cameras that may have taken it, the best first, each once for all turns of the target."""
-    found: list[tuple[float, Camera]] = []
-    for upright in find_upright(seen.picture.ends, seen.picture.strokes.length_px, _UPRIGHTS):
-        optics = _optics(upright, seen.picture)
-        matches = match(upright, seen.picture, seen.grid, lines_seen(upright, seen.picture))
-        found += [(one.score, _posed(optics, one)) for one in matches]
-        if found and max(score for score, _ in found) > _SURE:
+    scored: list[tuple[float, Camera]] = []
+    for upright in find_upright(search.stroke_map.ends, search.stroke_map.strokes.length_px, _UPRIGHTS):
+        optics = _optics(upright, search.stroke_map)
+        matches = match(upright, search.stroke_map, search.grid, lines_seen(upright, search.stroke_map))
+        scored += [(one.score, _posed(optics, one)) for one in matches]
+        if scored and max(score for score, _ in scored) > _SURE:
             break
-    return _distinct(sorted(found, key=lambda one: -one[0]), seen.turns, _WORTH_A_LOOK)[:_MOST]
+    return _distinct(sorted(scored, key=lambda one: -one[0]), search.turns, _COMPARABLE)[:_MOST]
 
 
-def alike(seen: Seen, camera: Camera, found: Collection[str]) -> list[Camera]:
+def alike(search: FieldSearch, camera: Camera, detected: Collection[str]) -> list[Camera]:
     """Other cameras with about these optics, turned by quarters, moved, higher or lower, that may have taken it too.
 
     Args:
-        camera: that may have. found: names of the curves that were found from there.
+        camera: that may have. detected: names of the curves that were found from there.
     """
-    picture, upright = replace(seen.picture, centre=np.array(camera.principal_point)), _upright_of(camera, seen)
-    x, y = camera.position[:2] @ seen.grid.turn
-    along, across = offsets_of(seen.target, found, seen.grid.turn)
+    stroke_map = replace(search.stroke_map, centre=np.array(camera.principal_point))
+    upright = _upright_of(camera, search)
+    x, y = camera.position[:2] @ search.grid.turn
+    along, across = offsets_of(search.target, detected, search.grid.turn)
     lines = FloorLines((across - x) / camera.position[2], (along - y) / camera.position[2])
-    optics = _optics(upright, picture)
-    others = [(one.score, _posed(optics, one)) for one in match(upright, picture, seen.grid, lines)]
-    return _distinct(others, seen.turns, _ALIKE, camera)
+    optics = _optics(upright, stroke_map)
+    others = [(one.score, _posed(optics, one)) for one in match(upright, stroke_map, search.grid, lines)]
+    return _distinct(others, search.turns, _ALIKE, camera)
 
 
 def _posed(optics: Camera, one: Match) -> Camera:
@@ -100,25 +101,25 @@ def _posed(optics: Camera, one: Match) -> Camera:
 # ---- one coefficient and lenses -------------------------------------------------------------------------------------
 
 
-def _optics(upright: Upright, picture: Picture) -> Camera:
+def _optics(upright: Upright, stroke_map: StrokeMap) -> Camera:
     """A camera with the polynomial that is nearest to the one coefficient, over the image."""
     share = np.linspace(0.0, 1.02, 60)  # of half the image's diagonal
     ideal = share / (1.0 + upright.bend * share**2)
     values = np.linalg.lstsq(share[:, None] ** np.array(_POWERS), ideal - share, rcond=None)[0]
-    lens = Radial(tuple(values / picture.unit_px ** (np.array(_POWERS) - 1.0)), _POWERS)
-    x, y = picture.centre
-    return Camera(picture.image_size, upright.phi * picture.unit_px, (float(x), float(y)), lens)
+    lens = Radial(tuple(values / stroke_map.unit_px ** (np.array(_POWERS) - 1.0)), _POWERS)
+    x, y = stroke_map.centre
+    return Camera(stroke_map.image_size, upright.phi * stroke_map.unit_px, (float(x), float(y)), lens)
 
 
-def _upright_of(camera: Camera, seen: Seen) -> Upright:
+def _upright_of(camera: Camera, search: FieldSearch) -> Upright:
     """A camera's turn, and the one coefficient that is nearest to its lens."""
-    share, unit = np.linspace(0.1, 1.0, 30), seen.picture.unit_px
+    share, unit = np.linspace(0.1, 1.0, 30), search.stroke_map.unit_px
     rays = camera.lens.undistort(np.column_stack([share * unit, np.zeros(30)]), camera.phi)
     ahead = np.isfinite(rays[:, 2]) & (rays[:, 2] > 0.0)
     stretch = share[ahead] * unit * rays[ahead, 2] / (camera.phi * rays[ahead, 0]) - 1.0  # c p^2
     bend = float(stretch @ share[ahead] ** 2 / np.sum(share[ahead] ** 4))
     turn = np.eye(3)
-    turn[:2, :2] = seen.grid.turn
+    turn[:2, :2] = search.grid.turn
     return Upright(bend, camera.phi / unit, camera.cam_from_world.rotation @ turn, 1.0)
 
 
@@ -126,12 +127,12 @@ def _upright_of(camera: Camera, seen: Seen) -> Upright:
 
 
 def _distinct(
-    found: Sequence[tuple[float, Camera]], turns: Sequence[Pose], least: float, known: Camera | None = None
+    scored: Sequence[tuple[float, Camera]], turns: Sequence[Pose], least: float, known: Camera | None = None
 ) -> list[Camera]:
     """The best of those that put the target elsewhere, whatever its turn, and not where it is known; best first."""
     chosen: list[Camera] = [] if known is None else [known]
-    for score, camera in found:
-        if len(chosen) > _MOST_ALIKE or score < least * found[0][0]:
+    for score, camera in scored:
+        if len(chosen) > _MOST_ALIKE or score < least * scored[0][0]:
             break
         if not any(_same_place(camera, other, turns) for other in chosen):
             chosen.append(camera)

@@ -14,8 +14,8 @@ from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import DegenerateError, InputError
 from ceres_cal.base.files import check_header, convert, read_json
 from ceres_cal.observations import Prior
-from ceres_cal.photographs.follow import Freedom
-from ceres_cal.photographs.refit import CAMERA, Shown
+from ceres_cal.photographs.follow import FreeIntrinsics
+from ceres_cal.photographs.refit import CAMERA, PointHints
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Radial
 from ceres_cal.scene.targets import Target
@@ -70,7 +70,9 @@ def clicks_from_json(data: Mapping[str, Any], where: str) -> Clicks:
         raise InputError(f"{where}: {error}") from None
 
 
-def starts_from_clicks(clicks: Clicks, target: Target, image_size: tuple[int, int]) -> tuple[list[Camera], Freedom]:
+def starts_from_clicks(
+    clicks: Clicks, target: Target, image_size: tuple[int, int]
+) -> tuple[list[Camera], FreeIntrinsics]:
     """Posed cameras of several lenses that the clicks may belong to, and what is free to be told by the photograph.
 
     Raises:
@@ -97,17 +99,17 @@ def starts_from_clicks(clicks: Clicks, target: Target, image_size: tuple[int, in
             raise InputError("the points to start from go round the wrong way, as if seen from below: check names")
         cameras.append(Camera(image_size, phi, (float(middle[0]), float(middle[1])), lens, 1.0, pose))
     phi = float(np.median([camera.phi for camera in cameras]))
-    return cameras, unknown_optics(image_size, phi, Shown(index, pixels, np.full(len(index), SIGMA_PX)))
+    return cameras, unknown_optics(image_size, phi, PointHints(index, pixels, np.full(len(index), SIGMA_PX)))
 
 
-def unknown_optics(image_size: tuple[int, int], phi: float, shown: Shown) -> Freedom:
+def unknown_optics(image_size: tuple[int, int], phi: float, hints: PointHints) -> FreeIntrinsics:
     """What a photograph may tell of a camera of which nothing is known but, roughly, its phi and where points are."""
     middle = 0.5 * (np.array(image_size) - 1.0)
     priors = (
         Prior("camera", CAMERA, "phi", (phi,), (0.5 * phi,)),
         Prior("camera", CAMERA, "principal_point", tuple(middle), (0.04 * image_size[0],) * 2),
     )
-    return Freedom(_FREED, priors, shown)
+    return FreeIntrinsics(_FREED, priors, hints)
 
 
 def _phi(homography: Array, half_px: float) -> float:

@@ -1,4 +1,4 @@
-"""Which way round: what settles which of a target's turns a photograph shows."""
+"""Which way round: the turns in which a target looks alike, and which of them a photograph shows."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def facing_cosine(facing: Facing, camera: Camera, target: Target, curves: Collec
     return float(way @ towards / np.linalg.norm(way) / max(float(np.linalg.norm(towards)), 1e-9))
 
 
-def settled_by_facing(
+def agreeing_with_facing(
     cameras: Sequence[Camera], facings: Sequence[Facing], target: Target, curves: Collection[str]
 ) -> list[int]:
     """Numbers of the cameras for which every feature lies towards its side."""
@@ -85,7 +85,7 @@ def settled_by_facing(
     return [int(n) for n in np.flatnonzero((worst > _FACES) & (worst >= worst.max(initial=0.0) - _AS_WELL))]
 
 
-def settled_by_before(cameras: Sequence[Camera], before: Camera) -> list[int]:
+def nearest_to_before(cameras: Sequence[Camera], before: Camera) -> list[int]:
     """Numbers of the cameras that are turned least from the one before, and of those turned little more."""
     angles = [
         float(np.linalg.norm(rotation_log(one.cam_from_world.rotation @ before.cam_from_world.rotation.T)))
@@ -101,7 +101,7 @@ def side_of(feature: str, camera: Camera, target: Target, curves: Collection[str
     return max(four, key=lambda side: facing_cosine(Facing(feature, side), camera, target, curves))
 
 
-def telling_feature(target: Target, curves: Collection[str]) -> str:
+def distinguishing_feature(target: Target, curves: Collection[str]) -> str:
     """The painted curve whose middle lies farthest from the target's: to say by it which way round the target is."""
     middle = middle_of(target, curves)[:2]
     return max(curves, key=lambda name: round(float(np.linalg.norm(_place(name, target) - middle)), 6))

@@ -10,12 +10,12 @@ import numpy as np
 from ceres_cal.base.arrays import Array, Array32
 from ceres_cal.base.errors import CalibrationError
 from ceres_cal.calibrating import calibrate
-from ceres_cal.detect.courses import clear_px, predict
+from ceres_cal.detect.courses import Course, clear_px, predict
 from ceres_cal.detect.lines import SPACING_PX, Lines, measure, search, window_px
 from ceres_cal.detect.registration import nearness, shifted
 from ceres_cal.model.parameters import Options
-from ceres_cal.observations import Prior
-from ceres_cal.photographs.refit import Shown, observations_of, refit_camera
+from ceres_cal.observations import Observations, Prior
+from ceres_cal.photographs.refit import PointHints, observations_of, refit_camera
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import LENSES
 from ceres_cal.scene.targets import Target
@@ -38,17 +38,17 @@ _AT_REST_PX = 0.02
 
 
 @dataclass(frozen=True, eq=False)
-class Freedom:
+class FreeIntrinsics:
     """What of the camera a photograph may change besides the pose.
 
     Attributes:
         names: of the free intrinsics, in the order in which they are freed. priors: that hold them.
-        shown: points that somebody showed, which hold the camera while lines are far off.
+        hints: points that somebody showed, which hold the camera while lines are far off.
     """
 
     names: tuple[str, ...] = ()
     priors: tuple[Prior, ...] = ()
-    shown: Shown | None = None
+    hints: PointHints | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,8 +74,8 @@ class Followed:
         """The curves in view of which next to nothing was found."""
         curve, found = self.lines.course.curve, self.lines.found
         numbers, places = np.unique(curve, return_counts=True)
-        seen = np.array([np.count_nonzero(found[curve == number]) for number in numbers])
-        return tuple(int(number) for number in numbers[seen < _ABSENT * places])
+        counts = np.array([np.count_nonzero(found[curve == number]) for number in numbers])
+        return tuple(int(number) for number in numbers[counts < _ABSENT * places])
 
     @property
     def holds(self) -> bool:
@@ -85,7 +85,7 @@ class Followed:
 
 
 def follow(
-    grey: Array32, target: Target, starts: Sequence[Camera], curves: Collection[str], freedom: Freedom | None = None
+    grey: Array32, target: Target, starts: Sequence[Camera], curves: Collection[str], free: FreeIntrinsics | None = None
 ) -> Followed:
     """Follow a target's painted curves in a photograph, from the best of several starts.
 
@@ -97,99 +97,117 @@ def follow(
     Returns:
         The best that was reached; whether it is the field, `Followed.holds` tells.
     """
-    freedom = freedom or Freedom()
+    tracker = _Tracker(grey, target, curves, free or FreeIntrinsics())
     tried: list[Followed] = []
-    if freedom.shown is None:
-        tried = [_close_in(grey, target, camera, curves, freedom, _NEAR_REACHES_PX) for camera in starts[:1]]
+    if tracker.free.hints is None:
+        tried = [tracker.close_in(camera, _NEAR_REACHES_PX) for camera in starts[:1]]
         if tried[0].holds and tried[0].share >= _SURE_SHARE:
             return tried[0]
-    for camera in _candidates(grey, target, starts, curves, freedom):
-        tried.append(_close_in(grey, target, camera, curves, freedom, _FAR_REACHES_PX))
+    for camera in tracker.shifted_starts(starts):
+        tried.append(tracker.close_in(camera, _FAR_REACHES_PX))
         if tried[-1].holds and tried[-1].share >= _SURE_SHARE:
             break
-    tried = tried or [_close_in(grey, target, starts[0], curves, freedom, ())]  # as it is: nothing to search
+    tried = tried or [tracker.close_in(starts[0], ())]  # as it is: nothing to search
     best = max(tried, key=lambda one: (one.holds, one.share))
-    return _with_its_lens(grey, target, best, curves) if best.holds and freedom.names else best
+    return tracker.with_best_lens(best) if best.holds and tracker.free.names else best
 
 
-# ---- near enough to search ------------------------------------------------------------------------------------------
+@dataclass(frozen=True, eq=False)
+class _Tracker:
+    """A photograph, the target's painted curves that are followed in it, and what of the camera is free."""
 
+    grey: Array32
+    target: Target
+    curves: Collection[str]
+    free: FreeIntrinsics
 
-def _candidates(
-    grey: Array32, target: Target, starts: Sequence[Camera], curves: Collection[str], freedom: Freedom
-) -> list[Camera]:
-    """Cameras that put the lines near something thin and bright, the best first."""
-    courses = [predict(target, camera, curves, _ROUGH_SPACING_PX) for camera in starts]
-    known = [number for number, course in enumerate(courses) if len(course) >= _FEWEST]
-    if not known:
-        return []
-    width = float(np.median(courses[known[0]].width_px))
-    near = nearness(grey, max(width, 2.0))
-    known.sort(key=lambda number: -near.score(courses[number].pixels))
-    found = []
-    if freedom.shown is None:
-        camera, wide = starts[known[0]], predict(target, starts[known[0]], curves, _ROUGH_SPACING_PX, -FAR_PX)
+    def shifted_starts(self, starts: Sequence[Camera]) -> list[Camera]:
+        """Cameras that put the lines near something thin and bright, the best first."""
+        courses = [self._predicted(camera) for camera in starts]
+        usable = [number for number, course in enumerate(courses) if len(course) >= _FEWEST]
+        if not usable:
+            return []
+        width = float(np.median(courses[usable[0]].width_px))
+        near = nearness(self.grey, max(width, 2.0))
+        usable.sort(key=lambda number: -near.score(courses[number].pixels))
+        if self.free.hints is not None:
+            return [starts[number] for number in usable[:_CANDIDATES]]
+        camera = starts[usable[0]]
+        wide, sigma_px = self._predicted(camera, -FAR_PX), 5.0
+        refitted = []
         for places in shifted(wide, near, camera.image_size, FAR_PX, _CANDIDATES):
-            moved = observations_of(target, camera.image_size, wide.curve, places, np.full(len(wide), 5.0))
-            found.append(refit_camera(camera, moved) or camera)
-        return found
-    return [starts[number] for number in known[:_CANDIDATES]]
+            moved = observations_of(self.target, camera.image_size, wide.curve, places, np.full(len(wide), sigma_px))
+            refitted.append(refit_camera(camera, moved) or camera)
+        return refitted
 
+    def close_in(self, camera: Camera, reaches_px: Sequence[float]) -> Followed:
+        """Search ever nearer, freeing one intrinsic after the other; then measure and refit until at rest."""
+        for number, reach in enumerate(reaches_px):
+            names = self.free.names[: max(0, 2 * number - 1)]
+            camera = self._search_step(camera, names, reach) or camera
+        lines, moved = self._measured(camera), np.inf
+        for _ in range(_ROUNDS):
+            if np.count_nonzero(lines.found) < _FEWEST:
+                break
+            refitted = refit_camera(camera, self._observed(lines, camera), self.free.names, self.free.priors)
+            if refitted is None:
+                break
+            moved = _moved_px(camera, refitted, lines.course.pixels)
+            camera, lines = refitted, self._measured(refitted)
+            if moved < _AT_REST_PX:
+                break
+        return Followed(camera, lines, moved)
 
-# ---- closing in -----------------------------------------------------------------------------------------------------
+    def with_best_lens(self, followed: Followed) -> Followed:
+        """What is found when the lines are predicted with the kind of lens that suits them best.
 
+        A polynomial that is a pixel off bends what crossings are extrapolated along.
+        """
+        lines, fits = followed.lines, []
+        observations = self._observed(lines, followed.camera)
+        for kind, lens in LENSES.items():
+            try:
+                calibration = calibrate(observations, Options(lens=kind, powers=(lens.trial_powers or ((),))[-1]))
+            except CalibrationError:
+                continue
+            fits.append((calibration.fit.curve_scale * len(lines.found) / calibration.fit.curves, calibration))
+        if not fits:
+            return followed
+        camera = min(fits, key=lambda fit: fit[0])[1].station()
+        lines = self._measured(camera)
+        refined = Followed(camera, lines, _moved_px(followed.camera, camera, lines.course.pixels))
+        return refined if refined.holds and refined.share > followed.share - 0.02 else followed
 
-def _close_in(
-    grey: Array32,
-    target: Target,
-    camera: Camera,
-    curves: Collection[str],
-    freedom: Freedom,
-    reaches_px: Sequence[float],
-) -> Followed:
-    for number, reach in enumerate(reaches_px):
-        free = freedom.names[: max(0, 2 * number - 1)]
-        camera = _searched(grey, target, camera, curves, freedom, free, reach) or camera
-    lines, moved = _measured(grey, target, camera, curves), np.inf
-    for _ in range(_ROUNDS):
-        found = lines.found
-        if np.count_nonzero(found) < _FEWEST:
-            break
-        seen = observations_of(
-            target, camera.image_size, lines.course.curve[found], lines.pixels[found], lines.sigma_px[found]
+    def _search_step(self, camera: Camera, names: tuple[str, ...], reach_px: float) -> Camera | None:
+        """The camera refitted to what is brightest along the normals; None where too little is."""
+        course = self._predicted(camera, 2.0)
+        if len(course) < _FEWEST:
+            return None
+        offset, bright = search(self.grey, course, reach_px, 0.6 * reach_px)
+        clear = bright > 0.4 * float(np.quantile(bright, 0.8))
+        if np.count_nonzero(clear) < _FEWEST:
+            return None
+        course, offset = course.take(clear), offset[clear]
+        places = course.pixels + offset[:, None] * course.normals
+        sigma = np.full(len(course), max(0.1 * reach_px, 0.5))
+        hints = self.free.hints if reach_px > 10.0 else None
+        observations = observations_of(self.target, camera.image_size, course.curve, places, sigma, hints)
+        return refit_camera(camera, observations, names, self.free.priors)
+
+    def _predicted(self, camera: Camera, margin_px: float = 0.0) -> Course:
+        return predict(self.target, camera, self.curves, _ROUGH_SPACING_PX, margin_px)
+
+    def _measured(self, camera: Camera) -> Lines:
+        course = predict(self.target, camera, self.curves, SPACING_PX, SPACING_PX)
+        clear = clear_px(self.target, camera, course, self.curves) > window_px(course)
+        return measure(self.grey, course.take(clear), _LAST_REACH_PX)
+
+    def _observed(self, lines: Lines, camera: Camera) -> Observations:
+        """The places where paint was found, as one view."""
+        rows = lines.found
+        return observations_of(
+            self.target, camera.image_size, lines.course.curve[rows], lines.pixels[rows], lines.sigma_px[rows]
         )
-        refitted = refit_camera(camera, seen, freedom.names, freedom.priors)
-        if refitted is None:
-            break
-        moved = _moved_px(camera, refitted, lines.course.pixels)
-        camera, lines = refitted, _measured(grey, target, refitted, curves)
-        if moved < _AT_REST_PX:
-            break
-    return Followed(camera, lines, moved)
-
-
-def _with_its_lens(grey: Array32, target: Target, followed: Followed, curves: Collection[str]) -> Followed:
-    """What is found when the lines are predicted with the kind of lens that suits them best.
-
-    A polynomial that is a pixel off bends what crossings are extrapolated along.
-    """
-    lines, fits = followed.lines, []
-    found = lines.found
-    seen = observations_of(
-        target, followed.camera.image_size, lines.course.curve[found], lines.pixels[found], lines.sigma_px[found]
-    )
-    for kind, lens in LENSES.items():
-        try:
-            calibration = calibrate(seen, Options(lens=kind, powers=(lens.trial_powers or ((),))[-1]))
-        except CalibrationError:
-            continue
-        fits.append((calibration.fit.curve_scale * len(lines.found) / calibration.fit.curves, calibration))
-    if not fits:
-        return followed
-    camera = min(fits, key=lambda fit: fit[0])[1].station()
-    lines = _measured(grey, target, camera, curves)
-    refined = Followed(camera, lines, _moved_px(followed.camera, camera, lines.course.pixels))
-    return refined if refined.holds and refined.share > followed.share - 0.02 else followed
 
 
 def _moved_px(camera: Camera, refitted: Camera, pixels: Array) -> float:
@@ -197,33 +215,3 @@ def _moved_px(camera: Camera, refitted: Camera, pixels: Array) -> float:
     floor = camera.locate(pixels)
     moved = refitted.project(np.column_stack([floor, np.zeros(len(floor))])) - pixels
     return float(np.nanmax(np.linalg.norm(moved, axis=1), initial=0.0))
-
-
-def _searched(
-    grey: Array32,
-    target: Target,
-    camera: Camera,
-    curves: Collection[str],
-    freedom: Freedom,
-    free: tuple[str, ...],
-    reach_px: float,
-) -> Camera | None:
-    course = predict(target, camera, curves, _ROUGH_SPACING_PX, 2.0)
-    if len(course) < _FEWEST:
-        return None
-    offset, bright = search(grey, course, reach_px, 0.6 * reach_px)
-    clear = bright > 0.4 * float(np.quantile(bright, 0.8))
-    if np.count_nonzero(clear) < _FEWEST:
-        return None
-    course, offset = course.take(clear), offset[clear]
-    places = course.pixels + offset[:, None] * course.normals
-    sigma = np.full(len(course), max(0.1 * reach_px, 0.5))
-    shown = freedom.shown if reach_px > 10.0 else None
-    seen = observations_of(target, camera.image_size, course.curve, places, sigma, shown)
-    return refit_camera(camera, seen, free, freedom.priors)
-
-
-def _measured(grey: Array32, target: Target, camera: Camera, curves: Collection[str]) -> Lines:
-    course = predict(target, camera, curves, SPACING_PX, SPACING_PX)
-    clear = clear_px(target, camera, course, curves) > window_px(course)
-    return measure(grey, course.take(clear), _LAST_REACH_PX)

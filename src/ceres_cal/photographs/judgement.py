@@ -6,7 +6,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.detect.courses import predict
-from ceres_cal.photographs.candidates import Seen
+from ceres_cal.photographs.candidates import FieldSearch
 from ceres_cal.photographs.follow import LEAST_SHARE, Followed
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.targets import Target
@@ -43,17 +43,17 @@ def why_missed(followed: Followed, target: Target, *, started: bool) -> str:
     return f"its lines were not found{share}: check the target's dimensions and which lines are painted, or {elsewhere}"
 
 
-def doubt(seen: Seen, followed: Followed) -> str:
+def objection(search: FieldSearch, followed: Followed) -> str:
     """What speaks against taking what was followed for the field, or nothing."""
     if not followed.holds:
-        return why_missed(followed, seen.target, started=False)
-    names = told(seen, followed)
-    if len(names) < _FEWEST_CURVES or not _spread(seen, names):
+        return why_missed(followed, search.target, started=False)
+    names = detected_curves(search, followed)
+    if len(names) < _FEWEST_CURVES or not _in_two_directions(search, names):
         return f"only {', '.join(names)} would be in the picture: too little to find a field by; start from corners"
-    phi = followed.camera.phi / seen.picture.unit_px
+    phi = followed.camera.phi / search.stroke_map.unit_px
     if -followed.camera.cam_from_world.rotation[2, 2] < _LEAST_UPRIGHT or not PHI_RANGE[0] < phi < PHI_RANGE[1]:
         return "its lines were not found in any view from above: start from corners"
-    share = explained(seen, followed.camera)
+    share = explained(search, followed.camera)
     if share < _EXPLAINED:
         return (
             f"of the bright lines where the field would be, only {100.0 * share:.0f} % are lines of it: "
@@ -62,36 +62,36 @@ def doubt(seen: Seen, followed: Followed) -> str:
     return ""
 
 
-def worth(seen: Seen, camera: Camera) -> float:
-    """Twice what the target covers of the strokes, over strokes and target in view together, in px: about 1 at best."""
-    course = predict(seen.target, camera, seen.curves, _COURSE_PX)
-    shown = _COURSE_PX * len(course)
-    covered = seen.picture.near.score(course.pixels) * shown if len(course) else 0.0
-    return 2.0 * covered / (shown + float(np.sum(seen.picture.strokes.length_px)))
+def dice(search: FieldSearch, camera: Camera) -> float:
+    """Dice's coefficient of strokes and target, by length: twice what one covers of the other, over both together."""
+    course = predict(search.target, camera, search.curves, _COURSE_PX)
+    in_view = _COURSE_PX * len(course)
+    covered = search.stroke_map.near.score(course.pixels) * in_view if len(course) else 0.0
+    return 2.0 * covered / (in_view + float(np.sum(search.stroke_map.strokes.length_px)))
 
 
-def explained(seen: Seen, camera: Camera) -> float:
+def explained(search: FieldSearch, camera: Camera) -> float:
     """Of the strokes inside the target's outline, the share (by length) that lies on its curves."""
-    strokes = seen.picture.strokes
+    strokes = search.stroke_map.strokes
     middles = strokes.ends.mean(axis=1)
-    places = seen.grid.outline
+    places = search.grid.outline
     margin = _RIM * np.ptp(places, axis=0)
-    floor = camera.locate(middles) @ seen.grid.turn
+    floor = camera.locate(middles) @ search.grid.turn
     with np.errstate(invalid="ignore"):
         inside = np.all((floor > places.min(axis=0) - margin) & (floor < places.max(axis=0) + margin), axis=1)
-    course = predict(seen.target, camera, seen.curves, _COURSE_PX)
+    course = predict(search.target, camera, search.curves, _COURSE_PX)
     if not np.any(inside) or not len(course):
         return 0.0
     away = np.min(np.linalg.norm(middles[inside, None] - course.pixels, axis=2), axis=1)
     return float(np.average(away < _NEAR_PX, weights=strokes.length_px[inside]))
 
 
-def same_labels(seen: Seen, one: Followed, other: Followed) -> bool:
+def same_labels(search: FieldSearch, one: Followed, other: Followed) -> bool:
     """Whether two put what is seen onto the same places of the target, whatever its turn."""
     pixels = one.lines.pixels[one.lines.found]
     here, there = (np.column_stack([c.locate(pixels), np.zeros(len(pixels))]) for c in (one.camera, other.camera))
     extent = float(np.max(np.ptp(here, axis=0)))
-    away = [float(np.nanmedian(_distances(turn.inverse.transform(here), there))) for turn in seen.turns]
+    away = [float(np.nanmedian(_distances(turn.inverse.transform(here), there))) for turn in search.turns]
     return min(away) < _SAME_FLOOR * extent
 
 
@@ -99,16 +99,16 @@ def _distances(a: Array, b: Array) -> Array:
     return np.asarray(np.nan_to_num(np.linalg.norm(a - b, axis=1), nan=np.inf))
 
 
-def told(seen: Seen, followed: Followed) -> list[str]:
+def detected_curves(search: FieldSearch, followed: Followed) -> list[str]:
     """Names of the curves that were found."""
     numbers, places = np.unique(followed.lines.course.curve[followed.lines.found], return_counts=True)
-    return [seen.target.curve_names[number] for number in numbers[places >= _FEWEST_PLACES]]
+    return [search.target.curve_names[number] for number in numbers[places >= _FEWEST_PLACES]]
 
 
-def _spread(seen: Seen, names: list[str]) -> bool:
+def _in_two_directions(search: FieldSearch, names: list[str]) -> bool:
     """Whether these curves run in more than one direction."""
-    numbers = [seen.target.curve_names.index(name) for name in names]
-    tracks, is_arc = seen.target.tracks[0, numbers], seen.target.is_arc[numbers]
+    numbers = [search.target.curve_names.index(name) for name in names]
+    tracks, is_arc = search.target.tracks[0, numbers], search.target.is_arc[numbers]
     ways = tracks[~is_arc, 1, :2]
     parallel = np.abs(ways[:, 0] * ways[:1, 1] - ways[:, 1] * ways[:1, 0]) < 1e-6 * np.linalg.norm(ways, axis=1)
     return bool(np.any(is_arc) or not np.all(parallel))

@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from ceres_cal.base.errors import InputError, NothingShownError
+from ceres_cal.base.progress import ImageProgress
 from ceres_cal.calibration import Calibration
 from ceres_cal.detect.boards import detect_boards
 from ceres_cal.moves import FALSE_ALARMS, Check, StationCheck, check
 from ceres_cal.observations import Observations, combine
-from ceres_cal.photographs.field import detect_field
+from ceres_cal.photographs.field import FieldOptions, detect_field
 from ceres_cal.photographs.follow import FAR_PX
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.targets import Target
-
-Progress = Callable[[int, int, str], None]
 
 _REACH = f"{FAR_PX:.0f} px or 5 degrees"
 
@@ -58,7 +57,7 @@ def detect_known(
     *,
     not_painted: Collection[str] = (),
     boards: bool = True,
-    progress: Progress | None = None,
+    progress: ImageProgress | None = None,
 ) -> KnownDetections:
     """Look through photographs of one station for everything that the calibration's targets let one find there.
 
@@ -92,8 +91,8 @@ def detect_known(
     for turn, (what, target) in enumerate(wanted.items()):
         report = _counting_on(progress, turn, len(wanted))
         try:
-            found, missed = _searched(paths, target, posed, names, not_painted, report)
-            parts.append(_renamed(found, what))
+            detected, missed = _searched(paths, target, posed, names, not_painted, report)
+            parts.append(_renamed(detected, what))
         except NothingShownError as error:
             missed = error.missed
         shown[what] = len(paths) - len(missed)
@@ -109,7 +108,7 @@ def _searched(
     posed: Camera,
     names: tuple[str, str],
     not_painted: Collection[str],
-    report: Progress,
+    report: ImageProgress,
 ) -> tuple[Observations, tuple[tuple[str, str], ...]]:
     """What images show of one target, and path and reason of those that do not show it."""
     camera, station = names
@@ -117,7 +116,7 @@ def _searched(
         corners = detect_boards(paths, target, camera, station, progress=report)
         return corners.observations, corners.missed
     painted = [curve for curve in target.curves if curve not in not_painted]
-    lines = detect_field(paths, target, posed, painted, camera, station, progress=report)
+    lines = detect_field(paths, target, posed, painted, FieldOptions(camera, station), report)
     return lines.observations, lines.missed
 
 
@@ -128,21 +127,21 @@ def check_photographs(
     false_alarms: float = FALSE_ALARMS,
     *,
     not_painted: Collection[str] = (),
-    progress: Progress | None = None,
+    progress: ImageProgress | None = None,
 ) -> tuple[Check, KnownDetections]:
     """`check` with photographs of one station; boards, which lie anywhere, are not looked for.
 
     Where no photograph shows the field near where the calibration has it, the station does not hold, and its words say
     so: the camera has moved far, or nothing is to be seen. Raises what `detect_known` and `check` raise.
     """
-    found = detect_known(calibration, images, station, not_painted=not_painted, boards=False, progress=progress)
-    if found.observations is not None:
-        return check(calibration, found.observations, false_alarms), found
+    detections = detect_known(calibration, images, station, not_painted=not_painted, boards=False, progress=progress)
+    if detections.observations is not None:
+        return check(calibration, detections.observations, false_alarms), detections
     words = (
         f"not found: no field within {_REACH} of where it was in {_counted(len(images))}: the camera has moved "
         "farther, or it sees no field (dark, covered, other lines): look at the picture"
     )
-    return Check(false_alarms, {found.station: StationCheck.untold(found.station, words)}), found
+    return Check(false_alarms, {detections.station: StationCheck.untold(detections.station, words)}), detections
 
 
 def is_painted(target: Target) -> bool:
@@ -164,7 +163,7 @@ def _require_known(calibration: Calibration, not_painted: Collection[str]) -> No
         raise InputError(f"curve {unknown[0]!r} is not one of the calibration's targets': see `ceres-cal targets`")
 
 
-def _counting_on(progress: Progress | None, turn: int, turns: int) -> Progress:
+def _counting_on(progress: ImageProgress | None, turn: int, turns: int) -> ImageProgress:
     """The callback of one of several searches through the same images."""
 
     def report(done: int, images: int, name: str) -> None:
@@ -174,7 +173,8 @@ def _counting_on(progress: Progress | None, turn: int, turns: int) -> Progress:
     return report
 
 
-def _renamed(found: Observations, target: str) -> Observations:
+def _renamed(detected: Observations, target: str) -> Observations:
     """What was found under the name that the calibration has for its target."""
-    (known,) = found.targets.values()
-    return replace(found, targets={target: known}, views=tuple(replace(view, target=target) for view in found.views))
+    (known,) = detected.targets.values()
+    views = tuple(replace(view, target=target) for view in detected.views)
+    return replace(detected, targets={target: known}, views=views)

@@ -1,9 +1,9 @@
 """Which line of a target is which in a photograph whose floor is known but for place, size and quarter turns.
 
 Two parallel lines of the floor taken for two of the target tell the camera's height and one coordinate of its place,
-one line across tells the other: every such choice, in all four turns, is a hypothesis. It is worth what the target that
-it predicts covers of the paint that was found, and how much of the target in view lies on such paint. Mirrored choices
-do not arise: the camera stands above a floor whose z points up, and a rotation mirrors nothing.
+one line across tells the other: every such choice, in all four turns, is a hypothesis. Its score is Dice's coefficient
+of the target that it predicts in view and the paint that was found. Mirrored choices do not arise: the camera stands
+above a floor whose z points up, and a rotation mirrors nothing.
 """
 
 from __future__ import annotations
@@ -44,8 +44,8 @@ class Match:
 
 
 @dataclass(frozen=True, eq=False)
-class Picture:
-    """What a photograph shows: strokes, how near each pixel is to them, and the lens's centre (2,) px."""
+class StrokeMap:
+    """The strokes of a photograph, how near each pixel is to them, and the lens's centre (2,) px."""
 
     strokes: Strokes
     near: Nearness
@@ -81,12 +81,12 @@ class FloorLines:
         return lines
 
 
-def lines_seen(upright: Upright, picture: Picture) -> FloorLines:
+def lines_seen(upright: Upright, stroke_map: StrokeMap) -> FloorLines:
     """The lines on which most strokes lie."""
-    ends, weights = picture.ends, picture.strokes.length_px
+    ends, weights = stroke_map.ends, stroke_map.strokes.length_px
     floor = np.stack([upright.floor(ends[:, 0]), upright.floor(ends[:, 1])], axis=1)
-    seen = np.all(np.isfinite(floor), axis=(1, 2))
-    floor, weights = floor[seen], weights[seen]
+    on_floor = np.all(np.isfinite(floor), axis=(1, 2))
+    floor, weights = floor[on_floor], weights[on_floor]
     along = np.diff(floor, axis=1)[:, 0]
     slope = np.abs(along / np.linalg.norm(along, axis=1, keepdims=True))
     middle = floor.mean(axis=1)
@@ -97,19 +97,19 @@ def lines_seen(upright: Upright, picture: Picture) -> FloorLines:
     return FloorLines(x, y)
 
 
-def match(upright: Upright, picture: Picture, grid: Grid, lines: FloorLines) -> list[Match]:
+def match(upright: Upright, stroke_map: StrokeMap, grid: Grid, lines: FloorLines) -> list[Match]:
     """The best hypotheses for these lines, the best first."""
     few, many = (places_along(grid, count) for count in (_FEW, _MANY))
-    found: list[tuple[float, Array, Array]] = []
+    scored: list[tuple[float, Array, Array]] = []
     for quarters in range(4 // gcd(4, grid.turns)):
         turned = replace(upright, rotation=upright.rotation @ _QUARTERS[quarters])
         hypotheses = _hypotheses(lines.turned(quarters), grid)
-        score = _scores(picture, turned, hypotheses, few)
+        score = _scores(stroke_map, turned, hypotheses, few)
         best = np.argsort(-score)[:_KEPT]
-        score = _scores(picture, turned, hypotheses[best], many)
-        found += [(float(value), hypotheses[row], turned.rotation) for value, row in zip(score, best, strict=True)]
-    found.sort(key=lambda one: -one[0])
-    return [_as_match(score, place, rotation, grid) for score, place, rotation in found[:_KEPT]]
+        score = _scores(stroke_map, turned, hypotheses[best], many)
+        scored += [(float(value), hypotheses[row], turned.rotation) for value, row in zip(score, best, strict=True)]
+    scored.sort(key=lambda one: -one[0])
+    return [_as_match(score, place, rotation, grid) for score, place, rotation in scored[:_KEPT]]
 
 
 def _as_match(score: float, place: Array, rotation: Array, grid: Grid) -> Match:
@@ -166,25 +166,25 @@ def _peaks(values: Array, weights: Array, total: float) -> Array:
     return np.sort(np.array(chosen))
 
 
-# ---- what they are worth --------------------------------------------------------------------------------------------
+# ---- their scores --------------------------------------------------------------------------------------------------
 
 
-def _scores(picture: Picture, upright: Upright, hypotheses: Array, places: Places) -> Array:
+def _scores(stroke_map: StrokeMap, upright: Upright, hypotheses: Array, places: Places) -> Array:
     """(K,) of each hypothesis, from 0 to 1."""
     blocks = range(0, len(hypotheses), _BLOCK)
-    parts = [_scored(picture, upright, hypotheses[b : b + _BLOCK].astype(np.float32), places) for b in blocks]
+    parts = [_scored(stroke_map, upright, hypotheses[b : b + _BLOCK].astype(np.float32), places) for b in blocks]
     return np.concatenate([np.empty(0), *parts])
 
 
-def _scored(picture: Picture, upright: Upright, hypotheses: Array, places: Places) -> Array:
+def _scored(stroke_map: StrokeMap, upright: Upright, hypotheses: Array, places: Places) -> Array:
     floor = (places.grid - hypotheses[:, None, 1:]) / hypotheses[:, None, :1]
-    pixels = picture.centre.astype(np.float32) + np.float32(picture.unit_px) * upright.offsets(floor)
+    pixels = stroke_map.centre.astype(np.float32) + np.float32(stroke_map.unit_px) * upright.offsets(floor)
     with np.errstate(invalid="ignore"):
-        inside = np.all((pixels > -0.5) & (pixels < np.array(picture.image_size) - 0.5), axis=2)
+        inside = np.all((pixels > -0.5) & (pixels < np.array(stroke_map.image_size) - 0.5), axis=2)
     step = np.linalg.norm(np.diff(pixels, axis=1, prepend=pixels[:, :1]), axis=2)
     step = np.where(inside & ~places.first & np.isfinite(step), step, 0.0)
-    near = picture.near.at(pixels[..., 0], pixels[..., 1])
-    paint_px = float(picture.strokes.length_px.sum())
+    near = stroke_map.near.at(pixels[..., 0], pixels[..., 1])
+    paint_px = float(stroke_map.strokes.length_px.sum())
     covered, shown = np.minimum(np.sum(step * near, axis=1), paint_px), np.sum(step, axis=1)
     enough = np.mean(inside, axis=1) >= _LEAST_IN_VIEW
     return np.asarray(np.where(enough, 2.0 * covered / (shown + paint_px), 0.0))

@@ -11,7 +11,7 @@ from ceres_cal.base.errors import CalibrationError
 from ceres_cal.model.parameters import Estimate, Layout, Options, Station, intrinsic_names
 from ceres_cal.model.priors import stated_prior
 from ceres_cal.model.structure import make_structure
-from ceres_cal.observations import Curves, Observations, Points, Prior, View
+from ceres_cal.observations import NO_POINTS, Curves, Observations, Points, Prior, View
 from ceres_cal.observations.sights import gather_sights
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.targets import Target
@@ -22,15 +22,12 @@ _QUICK = Options(max_iterations=30, threads=1)
 
 
 @dataclass(frozen=True, eq=False)
-class Shown:
+class PointHints:
     """Points that somebody showed: index (P,) among the target's, pixels (P, 2), sigma_px (P,)."""
 
     feature: Indices32
     pixels: Array
     sigma_px: Array
-
-
-_NONE_SHOWN = Shown(np.empty(0, np.int32), np.empty((0, 2)), np.empty(0))
 
 
 def observations_of(
@@ -39,16 +36,18 @@ def observations_of(
     curve: Indices32,
     pixels: Array,
     sigma_px: Array,
-    shown: Shown | None = None,
+    hints: PointHints | None = None,
 ) -> Observations:
     """One view of a field in the world: pixels (N, 2) on curves (N,), and points."""
     count = len(curve)
-    points = shown or _NONE_SHOWN
+    points = NO_POINTS
+    if hints is not None:
+        points = Points(np.zeros(len(hints.feature), np.int32), hints.feature, hints.pixels, hints.sigma_px)
     return Observations(
         {TARGET: target},
         {CAMERA: image_size},
         (View("frame", CAMERA, STATION, TARGET),),
-        Points(np.zeros(len(points.feature), np.int32), points.feature, points.pixels, points.sigma_px),
+        points,
         Curves(np.zeros(count, np.int32), curve, pixels, sigma_px, np.zeros(count, np.int8)),
     )
 
@@ -74,8 +73,9 @@ def refit_camera(
     problem = Problem(gather_sights(observations), layout, known, Weighting(loss="cauchy", loss_scale=2.0), _QUICK)
     try:
         solution = solve(problem, estimate, precision=1e-6)
-        found = solution.estimate.camera_at(STATION)
+        refitted = solution.estimate.camera_at(STATION)
     except CalibrationError:
         return None
-    usable = not solution.failed and not found.folds and np.all(np.isfinite(found.position)) and found.position[2] > 0.0
-    return found if usable else None
+    finite = np.all(np.isfinite(refitted.position))
+    usable = not solution.failed and not refitted.folds and finite and refitted.position[2] > 0.0
+    return refitted if usable else None

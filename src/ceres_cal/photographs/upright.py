@@ -22,19 +22,20 @@ from ceres_cal.start.initialise import USUAL_PHI, USUAL_PHI_FACTOR
 BENDS = (0.05, -0.05, -0.15, -0.25, -0.35, -0.45)
 PHIS = (0.8, 1.15, 1.6)
 _USUAL_BEND, _BEND_SIGMA = -0.15, 0.2
-# rad: a standard deviation of the tilts that cameras over fields have.
+# rad: a standard deviation of the tilts that cameras over fields have. Nothing changes from 0.33 to 0.67.
 _USUAL_TILT = 0.5
-# Of all strokes, at one standard deviation: it decides only where strokes do not.
+# Of all strokes, at one standard deviation: it decides only where strokes do not. Nothing changes from half to
+# double.
 _PRIOR_WEIGHT = 0.03
 _RINGS_DEG = ((0.0, 1), (11.0, 6), (22.0, 12), (33.0, 16), (44.0, 20), (54.0, 24))  # tilt, directions of it
 _ROLL_DEG = 5.0
 _ROUGH, _FINE = 0.06, 0.015  # sine of the angle by which a stroke may be off
 _ROUNDS = 12
-# Of the strokes, in the direction that has fewer: a floor needs both.
+# Of the strokes, in the direction that has fewer: a floor needs both. Nothing changes from half to double.
 _LEAST_SHARE = 0.06
 _DOWN = np.diag([1.0, -1.0, -1.0])
 _FROM_EACH, _REFINED = 2, 14  # of each lens and focal length, and of all
-# Of two answers' uprights, rad: nearer ones count as one.
+# Of two answers' uprights, rad: nearer ones count as one. Nothing changes from half to double.
 _APART = 0.1
 
 
@@ -76,7 +77,7 @@ class Upright:
 
 def find_upright(ends: Array, weights: Array, most: int) -> list[Upright]:
     """The best answers for strokes with these ends (N, 2, 2), in half image diagonals from the middle, best first."""
-    found: list[tuple[float, Upright]] = []
+    scored: list[tuple[float, Upright]] = []
     rotations = _rotations()
     lean = _PRIOR_WEIGHT * (np.arccos(np.clip(-rotations[:, 2, 2], -1.0, 1.0)) / _USUAL_TILT) ** 2
     for bend in BENDS:
@@ -85,9 +86,9 @@ def find_upright(ends: Array, weights: Array, most: int) -> list[Upright]:
             value = _score(_normals(optics, ends), weights, rotations, _ROUGH) - lean
             for best in np.argsort(-value)[:_FROM_EACH]:
                 turned = replace(optics, rotation=rotations[best].astype(float))
-                found.append((float(value[best]) - _penalty(optics), turned))
-    found.sort(key=lambda one: -one[0])
-    refined = [_refined(one, ends, weights) for _, one in found[:_REFINED]]
+                scored.append((float(value[best]) - _penalty(optics), turned))
+    scored.sort(key=lambda one: -one[0])
+    refined = [_refined(one, ends, weights) for _, one in scored[:_REFINED]]
     refined.sort(key=lambda one: -(one.share - _penalty(one)))
     chosen: list[Upright] = []
     for one in refined:
@@ -99,12 +100,12 @@ def find_upright(ends: Array, weights: Array, most: int) -> list[Upright]:
 def _rotations() -> Array:
     """(B, 3, 3) every way to look at the floor, but for quarter turns about the upright."""
     rolls = np.deg2rad(np.arange(-45.0, 45.0, _ROLL_DEG))
-    found = []
+    rotations = []
     for tilt, count in _RINGS_DEG:
         for direction in 2.0 * np.pi * np.arange(count) / count:
             lean = rotation_exp(np.deg2rad(tilt) * np.array([np.cos(direction), np.sin(direction), 0.0]))
-            found += [lean @ _DOWN @ rotation_exp([0.0, 0.0, roll]) for roll in rolls]
-    return np.array(found, dtype=np.float32)
+            rotations += [lean @ _DOWN @ rotation_exp([0.0, 0.0, roll]) for roll in rolls]
+    return np.array(rotations, dtype=np.float32)
 
 
 def _normals(optics: Upright, ends: Array) -> Array:

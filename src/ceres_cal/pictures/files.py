@@ -8,7 +8,7 @@ import cv2
 
 from ceres_cal.base.arrays import Image
 from ceres_cal.base.errors import InputError
-from ceres_cal.detect.boards import read_colour
+from ceres_cal.detect.images import encoded, read_colour
 from ceres_cal.pictures.overlay import in_8_bit_colour
 
 _QUALITIES = (90, 80, 70, 55, 40, 25)
@@ -30,19 +30,6 @@ def read_photograph(path: Path, image_size: tuple[int, int], camera: str) -> Ima
     return image
 
 
-def encoded(picture: Image, ending: str, jpeg_quality: int) -> bytes:
-    """The content of an image file: ".png" as it is, ".jpg" in 8 bit.
-
-    Raises:
-        InputError: OpenCV cannot write such a picture.
-    """
-    plain = in_8_bit_colour(picture) if ending == ".jpg" else picture
-    done, content = cv2.imencode(ending, plain, [cv2.IMWRITE_JPEG_QUALITY, jpeg_quality] if ending == ".jpg" else [])
-    if not done:
-        raise InputError(f"a picture of {picture.shape[1]} x {picture.shape[0]} px cannot be written as {ending}")
-    return bytes(content)
-
-
 def jpeg_of_at_most(picture: Image, widest_px: int, most_bytes: int) -> bytes:
     """A JPEG no wider than that, as good as the bytes allow."""
     width, height = picture.shape[1], picture.shape[0]
@@ -50,7 +37,7 @@ def jpeg_of_at_most(picture: Image, widest_px: int, most_bytes: int) -> bytes:
         size = (widest_px, max(1, round(height * widest_px / width)))
         picture = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
     for quality in _QUALITIES:
-        content = encoded(picture, ".jpg", quality)
+        content = encoded(in_8_bit_colour(picture), ".jpg", quality)
         if len(content) <= most_bytes:
             break
     return content

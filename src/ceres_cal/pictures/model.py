@@ -11,7 +11,7 @@ from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.transforms import Pose
 from ceres_cal.model.parameters import Estimate
 from ceres_cal.model.structure import Built
-from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.camera import Camera, in_image
 from ceres_cal.scene.curves import along_track
 from ceres_cal.scene.targets import Target
 
@@ -54,7 +54,7 @@ class Model:
         return (float(np.median(apart)), float(np.max(apart))) if len(apart) else (np.nan, np.nan)
 
     def _inside(self, pixels: Array) -> Mask:
-        return _inside(pixels, self.image_size)
+        return in_image(pixels, self.image_size)
 
 
 def model_seen(
@@ -90,7 +90,7 @@ def _lines(built: Built, camera: Camera) -> Iterator[Line]:
         middle, left, right = (
             camera.project(along_track(built.tracks[side, number], is_arc, s)) for side in (0, 1, -1)
         )
-        width = np.linalg.norm(left - right, axis=1)[_inside(middle, camera.image_size)]
+        width = np.linalg.norm(left - right, axis=1)[in_image(middle, camera.image_size)]
         wide = len(width) > 0 and float(np.median(width)) >= _WIDE_PX
         yield Line(middle, (left, right) if wide else ())
     if target.grid is not None:
@@ -102,7 +102,3 @@ def _between(corners: Array) -> Array:
     """Corners (C, 3) and places on the straight lines from each to the next."""
     at = np.linspace(0.0, len(corners) - 1.0, _BETWEEN * (len(corners) - 1) + 1)
     return np.column_stack([np.interp(at, np.arange(len(corners)), axis) for axis in corners.T])
-
-
-def _inside(pixels: Array, size: tuple[int, int]) -> Mask:
-    return np.asarray(np.all((pixels >= -0.5) & (pixels <= np.array(size) - 0.5), axis=1))  # False for NaN

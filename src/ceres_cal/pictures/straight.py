@@ -14,7 +14,7 @@ from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.transforms import Pose
 from ceres_cal.pictures.warp import Warp, make_warp, require_size
-from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.camera import Camera, in_image
 from ceres_cal.scene.lens import Brown
 
 WIDEST_DEG = 150.0
@@ -39,14 +39,14 @@ class Straight:
         camera: the straight image's own: a pinhole at the photograph's pose. What it projects and locates holds in
             the straight image.
         warp: makes the images.
-        shown: share of the photograph's pixels that the straight image shows.
+        share: of the photograph's pixels, that the straight image shows.
         limit_deg: angle off the axis from which on nothing is shown, because the lens has no answer there or draws
             pixels out too much, or for `angle_deg`; None where the photograph ends before.
     """
 
     camera: Camera
     warp: Warp
-    shown: float
+    share: float
     limit_deg: float | None
 
     @property
@@ -103,7 +103,7 @@ def straighten(
         return found
 
     warp = make_warp(new_size, camera.image_size, places)
-    return Straight(straight, warp, _shown(camera, straight, region.slope), region.limit_deg)
+    return Straight(straight, warp, _share_shown(camera, straight, region.slope), region.limit_deg)
 
 
 def _scaled(box: Array, wanted: tuple[int, int], phi: float | None, *, whole: bool) -> tuple[float, tuple[int, int]]:
@@ -116,13 +116,13 @@ def _scaled(box: Array, wanted: tuple[int, int], phi: float | None, *, whole: bo
     return float(phi), (int(count[0]), int(count[1]))
 
 
-def _shown(camera: Camera, straight: Camera, slope: float) -> float:
+def _share_shown(camera: Camera, straight: Camera, slope: float) -> float:
     """The share of the photograph's pixels, of every few, whose centres fall into the straight image."""
     width, height = camera.image_size
     step = max(1, int(np.sqrt(width * height / _COUNTED)))
     grid = np.meshgrid(np.arange(0.0, width, step), np.arange(0.0, height, step))
     there = _at_depth_1(camera, np.column_stack([part.ravel() for part in grid]), slope)
-    return float(np.mean(_inside(there * straight.phi + straight.principal_point, straight.image_size)))
+    return float(np.mean(in_image(there * straight.phi + straight.principal_point, straight.image_size)))
 
 
 # ---- what a photograph shows of the plane at depth 1 ----------------------------------------------------------------
@@ -147,11 +147,7 @@ class _Region:
         """(N,) whether the photograph shows these places (N, 2)."""
         pixels = self.camera.at(Pose.identity()).project(np.column_stack([places, np.ones(len(places))]))
         near = np.hypot(places[:, 0], places[:, 1]) <= self.slope
-        return np.asarray(near & _inside(pixels, self.camera.image_size))
-
-
-def _inside(pixels: Array, size: tuple[int, int]) -> Mask:
-    return np.asarray(np.all((pixels >= -0.5) & (pixels <= np.array(size) - 0.5), axis=1))  # False for NaN
+        return np.asarray(near & in_image(pixels, self.camera.image_size))
 
 
 def _at_depth_1(camera: Camera, pixels: Array, slope: float) -> Array:
@@ -169,7 +165,7 @@ def _region(camera: Camera, angle: float) -> _Region:
     turn = np.linspace(0.0, 2.0 * np.pi, _RIM_STEPS, endpoint=False)
     rim = slope * (1.0 - 1e-9) * np.column_stack([np.cos(turn), np.sin(turn)])
     pixels = camera.at(Pose.identity()).project(np.column_stack([rim, np.ones(len(rim))]))
-    rim = rim[_inside(pixels, camera.image_size)]
+    rim = rim[in_image(pixels, camera.image_size)]
     outline = np.concatenate([border[np.isfinite(border[:, 0])], rim])
     if not len(outline):
         raise InputError(

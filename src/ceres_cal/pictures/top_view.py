@@ -17,7 +17,7 @@ from ceres_cal.scene.camera import Camera
 
 
 @dataclass(frozen=True)
-class Plan:
+class TopViewGrid:
     """What part of which plane a top view shows, and how large.
 
     Attributes:
@@ -47,8 +47,8 @@ class Plan:
         return np.asarray(steps / self.m_per_px - 0.5)
 
 
-def make_plan(area_m: tuple[float, float, float, float], m_per_px: float, height_m: float = 0.0) -> Plan:
-    """The plan of an area.
+def make_grid(area_m: tuple[float, float, float, float], m_per_px: float, height_m: float = 0.0) -> TopViewGrid:
+    """The grid of pixels over an area.
 
     Args:
         area_m: x0, y0, x1, y1; widened to whole pixels at its right and lower edge.
@@ -64,10 +64,10 @@ def make_plan(area_m: tuple[float, float, float, float], m_per_px: float, height
     count = np.ceil(np.array([x1 - x0, y1 - y0]) / m_per_px - 1e-6)
     size = (int(count[0]), int(count[1]))
     require_size(size, "ask for more mm per pixel, or for a smaller area")
-    return Plan((x0, y1), size, m_per_px, height_m)
+    return TopViewGrid((x0, y1), size, m_per_px, height_m)
 
 
-def top_view(camera: Camera, plan: Plan) -> Warp:
+def top_view(camera: Camera, grid: TopViewGrid) -> Warp:
     """How the photographs of a station (a camera posed in the world) become top views.
 
     Raises:
@@ -75,13 +75,13 @@ def top_view(camera: Camera, plan: Plan) -> Warp:
     """
 
     def places(pixels: Array) -> Array:
-        return camera.project(np.column_stack([plan.places(pixels), np.full(len(pixels), plan.height_m)]))
+        return camera.project(np.column_stack([grid.places(pixels), np.full(len(pixels), grid.height_m)]))
 
-    warp = make_warp(plan.size, camera.image_size, places)
+    warp = make_warp(grid.size, camera.image_size, places)
     if not warp.seen.any():
-        x0, y0, x1, y1 = plan.area_m
+        x0, y0, x1, y1 = grid.area_m
         raise InputError(
             f"the camera sees nothing of x {x0:g} to {x1:g} m, y {y0:g} to {y1:g} m at a height of "
-            f"{plan.height_m:g} m: ask for another area"
+            f"{grid.height_m:g} m: ask for another area"
         )
     return warp

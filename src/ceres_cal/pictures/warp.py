@@ -15,6 +15,8 @@ import numpy as np
 from ceres_cal.base.arrays import Array, Array32, Image, Mask
 from ceres_cal.base.errors import InputError
 
+Plane = Array32
+
 MOST_PIXELS, LONGEST_SIDE = 100_000_000, 32_000  # OpenCV's remap ends at 32 767
 _FINEST = 4  # small squares along a pixel
 _USUAL = 0.9  # of all pixels: those that decide how many squares are needed

@@ -3,7 +3,7 @@
 The only package that imports the plotting library.
 """
 
-from ceres_cal.report.in_photographs import Album
+from ceres_cal.report.material import FramePhotographs
 from ceres_cal.report.report import make_report, write_report
 
-__all__ = ["Album", "make_report", "write_report"]
+__all__ = ["FramePhotographs", "make_report", "write_report"]

@@ -18,7 +18,6 @@ from ceres_cal.base.arrays import Array
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 POINT, CURVE, OUTLIER = "#0072b2", "#009e73", "#d55e00"  # Okabe and Ito's, apart for colour-blind readers too
 INK, QUIET, PAINT, FAINT = "#1f2933", "#5b6770", "#b3bcc4", "#e8ecef"
@@ -75,8 +74,8 @@ class Drawing:
     height: float
 
 
-def to_svg(drawing: Drawing, width_in: float, name: str) -> str:
-    """An <svg> element to stand in a page.
+def to_svg(drawing: Drawing, width_in: float, name: str, *, whole_file: bool = False) -> str:
+    """An <svg> element to stand in a page, or the text of a file of its own.
 
     Args:
         name: one of its own on the page: what the element calls its parts begins with it.
@@ -92,20 +91,21 @@ def to_svg(drawing: Drawing, width_in: float, name: str) -> str:
         assert engine is not None
         engine.set(w_pad=0.03, h_pad=0.03)  # type: ignore[call-arg]
         drawing.draw(figure.add_subplot(), width_in)
-        return _as_element(figure, FigureCanvasSVG)
+        stream = io.StringIO()
+        write: Any = FigureCanvasSVG(figure).print_svg
+        write(stream, metadata={"Date": None, "Creator": None})
+    return stream.getvalue() if whole_file else _as_element(stream.getvalue())
 
 
-def _as_element(figure: Figure, canvas: Any) -> str:
-    stream = io.StringIO()
-    canvas(figure).print_svg(stream, metadata={"Date": None, "Creator": None})
-    text = stream.getvalue()
+def _as_element(text: str) -> str:
+    """A file's <svg> without what a page does not need."""
     text = text[text.index("<svg") :]
     text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.S)
     text = re.sub(r' (?:width|height)="[\d.]+pt"', "", text)  # as wide as its place
     named = set(re.findall(r'(?:href="|url\()#([^")]+)', text))
-    text = re.sub(r' id="([^"]+)"', lambda found: found[0] if found[1] in named else "", text)
+    text = re.sub(r' id="([^"]+)"', lambda match: match[0] if match[1] in named else "", text)
     text = re.sub(r' xmlns(?::xlink)?="[^"]*"| version="1.1"', "", text)  # HTML knows them
-    text = re.sub(r' d="[^"]+"', lambda found: re.sub(r"(\.\d\d)\d+", r"\1", found[0]), text)  # a hundredth of a point
+    text = re.sub(r' d="[^"]+"', lambda match: re.sub(r"(\.\d\d)\d+", r"\1", match[0]), text)  # a hundredth of a point
     text = text.replace("xlink:href", "href")
     return re.sub(r"\n\s*", "\n", text).strip()
 

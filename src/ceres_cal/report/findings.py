@@ -6,21 +6,21 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from ceres_cal.base.words import DASH, chance, counted, fixed, grouped, mm, powered, sentence, short
 from ceres_cal.diagnostics import Choice, Finding, HeldOut, Noise
 from ceres_cal.report.grounds import is_against
 from ceres_cal.report.material import Material
 from ceres_cal.report.page import Card, Chapter, Piece, Table, Text
-from ceres_cal.report.words import DASH, count, fixed, grouped, mm, powered, short, signed
 
 _MOST_CARDS = 8
 
 
-def findings(material: Material, choice: Choice | None) -> Chapter:
+def findings(material: Material) -> Chapter:
     """Findings, the largest first, the noise that is left, and the held-out errors where they were computed."""
     diagnosis = material.diagnosis
     rate = f"{100.0 * diagnosis.false_alarm_rate:g} %"
     tested = (
-        f"{count(diagnosis.tests, 'alternative')} of the model were tested; of sound data {rate} raise any finding."
+        f"{counted(diagnosis.tests, 'alternative')} of the model were tested; of sound data {rate} raise any finding."
     )
     pieces: list[Piece] = []
     if diagnosis.new_data:
@@ -38,40 +38,31 @@ def findings(material: Material, choice: Choice | None) -> Chapter:
     else:
         pieces.append(Text(f"Nothing was found: what is left over looks like noise. {tested}"))
     pieces.append(_noise(diagnosis.noise))
-    if choice is not None:
-        pieces += _held_out(choice)
+    if material.choice is not None:
+        pieces += _held_out(material.choice)
     return Chapter("findings", "What the residuals say", tuple(pieces))
 
 
 def _others(others: Sequence[Finding]) -> Iterator[Piece]:
     if others:
         rows = tuple(
-            (_sentence(one.sentence), short(one.effect_px), short(one.effect_mm), _chance(one.log10_p))
+            (sentence(one.sentence), short(one.effect_px), short(one.effect_mm), powered(chance(one.log10_p)))
             for one in others
         )
         head = ("", "px", "mm", "false alarm")
-        yield Table(head, rows, f"{count(len(others), 'smaller finding')}", stacked=True)
+        yield Table(head, rows, f"{counted(len(others), 'smaller finding')}", stacked=True)
 
 
 def _card(finding: Finding) -> Card:
     facts = [f"{short(finding.effect_px)} px"]
     if np.isfinite(finding.effect_mm):
         facts.append(mm(finding.effect_mm))
-    facts.append(count(finding.observations, "observation"))
-    facts.append(f"false alarm: {_chance(finding.log10_p)}")
+    facts.append(counted(finding.observations, "observation"))
+    facts.append(f"false alarm: {powered(chance(finding.log10_p))}")
     facts += [f"{one.name} {one.value:+.3g} ± {short(one.sd)} {one.unit}".strip() for one in finding.amounts]
     return Card(
-        "no" if is_against(finding) else "care", _sentence(finding.sentence), _sentence(finding.advice), tuple(facts)
+        "no" if is_against(finding) else "care", sentence(finding.sentence), sentence(finding.advice), tuple(facts)
     )
-
-
-def _sentence(text: str) -> str:
-    return f"{text[:1].upper()}{text[1:]}"
-
-
-def _chance(log10_p: float) -> str:
-    """A probability in words: "0.21 %", "1 in 10¹²"."""
-    return f"{100.0 * 10.0**log10_p:.2g} %" if log10_p > -3.0 else f"1 in {powered(f'10^{-log10_p:.0f}')}"
 
 
 def _noise(noise: tuple[Noise, ...]) -> Table:
@@ -83,7 +74,7 @@ def _noise(noise: tuple[Noise, ...]) -> Table:
                 grouped(one.observations),
                 fixed(one.sigma_px, 3),
                 f"{one.scale:.2f} times" if np.isfinite(one.stated_px) else "none stated",
-                signed(one.correlation, 2),
+                fixed(one.correlation, 2, "+"),
             )
             for one in noise
         ),
@@ -92,9 +83,7 @@ def _noise(noise: tuple[Noise, ...]) -> Table:
 
 
 def _held_out(choice: Choice) -> tuple[Table, Text]:
-    chosen = choice.candidates[choice.chosen]
-    said = "The calibration's lens is the one to take" if choice.chosen == choice.current else f"Take {chosen.label}"
-    rule = f"{said}: the fewest coefficients within one standard error of the least error."
+    rule = f"{sentence(chosen_lens(choice))}: the fewest coefficients within one standard error of the least error."
     thinned = f" On {100.0 * choice.thinned:.0f} % of the observations." if choice.thinned < 1.0 else ""
     rows = tuple(_candidate(choice, number, one) for number, one in enumerate(choice.candidates))
     head = ("lens", "held-out px", "mm", "fit px", "")
@@ -104,6 +93,17 @@ def _held_out(choice: Choice) -> tuple[Table, Text]:
 def _candidate(choice: Choice, number: int, one: HeldOut) -> tuple[str, ...]:
     if one.failed:
         return one.label, DASH, DASH, DASH, one.failed
+    marks = choice_marks(choice, number)
+    return one.label, fixed(one.rms_px, 4), fixed(one.rms_mm, 3), fixed(one.fit_rms_px, 4), marks
+
+
+def chosen_lens(choice: Choice) -> str:
+    """Which lens to take."""
+    chosen = choice.candidates[choice.chosen].label
+    return "the calibration's lens is the one to take" if choice.chosen == choice.current else f"take {chosen}"
+
+
+def choice_marks(choice: Choice, number: int) -> str:
+    """What one of the candidates is: the current one, that of the least error, the chosen one."""
     marks = (("now", choice.current), ("least error", choice.best), ("chosen", choice.chosen))
-    said = ", ".join(word for word, index in marks if index == number)
-    return one.label, fixed(one.rms_px, 4), fixed(one.rms_mm, 3), fixed(one.fit_rms_px, 4), said
+    return ", ".join(word for word, index in marks if index == number)

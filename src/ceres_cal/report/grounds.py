@@ -6,9 +6,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from ceres_cal.base.words import counted, first_of, mm, sentence, short
 from ceres_cal.diagnostics import Finding
 from ceres_cal.report.material import Material
-from ceres_cal.report.words import count, listed, mm, short
 
 GOOD_MM, CARE_MM = 10.0, 50.0
 """95 % of located points nearer than the first is good (the width of a painted line), than the second to be used with
@@ -59,7 +59,7 @@ def grounds(material: Material) -> Iterator[tuple[str, str]]:
     if out > _MANY_OUTLIERS:
         yield "care", f"{100.0 * out:.0f} % of the observations were taken out: check labels, dimensions and the lens."
     yield from _of_knowledge(material)
-    yield from (("care", f"{text[0].upper()}{text[1:]}.") for text in calibration.warnings)
+    yield from (("care", f"{sentence(text)}.") for text in calibration.warnings)
 
 
 def _of_findings(material: Material) -> Iterator[tuple[str, str]]:
@@ -68,11 +68,11 @@ def _of_findings(material: Material) -> Iterator[tuple[str, str]]:
     if not diagnosis.findings:
         yield "good", "What the model leaves over looks like noise."
     elif not wrong:
-        yield "", f"{count(len(diagnosis.findings), 'finding')} below; none says that the model is wrong."
+        yield "", f"{counted(len(diagnosis.findings), 'finding')} below; none says that the model is wrong."
     if wrong:
         yield (
             "no" if wrong_mm > CARE_MM else "care",
-            f"The model is wrong: {listed(list(dict.fromkeys(wrong)), 4)}; up to {mm(wrong_mm)} rms. No standard "
+            f"The model is wrong: {first_of(list(dict.fromkeys(wrong)), 4)}; up to {mm(wrong_mm)} rms. No standard "
             "deviation on this page contains that.",
         )
     if off_mm:
@@ -86,16 +86,16 @@ def _of_findings(material: Material) -> Iterator[tuple[str, str]]:
 
 
 def _of_knowledge(material: Material) -> Iterator[tuple[str, str]]:
-    if material.known is None:
+    if material.uncertainty is None:
         return
-    weak = [direction.words for direction in material.known.weak_directions]
+    weak = [direction.words for direction in material.uncertainty.weak_directions]
     level = "" if material.maps else "care"  # what they do to places is in the maps
-    yield from ((level, f"{words[0].upper()}{words[1:]}.") for words in weak[:_MOST_LINES])
+    yield from ((level, f"{sentence(words)}.") for words in weak[:_MOST_LINES])
     if len(weak) > _MOST_LINES:
         yield level, f"{len(weak) - _MOST_LINES} more such directions: see the numbers."
     if not weak:
         yield "good", "Every number of the cameras and stations is known to 1 % or better."
-    lost = material.known.unknown_placements
+    lost = material.uncertainty.unknown_placements
     if lost:
-        named = listed([f"{' and '.join(parts)} of {name}" for name, parts in lost.items()], 3)
+        named = first_of([f"{' and '.join(parts)} of {name}" for name, parts in lost.items()], 3)
         yield "", f"Not known of placements: {named}. The cameras do not need it."

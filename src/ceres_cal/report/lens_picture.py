@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ceres_cal.base.arrays import Array
+from ceres_cal.base.words import powered
 from ceres_cal.report import canvas
 from ceres_cal.report.canvas import POINT, QUIET, Drawing
 from ceres_cal.report.material import Material
-from ceres_cal.report.page import Picture, Table
-from ceres_cal.report.words import powered
+from ceres_cal.report.page import Figure, Table
 from ceres_cal.scene.camera import Camera
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ def ideal_radii(camera: Camera, radii: Array) -> Array:
         return np.where((rays[:, 2] > 0.0) & (ideal <= _WIDEST * np.maximum(radii, 1.0)), ideal, np.nan)
 
 
-def distortion(material: Material, name: str) -> Picture:
+def distortion(material: Material, name: str) -> Figure:
     """r' against r of one camera, and how far observations reach."""
     camera, table = material.calibration.cameras[name], material.diagnosis.table
     radii = np.linspace(0.0, camera.corner_radius, _STEPS)
@@ -53,7 +53,7 @@ def distortion(material: Material, name: str) -> Picture:
 
     steps = np.linspace(0.0, camera.corner_radius, _TABLE_STEPS + 1)[1:]
     table_rows = zip(steps.tolist(), ideal_radii(camera, steps).tolist(), strict=True)
-    return Picture(
+    return Figure(
         f"lens-{list(material.observations.cameras).index(name)}",
         "The distortion curve" + (f", {name}" if len(material.observations.cameras) > 1 else ""),
         f"The paper's figure 4: how far from the principal point a pixel is (across) and would be without "

@@ -7,11 +7,13 @@ from collections.abc import Iterator
 import numpy as np
 
 from ceres_cal.base.transforms import euler_from_rotation
+from ceres_cal.base.words import DASH, at_precision, bounds_text, fixed, grouped, mm, powered, short
 from ceres_cal.model.parameters import anchored_stations
-from ceres_cal.report.material import Material, Seam
-from ceres_cal.report.page import Chapter, Piece, Points, Table, Text
-from ceres_cal.report.words import DASH, at_precision, bounds, fixed, grouped, mm, powered, short
+from ceres_cal.report.material import Material
+from ceres_cal.report.page import BulletList, Chapter, Piece, Table, Text
+from ceres_cal.report.quality import Seam
 from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.heights import HEIGHTS_M, at_height
 from ceres_cal.uncertainty import Verdict
 
 _HEAD = ("", "value", "± sd", "95 % bounds", "verdict")
@@ -55,20 +57,29 @@ def _named(camera: Camera, quantity: str) -> str:
     return words.get(quantity, quantity)
 
 
-def _row(name: str, value: float, unit: str, found: Verdict | None) -> _Row:
+def _row(name: str, value: float, unit: str, verdict: Verdict | None) -> _Row:
     """A number; without a verdict it was held, or nothing was minimised."""
     space = f" {unit}" if unit else ""
-    if found is None:
+    if verdict is None:
         return name, f"{value:.10g}{space}", "", "", "not free"
-    if found.key.kind == "camera" and not unit:
-        shown, width = repr(value), f"{found.sd:.2g}" if np.isfinite(found.sd) else "unknown"
+    if verdict.key.kind == "camera" and not unit:
+        shown, width = repr(value), f"{verdict.sd:.2g}" if np.isfinite(verdict.sd) else "unknown"
     elif unit == "m":
-        shown, width = f"{at_precision(value, found.sd, unit)} m", mm(1e3 * found.sd)
+        shown, width = f"{at_precision(value, verdict.sd, unit)} m", mm(1e3 * verdict.sd)
     else:
-        shown = f"{at_precision(value, found.sd, unit)}{space}"
-        width = f"{short(found.sd)}{space}" if np.isfinite(found.sd) else "unknown"
-    by = " (by its profile)" if found.by_profile and found.verdict != "known" else ""
-    return name, shown, width, f"{bounds(found)}{space}", found.verdict + by
+        shown = f"{at_precision(value, verdict.sd, unit)}{space}"
+        width = f"{short(verdict.sd)}{space}" if np.isfinite(verdict.sd) else "unknown"
+    by = " (by its profile)" if verdict.by_profile and verdict.verdict != "known" else ""
+    return name, shown, width, bounds(verdict, unit), verdict.verdict + by
+
+
+def bounds(verdict: Verdict, unit: str = "") -> str:
+    """What 95 % bounds leave, as finely as they lie apart."""
+    width = verdict.high - verdict.low
+    if verdict.key.unit.startswith("px^") or not np.isfinite(width) or verdict.low == 0.0:
+        return bounds_text(verdict.low, verdict.high, unit, ".4g")
+    places = int(np.clip(2 - np.floor(np.log10(max(width, 1e-12))), 0, 9))
+    return bounds_text(verdict.low, verdict.high, unit, f".{places}f")
 
 
 def _station(material: Material, name: str) -> Table:
@@ -86,16 +97,14 @@ def _station(material: Material, name: str) -> Table:
     angles = np.degrees(euler_from_rotation(camera.cam_from_world.rotation))
     for word, angle in zip(("alpha", "beta", "gamma"), angles.tolist(), strict=True):
         rows.append((f"{word}, the paper's", f"{angle:.4f}°", "", "", ""))
-    down = camera.cam_from_world.rotation[2]
-    tilt = float(np.degrees(np.arctan2(np.hypot(down[0], down[1]), -down[2])))
-    rows.append(("tilt from straight down", f"{tilt:.3f}°", "", "", ""))
+    rows.append(("tilt from straight down", f"{camera.tilt_deg:.3f}°", "", "", ""))
     for axis in "xyz":
-        found = material.verdicts.get(("station", name, f"turn_{axis}"))
-        if found is not None:
-            sd = float(np.degrees(found.sd))
-            limits = f"± {short(0.5 * float(np.degrees(found.high - found.low)))}°"
+        verdict = material.verdicts.get(("station", name, f"turn_{axis}"))
+        if verdict is not None:
+            sd = float(np.degrees(verdict.sd))
+            limits = f"± {short(0.5 * float(np.degrees(verdict.high - verdict.low)))}°"
             width = f"{short(sd)}°" if np.isfinite(sd) else "unknown"
-            rows.append((f"turn about the camera's {axis}", "", width, limits, found.verdict))
+            rows.append((f"turn about the camera's {axis}", "", width, limits, verdict.verdict))
     return Table(_HEAD, tuple(rows), caption, stacked=True)
 
 
@@ -107,8 +116,8 @@ def _as_built(material: Material) -> Iterator[Piece]:
     rows = []
     for i in order:
         target, _, feature = structure.names[i].partition("/")
-        found = material.verdicts.get(("structure", target, feature))
-        sd = 1e3 * found.sd if found is not None else np.nan
+        verdict = material.verdicts.get(("structure", target, feature))
+        sd = 1e3 * verdict.sd if verdict is not None else np.nan
         rows.append((structure.names[i], f"{1e3 * structure.values[i]:+.2f} mm", f"{short(sd)} mm",
                      f"{short(1e3 * float(structure.sigma_m[i]))} mm"))  # fmt: skip
     rest = len(structure.names) - len(order)
@@ -118,27 +127,27 @@ def _as_built(material: Material) -> Iterator[Piece]:
 
 
 def _weak(material: Material) -> Iterator[Piece]:
-    if material.known is None or not material.known.weak_directions:
+    if material.uncertainty is None or not material.uncertainty.weak_directions:
         return
     yield Text("What the observations hardly tell, weakest first:")
-    yield Points(tuple(("care", direction.words) for direction in material.known.weak_directions))
+    yield BulletList(tuple(("care", direction.words) for direction in material.uncertainty.weak_directions))
 
 
 def _seams(material: Material) -> Iterator[Piece]:
     if material.seams:
         rows = tuple(_seam_row(seam) for seam in material.seams)
-        head = ("stations", "on the floor", "at 150 mm", "found", "expected")
+        head = ("stations", *map(at_height, HEIGHTS_M), "found", "expected")
         yield Table(head, rows, "Where two cameras see the same: by how much they disagree", stacked=True)
 
 
 def _seam_row(seam: Seam) -> tuple[str, ...]:
-    found = seam.found
-    over = f" rms of {len(found.what)}" if len(found.what) else ""
+    measured = seam.measured
+    over = f" rms of {len(measured.what)}" if len(measured.what) else ""
     return (
-        f"{seam.first} {DASH} {seam.second}",
-        *(f"± {mm(one.mean_mm)}" for one in seam.maps),
-        f"{mm(found.rms_mm)}{over}",
-        mm(found.expected_rms_mm),
+        f" {DASH} ".join(seam.stations),
+        *(f"± {mm(one.mean_mm)}" for one in seam.predicted),
+        f"{mm(measured.rms_mm)}{over}",
+        mm(measured.expected_rms_mm),
     )
 
 

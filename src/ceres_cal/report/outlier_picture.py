@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices
+from ceres_cal.base.words import fixed, grouped, short
 from ceres_cal.report.canvas import INK, OUTLIER, QUIET, Drawing
 from ceres_cal.report.material import Material
-from ceres_cal.report.page import Picture, Table
-from ceres_cal.report.words import fixed, grouped, short
+from ceres_cal.report.page import Figure, Table
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 _MOST_BARS = 12
 
 
-def outliers(material: Material) -> Picture | None:
+def outliers(material: Material) -> Figure | None:
     """Which features were taken out, how often; None where nothing was."""
     table = material.diagnosis.table
     rows = np.flatnonzero(~table.inlier)
@@ -43,7 +43,7 @@ def outliers(material: Material) -> Picture | None:
         axes.spines["left"].set_color(QUIET)
 
     order = rows[np.argsort(-_sigmas(material, rows), kind="stable")]
-    return Picture(
+    return Figure(
         "outliers",
         "Outliers, by feature",
         f"{grouped(len(rows))} of {grouped(len(table))} observations did not take part "

@@ -9,8 +9,8 @@ from html import escape
 from importlib.resources import files
 from typing import Protocol
 
+from ceres_cal.base.words import grouped
 from ceres_cal.report.canvas import NARROW_IN, WIDE_IN, Drawing, to_svg
-from ceres_cal.report.words import grouped
 
 _MOST_ROWS = 200  # of a table
 _SHORT = 14  # letters that stay on one line
@@ -36,7 +36,7 @@ class Text:
 
 
 @dataclass(frozen=True)
-class Points:
+class BulletList:
     """A list; each line begins with a mark that its level has: "good", "care", "no" or ""."""
 
     lines: tuple[tuple[str, str], ...]
@@ -77,7 +77,7 @@ class Table:
 
 
 @dataclass(frozen=True)
-class Picture:
+class Figure:
     """A picture with a title, a sentence that says how to read it, and the table behind it.
 
     A wide one is drawn twice, for a wide and for a narrow window.
@@ -107,7 +107,7 @@ class Picture:
 
 
 @dataclass(frozen=True)
-class Photograph:
+class PhotoFigure:
     """A picture that is an image (JPEG), across both columns, and a sentence on what it shows."""
 
     name: str
@@ -129,7 +129,7 @@ class Photograph:
 class Gallery:
     """Pictures, two beside one another where there is room; one that is left over has its words beside it."""
 
-    pictures: tuple[Picture | Photograph, ...]
+    pictures: tuple[Figure | PhotoFigure, ...]
 
     def html(self) -> str:
         elements = [picture.html() for picture in self.pictures]

@@ -6,21 +6,20 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from ceres_cal.base.files import write_bytes
+from ceres_cal.base.words import counted, first_of
 from ceres_cal.calibration import Calibration
 from ceres_cal.diagnostics import Choice, Diagnosis, diagnose
 from ceres_cal.observations import Observations
 from ceres_cal.report.findings import findings
-from ceres_cal.report.in_photographs import Album, in_photographs
 from ceres_cal.report.lens_picture import distortion
-from ceres_cal.report.maps import map_picture
-from ceres_cal.report.material import ClosedForm, Material
+from ceres_cal.report.maps import map_figure
+from ceres_cal.report.material import ClosedForm, FramePhotographs, Material
 from ceres_cal.report.numbers import numbers
 from ceres_cal.report.outlier_picture import outliers
-from ceres_cal.report.page import Chapter, Gallery, Picture, Text, page
+from ceres_cal.report.page import Chapter, Figure, Gallery, Text, page
 from ceres_cal.report.residual_pictures import against_radius, by_frame, vectors
 from ceres_cal.report.solve_pictures import against_closed_form, convergence, correlation
-from ceres_cal.report.verdict import verdict
-from ceres_cal.report.words import count, listed
+from ceres_cal.report.verdict import verdict_chapter
 
 MOST_CAMERAS = 8
 """Cameras, and stations, that have pictures of their own; the others are in the tables alone."""
@@ -36,23 +35,26 @@ def make_report(
     observations: Observations,
     diagnosis: Diagnosis | None = None,
     choice: Choice | None = None,
-    album: Album | None = None,
+    photographs: FramePhotographs | None = None,
 ) -> str:
     """One self-contained HTML page on a calibration: verdict, findings, numbers, pictures.
 
     Args:
         observations: those it was made from; or others, with a diagnosis of them (`new_data`).
         diagnosis: of these observations; made here where there is none. choice: of lens, by held-out error.
-        album: photographs of the frames, for a chapter with the model drawn into them.
+        photographs: of the frames, for a chapter with the model drawn into them.
 
     Raises:
         InputError: the observations are not those of the calibration, and no diagnosis says so; or a photograph cannot
             be read.
     """
-    found = diagnose(calibration, observations) if diagnosis is None else diagnosis
-    material = Material(calibration, observations, found)
-    chapters = [verdict(material), findings(material, choice), numbers(material)]
-    chapters += [] if album is None else [in_photographs(material, album)]
+    diagnosis = diagnose(calibration, observations) if diagnosis is None else diagnosis
+    material = Material(calibration, observations, diagnosis, choice, photographs)
+    chapters = [verdict_chapter(material), findings(material), numbers(material)]
+    if photographs is not None:
+        from ceres_cal.report.in_photographs import in_photographs  # OpenCV, for photographs alone
+
+        chapters.append(in_photographs(material, photographs))
     chapters += _pictures(material)
     return page(", ".join(list(observations.cameras)[:4]), _about(material), chapters, _foot(calibration))
 
@@ -63,14 +65,14 @@ def write_report(
     observations: Observations,
     diagnosis: Diagnosis | None = None,
     choice: Choice | None = None,
-    album: Album | None = None,
+    photographs: FramePhotographs | None = None,
 ) -> None:
     """Write `make_report`'s page.
 
     Raises:
         InputError: see `make_report`; or the file cannot be written.
     """
-    write_bytes(path, make_report(calibration, observations, diagnosis, choice, album).encode())
+    write_bytes(path, make_report(calibration, observations, diagnosis, choice, photographs).encode())
 
 
 def _pictures(material: Material) -> Iterator[Chapter]:
@@ -83,30 +85,30 @@ def _pictures(material: Material) -> Iterator[Chapter]:
     yield Chapter("residuals", "Residuals and the lens", (*_left_out(cameras), Gallery(tuple(pictures))))
     if material.maps:
         stations = list(material.maps)
-        maps = [map_picture(material, name, number) for name in stations[:MOST_CAMERAS] for number in (0, 1)]
+        maps = [map_figure(material, name, number) for name in stations[:MOST_CAMERAS] for number in (0, 1)]
         yield Chapter("maps", "How well places are told", (Text(_OF_MAPS), *_left_out(stations), Gallery(tuple(maps))))
     yield _solve(material)
 
 
 def _left_out(names: list[str]) -> tuple[Text, ...]:
     rest = names[MOST_CAMERAS:]
-    return (Text(f"Without pictures here: {listed(rest, 12)}."),) if rest else ()
+    return (Text(f"Without pictures here: {first_of(rest, 12)}."),) if rest else ()
 
 
 def _solve(material: Material) -> Chapter:
     closed = material.closed_form
-    found: list[Picture | None] = [convergence(material), correlation(material)]
+    figures: list[Figure | None] = [convergence(material), correlation(material)]
     if isinstance(closed, ClosedForm):
-        found.insert(1, against_closed_form(material, closed))
+        figures.insert(1, against_closed_form(material, closed))
     texts = () if isinstance(closed, ClosedForm) else (Text(f"No closed form to compare with: {closed}.", "note"),)
-    pictures = Gallery(tuple(picture for picture in found if picture is not None))
-    return Chapter("solve", "The solve", (pictures, *texts))
+    gallery = Gallery(tuple(figure for figure in figures if figure is not None))
+    return Chapter("solve", "The solve", (gallery, *texts))
 
 
 def _about(material: Material) -> str:
     observations = material.observations
     counts = [
-        count(number, word)
+        counted(number, word)
         for number, word in (
             (len(observations.views), "view"),
             (len(observations.cameras), "camera"),

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ceres_cal.base.arrays import Array, Indices
+from ceres_cal.base.words import fixed, grouped, short
 from ceres_cal.diagnostics import ResidualTable, Summary
+from ceres_cal.diagnostics.summaries import RadiusTrend
 from ceres_cal.report import canvas
 from ceres_cal.report.canvas import CURVE, INK, OUTLIER, PAINT, POINT, QUIET, Drawing
 from ceres_cal.report.material import Material
-from ceres_cal.report.page import Picture, Table
-from ceres_cal.report.words import fixed, grouped, short, signed
+from ceres_cal.report.page import Figure, Table
 from ceres_cal.scene.camera import Camera
 
 if TYPE_CHECKING:
@@ -35,73 +38,101 @@ def stride(material: Material, count: int) -> int:
     return max(-(-count // most), 1)
 
 
-def _said_of(drawn: int, of: int) -> str:
+def _thinned(drawn: int, of: int) -> str:
     return "" if drawn == of else f" Drawn are {grouped(drawn)} of {grouped(of)}, evenly spread."
 
 
 # ---- vectors over the image -----------------------------------------------------------------------------------------
 
 
-def vectors(material: Material, name: str) -> Picture:
+def vectors(material: Material, name: str) -> Figure:
     """Residual vectors over one camera's image."""
     table, camera = material.diagnosis.table, material.calibration.cameras[name]
     own = material.of_camera(name)
     inliers, outliers = np.flatnonzero(own & table.inlier), np.flatnonzero(own & ~table.inlier)
-    typical = float(np.median(np.abs(table.distance_px[inliers]))) if len(inliers) else 1.0
-    wanted = _TYPICAL * camera.image_size[0] / max(typical, 1e-12)
-    enlarged = max((e for e in _ENLARGED if e <= wanted), default=1)
     step = stride(material, len(inliers) + len(outliers))
-    shown, crossed = inliers[::step], outliers[::step]
-    places, means, cells = telling_means(table, inliers, camera)
-    paint = _paint_in_image(material, name)
+    typical = float(np.median(np.abs(table.distance_px[inliers]))) if len(inliers) else 1.0
+    means = significant_means(table, inliers, camera)
+    field = _VectorField(
+        camera, table, inliers[::step], outliers[::step], typical, means, _paint_in_image(material, name)
+    )
+    shape = camera.image_size[1] / camera.image_size[0]
+    return Figure(
+        f"vectors-{_number_of(material, name)}",
+        f"Residual vectors over the image{_owner_suffix(material, name)}",
+        f"Each stroke leads from an observation to where the model puts it, {field.enlarged} times enlarged; of a line "
+        "or arc it is the shortest way to the curve. Strokes that point anyhow are noise. Dark: means of regions that "
+        f"noise cannot explain ({len(means.places)} of {means.regions}); where they grow or turn together, the model "
+        f"is wrong.{_thinned(len(field.inliers) + len(field.outliers), len(inliers) + len(outliers))}",
+        Drawing(field.draw, 0.93 * shape + 0.07),
+        _region_table(material.diagnosis.summaries.regions, name),
+        wide=True,
+        narrow_drawing=Drawing(field.draw, 0.86 * shape + 0.18),
+    )
 
-    def draw(axes: Axes, width_in: float) -> None:
-        _frame_image(axes, camera)
-        for line in paint:
+
+@dataclass(frozen=True, eq=False)
+class _VectorField:
+    """What is drawn: rows of the table, the median length, means of regions, and paint (S, 2) px each."""
+
+    camera: Camera
+    table: ResidualTable
+    inliers: Indices
+    outliers: Indices
+    typical_px: float
+    means: RegionMeans
+    paint: list[Array]
+
+    @property
+    def enlarged(self) -> int:
+        """So many times, a round number."""
+        wanted = _TYPICAL * self.camera.image_size[0] / max(self.typical_px, 1e-12)
+        return max((e for e in _ENLARGED if e <= wanted), default=1)
+
+    def draw(self, axes: Axes, width_in: float) -> None:
+        """Paint, vectors of points and of curves, means and outliers."""
+        table, enlarged, places = self.table, self.enlarged, self.means.places
+        _frame_image(axes, self.camera)
+        for line in self.paint:
             axes.plot(*line.T, color=PAINT, linewidth=1.6 if width_in > canvas.NARROW_IN else 1.0, alpha=0.6)
+        is_curve = table.is_curve[self.inliers]
         for rows, color, label in (
-            (shown[~table.is_curve[shown]], POINT, "points"),
-            (shown[table.is_curve[shown]], CURVE, "curves"),
+            (self.inliers[~is_curve], POINT, "points"),
+            (self.inliers[is_curve], CURVE, "curves"),
         ):
             if len(rows):
                 ends = table.pixel[rows] + enlarged * table.residual_px[rows]
                 canvas.strokes(axes, table.pixel[rows], ends, color, 0.7, alpha=0.8, label=label)
         if len(places):
-            canvas.strokes(axes, places, places + enlarged * means, INK, 1.6, label="mean of a region")
+            ends = places + enlarged * self.means.vectors
+            canvas.strokes(axes, places, ends, INK, 1.6, label="mean of a region")
             canvas.dots(axes, places, INK, 3.2)
-        if len(crossed):
-            canvas.crosses(axes, table.pixel[crossed], OUTLIER, 0.012 * camera.image_size[0])
+        if len(self.outliers):
+            canvas.crosses(axes, table.pixel[self.outliers], OUTLIER, 0.012 * self.camera.image_size[0])
             axes.plot([], [], "x", color=OUTLIER, markersize=4, label="taken out")
-        _scale_bar(axes, camera, enlarged, typical)
+        _scale_bar(axes, self.camera, enlarged, self.typical_px)
         canvas.key(axes, 4 if width_in > canvas.NARROW_IN else 2)
 
-    thinned = _said_of(len(shown) + len(crossed), len(inliers) + len(outliers))
-    shape = camera.image_size[1] / camera.image_size[0]
-    return Picture(
-        f"vectors-{_place(material, name)}",
-        f"Residual vectors over the image{_whose(material, name)}",
-        f"Each stroke leads from an observation to where the model puts it, {enlarged} times enlarged; of a line or "
-        "arc it is the shortest way to the curve. Strokes that point anyhow are noise. Dark: means of regions that "
-        f"noise cannot explain ({len(places)} of {cells}); where they grow or turn together, the model is wrong."
-        + thinned,
-        Drawing(draw, 0.93 * shape + 0.07),
-        _region_table(material.diagnosis.summaries.regions, name),
-        wide=True,
-        narrow_drawing=Drawing(draw, 0.86 * shape + 0.18),
-    )
 
-
-def _whose(material: Material, camera: str) -> str:
+def _owner_suffix(material: Material, camera: str) -> str:
     return f", {camera}" if len(material.observations.cameras) > 1 else ""
 
 
-def _place(material: Material, camera: str) -> int:
+def _number_of(material: Material, camera: str) -> int:
     return list(material.observations.cameras).index(camera)
 
 
-def telling_means(table: ResidualTable, rows: Indices, camera: Camera) -> tuple[Array, Array, int]:
-    """Mean displacements of the image's regions that noise does not explain: places (C, 2) and vectors (C, 2), px; and
-    how many regions could tell one.
+@dataclass(frozen=True, eq=False)
+class RegionMeans:
+    """Mean displacements of C regions of an image: places (C, 2) and vectors (C, 2), px; `regions` had enough rows."""
+
+    places: Array
+    vectors: Array
+    regions: int
+
+
+def significant_means(table: ResidualTable, rows: Indices, camera: Camera) -> RegionMeans:
+    """Those of the image's regions that noise does not explain.
 
     A point tells both of its coordinates, a curve the one across it: least squares over the region, in their sigmas.
     """
@@ -113,18 +144,18 @@ def telling_means(table: ResidualTable, rows: Indices, camera: Camera) -> tuple[
     region = np.clip((pixel[:, 1] / cell).astype(int), 0, lines - 1) * columns + column
     length = np.maximum(np.linalg.norm(residual, axis=1), 1e-300)
     across = np.einsum("ni,nj->nij", residual, residual) / length[:, None, None] ** 2
-    told = np.where(table.is_curve[rows, None, None], across, np.eye(2))
+    projector = np.where(table.is_curve[rows, None, None], across, np.eye(2))
     weight = (table.sigma_px[rows] * table.scale[rows]) ** -2.0
     count = np.bincount(region, minlength=columns * lines)
     normal, moved, centre = np.zeros((len(count), 2, 2)), np.zeros((len(count), 2)), np.zeros((len(count), 2))
-    np.add.at(normal, region, weight[:, None, None] * told)
+    np.add.at(normal, region, weight[:, None, None] * projector)
     np.add.at(moved, region, weight[:, None] * residual)
     np.add.at(centre, region, pixel)
     sizes = np.linalg.eigvalsh(normal)
     good = (count >= _FEWEST) & (sizes[:, 0] > 0.1 * sizes[:, 1])
     places, means = centre[good] / count[good, None], np.linalg.solve(normal[good], moved[good, :, None])[:, :, 0]
-    telling = np.sum(means * moved[good], axis=1) > _NOT_NOISE
-    return places[telling], means[telling], len(places)
+    significant = np.sum(means * moved[good], axis=1) > _NOT_NOISE
+    return RegionMeans(places[significant], means[significant], len(places))
 
 
 def _paint_in_image(material: Material, camera: str) -> list[Array]:
@@ -180,47 +211,43 @@ def _summary_row(summary: Summary, number: int, name: str) -> tuple[str, ...]:
 # ---- against the radius ---------------------------------------------------------------------------------------------
 
 
-def against_radius(material: Material, name: str) -> Picture:
+def against_radius(material: Material, name: str) -> Figure:
     """Residuals away from the principal point against the radius, with their trend."""
     table, camera = material.diagnosis.table, material.calibration.cameras[name]
     trend = next(trend for trend in material.diagnosis.summaries.trends if trend.camera == name)
-    rows = np.flatnonzero(material.of_camera(name) & table.inlier)
-    radius, outward = _outward(table, rows, camera)
-    told = np.flatnonzero(np.isfinite(outward))
-    shown = told[:: stride(material, len(told))]
+    radius, outward = _outward(table, np.flatnonzero(material.of_camera(name) & table.inlier), camera)
+    known = np.flatnonzero(np.isfinite(outward))
+    drawn = known[:: stride(material, len(known))]
     middle = 0.5 * (trend.radius_px[1:] + trend.radius_px[:-1])
-    spread = float(np.quantile(np.abs(outward[told]), 0.995)) if len(told) else 1.0
-    told_px = np.where(trend.sd_px < _VAGUE * spread, trend.outward_px, np.nan)  # else it hides the others
-    reach = 1.15 * max(spread, float(np.nanmax(np.abs(told_px), initial=0.0)), 1e-9)
+    spread = float(np.quantile(np.abs(outward[known]), 0.995)) if len(known) else 1.0
+    mean_px = np.where(trend.sd_px < _VAGUE * spread, trend.outward_px, np.nan)  # else it hides the others
+    reach = 1.15 * max(spread, float(np.nanmax(np.abs(mean_px), initial=0.0)), 1e-9)
 
     def draw(axes: Axes, width_in: float) -> None:
-        places = np.column_stack([radius, outward])[shown]
-        canvas.dots(axes, places, POINT, 1.6, alpha=0.35)
+        canvas.dots(axes, np.column_stack([radius, outward])[drawn], POINT, 1.6, alpha=0.35)
         axes.axhline(0.0, color=QUIET, linewidth=0.7)
-        low, high = (told_px + side * 2.0 * trend.sd_px for side in (-1.0, 1.0))
+        low, high = (mean_px + side * 2.0 * trend.sd_px for side in (-1.0, 1.0))
         axes.fill_between(middle, low, high, color=OUTLIER, alpha=0.25, linewidth=0.0, label="± 2 sd")
-        axes.plot(middle, told_px, color=OUTLIER, marker="o", markersize=2.6, label="trend")
+        axes.plot(middle, mean_px, color=OUTLIER, marker="o", markersize=2.6, label="trend")
         axes.set(xlim=(0.0, camera.corner_radius), ylim=(-reach, reach))
         axes.set(xlabel="distance from the principal point, px", ylabel="residual outwards, px")
         canvas.key(axes)
 
-    return Picture(
-        f"radius-{_place(material, name)}",
-        f"Residuals against the radius{_whose(material, name)}",
+    return Figure(
+        f"radius-{_number_of(material, name)}",
+        f"Residuals against the radius{_owner_suffix(material, name)}",
         "Each dot is the part of a residual that points away from the principal point. The trend should stay at 0 "
-        f"within its band: a wave means that the lens polynomial is too short.{_said_of(len(shown), len(told))}",
+        f"within its band: a wave means that the lens polynomial is too short.{_thinned(len(drawn), len(known))}",
         Drawing(draw, 0.66),
-        Table(
-            ("radius, px", "trend px", "± sd", "mean / sd"),
-            tuple(
-                (f"{a:.0f} to {b:.0f}", signed(m, 4), fixed(s, 4), signed(m / s, 1) if s else signed(np.nan, 1))
-                for a, b, m, s in zip(
-                    trend.radius_px[:-1], trend.radius_px[1:], trend.outward_px.tolist(), trend.sd_px.tolist(),
-                    strict=True,
-                )
-            ),
-        ),
-    )  # fmt: skip
+        Table(("radius, px", "trend px", "± sd", "mean / sd"), tuple(_trend_rows(trend))),
+    )
+
+
+def _trend_rows(trend: RadiusTrend) -> Iterator[tuple[str, ...]]:
+    for low, high, mean, sd in zip(
+        trend.radius_px[:-1], trend.radius_px[1:], trend.outward_px.tolist(), trend.sd_px.tolist(), strict=True
+    ):
+        yield f"{low:.0f} to {high:.0f}", fixed(mean, 4, "+"), fixed(sd, 4), fixed(mean / sd if sd else np.nan, 1, "+")
 
 
 def _outward(table: ResidualTable, rows: Indices, camera: Camera) -> tuple[Array, Array]:
@@ -238,7 +265,7 @@ def _outward(table: ResidualTable, rows: Indices, camera: Camera) -> tuple[Array
 # ---- by frame -------------------------------------------------------------------------------------------------------
 
 
-def by_frame(material: Material) -> Picture:
+def by_frame(material: Material) -> Figure:
     """Root mean square residual of each frame, in standard deviations."""
     frames = material.diagnosis.summaries.frames
     number = np.arange(len(frames.names), dtype=float)
@@ -257,7 +284,7 @@ def by_frame(material: Material) -> Picture:
         if not few:
             axes.set_xlabel("frame, in order")
 
-    return Picture(
+    return Figure(
         "frames",
         "Residuals frame by frame",
         "Root mean square residual of each frame over its expected noise: 1 is as everywhere. A frame that stands out "

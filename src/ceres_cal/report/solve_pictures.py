@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ceres_cal.base.arrays import Array
+from ceres_cal.base.words import counted, fixed, short
 from ceres_cal.calibration import Calibration
 from ceres_cal.model.keys import Key
 from ceres_cal.report import canvas
 from ceres_cal.report.canvas import DIVERGING, OUTLIER, PAINT, POINT, Drawing
 from ceres_cal.report.material import ClosedForm, Material
-from ceres_cal.report.page import Picture, Table
-from ceres_cal.report.words import count, fixed, short, signed
+from ceres_cal.report.page import Figure, Table
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -27,49 +27,45 @@ _QUANTILES = (0.1, 0.25, 0.5, 0.75, 0.9, 0.99)
 # ---- correlation ----------------------------------------------------------------------------------------------------
 
 
-def correlation(material: Material) -> Picture | None:
+def correlation(material: Material) -> Figure | None:
     """Correlation of the shared numbers, cameras and stations first; None where there is no covariance."""
     posterior = material.calibration.posterior
     if posterior is None:
         return None
-    order = sorted(
-        range(len(posterior.keys)), key=lambda place: posterior.keys[place].kind not in ("camera", "station")
-    )
+    order = sorted(range(len(posterior.keys)), key=lambda i: posterior.keys[i].kind not in ("camera", "station"))
     chosen = np.array(order[:_MOST_NUMBERS])
-    keys = [posterior.keys[place] for place in chosen]
+    keys = [posterior.keys[i] for i in chosen]
     sd = np.sqrt(np.diagonal(posterior.covariance)[chosen])
     with np.errstate(invalid="ignore", divide="ignore"):
         matrix = posterior.covariance[np.ix_(chosen, chosen)] / sd[:, None] / sd
     labels = [label(key, keys) for key in keys]
-
-    def draw(axes: Axes, width_in: float) -> None:
-        axes.set_facecolor(PAINT)
-        drawn = axes.pcolormesh(
-            matrix, vmin=-1.0, vmax=1.0, cmap=canvas.ramp(DIVERGING), edgecolor="white", linewidth=0.8
-        )
-        size = 6.5 if len(keys) <= 14 else 6.0
-        places = np.arange(len(keys)) + 0.5
-        axes.set_xticks(places, labels, rotation=60, ha="right", rotation_mode="anchor", fontsize=size)
-        axes.set_yticks(places, labels, fontsize=size)
-        axes.tick_params(length=0)
-        axes.invert_yaxis()
-        axes.set_aspect("equal")
-        axes.grid(visible=False)
-        figure = axes.get_figure()
-        assert figure is not None
-        bar = figure.colorbar(drawn, ax=axes, ticks=[-1, 0, 1], shrink=0.5, aspect=18, pad=0.02)
-        bar.outline.set_visible(False)
-
     rest = len(posterior.keys) - len(keys)
-    return Picture(
+    return Figure(
         "correlation",
         "Correlation of the numbers",
         "Dark blue: two numbers may be wrong together in the same sense; brown: in opposite senses. What is nearly 1 "
         "or -1 (such as phi and the height) is known as a ratio much better than each by itself. Grey: unknown."
-        + (f" {count(rest, 'further number')} not drawn." if rest else ""),
-        Drawing(draw, 0.86),
+        + (f" {counted(rest, 'further number')} not drawn." if rest else ""),
+        Drawing(lambda axes, _: _draw_matrix(axes, matrix, labels), 0.86),
         _pairs(matrix, labels),
     )
+
+
+def _draw_matrix(axes: Axes, matrix: Array, labels: Sequence[str]) -> None:
+    axes.set_facecolor(PAINT)
+    drawn = axes.pcolormesh(matrix, vmin=-1.0, vmax=1.0, cmap=canvas.ramp(DIVERGING), edgecolor="white", linewidth=0.8)
+    size = 6.5 if len(labels) <= 14 else 6.0
+    places = np.arange(len(labels)) + 0.5
+    axes.set_xticks(places, labels, rotation=60, ha="right", rotation_mode="anchor", fontsize=size)
+    axes.set_yticks(places, labels, fontsize=size)
+    axes.tick_params(length=0)
+    axes.invert_yaxis()
+    axes.set_aspect("equal")
+    axes.grid(visible=False)
+    figure = axes.get_figure()
+    assert figure is not None
+    bar = figure.colorbar(drawn, ax=axes, ticks=[-1, 0, 1], shrink=0.5, aspect=18, pad=0.02)
+    bar.outline.set_visible(False)
 
 
 def label(key: Key, others: Sequence[Key]) -> str:
@@ -86,14 +82,14 @@ def _pairs(matrix: Array, labels: Sequence[str]) -> Table:
     order = np.argsort(-np.abs(np.nan_to_num(strength)))[:_MOST_PAIRS]
     return Table(
         ("strongest pairs", "and", "correlation"),
-        tuple((labels[first[i]], labels[second[i]], signed(float(strength[i]), 4)) for i in order),
+        tuple((labels[first[i]], labels[second[i]], fixed(float(strength[i]), 4, "+")) for i in order),
     )
 
 
 # ---- convergence ----------------------------------------------------------------------------------------------------
 
 
-def convergence(material: Material) -> Picture | None:
+def convergence(material: Material) -> Figure | None:
     """The cost above its least, iteration by iteration of the last solve; None where nothing was minimised."""
     history = np.array(material.calibration.history)
     if len(history) < 2:
@@ -114,11 +110,11 @@ def convergence(material: Material) -> Picture | None:
 
     solved = material.calibration
     how = "It came to rest" if solved.converged else "It did not come to rest"
-    return Picture(
+    return Figure(
         "convergence",
         "Convergence of the last solve",
         f"A sound solve falls steeply and ends: a long flat tail means that some direction is hardly told. {how} after "
-        f"{count(solved.rounds, 'solve')}; this is the last one, to a cost of {history[-1]:.6g}.",
+        f"{counted(solved.rounds, 'solve')}; this is the last one, to a cost of {history[-1]:.6g}.",
         Drawing(draw, 0.66),
         Table(("iteration", "cost", "fall"), tuple(_cost_row(history, i) for i in range(len(history)))),
     )
@@ -132,7 +128,7 @@ def _cost_row(history: Array, number: int) -> tuple[str, ...]:
 # ---- closed form against bundle -------------------------------------------------------------------------------------
 
 
-def against_closed_form(material: Material, closed: ClosedForm) -> Picture:
+def against_closed_form(material: Material, closed: ClosedForm) -> Figure:
     """How many residuals are below a length, by the paper's closed form and by the bundle."""
     table = material.diagnosis.table
     inlier = table.inlier
@@ -150,7 +146,7 @@ def against_closed_form(material: Material, closed: ClosedForm) -> Picture:
         canvas.key(axes)
 
     medians = {name: float(np.median(values)) for name, values in lengths.items()}
-    return Picture(
+    return Figure(
         "closed-form",
         "Closed form against bundle",
         f"Farther left is better. Half of the residuals are below {short(medians['bundle'])} px by the bundle, below "

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ceres_cal.base.arrays import Array
+from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.errors import DegenerateError, InputError
 from ceres_cal.base.transforms import Pose
 from ceres_cal.scene.lens import Lens
@@ -64,6 +64,12 @@ class Camera:
     def position(self) -> Array:
         """Where the camera is in the world, (3,) metres: the paper's t. Its third number is the height."""
         return self.cam_from_world.position
+
+    @property
+    def tilt_deg(self) -> float:
+        """Angle between the camera's axis and straight down."""
+        x, y, z = self.cam_from_world.rotation[2]
+        return float(np.degrees(np.arctan2(np.hypot(x, y), -z)))
 
     @property
     def matrix(self) -> Array:
@@ -146,3 +152,8 @@ class Camera:
         if abs(self.position[2] - height_m) < 1e-9:  # the determinant of H
             raise DegenerateError(f"the camera lies in the plane z = {height_m} m, edge-on: ask for another height")
         return np.asarray(np.linalg.inv(self.homography(height_m)))
+
+
+def in_image(pixels: Array, image_size: tuple[int, int]) -> Mask:
+    """(N,) whether pixels (N, 2) lie within half a pixel of one of the image's; False for NaN."""
+    return np.asarray(np.all((pixels >= -0.5) & (pixels <= np.array(image_size) - 0.5), axis=-1))

@@ -6,6 +6,7 @@ What draws (`photograph`, `album`) needs OpenCV and is imported where it is used
 from ceres_cal.model.parameters import Station
 from ceres_cal.simulate.built_in import built_in_scene, scene_names
 from ceres_cal.simulate.compose import (
+    Held,
     board_placements,
     board_pose,
     board_scene,
@@ -25,6 +26,7 @@ __all__ = [
     "OUTLIER",
     "WRONG_LABEL",
     "Disturbance",
+    "Held",
     "Photography",
     "Scene",
     "Simulation",

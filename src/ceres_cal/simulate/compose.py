@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -41,50 +42,49 @@ def overhead_pose(
     return Pose.looking((x_m, y_m, height_m), tilt @ down)
 
 
+@dataclass(frozen=True)
+class Held:
+    """Ranges of how a board is held before the first camera: the distance to its middle, and the angle between its
+    normal and the line of sight to that.
+    """
+
+    distance_m: tuple[float, float] = (1.0, 2.5)
+    tilt_deg: tuple[float, float] = (15.0, 45.0)
+
+
 def board_placements(
     board: Target,
     cameras: Sequence[Camera],
     count: int,
     seed: int,
-    distance_m: tuple[float, float] = (1.0, 2.5),
-    tilt_deg: tuple[float, float] = (15.0, 45.0),
+    held: Held = Held(),
 ) -> list[Pose]:
     """world_from_target of a board at random places where every one of the posed cameras sees all of its points.
-
-    Args:
-        distance_m: range of the distance from the first camera to the middle of the board.
-        tilt_deg: range of the angle between the board's normal and the first camera's line of sight to its middle.
 
     Raises:
         InputError: no such place is found.
     """
     rng = np.random.default_rng(seed)
-    found: list[Pose] = []
+    placements: list[Pose] = []
     for _ in range(_TRIES):
-        if len(found) == count:
-            return found
-        cam_from_board = _random_board_pose(board, cameras[0], distance_m, tilt_deg, rng)
+        if len(placements) == count:
+            return placements
+        cam_from_board = _random_board_pose(board, cameras[0], held, rng)
         placement = cameras[0].cam_from_world.inverse @ cam_from_board
         if all(np.all(well_inside(camera, placement.transform(board.point_array))) for camera in cameras):
-            found.append(placement)
+            placements.append(placement)
     raise InputError(
         f"no {count} places found where {len(cameras)} camera(s) see a whole {board.kind}: "
         "take a smaller board, a larger distance or less tilt"
     )
 
 
-def _random_board_pose(
-    board: Target,
-    camera: Camera,
-    distance_m: tuple[float, float],
-    tilt_deg: tuple[float, float],
-    rng: np.random.Generator,
-) -> Pose:
+def _random_board_pose(board: Target, camera: Camera, held: Held, rng: np.random.Generator) -> Pose:
     """cam_from_board with the board's middle at a random pixel."""
     pixel = rng.uniform((0.0, 0.0), camera.image_size)
     direction, spin = rng.uniform(0.0, 2.0 * np.pi, size=2)
-    tilt = np.deg2rad(rng.uniform(*tilt_deg))
-    return board_pose(board, camera, pixel, rng.uniform(*distance_m), tilt, direction, spin)
+    tilt = np.deg2rad(rng.uniform(*held.tilt_deg))
+    return board_pose(board, camera, pixel, rng.uniform(*held.distance_m), (tilt, direction, spin))
 
 
 def board_pose(
@@ -92,22 +92,24 @@ def board_pose(
     camera: Camera,
     pixel: ArrayLike,
     distance_m: float,
-    tilt_rad: float,
-    direction_rad: float,
-    spin_rad: float = 0.0,
+    turn_rad: tuple[float, float, float],
 ) -> Pose:
     """cam_from_board with the board's middle at a pixel (2,), so far from the camera.
 
     Its normal points away from the camera, so that columns run right and rows down before it is turned: by spin about
     its own normal, then by the tilt about an axis across the line of sight. That tilt brings its upper edge nearer to
     the camera at direction 0, its right one at a quarter turn.
+
+    Args:
+        turn_rad: tilt, direction of the tilt, spin.
     """
+    tilt, direction, spin = turn_rad
     line_of_sight = camera.rays(np.reshape(pixel, (1, 2)))[0]
     across = np.array([-line_of_sight[1], line_of_sight[0], 0.0])  # z x line of sight
     sine = np.linalg.norm(across)
     facing = rotation_exp(across / max(sine, 1e-12) * np.arctan2(sine, line_of_sight[2]))
-    leaning = rotation_exp((tilt_rad * np.cos(direction_rad), tilt_rad * np.sin(direction_rad), 0.0))
-    rotation = facing @ leaning @ rotation_exp((0.0, 0.0, spin_rad))
+    leaning = rotation_exp((tilt * np.cos(direction), tilt * np.sin(direction), 0.0))
+    rotation = facing @ leaning @ rotation_exp((0.0, 0.0, spin))
     middle = board.point_array.mean(axis=0)
     return Pose(rotation, line_of_sight * distance_m - rotation @ middle)
 
@@ -152,17 +154,14 @@ def board_scene(
     stations: Mapping[str, Station],
     count: int,
     seed: int,
-    *,
-    distance_m: tuple[float, float] = (1.0, 2.5),
-    tilt_deg: tuple[float, float] = (15.0, 45.0),
-    name: str = "board",
+    held: Held = Held(),
 ) -> Scene:
     """A board held at `count` places, each seen whole from every station at once (see `board_placements`)."""
     posed = [cameras[station.camera].at(station.cam_from_world) for station in stations.values()]
-    poses = board_placements(board, posed, count, seed, distance_m, tilt_deg)
-    placements = {f"{name}_{number:02d}": pose for number, pose in enumerate(poses, start=1)}
-    views = tuple(ViewPlan((held,), station, name, held) for held in placements for station in stations)
-    return Scene({name: board}, cameras, stations, placements, views)
+    poses = board_placements(board, posed, count, seed, held)
+    placements = {f"board_{number:02d}": pose for number, pose in enumerate(poses, start=1)}
+    views = tuple(ViewPlan((frame,), station, "board", frame) for frame in placements for station in stations)
+    return Scene({"board": board}, cameras, stations, placements, views)
 
 
 def rings_scene(

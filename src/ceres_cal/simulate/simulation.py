@@ -9,7 +9,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, Codes, Indices, Indices32, Mask
 from ceres_cal.observations import Curves, Observations, Points, View
-from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.camera import Camera, in_image
 from ceres_cal.scene.curves import SIDES, along_curve, distance_to_curve
 from ceres_cal.scene.targets import Target
 from ceres_cal.simulate.scene import Disturbance, Scene, ViewPlan
@@ -59,6 +59,8 @@ class _InView:
     feature: Indices32
     pixels: Array
     features: int
+    image_size: tuple[int, int]
+    side: int = 0
     position_m: Array | None = None
     neighbour: Indices32 | None = None
 
@@ -96,13 +98,8 @@ def simulate(scene: Scene, disturbance: Disturbance | None = None, seed: int = 0
         points, curves = _points_in_view(scene, plan, camera), _curves_in_view(scene, plan, camera)
         hidden_points = _hidden_points(points, len(plan.frames), disturbance, point_rng)
         hidden_curves = _hidden_stretches(curves, len(plan.frames), disturbance, curve_rng)
-        first, side, size = len(views), SIDES[plan.side], camera.image_size
-        point_rows.append(
-            _observe(points, hidden_points, first, 0, disturbance.points_sigma_px, disturbance, size, point_rng)
-        )
-        curve_rows.append(
-            _observe(curves, hidden_curves, first, side, disturbance.curves_sigma_px, disturbance, size, curve_rng)
-        )
+        point_rows.append(_observe(points, hidden_points, len(views), disturbance, point_rng))
+        curve_rows.append(_observe(curves, hidden_curves, len(views), disturbance, curve_rng))
         camera_name = scene.stations[plan.station].camera
         views.extend(View(frame, camera_name, plan.station, plan.target, plan.placement) for frame in plan.frames)
     return _assemble(scene, disturbance, seed, views, point_rows, curve_rows)
@@ -111,17 +108,12 @@ def simulate(scene: Scene, disturbance: Disturbance | None = None, seed: int = 0
 # ---- what can be seen -----------------------------------------------------------------------------------------------
 
 
-def _inside(pixels: Array, image_size: tuple[int, int]) -> Mask:
-    """Whether pixels (N, 2) lie inside the image: within half a pixel of a pixel's centre."""
-    return np.asarray(np.all((pixels >= -0.5) & (pixels <= np.array(image_size) - 0.5), axis=1))
-
-
 def _project_seen(scene: Scene, plan: ViewPlan, camera: Camera, points: Array) -> tuple[Indices, Array]:
     """Which of the target's points (N, 3) the camera sees, and their pixels."""
     points_world = scene.world_from_target(plan.placement).transform(points)
     ahead = np.flatnonzero(camera.cam_from_world.transform(points_world)[:, 2] > 0.0)
     pixels = camera.project(points_world[ahead])
-    seen = _inside(pixels, camera.image_size)  # False for the NaN beyond the lens
+    seen = in_image(pixels, camera.image_size)  # False for the NaN beyond the lens
     return ahead[seen], pixels[seen]
 
 
@@ -137,7 +129,7 @@ def _points_in_view(scene: Scene, plan: ViewPlan, camera: Camera) -> _InView:
     target = scene.targets[plan.target]
     chosen = _chosen(plan.points, target.point_names)
     rows, pixels = _project_seen(scene, plan, camera, target.point_array[chosen])
-    return _InView(chosen[rows], pixels, len(target.points))
+    return _InView(chosen[rows], pixels, len(target.points), camera.image_size)
 
 
 def _curves_in_view(scene: Scene, plan: ViewPlan, camera: Camera) -> _InView:
@@ -157,7 +149,9 @@ def _curves_in_view(scene: Scene, plan: ViewPlan, camera: Camera) -> _InView:
     there, feature = np.concatenate(places), np.concatenate(features)
     rows, pixels = _project_seen(scene, plan, camera, there)
     neighbour = _neighbours(target, feature[rows], there[rows])
-    return _InView(feature[rows], pixels, len(chosen), np.concatenate(positions)[rows], neighbour)
+    position = np.concatenate(positions)[rows]
+    side = SIDES[plan.side]
+    return _InView(feature[rows], pixels, len(chosen), camera.image_size, side, position, neighbour)
 
 
 def _neighbours(target: Target, feature: Indices32, places: Array) -> Indices32:
@@ -201,17 +195,11 @@ def _hidden_stretches(in_view: _InView, frames: int, disturbance: Disturbance, r
 
 
 def _observe(
-    in_view: _InView,
-    hidden: Mask,
-    first_view: int,
-    side: int,
-    sigma_px: float,
-    disturbance: Disturbance,
-    image_size: tuple[int, int],
-    rng: np.random.Generator,
+    in_view: _InView, hidden: Mask, first_view: int, disturbance: Disturbance, rng: np.random.Generator
 ) -> _Rows:
     """The observations of all frames of a plan."""
     frame, place = np.nonzero(~hidden)
+    sigma_px = disturbance.points_sigma_px if in_view.position_m is None else disturbance.curves_sigma_px
     lot = rng.random(len(place))
     flag = np.zeros(len(place), dtype=np.int8)
     flag[lot < disturbance.outliers + disturbance.wrong_labels] = WRONG_LABEL
@@ -230,12 +218,12 @@ def _observe(
         feature=feature,
         pixels=pixels,
         sigma_px=np.full(len(place), sigma_px or 1.0),
-        side=np.full(len(place), side, dtype=np.int8),
+        side=np.full(len(place), in_view.side, dtype=np.int8),
         flag=flag,
         true_feature=true_feature,
         true_pixels=true_pixels,
     )
-    kept = _inside(pixels, image_size)
+    kept = in_image(pixels, in_view.image_size)
     return rows if np.all(kept) else _Rows(**{name: column[kept] for name, column in vars(rows).items()})
 
 

@@ -8,11 +8,12 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.heights import ROBOT_TOP_M
 
 Colour = tuple[float, float, float]
 """Blue, green and red, as shares of white."""
 
-ROBOT_RADIUS_M, ROBOT_HEIGHT_M, BALL_RADIUS_M = 0.09, 0.15, 0.0215
+ROBOT_RADIUS_M, BALL_RADIUS_M = 0.09, 0.0215
 _BODY: Colour = (0.04, 0.04, 0.04)
 _COVER: Colour = (0.08, 0.08, 0.08)
 _ORANGE: Colour = (0.05, 0.4, 0.95)
@@ -96,7 +97,7 @@ def shadow_outline(shadow: Shadow, camera: Camera) -> Array:
 
 def _disc(middle: Array, radius_m: float, camera: Camera) -> Array:
     place = middle + radius_m * _CIRCLE
-    return camera.project(np.column_stack([place, np.full(len(place), ROBOT_HEIGHT_M)]))
+    return camera.project(np.column_stack([place, np.full(len(place), ROBOT_TOP_M)]))
 
 
 def _ball_horizon(ball: Ball, position: Array) -> Array:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import reduce
+from functools import cached_property, reduce
 from operator import add
 
 import numpy as np
@@ -69,7 +69,7 @@ class ReducedInformation:
     point_leverage: float
     curve_leverage: float
 
-    @property
+    @cached_property
     def shared(self) -> Information:
         """All of it together."""
         return self.points + self.curves + self.priors

@@ -18,9 +18,11 @@ from ceres_cal.solve.problem import Problem, Weighting
 from ceres_cal.start.closed_forms import pose_from_homography
 from ceres_cal.start.planes import consensus_homography
 
-# Share of a sight's observations; with less of them in use its pose was not understood.
+# Share of a sight's observations; with less of them in use its pose was not understood. Of 40 boards before a
+# fisheye, 30 % outliers, 9 end in a wrong pose, 19 at 0.33; nothing changes at 0.67.
 _LOST = 0.5
-# Points that a consensus is sought among: four make a pose, two more agree by chance hardly ever.
+# Points that a consensus is sought among: four make a pose, two more agree by chance hardly ever. Nothing changes
+# from half to double.
 _FEWEST = 6
 
 

@@ -19,6 +19,9 @@ from ceres_cal.observations.sights import Sights
 # Spare equations below which a spread says nothing: its own error is 25 % at 8. At 4 the errors of fits to ten points
 # are 1.46 of their stated sigmas, at 16 they are 0.8 (1.16 at 8), because the stated sigmas are then taken.
 _LEAST_SPARE = 8.0
+# Spare equations that the other kind's noise counts as: a handful of points beside many curve observations, which the
+# fit nearly goes through, must not seem exact (without it their scale fell to 0.04 of the truth and less).
+_BORROWED = 4.0
 # Spare equations that a scale seen before stands for: few exact ones must not make it 0. Nothing changes from half to
 # double.
 USUAL_EQUATIONS = 10.0
@@ -81,6 +84,10 @@ class Inliers:
             and abs(self.curve_scale - other.curve_scale) <= relative * other.curve_scale
         )
 
+    def much_below(self, other: Inliers, share: float) -> bool:
+        """Whether a scale fell to less than a share of what it was."""
+        return self.point_scale < share * other.point_scale or self.curve_scale < share * other.curve_scale
+
 
 def relative_lengths(observations: Observations, residuals: Residuals) -> tuple[Array, Array]:
     """Lengths of the residuals of points and of curves in their stated sigmas; infinite where there is none."""
@@ -134,13 +141,12 @@ def judge(
         p, c = point_spread.scale_from(usual[0], spare[0]), curve_spread.scale_from(usual[1], spare[1])
         degrees = max(degrees, 0.0) + USUAL_EQUATIONS
     else:
-        point_scale, curve_scale = point_spread.scale(spare[0]), curve_spread.scale(spare[1])
-        # A kind with too few spare equations borrows the other's scale; if both have, the stated sigmas hold.
-        known = [scale for scale in (point_scale, curve_scale) if scale is not None]
-        fallback = known[0] if known else 1.0
-        p = fallback if point_scale is None else point_scale
-        c = fallback if curve_scale is None else curve_scale
-        degrees = degrees if known else np.inf
+        p, c = (
+            point_spread.scale(spare[0], curve_spread, spare[1]),
+            curve_spread.scale(spare[1], point_spread, spare[0]),
+        )
+        if degrees < _LEAST_SPARE:
+            p, c, degrees = 1.0, 1.0, np.inf
     return Inliers(points <= reject_sigma * p, curves <= reject_sigma * c, p, c, points / p, curves / c, degrees)
 
 
@@ -151,9 +157,11 @@ class _Spread:
     count: int
     squares: float
 
-    def scale(self, spare: float) -> float | None:
-        """Their scale, when they bring so many spare equations; None where those are too few to tell."""
-        return max(float(np.sqrt(self.squares / spare)), _LEAST_SCALE_PX) if spare >= _LEAST_SPARE else None
+    def scale(self, spare: float, other: _Spread, other_spare: float) -> float:
+        """Their scale, when they bring so many spare equations: that of the other kind counts as much as a few."""
+        borrowed = min(_BORROWED, max(other_spare, 0.0))
+        variance = borrowed * other.squares / max(other_spare, 1.0)
+        return max(float(np.sqrt((self.squares + variance) / max(spare + borrowed, 1.0))), _LEAST_SCALE_PX)
 
     def scale_from(self, usual: float, spare: float) -> float:
         """Their scale, when the usual one counts as much as a few spare equations: few exact ones do not make it 0."""

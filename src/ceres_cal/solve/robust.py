@@ -28,6 +28,10 @@ _AT_REST, _AT_REST_AGAIN = 1e-2, 1e-5
 # Nothing changes from half to double.
 _ENOUGH_PLACEMENTS = 20
 _ROUGH = 1e-3  # relative change of the cost at which the first solve ends
+_MOST_REFINED = 3
+# Share of the residuals' scale: a rough solve that leaves less is followed by another one at the new scale. A line that
+# is painted aside is told from noise only at a scale near the noise's own.
+_MUCH_LESS = 0.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,6 +86,8 @@ def solve_robustly(
             undecided = frozenset(state.problem.sights.keys)  # another lens had decided about mirrored poses
         if at_rest or before is None:
             state, changed, undecided = rounds.mended(state, undecided)
+            if before is None:
+                state = rounds.refined(state)
             if at_rest and not changed:
                 state = rounds.with_leverages(state)
                 if state.reduced is not None:
@@ -102,16 +108,32 @@ class _Rounds:
     ) -> None:
         self._problem, self._observations, self._usual, self._progress = problem, observations, usual, progress
         self._redundancy: Redundancy | None = None
+        self._visible: Inliers
         self.no_change = _AT_REST if usual is None else _AT_REST_AGAIN
 
     def first(self, estimate: Estimate) -> RobustSolution:
-        """The rough solve from a start, of few placements, which the others follow."""
-        start = residuals(self._observations, self._problem.sights, estimate)
-        visible = visible_from(self._observations, start)
+        """The rough solve from a start."""
+        there = residuals(self._observations, self._problem.sights, estimate)
+        return self._rough(estimate, there, visible_from(self._observations, there), 1)
+
+    def refined(self, state: RobustSolution) -> RobustSolution:
+        """Further rough solves, each at the scale of the residuals that the one before left, while that falls."""
+        for _ in range(_MOST_REFINED):
+            visible = visible_from(self._observations, state.residuals)
+            if not visible.much_below(self._visible, _MUCH_LESS):
+                break
+            state = self._rough(state.solution.estimate, state.residuals, visible, state.rounds + 1)
+        # Of one kind of observations without priors the leverages add up to the count.
+        mixed = bool(self._problem.priors) or all(kind.equations for kind in self._problem.sights.by_kind)
+        return self._by_leverages(state)[0] if mixed and len(state.problem.sights) else state
+
+    def _rough(self, estimate: Estimate, there: Residuals, visible: Inliers, rounds: int) -> RobustSolution:
+        """A solve of few placements, which the others follow, that gross errors do not decide."""
+        self._visible = visible
         # A line painted aside is an outlier to a redescending loss, but not to its tolerance.
         loss = "huber" if len(estimate.structure.values) else "cauchy"
         weighting = Weighting(visible.point_scale, visible.curve_scale, loss, loss_scale=1.0)
-        problem = replace(self._problem.used(visible.points, visible.curves), weighting=weighting, feet=start.feet)
+        problem = replace(self._problem.used(visible.points, visible.curves), weighting=weighting, feet=there.feet)
         if not len(problem.sights):
             raise DegenerateError(
                 "the observations fix no pose that could show them: add points or lines of the targets"
@@ -120,7 +142,7 @@ class _Rounds:
         solution = solve(few, estimate, self._progress, precision=_ROUGH, is_near=False)
         if len(few.sights) < len(problem.sights):
             solution = replace(solution, estimate=with_placements_at_best(problem, solution.estimate))
-        return self._judged(solution, start, 1)
+        return self._judged(solution, there, rounds)
 
     def next(self, state: RobustSolution) -> RobustSolution:
         """One more solve, from where the last one ended, of what was judged to be inliers."""
@@ -145,14 +167,17 @@ class _Rounds:
         """The state with what its problem says there, where the noise is judged no other by the leverages; else judged
         by them, for another round.
         """
-        estimate = state.solution.estimate
-        reduced = information(state.problem, estimate)
-        self._redundancy = Redundancy.by_leverage(state.problem.sights, reduced.leverages)
-        anew = self._weighted(state.solution, state.residuals, state.rounds)
+        anew, reduced = self._by_leverages(state)
         if not anew.inliers.same_as(state.inliers, self.no_change):
             return anew
         degrees = anew.inliers.degrees_of_freedom
         return replace(state, inliers=replace(state.inliers, degrees_of_freedom=degrees), reduced=reduced)
+
+    def _by_leverages(self, state: RobustSolution) -> tuple[RobustSolution, ReducedInformation]:
+        """The state judged by the leverages there, and what they were taken from."""
+        reduced = information(state.problem, state.solution.estimate)
+        self._redundancy = Redundancy.by_leverage(state.problem.sights, reduced.leverages)
+        return self._weighted(state.solution, state.residuals, state.rounds), reduced
 
     def _judged(self, solution: Solution, before: Residuals, rounds: int) -> RobustSolution:
         """Noise and inliers where a solve ended, and the problem that they make."""

@@ -13,7 +13,7 @@ from ceres_cal.uncertainty.posterior import Posterior, make_posterior
 from ceres_cal.uncertainty.profile import PhiProfile
 from ceres_cal.uncertainty.seam import Disagreement, disagreement
 from ceres_cal.uncertainty.uncertainty import Uncertainty
-from ceres_cal.uncertainty.weak import Verdict, WeakDirection, bounds_text
+from ceres_cal.uncertainty.weak import Verdict, WeakDirection
 
 __all__ = [
     "Disagreement",
@@ -26,7 +26,6 @@ __all__ = [
     "Verdict",
     "WeakDirection",
     "assess",
-    "bounds_text",
     "disagreement",
     "information_from",
     "lower_triangle",

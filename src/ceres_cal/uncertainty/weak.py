@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ceres_cal.base.arrays import Array
-from ceres_cal.base.digits import two_digits
+from ceres_cal.base.words import two_digits
 from ceres_cal.model.keys import PLACEMENT_QUANTITIES, Key
 from ceres_cal.model.parameters import Estimate
 from ceres_cal.model.quantities import natural_sizes, values_of
@@ -84,14 +84,6 @@ def verdicts(estimate: Estimate, posterior: Posterior) -> tuple[Verdict, ...]:
 def _word(key: Key, relative: float) -> str:
     known, weak = (_LEARNT, 0.95) if key.kind == "structure" else (KNOWN, WEAK)
     return "known" if relative <= known else "weak" if relative <= weak else "unknown"
-
-
-def bounds_text(low: float, high: float, unit: str) -> str:
-    """What 95 % bounds leave: "477 to 672 px", "below 1209 px", "above 300 px", "anything"; 0 is no bound."""
-    digits = ".2f" if unit == "m" else ".0f"
-    if low == 0.0 or np.isinf(low):
-        return "anything" if np.isinf(high) else f"below {high:{digits}} {unit}"
-    return f"above {low:{digits}} {unit}" if np.isinf(high) else f"{low:{digits}} to {high:{digits}} {unit}"
 
 
 def unknown_placements(posterior: Posterior) -> dict[str, tuple[str, ...]]:

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from ceres_cal.base.digits import two_digits
+from ceres_cal.base.words import two_digits
 
 
 @pytest.mark.parametrize(

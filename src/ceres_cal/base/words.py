@@ -1,0 +1,102 @@
+"""Numbers and names as people read them, in messages, answers and reports."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+DASH = "\N{EN DASH}"
+_SPACE = "\N{NO-BREAK SPACE}"
+_POWERS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
+# ---- numbers --------------------------------------------------------------------------------------------------------
+
+
+def two_digits(value: float) -> str:
+    """Two digits, and all that stand before the point: 0.21, 6.6, 24, 130."""
+    return f"{value:.2g}" if abs(value) < 99.5 else f"{value:.0f}"  # two digits of 99.5 are 1e+02
+
+
+def short(value: float) -> str:
+    """Two digits: 0.21, 6.6, 24, 130; a dash for what is not there, "unknown" for infinity."""
+    if np.isnan(value):
+        return DASH
+    return "unknown" if np.isinf(value) else two_digits(value)
+
+
+def mm(value: float) -> str:
+    """Two digits with their unit, on one line."""
+    return f"{short(value)}{_SPACE}mm" if np.isfinite(value) else short(value)
+
+
+def metres(place: tuple[float, float]) -> str:
+    """A place on the field."""
+    return f"x{_SPACE}{place[0]:.1f}, y{_SPACE}{place[1]:.1f}{_SPACE}m"
+
+
+def fixed(value: float, places: int, sign: str = "") -> str:
+    """So many places, a dash for what is not there; `sign` "+" also of what is positive."""
+    return f"{value:{sign}.{places}f}" if np.isfinite(value) else DASH
+
+
+def powered(text: str) -> str:
+    """px^-2, or 10^7, as it is written by hand."""
+    base, _, power = text.partition("^")
+    return base + power.translate(_POWERS)
+
+
+def chance(log10_p: float) -> str:
+    """A probability: "0.21 %", "1 in 10^12"."""
+    return f"{100.0 * 10.0**log10_p:.2g} %" if log10_p >= -3.0 else f"1 in 10^{-log10_p:.0f}"
+
+
+def at_precision(value: float, sd: float, unit: str) -> str:
+    """A value with as many places as two digits of its sd; coefficients keep every digit."""
+    if unit.startswith("px^"):
+        return repr(value)
+    if not (np.isfinite(sd) and sd > 0.0):
+        return f"{value:.4f}"
+    return f"{value:.{int(np.clip(1 - np.floor(np.log10(sd)), 0, 9))}f}"
+
+
+def bounds_text(low: float, high: float, unit: str, digits: str = "") -> str:
+    """What 95 % bounds leave: "477 to 672 px", "below 1209 px", "above 300 px", "anything"; 0 is no bound.
+
+    Args:
+        digits: how a bound is formatted; whole numbers by default, centimetres where the unit is m.
+    """
+    digits, space = digits or (".2f" if unit == "m" else ".0f"), f" {unit}" if unit else ""
+    if low == 0.0 or np.isinf(low):
+        return "anything" if np.isinf(high) else f"below {high:{digits}}{space}"
+    return f"above {low:{digits}}{space}" if np.isinf(high) else f"{low:{digits}} to {high:{digits}}{space}"
+
+
+# ---- counts and names -----------------------------------------------------------------------------------------------
+
+
+def grouped(number: int) -> str:
+    """A count with its thousands apart."""
+    return f"{number:,}".replace(",", "\N{NARROW NO-BREAK SPACE}")
+
+
+def plural(number: int, word: str, shown: str = "") -> str:
+    """A count with its word: 1 view, 1204 views; `shown` is the count as it is written, where otherwise."""
+    return f"{shown or number} {word}{'' if number == 1 else 's'}"
+
+
+def counted(number: int, word: str) -> str:
+    """A count with its word, thousands apart: 1 view, 1 204 views."""
+    return plural(number, word, grouped(number))
+
+
+def first_of(names: Sequence[str], most: int) -> str:
+    """At most so many names, and how many more there are."""
+    more = f" and {grouped(len(names) - most)} more" if len(names) > most else ""
+    return ", ".join(names[:most]) + more
+
+
+def sentence(text: str) -> str:
+    """The text with a capital at its beginning."""
+    return f"{text[:1].upper()}{text[1:]}"

@@ -1,0 +1,133 @@
+"""Arguments that several commands share, and what people type as values of them."""
+
+from __future__ import annotations
+
+from argparse import ArgumentParser, Namespace
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ceres_cal.base.errors import InputError
+
+if TYPE_CHECKING:
+    from ceres_cal.observations import Observations, Prior
+
+PRIOR_EXAMPLE = "overhead.height_m=4.02:0.01"
+
+
+def add_calibration(parser: ArgumentParser, what: str = "file that `ceres-cal calibrate` or `refit` wrote") -> None:
+    """The argument CALIBRATION."""
+    parser.add_argument("calibration", metavar="CALIBRATION", type=Path, help=what)
+
+
+def add_station(parser: ArgumentParser, what: str = "which station; may be left out where there is only one") -> None:
+    """The option --station NAME."""
+    parser.add_argument("--station", metavar="NAME", help=what)
+
+
+def add_quiet(parser: ArgumentParser) -> None:
+    """The option --quiet."""
+    parser.add_argument("--quiet", action="store_true", help="no progress")
+
+
+def add_output(parser: ArgumentParser, what: str, *, required: bool) -> None:
+    """The option -o FILE."""
+    parser.add_argument("-o", "--output", metavar="FILE", type=Path, required=required, help=f"file for {what}")
+
+
+def add_report(parser: ArgumentParser) -> None:
+    """The options --report PAGE and --images."""
+    parser.add_argument(
+        "--report",
+        metavar="PAGE",
+        type=Path,
+        help="file for a page (.html): may it be trusted, for what, to how many mm",
+    )
+    parser.add_argument(
+        "--images",
+        metavar="PHOTOGRAPH",
+        action="append",
+        default=[],
+        help="with --report: a photograph, or a folder of them, named like the frames: the model is drawn into them; "
+        "repeatable",
+    )
+
+
+def add_detection(parser: ArgumentParser) -> None:
+    """What `detect board` and `detect rings` write: --camera, --station and -o."""
+    parser.add_argument("--camera", default="camera", metavar="NAME", help="name of the camera; default: camera")
+    add_station(parser, "name of the station; default: that of the camera")
+    add_output(parser, "the observations (.json or .npz)", required=True)
+
+
+# ---- values ---------------------------------------------------------------------------------------------------------
+
+
+def parse_number(text: str, where: str) -> float:
+    """A finite number; InputError naming `where`."""
+    try:
+        value = float(text)
+    except ValueError:
+        raise InputError(f"{where}: {text.strip()!r} is not a number") from None
+    if not abs(value) < float("inf"):
+        raise InputError(f"{where}: {text.strip()!r} is not a finite number")
+    return value
+
+
+def parse_numbers(text: str, where: str) -> tuple[float, ...]:
+    """Finite numbers between commas; InputError naming `where`."""
+    return tuple(parse_number(part, where) for part in text.split(","))
+
+
+def parse_names(text: str) -> list[str]:
+    """Names between commas."""
+    return [name.strip() for name in text.split(",") if name.strip()]
+
+
+def height_m(args: Namespace) -> float:
+    """--height-mm in metres; 0 where it was not given."""
+    return 0.0 if args.height_mm is None else parse_number(args.height_mm, "--height-mm") / 1000.0
+
+
+@dataclass(frozen=True)
+class PriorNames:
+    """The quantities that a `--prior` may name: of a station, and of a camera."""
+
+    station: Sequence[str]
+    camera: Sequence[str] = ()
+
+    @property
+    def known(self) -> str:
+        of_camera = f", a camera {', '.join(self.camera)}" if self.camera else ""
+        return f"a station has {', '.join(self.station)}{of_camera}"
+
+
+def parse_prior(spec: str, observations: Observations, names: PriorNames) -> Prior:
+    """The prior of a `--prior` argument: [OWNER.]QUANTITY=VALUE[,VALUE..]:SIGMA[,SIGMA..]; InputError that names it."""
+    from ceres_cal.observations import prior_from_json
+
+    where = f"--prior {spec!r}"
+    left, equals, right = spec.rpartition("=")
+    values, colon, sigmas = right.partition(":")
+    if not (equals and colon):
+        raise InputError(f"{where}: write OWNER.NAME=VALUE:SIGMA, such as {PRIOR_EXAMPLE}")
+    name, _, quantity = left.strip().rpartition(".")
+    if quantity not in (*names.station, *names.camera):
+        raise InputError(f"{where}: {quantity!r} is unknown: {names.known}")
+    owner, known = ("station", observations.stations) if quantity in names.station else ("camera", observations.cameras)
+    if not name and len(known) == 1:
+        name = next(iter(known))
+    if name not in known:
+        raise InputError(f"{where}: name one {owner} before the dot: {', '.join(known)}")
+    sigma = parse_numbers(sigmas, f"{where}: sigma")
+    if min(sigma) <= 0.0:
+        raise InputError(f"{where}: sigma must be above 0")
+    return prior_from_json(
+        {
+            owner: name,
+            quantity: list(parse_numbers(values, where)),
+            "sigma_m" if owner == "station" else "sigma": sigma[0] if len(sigma) == 1 else list(sigma),
+        },
+        where,
+    )

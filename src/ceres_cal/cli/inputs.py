@@ -1,0 +1,78 @@
+"""What commands read: images, calibrations, observations; all of it checked before any long work."""
+
+from __future__ import annotations
+
+import glob
+import os
+from argparse import Namespace
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ceres_cal.base.errors import InputError
+
+if TYPE_CHECKING:
+    from ceres_cal.calibration import Calibration
+    from ceres_cal.observations import Observations
+
+IMAGE_ENDINGS = {".bmp", ".jp2", ".jpeg", ".jpg", ".pbm", ".pgm", ".png", ".pnm", ".ppm", ".tif", ".tiff", ".webp"}
+
+
+def image_files(given: Iterable[str]) -> list[Path]:
+    """The files named; those of folders, and of patterns that no shell expanded, in the order of their names."""
+    quiet_opencv()
+    return [path for name in given for path in _files(name)]
+
+
+def quiet_opencv() -> None:
+    """What OpenCV warns of in an image, we say ourselves; before it is imported."""
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")
+
+
+def _files(name: str) -> Iterator[Path]:
+    path = Path(name)
+    if path.is_dir():
+        inside = sorted(file for file in path.iterdir() if file.suffix.lower() in IMAGE_ENDINGS and file.is_file())
+        if not inside:
+            raise InputError(f"{name}: there are no images in this folder")
+        yield from inside
+    elif path.exists():
+        yield path
+    else:
+        matches = sorted(glob.glob(name))  # noqa: PTH207, Path.glob refuses absolute patterns
+        if not matches:
+            raise InputError(f"{name}: no such file")
+        yield from map(Path, matches)
+
+
+def require_different(files: Iterable[str | Path]) -> None:
+    """A file that counts twice would make its observations look better than they are."""
+    given: set[Path] = set()
+    for file in files:
+        if Path(file).resolve() in given:
+            raise InputError(f"{file}: given twice: name every file once")
+        given.add(Path(file).resolve())
+
+
+def read_calibration(args: Namespace) -> Calibration:
+    """The calibration that `add_calibration` names."""
+    from ceres_cal.calibration import Calibration
+
+    return Calibration.load(args.calibration)
+
+
+def read_observations(paths: Iterable[str]) -> Observations:
+    """All files of observations as one."""
+    from ceres_cal.observations import Observations, combine
+
+    return combine([Observations.load(path) for path in paths])
+
+
+def station_of(args: Namespace, calibration: Calibration) -> str:
+    """Name of the station in --station, or of the only one there is."""
+    if args.station is None and len(calibration.stations) > 1:
+        raise InputError(
+            f"{args.calibration} has several stations, name one: --station {' or '.join(calibration.stations)}"
+        )
+    calibration.station(args.station)  # or says which there are
+    return args.station or next(iter(calibration.stations))

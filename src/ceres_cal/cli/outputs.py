@@ -1,0 +1,158 @@
+"""What commands write: files, checked before any long work and written all or none, and the text for people."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from argparse import Namespace
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from textwrap import wrap
+from typing import TYPE_CHECKING
+
+from ceres_cal.base.errors import InputError
+from ceres_cal.cli.inputs import image_files
+
+if TYPE_CHECKING:
+    from ceres_cal.calibration import Calibration
+    from ceres_cal.diagnostics import Choice, Diagnosis
+    from ceres_cal.observations import Observations
+    from ceres_cal.report import FramePhotographs
+
+WIDTH = 100
+"""Of a text for people, in letters."""
+
+
+# ---- text -----------------------------------------------------------------------------------------------------------
+
+
+def section(title: str, lines: Iterable[str]) -> str:
+    """A title beside its lines."""
+    return "\n".join(f"{'' if number else title:10}{line}" for number, line in enumerate(lines))
+
+
+def wrapped(*texts: str) -> list[str]:
+    """The texts in lines of WIDTH letters."""
+    return [line for text in texts for line in wrap(text, WIDTH)]
+
+
+def written(args: Namespace) -> list[str]:
+    """The section that names the files which were asked for, or none."""
+    files = [str(path) for path in (args.output, args.report) if path is not None]
+    return [section("written", files)] if files else []
+
+
+def written_data(args: Namespace) -> dict[str, str | None]:
+    """The same for --json."""
+    paths = {"output": args.output, "report": args.report}
+    return {name: None if path is None else str(path) for name, path in paths.items()}
+
+
+# ---- files ----------------------------------------------------------------------------------------------------------
+
+
+def require_output(path: Path | None, inputs: Iterable[str | Path]) -> None:
+    """Raise InputError, before any long work, where a result cannot be written or would replace an input."""
+    if path is None:
+        return
+    if not path.parent.is_dir():
+        raise InputError(f"{path}: cannot be written: there is no folder {str(path.parent)!r}: make it first")
+    if path.is_dir():
+        raise InputError(f"{path}: cannot be written: it is a folder: name a file in it")
+    if path.exists() and any(Path(given).exists() and path.samefile(given) for given in inputs):
+        raise InputError(f"{path}: is an input, and the output would replace it: name another file")
+
+
+def require_observations_output(path: Path, inputs: Iterable[str | Path]) -> None:
+    """`require_output` of a file of observations."""
+    require_output(path, inputs)
+    require_ending(path, "observations are", ".json", ".npz")
+
+
+def require_ending(path: Path | None, what: str, *endings: str) -> None:
+    """Raise InputError where a file's ending is none of those that can be written; `what` such as "the table is"."""
+    if path is not None and path.suffix not in endings:
+        known = f"{', '.join(endings[:-1])} or {endings[-1]}"
+        raise InputError(f"{path}: {what} written as {known}: give one of these endings")
+
+
+def require_outputs(args: Namespace, inputs: Sequence[str | Path]) -> None:
+    """`require_output` of output and report, and that they are two files."""
+    require_output(args.output, inputs)
+    require_output(args.report, inputs)
+    if args.output is not None and args.report is not None and args.output.resolve() == args.report.resolve():
+        raise InputError(f"{args.report}: is named as output and as report: give them two names")
+
+
+@contextmanager
+def finishing() -> Iterator[None]:
+    """Hold Ctrl-C back while results are written: a command that was interrupted has written nothing."""
+    if threading.current_thread() is not threading.main_thread():  # where Ctrl-C does not arrive
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def write_results(args: Namespace, save: Callable[[Path], None], page: str | None) -> None:
+    """Write what was asked for: the output by `save`, and the page of the report."""
+    from ceres_cal.base.files import write_bytes
+
+    with finishing():
+        if args.output is not None:
+            save(args.output)
+        if page is not None:
+            write_bytes(args.report, page.encode())
+
+
+# ---- the report -----------------------------------------------------------------------------------------------------
+
+
+def report_photographs(
+    args: Namespace, observations: Observations, before: Calibration | None = None, detected_in: Sequence[Path] = ()
+) -> FramePhotographs | None:
+    """The photographs of `--report PAGE --images FOLDER` that belong to the observations' frames; None without any.
+
+    Args:
+        detected_in: photographs that the observations were just detected in: a report shows them without being asked.
+
+    Raises:
+        InputError: --images without --report, or none of the images is called like a frame.
+    """
+    if args.images and args.report is None:
+        raise InputError("--images is for the report: name a page with --report, or leave it out")
+    images = image_files(args.images) if args.images else list(detected_in)
+    if not images or args.report is None:
+        return None
+    from ceres_cal.pictures.frames import photographs_by_frame
+    from ceres_cal.report import FramePhotographs
+
+    paths = photographs_by_frame(images)
+    frames = dict.fromkeys(view.frame for view in observations.views)
+    known = {frame: paths[frame] for frame in frames if frame in paths}
+    if not known:
+        raise InputError(
+            f"none of the {len(paths)} images is called like a frame of the observations, such as "
+            f"{next(iter(frames))!r}: --images takes the photographs that were observed"
+        )
+    return FramePhotographs(known, before)
+
+
+def report_page(
+    args: Namespace,
+    calibration: Calibration,
+    observations: Observations,
+    photographs: FramePhotographs | None,
+    diagnosis: Diagnosis | None = None,
+    choice: Choice | None = None,
+) -> str | None:
+    """The page that --report asks for, or None."""
+    if args.report is None:
+        return None
+    from ceres_cal.report import make_report
+
+    return make_report(calibration, observations, diagnosis, choice, photographs)

@@ -1,0 +1,75 @@
+"""How well a calibration is known, gathered once for the commands' answers and for the report."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import combinations
+
+import numpy as np
+
+from ceres_cal.calibration import Calibration
+from ceres_cal.observations import Observations
+from ceres_cal.scene.heights import HEIGHTS_M
+from ceres_cal.scene.targets import Target
+from ceres_cal.uncertainty import Disagreement, FieldMap, Uncertainty, Verdict
+
+
+@dataclass(frozen=True, eq=False)
+class Seam:
+    """What two stations disagree about: predicted at HEIGHTS_M, and measured in what both observed."""
+
+    stations: tuple[str, str]
+    predicted: tuple[FieldMap, ...]
+    measured: Disagreement
+
+
+@dataclass(frozen=True, eq=False)
+class Quality:
+    """A calibration, the observations beside it, and how well it is known."""
+
+    calibration: Calibration
+    observations: Observations
+
+    @cached_property
+    def uncertainty(self) -> Uncertainty | None:
+        """None where nothing was minimised."""
+        return None if self.calibration.posterior is None else self.calibration.uncertainty
+
+    @cached_property
+    def verdicts(self) -> dict[tuple[str, str, str], Verdict]:
+        """By kind, owner and quantity; what was held is not there."""
+        if self.uncertainty is None:
+            return {}
+        return {verdict.key[:3]: verdict for verdict in self.uncertainty.verdicts}
+
+    @cached_property
+    def fields(self) -> tuple[Target, ...]:
+        """Targets that lie in the world."""
+        names = dict.fromkeys(view.target for view in self.observations.views if view.placement is None)
+        return tuple(self.observations.targets[name] for name in names)
+
+    @cached_property
+    def placed(self) -> tuple[str, ...]:
+        """Stations that have a place over a field."""
+        if not self.fields:
+            return ()
+        return tuple(name for name in self.calibration.stations if ("station", name, "height") in self.verdicts)
+
+    @cached_property
+    def maps(self) -> dict[str, tuple[FieldMap, ...]]:
+        """Of each placed station, at HEIGHTS_M."""
+        if self.uncertainty is None:
+            return {}
+        return {name: tuple(self.uncertainty.map_sd_mm(name, h) for h in HEIGHTS_M) for name in self.placed}
+
+    def each_seam(self) -> Iterator[Seam]:
+        """Of stations of different cameras that see some place both."""
+        owners = self.calibration.estimate.stations
+        for pair in combinations(self.placed, 2):
+            if self.uncertainty is None or owners[pair[0]].camera == owners[pair[1]].camera:
+                continue
+            maps = tuple(self.uncertainty.seam_sd_mm(*pair, height_m) for height_m in HEIGHTS_M)
+            if not np.all(np.isnan(maps[0].sd_mm)):
+                yield Seam(pair, maps, self.calibration.disagreement(self.observations, *pair))
