@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from ceres_cal import write_report
+from ceres_cal.base.arrays import Array
 from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
 from ceres_cal.cli import main
@@ -44,6 +45,10 @@ class Skew(ScoreTest):
         )
 
 
+def sheared_about(middle: float, pixels: Array) -> Array:
+    return pixels + (pixels[:, 1:] - middle) * (SKEW, 0.0)
+
+
 @pytest.fixture(autouse=True)
 def in_the_table(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(DIAGNOSTICS, "skew", Skew())
@@ -55,12 +60,12 @@ def sheared() -> Observations:
     scene = scenes.overhead(boards=4)
     seen = simulate(scene, scenes.NOISE, 1).observations
     middle = scene.cameras["overhead"].principal_point[1]
-    lean = np.array([[0.0, 0.0], [SKEW, 0.0]])
-    points, curves = (
-        replace(column, pixels=column.pixels + (column.pixels - middle) @ lean)  # type: ignore[type-var]
-        for column in (seen.points, seen.curves)
+    points, curves = seen.points, seen.curves
+    return replace(
+        seen,
+        points=replace(points, pixels=sheared_about(middle, points.pixels)),
+        curves=replace(curves, pixels=sheared_about(middle, curves.pixels)),
     )
-    return replace(seen, points=points, curves=curves)
 
 
 @pytest.fixture(scope="module")
@@ -75,7 +80,8 @@ def test_a_diagnostic_of_one_s_own_names_its_fault(calibration: Calibration, she
     assert finding.is_model_error and diagnosis.model_error and finding.log10_p < -20.0
     (lean,) = finding.amounts
     assert lean.value == pytest.approx(1e3 * SKEW, abs=4.0 * lean.sd) and lean.sd < 0.2
-    assert finding.sentence.startswith("camera 'overhead': the axes of its pixels lean by 3.92 ± 0.10 mrad")
+    leaning = f"lean by {lean.value:.2f} ± {lean.sd:.2f} mrad"
+    assert finding.sentence.startswith(f"camera 'overhead': the axes of its pixels {leaning} (")
 
 
 def test_it_counts_among_the_tests_and_is_silent_on_sound_data(monkeypatch: pytest.MonkeyPatch) -> None:

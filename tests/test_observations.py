@@ -263,6 +263,18 @@ def test_combine_puts_views_one_after_the_other(tmp_path: Path) -> None:
     assert both.cameras == {"overhead": (1280, 960), "side": (640, 480)}
     assert both.priors == (*first.priors, *second.priors)  # each once
     assert combine([first]) is first
+    alone = both.of_station("side")
+    assert alone.views == second.views and alone.cameras == second.cameras and not alone.priors
+    assert alone.points.view.tolist() == second.points.view.tolist()
+    assert np.array_equal(alone.curves.pixels, second.curves.pixels)
+
+
+def test_a_part_keeps_its_views(observations: Observations) -> None:
+    points, curves = np.arange(len(observations.points)) > 0, np.arange(len(observations.curves)) % 2 == 0
+    part = observations.part(points, curves)
+    assert part.views == observations.views and part.priors == observations.priors
+    assert np.array_equal(part.points.pixels, observations.points.pixels[1:])
+    assert np.array_equal(part.curves.side, observations.curves.side[::2])
 
 
 @pytest.mark.parametrize(

@@ -107,6 +107,9 @@ def write_equations(observations: Observations, sights: Sights, estimate: Estima
     order = np.argsort(columns["sight"], kind="stable")
     columns = {name: column[order] for name, column in columns.items()}
     bounds = np.searchsorted(columns["sight"], np.arange(len(sights) + 1))
+    view = np.concatenate([observations.points.view, observations.curves.view]).astype(np.int64)
+    columns["view"] = view[columns["observation"]]
+    columns["is_curve"] = columns["observation"] >= len(observations.points)
     return Equations(sights=sights, poses=poses, bounds=bounds, **columns)
 
 
@@ -124,8 +127,6 @@ def _of_camera(
     yield {
         "sight": np.repeat(numbers[_sight_of(own.point_bounds)], 2),
         "observation": np.repeat(own.point_rows, 2),
-        "view": np.repeat(observations.points.view[own.point_rows].astype(np.int64), 2),
-        "is_curve": np.zeros(2 * len(rows), dtype=bool),
         "feature": np.repeat(own.point_index, 2),
         "residual": there.points[own.point_rows].ravel(),
         "direction": np.tile(np.eye(2), (len(rows), 1)),
@@ -142,8 +143,6 @@ def _of_camera(
     yield {
         "sight": numbers[_sight_of(own.curve_bounds)],
         "observation": len(observations.points) + own.curve_rows,
-        "view": observations.curves.view[own.curve_rows].astype(np.int64),
-        "is_curve": np.ones(len(rows), dtype=bool),
         "feature": own.track_index.astype(np.int64),
         "residual": distance,
         "direction": normals,

@@ -19,7 +19,7 @@ from ceres_cal.model.residuals import camera_optics
 from ceres_cal.model.structure import EXACT
 from ceres_cal.observations import Columns, Curves, Observations
 from ceres_cal.scene.camera import Camera
-from ceres_cal.scene.curves import Arc, Curve, curve_points, nearest_to_rays, turned_on
+from ceres_cal.scene.curves import Curve, curve_points, nearest_to_rays, turned_on
 from ceres_cal.scene.targets import Target
 from ceres_cal.solve.noise import Inliers
 
@@ -140,23 +140,18 @@ def _visible_length_px(camera: Camera, curve: Curve) -> float:
 
 def _curve_distances(target: Target, camera: Camera, pixels: Array) -> Array:
     """(N, C) distances to each curve's centre between its ends, px."""
+    curves, tracks, is_arc = list(target.curves.values()), target.tracks[0], target.is_arc
     rays = np.nan_to_num(camera.rays(pixels) @ camera.cam_from_world.rotation)
-    answer = np.full((len(pixels), len(target.curves)), np.inf)
-    for number, curve in enumerate(target.curves.values()):
-        low, high = curve.parameter_range
-        s = turned_on(curve, nearest_to_rays(curve.track(), isinstance(curve, Arc), camera.position, rays))
-        inside = (s >= low) & (s <= high)
-        distance = _signed_distances(camera, curve.track(), isinstance(curve, Arc), pixels, s)
-        answer[inside, number] = np.abs(distance)[inside]
-    return answer
-
-
-def _signed_distances(camera: Camera, track: Array, arc: bool, pixels: Array, s: Array) -> Array:
-    pose = np.column_stack([camera.cam_from_world.rotation, camera.cam_from_world.translation])[None]
-    distance, count = np.empty(len(pixels)), len(pixels)
-    curves = kernels.CurveColumns(
-        np.array([0, count]), track[None], np.array([arc]), np.zeros(count, np.int32), np.ascontiguousarray(pixels),
-        np.ones(count), s.copy(), EXACT.track_slots,
+    track = np.repeat(np.arange(len(curves), dtype=np.int32), len(pixels))
+    nearest = nearest_to_rays(tracks[track], is_arc[track], camera.position, np.tile(rays, (len(curves), 1)))
+    s = np.concatenate([turned_on(curves[k], nearest[track == k]) for k in range(len(curves))])
+    low, high = np.array([curve.parameter_range for curve in curves])[track].T
+    inside = (s >= low) & (s <= high)
+    columns = kernels.CurveColumns(
+        np.array([0, len(s)]), tracks, is_arc, track, np.tile(pixels, (len(curves), 1)), np.ones(len(s)), s,
+        EXACT.track_slots,
     )  # fmt: skip
-    kernels.curve_residuals(camera_optics(camera), pose, curves, distance)
-    return distance
+    pose = np.column_stack([camera.cam_from_world.rotation, camera.cam_from_world.translation])[None]
+    distance = np.empty(len(s))
+    kernels.curve_residuals(camera_optics(camera), pose, columns, distance)
+    return np.where(inside, np.abs(distance), np.inf).reshape(len(curves), -1).T
