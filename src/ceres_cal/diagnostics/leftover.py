@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ceres_cal.base.arrays import Indices, Mask
+from ceres_cal.base.arrays import AnyArray, Indices, Mask
 from ceres_cal.base.tails import log_chi2_tail
 from ceres_cal.diagnostics.linear_model import LinearModel
 from ceres_cal.observations import Observations
@@ -92,24 +92,26 @@ def _neighbours(observations: Observations, model: LinearModel, kind: str) -> tu
         rows = np.flatnonzero(model.used & equations.is_curve)
         track = equations.feature[rows]
         along = nearest_on_track(equations.sights.tracks[track], equations.sights.is_arc[track], equations.place[rows])
-        order = rows[np.lexsort((along, equations.feature[rows], equations.view[rows]))]
-        first, second = order[:-1], order[1:]
-        near = (equations.view[first] == equations.view[second]) & (
-            equations.feature[first] == equations.feature[second]
-        )
-        return first[near], second[near]
-    grids = [observations.targets[view.target].grid for view in observations.views]
-    columns = np.array([0 if grid is None else grid.columns for grid in grids])
-    rows = np.flatnonzero(model.used & ~equations.is_curve & (columns[equations.view] > 0))
-    component = (equations.direction[rows, 1] > 0.5).astype(int)
-    order = rows[np.lexsort((equations.feature[rows], component, equations.view[rows]))]
-    first, second = order[:-1], order[1:]
-    near = equations.view[first] == equations.view[second]
-    near &= equations.feature[second] - equations.feature[first] == 1
-    near &= np.all(equations.direction[first] == equations.direction[second], axis=1)
-    column = observations.points.feature[equations.observation[second]] % columns[equations.view[second]]
-    near &= column > 0  # not from the end of a row to the next one
+        first, second = _successive(rows, along, track, equations.view[rows])
+        near = equations.feature[first] == equations.feature[second]
+    else:
+        grids = [observations.targets[view.target].grid for view in observations.views]
+        columns = np.array([0 if grid is None else grid.columns for grid in grids])
+        rows = np.flatnonzero(model.used & ~equations.is_curve & (columns[equations.view] > 0))
+        component = (equations.direction[rows, 1] > 0.5).astype(int)
+        first, second = _successive(rows, equations.feature[rows], component, equations.view[rows])
+        near = equations.feature[second] - equations.feature[first] == 1
+        near &= np.all(equations.direction[first] == equations.direction[second], axis=1)
+        column = observations.points.feature[equations.observation[second]] % columns[equations.view[second]]
+        near &= column > 0  # not from the end of a row to the next one
+    near &= equations.view[first] == equations.view[second]
     return first[near], second[near]
+
+
+def _successive(rows: Indices, *keys: AnyArray) -> tuple[Indices, Indices]:
+    """Rows and their successors in the order of the last key, then the one before it, and so on."""
+    order = rows[np.lexsort(keys)]
+    return order[:-1], order[1:]
 
 
 def _correlation(model: LinearModel, pairs: tuple[Indices, Indices], variance: float) -> tuple[float, float]:

@@ -104,18 +104,15 @@ def _summary(table: ResidualTable, group: Indices, names: list[str]) -> Summary:
 
     numbers = np.where(table.is_curve, 1.0, 2.0)
     sigmas = table.distance_px / (table.sigma_px * table.scale * np.sqrt(numbers))
-    numbers_of = (count(points), count(curves), count(~inlier))
-    filled = np.flatnonzero(sum(numbers_of))
-    return Summary(
-        tuple(names[i] for i in filled),
-        numbers_of[0][filled],
-        numbers_of[1][filled],
-        numbers_of[2][filled],
-        rms(points, table.distance_px)[filled],
-        rms(curves, table.distance_px)[filled],
-        rms(inlier, table.error_mm)[filled],
-        rms(inlier, sigmas)[filled],
+    counts = np.stack([count(points), count(curves), count(~inlier)])
+    filled = np.flatnonzero(counts.sum(axis=0))
+    measures = (
+        rms(points, table.distance_px),
+        rms(curves, table.distance_px),
+        rms(inlier, table.error_mm),
+        rms(inlier, sigmas),
     )
+    return Summary(tuple(names[i] for i in filled), *counts[:, filled], *(one[filled] for one in measures))
 
 
 def _regions(
@@ -136,12 +133,15 @@ def _rings(
     labels = []
     for number, name in enumerate(names):
         own = camera == number
-        inner = np.searchsorted(edges[number], table.radius_px[own], side="right") - 1
-        ring[own] = number * RADIUS_BINS + np.clip(inner, 0, RADIUS_BINS - 1)
+        ring[own] = number * RADIUS_BINS + _ring_of(table.radius_px[own], edges[number])
         labels += [
             f"{name} {low:.0f}-{high:.0f} px" for low, high in zip(edges[number], edges[number][1:], strict=False)
         ]
     return labels, ring, edges
+
+
+def _ring_of(radius: Array, edges: Array) -> Indices:
+    return np.asarray(np.clip(np.searchsorted(edges, radius, side="right") - 1, 0, RADIUS_BINS - 1))
 
 
 def _trend(model: LinearModel, camera: Camera, name: str, own: Mask, edges: Array) -> RadiusTrend:
@@ -150,7 +150,7 @@ def _trend(model: LinearModel, camera: Camera, name: str, own: Mask, edges: Arra
     offsets = camera.offsets(equations.pixel[rows])
     radius = np.linalg.norm(offsets, axis=1)
     outward = np.sum(equations.direction[rows] * offsets, axis=1) / np.maximum(radius, 1e-9)
-    ring = np.clip(np.searchsorted(edges, radius, side="right") - 1, 0, RADIUS_BINS - 1)
+    ring = _ring_of(radius, edges)
     weight = model.weight[rows] ** 2
     total = np.bincount(ring, weight * outward**2, RADIUS_BINS)
     moved = np.bincount(ring, weight * outward * equations.residual[rows], RADIUS_BINS)

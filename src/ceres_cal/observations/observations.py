@@ -126,15 +126,14 @@ class Observations:
     def of_station(self, name: str) -> Observations:
         """One station's views with all their observations, without priors."""
         chosen = np.array([view.station == name for view in self.views])
-        order = np.cumsum(chosen, dtype=np.int32) - 1
-        left = self.part(chosen[self.points.view], chosen[self.curves.view])
-        camera = self.stations[name]
+        order, camera = np.cumsum(chosen, dtype=np.int32) - 1, self.stations[name]
+        points, curves = taken(self.points, chosen[self.points.view]), taken(self.curves, chosen[self.curves.view])
         return Observations(
             self.targets,
             {camera: self.cameras[camera]},
             tuple(view for view in self.views if view.station == name),
-            replace(left.points, view=order[left.points.view]),
-            replace(left.curves, view=order[left.curves.view]),
+            replace(points, view=order[points.view]),
+            replace(curves, view=order[curves.view]),
         )
 
     # ---- checks -------------------------------------------------------------------------------------------------
