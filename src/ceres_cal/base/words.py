@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-
-import numpy as np
 
 DASH = "\N{EN DASH}"
 _SPACE = "\N{NO-BREAK SPACE}"
@@ -21,14 +20,14 @@ def two_digits(value: float) -> str:
 
 def short(value: float) -> str:
     """Two digits: 0.21, 6.6, 24, 130; a dash for what is not there, "unknown" for infinity."""
-    if np.isnan(value):
+    if math.isnan(value):
         return DASH
-    return "unknown" if np.isinf(value) else two_digits(value)
+    return "unknown" if math.isinf(value) else two_digits(value)
 
 
 def mm(value: float) -> str:
     """Two digits with their unit, on one line."""
-    return f"{short(value)}{_SPACE}mm" if np.isfinite(value) else short(value)
+    return f"{short(value)}{_SPACE}mm" if math.isfinite(value) else short(value)
 
 
 def metres(place: tuple[float, float]) -> str:
@@ -38,7 +37,7 @@ def metres(place: tuple[float, float]) -> str:
 
 def fixed(value: float, places: int, sign: str = "") -> str:
     """So many places, a dash for what is not there; `sign` "+" also of what is positive."""
-    return f"{value:{sign}.{places}f}" if np.isfinite(value) else DASH
+    return f"{value:{sign}.{places}f}" if math.isfinite(value) else DASH
 
 
 def powered(text: str) -> str:
@@ -56,9 +55,9 @@ def at_precision(value: float, sd: float, unit: str) -> str:
     """A value with as many places as two digits of its sd; coefficients keep every digit."""
     if unit.startswith("px^"):
         return repr(value)
-    if not (np.isfinite(sd) and sd > 0.0):
+    if not (math.isfinite(sd) and sd > 0.0):
         return f"{value:.4f}"
-    return f"{value:.{int(np.clip(1 - np.floor(np.log10(sd)), 0, 9))}f}"
+    return f"{value:.{min(max(1 - math.floor(math.log10(sd)), 0), 9)}f}"
 
 
 def bounds_text(low: float, high: float, unit: str, digits: str = "") -> str:
@@ -68,9 +67,9 @@ def bounds_text(low: float, high: float, unit: str, digits: str = "") -> str:
         digits: how a bound is formatted; whole numbers by default, centimetres where the unit is m.
     """
     digits, space = digits or (".2f" if unit == "m" else ".0f"), f" {unit}" if unit else ""
-    if low == 0.0 or np.isinf(low):
-        return "anything" if np.isinf(high) else f"below {high:{digits}}{space}"
-    return f"above {low:{digits}}{space}" if np.isinf(high) else f"{low:{digits}} to {high:{digits}}{space}"
+    if low == 0.0 or math.isinf(low):
+        return "anything" if math.isinf(high) else f"below {high:{digits}}{space}"
+    return f"above {low:{digits}}{space}" if math.isinf(high) else f"{low:{digits}} to {high:{digits}}{space}"
 
 
 # ---- counts and names -----------------------------------------------------------------------------------------------

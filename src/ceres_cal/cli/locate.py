@@ -7,7 +7,6 @@ from argparse import ArgumentParser, Namespace
 from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING, Any
 
-from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.cli.arguments import add_calibration, add_station, parse_number
 from ceres_cal.cli.command import Answer, Command
