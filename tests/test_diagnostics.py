@@ -20,7 +20,7 @@ from ceres_cal.calibration import Calibration
 from ceres_cal.cli import main
 from ceres_cal.detect.boards import BoardDetections
 from ceres_cal.diagnostics import Diagnosis, choose, cross_validate, diagnose
-from ceres_cal.diagnostics.equations import Equations, write_equations
+from ceres_cal.diagnostics.equations import Equations, whole_structure, write_equations
 from ceres_cal.diagnostics.linear_model import Weights, make_linear_model
 from ceres_cal.model.parameters import Options, intrinsics_vector, with_intrinsics
 from ceres_cal.model.residuals import residuals
@@ -93,6 +93,33 @@ def test_rows_are_the_derivatives_of_the_residuals(lens: str) -> None:
         own = world if k >= size - 6 else np.ones(len(equations), dtype=bool)
         worst = np.max(np.abs(slope - columns[:, k])[own]) / np.max(np.abs(columns[:, k]))
         assert worst < 2e-6  # 4e-7 at most, of the differences
+
+
+def test_columns_of_the_target_as_built_are_derivatives_too(
+    observations: Observations, calibration: Calibration
+) -> None:
+    equations, estimate = linearised(observations, calibration), calibration.estimate
+    structure, sights = whole_structure(observations.targets), gather_sights(observations)
+    slots, step = equations.slots(structure), 1e-5
+    assert np.all(slots[~equations.is_curve, :2] >= 0) and np.all(slots[equations.is_curve, 3] == -1)
+    first = np.r_[True, np.diff(equations.observation) != 0]
+    points = len(observations.points)
+
+    def residual(values: Array) -> Array:
+        there = residuals(observations, sights, replace(estimate, structure=structure.with_values(values)))
+        x, y = np.pad(there.points, ((0, len(there.curves)), (0, 0))).T
+        distance = np.pad(there.curves, (points, 0))
+        at = equations.observation
+        return np.asarray(np.where(equations.is_curve, distance[at], np.where(first, x[at], y[at])))
+
+    for k in range(4):
+        moved = np.unique(slots[slots[:, k] >= 0, k])
+        values = np.zeros(len(structure.values))
+        values[moved] = step  # no equation has two of them in one column
+        slope = (residual(values) - residual(-values)) / (2.0 * step)
+        own = slots[:, k] >= 0
+        assert np.max(np.abs(slope - equations.built[:, k])[own]) < 1e-6 * np.max(np.abs(equations.built[own, k]))
+        assert not np.any(equations.built[equations.is_curve & ~own, k])
 
 
 def test_leverage_is_the_diagonal_of_the_hat_matrix() -> None:

@@ -263,6 +263,19 @@ def test_combine_puts_views_one_after_the_other(tmp_path: Path) -> None:
     assert both.cameras == {"overhead": (1280, 960), "side": (640, 480)}
     assert both.priors == (*first.priors, *second.priors)  # each once
     assert combine([first]) is first
+    alone = both.of_station("side")
+    assert alone.views == second.views and alone.cameras == second.cameras and not alone.priors
+    assert alone.points.view.tolist() == second.points.view.tolist()
+    assert np.array_equal(alone.curves.pixels, second.curves.pixels)
+
+
+def test_a_part_keeps_its_views(tmp_path: Path) -> None:
+    whole = Observations.load(written(tmp_path, document()))
+    points, curves = np.arange(len(whole.points)) > 0, np.arange(len(whole.curves)) > 0
+    part = whole.part(points, curves)
+    assert part.views == whole.views and part.priors == whole.priors
+    assert np.array_equal(part.points.pixels, whole.points.pixels[1:])
+    assert np.array_equal(part.curves.side, whole.curves.side[1:])
 
 
 @pytest.mark.parametrize(

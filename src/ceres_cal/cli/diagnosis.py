@@ -17,6 +17,7 @@ from ceres_cal.diagnostics import Choice, Diagnosis, Finding, HeldOut, Noise, Re
 from ceres_cal.report.findings import choice_marks, chosen_lens
 
 _MOST_ROWS = 8
+_MOST_SAID = 3  # amounts that the sentence of a finding says itself
 _MODEL_ERROR = (
     "the model is wrong by more than its noise can hide: no covariance or standard deviation of this calibration "
     "contains that error"
@@ -95,7 +96,7 @@ def _finding(finding: Finding) -> list[str]:
     lines = wrapped(finding.sentence, f"-> {finding.advice}")
     size = f"{finding.effect_px:.2f} px, {_mm(finding.effect_mm)} mm; {plural(finding.observations, 'observation')}"
     lines.append(f"   {size}; false alarm: {chance(finding.log10_p)}")
-    if finding.kind.startswith("moved"):
+    if len(finding.amounts) > _MOST_SAID:
         lines += [f"   {one.name:28}{one.value:9.3f} ± {one.sd:.3f} {one.unit}" for one in finding.amounts]
     return lines
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,26 +9,25 @@ import numpy as np
 from ceres_cal import kernels
 from ceres_cal.base.errors import InputError
 from ceres_cal.calibration import Calibration
-from ceres_cal.diagnostics.alternatives import all_families, target_families
+from ceres_cal.diagnostics.diagnostic import Case, Tested
 from ceres_cal.diagnostics.equations import Equations, write_equations
 from ceres_cal.diagnostics.findings import Finding
-from ceres_cal.diagnostics.labels import Mislabelled, find_mislabelled
+from ceres_cal.diagnostics.labels import find_mislabelled
 from ceres_cal.diagnostics.leftover import Noise, measure_noise
-from ceres_cal.diagnostics.linear_model import LinearModel, Weights, make_linear_model
-from ceres_cal.diagnostics.new_data import validity_finding, with_newcomers_placed
-from ceres_cal.diagnostics.patterns import heard_again, select
+from ceres_cal.diagnostics.linear_model import Weights, make_linear_model
+from ceres_cal.diagnostics.of_new_data import with_newcomers_placed
+from ceres_cal.diagnostics.of_target import recalled
+from ceres_cal.diagnostics.registry import DIAGNOSTICS, all_families
+from ceres_cal.diagnostics.scores import select
 from ceres_cal.diagnostics.summaries import Summaries, summarise
 from ceres_cal.diagnostics.table import ResidualTable, make_table
-from ceres_cal.diagnostics.words import Context, label_findings, noise_findings, pattern_finding
-from ceres_cal.model.parameters import Estimate
+from ceres_cal.model.parameters import Options
 from ceres_cal.model.residuals import Residuals, residuals
 from ceres_cal.observations import Observations
-from ceres_cal.solve import Problem
 from ceres_cal.solve.noise import USUAL_EQUATIONS, Inliers, Redundancy, judge, relative_lengths
 
 FALSE_ALARM_RATE = 0.01
 """Probability that a calibration of sound data gets any finding at all."""
-_OTHER_TESTS = 5  # size and whiteness of the noise of points and of curves, validity on new data
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,23 +80,19 @@ def diagnose(
         SolutionError: it can show none of them.
     """
     _require_known(calibration, observations, new_data)
-    problem = calibration.problem(observations, new_data=new_data)
-    estimate = calibration.estimate
-    if new_data:
-        estimate = with_newcomers_placed(observations, problem, calibration)
-    there = residuals(observations, problem.sights, estimate)
-    inliers = _judged(calibration, observations, there, new_data)
-    equations = write_equations(observations, problem.sights, estimate, there)
-    case = _Case(observations, problem, estimate, inliers, equations)
-    model = make_linear_model(problem, estimate, equations, _weights(case))
-    if calibration.refitted is not None and not new_data:
-        model = replace(model, known_noise=USUAL_EQUATIONS)
-    table = make_table(observations, inliers, model, _weights(case).robust, dict(estimate.cameras))
-    findings, noise, tests = _judge_patterns(case, model, table, false_alarm_rate, calibration if new_data else None)
+    case = _case(calibration, observations, new_data)
+    tested = _tested(case, false_alarm_rate)
+    findings = [finding for one in DIAGNOSTICS.values() for finding in one.findings(tested)]
     return Diagnosis(
-        findings, table, summarise(observations, table, model, dict(estimate.cameras)), noise,
-        inliers.degrees_of_freedom, observations.digest != calibration.digest, tests, false_alarm_rate,
-    )  # fmt: skip
+        tuple(sorted(findings, key=lambda finding: -finding.effect_px)),
+        case.table,
+        summarise(case),
+        tested.noise,
+        case.inliers.degrees_of_freedom,
+        observations.digest != calibration.digest,
+        tested.selection.tests,
+        false_alarm_rate,
+    )
 
 
 def _require_known(calibration: Calibration, observations: Observations, new_data: bool) -> None:
@@ -119,23 +113,28 @@ def _require_known(calibration: Calibration, observations: Observations, new_dat
             raise InputError(f"target {name!r} is another one than the calibration's: give one of them another name")
 
 
-@dataclass(frozen=True, eq=False)
-class _Case:
-    """What the steps of a diagnosis share. `problem`: of all the observations."""
-
-    observations: Observations
-    problem: Problem
-    estimate: Estimate
-    inliers: Inliers
-    equations: Equations
-
-    @property
-    def scales(self) -> tuple[float, float]:
-        return self.inliers.point_scale, self.inliers.curve_scale
-
-    @property
-    def reject_sigma(self) -> float:
-        return self.problem.options.reject_sigma
+def _case(calibration: Calibration, observations: Observations, new_data: bool) -> Case:
+    """Everything there is to read, with those that were taken out and may speak again."""
+    problem = calibration.problem(observations, new_data=new_data)
+    estimate = calibration.estimate
+    if new_data:
+        estimate = with_newcomers_placed(observations, problem, calibration)
+    there = residuals(observations, problem.sights, estimate)
+    inliers = _judged(calibration, observations, there, new_data)
+    equations = write_equations(observations, problem.sights, estimate, there)
+    weights = _weights(observations, problem.options, inliers, equations)
+    model = make_linear_model(problem, estimate, equations, weights)
+    if calibration.refitted is not None and not new_data:
+        model = replace(model, known_noise=USUAL_EQUATIONS)
+    table = make_table(observations, inliers, model, weights.robust, estimate.cameras)
+    labels = find_mislabelled(observations, estimate, inliers, problem.options.reject_sigma)
+    case = Case(observations, problem, estimate, inliers, model, table, labels, calibration if new_data else None)
+    used = recalled(case)
+    if np.array_equal(used, model.used):
+        return case
+    again = Weights(weights.inverse_sigma, used, np.where(model.used, weights.robust, 1.0))
+    anew = make_linear_model(problem, estimate, equations, again)
+    return replace(case, model=replace(anew, known_noise=model.known_noise))
 
 
 def _judged(calibration: Calibration, observations: Observations, there: Residuals, new_data: bool) -> Inliers:
@@ -151,57 +150,27 @@ def _judged(calibration: Calibration, observations: Observations, there: Residua
     )
 
 
-def _weights(case: _Case) -> Weights:
+def _weights(observations: Observations, options: Options, inliers: Inliers, equations: Equations) -> Weights:
     """Of each equation."""
-    observations, inliers, options = case.observations, case.inliers, case.problem.options
     sigma = np.concatenate(
         [inliers.point_scale * observations.points.sigma_px, inliers.curve_scale * observations.curves.sigma_px]
     )
     lengths = np.concatenate([inliers.point_sigmas, inliers.curve_sigmas])
     squared = np.where(np.isfinite(lengths), lengths, 0.0) ** 2
     robust = kernels.loss_weights(kernels.Loss(kernels.LOSS_CODES[options.loss], options.loss_scale), squared)
-    inlier, at = np.concatenate([inliers.points, inliers.curves]), case.equations.observation
+    inlier, at = np.concatenate([inliers.points, inliers.curves]), equations.observation
     return Weights(1.0 / sigma[at], inlier[at], robust[at])
 
 
-def _judge_patterns(
-    case: _Case, model: LinearModel, table: ResidualTable, rate: float, calibration: Calibration | None
-) -> tuple[tuple[Finding, ...], tuple[Noise, ...], int]:
-    """Findings, noise and how many tests there were. `calibration`: that may not hold, where the data are new."""
-    rejected = np.flatnonzero(~case.inliers.points), np.flatnonzero(~case.inliers.curves)
-    labels, groups = find_mislabelled(case.observations, case.estimate, *rejected, case.scales, case.reject_sigma)
-    model = _with_the_rejected(case, model, labels)
-    families = all_families(case.observations, case.equations, case.estimate, case.problem, model.used)
-    extra = groups + _OTHER_TESTS
-    selection = select(model, families, rate, extra)
-    noise = measure_noise(case.observations, selection.model, model, case.scales)
+def _tested(case: Case, rate: float) -> Tested:
+    """Alternatives chosen at a rate of false alarms, and the noise that they leave."""
+    families = all_families(case)
+    extra = sum(one.tests(case) for one in DIAGNOSTICS.values())
+    selection = select(case.model, families, rate, extra)
+    noise = measure_noise(case.observations, selection.model, case.model, case.inliers)
     level = selection.log_level
-    agreeing = max((one.inflation for one in noise if one.correlation_log_p < level), default=1.0)
-    if agreeing > 1.0 and selection.chosen:  # correlated noise makes every other test too eager
-        selection = select(model, families, rate, extra, agreeing)
-        noise = measure_noise(case.observations, selection.model, model, case.scales)
-    context = Context(
-        case.observations, case.estimate, case.problem.layout, case.equations, model, table, selection.tests
-    )
-    findings = [
-        *(pattern_finding(context, selection, number) for number in range(len(selection.chosen))),
-        *label_findings(context, labels, level),
-        *noise_findings(context, noise, level),
-        *([] if calibration is None else validity_finding(context, model, calibration, level)),
-    ]
-    return tuple(sorted(findings, key=lambda finding: -finding.effect_px)), noise, selection.tests
-
-
-def _with_the_rejected(case: _Case, model: LinearModel, labels: Sequence[Mislabelled]) -> LinearModel:
-    """The model in which lines and points that were taken out nearly whole take part where they agree."""
-    explained = np.zeros(len(case.observations.points) + len(case.observations.curves), dtype=bool)
-    for label in labels:
-        explained[label.rows + (len(case.observations.points) if label.is_curve else 0)] = True
-    silent = explained[case.equations.observation]
-    families = list(target_families(case.observations, case.equations, case.estimate, ~silent))
-    used = heard_again(case.equations, model.weight, model.used, families, case.reject_sigma, silent)
-    if np.array_equal(used, model.used):
-        return model
-    robust = np.where(model.score != 0.0, model.score / (model.weight * case.equations.residual), 1.0)
-    anew = make_linear_model(case.problem, case.estimate, case.equations, Weights(model.weight, used, robust))
-    return replace(anew, known_noise=model.known_noise)
+    inflation = max((one.inflation for one in noise if one.correlation_log_p < level), default=1.0)
+    if inflation > 1.0 and selection.chosen:  # correlated noise makes every other test too eager
+        selection = select(case.model, families, rate, extra, inflation)
+        noise = measure_noise(case.observations, selection.model, case.model, case.inliers)
+    return Tested(case, selection, noise)

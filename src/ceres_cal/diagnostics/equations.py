@@ -2,12 +2,12 @@
 
 A point gives two equations, one for each image axis, a curve observation one, along the image normal at its foot. Any
 alternative to the model is a column over these equations: what it moves in the image goes in by `direction`, what it
-moves on a target by `motion`.
+moves on a target by `built`, the camera by `pose`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,9 +17,11 @@ from ceres_cal.base.arrays import AnyArray, Array, Indices, Mask
 from ceres_cal.base.errors import SolutionError
 from ceres_cal.model.parameters import Estimate
 from ceres_cal.model.residuals import Residuals, camera_optics, curve_columns, point_columns
+from ceres_cal.model.structure import Structure, Tolerance, make_structure
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights
 from ceres_cal.scene.curves import along_track
+from ceres_cal.scene.targets import Target
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +37,8 @@ class Equations:
         intrinsics: (E, K) px per solver's unit of [phi, aspect, cx, cy, coefficients], 0 past a camera's own.
         pose: (E, 6) px per left perturbation of cam_from_frame. motion: (E, 3) px per metre that the point or foot
             moves in the camera frame. place: (E, 3) where it lies in its sight's frame, m.
+        built: (E, 4) px per metre of what moves it on its target: of a point x, y, first and second bow; of a segment
+            its offset to the left; of an arc x, y and radius; 0 for the rest.
     """
 
     sights: Sights
@@ -51,6 +55,7 @@ class Equations:
     intrinsics: Array
     pose: Array
     place: Array
+    built: Array
 
     def __len__(self) -> int:
         return len(self.residual)
@@ -63,19 +68,28 @@ class Equations:
         """(E,) the equations of the chosen sights."""
         return np.asarray(chosen[self.sight])
 
-    def moved_along(self, directions: Array) -> Array:
-        """(E,) px per metre of moving what is seen along a direction (E, 3) of its sight's frame."""
-        turned = np.einsum("eij,ej->ei", self.poses[self.sight, :, :3], directions)
-        return np.asarray(np.sum(self.motion * turned, axis=1))
+    def slots(self, structure: Structure) -> Indices:
+        """(E, 4) which of the structure's numbers are those of `built`, -1 for none."""
+        slots = np.full((len(self), 4), -1)
+        if structure.names:
+            slots[~self.is_curve] = structure.point_slots[self.feature[~self.is_curve]]
+            slots[self.is_curve, :3] = structure.track_slots[self.feature[self.is_curve]]
+        return slots
 
 
-def write_equations(observations: Observations, sights: Sights, estimate: Estimate, found: Residuals) -> Equations:
+def whole_structure(targets: Mapping[str, Target]) -> Structure:
+    """Everything that could be built otherwise than it is drawn."""
+    every = {name: Tolerance(1.0, 1.0, 1.0 if target.bows else 0.0) for name, target in targets.items()}
+    return make_structure(targets, every)
+
+
+def write_equations(observations: Observations, sights: Sights, estimate: Estimate, there: Residuals) -> Equations:
     """The equations of every observation whose residual is finite.
 
     Raises:
         SolutionError: there is none.
     """
-    finite = np.all(np.isfinite(found.points), axis=1), np.isfinite(found.curves)
+    finite = np.all(np.isfinite(there.points), axis=1), np.isfinite(there.curves)
     sights = sights.used(*finite)
     if not len(sights):
         raise SolutionError("the calibration can show none of the observations: give those it was made from")
@@ -83,7 +97,7 @@ def write_equations(observations: Observations, sights: Sights, estimate: Estima
     parts = [
         part
         for name in sights.cameras
-        for part in _of_camera(observations, sights, sights.numbers(name), poses, estimate, found)
+        for part in _of_camera(observations, sights, sights.numbers(name), poses, estimate, there)
     ]
     size = max(part["intrinsics"].shape[1] for part in parts)
     for part in parts:
@@ -93,48 +107,50 @@ def write_equations(observations: Observations, sights: Sights, estimate: Estima
     order = np.argsort(columns["sight"], kind="stable")
     columns = {name: column[order] for name, column in columns.items()}
     bounds = np.searchsorted(columns["sight"], np.arange(len(sights) + 1))
+    view = np.concatenate([observations.points.view, observations.curves.view]).astype(np.int64)
+    columns["view"] = view[columns["observation"]]
+    columns["is_curve"] = columns["observation"] >= len(observations.points)
     return Equations(sights=sights, poses=poses, bounds=bounds, **columns)
 
 
 def _of_camera(
-    observations: Observations, sights: Sights, numbers: Indices, poses: Array, estimate: Estimate, found: Residuals
+    observations: Observations, sights: Sights, numbers: Indices, poses: Array, estimate: Estimate, there: Residuals
 ) -> Iterator[dict[str, AnyArray]]:
     """The columns of one camera's points, then of its curve observations."""
     own = sights.take(numbers)
     optics = camera_optics(estimate.cameras[own.keys[0].camera])
     size = len(optics.intrinsics)
-    rows = np.empty((len(own.point_rows), 2, size + 6))
+    rows = np.empty((len(own.point_rows), 2, size + 10))
     points = point_columns(own, estimate.structure)
+    points = points._replace(bends=whole_structure(observations.targets).bends[own.point_index])
     kernels.point_rows(optics, poses[numbers], points, rows)
     yield {
         "sight": np.repeat(numbers[_sight_of(own.point_bounds)], 2),
         "observation": np.repeat(own.point_rows, 2),
-        "view": np.repeat(observations.points.view[own.point_rows].astype(np.int64), 2),
-        "is_curve": np.zeros(2 * len(rows), dtype=bool),
         "feature": np.repeat(own.point_index, 2),
-        "residual": found.points[own.point_rows].ravel(),
+        "residual": there.points[own.point_rows].ravel(),
         "direction": np.tile(np.eye(2), (len(rows), 1)),
-        "pixel": np.repeat(own.pixels + found.points[own.point_rows], 2, axis=0),
+        "pixel": np.repeat(own.pixels + there.points[own.point_rows], 2, axis=0),
         "intrinsics": rows[:, :, :size].reshape(-1, size),
-        "pose": rows[:, :, size:].reshape(-1, 6),
+        "pose": rows[:, :, size:-4].reshape(-1, 6),
         "place": np.repeat(points.places, 2, axis=0),
+        "built": rows[:, :, -4:].reshape(-1, 4),
     }
-    curves = curve_columns(own, estimate.structure, found.feet[own.curve_rows])
-    rows, normals = np.empty((len(own.curve_rows), size + 6)), np.empty((len(own.curve_rows), 2))
+    curves = curve_columns(own, estimate.structure, there.feet[own.curve_rows])
+    rows, normals = np.empty((len(own.curve_rows), size + 10)), np.empty((len(own.curve_rows), 2))
     kernels.curve_rows(optics, poses[numbers], curves, rows, normals)
-    distance = found.curves[own.curve_rows]
+    distance = there.curves[own.curve_rows]
     yield {
         "sight": numbers[_sight_of(own.curve_bounds)],
         "observation": len(observations.points) + own.curve_rows,
-        "view": observations.curves.view[own.curve_rows].astype(np.int64),
-        "is_curve": np.ones(len(rows), dtype=bool),
         "feature": own.track_index.astype(np.int64),
         "residual": distance,
         "direction": normals,
         "pixel": own.curve_pixels + distance[:, None] * normals,
         "intrinsics": rows[:, :size],
-        "pose": rows[:, size:],
+        "pose": rows[:, size:-4],
         "place": along_track(curves.tracks[own.track_index], own.on_arc, curves.feet),
+        "built": rows[:, -4:],
     }
 
 

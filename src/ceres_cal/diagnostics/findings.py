@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Literal
 
-OF_LENS = ("radius", "decentring", "aspect", "principal point", "phi")
-MODEL_ERRORS = (*OF_LENS, "curve aside", "point aside", "board bent")
-"""Kinds of findings that say the model is wrong: no covariance of the parameters contains them."""
-MOTIONS = ("moved after", "moved in")
+from ceres_cal.base.arrays import Array
+
 SMALL = 0.4
 """Beside the noise: an effect of less than this share of it does not show in a single observation, only in many."""
+Wrong = Literal["model", "calibration", "observations"]
 
 
 @dataclass(frozen=True)
@@ -22,16 +23,20 @@ class Amount:
     unit: str
 
 
+def amounts(names: Iterable[str], values: Array, sd: Array, unit: str) -> tuple[Amount, ...]:
+    """Several numbers of one unit."""
+    return tuple(Amount(n, float(v), float(s), unit) for n, v, s in zip(names, values, sd, strict=False))
+
+
 @dataclass(frozen=True)
 class Finding:
     """One cause of what is left over.
 
     Attributes:
-        kind: "radius", "decentring", "aspect", "principal point" or "phi" (of a camera: subject), "curve aside",
-            "point aside" ("target/feature") or "board bent" (target), "moved after", "moved in" (of a station: subject,
-            at a frame), "wrong label" ("target/feature" as named), "does not hold"
-            (on new data: stations), "noise" or "correlated" ("points" or "curves").
-        subject: what it is about. frame: at which frame, None where it is about all.
+        kind: of one of DIAGNOSTICS. wrong: what is, the model (no covariance of the parameters contains that), the
+            calibration (a refit would mend it), or the observations, their labels or their noise.
+        subject: what it is about: a camera, a station, "target/feature", a board's target, "points" or "curves".
+            frame: at which frame, None where it is about all.
         sentence: the cause in words. advice: what to do.
         effect_px: root mean square displacement in the image of the observations that it moves (of the lens: of what
             the calibration could not absorb); of noise its standard deviation, of a wrong label how far off it is.
@@ -43,6 +48,7 @@ class Finding:
     """
 
     kind: str
+    wrong: Wrong
     subject: str
     frame: str | None
     sentence: str
@@ -58,4 +64,4 @@ class Finding:
     @property
     def is_model_error(self) -> bool:
         """Whether it says that the model is wrong, so that no covariance contains it."""
-        return self.kind in MODEL_ERRORS or self.kind in MOTIONS
+        return self.wrong == "model"

@@ -8,12 +8,11 @@ below that of a field, by the same share whatever the lens.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Mask
+from ceres_cal.base.arrays import AnyArray, Array, Indices, Mask
 from ceres_cal.base.errors import CalibrationError, DegenerateError, InputError
 from ceres_cal.base.transforms import Pose
 from ceres_cal.calibrating import calibrate
@@ -23,7 +22,7 @@ from ceres_cal.diagnostics.table import error_mm
 from ceres_cal.model.parameters import Estimate, Layout, Options
 from ceres_cal.model.residuals import residuals
 from ceres_cal.model.structure import make_structure
-from ceres_cal.observations import Columns, Observations
+from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights, gather_sights
 from ceres_cal.solve import Problem, Weighting, solve
 
@@ -50,16 +49,16 @@ class HeldOut:
 
     label: str
     coefficients: int
-    folds: int
-    failed_folds: int
-    points_rms_px: float
-    curves_rms_px: float
-    rms_px: float
-    rms_mm: float
-    fit_rms_px: float
-    frames: tuple[str, ...]
-    frame_squares: Array
-    frame_counts: Array
+    folds: int = 0
+    failed_folds: int = 0
+    points_rms_px: float = np.nan
+    curves_rms_px: float = np.nan
+    rms_px: float = np.nan
+    rms_mm: float = np.nan
+    fit_rms_px: float = np.nan
+    frames: tuple[str, ...] = ()
+    frame_squares: Array = field(default_factory=lambda: np.empty(0))
+    frame_counts: Array = field(default_factory=lambda: np.empty(0))
     failed: str = ""
 
 
@@ -89,14 +88,14 @@ def cross_validate(
     k: int = FOLDS,
     *,
     calibration: Calibration | None = None,
-    counted: tuple[Mask, Mask] | None = None,
+    counted: Mask | None = None,
     label: str | None = None,
 ) -> HeldOut:
     """The error with which frames are predicted by a calibration of the others, k-fold.
 
     Args:
         calibration: of all the observations with these options, where it is there already.
-        counted: (N,) of points and (M,) of curves, which observations count; those that the calibration of all kept.
+        counted: (N + M,) which observations count, points by row, then curves; those that the calibration of all kept.
 
     Raises:
         InputError: k below 2, or fewer than two frames.
@@ -104,34 +103,37 @@ def cross_validate(
     """
     options = options or Options()
     whole = calibration or calibrate(observations, options)
-    kept = counted or whole.inlier_masks(observations)
+    kept = _inliers(whole, observations) if counted is None else counted
     names, frame = _frames(observations)
     if k < 2:
         raise InputError(f"cross-validation needs at least 2 folds, not {k}")
     if len(names) < 2:
         raise InputError("cross-validation by frame needs at least two frames: a single one cannot be held out")
     folds = min(k, len(names))
-    fold = np.random.default_rng(0).permutation(len(names)) % folds  # of each frame; the same every time
-    point_frame, curve_frame = frame[observations.points.view], frame[observations.curves.view]
-    columns = [np.full((len(column.view), 2), np.nan) for column in (observations.points, observations.curves)]
-    failures = []
+    fold = np.random.default_rng(0).permutation(len(names))[frame] % folds  # the same every time
+    errors = np.full((len(frame), 2), np.nan)
+    failed = 0
     for number in range(folds):
-        out = fold[point_frame] == number, fold[curve_frame] == number
-        held = out[0] & kept[0], out[1] & kept[1]
+        held = (fold == number) & kept
         try:
-            trained = calibrate(_subset(observations, ~out[0], ~out[1]), options)
-        except CalibrationError as error:
-            failures.append(error)
-            if 2 * len(failures) > folds:
+            trained = calibrate(_part(observations, fold != number), options)
+        except CalibrationError:
+            failed += 1
+            if 2 * failed > folds:
                 raise
             continue
-        for column, found, rows in zip(columns, _predicted(observations, held, trained, whole), held, strict=True):
-            column[rows] = found[rows]
-    kept = kept[0] & np.isfinite(columns[0][:, 0]), kept[1] & np.isfinite(columns[1][:, 0])
-    fit_px = _errors(observations, kept, whole.estimate)
-    return _held_out(
-        observations, options, label or label_of(options), (folds, len(failures)), columns, fit_px, kept, names, frame
-    )
+        errors[held] = _predicted(observations, held, trained, whole)[held]
+    kept = kept & np.isfinite(errors[:, 0])
+    fit_px = _errors(observations, kept, whole.estimate)[kept, 0]
+    squares, counts = np.zeros(len(names)), np.zeros(len(names))
+    np.add.at(squares, frame[kept], (errors[kept, 0] / _columns(observations, "sigma_px")[kept]) ** 2)
+    np.add.at(counts, frame[kept], 1.0)
+    points = kept & (np.arange(len(kept)) < len(observations.points))
+    return HeldOut(
+        label or label_of(options), _coefficients(options), folds, failed, _rms(errors[points, 0]),
+        _rms(errors[kept & ~points, 0]), _rms(errors[kept, 0]), _rms(errors[kept, 1]), _rms(fit_px), names,
+        squares, counts,
+    )  # fmt: skip
 
 
 def choose(observations: Observations, options: Options, k: int = FOLDS, *, most: int = MOST_OBSERVATIONS) -> Choice:
@@ -153,21 +155,20 @@ def choose(observations: Observations, options: Options, k: int = FOLDS, *, most
     good = [whole for whole in wholes if isinstance(whole, Calibration)]
     if not good:
         raise DegenerateError(f"no lens can be calibrated: {wholes[0]}")
-    masks = [whole.inlier_masks(few) for whole in good]
-    counted = np.any([m[0] for m in masks], axis=0), np.any([m[1] for m in masks], axis=0)
-    found = []
+    counted = np.any([_inliers(whole, few) for whole in good], axis=0)
+    errors = []
     for one, whole in zip(tried, wholes, strict=True):
         if isinstance(whole, str):
-            found.append(_failure(one, whole))
+            errors.append(HeldOut(label_of(one), _coefficients(one), failed=whole))
             continue
         try:
-            found.append(cross_validate(few, one, k, calibration=whole, counted=counted))
+            errors.append(cross_validate(few, one, k, calibration=whole, counted=counted))
         except CalibrationError as error:
-            found.append(_failure(one, str(error)))
-    best, chosen = _decide(found)
+            errors.append(HeldOut(label_of(one), _coefficients(one), failed=str(error)))
+    best, chosen = _decide(errors)
     share = (len(few.points) + len(few.curves)) / (len(observations.points) + len(observations.curves))
     current = next(i for i, one in enumerate(tried) if label_of(one) == label_of(options))
-    return Choice(tuple(found), tuple(tried), best, chosen, current, share)
+    return Choice(tuple(errors), tuple(tried), best, chosen, current, share)
 
 
 def _attempt(observations: Observations, options: Options) -> Calibration | str:
@@ -177,15 +178,15 @@ def _attempt(observations: Observations, options: Options) -> Calibration | str:
         return str(error)
 
 
-def _decide(found: Sequence[HeldOut]) -> tuple[int, int]:
+def _decide(tried: Sequence[HeldOut]) -> tuple[int, int]:
     """Indices of the best candidate and of the simplest that is as good within one standard error."""
-    good = [i for i, one in enumerate(found) if not one.failed]
+    good = [i for i, one in enumerate(tried) if not one.failed]
     if not good:
-        raise DegenerateError(f"no lens can be calibrated without one of the folds: {found[0].failed}")
-    common = np.all([found[i].frame_counts > 0 for i in good], axis=0)
-    squares = {i: found[i].frame_squares[common] for i in good}
+        raise DegenerateError(f"no lens can be calibrated without one of the folds: {tried[0].failed}")
+    common = np.all([tried[i].frame_counts > 0 for i in good], axis=0)
+    squares = {i: tried[i].frame_squares[common] for i in good}
     best = min(good, key=lambda i: float(squares[i].sum()))
-    for i in sorted(good, key=lambda i: (found[i].coefficients, float(squares[i].sum()))):
+    for i in sorted(good, key=lambda i: (tried[i].coefficients, float(squares[i].sum()))):
         more = squares[i] - squares[best]
         error = float(np.sqrt(len(more)) * np.std(more, ddof=1))
         if float(more.sum()) <= error:
@@ -207,12 +208,12 @@ def candidates(options: Options) -> list[Options]:
     by_order = sorted(zip(lens.orders, lens.names, strict=True))
     names = [name for _, name in by_order if name not in lens.decentring]
     held = {name: value for name, value in options.fixed.items() if name not in names}
-    found = []
+    shorter = []
     for count in range(_FEWEST_COEFFICIENTS, len(names) + 1):
-        found.append(replace(options, fixed={**held, **dict.fromkeys(names[count:], 0.0)}))
-    if all(label_of(one) != label_of(options) for one in found):
-        found.append(options)
-    return found
+        shorter.append(replace(options, fixed={**held, **dict.fromkeys(names[count:], 0.0)}))
+    if all(label_of(one) != label_of(options) for one in shorter):
+        shorter.append(options)
+    return shorter
 
 
 def label_of(options: Options) -> str:
@@ -225,20 +226,25 @@ def label_of(options: Options) -> str:
 # ---- one fold -------------------------------------------------------------------------------------------------------
 
 
-def _frames(observations: Observations) -> tuple[tuple[str, ...], Array]:
-    """Names of the frames that show anything, and the frame's number of each view (-1: shows nothing)."""
-    showing = np.union1d(observations.points.view, observations.curves.view)
-    order: dict[str, int] = {}
-    for view in showing:
-        order.setdefault(observations.views[int(view)].frame, len(order))
-    return tuple(order), np.array([order.get(view.frame, -1) for view in observations.views])
+def _columns(observations: Observations, name: str) -> AnyArray:
+    """(N + M,) one column of the points, then of the curves."""
+    return np.concatenate([getattr(observations.points, name), getattr(observations.curves, name)])
 
 
-def _subset(observations: Observations, points: Mask, curves: Mask) -> Observations:
-    """The same views with some of the observations."""
-    both = ((observations.points, points), (observations.curves, curves))
-    left: list[Any] = [replace(c, **{name: values[rows] for name, values in vars(c).items()}) for c, rows in both]
-    return replace(observations, points=left[0], curves=left[1])
+def _inliers(calibration: Calibration, observations: Observations) -> Mask:
+    return np.concatenate(calibration.inlier_masks(observations))
+
+
+def _frames(observations: Observations) -> tuple[tuple[str, ...], Indices]:
+    """Names of the frames that show anything, and (N + M,) the frame's number of each observation."""
+    views = _columns(observations, "view")
+    names = dict.fromkeys(observations.views[int(view)].frame for view in np.unique(views))
+    order = {name: number for number, name in enumerate(names)}
+    return tuple(names), np.array([order.get(view.frame, -1) for view in observations.views])[views]
+
+
+def _part(observations: Observations, rows: Mask) -> Observations:
+    return observations.part(*np.split(rows, [len(observations.points)]))
 
 
 def thinned(observations: Observations, most: int) -> Observations:
@@ -248,21 +254,17 @@ def thinned(observations: Observations, most: int) -> Observations:
         return observations
     names, frame = _frames(observations)
     count = max(min(_FEWEST_FRAMES, len(names)), int(len(names) * most / total))
-    chosen = np.zeros(len(names) + 1, dtype=bool)
-    chosen[np.linspace(0, len(names) - 1, count).round().astype(int)] = True
-    rows = chosen[frame[observations.points.view]], chosen[frame[observations.curves.view]]
-    step = max(1, round((np.count_nonzero(rows[0]) + np.count_nonzero(rows[1])) / most))
-    for mask in rows:
+    chosen = np.isin(frame, np.linspace(0, len(names) - 1, count).round())
+    step = max(1, round(np.count_nonzero(chosen) / most))
+    for mask in np.split(chosen, [len(observations.points)]):
         mask[np.flatnonzero(mask)[np.arange(np.count_nonzero(mask)) % step > 0]] = False
-    return _subset(observations, *rows)
+    return _part(observations, chosen)
 
 
-def _predicted(
-    observations: Observations, held: tuple[Mask, Mask], trained: Calibration, whole: Calibration
-) -> tuple[Array, Array]:
-    """Errors (N, 2) and (M, 2), px and mm, of held-out observations under a calibration that did not see them."""
+def _predicted(observations: Observations, held: Mask, trained: Calibration, whole: Calibration) -> Array:
+    """Errors (N + M, 2), px and mm, of held-out observations under a calibration that did not see them."""
     estimate = trained.estimate
-    sights = gather_sights(observations).used(*held)
+    sights = gather_sights(observations).used(*np.split(held, [len(observations.points)]))
     new = {key.placement for key in sights.keys if key.placement is not None} - set(estimate.placements)
     missing = {key.station for key in sights.keys} - set(estimate.stations)
     if missing:
@@ -286,52 +288,14 @@ def _posed(sights: Sights, estimate: Estimate, trained: Calibration, observation
     return solve(Problem(built, layout, weighting=weighting, options=options), start).estimate.placements
 
 
-def _errors(observations: Observations, rows: tuple[Mask, Mask], estimate: Estimate) -> tuple[Array, Array]:
-    """Lengths in px and mm of the residuals, (N, 2) and (M, 2); what is not seen counts 10 sigma in px, NaN in mm."""
-    sights = gather_sights(observations).used(*rows)
-    found = residuals(observations, sights, estimate)
-    equations = write_equations(observations, sights, estimate, found)
-    count = len(observations.points)
-    mm = np.abs(error_mm(equations, equations.residual, count + len(observations.curves)))
-    px = np.linalg.norm(found.points, axis=1), np.abs(found.curves)
-    answer = []
-    both: tuple[Columns, Columns] = (observations.points, observations.curves)
-    for length, own_mm, column in zip(px, (mm[:count], mm[count:]), both, strict=True):
-        length = np.where(np.isfinite(length), length, _UNSEEN_SIGMA * column.sigma_px)
-        answer.append(np.column_stack([length, own_mm]))
-    return answer[0], answer[1]
-
-
-def _held_out(
-    observations: Observations,
-    options: Options,
-    label: str,
-    folds: tuple[int, int],
-    columns: Sequence[Array],
-    fit_columns: Sequence[Array],
-    kept: tuple[Mask, Mask],
-    names: tuple[str, ...],
-    frame: Array,
-) -> HeldOut:
-    both: tuple[Columns, Columns] = (observations.points, observations.curves)
-    squares = np.zeros(len(names))
-    counts = np.zeros(len(names))
-    for column, errors, rows in zip(both, columns, kept, strict=True):
-        own = frame[column.view[rows]]
-        squares += np.bincount(own, (errors[rows, 0] / column.sigma_px[rows]) ** 2, len(names))
-        counts += np.bincount(own, minlength=len(names))
-    points, curves = (errors[rows] for errors, rows in zip(columns, kept, strict=True))
-    together = np.concatenate([points, curves])
-    fitted = np.concatenate([errors[rows, 0] for errors, rows in zip(fit_columns, kept, strict=True)])
-    return HeldOut(
-        label, _coefficients(options), *folds, _rms(points[:, 0]), _rms(curves[:, 0]), _rms(together[:, 0]),
-        _rms(together[:, 1]), _rms(fitted), names, squares, counts,
-    )  # fmt: skip
-
-
-def _failure(options: Options, why: str) -> HeldOut:
-    nothing, nan = np.empty(0), float("nan")
-    return HeldOut(label_of(options), _coefficients(options), 0, 0, nan, nan, nan, nan, nan, (), nothing, nothing, why)
+def _errors(observations: Observations, rows: Mask, estimate: Estimate) -> Array:
+    """Lengths in px and mm of the residuals, (N + M, 2); what is not seen counts 10 sigma in px, NaN in mm."""
+    sights = gather_sights(observations).used(*np.split(rows, [len(observations.points)]))
+    there = residuals(observations, sights, estimate)
+    equations = write_equations(observations, sights, estimate, there)
+    px = np.concatenate([np.linalg.norm(there.points, axis=1), np.abs(there.curves)])
+    px = np.where(np.isfinite(px), px, _UNSEEN_SIGMA * _columns(observations, "sigma_px"))
+    return np.column_stack([px, np.abs(error_mm(equations, equations.residual, len(px)))])
 
 
 def _coefficients(options: Options) -> int:

@@ -12,15 +12,16 @@ from functools import cache, cached_property
 import numpy as np
 
 from ceres_cal import kernels
-from ceres_cal.base.arrays import Array, Indices
+from ceres_cal.base.arrays import Array, Indices, Mask
 from ceres_cal.base.tails import log_binomial_tail
 from ceres_cal.model.parameters import Estimate
 from ceres_cal.model.residuals import camera_optics
 from ceres_cal.model.structure import EXACT
-from ceres_cal.observations import Curves, Observations, Points
+from ceres_cal.observations import Columns, Curves, Observations
 from ceres_cal.scene.camera import Camera
-from ceres_cal.scene.curves import Arc, Curve, curve_points, nearest_to_rays, turned_on
+from ceres_cal.scene.curves import Curve, curve_points, nearest_to_rays, turned_on
 from ceres_cal.scene.targets import Target
+from ceres_cal.solve.noise import Inliers
 
 _PIECES = 199  # of a curve, to measure its length in the image
 _MOST = 20_000  # rejected observations looked at: of more, evenly spread ones
@@ -46,34 +47,40 @@ class Mislabelled:
     log_p: float
 
 
-def find_mislabelled(
-    observations: Observations, estimate: Estimate, rejected_points: Indices, rejected_curves: Indices,
-    scales: tuple[float, float], reject_sigma: float,
-) -> tuple[list[Mislabelled], int]:  # fmt: skip
-    """Every group of rejected observations that another feature explains within the noise, and how many groups were
-    looked at.
+@dataclass(frozen=True, eq=False)
+class Mislabelling:
+    """All such groups, and how many groups were looked at."""
 
-    Args:
-        rejected_points, rejected_curves: their rows. scales: noise scales of points and of curves.
-    """
-    found: list[Mislabelled] = []
-    groups = 0
+    mislabelled: tuple[Mislabelled, ...]
+    tried: int
+
+
+def find_mislabelled(
+    observations: Observations, estimate: Estimate, inliers: Inliers, reject_sigma: float
+) -> Mislabelling:
+    """Every group of rejected observations that another feature explains within the noise."""
+    mislabelled: list[Mislabelled] = []
+    tried = 0
 
     @cache  # all frames of one station show a field from the same place
     def sight(target: str, station: str, placement: str | None) -> _Sight:
         return _Sight(observations.targets[target], estimate.camera_at(station, placement))
 
-    for is_curve, rows in ((False, rejected_points), (True, rejected_curves)):
-        column = observations.curves if is_curve else observations.points
+    both: tuple[tuple[Columns, Mask, float], ...] = (
+        (observations.points, inliers.points, inliers.point_scale),
+        (observations.curves, inliers.curves, inliers.curve_scale),
+    )
+    for column, inlier, scale in both:
+        rows = np.flatnonzero(~inlier)
         rows = rows[:: max(1, len(rows) // _MOST)]
-        for view in np.unique(column.view[rows]):
-            own = rows[column.view[rows] == view]
-            groups += len(np.unique(column.feature[own]))
-            one = observations.views[view]
-            if one.placement is None or one.placement in estimate.placements:
-                bound = reject_sigma * scales[is_curve] * column.sigma_px[own]
-                found += _of_view(sight(one.target, one.station, one.placement), column, int(view), own, bound)
-    return found, groups
+        for number in np.unique(column.view[rows]):
+            own, view = rows[column.view[rows] == number], observations.views[number]
+            tried += len(np.unique(column.feature[own]))
+            if view.placement is None or view.placement in estimate.placements:
+                bound = reject_sigma * scale * column.sigma_px[own]
+                seen = sight(view.target, view.station, view.placement)
+                mislabelled += _of_view(seen, column, int(number), own, bound)
+    return Mislabelling(tuple(mislabelled), tried)
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +103,7 @@ class _Sight:
         return min(1.0, 2.0 * distance_px * self.length_px / (width * height))
 
 
-def _of_view(sight: _Sight, column: Points | Curves, view: int, rows: Indices, bound: Array) -> list[Mislabelled]:
+def _of_view(sight: _Sight, column: Columns, view: int, rows: Indices, bound: Array) -> list[Mislabelled]:
     """The groups of one view."""
     is_curve = isinstance(column, Curves)
     pixels, named = column.pixels[rows], column.feature[rows]
@@ -110,18 +117,18 @@ def _of_view(sight: _Sight, column: Points | Curves, view: int, rows: Indices, b
     nearest = np.argmin(distance, axis=1)
     away = distance[np.arange(len(rows)), nearest]
     fits = away <= bound
-    found = []
+    groups = []
     for label, instead in np.unique(np.column_stack([named, nearest])[fits], axis=0):
         tried = named == label
         chosen = fits & tried & (nearest == instead)
         near = sight.chance(is_curve, float(away[chosen].max()))
         log_p = float(log_binomial_tail(chosen.sum(), tried.sum(), near))
-        found.append(
+        groups.append(
             Mislabelled(
                 is_curve, view, int(label), int(instead), rows[chosen], away[chosen], int(tried.sum()), log_p
             )
         )  # fmt: skip
-    return found
+    return groups
 
 
 def _visible_length_px(camera: Camera, curve: Curve) -> float:
@@ -133,23 +140,18 @@ def _visible_length_px(camera: Camera, curve: Curve) -> float:
 
 def _curve_distances(target: Target, camera: Camera, pixels: Array) -> Array:
     """(N, C) distances to each curve's centre between its ends, px."""
+    curves, tracks, is_arc = list(target.curves.values()), target.tracks[0], target.is_arc
     rays = np.nan_to_num(camera.rays(pixels) @ camera.cam_from_world.rotation)
-    answer = np.full((len(pixels), len(target.curves)), np.inf)
-    for number, curve in enumerate(target.curves.values()):
-        low, high = curve.parameter_range
-        s = turned_on(curve, nearest_to_rays(curve.track(), isinstance(curve, Arc), camera.position, rays))
-        inside = (s >= low) & (s <= high)
-        distance = _signed_distances(camera, curve.track(), isinstance(curve, Arc), pixels, s)
-        answer[inside, number] = np.abs(distance)[inside]
-    return answer
-
-
-def _signed_distances(camera: Camera, track: Array, arc: bool, pixels: Array, s: Array) -> Array:
-    pose = np.column_stack([camera.cam_from_world.rotation, camera.cam_from_world.translation])[None]
-    distance, count = np.empty(len(pixels)), len(pixels)
-    curves = kernels.CurveColumns(
-        np.array([0, count]), track[None], np.array([arc]), np.zeros(count, np.int32), np.ascontiguousarray(pixels),
-        np.ones(count), s.copy(), EXACT.track_slots,
+    track = np.repeat(np.arange(len(curves), dtype=np.int32), len(pixels))
+    nearest = nearest_to_rays(tracks[track], is_arc[track], camera.position, np.tile(rays, (len(curves), 1)))
+    s = np.concatenate([turned_on(curves[k], nearest[track == k]) for k in range(len(curves))])
+    low, high = np.array([curve.parameter_range for curve in curves])[track].T
+    inside = (s >= low) & (s <= high)
+    columns = kernels.CurveColumns(
+        np.array([0, len(s)]), tracks, is_arc, track, np.tile(pixels, (len(curves), 1)), np.ones(len(s)), s,
+        EXACT.track_slots,
     )  # fmt: skip
-    kernels.curve_residuals(camera_optics(camera), pose, curves, distance)
-    return distance
+    pose = np.column_stack([camera.cam_from_world.rotation, camera.cam_from_world.translation])[None]
+    distance = np.empty(len(s))
+    kernels.curve_residuals(camera_optics(camera), pose, columns, distance)
+    return np.where(inside, np.abs(distance), np.inf).reshape(len(curves), -1).T

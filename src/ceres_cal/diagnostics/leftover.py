@@ -6,11 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ceres_cal.base.arrays import Indices, Mask
+from ceres_cal.base.arrays import AnyArray, Indices, Mask
 from ceres_cal.base.tails import log_chi2_tail
 from ceres_cal.diagnostics.linear_model import LinearModel
 from ceres_cal.observations import Observations
 from ceres_cal.scene.curves import nearest_on_track
+from ceres_cal.solve.noise import Inliers
 
 # Noise within so much of what was stated is as stated: sigmas are guessed to a tenth or two. Below 1 every sound
 # scene is a finding; at 2.3 noise of twice the stated one is missed.
@@ -50,19 +51,19 @@ class Noise:
 
 
 def measure_noise(
-    observations: Observations, model: LinearModel, before: LinearModel, scales: tuple[float, float]
+    observations: Observations, model: LinearModel, before: LinearModel, inliers: Inliers
 ) -> tuple[Noise, ...]:
     """The noise of points and of curves, where there are any.
 
     Args:
-        model: with the named causes taken off. before: the calibration's own. scales: its noise scales.
+        model: with the named causes taken off. before: the calibration's own. inliers: with its noise scales.
     """
     answer = []
-    for is_curve, kind in ((False, "points"), (True, "curves")):
+    for is_curve, kind, scale in ((False, "points", inliers.point_scale), (True, "curves", inliers.curve_scale)):
         rows = model.used & (model.equations.is_curve == is_curve)
         if np.any(rows):
             own = before.variance(before.used & (before.equations.is_curve == is_curve))
-            answer.append(_noise_of(observations, model, kind, rows, scales[is_curve], own))
+            answer.append(_noise_of(observations, model, kind, rows, scale, own))
     return tuple(answer)
 
 
@@ -91,24 +92,26 @@ def _neighbours(observations: Observations, model: LinearModel, kind: str) -> tu
         rows = np.flatnonzero(model.used & equations.is_curve)
         track = equations.feature[rows]
         along = nearest_on_track(equations.sights.tracks[track], equations.sights.is_arc[track], equations.place[rows])
-        order = rows[np.lexsort((along, equations.feature[rows], equations.view[rows]))]
-        first, second = order[:-1], order[1:]
-        near = (equations.view[first] == equations.view[second]) & (
-            equations.feature[first] == equations.feature[second]
-        )
-        return first[near], second[near]
-    grids = [observations.targets[view.target].grid for view in observations.views]
-    columns = np.array([0 if grid is None else grid.columns for grid in grids])
-    rows = np.flatnonzero(model.used & ~equations.is_curve & (columns[equations.view] > 0))
-    component = (equations.direction[rows, 1] > 0.5).astype(int)
-    order = rows[np.lexsort((equations.feature[rows], component, equations.view[rows]))]
-    first, second = order[:-1], order[1:]
-    near = equations.view[first] == equations.view[second]
-    near &= equations.feature[second] - equations.feature[first] == 1
-    near &= np.all(equations.direction[first] == equations.direction[second], axis=1)
-    column = observations.points.feature[equations.observation[second]] % columns[equations.view[second]]
-    near &= column > 0  # not from the end of a row to the next one
+        first, second = _successive(rows, along, track, equations.view[rows])
+        near = equations.feature[first] == equations.feature[second]
+    else:
+        grids = [observations.targets[view.target].grid for view in observations.views]
+        columns = np.array([0 if grid is None else grid.columns for grid in grids])
+        rows = np.flatnonzero(model.used & ~equations.is_curve & (columns[equations.view] > 0))
+        component = (equations.direction[rows, 1] > 0.5).astype(int)
+        first, second = _successive(rows, equations.feature[rows], component, equations.view[rows])
+        near = equations.feature[second] - equations.feature[first] == 1
+        near &= np.all(equations.direction[first] == equations.direction[second], axis=1)
+        column = observations.points.feature[equations.observation[second]] % columns[equations.view[second]]
+        near &= column > 0  # not from the end of a row to the next one
+    near &= equations.view[first] == equations.view[second]
     return first[near], second[near]
+
+
+def _successive(rows: Indices, *keys: AnyArray) -> tuple[Indices, Indices]:
+    """Rows and their successors in the order of the last key, then the one before it, and so on."""
+    order = rows[np.lexsort(keys)]
+    return order[:-1], order[1:]
 
 
 def _correlation(model: LinearModel, pairs: tuple[Indices, Indices], variance: float) -> tuple[float, float]:

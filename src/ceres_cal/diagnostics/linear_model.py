@@ -19,9 +19,10 @@ from ceres_cal.diagnostics.equations import Equations
 from ceres_cal.model.keys import Key, columns_by_owner
 from ceres_cal.model.parameters import Estimate, intrinsic_names, intrinsics_scales
 from ceres_cal.model.quantities import free_keys, from_placement, from_station
-from ceres_cal.model.structure import Structure
 from ceres_cal.solve import Problem
 
+LEAST_LEFT = 1e-7
+"""Share of an alternative's squared length that the free numbers must leave for it to be testable."""
 _SINGULAR = 1e-12  # share of its own information that a number must keep beside the others
 
 
@@ -37,6 +38,37 @@ class Weights:
     inverse_sigma: Array
     used: Mask
     robust: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Freed:
+    """What Q more free numbers would do to a model.
+
+    Attributes:
+        rest: (E, Q) their columns, in standard deviations, beyond private placements. taken: (P, Q) what its shared
+            directions take of them. root: (Q, R) a root of their covariance, of what is determined. step: (R,) how far
+            they are from their best values.
+    """
+
+    rest: Array
+    taken: Array
+    root: Array
+    step: Array
+
+    @property
+    def amount(self) -> Array:
+        """(Q,) what brings them to their best values; 0 for what cannot be determined."""
+        return -self.root @ self.step
+
+    @property
+    def sd(self) -> Array:
+        """(Q,) its standard deviations, infinite for what cannot be determined."""
+        return np.where(np.any(self.root != 0.0, axis=1), np.sqrt(np.sum(self.root**2, axis=1)), np.inf)
+
+    @property
+    def decrease(self) -> float:
+        """By how much the squared residuals fall."""
+        return float(self.step @ self.step)
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,21 +124,44 @@ class LinearModel:
         """(E,) the residuals, in standard deviations, once every free number is at its best value; 0 where not used."""
         return np.where(self.used, self.placed_score - self.shared @ self.step, 0.0)
 
-    def with_columns(self, columns: Array) -> LinearModel:
-        """The same model with more free numbers: columns (E, Q), in standard deviations, not yet projected."""
-        rest = self.beyond_private(columns)
+    def freed(self, columns: Array) -> Freed:
+        """More numbers to be free besides: columns (E, Q), px per unit."""
+        scaled = columns * self.weight[:, None]
+        rest, taken = self._projected(scaled)
         inside = rest[self.used]
-        taken = self.shared[self.used].T @ inside
         normal = inside.T @ inside - taken.T @ taken
-        root = inverse_root(normal, np.sum(columns[self.used] ** 2, axis=0), 1e-7)
-        basis = (rest - self.shared @ taken) @ root
-        step = root.T @ (inside.T @ self.score[self.used] - taken.T @ self.step)
+        root = inverse_root(normal, np.sum(scaled[self.used] ** 2, axis=0), LEAST_LEFT)
+        return Freed(rest, taken, root, root.T @ (inside.T @ self.score[self.used] - taken.T @ self.step))
+
+    def with_columns(self, columns: Array) -> LinearModel:
+        """The same model with these numbers free."""
+        more = self.freed(columns)
+        basis = (more.rest - self.shared @ more.taken) @ more.root
         return replace(
             self,
             shared=np.hstack([self.shared, basis]),
-            step=np.concatenate([self.step, step]),
-            unknowns=self.unknowns + root.shape[1],
+            step=np.concatenate([self.step, more.step]),
+            unknowns=self.unknowns + more.root.shape[1],
         )
+
+    def decreases(self, columns: Array) -> Array:
+        """(Q,) by how much the squared residuals fall with each of the columns (E, Q), px per unit, alone."""
+        scaled = columns * self.weight[:, None]
+        rest, taken = self._projected(scaled)
+        left = np.sum(rest[self.used] ** 2, axis=0) - np.sum(taken**2, axis=0)
+        determined = left > LEAST_LEFT * np.sum(scaled[self.used] ** 2, axis=0)
+        slope = rest[self.used].T @ self.score[self.used] - taken.T @ self.step
+        return np.where(determined, slope**2 / np.where(determined, left, 1.0), 0.0)
+
+    def unabsorbed(self, shift: Array) -> Array:
+        """(E,) px of a displacement (E,) px that the free numbers could not have taken up."""
+        rest, taken = self._projected((shift * self.weight)[:, None])
+        return np.asarray((rest - self.shared @ taken)[:, 0] / self.weight)
+
+    def _projected(self, columns: Array) -> tuple[Array, Array]:
+        """Columns (E, Q), in standard deviations, beyond private placements, and what `shared` takes of them (P, Q)."""
+        rest = self.beyond_private(columns)
+        return rest, self.shared[self.used].T @ rest[self.used]
 
     @cached_property
     def leverage(self) -> Array:
@@ -196,17 +251,10 @@ def shared_columns(equations: Equations, estimate: Estimate, keys: Sequence[Key]
             columns[here, own] = equations.pose[here] @ from_placement(pose, world)[0]
     structure = [column for column, key in enumerate(keys) if key.kind == "structure"]
     if structure:
-        columns[:, structure[0] : structure[-1] + 1] += _structure_columns(equations, estimate.structure)
-    return columns
-
-
-def _structure_columns(equations: Equations, structure: Structure) -> Array:
-    """(E, Q) px per metre of each structure number."""
-    columns = np.zeros((len(equations), len(structure.values)))
-    slots, values = structure_columns(equations, structure)
-    for k in range(slots.shape[1]):
-        rows = np.flatnonzero(slots[:, k] >= 0)
-        columns[rows, slots[rows, k]] += values[rows, k]
+        slots, rows = equations.slots(estimate.structure), np.arange(len(equations))
+        for k in range(slots.shape[1]):
+            moved = rows[slots[:, k] >= 0]
+            columns[moved, structure[0] + slots[moved, k]] += equations.built[moved, k]
     return columns
 
 
@@ -220,34 +268,3 @@ def _prior_equations(problem: Problem, estimate: Estimate, keys: Sequence[Key]) 
         rows.append(row)
         values.append(prior.residuals(estimate))
     return np.vstack(rows), np.concatenate(values)
-
-
-def structure_columns(equations: Equations, structure: Structure) -> tuple[Indices, Array]:
-    """Which structure numbers move each equation, (E, 4), -1 for none, and by how many px per metre, (E, 4).
-
-    Points: x, y, first and second bow. Curves: a segment's offset to the left, or an arc's centre and radius.
-    """
-    count = len(equations)
-    slots, values = np.full((count, 4), -1), np.zeros((count, 4))
-    points = np.flatnonzero(~equations.is_curve)
-    axes = np.array([equations.moved_along(np.tile(axis, (count, 1))) for axis in np.eye(3)]).T
-    feature = equations.feature[points]
-    slots[points] = structure.point_slots[feature]
-    values[points, :2] = axes[points, :2]
-    values[points, 2:] = axes[points, 2:] * structure.bends[feature]
-    curves = np.flatnonzero(equations.is_curve)
-    track = equations.feature[curves]
-    slots[curves, :3] = structure.track_slots[track]
-    c, a = equations.sights.tracks[track, 0], equations.sights.tracks[track, 1]
-    arc = equations.sights.is_arc[track]
-    outward = equations.place[curves] - c
-    left = np.column_stack([-a[:, 1], a[:, 0], np.zeros(len(a))])
-    radius = np.where(arc[:, None], outward * [1.0, 1.0, 0.0], left)
-    radius /= np.maximum(np.linalg.norm(radius, axis=1, keepdims=True), 1e-300)
-    full = np.zeros((count, 3))
-    full[curves] = radius
-    along = equations.moved_along(full)[curves]
-    values[curves, 0] = np.where(arc, axes[curves, 0], along)
-    values[curves, 1] = np.where(arc, axes[curves, 1], 0.0)
-    values[curves, 2] = np.where(arc, along, 0.0)
-    return slots, values

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask
+from ceres_cal.diagnostics.diagnostic import Case
 from ceres_cal.diagnostics.linear_model import LinearModel
-from ceres_cal.diagnostics.table import ResidualTable
-from ceres_cal.observations import Observations
+from ceres_cal.diagnostics.table import ResidualTable, numbers_of
 from ceres_cal.scene.camera import Camera
 
 REGIONS = (6, 4)
@@ -69,16 +69,15 @@ class Summaries:
     trends: tuple[RadiusTrend, ...]
 
 
-def summarise(
-    observations: Observations, table: ResidualTable, model: LinearModel, cameras: Mapping[str, Camera]
-) -> Summaries:
+def summarise(case: Case) -> Summaries:
     """All summaries of a table."""
+    observations, table, cameras = case.observations, case.table, case.estimate.cameras
     several = len(observations.stations) > 1
     labels = [f"{view.station} {view.frame}" if several else view.frame for view in observations.views]
     frames = list(dict.fromkeys(labels))
-    frame_of_view = _numbers(labels, frames)
+    frame_of_view = numbers_of(labels, frames)
     camera_names = list(observations.cameras)
-    camera = _numbers([view.camera for view in observations.views], camera_names)[table.view]
+    camera = numbers_of([view.camera for view in observations.views], camera_names)[table.view]
     region_names, region = _regions(table, camera, camera_names, cameras)
     radius_names, ring, edges = _rings(table, camera, camera_names, cameras)
     return Summaries(
@@ -86,13 +85,8 @@ def summarise(
         _summary(table, table.feature, list(table.features)),
         _summary(table, region, region_names),
         _summary(table, ring, radius_names),
-        tuple(_trend(model, cameras[name], name, camera == i, edges[i]) for i, name in enumerate(camera_names)),
+        tuple(_trend(case.model, cameras[name], name, camera == i, edges[i]) for i, name in enumerate(camera_names)),
     )
-
-
-def _numbers(labels: list[str], known: list[str]) -> Indices:
-    order = {name: number for number, name in enumerate(known)}
-    return np.array([order[label] for label in labels], dtype=np.int64)
 
 
 def _summary(table: ResidualTable, group: Indices, names: list[str]) -> Summary:
@@ -110,18 +104,15 @@ def _summary(table: ResidualTable, group: Indices, names: list[str]) -> Summary:
 
     numbers = np.where(table.is_curve, 1.0, 2.0)
     sigmas = table.distance_px / (table.sigma_px * table.scale * np.sqrt(numbers))
-    numbers_of = (count(points), count(curves), count(~inlier))
-    filled = np.flatnonzero(sum(numbers_of))
-    return Summary(
-        tuple(names[i] for i in filled),
-        numbers_of[0][filled],
-        numbers_of[1][filled],
-        numbers_of[2][filled],
-        rms(points, table.distance_px)[filled],
-        rms(curves, table.distance_px)[filled],
-        rms(inlier, table.error_mm)[filled],
-        rms(inlier, sigmas)[filled],
+    counts = np.stack([count(points), count(curves), count(~inlier)])
+    filled = np.flatnonzero(counts.sum(axis=0))
+    measures = (
+        rms(points, table.distance_px),
+        rms(curves, table.distance_px),
+        rms(inlier, table.error_mm),
+        rms(inlier, sigmas),
     )
+    return Summary(tuple(names[i] for i in filled), *counts[:, filled], *(one[filled] for one in measures))
 
 
 def _regions(
@@ -142,12 +133,15 @@ def _rings(
     labels = []
     for number, name in enumerate(names):
         own = camera == number
-        inner = np.searchsorted(edges[number], table.radius_px[own], side="right") - 1
-        ring[own] = number * RADIUS_BINS + np.clip(inner, 0, RADIUS_BINS - 1)
+        ring[own] = number * RADIUS_BINS + _ring_of(table.radius_px[own], edges[number])
         labels += [
             f"{name} {low:.0f}-{high:.0f} px" for low, high in zip(edges[number], edges[number][1:], strict=False)
         ]
     return labels, ring, edges
+
+
+def _ring_of(radius: Array, edges: Array) -> Indices:
+    return np.asarray(np.clip(np.searchsorted(edges, radius, side="right") - 1, 0, RADIUS_BINS - 1))
 
 
 def _trend(model: LinearModel, camera: Camera, name: str, own: Mask, edges: Array) -> RadiusTrend:
@@ -156,7 +150,7 @@ def _trend(model: LinearModel, camera: Camera, name: str, own: Mask, edges: Arra
     offsets = camera.offsets(equations.pixel[rows])
     radius = np.linalg.norm(offsets, axis=1)
     outward = np.sum(equations.direction[rows] * offsets, axis=1) / np.maximum(radius, 1e-9)
-    ring = np.clip(np.searchsorted(edges, radius, side="right") - 1, 0, RADIUS_BINS - 1)
+    ring = _ring_of(radius, edges)
     weight = model.weight[rows] ** 2
     total = np.bincount(ring, weight * outward**2, RADIUS_BINS)
     moved = np.bincount(ring, weight * outward * equations.residual[rows], RADIUS_BINS)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+from collections.abc import Hashable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -135,7 +136,7 @@ def _plain(column: AnyArray) -> list[Any]:
 
 
 def make_table(
-    observations: Observations, inliers: Inliers, model: LinearModel, weight: Array, cameras: dict[str, Camera]
+    observations: Observations, inliers: Inliers, model: LinearModel, weight: Array, cameras: Mapping[str, Camera]
 ) -> ResidualTable:
     """The table of all observations.
 
@@ -147,7 +148,7 @@ def make_table(
     is_curve = np.arange(count) >= len(points)
     features, first = _feature_names(observations)
     view = np.concatenate([points.view, curves.view]).astype(np.int64)
-    target_of_view = _index([one.target for one in observations.views], list(observations.targets))
+    target_of_view = numbers_of((one.target for one in observations.views), observations.targets)
     feature = np.concatenate([points.feature, curves.feature]) + first[is_curve.astype(int), target_of_view[view]]
     pixel = np.concatenate([points.pixels, curves.pixels])
     residual = np.full((count, 2), np.nan)
@@ -177,7 +178,8 @@ def make_table(
     )
 
 
-def _index(names: list[str], known: list[str]) -> Indices:
+def numbers_of(names: Iterable[Hashable], known: Iterable[Hashable]) -> Indices:
+    """Which of the known names each one is."""
     order = {name: number for number, name in enumerate(known)}
     return np.array([order[name] for name in names], dtype=np.int64)
 
@@ -215,19 +217,22 @@ def error_mm(equations: Equations, values: Array, count: int) -> Array:
 
 def plane_shift(equations: Equations, values: Array) -> tuple[Array, Array]:
     """mm along x and y of the target, (E,) each, alike for both equations of a point; across a curve, 0 for y."""
-    count = len(equations)
-    along = [equations.moved_along(np.tile(axis, (count, 1))) for axis in np.eye(3)[:2]]
-    x, y = np.zeros(count), np.zeros(count)
-    pairs = np.flatnonzero(~equations.is_curve).reshape(-1, 2)  # a point's two equations follow one another
-    (a, c), (b, d) = along[0][pairs].T, along[1][pairs].T
-    p, q = values[pairs].T
+    x, y = np.zeros(len(equations)), np.zeros(len(equations))
+    first, second = pairs_of(equations)
+    (a, b), (c, d) = equations.built[first, :2].T, equations.built[second, :2].T
+    p, q = values[first], values[second]
     determinant = a * d - b * c
-    for column in pairs.T:
-        x[column], y[column] = 1e3 * (d * p - b * q) / determinant, 1e3 * (a * q - c * p) / determinant
+    x[first] = x[second] = 1e3 * (d * p - b * q) / determinant
+    y[first] = y[second] = 1e3 * (a * q - c * p) / determinant
     curves = np.flatnonzero(equations.is_curve)
-    steepest = np.hypot(along[0], along[1])[curves]  # the distance grows fastest across the curve
-    x[curves] = 1e3 * values[curves] / steepest
+    x[curves] = 1e3 * values[curves] / np.hypot(*equations.built[curves, :2].T)  # it grows fastest across the curve
     return x, y
+
+
+def pairs_of(equations: Equations) -> tuple[Indices, Indices]:
+    """The two equations of each point, which follow one another."""
+    first, second = np.flatnonzero(~equations.is_curve).reshape(-1, 2).T
+    return first, second
 
 
 def _mean_leverage(model: LinearModel, count: int) -> Array:
@@ -246,7 +251,7 @@ def _standardised(model: LinearModel, count: int) -> Array:
     variance = np.maximum(1.0 + sign * leverage, 1e-9)
     curves = equations.is_curve
     answer[equations.observation[curves]] = (residual / np.sqrt(variance))[curves]
-    first, second = np.flatnonzero(~curves).reshape(-1, 2).T
+    first, second = pairs_of(equations)
     cross = sign[first] * model.overlap(first, second)
     p, q = residual[first], residual[second]
     determinant = np.maximum(variance[first] * variance[second] - cross**2, 1e-18)
@@ -255,7 +260,7 @@ def _standardised(model: LinearModel, count: int) -> Array:
     return answer
 
 
-def _radii(observations: Observations, view: Indices, pixel: Array, cameras: dict[str, Camera]) -> Array:
+def _radii(observations: Observations, view: Indices, pixel: Array, cameras: Mapping[str, Camera]) -> Array:
     owner = np.array([one.camera for one in observations.views])[view]
     radii = np.full(len(view), np.nan)
     for name in observations.cameras:

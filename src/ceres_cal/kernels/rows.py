@@ -7,22 +7,30 @@ from typing import Any
 import numpy as np
 
 from ceres_cal.kernels.arguments import CurveColumns, Loss, Optics, PointColumns
-from ceres_cal.kernels.jit import jit
+from ceres_cal.kernels.jit import borrowing, jit
 from ceres_cal.kernels.lenses import prepared
 from ceres_cal.kernels.losses import robust_loss
-from ceres_cal.kernels.sight import CHUNK, jacobian_rows, move_to_feet, shown_points, working_space
+from ceres_cal.kernels.sight import (
+    CHUNK,
+    curve_directions,
+    jacobian_rows,
+    move_to_feet,
+    shown_points,
+    working_space,
+)
 
 
 @jit
 def point_rows(optics: Optics, poses: Any, points: PointColumns, rows: Any) -> bool:
-    """d project(X) / d [intrinsics | 6 pose] into `rows` (N, 2, intrinsics + 6); False where one cannot be projected.
+    """d project(X) / d [intrinsics | 6 pose | x, y, first and second bow] into `rows` (N, 2, intrinsics + 10); False
+    where one cannot be projected.
 
     Args:
         See `point_residuals`. The pose columns are left perturbations in the camera frame: (dw x R X) + dt.
     """
     optics = prepared(optics, optics.intrinsics)
     space = working_space(optics, 0)
-    jacobian = space.jacobian
+    jacobian, directions = space.jacobian, np.eye(4, 3)
     for v in range(len(poses)):
         for start in range(points.bounds[v], points.bounds[v + 1], CHUNK):
             n = min(CHUNK, points.bounds[v + 1] - start)
@@ -30,15 +38,19 @@ def point_rows(optics: Optics, poses: Any, points: PointColumns, rows: Any) -> b
                 return False
             jacobian_rows(n, optics, space, False)
             for i in range(n):
+                directions[2, 2], directions[3, 2] = points.bends[start + i, 0], points.bends[start + i, 1]
                 for c in range(2):
+                    row = rows[start + i, c]
                     for k in range(len(jacobian)):
-                        rows[start + i, c, k] = jacobian[k, c, i]
+                        row[k] = jacobian[k, c, i]
+                    _add_built(poses[v], directions, row)
     return True
 
 
 @jit
 def curve_rows(optics: Optics, poses: Any, curves: CurveColumns, rows: Any, normals: Any) -> bool:
-    """The same of the signed distance to the curve, into `rows` (M, intrinsics + 6), by the envelope theorem.
+    """The same of the signed distance to the curve, into `rows` (M, intrinsics + 10), by the envelope theorem; the last
+    columns are of a segment's offset to the left, or of an arc's x, y and radius, and 0.
 
     Args:
         See `curve_residuals`; s is moved to the foot. normals: (M, 2), filled with the image normal there: the foot
@@ -46,7 +58,7 @@ def curve_rows(optics: Optics, poses: Any, curves: CurveColumns, rows: Any, norm
     """
     optics = prepared(optics, optics.intrinsics)
     space = working_space(optics, 0)
-    jacobian, foot = space.jacobian, space.foot
+    jacobian, foot, directions = space.jacobian, space.foot, space.directions
     for v in range(len(poses)):
         for start in range(curves.bounds[v], curves.bounds[v + 1], CHUNK):
             n = min(CHUNK, curves.bounds[v + 1] - start)
@@ -57,9 +69,26 @@ def curve_rows(optics: Optics, poses: Any, curves: CurveColumns, rows: Any, norm
                 length = np.sqrt(foot[7, i])
                 nx, ny = -foot[1, i] / length, foot[0, i] / length
                 normals[start + i, 0], normals[start + i, 1] = nx, ny
+                row = rows[start + i]
                 for k in range(len(jacobian)):
-                    rows[start + i, k] = nx * jacobian[k, 0, i] + ny * jacobian[k, 1, i]
+                    row[k] = nx * jacobian[k, 0, i] + ny * jacobian[k, 1, i]
+                track = curves.track[start + i]
+                directions[:] = 0.0
+                directions[1, 1] = 1.0 if curves.is_arc[track] else 0.0
+                curve_directions(i, track, curves, space.tangents, directions)
+                _add_built(poses[v], directions, row)
     return True
+
+
+@borrowing
+def _add_built(pose: Any, directions: Any, row: Any) -> None:
+    """A row's last four columns, the target moved along each direction; the three before are the pose's translation."""
+    first = len(row) - 4
+    for a in range(4):
+        row[first + a] = 0.0
+        for j in range(3):
+            for k in range(3):
+                row[first + a] += row[first - 3 + j] * pose[j, k] * directions[a, k]
 
 
 @jit

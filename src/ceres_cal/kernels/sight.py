@@ -243,7 +243,7 @@ def _add_points(
 
 
 @borrowing
-def _curve_directions(i: int, k: int, curves: CurveColumns, tangents: Any, directions: Any) -> None:
+def curve_directions(i: int, k: int, curves: CurveColumns, tangents: Any, directions: Any) -> None:
     """Where the foot on track k goes: to the left of a segment; with the centre and outwards on an arc."""
     if curves.is_arc[k]:
         directions[0, 0], directions[0, 1] = 1.0, 0.0
@@ -297,7 +297,7 @@ def _add_curves(
             directions[0, 0], directions[1, 1], directions[2, 2] = 1.0, 1.0, 1.0
             for i in range(n):
                 k = track[start + i]
-                _curve_directions(i, k, curves, space.tangents, directions)
+                curve_directions(i, k, curves, space.tangents, directions)
                 add_structure(i, n, 1, curves.slots[k], pose, order.places, space, normal)
     return cost
 

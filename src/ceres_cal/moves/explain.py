@@ -21,7 +21,7 @@ from ceres_cal.model.structure import make_structure
 from ceres_cal.moves.carried import RefitPlan
 from ceres_cal.moves.labels import MIRRORED, TURNED, mistaken_targets, relabelled
 from ceres_cal.moves.poses import PoseCandidate, PoseSearch, misfit, movement, pose_candidates
-from ceres_cal.observations import Observations, taken
+from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import gather_sights
 
 _ZOOMS = 15
@@ -121,7 +121,7 @@ def _others(plan: RefitPlan, search: PoseSearch) -> Iterator[str]:
         before = search.camera.phi
         yield f"with phi {phi:.0f} px in place of {before:.0f} they do: {WORDS['zoom']}: refit with --what zoom"
     try:
-        fresh = calibrate(_of_camera(search), replace(plan.options, priors=()))
+        fresh = calibrate(search.observations.of_station(search.sight.key.station), replace(plan.options, priors=()))
     except CalibrationError:
         return
     noise = max(fresh.fit.point_scale / search.scales[0], fresh.fit.curve_scale / search.scales[1])
@@ -145,25 +145,6 @@ def _seen_as(search: PoseSearch, observations: Observations) -> PoseSearch:
     number = sights.keys.index(search.sight.key)
     estimate = replace(search.estimate, structure=make_structure(observations.targets, {}))
     return replace(search, observations=observations, sight=sights[number], estimate=estimate)
-
-
-def _of_camera(search: PoseSearch) -> Observations:
-    """The observations of the search's station alone."""
-    observations = search.observations
-    views = [n for n, view in enumerate(observations.views) if view.station == search.sight.key.station]
-    order = np.full(len(observations.views), -1, dtype=np.int32)
-    order[views] = np.arange(len(views))
-
-    points = taken(observations.points, order[observations.points.view] >= 0)
-    curves = taken(observations.curves, order[observations.curves.view] >= 0)
-    camera = search.sight.key.camera
-    return Observations(
-        observations.targets,
-        {camera: observations.cameras[camera]},
-        tuple(observations.views[n] for n in views),
-        replace(points, view=order[points.view]),
-        replace(curves, view=order[curves.view]),
-    )
 
 
 def zoomed_search(search: PoseSearch, old: list[Pose]) -> tuple[PoseSearch, PoseCandidate] | None:

@@ -15,8 +15,9 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from ceres_cal.base.arrays import Mask
 from ceres_cal.base.errors import InputError
-from ceres_cal.observations.columns import Columns, Curves, Points, Prior, View, choices, view_label
+from ceres_cal.observations.columns import Columns, Curves, Points, Prior, View, choices, taken, view_label
 from ceres_cal.observations.files import Content, header_of, read_content, write_content
 from ceres_cal.scene.targets import Target
 
@@ -115,6 +116,25 @@ class Observations:
         target = self.targets[self.views[int(column.view[row])].target]
         names = target.point_names if kind == "point" else target.curve_names
         return names[int(column.feature[row])]
+
+    # ---- parts --------------------------------------------------------------------------------------------------
+
+    def part(self, points: Mask, curves: Mask) -> Observations:
+        """The same views with some of the observations."""
+        return replace(self, points=taken(self.points, points), curves=taken(self.curves, curves))
+
+    def of_station(self, name: str) -> Observations:
+        """One station's views with all their observations, without priors."""
+        chosen = np.array([view.station == name for view in self.views])
+        order, camera = np.cumsum(chosen, dtype=np.int32) - 1, self.stations[name]
+        points, curves = taken(self.points, chosen[self.points.view]), taken(self.curves, chosen[self.curves.view])
+        return Observations(
+            self.targets,
+            {camera: self.cameras[camera]},
+            tuple(view for view in self.views if view.station == name),
+            replace(points, view=order[points.view]),
+            replace(curves, view=order[curves.view]),
+        )
 
     # ---- checks -------------------------------------------------------------------------------------------------
 

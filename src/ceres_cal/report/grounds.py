@@ -14,7 +14,6 @@ GOOD_MM, CARE_MM = 10.0, 50.0
 """95 % of located points nearer than the first is good (the width of a painted line), than the second to be used with
 care, beyond it not to be used."""
 _MANY_OUTLIERS = 0.3
-_NOT_HOLDING = "does not hold"
 _MOST_LINES = 6
 _ORDER = ("good", "care", "no")
 
@@ -31,7 +30,7 @@ def worst(*levels: str) -> str:
 
 def is_against(finding: Finding) -> bool:
     """Whether it says that the calibration is wrong, not only that some observation or its noise is."""
-    return finding.is_model_error or finding.kind == _NOT_HOLDING
+    return finding.wrong in ("model", "calibration")
 
 
 def model_error_mm(material: Material) -> float:
@@ -41,7 +40,7 @@ def model_error_mm(material: Material) -> float:
 
 def misfit_mm(material: Material) -> float:
     """By how much a refit to new data would move it, rms mm; 0 where it holds on them, or they are its own."""
-    return _largest_mm([finding for finding in material.diagnosis.findings if finding.kind == _NOT_HOLDING])
+    return _largest_mm([finding for finding in material.diagnosis.findings if finding.wrong == "calibration"])
 
 
 def _largest_mm(findings: list[Finding]) -> float:

@@ -96,12 +96,9 @@ def _hidden_rows(simulation: Simulation, shot: Photograph, truth: Truth, view: I
 
 def _without(simulation: Simulation, points: Mask, curves: Mask) -> Simulation:
     """A simulation with these rows only."""
-    observations = simulation.observations
     return replace(
         simulation,
-        observations=replace(
-            observations, points=taken(observations.points, points), curves=taken(observations.curves, curves)
-        ),
+        observations=simulation.observations.part(points, curves),
         points=taken(simulation.points, points),
         curves=taken(simulation.curves, curves),
     )

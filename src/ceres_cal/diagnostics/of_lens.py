@@ -1,0 +1,185 @@
+"""Diagnostics of the lens and the pixels: a polynomial too short, decentring, and each number that is held."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import ClassVar
+
+import numpy as np
+
+from ceres_cal.base.arrays import Array
+from ceres_cal.diagnostics.diagnostic import Case, Evidence, ScoreTest, Words
+from ceres_cal.diagnostics.findings import SMALL, amounts
+from ceres_cal.diagnostics.scores import Family
+from ceres_cal.model.parameters import unit_px
+from ceres_cal.scene.lens import LENSES
+
+_RADIAL_BASIS = 3  # powers of the radius past those of the lens: enough for any smooth trend that one more power mends
+
+
+class Radius(ScoreTest):
+    """Residuals follow the radius: the polynomial is too short."""
+
+    kind = "radius"
+    absorbed = True
+
+    def families(self, case: Case) -> Iterator[Family]:
+        columns = np.zeros((len(case.equations), _RADIAL_BASIS))
+        for number, name in enumerate(case.cameras):
+            own = case.camera == number
+            for k, power in enumerate(_missing_powers(case, name)[:_RADIAL_BASIS]):
+                columns[own, k] = _radial_column(case, name, power)[own]
+        yield Family(self.kind, columns, case.camera, case.cameras)
+
+    def words(self, evidence: Evidence) -> Words:
+        case, name, own = evidence.case, evidence.score.subject, evidence.case.camera == evidence.score.number
+        powers = _missing_powers(case, name)
+        columns = np.column_stack([_radial_column(case, name, power) * own for power in powers])
+        decreases = evidence.others.decreases(columns)
+        power, decrease = powers[int(np.argmax(decreases))], float(np.max(decreases))
+        share = 100.0 * min(1.0, decrease / evidence.others.freed(evidence.score.columns).decrease)
+        judged = "is too short" if evidence.noise_ratio >= SMALL else "is too short by little"
+        sentence = (
+            f"camera {name!r}: residuals follow the radius, up to {evidence.most_px(own):.2f} px ({evidence.size}): "
+            f"the radial polynomial {judged}; one more power, r^{power}, explains {share:.0f} % of it"
+        )
+        return Words(sentence, _longer(case, name, power))
+
+
+def _longer(case: Case, camera: str, power: int) -> str:
+    """How to calibrate with one more power."""
+    lens = case.estimate.cameras[camera].lens
+    held = [key for key, order in zip(lens.names, lens.orders, strict=True) if order == power]
+    held = [key for key in held if key not in lens.decentring]
+    if lens.powers:
+        return f"calibrate with --powers {','.join(map(str, sorted({*lens.powers, power})))}"
+    if held:
+        return f"let {held[0]} free (no --fix {held[0]}=...)"
+    growing = " or ".join(kind for kind, other in LENSES.items() if other.trial_powers)
+    return f"the {lens.kind} lens has no such power: try another lens or the {growing} one with more powers"
+
+
+def _missing_powers(case: Case, camera: str) -> list[int]:
+    """Powers of the radius that the lens does not solve for, lowest first."""
+    lens = case.estimate.cameras[camera].lens
+    free = [int(i) - 4 for i in case.problem.layout.free[camera] if i >= 4]
+    solved = {lens.orders[i] for i in free if lens.names[i] not in lens.decentring}
+    return [power for power in lens.missing_powers if power not in solved]
+
+
+def _offsets(case: Case, camera: str) -> Array:
+    """(E, 2) of every predicted pixel from the principal point, in half image diagonals."""
+    one = case.estimate.cameras[camera]
+    return one.offsets(case.equations.pixel) / unit_px(one)
+
+
+def _radial_column(case: Case, camera: str, power: int) -> Array:
+    """(E,) px per unit of a coefficient more in the lens's polynomial, scaled to be of order one."""
+    one, equations = case.estimate.cameras[camera], case.equations
+    offsets = _offsets(case, camera)
+    radius = np.maximum(np.linalg.norm(offsets, axis=1), 1e-12)
+    outward = np.sum(equations.direction * offsets * (1.0, one.aspect), axis=1) / radius
+    growth = one.lens.radial_change(one.offsets(equations.pixel), one.phi, unit_px(one), power)
+    return np.asarray(outward * growth)
+
+
+class Decentring(ScoreTest):
+    """Brown's tangential displacement, where the lens does not solve for it."""
+
+    kind = "decentring"
+    absorbed = True
+
+    def families(self, case: Case) -> Iterator[Family]:
+        columns, group = np.zeros((len(case.equations), 2)), case.camera.copy()
+        for number, name in enumerate(case.cameras):
+            own = case.camera == number
+            lens, free = case.estimate.cameras[name].lens, case.problem.layout.free[name].tolist()
+            if lens.decentring and all(4 + lens.names.index(part) in free for part in lens.decentring):
+                group[own] = -1
+            else:
+                columns[own] = _decentring_columns(case, name)[own]
+        yield Family(self.kind, columns, group, case.cameras)
+
+    def words(self, evidence: Evidence) -> Words:
+        name, every = evidence.score.subject, np.ones(len(evidence.shift), dtype=bool)
+        own = evidence.case.estimate.cameras[name].lens.decentring
+        kind, names = next((kind, lens.decentring) for kind, lens in LENSES.items() if lens.decentring)
+        return Words(
+            f"camera {name!r}: its lens is not centred: a tangential displacement of up to "
+            f"{evidence.most_px(every):.2f} px ({evidence.size})",
+            f"let {' and '.join(own)} free"
+            if own
+            else f"calibrate with --lens {kind}, which has {' and '.join(names)}",
+        )
+
+
+def _decentring_columns(case: Case, camera: str) -> Array:
+    """(E, 2) px of Brown's tangential displacements, 1 px at half the image diagonal."""
+    x, y = _offsets(case, camera).T
+    r2 = x * x + y * y
+    first = np.column_stack([2.0 * x * y, r2 + 2.0 * y * y])
+    second = np.column_stack([r2 + 2.0 * x * x, 2.0 * x * y])
+    return np.column_stack([np.sum(case.equations.direction * field, axis=1) for field in (first, second)])
+
+
+class Held(ScoreTest):
+    """Numbers of the pixels that are held; places: theirs in the intrinsics vector."""
+
+    absorbed = True
+    places: ClassVar[list[int]]
+
+    def families(self, case: Case) -> Iterator[Family]:
+        free = case.problem.layout.free
+        held = np.array([not set(self.places) & set(free[name].tolist()) for name in case.cameras])
+        group = np.where(held[case.camera], case.camera, -1)
+        yield Family(self.kind, case.equations.intrinsics[:, self.places], group, case.cameras)
+
+
+class Aspect(Held):
+    """How high pixels are beside their width."""
+
+    kind = "aspect"
+    places: ClassVar = [1]
+
+    def words(self, evidence: Evidence) -> Words:
+        score = evidence.score
+        held = evidence.case.estimate.cameras[score.subject].aspect
+        return Words(
+            f"camera {score.subject!r}: its pixels are not as wide as high: aspect {held + score.amount[0]:.5f} ± "
+            f"{score.sd[0]:.5f}, not {held:g} ({evidence.size})",
+            "calibrate with --free-aspect",
+            amounts(["aspect"], score.amount, score.sd, ""),
+        )
+
+
+class PrincipalPoint(Held):
+    """Where the optical axis meets the image."""
+
+    kind = "principal point"
+    places: ClassVar = [2, 3]
+
+    def words(self, evidence: Evidence) -> Words:
+        score = evidence.score
+        x, y = score.amount
+        return Words(
+            f"camera {score.subject!r}: the principal point is held, but the residuals ask for it {x:+.1f}, {y:+.1f} "
+            f"px from there ({evidence.size})",
+            "let it free",
+            amounts(["cx", "cy"], score.amount, score.sd, "px"),
+        )
+
+
+class Phi(Held):
+    """The focal length."""
+
+    kind = "phi"
+    places: ClassVar = [0]
+
+    def words(self, evidence: Evidence) -> Words:
+        score = evidence.score
+        return Words(
+            f"camera {score.subject!r}: phi is held, but residuals ask for {score.amount[0]:+.2f} ± "
+            f"{score.sd[0]:.2f} px ({evidence.size})",
+            "let it free, or give it as a prior with a sigma",
+            amounts(["phi"], score.amount, score.sd, "px"),
+        )

@@ -1,0 +1,168 @@
+"""Diagnostics of the target as built: a line, an arc or a point aside, a board that is bent."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import ClassVar
+
+import numpy as np
+
+from ceres_cal.base.arrays import Array, Indices, Mask
+from ceres_cal.diagnostics.diagnostic import Case, Evidence, ScoreTest, Words
+from ceres_cal.diagnostics.equations import whole_structure
+from ceres_cal.diagnostics.findings import amounts
+from ceres_cal.diagnostics.scores import Family, grouped
+from ceres_cal.scene.targets import Arc, Segment
+
+# Observations that say whether a curve lies aside: three numbers of an arc, and as many left to contradict them.
+# Nothing changes from half to double.
+_FEWEST_ON_CURVE = 8
+# Observations that say whether a point lies aside: one could be an outlier that was just not taken out. Nothing
+# changes from half to double.
+_FEWEST_OF_POINT = 2
+# Rejected observations of one line that must agree on its place: two determine it, three more do not by chance.
+# Nothing changes from half to double.
+_FEWEST_AGREE = 5
+# What lies farther aside is no painting error: its label is wrong. Nothing changes from half to double.
+_FAR_M = 0.1
+
+
+class _AsBuilt(ScoreTest):
+    """What moves some numbers of the structure that no tolerance solves for, where enough equations of it are used.
+
+    Attributes:
+        curves: whether of curves, or of points. places: of the numbers, as in `Equations.built`.
+    """
+
+    curves: ClassVar[bool] = False
+    places: ClassVar[slice]
+
+    @property
+    def _fewest(self) -> int:
+        return _FEWEST_ON_CURVE if self.curves else 2 * _FEWEST_OF_POINT
+
+    def families(self, case: Case) -> Iterator[Family]:
+        equations, structure = case.equations, whole_structure(case.observations.targets)
+        slot = equations.slots(structure)[:, self.places.start]
+        solved = equations.slots(case.estimate.structure)[:, self.places.start] >= 0
+        rows = (equations.is_curve == self.curves) & (slot >= 0) & ~solved
+        numbers, group = grouped(slot, rows)
+        counts = np.bincount(group[rows & case.model.used], minlength=len(numbers) + 1)  # group -1 finds the last, 0
+        group = np.where(counts[group] >= self._fewest, group, -1)
+        names = tuple(_feature_of(structure.names[number]) for number in numbers)
+        yield Family(self.kind, equations.built[:, self.places], group, names)
+
+
+def _feature_of(name: str) -> str:
+    """field/CenterCircle.x -> field/CenterCircle"""
+    for ending in (".x", ".y"):
+        name = name.removesuffix(ending)
+    return name.removesuffix("/bow")
+
+
+class CurveAside(_AsBuilt):
+    """A line or an arc is not painted as drawn."""
+
+    kind = "curve aside"
+    curves = True
+    places: ClassVar = slice(0, 3)
+
+    def words(self, evidence: Evidence) -> Words:
+        name = evidence.score.subject
+        target, _, feature = name.partition("/")
+        curve = evidence.case.observations.targets[target].curves[feature]
+        mm, sd = 1e3 * evidence.score.amount, 1e3 * evidence.score.sd
+        advice = f"measure it, or solve for it: --tolerance {target}.lines_m=0.01"
+        if isinstance(curve, Arc):
+            how = f"its centre x {mm[0]:+.1f}, y {mm[1]:+.1f} mm and its radius {mm[2]:+.1f} mm off"
+            sentence = f"{name} is not painted as drawn: {how} ({evidence.size})"
+            return Words(sentence, advice, amounts(("x", "y", "radius"), mm, sd, "mm"))
+        assert isinstance(curve, Segment)
+        along = np.subtract(curve.end, curve.start)[:2]
+        x, y = mm[0] * np.array([-along[1], along[0]]) / np.hypot(*along)
+        sentence = (
+            f"{name} is painted {abs(mm[0]):.1f} ± {sd[0]:.1f} mm aside of its drawing (x {x:+.1f}, y {y:+.1f} mm; "
+            f"{evidence.size})"
+        )
+        return Words(sentence, advice, amounts(["left"], mm[:1], sd[:1], "mm"))
+
+
+class PointAside(_AsBuilt):
+    """A point does not lie where it is drawn."""
+
+    kind = "point aside"
+    places: ClassVar = slice(0, 2)
+
+    def words(self, evidence: Evidence) -> Words:
+        name = evidence.score.subject
+        mm, sd = 1e3 * evidence.score.amount, 1e3 * evidence.score.sd
+        return Words(
+            f"{name} lies x {mm[0]:+.1f} ± {sd[0]:.1f}, y {mm[1]:+.1f} ± {sd[1]:.1f} mm from where it is drawn "
+            f"({evidence.size})",
+            f"measure it, or solve for it: --tolerance {name.partition('/')[0]}.points_m=0.005",
+            amounts("xy", mm, sd, "mm"),
+        )
+
+
+class BoardBent(_AsBuilt):
+    """A board is bowed along its sides."""
+
+    kind = "board bent"
+    places: ClassVar = slice(2, 4)
+
+    def words(self, evidence: Evidence) -> Words:
+        name = evidence.score.subject
+        mm, sd = 1e3 * evidence.score.amount, 1e3 * evidence.score.sd
+        return Words(
+            f"board {name} is not flat: bowed by {mm[0]:+.2f} ± {sd[0]:.2f} mm along x, {mm[1]:+.2f} ± {sd[1]:.2f} mm "
+            f"along y ({evidence.size})",
+            f"mount it on something flat, or solve for it: --tolerance {name}.warp_m=0.002",
+            amounts(("bow.x", "bow.y"), mm, sd, "mm"),
+        )
+
+
+# ---- observations that were taken out and may speak again -----------------------------------------------------------
+
+
+def recalled(case: Case) -> Mask:
+    """(E,) which equations take part when lines and points that were taken out nearly whole may speak too.
+
+    A feature that lies aside is an outlier everywhere. Where more of its observations agree about one place of their
+    own than agree with the drawing, those take part instead.
+    """
+    equations, weight, used = case.equations, case.model.weight, case.model.used.copy()
+    open_to_it = ~_mislabelled(case)[equations.observation]
+    counted = replace(case, model=replace(case.model, used=open_to_it))
+    for family in (*CurveAside().families(counted), *PointAside().families(counted)):
+        own = (family.group >= 0) & open_to_it
+        rejected = np.bincount(family.group[own & ~used], minlength=len(family.subjects))
+        for number in np.flatnonzero(rejected >= _FEWEST_AGREE):
+            rows = np.flatnonzero(own & (family.group == number))
+            agree = _agreeing(family.columns[rows] * weight[rows, None], equations.residual[rows] * weight[rows],
+                              equations.observation[rows], case.problem.options.reject_sigma)  # fmt: skip
+            if np.count_nonzero(agree) > max(int(np.count_nonzero(used[rows])), _FEWEST_AGREE - 1):
+                used[rows] = agree
+    return used
+
+
+def _mislabelled(case: Case) -> Mask:
+    """(N + M,) the observations that a wrong label explains."""
+    points = len(case.observations.points)
+    explained = np.zeros(len(case.table), dtype=bool)
+    for label in case.labels.mislabelled:
+        explained[label.rows + (points if label.is_curve else 0)] = True
+    return explained
+
+
+def _agreeing(columns: Array, residual: Array, observation: Indices, reject_sigma: float) -> Mask:
+    """(N,) which equations one amount brings within the bound, by least absolute deviations; none if it is too far."""
+    columns = columns[:, np.any(columns != 0.0, axis=0)]
+    amount: Array = np.zeros(columns.shape[1])
+    for _ in range(30):
+        sizes = 1.0 / np.sqrt(np.maximum(np.abs(residual + columns @ amount), 1.0))
+        amount = -np.asarray(np.linalg.lstsq(columns * sizes[:, None], residual * sizes, rcond=1e-9)[0])
+    _, of = np.unique(observation, return_inverse=True)
+    lengths = np.sqrt(np.bincount(of, (residual + columns @ amount) ** 2))
+    agree = (lengths <= reject_sigma)[of]
+    return agree if np.all(np.abs(amount) < _FAR_M) else np.zeros(len(agree), dtype=bool)
