@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import SolutionError
 from ceres_cal.base.threads import at_most, meanwhile, single_threaded_blas
 from ceres_cal.base.words import bounds_text
@@ -209,16 +210,24 @@ def _lost(inliers: Inliers, problem: Problem) -> Iterator[str]:
 
 def _fit(end: RobustSolution, layout: Layout) -> Fit:
     points, curves = end.residuals.lengths
-    points, curves = points[end.inliers.points], curves[end.inliers.curves]
+    used = points[end.inliers.points], curves[end.inliers.curves]
+    sigmas = end.problem.sights.sigma_px, end.problem.sights.curve_sigma_px
     return Fit(
-        len(points),
-        len(curves),
-        float(np.sqrt(points @ points / max(len(points), 1))),
-        float(np.sqrt(curves @ curves / max(len(curves), 1))),
+        len(used[0]),
+        len(used[1]),
+        _rms(used[0]),
+        _rms(used[1]),
         end.inliers.point_scale,
         end.inliers.curve_scale,
         layout.size,
+        _rms(sigmas[0]),
+        _rms(sigmas[1]),
     )
+
+
+def _rms(values: Array) -> float:
+    """Root mean square; 0 of nothing."""
+    return float(np.sqrt(values @ values / max(len(values), 1)))
 
 
 def _rejected(observations: Observations, inliers: Inliers) -> tuple[Rejected, ...]:

@@ -155,9 +155,7 @@ def _of_camera(posterior: Posterior, estimate: Estimate, camera: str) -> Posteri
 
 def _weighting(fit: Fit) -> Weighting:
     """Noise in px of points and curves, as the fit found it; of a kind that nobody observed that of the other."""
-    spare = max(1.0 - fit.unknowns / max(2 * fit.points + fit.curves, 1), 1e-3)
-    noise_px = [fit.points_rms_px / np.sqrt(2.0 * spare), fit.curves_rms_px / np.sqrt(spare)]
-    points, curves = (float(mine or other) for mine, other in (noise_px, noise_px[::-1]))
+    points, curves = (mine or other for mine, other in (fit.noise_px, fit.noise_px[::-1]))
     if not points > 0.0:
         raise InputError("the calibration found no noise at all: advice would promise miracles")
     return Weighting(points, curves, "trivial")

@@ -31,6 +31,8 @@ class Fit:
             not how well the camera is known.
         point_scale, curve_scale: estimated factors on the stated sigmas.
         unknowns: free numbers.
+        point_sigma_px, curve_sigma_px: root mean square of the stated sigmas of those that took part; None in files of
+            0.1, which do not have them.
     """
 
     points: int
@@ -40,6 +42,19 @@ class Fit:
     point_scale: float
     curve_scale: float
     unknowns: int
+    point_sigma_px: float | None = None
+    curve_sigma_px: float | None = None
+
+    @property
+    def noise_px(self) -> tuple[float, float]:
+        """Standard deviations of each coordinate of a point and of the distance to a curve, px; 0 of what nobody saw.
+
+        Where the stated sigmas are not known, from the residuals, as if every equation determined as much as any other.
+        """
+        if self.point_sigma_px is not None and self.curve_sigma_px is not None:
+            return self.point_scale * self.point_sigma_px, self.curve_scale * self.curve_sigma_px
+        spare = max(1.0 - self.unknowns / max(2 * self.points + self.curves, 1), 1e-3)
+        return self.points_rms_px / (2.0 * spare) ** 0.5, self.curves_rms_px / spare**0.5
 
     @property
     def scales(self) -> tuple[float, float]:

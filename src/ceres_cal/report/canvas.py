@@ -94,12 +94,13 @@ def to_svg(drawing: Drawing, width_in: float, name: str, *, whole_file: bool = F
         stream = io.StringIO()
         write: Any = FigureCanvasSVG(figure).print_svg
         write(stream, metadata={"Date": None, "Creator": None})
-    return stream.getvalue() if whole_file else _as_element(stream.getvalue())
+    text = stream.getvalue()
+    element = text[text.index("<svg") :]
+    return element if whole_file else _for_page(element)
 
 
-def _as_element(text: str) -> str:
+def _for_page(text: str) -> str:
     """A file's <svg> without what a page does not need."""
-    text = text[text.index("<svg") :]
     text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.S)
     text = re.sub(r' (?:width|height)="[\d.]+pt"', "", text)  # as wide as its place
     named = set(re.findall(r'(?:href="|url\()#([^")]+)', text))
