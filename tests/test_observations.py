@@ -104,6 +104,7 @@ sigmas = st.floats(5e-324, 1e300)
 @st.composite
 def observation_sets(draw: st.DrawFn) -> Observations:
     cameras = draw(st.lists(st.text(max_size=4), min_size=1, max_size=2, unique=True))
+    sizes = draw(st.tuples(st.integers(1, 9999), st.integers(1, 9999)))
     views: list[View] = []
     rows: dict[str, list[tuple[Any, ...]]] = {"point": [], "curve": []}
     for camera in cameras:
@@ -115,9 +116,8 @@ def observation_sets(draw: st.DrawFn) -> Observations:
                 least = 1 if number == 0 and kind == "point" else 0
                 for _ in range(draw(st.integers(least, 3)) if names else 0):
                     feature = draw(st.integers(0, len(names) - 1))
-                    rows[kind].append(
-                        (len(views) - 1, feature, draw(finite), draw(finite), draw(sigmas), draw(st.integers(-1, 1)))
-                    )
+                    x, y = (draw(st.floats(-1.5, end)) for end in sizes)
+                    rows[kind].append((len(views) - 1, feature, x, y, draw(sigmas), draw(st.integers(-1, 1))))
     columns: dict[str, dict[str, Any]] = {
         kind: {
             "view": [row[0] for row in rows[kind]],
@@ -133,7 +133,6 @@ def observation_sets(draw: st.DrawFn) -> Observations:
         for camera in cameras
     ]
     priors += [Prior("station", views[0].station, "height_m", (draw(finite),), (draw(sigmas),))]
-    sizes = draw(st.tuples(st.integers(1, 9999), st.integers(1, 9999)))
     return Observations(
         TARGETS,
         dict.fromkeys(cameras, sizes),
@@ -248,7 +247,7 @@ def test_columns_are_owned_and_frozen() -> None:
 def test_combine_puts_views_one_after_the_other(tmp_path: Path) -> None:
     first = Observations.load(written(tmp_path, document()))
     other = document()
-    other["cameras"] = {"side": {"image_size": [640, 480]}}
+    other["cameras"] = {"side": {"image_size": [1600, 1200]}}
     for view in other["views"]:
         view |= {"camera": "side", "station": "side"}
     other["priors"].append({"camera": "side", "phi": 700.0, "sigma": 5.0})
@@ -260,7 +259,7 @@ def test_combine_puts_views_one_after_the_other(tmp_path: Path) -> None:
     assert both.curves.view.tolist() == [0, 0, 2, 2, 4, 4]
     assert both.points.view.dtype == np.int32
     assert np.array_equal(both.points.pixels, np.tile(first.points.pixels, (3, 1)))
-    assert both.cameras == {"overhead": (1280, 960), "side": (640, 480)}
+    assert both.cameras == {"overhead": (1280, 960), "side": (1600, 1200)}
     assert both.priors == (*first.priors, *second.priors)  # each once
     assert combine([first]) is first
     alone = both.of_station("side")
@@ -281,7 +280,10 @@ def test_a_part_keeps_its_views(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "change, message",
     [
-        ({"cameras": {"overhead": {"image_size": [640, 480]}}}, r"camera 'overhead' has image sizes \(1280, 960\) and"),
+        (
+            {"cameras": {"overhead": {"image_size": [1600, 1200]}}},
+            r"camera 'overhead' has image sizes \(1280, 960\) and",
+        ),
         (
             {"targets": {"field": {"kind": "ssl-field", "division": "A"}, "board": document()["targets"]["board"]}},
             "target 'field'",

@@ -46,10 +46,11 @@ def calibrate(
     Raises:
         DegenerateError: the observations cannot determine the unknowns; the message names the frame or the numbers.
         SolutionError: no usable camera came out.
-        InputError: a prior or a fixed number that the camera does not have.
+        InputError: a prior or a fixed number that the camera does not have; pixels outside their image.
     """
     options = options or Options()
     with single_threaded_blas(), at_most(options.threads):
+        observations.require_inside()
         sights, layout = gather_sights(observations), make_layout(observations, options)
         start = initialise(observations, sights, options)
         priors = gather_priors(observations, options, start.estimate.structure)
@@ -97,7 +98,8 @@ def solved_from(
         warnings = tuple(_unknown(end, posterior))
     digest.result()  # which the observations remember
     calibration = _calibration(start, observations, problem, end)
-    return replace(calibration, warnings=(*_require_usable(end, problem), *warnings), posterior=posterior)
+    warnings = (*calibration.warnings, *_require_usable(end, problem), *warnings)
+    return replace(calibration, warnings=warnings, posterior=posterior)
 
 
 def _closed_form(start: Start, observations: Observations, problem: Problem) -> Calibration:
@@ -121,7 +123,7 @@ def _calibration(start: Start, observations: Observations, problem: Problem, end
         end.rounds,
         end.solution.history,
         start.phi_from,
-        (),
+        observations.warnings,
         problem.options,
         observations.digest,
     )

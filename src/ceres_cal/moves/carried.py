@@ -102,8 +102,8 @@ def make_plan(
 
 
 def require_same_things(calibration: Calibration, observations: Observations) -> None:
-    """Raise an error where cameras, image sizes or targets are not those that were calibrated, or nothing is known of
-    how well they were.
+    """Raise an error where cameras, image sizes or targets are not those that were calibrated, images too small for
+    the observations, or nothing is known of how well they were.
     """
     if calibration.posterior is None:
         raise InputError("the calibration does not say how well it is known: calibrate again")
@@ -127,6 +127,7 @@ def require_same_things(calibration: Calibration, observations: Observations) ->
         station = calibration.estimate.stations.get(name)
         if station is not None and station.camera != camera:
             raise InputError(f"station {name!r} is one of camera {station.camera!r}, not of {camera!r}: name another")
+    observations.require_inside()
 
 
 def carried_prior(calibration: Calibration, observations: Observations, stays: frozenset[str]) -> GaussianPrior:

@@ -17,6 +17,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import Mask
 from ceres_cal.base.errors import InputError
+from ceres_cal.observations.bounds import stray_pixels
 from ceres_cal.observations.columns import Columns, Curves, Points, Prior, View, choices, taken, view_label
 from ceres_cal.observations.files import Content, header_of, read_content, write_content
 from ceres_cal.scene.targets import Target
@@ -66,11 +67,13 @@ class Observations:
         """Read `.json` or `.npz` (design, section 9).
 
         Raises:
-            InputError: one line that names the file, the view and the feature.
+            InputError: one line that names the file, the view and the feature; also for pixels outside their images.
         """
         path = Path(path)
         try:
-            return cls(*read_content(path))
+            observations = cls(*read_content(path))
+            observations.require_inside()
+            return observations
         except InputError as error:
             text = str(error)
             raise InputError(text if text.startswith(f"{path}: ") else f"{path}: {text}") from None
@@ -93,6 +96,11 @@ class Observations:
         return Content(self.targets, self.cameras, self.views, self.points, self.curves, self.priors)
 
     # ---- reading ------------------------------------------------------------------------------------------------
+
+    @cached_property
+    def warnings(self) -> tuple[str, ...]:
+        """What to know of the observations before using them, each one line: strays outside an image."""
+        return self.require_inside()
 
     @cached_property
     def shown_views(self) -> tuple[View, ...]:
@@ -192,6 +200,14 @@ class Observations:
                 row = int(np.argmax(bad))
                 here = view_label(column.view[row], self.views)
                 raise InputError(f"{here}, {kind} {self.feature_name(kind, row)!r}: {what}: correct or remove it")
+
+    def require_inside(self) -> tuple[str, ...]:
+        """A line for each camera of which a few observations lie outside its image.
+
+        Raises:
+            InputError: more than a few do; naming the likely cause, and view, feature and pixel of the first.
+        """
+        return stray_pixels(self._content)
 
     def require_owner(self, prior: Prior) -> None:
         """Raise InputError where a prior names a camera or station that is not there."""

@@ -1,0 +1,94 @@
+"""Pixels outside their camera's image: a few are strays, many mean that the image size is another one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from ceres_cal.base.arrays import Array, Mask
+from ceres_cal.base.errors import InputError
+from ceres_cal.observations.columns import Columns, Curves, View, view_label
+from ceres_cal.observations.files import Content
+
+# The image ends half a pixel beyond the centres of its outermost ones; a detector that interpolates may go one further.
+_MARGIN_PX = 1.5
+# Of a camera's observations: more of them outside, and its image has another size.
+_FEW = 0.01
+
+
+def stray_pixels(content: Content) -> tuple[str, ...]:
+    """A line for each camera of which a few observations lie outside its image.
+
+    Raises:
+        InputError: naming the first of them, where they are more than one in a hundred (and not a single one).
+    """
+    if _all_inside(content):
+        return ()
+    sizes = np.array([content.cameras[view.camera] for view in content.views])
+    points, curves = (_outside(column, sizes) for column in (content.points, content.curves))
+    owners = np.array([view.camera for view in content.views])
+    lines = []
+    for camera, size in content.cameras.items():
+        own = owners == camera
+        mine = own[content.points.view], own[content.curves.view]
+        count = sum(np.count_nonzero(out & here) for out, here in zip((points, curves), mine, strict=True))
+        total = sum(np.count_nonzero(here) for here in mine)
+        if not count:
+            continue
+        first = _first(content, points & mine[0], curves & mine[1])
+        text = f"camera {camera!r}: {count} of {total} observations lie outside its image"
+        if count > max(1.0, _FEW * total):
+            pixels = np.concatenate([content.points.pixels[mine[0]], content.curves.pixels[mine[1]]])
+            raise InputError(f"{text}: {_cause(pixels, size)}; the first is {first}")
+        lines.append(f"{text} of {size[0]} x {size[1]} px, the first is {first}: correct or remove what lies outside")
+    return tuple(lines)
+
+
+def _all_inside(content: Content) -> bool:
+    """Whether no pixel lies outside the smallest image."""
+    smallest = np.min(list(content.cameras.values()), axis=0)
+    return all(
+        bool(np.all(column.pixels.min(axis=0) >= -_MARGIN_PX) and np.all(column.pixels.max(axis=0) <= _end(smallest)))
+        for column in (content.points, content.curves)
+        if len(column)
+    )
+
+
+def _end(size: Sequence[int] | Array) -> Array:
+    """The last pixel that may be seen in an image of that size."""
+    return np.asarray(size) - 1.0 + _MARGIN_PX
+
+
+def _outside(column: Columns, sizes: Array) -> Mask:
+    """(N,) which observations lie outside; `sizes` (V, 2) is that of each view's image."""
+    seen = column.pixels
+    return np.asarray(np.any((seen < -_MARGIN_PX) | (seen > _end(sizes[column.view])), axis=1))
+
+
+def _cause(pixels: Array, size: Sequence[int]) -> str:
+    """What the pixels say is wrong with the image size, or with themselves."""
+    (left, top), (right, bottom) = pixels.min(axis=0), pixels.max(axis=0)
+    width, height = size
+    if left < -_MARGIN_PX or top < -_MARGIN_PX:
+        reach = f"pixels begin at ({left:.0f}, {top:.0f})"
+        return f"{reach}, but (0, 0) is the centre of the top-left pixel, x to the right, y downwards: correct them"
+    reach = f"pixels reach {right:.0f} x {bottom:.0f} but image_size is {width} x {height}"
+    if width != height and np.all((right, bottom) <= _end((height, width))):
+        return f"{reach}: width and height, or x and y, are swapped: correct that"
+    return f"{reach}: another image size? Give that of the pictures the pixels were measured in"
+
+
+def _first(content: Content, points: Mask, curves: Mask) -> str:
+    """The first of these observations, as messages name it."""
+    column: Columns = content.points if points.any() else content.curves
+    row = int(np.argmax(points if points.any() else curves))
+    kind = "curve" if isinstance(column, Curves) else "point"
+    feature = _names(content, content.views[column.view[row]], kind)[int(column.feature[row])]
+    x, y = column.pixels[row]
+    return f"{view_label(column.view[row], content.views)}, {kind} {feature!r}: pixel ({x:.1f}, {y:.1f})"
+
+
+def _names(content: Content, view: View, kind: str) -> Sequence[str]:
+    target: Mapping[str, object] = getattr(content.targets[view.target], f"{kind}s")
+    return tuple(target)
