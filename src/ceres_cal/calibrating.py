@@ -20,6 +20,7 @@ from ceres_cal.observations.sights import gather_sights
 from ceres_cal.scene.camera import Camera
 from ceres_cal.solve import Problem, Progress, RobustSolution, Solution, information, solve_robustly
 from ceres_cal.solve.noise import Inliers, visible_from
+from ceres_cal.solve.possible import require_possible
 from ceres_cal.start.baseline import four_point_baseline
 from ceres_cal.start.initialise import Start, initialise
 from ceres_cal.uncertainty import Posterior, Uncertainty, assess
@@ -91,6 +92,7 @@ def solved_from(
     usual = again.scales if again else None
     end = solve_robustly(problem, observations, start.estimate, usual, progress)
     _require_fits(end, problem)
+    require_possible(observations, problem.sights, end.solution.estimate, end.residuals)
     warnings: tuple[str, ...] = ()
     posterior = None
     if again is None or again.assessed:
@@ -106,6 +108,7 @@ def _closed_form(start: Start, observations: Observations, problem: Problem) -> 
     """The paper's own method alone: nothing is minimised."""
     estimate = four_point_baseline(problem.sights, start.estimate)
     there = residuals(observations, problem.sights, estimate)
+    require_possible(observations, problem.sights, estimate, there)
     solution = Solution(estimate, np.nan, False, "the paper's closed form, nothing was minimised", ())
     end = RobustSolution(problem, solution, visible_from(observations, there), there, 0)
     return _calibration(start, observations, problem, end)

@@ -1,0 +1,143 @@
+"""Geometry that cannot be: mirrored pictures of a flat scene fit it perfectly, and are refused with their cause."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from scenes import SCENES, camera
+
+from ceres_cal.base.arrays import Array
+from ceres_cal.base.errors import SolutionError
+from ceres_cal.base.transforms import Pose
+from ceres_cal.calibrating import calibrate
+from ceres_cal.model.parameters import Estimate, Options
+from ceres_cal.model.parameters import Station as Placed
+from ceres_cal.model.residuals import residuals
+from ceres_cal.model.structure import EXACT
+from ceres_cal.observations import Observations
+from ceres_cal.observations.sights import gather_sights
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.targets import Target, custom
+from ceres_cal.simulate import Disturbance, Scene, Station, field_scene, overhead_pose, simulate
+from ceres_cal.solve.possible import require_possible
+
+NOISE = Disturbance(0.3, 0.3)
+MIRRORED: dict[str, Callable[[Array], Array]] = {
+    "mirrored": lambda p: np.array([1279.0, 0.0]) + p * (-1.0, 1.0),
+    "y upwards": lambda p: np.array([0.0, 959.0]) + p * (1.0, -1.0),
+}
+ANY = "the image is mirrored, or x and y are swapped, image_size too, or y points upwards"
+
+
+def with_pixels(observations: Observations, change: Callable[[Array], Array]) -> Observations:
+    points, curves = observations.points, observations.curves
+    return replace(
+        observations,
+        points=replace(points, pixels=change(points.pixels)),
+        curves=replace(curves, pixels=change(curves.pixels)),
+    )
+
+
+def refusal(observations: Observations, options: Options | None = None) -> str:
+    with pytest.raises(SolutionError) as refused:
+        calibrate(observations, options)
+    return str(refused.value)
+
+
+@pytest.mark.parametrize("name", ["corners", "lines", "lines-arcs", "field-boards", "rings-field", "two-cameras"])
+@pytest.mark.parametrize("how", MIRRORED)
+def test_a_mirrored_picture_is_refused(name: str, how: str) -> None:
+    seen = simulate(SCENES[f"radial-2-3/{name}"](), NOISE).observations
+    text = refusal(with_pixels(seen, MIRRORED[how]))
+    assert "the camera stands 5.2" in text and " m under the floor that it sees: " in text and ANY in text
+    assert text.endswith("or left and right are exchanged in the labels: correct the observations")
+    assert "\n" not in text
+
+
+def test_the_closed_form_is_refused_too() -> None:
+    seen = simulate(SCENES["radial-2-3/corners"](), NOISE).observations
+    text = refusal(with_pixels(seen, MIRRORED["mirrored"]), Options(closed_form_only=True))
+    assert "under the floor" in text
+
+
+def test_a_custom_target_in_the_world_is_a_floor_too() -> None:
+    """With poles on it: what stands on the floor cannot be mirrored, and the picture still is refused."""
+    seen = simulate(SCENES["radial-3-5/poles"](), NOISE).observations
+    text = refusal(with_pixels(seen, MIRRORED["mirrored"]), Options(powers=(3, 5)))
+    assert "under the floor" in text and ANY in text
+
+
+def small_field() -> Target:
+    """Points within what both a wide and a high image show."""
+    places = [(x, y) for x in np.linspace(-1.5, 1.5, 6) for y in np.linspace(-1.5, 1.5, 6)]
+    return custom({f"{i}": (float(x), float(y), 0.0) for i, (x, y) in enumerate(places)}, {})
+
+
+@cache
+def over_a_small_field() -> Scene:
+    cameras = {"overhead": camera("radial-2-3")}
+    poses = [overhead_pose(0.1, -0.1, 5.0, *tilts) for tilts in ((14.0, 2.0), (-3.0, -16.0), (8.0, 12.0))]
+    stations = {f"{number}": Station("overhead", pose) for number, pose in enumerate(poses)}
+    return field_scene(small_field(), cameras, stations, curves=())
+
+
+def test_the_principal_point_tells_swapped_axes() -> None:
+    """Where swapped pixels stay inside the image: at (469, 651), the image's centre being (639, 479)."""
+    seen = simulate(over_a_small_field(), NOISE).observations
+    inside = np.all(seen.points.pixels < 960.0, axis=1)
+    columns = {name: column[inside] for name, column in vars(seen.points).items()}
+    swapped = replace(seen, points=type(seen.points)(**columns | {"pixels": columns["pixels"][:, ::-1]}))
+    assert swapped.require_inside() == ()
+    text = refusal(swapped)
+    assert "under the floor that it sees: x and y are swapped (its principal point is where that puts it)" in text
+
+
+def test_boards_in_the_air_are_seen_from_either_side() -> None:
+    seen = simulate(SCENES["radial-2-3/boards"](), NOISE).observations
+    assert calibrate(with_pixels(seen, MIRRORED["mirrored"])).fit.rms_px < 0.7
+
+
+# ---- from a pose alone ----------------------------------------------------------------------------------------------
+
+
+def judged(points: dict[str, tuple[float, float, float]], pose: Pose) -> None:
+    """Ask of a camera at that pose, which is taken to have seen these points."""
+    target = custom(points, {})
+    above = Camera((1280, 960), 800.0, (640.0, 480.0), camera("radial-3").lens)
+    seen = simulate(
+        field_scene(target, {"a": above}, {"a": Station("a", overhead_pose(0.0, 0.0, 9.0))}, curves=())
+    ).observations
+    estimate = Estimate({"a": above}, {"a": Placed("a", pose)}, {}, EXACT)
+    sights = gather_sights(seen)
+    require_possible(seen, sights, estimate, residuals(seen, sights, estimate))
+
+
+def turned_upwards(height_m: float) -> Pose:
+    """A camera at that height that looks straight up."""
+    return Pose(np.eye(3), np.array([0.0, 0.0, -height_m]))
+
+
+def square(height_m: float) -> dict[str, tuple[float, float, float]]:
+    return {f"{x} {y}": (float(x), float(y), height_m) for x in (-1, 0, 1) for y in (-1, 0, 1)}
+
+
+def test_a_ceiling_and_a_wall_are_no_floor() -> None:
+    judged(square(3.0), turned_upwards(1.0))  # a ceiling
+    judged(square(-1.0), overhead_pose(0.0, 0.0, -0.5))  # a pit, from above
+    wall = {f"{x} {z}": (float(x), 0.001 * z, float(z)) for x in (-2, 0, 2) for z in (3, 4, 5)}
+    judged(wall, turned_upwards(-1.0))
+
+
+@pytest.mark.parametrize("depth_m", [0.0, 0.2, 5.0])
+def test_under_a_floor(depth_m: float) -> None:
+    with pytest.raises(SolutionError, match=f"stands {depth_m:.2f} m under the floor that it sees"):
+        judged(square(0.0), turned_upwards(-depth_m))
+
+
+def test_what_is_seen_lies_behind() -> None:
+    with pytest.raises(SolutionError, match=r"^station 'a': 9 of the 9 observations it has of the world lie behind"):
+        judged(square(0.0), turned_upwards(2.0))
