@@ -47,10 +47,11 @@ def stray_pixels(content: Content) -> tuple[str, ...]:
 
 def _all_inside(content: Content) -> bool:
     """Whether no pixel lies outside the smallest image."""
-    smallest = np.min(list(content.cameras.values()), axis=0)
+    ends = _end(np.min(list(content.cameras.values()), axis=0))
     return all(
-        bool(np.all(column.pixels.min(axis=0) >= -_MARGIN_PX) and np.all(column.pixels.max(axis=0) <= _end(smallest)))
+        bool(numbers.min() >= -_MARGIN_PX and numbers.max() <= end)
         for column in (content.points, content.curves)
+        for numbers, end in zip(column.pixels.T, ends, strict=True)
         if len(column)
     )
 

@@ -207,6 +207,10 @@ class Observations:
         Raises:
             InputError: more than a few do; naming the likely cause, and view, feature and pixel of the first.
         """
+        return self._strays
+
+    @cached_property
+    def _strays(self) -> tuple[str, ...]:
         return stray_pixels(self._content)
 
     def require_owner(self, prior: Prior) -> None:
