@@ -1,0 +1,229 @@
+"""Whether random halves of the views agree as stated, on real photographs: python scripts/halves.py [--help]
+
+Each half is calibrated by itself. What the two differ by, over the standard deviation that both together state: of the
+intrinsics (Mahalanobis length over the square root of their number) and of where rays are seen over the part of the
+image that the views fill (root mean square over a grid, the rotation that fits best taken out, for nothing says which
+way a camera frame looks). Both are 1 where the statement is honest. Each set stands beside its control: the same views
+as the calibration of the whole set sees them, with independent normal noise of the size that it found. Exits with 1
+when a figure is missed by more than two of its standard errors; the folder of real sets is $CERES_CAL_REAL, or
+shared/real beside the repository.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+from cases import Row, run
+
+from ceres_cal.base.arrays import Array, Mask
+from ceres_cal.base.errors import CalibrationError
+from ceres_cal.base.transforms import Pose, skew
+from ceres_cal.calibrating import calibrate
+from ceres_cal.calibration import Calibration
+from ceres_cal.detect.boards import detect_boards
+from ceres_cal.model.parameters import Options
+from ceres_cal.model.quantities import camera_moved, difference, natural_sizes
+from ceres_cal.observations import Curves, Observations, Points, View
+from ceres_cal.observations.columns import taken
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.targets import checkerboard
+
+REAL = Path(os.environ.get("CERES_CAL_REAL") or Path(__file__).parents[2] / "shared" / "real")
+LEAST, MOST = 0.85, 1.25
+_CONTROL = 0.9, 1.1
+_NO_CURVES = Curves(np.empty(0, np.int32), np.empty(0, np.int32), np.empty((0, 2)), np.empty(0), np.empty(0, np.int8))
+_GRID = 12  # places along the longer side of the image
+_STEP = 1e-5  # of each number's natural size
+
+
+# ---- the sets -------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class RealSet:
+    """One camera's views of a board, and how they are calibrated."""
+
+    observations: Callable[[], Observations]
+    options: Options
+
+
+def _photographed(pattern: str, columns: int, rows: int, square_m: float) -> Observations:
+    return detect_boards(sorted(REAL.glob(pattern)), checkerboard(columns, rows, square_m)).observations
+
+
+def _ov_plane() -> Observations:
+    """The corners of the training views, which come as numbers."""
+    with np.load(REAL / "babelcalib_ov_plane" / "train.npz") as data:
+        board, view, point, pixels, size = (data[n] for n in ("board_m", "view", "point", "pixels", "image_size"))
+    pitch_m = float(board[0, 0])
+    column, row = np.rint(board[:, :2] / pitch_m).astype(np.int32).T - 1
+    count = len(pixels)
+    views = tuple(View(f"{n:02d}", "camera", "camera", "board", f"{n:02d}") for n in range(int(view.max()) + 1))
+    points = Points(view.astype(np.int32), (22 * row + column)[point], pixels, np.ones(count))
+    board_target, sizes = {"board": checkerboard(22, 22, pitch_m)}, {"camera": (int(size[0]), int(size[1]))}
+    return Observations(board_target, sizes, views, points, _NO_CURVES)
+
+
+_ORDINARY = Options()
+_WIDE = Options(lens="kannala-brandt", free_aspect=True)
+SETS: Mapping[str, RealSet] = {
+    "opencv left": RealSet(partial(_photographed, "opencv_left_right/left*.jpg", 9, 6, 0.025), _ORDINARY),
+    "opencv right": RealSet(partial(_photographed, "opencv_left_right/right*.jpg", 9, 6, 0.025), _ORDINARY),
+    "sony": RealSet(partial(_photographed, "boofcv_sony_chess/*.jpg", 4, 6, 0.03), _ORDINARY),
+    "gopro": RealSet(partial(_photographed, "udacity_gopro_wide/GOPR*.jpg", 8, 6, 1.0), _WIDE),
+    "ov plane": RealSet(_ov_plane, _WIDE),
+}
+
+
+def control(calibration: Calibration, observations: Observations, seed: int) -> Observations:
+    """The same views of the same points as the calibration sees them, with independent normal noise."""
+    points, pixels = observations.points, np.empty_like(observations.points.pixels)
+    for number, view in enumerate(observations.views):
+        own = points.view == number
+        camera = calibration.estimate.camera_at(view.station, view.placement)
+        pixels[own] = camera.project(observations.targets[view.target].point_array[points.feature[own]])
+    noise = np.random.default_rng(seed).standard_normal(pixels.shape)
+    seen = pixels + calibration.fit.point_scale * points.sigma_px[:, None] * noise
+    return _of_rows(replace(points, pixels=np.nan_to_num(seen)), np.isfinite(pixels[:, 0]), observations)
+
+
+# ---- halves ---------------------------------------------------------------------------------------------------------
+
+
+def halves(observations: Observations, seed: int) -> tuple[Observations, Observations]:
+    """The views split at random into two halves, as nearly as may be."""
+    count = len(observations.views)
+    first = np.isin(np.arange(count), np.random.default_rng(seed).permutation(count)[: count // 2])
+    return _of_views(observations, first), _of_views(observations, ~first)
+
+
+def _of_views(observations: Observations, chosen: Mask) -> Observations:
+    return _of_rows(observations.points, chosen[observations.points.view], observations)
+
+
+def _of_rows(points: Points, rows: Mask, observations: Observations) -> Observations:
+    """The observations with some rows of these points in place of their own."""
+    return replace(observations, points=taken(points, rows))
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """How far two calibrations of one camera lie apart, over what they state: 1 on average where both are honest.
+
+    Attributes:
+        intrinsics, projections: see the script's own words; mean squares, not yet their roots.
+    """
+
+    intrinsics: float
+    projections: float
+
+
+def agreement(first: Calibration, second: Calibration, pixels: Array) -> Agreement:
+    """Of the only camera of two calibrations from different observations; projections at pixels (N, 2)."""
+    posteriors = first.uncertainty.posterior, second.uncertainty.posterior
+    keys = [key for key in posteriors[0].keys if key.kind == "camera"]
+    name = keys[0].owner
+    spread = np.zeros((len(keys), len(keys)))
+    for posterior in posteriors:
+        at = [posterior.keys.index(key) for key in keys]
+        spread += posterior.covariance[np.ix_(at, at)]
+    step = difference(first.estimate, second.estimate, keys)
+    sizes = natural_sizes(first.estimate, keys)
+    scaled = step / sizes
+    mahalanobis = float(scaled @ np.linalg.solve(spread / sizes[:, None] / sizes, scaled)) / len(keys)
+    one, other = (calibration.estimate.cameras[name].at(Pose.identity()) for calibration in (first, second))
+    rays = one.rays(pixels)
+    pixels, rays = pixels[np.isfinite(rays[:, 0])], rays[np.isfinite(rays[:, 0])]
+    slopes = _projection_slopes(one, rays, [key.quantity for key in keys], _STEP * sizes)
+    turned = np.linalg.qr(_turn_slopes(one, rays))[0]
+    off = (other.project(rays) - pixels).ravel()
+    off -= turned @ (turned.T @ off)
+    slopes -= turned @ (turned.T @ slopes)
+    stated = np.einsum("ni,ij,nj->n", slopes, spread, slopes)
+    return Agreement(mahalanobis, float(np.mean(_pairs(off**2) / _pairs(stated))))
+
+
+def _pairs(values: Array) -> Array:
+    """(N,) sums over x and y of (2 N,)."""
+    return np.asarray(values.reshape(-1, 2).sum(axis=1))
+
+
+def seen_grid(observations: Observations) -> Array:
+    """(N, 2) a grid of pixels over the part of the image that the observed points of all views enclose."""
+    ((width, height),) = observations.cameras.values()
+    step = max(width, height) / _GRID
+    x, y = (np.arange(0.5 * step, size, step) for size in (width, height))
+    hull = cv2.convexHull(observations.points.pixels.astype(np.float32))
+    every = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    return every[[cv2.pointPolygonTest(hull, (float(a), float(b)), False) > 0.0 for a, b in every]]
+
+
+def _projection_slopes(camera: Camera, rays: Array, quantities: Sequence[str], steps: Array) -> Array:
+    """(2 N, K) px by which rays (N, 3) are seen elsewhere, per unit of each intrinsic."""
+    columns = []
+    for number, size in enumerate(steps):
+        step = np.array([size])
+        ahead, behind = (camera_moved(camera, [quantities[number]], s).project(rays) for s in (step, -step))
+        columns.append((ahead - behind).ravel() / (2.0 * size))
+    return np.column_stack(columns)
+
+
+def _turn_slopes(camera: Camera, rays: Array) -> Array:
+    """(2 N, 3) px per radian that the camera turns."""
+    ahead, behind = (
+        [camera.project(rays + sign * _STEP * rays @ skew(axis)) for axis in np.eye(3)] for sign in (1, -1)
+    )
+    return np.column_stack([(a - b).ravel() / (2.0 * _STEP) for a, b in zip(ahead, behind, strict=True)])
+
+
+# ---- the command ----------------------------------------------------------------------------------------------------
+
+
+def rows(name: str, chosen: RealSet, splits: int) -> Iterator[Row]:
+    """The figures of one set and of its control."""
+    observations = chosen.observations()
+    whole = calibrate(observations, chosen.options)
+    pixels = seen_grid(observations)
+    real = [halves(observations, seed) for seed in range(splits)]
+    yield from _rows(name, real, chosen.options, pixels, (LEAST, MOST))
+    simulated = [halves(control(whole, observations, seed), seed) for seed in range(splits)]
+    yield from _rows(f"{name}, control", simulated, chosen.options, pixels, _CONTROL)
+
+
+def _rows(
+    name: str,
+    pairs: Sequence[tuple[Observations, Observations]],
+    options: Options,
+    pixels: Array,
+    limits: tuple[float, float],
+) -> Iterator[Row]:
+    found, failed = [], 0
+    for pair in pairs:
+        try:
+            one, other = (calibrate(half, options) for half in pair)
+            found.append(agreement(one, other, pixels))
+        except CalibrationError:
+            failed += 1
+    views = " and ".join(str(len(half.shown_views)) for half in pairs[0])
+    note = f"{len(found)} splits into {views} views" + (f", {failed} without a calibration" if failed else "")
+    for what in ("intrinsics", "projections"):
+        squares = np.array([getattr(one, what) for one in found])
+        value = float(np.sqrt(np.mean(squares)))
+        error = float(np.std(squares, ddof=1) / np.sqrt(len(squares)) / (2.0 * value))
+        yield Row(name, f"{what}: difference over stated, rms", value, error, *limits, note)
+
+
+def main(arguments: Sequence[str]) -> int:
+    cases = {name: partial(rows, name, chosen) for name, chosen in SETS.items()}
+    return run(cases, arguments, __doc__, (20, "random splits of each set"), 2)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
