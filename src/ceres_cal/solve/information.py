@@ -158,30 +158,36 @@ class _Sums:
         stacks, limits = [], sigma_limits(pose_keys("placement", ""))
         for poses, normals in self._normals(sights):
             chain = from_placement(poses, world)
-            whole = np.sum(list(normals.values()), axis=0)
-            own = np.swapaxes(chain, 1, 2) @ whole[:, -6:, -6:] @ chain
+            back = np.swapaxes(chain, 1, 2)  # the chain is orthogonal
+            whole = reduce(add, normals.values())
+            own = back @ whole[:, -6:, -6:] @ chain
             inverse = known_inverses(own, limits)
-            gain = inverse @ (np.swapaxes(chain, 1, 2) @ whole[:, -6:, :-6])
-            self._add_reduced(lead, normals, chain, inverse, gain)
-            if len(station):  # the placement makes up for whatever its station does: the chain is orthogonal
-                gain = np.concatenate([gain, np.swapaxes(chain, 1, 2) @ from_station(poses, world)], axis=2)
+            covariance = chain @ inverse @ back
+            follows = covariance @ whole[:, -6:, :-6]
+            self._add_reduced(lead, normals, covariance, follows)
+            gain = back @ follows
+            if len(station):  # the placement makes up for whatever its station does
+                gain = np.concatenate([gain, back @ from_station(poses, world)], axis=2)
             stacks.append((own, inverse, gain))
         own, inverse, gain = (np.concatenate(parts) for parts in zip(*stacks, strict=True))
         names = tuple(str(key.placement) for key in sights.keys)
         return Eliminated(names, own, inverse, gain, tuple(self._keys[i] for i in np.concatenate([lead, station])))
 
-    def _add_reduced(self, lead: Indices, normals: dict[int, Array], chain: Array, inverse: Array, gain: Array) -> None:
-        """V^T N V of each kind, with V how a sight's numbers follow the shared ones, summed over the sights."""
-        follows = chain @ gain
+    def _add_reduced(self, lead: Indices, normals: dict[int, Array], covariance: Array, follows: Array) -> None:
+        """V^T N V of each kind, with V how a sight's numbers follow the shared ones, summed over the sights.
+
+        Args:
+            covariance: (S, 6, 6) of each pose with everything shared held. follows: (S, 6, K) less what V has for it.
+        """
+        flat = follows.reshape(-1, len(lead))
         for kind, normal in normals.items():
-            coupling, own = normal[:, -6:, :-6], np.swapaxes(chain, 1, 2) @ normal[:, -6:, -6:] @ chain
-            taken = coupling.reshape(-1, len(lead)).T @ follows.reshape(-1, len(lead))
-            reduced = np.sum(normal[:, :-6, :-6], axis=0) - taken
+            coupling = normal[:, -6:, :-6]
+            reduced = np.sum(normal[:, :-6, :-6], axis=0) - coupling.reshape(-1, len(lead)).T @ flat
             if len(normals) > 1:  # of all kinds together the placements are at their best, not of each
                 left = coupling - normal[:, -6:, -6:] @ follows
-                reduced -= follows.reshape(-1, len(lead)).T @ left.reshape(-1, len(lead))
+                reduced -= flat.T @ left.reshape(-1, len(lead))
             self._matrices[kind][np.ix_(lead, lead)] += reduced
-            self._leverages[kind] += float(np.einsum("sij,sji->", own, inverse))
+            self._leverages[kind] += float(np.sum(normal[:, -6:, -6:] * covariance))
 
     def _add(self, key: SightKey, pose: Array, normals: dict[int, Array]) -> None:
         """What a sight that nothing is eliminated from says, added to the sums."""
