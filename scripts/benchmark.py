@@ -255,7 +255,7 @@ def uncertainty_share(frames: int, repeat: int) -> float:
         whole = Problem(sights, layout, (), Weighting(calibration.fit.point_scale), options)
         _, posterior = assess(whole, calibration.estimate, information(whole, calibration.estimate), np.inf)
         assessed = time.perf_counter() - middle
-        known = len(dict(posterior.placements))
+        known = len(posterior.placements)  # works them all out
         everything = time.perf_counter() - middle
         assert known == frames
         shares.append(everything / (middle - start - assessed))  # calibrate() assesses what is shared

@@ -146,22 +146,18 @@ class _Placements(Mapping[str, Information]):
     shared: Information
 
     @cached_property
-    def _information(self) -> dict[str, Information]:
+    def _matrices(self) -> dict[str, Array]:
         parts = ((part.names, _placement_information(part, self.shared)) for part in self.eliminated)
-        return {
-            name: Information(tuple(pose_keys("placement", name)), matrix)
-            for names, matrices in parts
-            for name, matrix in zip(names, matrices, strict=True)
-        }
+        return {name: matrix for names, matrices in parts for name, matrix in zip(names, matrices, strict=True)}
 
     def __getitem__(self, name: str) -> Information:
-        return self._information[name]
+        return Information(tuple(pose_keys("placement", name)), self._matrices[name])
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self._information)
+        return iter(self._matrices)
 
     def __len__(self) -> int:
-        return len(self._information)
+        return len(self._matrices)
 
 
 def _placement_information(part: Eliminated, shared: Information) -> Array:
