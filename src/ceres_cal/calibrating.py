@@ -189,7 +189,7 @@ def _require_usable(end: RobustSolution, problem: Problem) -> tuple[str, ...]:
             continue
         fold, corner = camera.lens.monotone_radius(camera.phi), camera.corner_radius
         where = f"camera {name!r}: the solved {camera.lens.kind} lens folds {fold:.0f} px from the principal point"
-        farthest = end.problem.sights.of_camera(name).reach_px(camera)
+        farthest = end.problem.sights.of_camera(name).about(camera).reach_px
         if not camera.lens.may_fold or fold <= farthest:
             raise SolutionError(
                 f"{where}, inside the image (corner at {corner:.0f} px): "

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -23,8 +23,9 @@ from ceres_cal.calibration.file import (
     options_to_json,
 )
 from ceres_cal.calibration.origin import Fit, Refitted, Rejected, package_versions
+from ceres_cal.model.keys import Key
 from ceres_cal.model.parameters import Estimate, Options, make_layout
-from ceres_cal.model.priors import gather_priors, gather_stated, tolerances
+from ceres_cal.model.priors import GaussianPrior, gather_priors, gather_stated, tolerances
 from ceres_cal.observations import Observations, taken
 from ceres_cal.observations.sights import gather_sights
 from ceres_cal.scene.camera import Camera
@@ -138,6 +139,10 @@ class Calibration:
         fresh = tolerances(self.estimate.structure, prior.keys)
         priors = (prior, *gather_stated(observations, options, lenses), *fresh)
         return Problem(sights, self.posterior.layout(self.estimate), priors, weighting, options)
+
+    def prior_of(self, keys: Sequence[Key]) -> GaussianPrior:
+        """What the posterior says of some numbers, all others integrated out, as the prior of the next solve."""
+        return GaussianPrior.about(self.uncertainty.posterior.information.marginal(keys), self.estimate)
 
     @property
     def rms_px(self) -> float:
