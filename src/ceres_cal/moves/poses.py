@@ -176,14 +176,10 @@ def _distinct(candidates: Sequence[PoseCandidate]) -> list[PoseCandidate]:
     """The candidates, best first, without repetitions."""
     kept: list[PoseCandidate] = []
     for candidate in sorted(candidates, key=lambda c: c.misfit):
-        if not any(_alike(candidate.pose, other.pose) for other in kept):
+        moves = [movement(candidate.pose, other.pose) for other in kept]
+        if not any(shift_m < _ALIKE[0] and turn < _ALIKE[1] for shift_m, turn in moves):
             kept.append(candidate)
     return kept
-
-
-def _alike(a: Pose, b: Pose) -> bool:
-    shift_m, turn = movement(a, b)
-    return shift_m < _ALIKE[0] and turn < _ALIKE[1]
 
 
 def movement(a: Pose, b: Pose) -> tuple[float, float]:

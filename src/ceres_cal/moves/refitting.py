@@ -69,11 +69,13 @@ def refit(
     """
     plan = make_plan(calibration, observations, what, moved, options)
     estimate = _start(plan)
+    zoomed = plan.moved_cameras if what in ("zoom", "everything") else ()
+    phi_from = {name: "views" if name in zoomed else "posterior" for name in calibration.cameras}
 
     def attempt(what: str, start: Estimate, *, assessed: bool = False) -> Calibration:
         problem, known = refit_problem(plan, what, start)
         again = Again(known, plan.scales, assessed)
-        return solved_from(Start(start, _phi_from(plan)), plan.observations, problem, again, progress)
+        return solved_from(Start(start, phi_from), plan.observations, problem, again, progress)
 
     result = attempt(what, estimate, assessed=True)
     others = require_supported(plan, result, attempt)
@@ -107,7 +109,6 @@ def _start(plan: RefitPlan) -> Estimate:
 
 
 def _moved_sights(plan: RefitPlan) -> list[Sights]:
-    """What each station that moved sees of the world."""
     moved = {name: sight for name, sight in plan.sights.of_world.items() if name in plan.moved}
     for name in sorted(plan.moved - moved.keys()):
         raise DegenerateError(
@@ -126,7 +127,9 @@ def _sought(plan: RefitPlan, search: PoseSearch) -> tuple[PoseSearch, Pose]:
     candidates = pose_candidates(search, old)
     fitting = [c for c in candidates if c.fits and c.misfit <= candidates[0].misfit + _NATS_ALIKE]
     if fitting:
-        pose = min(fitting, key=lambda candidate: _far(candidate.pose, old)).pose
+        # Of explanations that fit alike the one of the smallest move is taken.
+        far = [min((sum(movement(one.pose, before)) for before in old), default=0.0) for one in fitting]
+        pose = fitting[int(np.argmin(far))].pose
         _require_unique(search, pose, old)
         return search, pose
     if plan.what in ("zoom", "iris", "everything"):
@@ -139,26 +142,13 @@ def _sought(plan: RefitPlan, search: PoseSearch) -> tuple[PoseSearch, Pose]:
 def _require_unique(search: PoseSearch, pose: Pose, old: list[Pose]) -> None:
     """Raise DegenerateError where so few features cannot tell a large move from another one."""
     known = equations(search.sight)
-    if known >= _UNIQUE or any(_is_small(*movement(pose, before)) for before in old):
+    moves = [movement(pose, before) for before in old]
+    if known >= _UNIQUE or any(shift_m < _SMALL[0] and turn < _SMALL[1] for shift_m, turn in moves):
         return
     raise DegenerateError(
         f"station {search.sight.key.station!r}: its points, lines and arcs give {known} equations, which tell a small "
         f"move but not a large one for sure: show {_UNIQUE} (two a point or straight line, three an arc)"
     )
-
-
-def _is_small(shift_m: float, turn: float) -> bool:
-    return shift_m < _SMALL[0] and turn < _SMALL[1]
-
-
-def _phi_from(plan: RefitPlan) -> dict[str, str]:
-    free = plan.moved_cameras if plan.what in ("zoom", "everything") else ()
-    return {name: "views" if name in free else "posterior" for name in plan.calibration.cameras}
-
-
-def _far(pose: Pose, old: list[Pose]) -> float:
-    """How large a move is: of explanations that fit alike the nearest is taken."""
-    return min((sum(movement(pose, before)) for before in old), default=0.0)
 
 
 def _placements(plan: RefitPlan, estimate: Estimate) -> dict[str, Pose]:
@@ -196,7 +186,6 @@ def _require_known(plan: RefitPlan, result: Calibration) -> None:
 
 
 def _explained(plan: RefitPlan, result: Calibration) -> str:
-    """What has happened to each station that was sought, in words."""
     words, moves = [], movements(plan.calibration, result)
     for name in sorted(plan.moved):
         how = "is new" if name not in moves else f"moved by {1e3 * moves[name][0]:.1f} mm and {moves[name][1]:.3f} deg"
@@ -220,7 +209,6 @@ def movements(before: Calibration, after: Calibration) -> dict[str, tuple[float,
 
 
 def _warnings(plan: RefitPlan, result: Calibration) -> tuple[str, ...]:
-    """Those of the solve, and what the noise says."""
     judgement = judged(plan, plan.what, result)
     noisy = f"the noise is {judgement.noise:.1f} times that of the calibration before"
     return (*result.warnings, noisy) if judgement.noisy else result.warnings

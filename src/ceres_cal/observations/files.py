@@ -5,8 +5,9 @@ from __future__ import annotations
 import io
 import zipfile
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -21,14 +22,15 @@ FORMAT, VERSION = "ceres-cal/observations", 1
 _SIDE_NAMES = {value: name for name, value in SIDES.items()}
 
 
-class Content(NamedTuple):
-    """What a file holds: the fields of `Observations`."""
+@dataclass(frozen=True, eq=False)
+class Content:
+    """What a file holds, not checked: see `Observations`."""
 
     targets: Mapping[str, Target]
     cameras: Mapping[str, tuple[int, int]]
     views: tuple[View, ...]
-    points: Points = NO_POINTS
-    curves: Curves = NO_CURVES
+    points: Points
+    curves: Curves
     priors: tuple[Prior, ...] = ()
 
 
@@ -76,7 +78,9 @@ class _ObservationsFile(msgspec.Struct, forbid_unknown_fields=True, kw_only=True
             {name: target_from_spec(spec, f"target {name!r}") for name, spec in self.targets.items()},
             {name: camera.image_size for name, camera in self.cameras.items()},
             tuple(entry.view() for entry in self.views),
-            priors=tuple(prior_from_json(entry, f"prior {i}") for i, entry in enumerate(self.priors)),
+            NO_POINTS,
+            NO_CURVES,
+            tuple(prior_from_json(entry, f"prior {i}") for i, entry in enumerate(self.priors)),
         )
 
 
@@ -165,7 +169,8 @@ def _from_json(content: bytes, where: str) -> Content:
     point_index = {name: {f: i for i, f in enumerate(target.point_names)} for name, target in targets.items()}
     curve_index = {name: {f: i for i, f in enumerate(target.curve_names)} for name, target in targets.items()}
     sides = [_sides(entry, view_label(i, views)) for i, entry in curves]
-    return header._replace(
+    return replace(
+        header,
         points=Points(**_columns(points, views, point_index, "point")),
         curves=Curves(**_columns(curves, views, curve_index, "curve"), side=_concatenate(sides, np.int8)),
     )
@@ -226,14 +231,14 @@ def _same_or_list(values: AnyArray) -> Any:
 
 def _to_json(content: Content) -> bytes:
     data = header_of(content)
-    for rows, entry in zip(_rows_by_view(content.points, len(data.views)), data.views, strict=True):
-        if len(rows):
-            entry.points = _PointsFile(*_features(content.points, rows, content.targets[entry.target].point_names))
-    for rows, entry in zip(_rows_by_view(content.curves, len(data.views)), data.views, strict=True):
-        if len(rows):
-            side = _side_names(content.curves.side[rows])
-            names = content.targets[entry.target].curve_names
-            entry.curves = _CurvesFile(*_features(content.curves, rows, names), side)
+    points, curves = (_rows_by_view(columns, len(data.views)) for columns in (content.points, content.curves))
+    for p, c, entry in zip(points, curves, data.views, strict=True):
+        target = content.targets[entry.target]
+        if len(p):
+            entry.points = _PointsFile(*_features(content.points, p, target.point_names))
+        if len(c):
+            side = _side_names(content.curves.side[c])
+            entry.curves = _CurvesFile(*_features(content.curves, c, target.curve_names), side)
     plain = msgspec.structs.asdict(data)
     del plain["views"]
     head = msgspec.json.format(msgspec.json.encode(plain), indent=1).rstrip(b"}\n")
@@ -269,7 +274,6 @@ def _to_npz(content: Content) -> bytes:
 
 
 def _arrays(content: bytes, where: str) -> dict[str, AnyArray]:
-    """What an NPZ file holds, by name."""
     reason = "it is cut short or no NPZ file"
     try:
         if zipfile.is_zipfile(io.BytesIO(content)):
@@ -282,7 +286,6 @@ def _arrays(content: bytes, where: str) -> dict[str, AnyArray]:
 
 
 def _taken(arrays: dict[str, AnyArray], kind: str, names: Sequence[str], where: str) -> dict[str, Any]:
-    """The columns of one kind, taken out of the arrays."""
     columns = {}
     for name in names:
         array, dtype, ndim = arrays.pop(f"{kind}_{name}", None), np.dtype(TYPES[name]), 2 if name == "pixels" else 1
@@ -308,4 +311,4 @@ def _from_npz(packed: bytes, where: str) -> Content:
     curves = Curves(**_taken(arrays, "curves", (*names, "side"), where))
     if arrays:
         raise InputError(f"{where}: unknown column {min(arrays)!r}")
-    return content._replace(points=points, curves=curves)
+    return replace(content, points=points, curves=curves)

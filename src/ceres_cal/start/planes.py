@@ -209,7 +209,6 @@ def _spread_rows(bounds: Indices) -> Indices:
 
 
 def _plane_data(board: Sights, rows: Indices) -> PlaneData:
-    """Of some points of the sights, given by their rows there."""
     return PlaneData(
         np.searchsorted(rows, board.point_bounds),
         np.ascontiguousarray(board.points.take(rows, axis=0)[:, :2]),
@@ -284,7 +283,6 @@ def ring_radii(sight: Sights) -> RingRadii:
 
 
 def _from_rings(sight: Sights, unit: float) -> tuple[RadialProfile, Array]:
-    """Profile and homography of concentric rings seen about frontally."""
     radii = ring_radii(sight)
     profile, kappa = ring_profile(radii.measured_px, radii.ring_m, unit)
     if len(np.unique(radii.ring_m)) < 3:
