@@ -15,11 +15,11 @@ from functools import cached_property
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask
-from ceres_cal.diagnostics.equations import Equations
+from ceres_cal.model.equations import Equations
 from ceres_cal.model.keys import Key, columns_by_owner
 from ceres_cal.model.parameters import Estimate, intrinsic_names, intrinsics_scales
 from ceres_cal.model.quantities import free_keys, from_placement, from_station
-from ceres_cal.solve import Problem
+from ceres_cal.solve.problem import Problem
 
 LEAST_LEFT = 1e-7
 """Share of an alternative's squared length that the free numbers must leave for it to be testable."""
