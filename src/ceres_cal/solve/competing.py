@@ -26,9 +26,9 @@ from ceres_cal.solve.problem import Problem
 from ceres_cal.solve.robust import RobustSolution
 from ceres_cal.solve.wholes import FEWEST, Wholes, wholes_of
 
-# Log odds, by the linear model, from which on a whole is looked at by a solve without it: sound scenes stay below -8,
-# errors that agree along lines over 2 m reach -3, a line 1.2 px aside is above -6.
-_SUSPECT = -7.0
+# Log odds, by the linear model, from which on a whole is looked at by a solve without it: one in thirty sound scenes is
+# above -9, errors that agree along lines over 2 m reach -3, a line 1.2 px aside is above -7.
+_SUSPECT = -9.0
 # Log odds between which both explanations are named: 19 to 1.
 _DOUBTFUL = 3.0
 # Share of a whole's observations in use below which it is looked at in any case: its other rows are good by chance.
@@ -105,7 +105,7 @@ def compete(
     court = _Court(problem, observations, solver)
     explanations: list[Explanation] = []
     while court.has_any and len(explanations) < _MOST_WRONG:
-        trials = [trial for suspects in court.suspects(end) if (trial := court.tried(end, suspects)) is not None]
+        trials = list(court.trials(end))
         if not trials:
             break
         best = _best(trials)
@@ -130,12 +130,18 @@ class _Suspects:
 
 @dataclass(frozen=True, eq=False)
 class _Trial:
-    """What a solve without some wholes says of them. rows: (N + M,) theirs. log_odds: the least of theirs."""
+    """What a solve without some wholes says of them.
+
+    Attributes:
+        end: of that solve. rows: (N + M,) theirs. log_odds: the least of theirs. explanations: of each.
+        next: the whole that does not belong either, where one is suspected.
+    """
 
     end: RobustSolution
     rows: Mask
     log_odds: float
     explanations: tuple[Explanation, ...]
+    next: int | None
 
 
 def _best(trials: Sequence[_Trial]) -> _Trial:
@@ -159,6 +165,16 @@ class _Court:
     def has_any(self) -> bool:
         """Whether there is any whole."""
         return bool(self._kinds)
+
+    def trials(self, end: RobustSolution) -> Iterator[_Trial]:
+        """What solves without the suspects say; also without one more, where a second one may hide the first."""
+        for suspects in self.suspects(end):
+            trial = self.tried(end, suspects)
+            if trial is not None and trial.log_odds < _DOUBTFUL and trial.next is not None:
+                pair = self.tried(end, _Suspects(suspects.wholes, (*suspects.numbers, trial.next)))
+                trial = trial if pair is None or pair.log_odds < trial.log_odds else pair
+            if trial is not None:
+                yield trial
 
     # ---- who is looked at -------------------------------------------------------------------------------------------
 
@@ -218,7 +234,8 @@ class _Court:
             aside_px = float(np.nanmedian(lengths[own]))
             explanations.append(Explanation(wholes.name(number), own, aside_px, odds, instead, other))
         rows = wholes.among(np.array(numbers)) & self.taking_part
-        return _Trial(without, rows, min(one.log_odds for one in explanations), tuple(explanations))
+        least = min(one.log_odds for one in explanations)
+        return _Trial(without, rows, least, tuple(explanations), _next(offsets, chosen, numbers))
 
     def _without(self, wholes: Wholes, numbers: tuple[int, ...]) -> RobustSolution | None:
         """The end of a solve without some wholes; None where the others determine nothing."""
@@ -304,6 +321,14 @@ def _odds(offsets: Offsets, chosen: Indices, number: int, wrong: tuple[int, ...]
     each[at[number]] = -np.inf
     rival = int(np.argmax(each))
     return evidence - max(none, float(each[rival])), int(chosen[rival]) if each[rival] > none else None
+
+
+def _next(offsets: Offsets, chosen: Indices, wrong: tuple[int, ...]) -> int | None:
+    """The whole that does not belong, either, when these do not; None where there is none."""
+    at = [int(np.flatnonzero(chosen == number)[0]) for number in wrong]
+    each = offsets.log_evidence_with_each(at)
+    best = int(np.argmax(each))
+    return int(chosen[best]) if each[best] > offsets.log_evidence(at) else None
 
 
 def _thinned(rows: Indices, key: Indices, of_whole: Mask) -> Indices:
