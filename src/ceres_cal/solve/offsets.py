@@ -29,6 +29,7 @@ _INDEPENDENT = 0.5  # probability that errors do not go together along features
 # Standard deviations of offsets in those of one observation's noise: of features that belong, and of those that do not.
 _SCATTER = np.concatenate([[0.0], np.geomspace(0.1, 60.0, 14)])
 _ASIDE = np.array([10.0, 40.0, 160.0])
+_LEAST_PX = 1e-3  # noise that nothing is measured better than: of exact observations rounding is no offset
 _DETERMINED = 1e-5  # of the largest squared length of a mode: what the model leaves of directions that can be judged
 
 
@@ -76,7 +77,7 @@ class Offsets:
         for aside in _ASIDE[: len(_ASIDE) if count else 1]:
             wider = np.eye(width) + aside**2 * normal
             explained = aside**2 * np.sum(slope * np.linalg.solve(wider, slope[..., None])[..., 0], axis=-1)
-            left = np.log(np.maximum(self.rest + total - explained, 1e-9) / max(self.spare, 1))
+            left = np.log((self.rest + total - explained) / max(self.spare, 1))
             logs.append(prior - 0.5 * np.linalg.slogdet(wider)[1] - 0.5 * self.spare * left)
         every = np.concatenate(logs, axis=1)
         most = np.max(every, axis=1)
@@ -105,4 +106,5 @@ def measure_offsets(model: LinearModel, columns: Array, group: Indices) -> Offse
     modes[there] = turns * np.sqrt(size)
     modes = np.swapaxes(modes.reshape(groups, width, -1), 1, 2)
     rest = float(np.sum(model.left_over[model.used] ** 2) - value @ value)
-    return Offsets(size, value, modes, max(rest, 0.0), model.spare)
+    least = model.spare * (_LEAST_PX * float(np.median(model.weight[rows]))) ** 2
+    return Offsets(size, value, modes, max(rest, least), model.spare)
