@@ -108,7 +108,7 @@ def solved_from(
         warnings = (*warnings, *_unknown(end, posterior))
     digest.result()  # which the observations remember
     calibration = _calibration(start, observations, problem, end, explanations)
-    warnings = (*calibration.warnings, *_require_usable(end, problem), *warnings)
+    warnings = (*calibration.warnings, *_require_usable(end, problem, explanations), *warnings)
     return replace(calibration, warnings=warnings, posterior=posterior)
 
 
@@ -214,7 +214,7 @@ def _require_fit(name: str, camera: Camera, end: RobustSolution, problem: Proble
         )
 
 
-def _require_usable(end: RobustSolution, problem: Problem) -> tuple[str, ...]:
+def _require_usable(end: RobustSolution, problem: Problem, explanations: Sequence[Explanation]) -> tuple[str, ...]:
     """Warnings about the solution; SolutionError where it must not be used."""
     warnings = []
     for name, camera in end.solution.estimate.cameras.items():
@@ -232,12 +232,15 @@ def _require_usable(end: RobustSolution, problem: Problem) -> tuple[str, ...]:
             f"{where}: from there to the corner ({corner:.0f} px) pixels have no answer; "
             f"observations reach {farthest:.0f} px"
         )
-    return (*warnings, *_lost(end.inliers, problem))
+    return (*warnings, *_lost(end.inliers, problem, explanations))
 
 
-def _lost(inliers: Inliers, problem: Problem) -> Iterator[str]:
-    """Sights most of whose observations were taken out: they were not understood, whatever the rest says."""
-    shares = problem.sights.used_share(inliers.points, inliers.curves)
+def _lost(inliers: Inliers, problem: Problem, explanations: Sequence[Explanation]) -> Iterator[str]:
+    """Sights most of whose observations were taken out one by one: they were not understood, whatever the rest says."""
+    used = np.concatenate([inliers.points, inliers.curves])
+    for one in explanations:
+        used |= one.rows & one.is_taken
+    shares = problem.sights.used_share(used[: len(inliers.points)], used[len(inliers.points) :])
     for number in np.flatnonzero(shares < 0.5):
         out = f"{100.0 * (1.0 - shares[number]):.0f} % of its observations were taken out"
         yield f"{problem.sights.keys[number]}: {out}: check its labels, do not use its pose"

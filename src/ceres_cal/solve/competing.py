@@ -1,9 +1,10 @@
 """Competing explanations: the same observations without a line that may not belong, as a whole.
 
 A line that lies aside as a whole outvotes the others: the fit goes half of the way towards it, no row of it is an
-outlier, and good rows elsewhere become some. So it is asked of each curve in each frame, and of each feature over all
-frames, whether the rest is better explained without it. The linear model at the end of all rounds names a few suspects
-(see `offsets`), a solve without each of them tells what the rest says of it, and the more probable explanation wins.
+outlier, and good rows elsewhere become some. So it is asked of each curve in each frame, of each feature over all
+frames, of each frame and of each placement, whether the rest is better explained without it. The linear model at the
+end of all rounds names a few suspects (see `offsets`), a solve without each of them tells what the rest says of it, and
+the more probable explanation wins.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from ceres_cal.model.equations import write_equations
 from ceres_cal.model.parameters import Estimate
 from ceres_cal.model.residuals import residuals
 from ceres_cal.observations import Observations
+from ceres_cal.solve.bundle import with_placements_at_best
 from ceres_cal.solve.linear_model import LinearModel, equation_weights, make_linear_model
 from ceres_cal.solve.offsets import Offsets, measure_offsets
 from ceres_cal.solve.problem import Problem
@@ -33,9 +35,12 @@ _SUSPECT = -9.0
 _DOUBTFUL = 3.0
 # Share of a whole's observations in use below which it is looked at in any case: its other rows are good by chance.
 _LEFT = 0.5
-_MOST_VIEWS = 8  # with curves that are looked at together: they cost the cube of their number
+_MOST_VIEWS, _MOST_WHOLE_VIEWS = 8, 24  # whose features, or which, are looked at together: at the cube of the number
 _MOST_OTHERS = 16  # views besides, which tell the lens
 _MOST_ROWS = 40  # of a whole in one view
+# Standard deviations by which a view's mean square must stand out, beyond the largest of so many by noise, for views to
+# be looked at: boards whose drawing is 3 % too short in one of ten do by 2 to 4, 10 % by 17.
+_STANDS_OUT = 2.5
 _MOST_WRONG = 4  # wholes
 
 
@@ -156,7 +161,7 @@ class _Court:
 
     def __init__(self, problem: Problem, observations: Observations, solver: Solver) -> None:
         self._problem, self._observations, self._solver = problem, observations, solver
-        self._kinds = list(wholes_of(observations, problem.sights)) if len(observations.curves) else []
+        self._kinds = list(wholes_of(observations, problem.sights))
         self._view = np.concatenate([observations.points.view, observations.curves.view])
         self._tried: set[tuple[int, ...]] = set()
         self.taking_part = np.ones(len(observations.points) + len(observations.curves), dtype=bool)
@@ -196,6 +201,10 @@ class _Court:
 
     def _by_offsets(self, end: RobustSolution, wholes: Wholes) -> Iterator[tuple[int, ...]]:
         """Those that the offsets speak against: single ones, and the pair of most evidence."""
+        if not wholes.of_features:
+            excess = self._excess(end, wholes)
+            if np.max(excess) < _STANDS_OUT + np.sqrt(2.0 * np.log(np.count_nonzero(excess))):
+                return
         chosen, offsets = self._offsets(end, wholes, ())
         if offsets is None:
             return
@@ -240,10 +249,16 @@ class _Court:
     def _without(self, wholes: Wholes, numbers: tuple[int, ...]) -> RobustSolution | None:
         """The end of a solve without some wholes; None where the others determine nothing."""
         try:
-            rows = self._split(self.taking_part & ~wholes.among(np.array(numbers)))
-            return self._solver(self._problem.used(*rows))
+            gone = wholes.among(np.array(numbers))
+            others = self._problem.used(*self._split(self.taking_part & ~gone))
+            end = self._solver(replace(others, layout=others.layout.of(others.sights.keys)))
         except CalibrationError:
             return None
+        if wholes.of_features:
+            return end
+        alone = self._problem.used(*self._split(gone)).weighted(replace(end.problem.weighting, loss="cauchy"))
+        estimate = with_placements_at_best(alone, end.solution.estimate)
+        return replace(end, solution=replace(end.solution, estimate=estimate))
 
     def _offsets(self, end: RobustSolution, wholes: Wholes, back: tuple[int, ...]) -> tuple[Indices, Offsets | None]:
         """Which wholes are looked at, and what is said of their offsets, with all rows of some that were left out.
@@ -277,17 +292,37 @@ class _Court:
         """(N + M,) the rows that are looked at: of some views, of each whole some."""
         taking_part = self.taking_part & (_inliers(end) | recalled)
         shows_some = np.bincount(self._view[taking_part & (wholes.of >= 0)], minlength=len(self._observations.views))
-        largest = self._largest(end)
+        largest = self._largest(end) if wholes.of_features else self._excess(end, wholes)[self._owner(wholes)]
+        most = _MOST_VIEWS if wholes.of_features else _MOST_WHOLE_VIEWS
         with_some, others = np.flatnonzero(shows_some), np.flatnonzero(shows_some == 0)
         chosen = np.zeros(len(shows_some), dtype=bool)
-        chosen[np.unique(self._view[recalled])[:_MOST_VIEWS]] = True
-        chosen[with_some[np.argsort(-largest[with_some], kind="stable")][: _MOST_VIEWS // 2]] = True
-        chosen[with_some[:: max(1, 2 * len(with_some) // _MOST_VIEWS)]] = True
+        chosen[np.unique(self._view[recalled])[:most]] = True
+        chosen[with_some[np.argsort(-largest[with_some], kind="stable")][: most // 2]] = True
+        chosen[with_some[:: max(1, 2 * len(with_some) // most)]] = True
         chosen[others[:: max(1, len(others) // _MOST_OTHERS)]] = True
         rows = np.flatnonzero(taking_part & chosen[self._view])
         taking_part[:] = False
         taking_part[_thinned(rows, wholes.of[rows] * len(shows_some) + self._view[rows], wholes.of[rows] >= 0)] = True
         return taking_part
+
+    def _excess(self, end: RobustSolution, wholes: Wholes) -> Array:
+        """(size + 1,) by how many standard deviations the mean square residual of each view or placement is above the
+        median one.
+        """
+        lengths = np.concatenate([end.inliers.point_sigmas, end.inliers.curve_sigmas])
+        own = _inliers(end) & (wholes.of >= 0) & self.taking_part
+        equations = np.where(np.arange(len(lengths)) < len(end.inliers.points), 2.0, 1.0)
+        spare = np.bincount(wholes.of[own], equations[own], minlength=wholes.size + 1)
+        square = np.bincount(wholes.of[own], lengths[own] ** 2, minlength=wholes.size + 1) / np.maximum(spare, 1.0)
+        there = spare > 0.0
+        middle = float(np.median(square[there])) if np.any(there) else 1.0
+        return np.asarray((square / max(middle, 1e-12) - 1.0) / np.sqrt(2.0 / np.maximum(spare, 1.0)) * there)
+
+    def _owner(self, wholes: Wholes) -> Indices:
+        """(V,) number of the whole that each view is of; the last for none."""
+        owner = np.full(len(self._observations.views), wholes.size)
+        owner[self._view[wholes.of >= 0]] = wholes.of[wholes.of >= 0]
+        return owner
 
     def _largest(self, end: RobustSolution) -> Array:
         """(V,) the largest mean offset of a curve in each view, in standard deviations where errors are independent."""
