@@ -1,8 +1,8 @@
-"""The steps, in order: initialise, solve, reject, solve, assess."""
+"""The steps, in order: initialise, solve, reject, solve, let explanations compete, assess."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,10 +14,12 @@ from ceres_cal.base.words import bounds_text
 from ceres_cal.calibration import Calibration, Fit, Rejected
 from ceres_cal.model.parameters import Estimate, Layout, Options, make_layout
 from ceres_cal.model.priors import gather_priors
+from ceres_cal.model.quantities import difference
 from ceres_cal.model.residuals import residuals
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import gather_sights
 from ceres_cal.solve import Problem, Progress, ReducedInformation, RobustSolution, Solution, information, solve_robustly
+from ceres_cal.solve.competing import Explanation, compete
 from ceres_cal.solve.noise import Inliers, visible_from
 from ceres_cal.solve.possible import require_possible
 from ceres_cal.start.baseline import four_point_baseline
@@ -82,7 +84,7 @@ def solved_from(
     again: Again | None = None,
     progress: Callable[[Progress], None] | None = None,
 ) -> Calibration:
-    """Solve, reject, solve, assess, from a start.
+    """Solve, reject, solve, let explanations compete, assess, from a start.
 
     Raises:
         CalibrationError: see `calibrate`.
@@ -90,16 +92,22 @@ def solved_from(
     digest = meanwhile(lambda: observations.digest)
     usual = again.scales if again else None
     end = solve_robustly(problem, observations, start.estimate, usual, progress)
+
+    def solved(others: Problem) -> RobustSolution:
+        return solve_robustly(others, observations, _start_of(others, problem, observations, start, again), usual)
+
+    end, explanations = compete(problem, observations, end, solved)
     _require_fits(end, problem)
     require_possible(observations, problem.sights, end.solution.estimate, end.residuals)
-    warnings: tuple[str, ...] = ()
+    warnings = tuple(one.warning for one in explanations)
     posterior = None
     if again is None or again.assessed:
         end, posterior = _assess(end, observations, problem, again)
-        warnings = tuple(_unknown(end, posterior))
+        posterior = _with_doubts(posterior, end, explanations)
+        warnings = (*warnings, *_unknown(end, posterior))
     digest.result()  # which the observations remember
-    calibration = _calibration(start, observations, problem, end)
-    warnings = (*calibration.warnings, *_require_usable(end, problem), *warnings)
+    calibration = _calibration(start, observations, problem, end, explanations)
+    warnings = (*calibration.warnings, *_require_usable(end, problem, explanations), *warnings)
     return replace(calibration, warnings=warnings, posterior=posterior)
 
 
@@ -113,13 +121,19 @@ def _closed_form(start: Start, observations: Observations, problem: Problem) -> 
     return _calibration(start, observations, problem, end)
 
 
-def _calibration(start: Start, observations: Observations, problem: Problem, end: RobustSolution) -> Calibration:
+def _calibration(
+    start: Start,
+    observations: Observations,
+    problem: Problem,
+    end: RobustSolution,
+    explanations: Sequence[Explanation] = (),
+) -> Calibration:
     """What came out, not assessed."""
     return Calibration(
         end.solution.estimate,
         observations.targets,
         _fit(end, problem.layout),
-        _rejected(observations, end.inliers),
+        _rejected(observations, end.inliers, explanations),
         end.solution.termination,
         end.solution.converged,
         end.rounds,
@@ -152,6 +166,25 @@ def _assess(
     return (end if assessed is estimate else end.moved_to(assessed, observations, problem)), posterior
 
 
+def _start_of(
+    others: Problem, problem: Problem, observations: Observations, start: Start, again: Again | None
+) -> Estimate:
+    """A start for some of the observations that the rest had no part in; the one there is where it was known before."""
+    if again is not None or set(others.sights.keys) != set(problem.sights.keys):
+        return start.estimate
+    return initialise(observations, others.sights, problem.options).estimate
+
+
+def _with_doubts(posterior: Posterior, end: RobustSolution, explanations: Sequence[Explanation]) -> Posterior:
+    """The posterior with what the less probable explanations say in it."""
+    information = posterior.information
+    for one in explanations:
+        if one.is_doubtful:
+            step = difference(one.other, end.solution.estimate, information.keys)
+            information = information.widened(step, one.doubt)
+    return replace(posterior, information=information)
+
+
 def _unknown(end: RobustSolution, posterior: Posterior) -> Iterator[str]:
     """Warnings of cameras whose phi the observations leave open."""
     known = Uncertainty(end.solution.estimate, posterior, {})
@@ -181,7 +214,7 @@ def _require_fits(end: RobustSolution, problem: Problem) -> None:
             )
 
 
-def _require_usable(end: RobustSolution, problem: Problem) -> tuple[str, ...]:
+def _require_usable(end: RobustSolution, problem: Problem, explanations: Sequence[Explanation]) -> tuple[str, ...]:
     """Warnings about the solution; SolutionError where it must not be used."""
     warnings = []
     for name, camera in end.solution.estimate.cameras.items():
@@ -199,12 +232,15 @@ def _require_usable(end: RobustSolution, problem: Problem) -> tuple[str, ...]:
             f"{where}: from there to the corner ({corner:.0f} px) pixels have no answer; "
             f"observations reach {farthest:.0f} px"
         )
-    return (*warnings, *_lost(end.inliers, problem))
+    return (*warnings, *_lost(end.inliers, problem, explanations))
 
 
-def _lost(inliers: Inliers, problem: Problem) -> Iterator[str]:
-    """Sights most of whose observations were taken out: they were not understood, whatever the rest says."""
-    shares = problem.sights.used_share(inliers.points, inliers.curves)
+def _lost(inliers: Inliers, problem: Problem, explanations: Sequence[Explanation]) -> Iterator[str]:
+    """Sights most of whose observations were taken out one by one: they were not understood, whatever the rest says."""
+    used = np.concatenate([inliers.points, inliers.curves])
+    for one in explanations:
+        used |= one.rows & one.is_taken
+    shares = problem.sights.used_share(used[: len(inliers.points)], used[len(inliers.points) :])
     for number in np.flatnonzero(shares < 0.5):
         out = f"{100.0 * (1.0 - shares[number]):.0f} % of its observations were taken out"
         yield f"{problem.sights.keys[number]}: {out}: check its labels, do not use its pose"
@@ -235,14 +271,18 @@ def _rms(values: Array) -> float:
     return float(np.sqrt(values @ values / max(len(values), 1)))
 
 
-def _rejected(observations: Observations, inliers: Inliers) -> tuple[Rejected, ...]:
+def _rejected(
+    observations: Observations, inliers: Inliers, explanations: Sequence[Explanation]
+) -> tuple[Rejected, ...]:
+    wholes = [one for one in explanations if one.is_taken]
     entries = []
-    for kind, mask, sigmas, column in (
-        ("point", inliers.points, inliers.point_sigmas, observations.points),
-        ("curve", inliers.curves, inliers.curve_sigmas, observations.curves),
+    for kind, mask, sigmas, column, first in (
+        ("point", inliers.points, inliers.point_sigmas, observations.points, 0),
+        ("curve", inliers.curves, inliers.curve_sigmas, observations.curves, len(observations.points)),
     ):
         for row in np.flatnonzero(~mask):
             reason = f"{sigmas[row]:.1f} sigma off" if np.isfinite(sigmas[row]) else "cannot be seen from there"
+            reason = next((one.words for one in wholes if one.rows[first + row]), reason)
             frame = observations.views[column.view[row]].frame
             entries.append(Rejected(kind, int(row), frame, observations.feature_name(kind, int(row)), reason))
     return tuple(entries)

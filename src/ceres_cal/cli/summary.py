@@ -155,7 +155,9 @@ def _outlier_lines(calibration: Calibration) -> list[str]:
     everything = fit.points + fit.curves + total
     if not total:
         return [f"none of {everything}"]
-    lines = [f"{total} of {everything} taken out ({calibration.options.reject_sigma:g} sigma and more)"]
+    lines = [
+        f"{total} of {everything} taken out ({calibration.options.reject_sigma:g} sigma and more, or a whole line)"
+    ]
     lines += [f"{count:5}  {name}" for name, count in features.most_common(_MOST_FEATURES)]
     rest = len(features) - _MOST_FEATURES
     if rest > 0:

@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ceres_cal import kernels
 from ceres_cal.base.errors import InputError
 from ceres_cal.calibration import Calibration
 from ceres_cal.diagnostics.diagnostic import Case, Tested
@@ -19,11 +18,10 @@ from ceres_cal.diagnostics.registry import DIAGNOSTICS, all_families
 from ceres_cal.diagnostics.scores import select
 from ceres_cal.diagnostics.summaries import Summaries, summarise
 from ceres_cal.diagnostics.table import ResidualTable, make_table
-from ceres_cal.model.equations import Equations, write_equations
-from ceres_cal.model.parameters import Options
+from ceres_cal.model.equations import write_equations
 from ceres_cal.model.residuals import Residuals, residuals
 from ceres_cal.observations import Observations
-from ceres_cal.solve.linear_model import Weights, make_linear_model
+from ceres_cal.solve.linear_model import Weights, equation_weights, make_linear_model
 from ceres_cal.solve.noise import USUAL_EQUATIONS, Inliers, Redundancy, judge, relative_lengths
 
 FALSE_ALARM_RATE = 0.01
@@ -122,7 +120,7 @@ def _case(calibration: Calibration, observations: Observations, new_data: bool) 
     there = residuals(observations, problem.sights, estimate)
     inliers = _judged(calibration, observations, there, new_data)
     equations = write_equations(observations, problem.sights, estimate, there)
-    weights = _weights(observations, problem.options, inliers, equations)
+    weights = equation_weights(observations, problem.options, inliers, equations)
     model = make_linear_model(problem, estimate, equations, weights)
     if calibration.refitted is not None and not new_data:
         model = replace(model, known_noise=USUAL_EQUATIONS)
@@ -148,18 +146,6 @@ def _judged(calibration: Calibration, observations: Observations, there: Residua
     return Inliers(
         inliers[0] & np.isfinite(points), inliers[1] & np.isfinite(curves), p, c, points / p, curves / c, degrees
     )
-
-
-def _weights(observations: Observations, options: Options, inliers: Inliers, equations: Equations) -> Weights:
-    """Of each equation."""
-    sigma = np.concatenate(
-        [inliers.point_scale * observations.points.sigma_px, inliers.curve_scale * observations.curves.sigma_px]
-    )
-    lengths = np.concatenate([inliers.point_sigmas, inliers.curve_sigmas])
-    squared = np.where(np.isfinite(lengths), lengths, 0.0) ** 2
-    robust = kernels.loss_weights(kernels.Loss(kernels.LOSS_CODES[options.loss], options.loss_scale), squared)
-    inlier, at = np.concatenate([inliers.points, inliers.curves]), equations.observation
-    return Weights(1.0 / sigma[at], inlier[at], robust[at])
 
 
 def _tested(case: Case, rate: float) -> Tested:

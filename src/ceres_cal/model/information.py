@@ -81,6 +81,12 @@ class Information:
         whole.matrix[np.ix_(at, at)] = self.matrix
         return whole
 
+    def widened(self, step: Array, share: float) -> Information:
+        """With a covariance that is larger by this share of step step^T; step: (K,) (Sherman and Morrison)."""
+        slope = self.matrix @ step
+        less = share / (1.0 + share * float(slope @ step))
+        return Information(self.keys, self.matrix - less * np.outer(slope, slope))
+
     def __add__(self, other: Information) -> Information:
         """Both together, over the keys of either."""
         if self.keys == other.keys:

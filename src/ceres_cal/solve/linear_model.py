@@ -14,11 +14,14 @@ from functools import cached_property
 
 import numpy as np
 
+from ceres_cal import kernels
 from ceres_cal.base.arrays import Array, Indices, Mask
 from ceres_cal.model.equations import Equations
 from ceres_cal.model.keys import Key, columns_by_owner
-from ceres_cal.model.parameters import Estimate, intrinsic_names, intrinsics_scales
+from ceres_cal.model.parameters import Estimate, Options, intrinsic_names, intrinsics_scales
 from ceres_cal.model.quantities import free_keys, from_placement, from_station
+from ceres_cal.observations import Observations
+from ceres_cal.solve.noise import Inliers
 from ceres_cal.solve.problem import Problem
 
 LEAST_LEFT = 1e-7
@@ -130,10 +133,19 @@ class LinearModel:
         """More numbers to be free besides: columns (E, Q), px per unit."""
         scaled = columns * self.weight[:, None]
         rest, taken = self._projected(scaled)
-        inside = rest[self.used]
-        normal = inside.T @ inside - taken.T @ taken
+        normal, slope = self._normal(rest, taken)
         root = inverse_root(normal, np.sum(scaled[self.used] ** 2, axis=0), LEAST_LEFT)
-        return Freed(rest, taken, root, root.T @ (inside.T @ self.score[self.used] - taken.T @ self.step))
+        return Freed(rest, taken, root, root.T @ slope)
+
+    def left_of(self, columns: Array) -> tuple[Array, Array]:
+        """Normal equations (Q, Q) of more numbers, columns (E, Q), px per unit, once everything free followed them; and
+        half the derivative (Q,) of the squared residuals by them.
+        """
+        return self._normal(*self._projected(columns * self.weight[:, None]))
+
+    def _normal(self, rest: Array, taken: Array) -> tuple[Array, Array]:
+        inside = rest[self.used]
+        return inside.T @ inside - taken.T @ taken, inside.T @ self.score[self.used] - taken.T @ self.step
 
     def with_columns(self, columns: Array) -> LinearModel:
         """The same model with these numbers free."""
@@ -196,6 +208,18 @@ def inverse_root(normal: Array, sizes: Array, least: float) -> Array:
     values, vectors = np.linalg.eigh(scale[:, None] * normal * scale)
     kept = values > least
     return np.asarray(scale[:, None] * vectors[:, kept] / np.sqrt(values[kept]))
+
+
+def equation_weights(observations: Observations, options: Options, inliers: Inliers, equations: Equations) -> Weights:
+    """How each equation counts at the noise that was found, with the loss of the options."""
+    sigma = np.concatenate(
+        [inliers.point_scale * observations.points.sigma_px, inliers.curve_scale * observations.curves.sigma_px]
+    )
+    lengths = np.concatenate([inliers.point_sigmas, inliers.curve_sigmas])
+    squared = np.where(np.isfinite(lengths), lengths, 0.0) ** 2
+    robust = kernels.loss_weights(kernels.Loss(kernels.LOSS_CODES[options.loss], options.loss_scale), squared)
+    inlier, at = np.concatenate([inliers.points, inliers.curves]), equations.observation
+    return Weights(1.0 / sigma[at], inlier[at], robust[at])
 
 
 def make_linear_model(problem: Problem, estimate: Estimate, equations: Equations, weights: Weights) -> LinearModel:
