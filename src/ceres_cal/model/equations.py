@@ -98,17 +98,19 @@ def write_equations(observations: Observations, sights: Sights, estimate: Estima
         part
         for name in sights.cameras
         for part in _of_camera(observations, sights, sights.numbers(name), poses, estimate, there)
+        if len(part["sight"])
     ]
     size = max(part["intrinsics"].shape[1] for part in parts)
     for part in parts:
         missing = size - part["intrinsics"].shape[1]
         part["intrinsics"] = np.pad(part["intrinsics"], ((0, 0), (0, missing)))
-    columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    order = np.argsort(columns["sight"], kind="stable")
-    columns = {name: column[order] for name, column in columns.items()}
+    columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]} if parts[1:] else parts[0]
+    if np.any(np.diff(columns["sight"]) < 0):
+        order = np.argsort(columns["sight"], kind="stable")
+        columns = {name: column[order] for name, column in columns.items()}
     bounds = np.searchsorted(columns["sight"], np.arange(len(sights) + 1))
-    view = np.concatenate([observations.points.view, observations.curves.view]).astype(np.int64)
-    columns["view"] = view[columns["observation"]]
+    view = np.concatenate([observations.points.view, observations.curves.view])
+    columns["view"] = view[columns["observation"]].astype(np.int64)
     columns["is_curve"] = columns["observation"] >= len(observations.points)
     return Equations(sights=sights, poses=poses, bounds=bounds, **columns)
 
