@@ -22,6 +22,7 @@ from ceres_cal.model.keys import Key
 from ceres_cal.model.parameters import Estimate
 from ceres_cal.model.priors import GaussianPrior, tolerances
 from ceres_cal.model.quantities import layout_of
+from ceres_cal.model.residuals import residuals
 from ceres_cal.moves.carried import posterior_of, require_same_things, with_structure
 from ceres_cal.moves.contrast import Contrast, Statement, contrast
 from ceres_cal.moves.poses import PoseCandidate, PoseSearch, in_sigmas, movement, pose_candidates
@@ -30,6 +31,7 @@ from ceres_cal.observations.sights import Sights, gather_sights
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.heights import HEIGHTS_M
 from ceres_cal.solve import Problem, Weighting, information, solve
+from ceres_cal.uncertainty import measure_scatter
 from ceres_cal.uncertainty.maps import Grid, visible_pixels
 from ceres_cal.uncertainty.uncertainty import field_grid
 
@@ -150,6 +152,7 @@ class _Case:
     """One station's new observations and what was known of its numbers."""
 
     calibration: Calibration
+    observed: Observations
     sight: Sights
     estimate: Estimate
     prior: GaussianPrior
@@ -204,7 +207,7 @@ def _case(calibration: Calibration, observed: Observations, sight: Sights) -> _C
     estimate = Estimate({key.camera: old.cameras[key.camera]}, {key.station: old.stations[key.station]}, {}, structure)
     tested = tuple(k for k in own if k.kind == "station" or k.quantity == "phi")
     kept = [k for k in posterior.keys if k in own or k.kind == "structure"]
-    return _Case(calibration, sight, estimate, posterior_of(calibration, kept), tested)
+    return _Case(calibration, observed, sight, estimate, posterior_of(calibration, kept), tested)
 
 
 @dataclass(frozen=True)
@@ -244,14 +247,18 @@ def _apart(case: _Case, used: Sights, least: float, estimate: Estimate) -> tuple
     Args:
         least: twice the least cost with the pose free. estimate: there.
     """
-    spare = max(used.equations - len(case.station_keys), 0)
-    freedom = spare + _USUAL_EQUATIONS
+    freedom = max(used.equations - len(case.station_keys), 0) + _USUAL_EQUATIONS
     noise = math.sqrt((least + _USUAL_EQUATIONS) / freedom)
-    told = information(case.problem(used, case.station_keys, noise), estimate)
+    problem = case.problem(used, case.station_keys, noise)
+    told = information(problem, estimate)
     seen, keys = told.points + told.curves, told.shared.keys
     # At its end the solve's priors pull as much as the observations do, at the noise that they had there.
-    information_there, offsets = case.known(used, case.station_keys, estimate, keys)
-    best = seen.inverse @ (information_there.matrix @ offsets) / noise**2
+    pull, offsets = case.known(used, case.station_keys, estimate, keys)
+    best = seen.inverse @ (pull.matrix @ offsets) / noise**2
+    scatter = measure_scatter(case.observed, problem, residuals(case.observed, used, estimate), estimate, told)
+    if scatter is not None:
+        seen = Information(keys, scatter.widened(told.shared).matrix - pull.matrix)
+        freedom = 1.0 / (1.0 / freedom + scatter.found.inverse_freedom)
     before = case.calibration.uncertainty.posterior.degrees_of_freedom
     old = Statement(*case.known(used, (), estimate, keys), before)
     return noise, contrast(old, Statement(seen, -best, freedom), case.tested)
