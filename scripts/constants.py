@@ -93,7 +93,7 @@ DECIDING: tuple[Constant, ...] = (
     *_of("diagnostics.leftover", "LARGER _FEWEST_PAIRS", "diagnose"),
     *_of("diagnostics.scores", "_LEAST_SHARE", "diagnose"),
     *_of("diagnostics.of_target", "_FEWEST_ON_CURVE _FEWEST_OF_POINT _FEWEST_AGREE _FAR_M", "diagnose"),
-    *_of("moves.checking", "_INLIER_SIGMA _LEAST_SHARE _NOISY _WILL_DO", "check"),
+    *_of("moves.checking", "_INLIER_SIGMA _LEAST_SHARE _USUAL_EQUATIONS _WILL_DO", "check"),
     *_of("moves.comparison", "_DOUBTFUL", "check"),
     *_of("model.residuals", "_STRAY", "check", "refit"),
     *_of("moves.poses", "_FITS_SHARE _FITS_SIGMA _FITS_SCALE _ALIKE _WIDE", "check", "refit"),
