@@ -11,7 +11,7 @@ from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import SolutionError
 from ceres_cal.base.threads import at_most, meanwhile, single_threaded_blas
 from ceres_cal.base.words import bounds_text
-from ceres_cal.calibration import Calibration, Fit, Rejected
+from ceres_cal.calibration import COPY, Calibration, Fit, Rejected
 from ceres_cal.model.parameters import Layout, Options, make_layout
 from ceres_cal.model.priors import gather_priors
 from ceres_cal.model.residuals import residuals
@@ -236,13 +236,15 @@ def _rms(values: Array) -> float:
 
 
 def _rejected(observations: Observations, inliers: Inliers) -> tuple[Rejected, ...]:
-    entries = []
-    for kind, mask, sigmas, column in (
-        ("point", inliers.points, inliers.point_sigmas, observations.points),
-        ("curve", inliers.curves, inliers.curve_sigmas, observations.curves),
+    entries, views, copies = [], observations.views, observations.copies
+    for kind, mask, sigmas, column, copy_of in (
+        ("point", inliers.points, inliers.point_sigmas, observations.points, copies.points),
+        ("curve", inliers.curves, inliers.curve_sigmas, observations.curves, copies.curves),
     ):
         for row in np.flatnonzero(~mask):
             reason = f"{sigmas[row]:.1f} sigma off" if np.isfinite(sigmas[row]) else "cannot be seen from there"
-            frame = observations.views[column.view[row]].frame
+            if copy_of[row] >= 0:
+                reason = f"{COPY} of frame {views[copy_of[row]].frame!r}"
+            frame = views[column.view[row]].frame
             entries.append(Rejected(kind, int(row), frame, observations.feature_name(kind, int(row)), reason))
     return tuple(entries)

@@ -22,7 +22,7 @@ from ceres_cal.calibration.file import (
     options_from_json,
     options_to_json,
 )
-from ceres_cal.calibration.origin import Fit, Refitted, Rejected, package_versions
+from ceres_cal.calibration.origin import COPY, Fit, Refitted, Rejected, package_versions
 from ceres_cal.model.parameters import Estimate, Options, make_layout
 from ceres_cal.model.priors import gather_priors, gather_stated, tolerances
 from ceres_cal.observations import Observations, taken
@@ -121,6 +121,11 @@ class Calibration:
         for entry in self.rejected:
             masks[entry.kind == "curve"][entry.row] = False
         return masks
+
+    @property
+    def outliers(self) -> tuple[Rejected, ...]:
+        """What was taken out for its residual: all that was but copies of other observations."""
+        return tuple(entry for entry in self.rejected if not entry.reason.startswith(COPY))
 
     def problem(self, observations: Observations, *, new_data: bool = False) -> Problem:
         """The problem of which this is the solution, of all the observations, at the noise that was found.

@@ -130,7 +130,7 @@ def _errors(one: HeldOut) -> str:
 
 
 def _rejected(table: ResidualTable) -> Counter[str]:
-    names = np.array(table.features)[table.feature[~table.inlier]]
+    names = np.array(table.features)[table.feature[table.outlier]]
     return Counter(names.tolist())
 
 

@@ -162,11 +162,11 @@ def _pose(name: str, camera: Camera, anchored: bool, quality: Quality) -> list[s
 
 
 def _outliers(calibration: Calibration) -> Counter[str]:
-    return Counter(f"{entry.kind} {entry.feature}" for entry in calibration.rejected)
+    return Counter(f"{entry.kind} {entry.feature}" for entry in calibration.outliers)
 
 
 def _outlier_lines(calibration: Calibration) -> list[str]:
-    fit, total, features = calibration.fit, len(calibration.rejected), _outliers(calibration)
+    fit, total, features = calibration.fit, len(calibration.outliers), _outliers(calibration)
     everything = fit.points + fit.curves + total
     if not total:
         return [f"none of {everything}"]
@@ -196,7 +196,8 @@ def _warnings(calibration: Calibration, observations: Observations) -> Iterator[
         return
     if not calibration.converged:
         yield "the solve did not come to rest: raise --max-iterations"
-    if len(calibration.rejected) > _MANY_OUTLIERS * (len(observations.points) + len(observations.curves)):
+    out = len(calibration.outliers)
+    if out > _MANY_OUTLIERS * (calibration.fit.points + calibration.fit.curves + out):
         yield "so many observations were taken out: check labels, target dimensions and the choice of lens"
     scale = max(calibration.fit.point_scale, calibration.fit.curve_scale)
     if scale > _LARGE_SCALE:

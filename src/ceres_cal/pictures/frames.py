@@ -104,7 +104,7 @@ def marks_of(calibration: Calibration, observations: Observations, frame: Frame)
     out: list[Mask] = []
     for kind, columns in (("point", observations.points), ("curve", observations.curves)):
         rejected = np.zeros(len(columns), dtype=bool)
-        rejected[[entry.row for entry in calibration.rejected if own and entry.kind == kind]] = True
+        rejected[[entry.row for entry in calibration.outliers if own and entry.kind == kind]] = True
         here = np.isin(columns.view, frame.views)
         pixels.append(columns.pixels[here])
         out.append(rejected[here])

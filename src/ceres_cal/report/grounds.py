@@ -55,7 +55,7 @@ def grounds(material: Material) -> Iterator[tuple[str, str]]:
     elif calibration.rounds:
         yield "no", "The solve did not come to rest: raise --max-iterations."
     yield from _of_findings(material)
-    out = 1.0 - float(np.mean(table.inlier)) if len(table) else 0.0
+    out = float(np.mean(table.outlier)) if len(table) else 0.0
     if out > _MANY_OUTLIERS:
         yield "care", f"{100.0 * out:.0f} % of the observations were taken out: check labels, dimensions and the lens."
     yield from _of_knowledge(material)

@@ -118,7 +118,7 @@ def _tiles(material: Material) -> Iterator[Tile]:
     else:
         total = counted(fit.points + fit.curves, "observation")
         yield Tile("Residuals", short(fit.rms_px), "px rms", f"over {total}: how well data and model agree")
-    out = int(np.count_nonzero(~table.inlier))
+    out = int(np.count_nonzero(table.outlier))
     share = 100.0 * out / max(len(table), 1)
     yield Tile("Taken out", short(share), "%", f"{counted(out, 'outlier')} of {counted(len(table), 'observation')}")
 
