@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ceres_cal.base.arrays import Array
-from ceres_cal.base.errors import SolutionError
+from ceres_cal.base.errors import CalibrationError, DegenerateError, SolutionError
 from ceres_cal.base.threads import at_most, meanwhile, single_threaded_blas
 from ceres_cal.base.words import bounds_text
 from ceres_cal.calibration import COPY, Calibration, Fit, Rejected
@@ -18,7 +18,17 @@ from ceres_cal.model.residuals import residuals
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import gather_sights
 from ceres_cal.scene.camera import Camera
-from ceres_cal.solve import Problem, Progress, RobustSolution, Solution, information, solve_robustly
+from ceres_cal.solve import (
+    Conflicts,
+    Problem,
+    Progress,
+    RobustSolution,
+    Solution,
+    find_conflicts,
+    information,
+    solve_robustly,
+)
+from ceres_cal.solve.conflicts import contradicted_by
 from ceres_cal.solve.noise import Inliers, visible_from
 from ceres_cal.solve.possible import require_possible
 from ceres_cal.start.baseline import four_point_baseline
@@ -31,6 +41,10 @@ _NO_FIT = 0.015
 _UNKNOWN = (
     "camera {!r}: its views are too frontal to tell phi, which is {} at 95 %, and its heights go with phi: the floor "
     "is right, what is above it is not: add boards tilted by 20 degrees, or a prior on height_m where it sees the field"
+)
+_OTHERWISE = (
+    "no calibration agrees with what was stated beforehand, though the observations make one without it: check the "
+    "priors and their units"
 )
 
 
@@ -51,14 +65,45 @@ def calibrate(
     """
     options = options or Options()
     with single_threaded_blas(), at_most(options.threads):
-        observations.require_inside()
-        sights, layout = gather_sights(observations), make_layout(observations, options)
-        start = initialise(observations, sights, options)
-        priors = gather_priors(observations, options, start.estimate.structure)
-        problem = Problem(sights, layout, priors, options=options)
-        if options.closed_form_only:
-            return _closed_form(start, observations, problem)
-        return solved_from(start, observations, problem, progress=progress)
+        try:
+            return _calibrated(observations, options, progress)
+        except (DegenerateError, SolutionError):
+            free = _without_priors(observations, options)
+            if free is None:
+                raise
+            words = _contradicted(observations, options, free)
+            raise SolutionError(words or _OTHERWISE) from None
+
+
+def _calibrated(
+    observations: Observations, options: Options, progress: Callable[[Progress], None] | None = None
+) -> Calibration:
+    """See `calibrate`."""
+    observations.require_inside()
+    sights, layout = gather_sights(observations), make_layout(observations, options)
+    start = initialise(observations, sights, options)
+    priors = gather_priors(observations, options, start.estimate.structure)
+    problem = Problem(sights, layout, priors, options=options)
+    if options.closed_form_only:
+        return _closed_form(start, observations, problem)
+    return solved_from(start, observations, problem, progress=progress)
+
+
+def _without_priors(observations: Observations, options: Options) -> Calibration | None:
+    """None where nothing was stated, or the observations make no calibration by themselves either."""
+    if not (observations.priors or options.priors):
+        return None
+    try:
+        return _calibrated(replace(observations, priors=()), replace(options, priors=()))
+    except CalibrationError:
+        return None
+
+
+def _contradicted(observations: Observations, options: Options, free: Calibration) -> str | None:
+    """What the priors that no calibration came out of contradict, when one comes out without them."""
+    stated = gather_priors(observations, options, free.estimate.structure)
+    posterior = free.uncertainty.posterior
+    return contradicted_by(stated, free.estimate, posterior.information, posterior.degrees_of_freedom)
 
 
 @dataclass(frozen=True)
@@ -94,14 +139,16 @@ def solved_from(
     _require_fits(end, problem)
     require_possible(observations, problem.sights, end.solution.estimate, end.residuals)
     warnings: tuple[str, ...] = ()
-    posterior = None
+    posterior, conflicts = None, Conflicts()
     if again is None or again.assessed:
+        conflicts = find_conflicts(problem, observations, end, usual)
         end, posterior = _assess(end, observations, problem, again)
-        warnings = tuple(_unknown(end, posterior))
+        posterior = posterior.in_doubt(conflicts) if conflicts.every else posterior
+        warnings = (*(one.words for one in conflicts.every), *_unknown(end, posterior))
     digest.result()  # which the observations remember
     calibration = _calibration(start, observations, problem, end)
     warnings = (*calibration.warnings, *_require_usable(end, problem), *warnings)
-    return replace(calibration, warnings=warnings, posterior=posterior)
+    return replace(calibration, warnings=warnings, posterior=posterior, conflicts=conflicts.every)
 
 
 def _closed_form(start: Start, observations: Observations, problem: Problem) -> Calibration:

@@ -30,7 +30,7 @@ from ceres_cal.observations.sights import gather_sights
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.files import CameraFile, PoseFile
 from ceres_cal.scene.targets import Target, target_from_spec
-from ceres_cal.solve import Problem, Weighting
+from ceres_cal.solve import Conflict, Problem, Weighting
 from ceres_cal.uncertainty import Disagreement, Posterior, PosteriorFile, Uncertainty, disagreement
 
 
@@ -49,6 +49,7 @@ class Calibration:
         posterior: what is known of every number; None where nothing was minimised, or a file says nothing of it.
         options: how it was solved. digest: SHA-256 of the observations. versions: of the packages that solved it.
         refitted: how it came from an earlier calibration; None for one from scratch.
+        conflicts: what was known beforehand and everything else contradicts; what is in dispute is in the posterior.
     """
 
     estimate: Estimate
@@ -66,6 +67,7 @@ class Calibration:
     posterior: Posterior | None = None
     versions: Mapping[str, str] = field(default_factory=package_versions)
     refitted: Refitted | None = None
+    conflicts: tuple[Conflict, ...] = ()
 
     @property
     def cameras(self) -> Mapping[str, Camera]:
@@ -192,6 +194,7 @@ class Calibration:
             versions=dict(self.versions),
             posterior=None if self.posterior is None else PosteriorFile.of(self.posterior),
             refitted=None if self.refitted is None else RefittedFile.of(self.refitted),
+            conflicts=self.conflicts,
         )
 
     @classmethod
@@ -215,4 +218,5 @@ class Calibration:
             None if data.posterior is None else data.posterior.posterior(),
             data.versions,
             None if data.refitted is None else data.refitted.refitted(),
+            data.conflicts,
         )
