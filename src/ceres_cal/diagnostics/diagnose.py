@@ -24,6 +24,7 @@ from ceres_cal.diagnostics.table import ResidualTable, make_table
 from ceres_cal.model.parameters import Options
 from ceres_cal.model.residuals import Residuals, residuals
 from ceres_cal.observations import Observations
+from ceres_cal.solve import Conflict
 from ceres_cal.solve.noise import USUAL_EQUATIONS, Inliers, Redundancy, judge, relative_lengths
 
 FALSE_ALARM_RATE = 0.01
@@ -39,6 +40,7 @@ class Diagnosis:
         table: every observation. summaries: the same by frame, feature, image region and radius.
         noise: of points and of curves, with the findings taken off; without any it is the calibration's own.
         degrees_of_freedom: spare equations behind it, the calibration's own; infinite where sigmas are as stated.
+        conflicts: what was known beforehand and everything else contradicts, the calibration's own.
         new_data: whether the observations are others than those the calibration was made from. tests: how many
             alternatives were tested, and false_alarm_rate: the probability that sound data get any finding at all,
             Bonferroni over all of them. It holds for normal noise; what it does not hold for is said by "correlated".
@@ -53,6 +55,7 @@ class Diagnosis:
     new_data: bool
     tests: int
     false_alarm_rate: float
+    conflicts: tuple[Conflict, ...] = ()
 
     @property
     def model_error(self) -> bool:
@@ -92,6 +95,7 @@ def diagnose(
         observations.digest != calibration.digest,
         tested.selection.tests,
         false_alarm_rate,
+        calibration.conflicts,
     )
 
 

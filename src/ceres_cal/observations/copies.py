@@ -22,6 +22,8 @@ from ceres_cal.observations.columns import Columns, Curves, Points, View
 
 Hashes = NDArray[np.uint64]
 
+COUNTED_ONCE = ": counted once"
+"""How a line about copies ends."""
 _LEAST_ROWS = 4  # of a view that copies another: fewer whole pixels agree by chance
 # Large odd numbers without pattern, those of splitmix64: what the parts of a row are multiplied with.
 _X, _FEATURE, _FRAME = (np.uint64(n) for n in (0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB))
@@ -53,11 +55,11 @@ class Copies:
         frames = [pair for pair in rows if pair[0] != pair[1]]
         if frames:
             more = f", and so do {len(frames) - 1} other frames" if len(frames) > 1 else ""
-            yield f"frame {frames[0][0]!r} repeats frame {frames[0][1]!r} point by point{more}: counted once"
+            yield f"frame {frames[0][0]!r} repeats frame {frames[0][1]!r} point by point{more}{COUNTED_ONCE}"
         twice = {frame: count for (frame, first), count in rows.items() if frame == first}
         if twice:
             some = ", ".join(map(repr, list(twice)[:3])) + (", ..." if len(twice) > 3 else "")
-            yield f"{sum(twice.values())} observations of frame {some} are there more than once: counted once"
+            yield f"{sum(twice.values())} observations of frame {some} are there more than once{COUNTED_ONCE}"
 
 
 def find_copies(views: Sequence[View], points: Points, curves: Curves) -> Copies:
