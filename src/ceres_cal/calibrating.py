@@ -8,18 +8,29 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ceres_cal.base.arrays import Array
-from ceres_cal.base.errors import SolutionError
+from ceres_cal.base.errors import CalibrationError, DegenerateError, SolutionError
 from ceres_cal.base.threads import at_most, meanwhile, single_threaded_blas
 from ceres_cal.base.words import bounds_text
-from ceres_cal.calibration import Calibration, Fit, Rejected
+from ceres_cal.calibration import COPY, Calibration, Fit, Rejected
 from ceres_cal.model.parameters import Estimate, Layout, Options, make_layout
 from ceres_cal.model.priors import gather_priors
 from ceres_cal.model.quantities import difference
 from ceres_cal.model.residuals import residuals
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import gather_sights
-from ceres_cal.solve import Problem, Progress, ReducedInformation, RobustSolution, Solution, information, solve_robustly
+from ceres_cal.solve import (
+    Conflicts,
+    Problem,
+    Progress,
+    ReducedInformation,
+    RobustSolution,
+    Solution,
+    find_conflicts,
+    information,
+    solve_robustly,
+)
 from ceres_cal.solve.competing import Explanation, compete
+from ceres_cal.solve.conflicts import contradicted_by
 from ceres_cal.solve.noise import Inliers, visible_from
 from ceres_cal.solve.possible import require_possible
 from ceres_cal.start.baseline import four_point_baseline
@@ -32,6 +43,10 @@ _NO_FIT = 0.015
 _UNKNOWN = (
     "camera {!r}: its views are too frontal to tell phi, which is {} at 95 %, and its heights go with phi: the floor "
     "is right, what is above it is not: add boards tilted by 20 degrees, or a prior on height_m where it sees the field"
+)
+_OTHERWISE = (
+    "no calibration agrees with what was stated beforehand, though the observations make one without it: check the "
+    "priors and their units"
 )
 
 
@@ -52,14 +67,45 @@ def calibrate(
     """
     options = options or Options()
     with single_threaded_blas(), at_most(options.threads):
-        observations.require_inside()
-        sights, layout = gather_sights(observations), make_layout(observations, options)
-        start = initialise(observations, sights, options)
-        priors = gather_priors(observations, options, start.estimate.structure)
-        problem = Problem(sights, layout, priors, options=options)
-        if options.closed_form_only:
-            return _closed_form(start, observations, problem)
-        return solved_from(start, observations, problem, progress=progress)
+        try:
+            return _calibrated(observations, options, progress)
+        except (DegenerateError, SolutionError):
+            free = _without_priors(observations, options)
+            if free is None:
+                raise
+            words = _contradicted(observations, options, free)
+            raise SolutionError(words or _OTHERWISE) from None
+
+
+def _calibrated(
+    observations: Observations, options: Options, progress: Callable[[Progress], None] | None = None
+) -> Calibration:
+    """See `calibrate`."""
+    observations.require_inside()
+    sights, layout = gather_sights(observations), make_layout(observations, options)
+    start = initialise(observations, sights, options)
+    priors = gather_priors(observations, options, start.estimate.structure)
+    problem = Problem(sights, layout, priors, options=options)
+    if options.closed_form_only:
+        return _closed_form(start, observations, problem)
+    return solved_from(start, observations, problem, progress=progress)
+
+
+def _without_priors(observations: Observations, options: Options) -> Calibration | None:
+    """None where nothing was stated, or the observations make no calibration by themselves either."""
+    if not (observations.priors or options.priors):
+        return None
+    try:
+        return _calibrated(replace(observations, priors=()), replace(options, priors=()))
+    except CalibrationError:
+        return None
+
+
+def _contradicted(observations: Observations, options: Options, free: Calibration) -> str | None:
+    """What the priors that no calibration came out of contradict, when one comes out without them."""
+    stated = gather_priors(observations, options, free.estimate.structure)
+    posterior = free.uncertainty.posterior
+    return contradicted_by(stated, free.estimate, posterior.information, posterior.degrees_of_freedom)
 
 
 @dataclass(frozen=True)
@@ -100,15 +146,16 @@ def solved_from(
     _require_fits(end, problem)
     require_possible(observations, problem.sights, end.solution.estimate, end.residuals)
     warnings = tuple(one.warning for one in explanations)
-    posterior = None
+    posterior, conflicts = None, Conflicts()
     if again is None or again.assessed:
+        conflicts = find_conflicts(problem, observations, end, usual)
         end, posterior = _assess(end, observations, problem, again)
-        posterior = _with_doubts(posterior, end, explanations)
-        warnings = (*warnings, *_unknown(end, posterior))
+        posterior = _with_doubts(posterior.in_doubt(conflicts), end, explanations)
+        warnings = (*warnings, *(one.words for one in conflicts.every), *_unknown(end, posterior))
     digest.result()  # which the observations remember
     calibration = _calibration(start, observations, problem, end, explanations)
     warnings = (*calibration.warnings, *_require_usable(end, problem, explanations), *warnings)
-    return replace(calibration, warnings=warnings, posterior=posterior)
+    return replace(calibration, warnings=warnings, posterior=posterior, conflicts=conflicts.every)
 
 
 def _closed_form(start: Start, observations: Observations, problem: Problem) -> Calibration:
@@ -275,14 +322,16 @@ def _rejected(
     observations: Observations, inliers: Inliers, explanations: Sequence[Explanation]
 ) -> tuple[Rejected, ...]:
     wholes = [one for one in explanations if one.is_taken]
-    entries = []
-    for kind, mask, sigmas, column, first in (
-        ("point", inliers.points, inliers.point_sigmas, observations.points, 0),
-        ("curve", inliers.curves, inliers.curve_sigmas, observations.curves, len(observations.points)),
+    entries, views, copies = [], observations.views, observations.copies
+    for kind, mask, sigmas, column, copy_of, first in (
+        ("point", inliers.points, inliers.point_sigmas, observations.points, copies.points, 0),
+        ("curve", inliers.curves, inliers.curve_sigmas, observations.curves, copies.curves, len(observations.points)),
     ):
         for row in np.flatnonzero(~mask):
             reason = f"{sigmas[row]:.1f} sigma off" if np.isfinite(sigmas[row]) else "cannot be seen from there"
             reason = next((one.words for one in wholes if one.rows[first + row]), reason)
-            frame = observations.views[column.view[row]].frame
+            if copy_of[row] >= 0:
+                reason = f"{COPY} of frame {views[copy_of[row]].frame!r}"
+            frame = views[column.view[row]].frame
             entries.append(Rejected(kind, int(row), frame, observations.feature_name(kind, int(row)), reason))
     return tuple(entries)

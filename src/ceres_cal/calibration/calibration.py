@@ -22,7 +22,7 @@ from ceres_cal.calibration.file import (
     options_from_json,
     options_to_json,
 )
-from ceres_cal.calibration.origin import Fit, Refitted, Rejected, package_versions
+from ceres_cal.calibration.origin import COPY, Fit, Refitted, Rejected, package_versions
 from ceres_cal.model.keys import Key
 from ceres_cal.model.parameters import Estimate, Options, make_layout
 from ceres_cal.model.priors import GaussianPrior, gather_priors
@@ -31,12 +31,12 @@ from ceres_cal.observations.sights import gather_sights
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.files import CameraFile, PoseFile
 from ceres_cal.scene.targets import Target, target_from_spec
-from ceres_cal.solve import Problem, Weighting
+from ceres_cal.solve import Conflict, Problem, Weighting
 from ceres_cal.uncertainty import Disagreement, Posterior, PosteriorFile, Uncertainty, disagreement
 
 _ALIKE = (
     *("fit", "rejected", "termination", "converged", "rounds", "history"),
-    *("phi_from", "warnings", "digest", "versions"),
+    *("phi_from", "warnings", "digest", "versions", "conflicts"),
 )
 """What the file has as it is."""
 
@@ -56,6 +56,7 @@ class Calibration:
         posterior: what is known of every number; None where nothing was minimised, or a file says nothing of it.
         options: how it was solved. digest: SHA-256 of the observations. versions: of the packages that solved it.
         refitted: how it came from an earlier calibration; None for one from scratch.
+        conflicts: what was known beforehand and everything else contradicts; what is in dispute is in the posterior.
     """
 
     estimate: Estimate
@@ -73,6 +74,7 @@ class Calibration:
     posterior: Posterior | None = None
     versions: Mapping[str, str] = field(default_factory=package_versions)
     refitted: Refitted | None = None
+    conflicts: tuple[Conflict, ...] = ()
 
     @property
     def cameras(self) -> Mapping[str, Camera]:
@@ -126,6 +128,11 @@ class Calibration:
         for entry in self.rejected:
             masks[entry.kind == "curve"][entry.row] = False
         return masks
+
+    @property
+    def outliers(self) -> tuple[Rejected, ...]:
+        """What was taken out for its residual: all that was but copies of other observations."""
+        return tuple(entry for entry in self.rejected if not entry.reason.startswith(COPY))
 
     def problem(self, observations: Observations, *, new_data: bool = False) -> Problem:
         """The problem of which this is the solution, of all the observations, at the noise that was found.

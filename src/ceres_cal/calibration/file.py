@@ -20,6 +20,7 @@ from ceres_cal.model.structure import EXACT, make_structure
 from ceres_cal.observations import prior_from_json, prior_to_json
 from ceres_cal.scene.files import CameraFile, Matrix, PoseFile, Vector
 from ceres_cal.scene.targets import Target
+from ceres_cal.solve import Conflict
 from ceres_cal.uncertainty import PosteriorFile, information_from, lower_triangle
 
 FORMAT, VERSION = "ceres-cal/calibration", 1
@@ -117,6 +118,7 @@ class CalibrationFile(msgspec.Struct, forbid_unknown_fields=True):
     versions: dict[str, str]
     posterior: PosteriorFile | None = None
     refitted: RefittedFile | None = None
+    conflicts: tuple[Conflict, ...] = ()
 
     def estimate(self, targets: Mapping[str, Target], options: Options) -> Estimate:
         """Cameras, stations, placements and the targets as built; InputError where one does not fit the others."""

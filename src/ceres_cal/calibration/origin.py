@@ -8,6 +8,9 @@ from importlib.metadata import PackageNotFoundError, version
 
 from ceres_cal.model.priors import GaussianPrior
 
+COPY = "a copy"
+"""How the reason begins of an observation that repeats another one, and was not taken out for its residual."""
+
 
 @dataclass(frozen=True)
 class Rejected:

@@ -21,6 +21,7 @@ from ceres_cal.diagnostics.table import ResidualTable, make_table
 from ceres_cal.model.equations import write_equations
 from ceres_cal.model.residuals import Residuals, residuals
 from ceres_cal.observations import Observations
+from ceres_cal.solve import Conflict
 from ceres_cal.solve.linear_model import Weights, equation_weights, make_linear_model
 from ceres_cal.solve.noise import USUAL_EQUATIONS, Inliers, Redundancy, judge, relative_lengths
 
@@ -37,6 +38,7 @@ class Diagnosis:
         table: every observation. summaries: the same by frame, feature, image region and radius.
         noise: of points and of curves, with the findings taken off; without any it is the calibration's own.
         degrees_of_freedom: spare equations behind it, the calibration's own; infinite where sigmas are as stated.
+        conflicts: what was known beforehand and everything else contradicts, the calibration's own.
         new_data: whether the observations are others than those the calibration was made from. tests: how many
             alternatives were tested, and false_alarm_rate: the probability that sound data get any finding at all,
             Bonferroni over all of them. It holds for normal noise; what it does not hold for is said by "correlated".
@@ -51,6 +53,7 @@ class Diagnosis:
     new_data: bool
     tests: int
     false_alarm_rate: float
+    conflicts: tuple[Conflict, ...] = ()
 
     @property
     def model_error(self) -> bool:
@@ -90,6 +93,7 @@ def diagnose(
         observations.digest != calibration.digest,
         tested.selection.tests,
         false_alarm_rate,
+        calibration.conflicts,
     )
 
 

@@ -104,7 +104,7 @@ def _summary(table: ResidualTable, group: Indices, names: list[str]) -> Summary:
 
     numbers = np.where(table.is_curve, 1.0, 2.0)
     sigmas = table.distance_px / (table.sigma_px * table.scale * np.sqrt(numbers))
-    counts = np.stack([count(points), count(curves), count(~inlier)])
+    counts = np.stack([count(points), count(curves), count(table.outlier)])
     filled = np.flatnonzero(counts.sum(axis=0))
     measures = (
         rms(points, table.distance_px),

@@ -19,6 +19,7 @@ from ceres_cal.base.arrays import Mask
 from ceres_cal.base.errors import InputError, naming
 from ceres_cal.observations.bounds import stray_pixels
 from ceres_cal.observations.columns import Columns, Curves, Points, Prior, View, choices, taken, view_label
+from ceres_cal.observations.copies import Copies, find_copies
 from ceres_cal.observations.files import Content, header_of, read_content, write_content
 from ceres_cal.scene.targets import Target
 
@@ -83,15 +84,22 @@ class Observations(Content):
     # ---- reading ------------------------------------------------------------------------------------------------
 
     @cached_property
+    def copies(self) -> Copies:
+        """Which observations repeat others to the last bit: they count once."""
+        return find_copies(self.views, self.points, self.curves)
+
+    @cached_property
     def warnings(self) -> tuple[str, ...]:
-        """What to know of the observations before using them, each one line: strays outside an image."""
-        return self.require_inside()
+        """What to know of the observations before using them, each one line: strays outside an image, copies."""
+        return (*self.require_inside(), *self.copies.words(self.views, (self.points, self.curves)))
 
     @cached_property
     def shown_views(self) -> tuple[View, ...]:
-        """The views with observations; what the others name is not there for the solve."""
-        counts = sum(np.bincount(column.view, minlength=len(self.views)) for column in (self.points, self.curves))
-        return tuple(self.views[number] for number in np.flatnonzero(counts))
+        """The views with observations that are no copies; what the others name is not there for the solve."""
+        points, curves = self.copies.originals
+        shown = np.zeros(len(self.views), dtype=bool)
+        shown[self.points.view[points]] = shown[self.curves.view[curves]] = True
+        return tuple(self.views[number] for number in np.flatnonzero(shown))
 
     @property
     def stations(self) -> dict[str, str]:

@@ -235,7 +235,7 @@ def ranges(bounds: Indices, numbers: Indices) -> Indices:
 
 
 def gather_sights(observations: Observations) -> Sights:
-    """The sights of all observations; a sight without any observation is left out."""
+    """The sights of all observations that are no copies of others; a sight without any is left out."""
     keys = [SightKey(view.camera, view.station, view.placement) for view in observations.views]
     order = {key: number for number, key in enumerate(dict.fromkeys(keys))}
     sight_of_view = np.array([order[key] for key in keys], dtype=np.int64)
@@ -274,7 +274,7 @@ def gather_sights(observations: Observations) -> Sights:
         np.concatenate([np.tile(t.is_arc, 3) for t in targets]),
     )
     filled = np.flatnonzero(np.diff(point_bounds) + np.diff(curve_bounds))
-    return every if len(filled) == len(every) else every.take(filled)
+    return (every if len(filled) == len(every) else every.take(filled)).used(*observations.copies.originals)
 
 
 def _grouped(columns: Columns, sight_of_view: Indices, count: int) -> tuple[Indices | slice, Indices]:

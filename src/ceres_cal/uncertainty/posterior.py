@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -16,7 +16,7 @@ from ceres_cal.model.information import Information
 from ceres_cal.model.keys import Key, pose_keys, sigma_limits
 from ceres_cal.model.parameters import Estimate, Layout
 from ceres_cal.model.quantities import layout_of
-from ceres_cal.solve import Eliminated, ReducedInformation
+from ceres_cal.solve import Conflicts, Eliminated, ReducedInformation
 from ceres_cal.uncertainty.dependence import Dependence, Scatter
 from ceres_cal.uncertainty.profile import PhiProfile
 
@@ -49,6 +49,22 @@ class Posterior:
     def keys(self) -> tuple[Key, ...]:
         """(P) the numbers that are shared."""
         return self.information.keys
+
+    def in_doubt(self, conflicts: Conflicts) -> Posterior:
+        """The posterior that holds what is in dispute: the shift d of everything when a statement in conflict is left
+        out goes into the covariance as d d^T (into the information by Sherman and Morrison), so that no number is
+        stated better than to what it would move.
+        """
+        matrix, at = self.information.matrix, self.information.columns(self.information.among(conflicts.keys))
+        own = [conflicts.keys.index(self.keys[column]) for column in at]
+        for shift in conflicts.shifts:
+            pull = matrix[:, at] @ shift[own]
+            matrix = matrix - np.outer(pull, pull) / (1.0 + shift[own] @ pull[at])
+        information = Information(self.keys, matrix)
+        placements = self.placements
+        if isinstance(placements, _Placements):
+            placements = replace(placements, shared=information)
+        return replace(self, information=information, placements=placements)
 
     @property
     def spread(self) -> Spread:
