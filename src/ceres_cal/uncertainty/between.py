@@ -8,8 +8,9 @@ known to one, the optimum leaves
 
 Their mean square over what is expected is the factor c on the variance, whose own spread follows from the same matrices
 (Satterthwaite). The jackknife (1 - A_i)^-1 g_i, by which the optimum moves without a view, says in which directions
-they scatter (CR3; Bell and McCaffrey, Survey Methodology 28, 2002). With few views it is singular and overshoots: it
-counts as far as views disagree at all, and as much as G - 1 of G - 1 + P numbers.
+they scatter (CR3; Bell and McCaffrey, Survey Methodology 28, 2002). With few views, or one that says most, it is
+singular and overshoots: it counts as far as views disagree at all, and as much as G - 1 of G - 1 + P numbers with G the
+number of views that would say as much if all said the same.
 """
 
 from __future__ import annotations
@@ -57,12 +58,13 @@ def compare_groups(sample: Sample, scatter: Array, whole: Array) -> tuple[Betwee
     mean = float(np.sum(np.trace(expected, axis1=1, axis2=2)))
     ratio, degrees = float(np.sum((sample.scores @ white) ** 2)) / mean, 2.0 * mean**2 / spread
     variance, probability = _averaged(ratio, degrees)
-    groups, size = len(scatter), len(whole)
-    weight = probability * (groups - 1) / (groups - 1 + size)
+    size, told = len(whole), np.trace(sample.informations, axis1=1, axis2=2)
+    alike = float(np.sum(told) ** 2 / np.sum(told**2)) - 1.0  # groups beyond the first that say as much as one another
+    weight = probability * alike / (alike + size)
     jackknife = _jackknife(sample, expected, white, root)
     factor = (1.0 - weight) * variance * np.eye(size) + weight * jackknife
     widened = _widened(factor, white @ (whole - sample.prior) @ white)
-    return Between(groups, variance, probability, degrees), root @ widened @ root
+    return Between(len(scatter), variance, probability, degrees), root @ widened @ root
 
 
 def _expected(informations: Array, scatter: Array, whole: Array, white: Array) -> tuple[Array, float]:

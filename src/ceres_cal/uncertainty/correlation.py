@@ -28,6 +28,7 @@ _FEWEST_FREEDOM = 3.0  # degrees of freedom that a variance is given at least
 _NEAR, _FAR = 30, 30  # rows of a strand for the likelihood: next to one another, and over all of it
 _LOUD = 0.85  # standard deviations of a score test from which on the grid is run: one in five
 _FEWEST_ROWS = 12
+_NO_NOISE = 1e-6  # mean square, in squared standard deviations, below which residuals are rounding
 _INDEFINITE, _BISECTIONS = 1e6, 50  # degrees of freedom that are as good as any number
 _NEGLIGIBLE = 1e-3  # weight below which a place on the grid is left out
 
@@ -161,10 +162,12 @@ def _is_loud(sample: Sample, family: _Family) -> bool:
     independent errors, of which the fit took up the part U U'.
     """
     gap, longest = family.gap, family.longest
-    if gap == 0.0:
-        return False
     taken = family.columns(np.column_stack([sample.private, sample.shared]))
     left = family.columns(sample.left[:, None])
+    noise = np.sum(left**2) / max(np.count_nonzero(family.filled) - np.sum(taken**2), 1.0)
+    if gap == 0.0 or noise < _NO_NOISE:
+        return False
+    left /= np.sqrt(noise)
     for length in (gap, np.sqrt(gap * longest), _ASIDE * longest):
         together = np.exp(-family.distance / length) * (family.distance > 0.0)
         squares = np.sum(together**2, axis=(1, 2))[family.same].sum()
@@ -266,7 +269,8 @@ def _averaged(sample: Sample, families: Sequence[_Family], rows: Mask) -> _Avera
     likelihood, trace = np.concatenate([g.likelihood for g in grids]), np.concatenate([g.trace for g in grids])
     inverse = np.concatenate([g.inverse_freedom for g in grids])
     weight = np.full(len(share), (1.0 - INDEPENDENT) / max(len(share) - 1, 1))
-    weight[0], variance[0] = INDEPENDENT, 1.0  # the noise scale is that of independent errors
+    weight[0] = INDEPENDENT
+    variance /= variance[0]  # the noise scale is that of independent errors
     weight *= np.exp(likelihood - likelihood.max())
     weight /= weight.sum()
     weight[weight < _NEGLIGIBLE] = 0.0
