@@ -176,11 +176,11 @@ def test_the_file_says_what_was_used_and_old_files_load(
 
 def test_few_groups_hardly_move_what_is_known() -> None:
     """A ratio of four over two degrees of freedom is no evidence, over a hundred it is."""
-    few, likely = _averaged(4.0, 2.0)
+    few, likely = _averaged(4.0, 2.0, 1.0)
     assert few < 2.6 and likely < 0.5
-    many, certain = _averaged(4.0, 100.0)
+    many, certain = _averaged(4.0, 100.0, 1.0)
     assert many == pytest.approx(4.0, rel=0.1) and certain > 0.999
-    assert _averaged(1.0, 100.0)[0] == pytest.approx(1.0, abs=0.03)
+    assert _averaged(1.0, 100.0, 1.0)[0] == pytest.approx(1.0, abs=0.03)
 
 
 def test_a_mixture_has_the_tails_of_its_widest_part() -> None:

@@ -26,7 +26,7 @@ FEWEST_GROUPS = 3
 INDEPENDENT = 0.8
 """Probability, before anything was seen, that errors are independent."""
 _RIDGE = 1e-3  # of a view's information: one that tells a direction alone cannot be left out
-_LOG_C = np.linspace(0.02, 6.0, 300)  # exponential of mean 1, where views disagree
+_LOG_C = np.linspace(0.02, 6.0, 300)  # either way exponential of mean 1, where views do not scatter as expected
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ def compare_groups(sample: Sample, scatter: Array, whole: Array) -> tuple[Betwee
     expected, spread = _expected(sample.informations, scatter, whole, white)
     mean = float(np.sum(np.trace(expected, axis1=1, axis2=2)))
     ratio, degrees = float(np.sum((sample.scores @ white) ** 2)) / mean, 2.0 * mean**2 / spread
-    variance, probability = _averaged(ratio, degrees)
+    variance, probability = _averaged(ratio, degrees, float(np.trace(whole)) / len(whole))
     size, told = len(whole), np.trace(sample.informations, axis1=1, axis2=2)
     alike = float(np.sum(told) ** 2 / np.sum(told**2)) - 1.0  # groups beyond the first that say as much as one another
     weight = probability * alike / (alike + size)
@@ -79,11 +79,17 @@ def _expected(informations: Array, scatter: Array, whole: Array, white: Array) -
     return np.array(own), spread
 
 
-def _averaged(ratio: float, degrees: float) -> tuple[float, float]:
-    """Mean of the factor on the variance over what it may be, given a chi-squared ratio; and that it is not 1."""
-    logs = np.concatenate([[0.0], _LOG_C])
-    prior = np.exp(-_LOG_C)
-    weights = np.concatenate([[INDEPENDENT], (1.0 - INDEPENDENT) * prior / prior.sum()])
+def _averaged(ratio: float, degrees: float, widened: float) -> tuple[float, float]:
+    """Mean of the factor on the variance over what it may be, given a chi-squared ratio; and that it is not 1.
+
+    Args:
+        widened: factor on the variance by errors within the views. No more than that is taken back where the views
+            agree better than it says: what looks like an error of each view is then one of all of them.
+    """
+    logs = np.concatenate([[0.0], _LOG_C, -_LOG_C])
+    prior = np.exp(-np.abs(logs)) * (logs >= -np.log(max(widened, 1.0)))
+    weights = (1.0 - INDEPENDENT) / prior[1:].sum() * prior
+    weights[0] = INDEPENDENT
     likelihood = -0.5 * degrees * (logs + ratio * np.exp(-logs))
     weights *= np.exp(likelihood - likelihood.max())
     weights /= weights.sum()

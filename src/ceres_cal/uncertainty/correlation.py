@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -69,10 +69,12 @@ def correlated(sample: Sample) -> Covariances:
     """The covariance of each group's score, with what errors have in common."""
     scores, private, inverse, kinds = sample.informations.copy(), [1.0], 0.0, []
     for is_curve, kind in ((False, "points"), (True, "curves")):
-        families = [_Family.of(sample, strands) for strands in sample.families(is_curve)]
+        families = [_Family.of(sample, s, number > 0) for number, s in enumerate(sample.families(is_curve))]
         rows = sample.is_curve == is_curve
         if np.count_nonzero(rows) < _FEWEST_ROWS or not any(_is_loud(sample, family) for family in families):
             continue
+        if not is_curve:  # bent boards and lenses err smoothly, edges along a line do not
+            families += [replace(family, smooth=True) for family in families]
         average = _averaged(sample, families, rows)
         change, factor = average.change(sample)
         scores += change
@@ -90,11 +92,14 @@ class _Family:
     """S strands side by side, of M rows each at most that the likelihood looks at.
 
     Attributes:
+        lasting: whether they go over several views. smooth: whether errors have no edges: then it is exp(-(d / l)^2 / 2).
         strands: with all their rows. rows: (S, M) of the sample; filled: (S, M) which there are. distance: (D, M, M) m,
             infinite where one is missing; same: (S,) which of them is each strand's. view: (S,) whose private
             placement it shows.
     """
 
+    lasting: bool
+    smooth: bool
     strands: Sequence[Strand]
     rows: Indices
     filled: Mask
@@ -103,7 +108,7 @@ class _Family:
     view: Indices
 
     @classmethod
-    def of(cls, sample: Sample, strands: Sequence[Strand]) -> _Family:
+    def of(cls, sample: Sample, strands: Sequence[Strand], lasting: bool) -> _Family:
         """Of the strands of one kind."""
         picked = [_near_and_far(len(strand.rows)) for strand in strands]
         shape = len(strands), max(len(p) for p in picked)
@@ -120,7 +125,7 @@ class _Family:
                 whole[: len(at), : len(at)] = distances_of(places)
                 np.fill_diagonal(whole, 0.0)
                 distances.append(whole)
-        return cls(strands, rows, filled, np.array(distances), same, sample.group[rows[:, 0]])
+        return cls(lasting, False, strands, rows, filled, np.array(distances), same, sample.group[rows[:, 0]])
 
     @property
     def gap(self) -> float:
@@ -144,6 +149,12 @@ def _near_and_far(count: int) -> Indices:
     """Rows of a strand: some next to one another in its middle, and some over all of it."""
     middle = max(0, (count - _NEAR) // 2)
     return np.union1d(np.arange(middle, min(count, middle + _NEAR)), evenly(count, _FAR))
+
+
+def _decay(distance: Array, length: float, smooth: bool) -> Array:
+    """Correlation at distances: of a rough random function, or of a smooth one."""
+    relative = distance / length
+    return np.asarray(np.exp(-0.5 * relative**2 if smooth else -relative))
 
 
 def distances_of(places: Array) -> Array:
@@ -225,7 +236,11 @@ class _Average:
         length, longest = float(self.length_m[best]), max(family.longest for family in self.families)
         aside, probability = length > 2.0 * longest, float(1.0 - self.weight[0])
         return Correlation(
-            kind, probability, None if aside else length, float(self.share[best]), bool(self.family[best])
+            kind,
+            probability,
+            None if aside else length,
+            float(self.share[best]),
+            self.families[self.family[best]].lasting,
         )
 
     def change(self, sample: Sample) -> tuple[Array, float]:
@@ -241,21 +256,22 @@ class _Average:
                 x = both[strand.rows]
                 name = strand.places.tobytes()
                 if name not in kernels:
-                    kernels[name] = _kernel(strand.places, lengths, together)
+                    kernels[name] = _kernel(strand.places, lengths, together, family.smooth)
                 product = alone * (x.T @ x) + x.T @ (kernels[name] @ x)
                 if number == 0:
                     product -= x.T @ x
                     private[1] += np.trace(x[:, size:].T @ x[:, size:])
-                private[0] += np.trace(product[size:, size:])
+                common = float(kernels[name].min()) * float(np.sum(x[:, size:].sum(axis=0) ** 2))
+                private[0] += float(np.trace(product[size:, size:])) - common  # what moves all of it is not its scatter
                 scores[sample.group[strand.rows[0]]] += product[:size, :size]
         return scores, float(1.0 + max(private[0], 0.0) / private[1]) if private[1] > 0.0 else 1.0
 
 
-def _kernel(places: Array, lengths: Array, weights: Array) -> Array:
+def _kernel(places: Array, lengths: Array, weights: Array, smooth: bool) -> Array:
     """(N, N) sum of weights exp(-d / length)."""
     distance, kernel = distances_of(places), np.zeros((len(places), len(places)))
     for length in np.unique(lengths[weights > 0.0]):
-        kernel += float(np.sum(weights[lengths == length])) * np.exp(-distance / length)
+        kernel += float(np.sum(weights[lengths == length])) * _decay(distance, length, smooth)
     return kernel
 
 
@@ -304,7 +320,7 @@ def _likelihoods(sample: Sample, family: _Family, rows: Mask, number: int, lengt
         shares, values = np.zeros(1), family.filled.astype(float)
     else:
         shares = _SHARES
-        eigenvalues, vectors = np.linalg.eigh(np.exp(-family.distance / length))
+        eigenvalues, vectors = np.linalg.eigh(_decay(family.distance, length, family.smooth))
         z = np.swapaxes(vectors, 1, 2)[family.same] @ z
         values = np.maximum(eigenvalues, 0.0)[family.same]
     diagonal = 1.0 - shares[:, None, None] + shares[:, None, None] * values

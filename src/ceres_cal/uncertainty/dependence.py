@@ -93,7 +93,7 @@ def measure_scatter(
         return None
     within = correlated(sample)
     whole = _whole(sample, within.scores)
-    lasting = any(kind.lasting for kind in within.kinds)
+    lasting = sample.is_shared and any(kind.lasting for kind in within.kinds)
     between, inverse = None, within.inverse_freedom
     if sample.groups >= FEWEST_GROUPS and not lasting:
         between, whole = compare_groups(sample, within.scores, whole)

@@ -80,6 +80,11 @@ class Sample:
         np.add.at(scores, self.group, self.shared * self.left[:, None])
         return scores
 
+    @cached_property
+    def is_shared(self) -> bool:
+        """Whether some strand goes over several groups."""
+        return any(np.any(self.group[strand.rows] != self.group[strand.rows[0]]) for strand in self.lasting)
+
     def families(self, curves: bool) -> list[list[Strand]]:
         """The strands of curves or of points, within views and then, where there are others, over all views."""
         families = (
