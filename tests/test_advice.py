@@ -84,7 +84,9 @@ def test_what_is_told_is_what_the_observations_would_tell(name: str) -> None:
             placements={**estimate.placements, **added.placements},
         )
         priors = gather_priors(seen, options, there.structure)
-        found = information(Problem(gather_sights(seen), make_layout(seen, options), priors, weighting), there).shared
+        found = information(
+            Problem(gather_sights(seen, predicted=True), make_layout(seen, options), priors, weighting), there
+        ).shared
         at = found.columns(ground.keys)
         if len(at) == len(found.keys):
             return found.given(ground.keys).matrix
