@@ -22,6 +22,11 @@ class Rejected:
     feature: str
     reason: str
 
+    @property
+    def is_of_whole(self) -> bool:
+        """Whether it was taken out with all others of its line, frame or placement; the reason then says which."""
+        return self.reason.startswith("the whole of ")
+
 
 @dataclass(frozen=True)
 class Fit:

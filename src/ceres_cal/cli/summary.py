@@ -166,7 +166,9 @@ def _pose(name: str, camera: Camera, anchored: bool, quality: Quality) -> list[s
 
 
 def _outliers(calibration: Calibration) -> Counter[str]:
-    return Counter(f"{entry.kind} {entry.feature}" for entry in calibration.outliers)
+    wholes = (entry.reason.partition(":")[0] for entry in calibration.outliers if entry.is_of_whole)
+    single = (f"{entry.kind} {entry.feature}" for entry in calibration.outliers if not entry.is_of_whole)
+    return Counter(wholes) + Counter(single)
 
 
 def _outlier_lines(calibration: Calibration) -> list[str]:

@@ -25,7 +25,8 @@ from ceres_cal.solve.linear_model import LinearModel
 # Probability, before anything was seen, that some feature does not belong. From half to double the log odds change by
 # 0.7, those of a line 3 px aside are 10 to 20.
 _FAULTY = 0.01
-_INDEPENDENT = 0.5  # probability that errors do not go together along features
+# Probability, before anything was seen, that errors do not go together along features. The log odds change by as much.
+_INDEPENDENT = 0.5
 # Standard deviations of offsets in those of one observation's noise: of features that belong, and of those that do not.
 _SCATTER = np.concatenate([[0.0], np.geomspace(0.1, 60.0, 14)])
 _ASIDE = np.array([10.0, 40.0, 160.0])
