@@ -11,8 +11,9 @@ from ceres_cal.model.parameters import Estimate, unit_px
 from ceres_cal.scene.camera import Camera
 from ceres_cal.solve import Problem, ReducedInformation, information
 from ceres_cal.start.initialise import PHI_RANGE, USUAL_PHI
+from ceres_cal.uncertainty.bent import bends, widened
 from ceres_cal.uncertainty.posterior import Posterior, make_posterior, student_95
-from ceres_cal.uncertainty.profile import Node, profile, valley
+from ceres_cal.uncertainty.profile import Node, PhiProfile, profile, valley
 
 # Relative sigma of phi above which the quadratic picture is left. Nothing changes from half to double.
 _BENT = 0.05
@@ -24,8 +25,8 @@ def assess(
     """What is known at the estimate, and the estimate: another one where phi went astray.
 
     Nearly frontal views can be fitted a little better by a camera a hand's breadth over the floor, or in the clouds,
-    than by the true one. Where the least cost lies at a phi that no lens has, or the observations say nothing of phi as
-    far as lenses go, the node of the valley within the 95 % bound that is nearest to a usual lens is taken; the
+    than by the true one. Where the least cost lies at a phi that no lens has, or the observations leave phi open on
+    a side as far as lenses go, the node of the valley within the 95 % bound that is nearest to a usual lens is taken; the
     posterior says that phi is unknown.
 
     Args:
@@ -43,14 +44,36 @@ def assess(
         if _is_lens(camera) and posterior.sd_of("camera", name, "phi") <= _BENT * camera.phi:
             continue
         nodes = valleys[name] = valley(name, astray, estimate)
-        rise = max(nodes[0].cost, nodes[-1].cost) - min(node.cost for node in nodes)
+        rise = min(nodes[0].cost, nodes[-1].cost) - min(node.cost for node in nodes)
         if not _is_lens(camera) or rise < width**2:
             estimate = _usual(name, nodes, width)
             astray = astray.holding(name, 0)
     if astray is not problem:
         posterior = make_posterior(information(problem, estimate), degrees_of_freedom)
     profiles = {name: profile(name, nodes, estimate, width) for name, nodes in valleys.items()}
-    return estimate, replace(posterior, profiles=profiles)
+    return estimate, _with_bends(replace(posterior, profiles=profiles), problem, estimate)
+
+
+def _with_bends(posterior: Posterior, problem: Problem, estimate: Estimate) -> Posterior:
+    """The posterior, and what it says across its valleys, with as much more as the quadratic picture bends."""
+    followed = {profile.keys[0] for profile in posterior.profiles.values()}
+    held = posterior.information.given([key for key in posterior.keys if key not in followed])
+    for name in posterior.profiles:
+        problem = problem.holding(name, 0)
+    width = posterior.half_width
+    excesses = bends(problem, estimate, held, width)
+    everywhere = np.zeros((len(excesses), len(posterior.keys)))
+    everywhere[:, posterior.information.columns(held.keys)] = excesses
+
+    def across(profile: PhiProfile) -> PhiProfile:
+        own = excesses[:, held.columns(profile.keys[1:])]
+        return replace(profile, across=tuple(widened(information, own, width) for information in profile.across))
+
+    return replace(
+        posterior,
+        information=widened(posterior.information, everywhere, width),
+        profiles={name: across(profile) for name, profile in posterior.profiles.items()},
+    )
 
 
 def _is_lens(camera: Camera) -> bool:

@@ -7,6 +7,7 @@ with too few coefficients, a field painted amiss) is not in them.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +18,7 @@ from ceres_cal.base.tails import NORMAL_95, NORMAL_95_ONE_SIDED
 from ceres_cal.model.keys import STATION_QUANTITIES, Key
 from ceres_cal.model.parameters import Estimate
 from ceres_cal.model.quantities import camera_moved, moved, natural_sizes
+from ceres_cal.uncertainty.bent import weak_axes
 from ceres_cal.uncertainty.posterior import Posterior
 
 _STEP = 1e-5  # of each number's natural size: the differences are good to 1e-9 of the slope
@@ -107,13 +109,42 @@ def spread_of_points(
     if estimate.stations[station].camera in posterior.profiles:
         return _by_profile(estimate, posterior, station, pixels, height_m)
     located = estimate.camera_at(station).locate(pixels, height_m)
-    slopes = np.zeros((len(pixels), 2, len(posterior.keys)))
-    slopes[:, :, posterior.information.columns(keys)] = locate_slopes(estimate, keys, station, pixels, height_m)
-    covariance = posterior.spread.through(slopes)
+    slopes, at = np.zeros((len(pixels), 2, len(posterior.keys))), posterior.information.columns(keys)
+    slopes[:, :, at] = locate_slopes(estimate, keys, station, pixels, height_m)
+    axes = weak_axes(posterior.information, estimate, keys)
+    bend = _bend(estimate, keys, posterior.half_width * axes, (station, pixels, height_m), slopes[:, :, at])
+    covariance = posterior.spread.through(slopes) + bend / posterior.half_width**2
     variance = np.diagonal(covariance, axis1=1, axis2=2)
     reach = posterior.half_width * np.sqrt(variance)
     radius = radius_95(covariance) * posterior.half_width / NORMAL_95
     return PointSpread(located, located - reach, located + reach, radius, np.sqrt(np.sum(variance, axis=1)))
+
+
+def _bend(
+    estimate: Estimate, keys: Sequence[Key], steps: Array, asked: tuple[str, Array, float], slopes: Array
+) -> Array:
+    """(N, 2, 2) squares of how much farther off places are than their slopes (N, 2, K) say, summed over steps (K, A):
+    the larger one of forth and back; infinite where a place is lost on the way.
+
+    Args:
+        asked: the station, pixels (N, 2) and a height, m.
+    """
+    station, pixels, height_m = asked
+    located = estimate.camera_at(station).locate(pixels, height_m)
+    total = np.zeros((len(pixels), 2, 2))
+    for step in steps.T:
+        off = np.full((2, len(pixels), 2), np.nan)
+        for end, sign in zip(off, (1.0, -1.0), strict=True):
+            with suppress(InputError):  # no camera there
+                end[:] = moved(estimate, keys, sign * step).camera_at(station).locate(pixels, height_m)
+                end -= located + sign * slopes @ step
+        length = np.linalg.norm(off, axis=2)
+        more = off[np.argmax(np.nan_to_num(length, nan=np.inf), axis=0), np.arange(len(pixels))]
+        total += more[:, :, None] * more[:, None, :]
+    lost = np.isnan(total).any(axis=(1, 2))
+    total[lost] = np.nan
+    total[lost, 0, 0] = total[lost, 1, 1] = np.inf
+    return total
 
 
 def _by_profile(estimate: Estimate, posterior: Posterior, station: str, pixels: Array, height_m: float) -> PointSpread:
@@ -125,7 +156,9 @@ def _by_profile(estimate: Estimate, posterior: Posterior, station: str, pixels: 
         there = moved(estimate, profile.keys, step)
         offsets.append(there.camera_at(station).locate(pixels, height_m) - located)
         slopes = locate_slopes(there, profile.keys[1:], station, pixels, height_m)
-        covariances.append(across.spread.through(slopes))
+        axes = width * weak_axes(across, there, across.keys)
+        bend = _bend(there, across.keys, axes, (station, pixels, height_m), slopes)
+        covariances.append(across.spread.through(slopes) + bend / width**2)
     values, known = np.array(offsets), np.array(covariances)
     nowhere = np.asarray(np.isnan(values).any(axis=(0, 2)))  # from some node of the valley nothing is seen there
     sds = np.sqrt(np.diagonal(known, axis1=2, axis2=3))

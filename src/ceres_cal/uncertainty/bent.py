@@ -1,0 +1,135 @@
+"""Where the quadratic picture bends: the least cost at the ends of weak directions, and by how much that widens.
+
+A direction that is known to a few hundredths of its natural size reaches so far that the least cost there is a curve,
+not a line: one board before a lens with tangential terms fits nearly as well with its principal point a quarter of the
+image aside and all coefficients changed along. At both ends of each such direction the rest is solved for anew; what
+the numbers do there, less what the normal equations promise, is added to the covariance. Nothing is solved where all
+directions are well known.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ceres_cal.base.arrays import Array
+from ceres_cal.base.errors import CalibrationError, InputError
+from ceres_cal.model.information import Information
+from ceres_cal.model.keys import Key
+from ceres_cal.model.parameters import Estimate
+from ceres_cal.model.priors import GaussianPrior
+from ceres_cal.model.quantities import difference, moved, natural_sizes
+from ceres_cal.solve import Problem, Solution, solve
+
+# Sigma in natural sizes from which on a direction is looked at.
+BENDING = 0.01
+_HELD = 0.005  # of a step: how closely its end is held
+_FARTHEST = 4.0  # times as far as the normal equations have it: what is flatter than that is unknown
+_UNKNOWN = 10.0  # natural sizes: farther is not worth knowing
+_FEW = 300  # equations; with more of them no second minimum was seen that fits as well
+_FAR_OUT = 3.0  # times 95 %: where a search for another minimum starts
+
+
+def weak_axes(information: Information, estimate: Estimate, keys: Sequence[Key]) -> Array:
+    """(K, A) directions of some of the keys whose sigma in natural sizes is above BENDING, one sigma long, in the units
+    of the keys.
+
+    Structure is not looked at, nor what is not known at all.
+    """
+    sizes, at = natural_sizes(estimate, keys), information.columns(keys)
+    plain = np.array([key.kind != "structure" for key in keys])
+    scaled = information.spread.covariance[np.ix_(at, at)] / sizes[:, None] / sizes
+    values, vectors = np.linalg.eigh(np.where(plain[:, None] & plain, scaled, 0.0))
+    weak = values > BENDING**2
+    return np.asarray(vectors[:, weak] * np.sqrt(values[weak]) * sizes[:, None])
+
+
+def bends(problem: Problem, estimate: Estimate, information: Information, half_width: float) -> Array:
+    """(B, K) how much farther the numbers of the keys are off at the ends of weak directions than a linear step of
+    half_width standard deviations takes them, a row for each direction; of few observations also how far off other
+    minima are that fit as well.
+
+    Args:
+        problem: that the information is of; the estimate is where its cost is least.
+    """
+    keys, sizes = information.keys, natural_sizes(estimate, information.keys)
+    axes = half_width * weak_axes(information, estimate, keys)
+    if not axes.shape[1]:
+        return np.zeros((0, len(keys)))
+    least = 2.0 * solve(problem, estimate).cost
+    rows = []
+    for axis in axes.T:
+        ends = [_excess(_end(problem, estimate, keys, s), s / sizes, least, half_width) for s in (axis, -axis)]
+        rows.append(max(ends, key=lambda excess: float(excess @ excess)))
+        if problem.sights.equations < _FEW:
+            rows += _minima(problem, estimate, keys, axis, least + half_width**2)
+    off = np.array(rows)
+    too_far = np.maximum(np.linalg.norm(off, axis=1, keepdims=True) / _UNKNOWN, 1.0)
+    return np.asarray(off / too_far * sizes)
+
+
+def widened(information: Information, excesses: Array, half_width: float) -> Information:
+    """The information with excesses (A, K) at half_width standard deviations as variances of their own."""
+    if not len(excesses):
+        return information
+    shared = excesses.T / half_width
+    through = information.matrix @ shared
+    middle = np.eye(len(excesses)) + shared.T @ through
+    unit = np.sqrt(np.diagonal(middle))
+    matrix = information.matrix - (through / unit) @ np.linalg.solve(middle / unit[:, None] / unit, (through / unit).T)
+    return Information(information.keys, 0.5 * (matrix + matrix.T))
+
+
+def _minima(problem: Problem, estimate: Estimate, keys: tuple[Key, ...], axis: Array, most: float) -> list[Array]:
+    """How far off (K,) other minima are, in natural sizes, that a solve runs into from far out along an axis."""
+    sizes, found = natural_sizes(estimate, keys), []
+    for step in (_FAR_OUT * axis, -_FAR_OUT * axis):
+        end = _end(problem, estimate, keys, step)
+        solution = None if end is None else _solved(problem, end.estimate)
+        if solution is not None and 2.0 * solution.cost <= most:
+            found.append(difference(solution.estimate, estimate, keys) / sizes)
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class _End:
+    """Where the numbers are (K,), in natural sizes from the estimate, and twice the cost there."""
+
+    estimate: Estimate
+    off: Array
+    cost: float
+
+
+def _end(problem: Problem, estimate: Estimate, keys: tuple[Key, ...], step: Array) -> _End | None:
+    """The least cost where the part of the numbers along a step is as long as it; None where it is not found."""
+    sizes = natural_sizes(estimate, keys)
+    row = step / sizes**2 / float(np.sum((step / sizes) ** 2)) / _HELD
+    with suppress(InputError):  # no camera there
+        pull = GaussianPrior.about(Information(keys, np.outer(row, row)), moved(estimate, keys, step))
+        solution = _solved(replace(problem, priors=(*problem.priors, pull)), estimate)
+        if solution is not None:
+            pulled = float(np.sum(pull.residuals(solution.estimate) ** 2))
+            off = difference(solution.estimate, estimate, keys) / sizes
+            return _End(solution.estimate, off, 2.0 * solution.cost - pulled)
+    return None
+
+
+def _solved(problem: Problem, start: Estimate) -> Solution | None:
+    try:
+        solution = solve(problem, start)
+    except CalibrationError:
+        return None
+    return None if solution.failed else solution
+
+
+def _excess(end: _End | None, step: Array, least: float, half_width: float) -> Array:
+    """(K,) in natural sizes: the end, brought to where the cost has risen as it should by a step, less that step."""
+    if end is None:
+        return (_FARTHEST - 1.0) * step
+    reach = half_width / np.sqrt(max(end.cost - least, 1e-12))
+    excess = end.off * np.clip(reach, 1.0 / _FARTHEST, _FARTHEST) - step
+    along = step / np.linalg.norm(step)
+    return np.asarray(excess - min(float(along @ excess), 0.0) * along)  # that it ends earlier narrows nothing
