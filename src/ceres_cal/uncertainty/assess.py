@@ -11,9 +11,9 @@ from ceres_cal.model.parameters import Estimate, unit_px
 from ceres_cal.scene.camera import Camera
 from ceres_cal.solve import Problem, ReducedInformation, information
 from ceres_cal.start.initialise import PHI_RANGE, USUAL_PHI
-from ceres_cal.uncertainty.bent import bends, widened
+from ceres_cal.uncertainty.bent import bends
 from ceres_cal.uncertainty.posterior import Posterior, make_posterior, student_95
-from ceres_cal.uncertainty.profile import Node, PhiProfile, profile, valley
+from ceres_cal.uncertainty.profile import Node, profile, valley
 
 # Relative sigma of phi above which the quadratic picture is left. Nothing changes from half to double.
 _BENT = 0.05
@@ -26,8 +26,8 @@ def assess(
 
     Nearly frontal views can be fitted a little better by a camera a hand's breadth over the floor, or in the clouds,
     than by the true one. Where the least cost lies at a phi that no lens has, or the observations leave phi open on
-    a side as far as lenses go, the node of the valley within the 95 % bound that is nearest to a usual lens is taken; the
-    posterior says that phi is unknown.
+    a side as far as lenses go, the node of the valley within the 95 % bound that is nearest to a usual lens is taken;
+    the posterior says that phi is unknown.
 
     Args:
         reduced: what the problem says at the estimate.
@@ -55,25 +55,19 @@ def assess(
 
 
 def _with_bends(posterior: Posterior, problem: Problem, estimate: Estimate) -> Posterior:
-    """The posterior, and what it says across its valleys, with as much more as the quadratic picture bends."""
+    """The posterior with what bends in it; across its valleys, where phi is held, that is put into what they say."""
     followed = {profile.keys[0] for profile in posterior.profiles.values()}
     held = posterior.information.given([key for key in posterior.keys if key not in followed])
     for name in posterior.profiles:
         problem = problem.holding(name, 0)
-    width = posterior.half_width
-    excesses = bends(problem, estimate, held, width)
-    everywhere = np.zeros((len(excesses), len(posterior.keys)))
-    everywhere[:, posterior.information.columns(held.keys)] = excesses
-
-    def across(profile: PhiProfile) -> PhiProfile:
-        own = excesses[:, held.columns(profile.keys[1:])]
-        return replace(profile, across=tuple(widened(information, own, width) for information in profile.across))
-
-    return replace(
-        posterior,
-        information=widened(posterior.information, everywhere, width),
-        profiles={name: across(profile) for name, profile in posterior.profiles.items()},
-    )
+    bent = bends(problem, estimate, held, posterior.half_width)
+    if bent is None:
+        return posterior
+    profiles = {
+        name: replace(profile, across=tuple(map(bent.widened, profile.across)))
+        for name, profile in posterior.profiles.items()
+    }
+    return replace(posterior, profiles=profiles, bends=bent)
 
 
 def _is_lens(camera: Camera) -> bool:

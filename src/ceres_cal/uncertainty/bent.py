@@ -33,6 +33,39 @@ _FEW = 300  # equations; with more of them no second minimum was seen that fits 
 _FAR_OUT = 3.0  # times 95 %: where a search for another minimum starts
 
 
+@dataclass(frozen=True, eq=False)
+class Bends:
+    """What the numbers do at the ends of weak directions.
+
+    Attributes:
+        keys: (K). steps: (B, K) as far as the quadratic picture has the end of the 95 % interval along each direction.
+        ends: (B, K) where the least cost has risen there as much, or has another minimum.
+        half_width: standard deviations that a step is long.
+    """
+
+    keys: tuple[Key, ...]
+    steps: Array
+    ends: Array
+    half_width: float
+
+    @property
+    def excesses(self) -> Array:
+        """(B, K) by how much the ends are farther off, in standard deviations' worth."""
+        return np.asarray((self.ends - self.steps) / self.half_width)
+
+    def widened(self, information: Information) -> Information:
+        """Information about some of the keys with the excesses as variances of their own."""
+        if not len(self.ends):
+            return information
+        shared = self.excesses[:, [self.keys.index(key) for key in information.keys]].T
+        through = information.matrix @ shared
+        middle = np.eye(len(self.ends)) + shared.T @ through
+        unit = np.sqrt(np.diagonal(middle))
+        scaled = through / unit
+        matrix = information.matrix - scaled @ np.linalg.solve(middle / unit[:, None] / unit, scaled.T)
+        return Information(information.keys, 0.5 * (matrix + matrix.T))
+
+
 def weak_axes(information: Information, estimate: Estimate, keys: Sequence[Key]) -> Array:
     """(K, A) directions of some of the keys whose sigma in natural sizes is above BENDING, one sigma long, in the units
     of the keys.
@@ -47,10 +80,9 @@ def weak_axes(information: Information, estimate: Estimate, keys: Sequence[Key])
     return np.asarray(vectors[:, weak] * np.sqrt(values[weak]) * sizes[:, None])
 
 
-def bends(problem: Problem, estimate: Estimate, information: Information, half_width: float) -> Array:
-    """(B, K) how much farther the numbers of the keys are off at the ends of weak directions than a linear step of
-    half_width standard deviations takes them, a row for each direction; of few observations also how far off other
-    minima are that fit as well.
+def bends(problem: Problem, estimate: Estimate, information: Information, half_width: float) -> Bends | None:
+    """What the numbers of the information do at the ends of its weak directions, and, of few observations, where other
+    minima are that fit as well; None where it has no such direction.
 
     Args:
         problem: that the information is of; the estimate is where its cost is least.
@@ -58,29 +90,23 @@ def bends(problem: Problem, estimate: Estimate, information: Information, half_w
     keys, sizes = information.keys, natural_sizes(estimate, information.keys)
     axes = half_width * weak_axes(information, estimate, keys)
     if not axes.shape[1]:
-        return np.zeros((0, len(keys)))
+        return None
     least = 2.0 * solve(problem, estimate).cost
-    rows = []
+    steps, excesses = [], []
     for axis in axes.T:
-        ends = [_excess(_end(problem, estimate, keys, s), s / sizes, least, half_width) for s in (axis, -axis)]
-        rows.append(max(ends, key=lambda excess: float(excess @ excess)))
+        both = [
+            (s / sizes, _excess(_end(problem, estimate, keys, s), s / sizes, least, half_width)) for s in (axis, -axis)
+        ]
+        step, excess = max(both, key=lambda end: float(end[1] @ end[1]))
+        steps.append(step)
+        excesses.append(excess)
         if problem.sights.equations < _FEW:
-            rows += _minima(problem, estimate, keys, axis, least + half_width**2)
-    off = np.array(rows)
-    too_far = np.maximum(np.linalg.norm(off, axis=1, keepdims=True) / _UNKNOWN, 1.0)
-    return np.asarray(off / too_far * sizes)
-
-
-def widened(information: Information, excesses: Array, half_width: float) -> Information:
-    """The information with excesses (A, K) at half_width standard deviations as variances of their own."""
-    if not len(excesses):
-        return information
-    shared = excesses.T / half_width
-    through = information.matrix @ shared
-    middle = np.eye(len(excesses)) + shared.T @ through
-    unit = np.sqrt(np.diagonal(middle))
-    matrix = information.matrix - (through / unit) @ np.linalg.solve(middle / unit[:, None] / unit, (through / unit).T)
-    return Information(information.keys, 0.5 * (matrix + matrix.T))
+            for off in _minima(problem, estimate, keys, axis, least + half_width**2):
+                steps.append(np.zeros(len(keys)))
+                excesses.append(off)
+    off = np.array(excesses)
+    off /= np.maximum(np.linalg.norm(off, axis=1, keepdims=True) / _UNKNOWN, 1.0)
+    return Bends(keys, np.array(steps) * sizes, (np.array(steps) + off) * sizes, half_width)
 
 
 def _minima(problem: Problem, estimate: Estimate, keys: tuple[Key, ...], axis: Array, most: float) -> list[Array]:

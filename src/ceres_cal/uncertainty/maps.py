@@ -111,9 +111,12 @@ def spread_of_points(
     located = estimate.camera_at(station).locate(pixels, height_m)
     slopes, at = np.zeros((len(pixels), 2, len(posterior.keys))), posterior.information.columns(keys)
     slopes[:, :, at] = locate_slopes(estimate, keys, station, pixels, height_m)
-    axes = weak_axes(posterior.information, estimate, keys)
-    bend = _bend(estimate, keys, posterior.half_width * axes, (station, pixels, height_m), slopes[:, :, at])
-    covariance = posterior.spread.through(slopes) + bend / posterior.half_width**2
+    covariance = posterior.spread.through(slopes)
+    if posterior.bends is not None:
+        own = [posterior.bends.keys.index(key) for key in keys]
+        steps, ends = posterior.bends.steps[:, own], posterior.bends.ends[:, own]
+        bend = _bend(estimate, keys, (steps, ends), (station, pixels, height_m), slopes[:, :, at])
+        covariance += bend / posterior.half_width**2
     variance = np.diagonal(covariance, axis1=1, axis2=2)
     reach = posterior.half_width * np.sqrt(variance)
     radius = radius_95(covariance) * posterior.half_width / NORMAL_95
@@ -121,26 +124,26 @@ def spread_of_points(
 
 
 def _bend(
-    estimate: Estimate, keys: Sequence[Key], steps: Array, asked: tuple[str, Array, float], slopes: Array
+    estimate: Estimate,
+    keys: Sequence[Key],
+    steps: tuple[Array, Array],
+    asked: tuple[str, Array, float],
+    slopes: Array,
 ) -> Array:
-    """(N, 2, 2) squares of how much farther off places are than their slopes (N, 2, K) say, summed over steps (K, A):
-    the larger one of forth and back; infinite where a place is lost on the way.
+    """(N, 2, 2) squares of how much farther off places are than their slopes (N, 2, K) say, summed over directions;
+    infinite where a place is lost on the way.
 
     Args:
-        asked: the station, pixels (N, 2) and a height, m.
+        steps: (B, K) what the slopes take, and where the numbers really go. asked: station, pixels (N, 2), height in m.
     """
     station, pixels, height_m = asked
     located = estimate.camera_at(station).locate(pixels, height_m)
     total = np.zeros((len(pixels), 2, 2))
-    for step in steps.T:
-        off = np.full((2, len(pixels), 2), np.nan)
-        for end, sign in zip(off, (1.0, -1.0), strict=True):
-            with suppress(InputError):  # no camera there
-                end[:] = moved(estimate, keys, sign * step).camera_at(station).locate(pixels, height_m)
-                end -= located + sign * slopes @ step
-        length = np.linalg.norm(off, axis=2)
-        more = off[np.argmax(np.nan_to_num(length, nan=np.inf), axis=0), np.arange(len(pixels))]
-        total += more[:, :, None] * more[:, None, :]
+    for step, end in zip(*steps, strict=True):
+        off = np.full((len(pixels), 2), np.nan)
+        with suppress(InputError):  # no camera there
+            off = moved(estimate, keys, end).camera_at(station).locate(pixels, height_m) - located - slopes @ step
+        total += off[:, :, None] * off[:, None, :]
     lost = np.isnan(total).any(axis=(1, 2))
     total[lost] = np.nan
     total[lost, 0, 0] = total[lost, 1, 1] = np.inf
@@ -156,8 +159,9 @@ def _by_profile(estimate: Estimate, posterior: Posterior, station: str, pixels: 
         there = moved(estimate, profile.keys, step)
         offsets.append(there.camera_at(station).locate(pixels, height_m) - located)
         slopes = locate_slopes(there, profile.keys[1:], station, pixels, height_m)
-        axes = width * weak_axes(across, there, across.keys)
-        bend = _bend(there, across.keys, axes, (station, pixels, height_m), slopes)
+        axes = width * weak_axes(across, there, across.keys).T
+        steps = np.concatenate([axes, -axes])
+        bend = 0.5 * _bend(there, across.keys, (steps, steps), (station, pixels, height_m), slopes)
         covariances.append(across.spread.through(slopes) + bend / width**2)
     values, known = np.array(offsets), np.array(covariances)
     nowhere = np.asarray(np.isnan(values).any(axis=(0, 2)))  # from some node of the valley nothing is seen there

@@ -17,6 +17,7 @@ from ceres_cal.model.keys import Key, pose_keys, sigma_limits
 from ceres_cal.model.parameters import Estimate, Layout
 from ceres_cal.model.quantities import layout_of
 from ceres_cal.solve import Eliminated, ReducedInformation
+from ceres_cal.uncertainty.bent import Bends
 from ceres_cal.uncertainty.profile import PhiProfile
 
 
@@ -32,12 +33,14 @@ class Posterior:
         placements: name -> information about each placement that one station alone sees, all else integrated out.
         degrees_of_freedom: spare equations behind the estimated noise; infinite where the sigmas were taken as stated.
         profiles: camera -> the valley along its phi, where that is too little known for the quadratic picture.
+        bends: what else leaves the quadratic picture, or None: it counts in sd, bounds and maps.
     """
 
     information: Information
     placements: Mapping[str, Information] = field(default_factory=dict)
     degrees_of_freedom: float = np.inf
     profiles: Mapping[str, PhiProfile] = field(default_factory=dict)
+    bends: Bends | None = None
 
     @property
     def keys(self) -> tuple[Key, ...]:
@@ -57,7 +60,10 @@ class Posterior:
     @cached_property
     def sd(self) -> Array:
         """(P,) standard deviations in the units of the keys, infinite where unknown."""
-        return self.spread.sd
+        variance = self.spread.sd**2
+        if self.bends is not None:
+            variance[self.information.columns(self.bends.keys)] += np.sum(self.bends.excesses**2, axis=0)
+        return np.asarray(np.sqrt(variance))
 
     @property
     def half_width(self) -> float:
