@@ -10,7 +10,7 @@ import numpy as np
 from ceres_cal.model.parameters import Estimate, unit_px
 from ceres_cal.scene.camera import Camera
 from ceres_cal.solve import Problem, ReducedInformation, information
-from ceres_cal.start.initialise import PHI_RANGE, USUAL_PHI
+from ceres_cal.start.initialise import PHI_RANGE, USUAL_PHI, USUAL_PHI_FACTOR
 from ceres_cal.uncertainty.bent import bends
 from ceres_cal.uncertainty.posterior import Posterior, make_posterior, student_95
 from ceres_cal.uncertainty.profile import Node, profile, valley
@@ -26,8 +26,8 @@ def assess(
 
     Nearly frontal views can be fitted a little better by a camera a hand's breadth over the floor, or in the clouds,
     than by the true one. Where the least cost lies at a phi that no lens has, or the observations leave phi open on
-    a side as far as lenses go, the node of the valley within the 95 % bound that is nearest to a usual lens is taken;
-    the posterior says that phi is unknown.
+    a side as far as lenses go, the node of the valley is taken that fits best with what is usual of lenses; the
+    posterior says that phi is unknown.
 
     Args:
         reduced: what the problem says at the estimate.
@@ -46,7 +46,7 @@ def assess(
         nodes = valleys[name] = valley(name, astray, estimate)
         rise = min(nodes[0].cost, nodes[-1].cost) - min(node.cost for node in nodes)
         if not _is_lens(camera) or rise < width**2:
-            estimate = _usual(name, nodes, width)
+            estimate = _usual(name, nodes)
             astray = astray.holding(name, 0)
     if astray is not problem:
         posterior = make_posterior(information(problem, estimate), degrees_of_freedom)
@@ -75,8 +75,11 @@ def _is_lens(camera: Camera) -> bool:
     return PHI_RANGE[0] * unit <= camera.phi <= PHI_RANGE[1] * unit
 
 
-def _usual(name: str, nodes: Sequence[Node], width: float) -> Estimate:
-    """Of the nodes within the 95 % bound the one whose phi is nearest to a usual lens'."""
-    least = min(node.cost for node in nodes)
-    possible = [node.estimate for node in nodes if node.cost - least <= width**2]
-    return min(possible, key=lambda e: abs(np.log(e.cameras[name].phi / (USUAL_PHI * unit_px(e.cameras[name])))))
+def _usual(name: str, nodes: Sequence[Node]) -> Estimate:
+    """The node that fits best with what is usual of lenses: a standard deviation is a factor of USUAL_PHI_FACTOR."""
+
+    def cost(node: Node) -> float:
+        camera = node.estimate.cameras[name]
+        return float(node.cost + (np.log(camera.phi / (USUAL_PHI * unit_px(camera))) / np.log(USUAL_PHI_FACTOR)) ** 2)
+
+    return min(nodes, key=cost).estimate

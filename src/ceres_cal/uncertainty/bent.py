@@ -28,7 +28,6 @@ from ceres_cal.solve import Problem, Solution, solve
 BENDING = 0.01
 _HELD = 0.005  # of a step: how closely its end is held
 _FARTHEST = 4.0  # times as far as the normal equations have it: what is flatter than that is unknown
-_UNKNOWN = 10.0  # natural sizes: farther is not worth knowing
 _FEW = 300  # equations; with more of them no second minimum was seen that fits as well
 _FAR_OUT = 3.0  # times 95 %: where a search for another minimum starts
 
@@ -92,32 +91,23 @@ def bends(problem: Problem, estimate: Estimate, information: Information, half_w
     if not axes.shape[1]:
         return None
     least = 2.0 * solve(problem, estimate).cost
+    few = problem.sights.equations < _FEW
     steps, excesses = [], []
     for axis in axes.T:
-        both = [
-            (s / sizes, _excess(_end(problem, estimate, keys, s), s / sizes, least, half_width)) for s in (axis, -axis)
-        ]
-        step, excess = max(both, key=lambda end: float(end[1] @ end[1]))
+        found = []
+        for step in (axis, -axis):
+            for factor in (1.0, _FAR_OUT) if few else (1.0,):
+                end = _end(problem, estimate, keys, factor * step)
+                found.append((step / sizes, _excess(end, factor, step / sizes, least, half_width)))
+                other = _minimum(problem, end) if factor > 1.0 else None
+                if other is not None and 2.0 * other.cost <= least + half_width**2:
+                    steps.append(np.zeros(len(keys)))
+                    excesses.append(difference(other.estimate, estimate, keys) / sizes)
+        step, excess = max(found, key=lambda one: float(np.linalg.norm(np.clip(one[1], -1.0, 1.0))))
         steps.append(step)
         excesses.append(excess)
-        if problem.sights.equations < _FEW:
-            for off in _minima(problem, estimate, keys, axis, least + half_width**2):
-                steps.append(np.zeros(len(keys)))
-                excesses.append(off)
-    off = np.array(excesses)
-    off /= np.maximum(np.linalg.norm(off, axis=1, keepdims=True) / _UNKNOWN, 1.0)
-    return Bends(keys, np.array(steps) * sizes, (np.array(steps) + off) * sizes, half_width)
-
-
-def _minima(problem: Problem, estimate: Estimate, keys: tuple[Key, ...], axis: Array, most: float) -> list[Array]:
-    """How far off (K,) other minima are, in natural sizes, that a solve runs into from far out along an axis."""
-    sizes, found = natural_sizes(estimate, keys), []
-    for step in (_FAR_OUT * axis, -_FAR_OUT * axis):
-        end = _end(problem, estimate, keys, step)
-        solution = None if end is None else _solved(problem, end.estimate)
-        if solution is not None and 2.0 * solution.cost <= most:
-            found.append(difference(solution.estimate, estimate, keys) / sizes)
-    return found
+    reached = np.array(steps)
+    return Bends(keys, reached * sizes, (reached + excesses) * sizes, half_width)
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,8 +141,17 @@ def _solved(problem: Problem, start: Estimate) -> Solution | None:
     return None if solution.failed else solution
 
 
-def _excess(end: _End | None, step: Array, least: float, half_width: float) -> Array:
-    """(K,) in natural sizes: the end, brought to where the cost has risen as it should by a step, less that step."""
+def _minimum(problem: Problem, end: _End | None) -> Solution | None:
+    """Where a solve runs into from an end."""
+    return None if end is None else _solved(problem, end.estimate)
+
+
+def _excess(end: _End | None, factor: float, step: Array, least: float, half_width: float) -> Array:
+    """(K,) in natural sizes: the end of so many steps, brought to where the cost has risen as it should by one, less
+    that.
+    """
+    if end is None and factor > 1.0:
+        return np.zeros(len(step))
     if end is None:
         return (_FARTHEST - 1.0) * step
     reach = half_width / np.sqrt(max(end.cost - least, 1e-12))

@@ -20,6 +20,7 @@ from ceres_cal.model.parameters import Estimate
 from ceres_cal.model.quantities import camera_moved, moved, natural_sizes
 from ceres_cal.uncertainty.bent import weak_axes
 from ceres_cal.uncertainty.posterior import Posterior
+from ceres_cal.uncertainty.profile import FARTHER
 
 _STEP = 1e-5  # of each number's natural size: the differences are good to 1e-9 of the slope
 
@@ -171,10 +172,14 @@ def _by_profile(estimate: Estimate, posterior: Posterior, station: str, pixels: 
     low = np.where(nowhere[:, None], -np.inf, below.reshape(-1, 2))
     high = np.where(nowhere[:, None], np.inf, above.reshape(-1, 2))
     circles = np.array([radius_95(part) for part in known]) / NORMAL_95
-    weights, widths = profile.reaches(width)
-    away = np.linalg.norm(np.einsum("mn,npk->mpk", weights, values), axis=2)
     unknown = ~np.isfinite(circles).all(axis=0)  # from some node of the valley
-    radius = np.max(away + widths[:, None] * (weights @ np.where(unknown, 0.0, circles)), axis=0)
+
+    def radius_at(width: float) -> Array:
+        weights, widths = profile.reaches(width)
+        away = np.linalg.norm(np.einsum("mn,npk->mpk", weights, values), axis=2)
+        return np.asarray(np.max(away + widths[:, None] * (weights @ np.where(unknown, 0.0, circles)), axis=0))
+
+    radius = np.maximum(radius_at(width), radius_at(FARTHER) * min(width / FARTHER, 1.0))
     radius = np.where(unknown | np.isinf(low).any(axis=1) | np.isinf(high).any(axis=1), np.inf, radius)
     return PointSpread(located, located + low, located + high, radius, radius / NORMAL_95)
 

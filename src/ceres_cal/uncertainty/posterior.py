@@ -73,12 +73,16 @@ class Posterior:
     @cached_property
     def bounds(self) -> Array:
         """(P, 2) 95 % bounds of the shared numbers, from the estimate; infinite on a side that is open."""
-        bounds = self.half_width * self.sd[:, None] * (-1.0, 1.0)
+        return self.bounds_at(self.half_width)
+
+    def bounds_at(self, width: float) -> Array:
+        """(P, 2) the same so many standard deviations up, at most three."""
+        bounds = width * self.sd[:, None] * (-1.0, 1.0)
         for profile in self.profiles.values():
             across = [information.spread.sd for information in profile.across]
             sds = np.column_stack([np.zeros(len(across)), across])
             at = self.information.columns(profile.keys)
-            bounds[at] = np.column_stack(profile.bounds(profile.steps, sds, self.half_width))
+            bounds[at] = np.column_stack(profile.bounds(profile.steps, sds, width))
         return np.asarray(bounds)
 
     def layout(self, estimate: Estimate) -> Layout:

@@ -26,6 +26,9 @@ from ceres_cal.start.initialise import PHI_RANGE
 # Rise of twice the cost at which the valley is followed no further: three sigma, well beyond any 95 % bound. Nothing
 # changes from half to double.
 _FAR = 9.0
+FARTHER = 3.0
+"""Standard deviations up to which valleys are followed: where one widens out there, that counts in standard deviations
+and radii, not only what lies within 95 %."""
 _STEPS = (0.02, 0.35)  # of log phi
 _MOST_RISE = 1.5  # from one node to the next
 _MOST_NODES = 60
