@@ -216,7 +216,7 @@ def test_a_suspect_without_which_nothing_is_determined_stays_in() -> None:
 def test_covariance_is_widened_by_what_is_in_doubt() -> None:
     keys = (Key("camera", "c", "phi", "px"), Key("camera", "c", "cx", "px"))
     matrix, step = np.array([[2.0, 0.3], [0.3, 1.0]]), np.array([0.5, -2.0])
-    widened = np.linalg.inv(Information(keys, matrix).widened(step, 0.2).matrix)
+    widened = np.linalg.inv(Information(keys, matrix).widened(0.2**0.5 * step[None]).matrix)
     np.testing.assert_allclose(widened, np.linalg.inv(matrix) + 0.2 * np.outer(step, step), rtol=1e-12)
 
 

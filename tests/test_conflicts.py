@@ -243,7 +243,6 @@ def test_what_stands_beside_a_prior(seed: int, size: int, strength: float) -> No
 @settings(max_examples=20)
 def test_what_is_in_dispute_is_in_the_covariance(seed: int) -> None:
     """Two shifts d and e: C + d d^T + e e^T."""
-    from ceres_cal.solve import Conflicts
     from ceres_cal.uncertainty import Posterior
 
     rng = np.random.default_rng(seed)
@@ -251,6 +250,6 @@ def test_what_is_in_dispute_is_in_the_covariance(seed: int) -> None:
     rows = rng.standard_normal((6, 3))
     shifts = tuple(10.0 * rng.standard_normal((2, 3)))
     before = Posterior(Information(keys, rows.T @ rows))
-    after = before.in_doubt(Conflicts((), keys[::-1], tuple(shift[::-1] for shift in shifts)))
+    after = before.in_doubt(keys[::-1], [shift[::-1] for shift in shifts])
     expected = before.covariance + sum(np.outer(shift, shift) for shift in shifts)
     assert after.covariance == pytest.approx(expected, rel=1e-6, abs=1e-6)

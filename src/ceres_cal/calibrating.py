@@ -150,7 +150,7 @@ def solved_from(
     if again is None or again.assessed:
         conflicts = find_conflicts(problem, observations, end, usual)
         end, posterior = _assess(end, observations, problem, again)
-        posterior = _with_doubts(posterior.in_doubt(conflicts), end, explanations)
+        posterior = _with_doubts(posterior.in_doubt(conflicts.keys, conflicts.shifts), end, explanations)
         warnings = (*warnings, *(one.words for one in conflicts.every), *_unknown(end, posterior))
     digest.result()  # which the observations remember
     calibration = _calibration(start, observations, problem, end, explanations)
@@ -224,12 +224,9 @@ def _start_of(
 
 def _with_doubts(posterior: Posterior, end: RobustSolution, explanations: Sequence[Explanation]) -> Posterior:
     """The posterior with what the less probable explanations say in it."""
-    information = posterior.information
-    for one in explanations:
-        if one.is_doubtful:
-            step = difference(one.other, end.solution.estimate, information.keys)
-            information = information.widened(step, one.doubt)
-    return replace(posterior, information=information)
+    doubtful = [one for one in explanations if one.is_doubtful]
+    shifts = [one.doubt**0.5 * difference(one.other, end.solution.estimate, posterior.keys) for one in doubtful]
+    return posterior.in_doubt(posterior.keys, shifts)
 
 
 def _unknown(end: RobustSolution, posterior: Posterior) -> Iterator[str]:

@@ -81,11 +81,16 @@ class Information:
         whole.matrix[np.ix_(at, at)] = self.matrix
         return whole
 
-    def widened(self, step: Array, share: float) -> Information:
-        """With a covariance that is larger by this share of step step^T; step: (K,) (Sherman and Morrison)."""
-        slope = self.matrix @ step
-        less = share / (1.0 + share * float(slope @ step))
-        return Information(self.keys, self.matrix - less * np.outer(slope, slope))
+    def widened(self, shifts: Array) -> Information:
+        """With a covariance that is larger by d d^T for each of the shifts d (S, K) (Woodbury)."""
+        if not len(shifts):
+            return self
+        through = self.matrix @ shifts.T
+        middle = np.eye(len(shifts)) + shifts @ through
+        unit = np.sqrt(np.diagonal(middle))
+        scaled = through / unit
+        matrix = self.matrix - scaled @ np.linalg.solve(middle / unit[:, None] / unit, scaled.T)
+        return Information(self.keys, 0.5 * (matrix + matrix.T))
 
     def __add__(self, other: Information) -> Information:
         """Both together, over the keys of either."""

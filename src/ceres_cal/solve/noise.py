@@ -134,10 +134,13 @@ def judge(
         usual: scales of points and curves seen before; they count as much as a few spare equations do.
     """
     points, curves = relative_lengths(observations, residuals)
-    reject_sigma = options.reject_sigma
     if options.noise_scale == "stated":
-        return Inliers(points <= reject_sigma, curves <= reject_sigma, 1.0, 1.0, points, curves)
+        inside = points <= options.reject_sigma, curves <= options.reject_sigma
+        return Inliers(*inside, 1.0, 1.0, points, curves)
     floor = usual or (0.0, 0.0)
+    finite = np.count_nonzero(np.isfinite(points)), np.count_nonzero(np.isfinite(curves))
+    spare_of_all = 2.0 * redundancy.points * finite[0] + redundancy.curves * finite[1]
+    reject_sigma = _as_rare(options.reject_sigma, spare_of_all + (USUAL_EQUATIONS if usual else 0.0))
     point_spread = _spread(points, _RAYLEIGH_MEDIAN, reject_sigma, floor[0], 2.0 * redundancy.points)
     curve_spread = _spread(curves, _NORMAL_MEDIAN, reject_sigma, floor[1], redundancy.curves)
     spare = 2.0 * redundancy.points * point_spread.count, redundancy.curves * curve_spread.count
@@ -153,6 +156,16 @@ def judge(
         if degrees < _LEAST_SPARE:
             p, c, degrees = 1.0, 1.0, np.inf
     return Inliers(points <= reject_sigma * p, curves <= reject_sigma * c, p, c, points / p, curves / c, degrees)
+
+
+def _as_rare(sigmas: float, degrees: float) -> float:
+    """The length that is as rare among residuals over a scale that was estimated from so few spare equations as
+    `sigmas` is over a known one: (1 + length^2 / degrees)^(-degrees / 2) = exp(-sigmas^2 / 2), that of Student's t in
+    two dimensions. Where the stated sigmas are taken it is `sigmas`.
+    """
+    if degrees < _LEAST_SPARE:
+        return sigmas
+    return float(np.sqrt(degrees * np.expm1(sigmas**2 / degrees)))
 
 
 @dataclass(frozen=True)

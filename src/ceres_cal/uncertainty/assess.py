@@ -11,7 +11,8 @@ from ceres_cal.model.information import Information
 from ceres_cal.model.parameters import Estimate, unit_px
 from ceres_cal.scene.camera import Camera
 from ceres_cal.solve import Problem, ReducedInformation, information
-from ceres_cal.start.initialise import PHI_RANGE, USUAL_PHI
+from ceres_cal.start.initialise import PHI_RANGE, USUAL_PHI, USUAL_PHI_FACTOR
+from ceres_cal.uncertainty.bent import bends
 from ceres_cal.uncertainty.dependence import Scatter
 from ceres_cal.uncertainty.posterior import Posterior, make_posterior, widths_over
 from ceres_cal.uncertainty.profile import Node, PhiProfile, profile, valley
@@ -30,8 +31,8 @@ def assess(
     """What is known at the estimate, and the estimate: another one where phi went astray.
 
     Nearly frontal views can be fitted a little better by a camera a hand's breadth over the floor, or in the clouds,
-    than by the true one. Where the least cost lies at a phi that no lens has, or the observations say nothing of phi as
-    far as lenses go, the node of the valley within the 95 % bound that is nearest to a usual lens is taken; the
+    than by the true one. Where the least cost lies at a phi that no lens has, or the observations leave phi open on
+    a side as far as lenses go, the node of the valley is taken that fits best with what is usual of lenses; the
     posterior says that phi is unknown.
 
     Args:
@@ -51,15 +52,32 @@ def assess(
         if _is_lens(camera) and posterior.sd_of("camera", name, "phi") <= _BENT * camera.phi:
             continue
         nodes = valleys[name] = valley(name, astray, estimate, _inflation(posterior, name))
-        rise = max(nodes[0].cost, nodes[-1].cost) - min(node.cost for node in nodes)
+        rise = min(nodes[0].cost, nodes[-1].cost) - min(node.cost for node in nodes)
         if not _is_lens(camera) or rise < width**2:
-            estimate = _usual(name, nodes, width)
+            estimate = _usual(name, nodes)
             astray = astray.holding(name, 0)
     if astray is not problem:
         reduced = information(problem, estimate)
         posterior = make_posterior(reduced, degrees_of_freedom, scatter_at(estimate, reduced))
     profiles = {name: _profile(name, nodes, estimate, posterior) for name, nodes in valleys.items()}
-    return estimate, replace(posterior, profiles=profiles)
+    return estimate, _with_bends(replace(posterior, profiles=profiles), problem, estimate)
+
+
+def _with_bends(posterior: Posterior, problem: Problem, estimate: Estimate) -> Posterior:
+    """The posterior with what bends in it; across its valleys, where phi is held, that is put into what they say."""
+    followed = {profile.keys[0] for profile in posterior.profiles.values()}
+    held = [key for key in posterior.keys if key not in followed]
+    by_model = posterior.by_model or posterior.information
+    for name in posterior.profiles:
+        problem = problem.holding(name, 0)
+    bent = bends(problem, estimate, posterior.information.given(held), by_model.given(held), posterior.half_width)
+    if bent is None:
+        return posterior
+    profiles = {
+        name: replace(profile, across=tuple(map(bent.widened, profile.across)))
+        for name, profile in posterior.profiles.items()
+    }
+    return replace(posterior, profiles=profiles, bends=bent)
 
 
 def _inflation(posterior: Posterior, camera: str) -> float:
@@ -84,8 +102,11 @@ def _is_lens(camera: Camera) -> bool:
     return PHI_RANGE[0] * unit <= camera.phi <= PHI_RANGE[1] * unit
 
 
-def _usual(name: str, nodes: Sequence[Node], width: float) -> Estimate:
-    """Of the nodes within the 95 % bound the one whose phi is nearest to a usual lens'."""
-    least = min(node.cost for node in nodes)
-    possible = [node.estimate for node in nodes if node.cost - least <= width**2]
-    return min(possible, key=lambda e: abs(np.log(e.cameras[name].phi / (USUAL_PHI * unit_px(e.cameras[name])))))
+def _usual(name: str, nodes: Sequence[Node]) -> Estimate:
+    """The node that fits best with what is usual of lenses: a standard deviation is a factor of USUAL_PHI_FACTOR."""
+
+    def cost(node: Node) -> float:
+        camera = node.estimate.cameras[name]
+        return float(node.cost + (np.log(camera.phi / (USUAL_PHI * unit_px(camera))) / np.log(USUAL_PHI_FACTOR)) ** 2)
+
+    return min(nodes, key=cost).estimate

@@ -92,7 +92,7 @@ class _Family:
     """S strands side by side, of M rows each at most that the likelihood looks at.
 
     Attributes:
-        lasting: whether they go over several views. smooth: whether errors have no edges: then it is exp(-(d / l)^2 / 2).
+        lasting: whether they go over several views. smooth: whether errors have no edges: exp(-(d / l)^2 / 2).
         strands: with all their rows. rows: (S, M) of the sample; filled: (S, M) which there are. distance: (D, M, M) m,
             infinite where one is missing; same: (S,) which of them is each strand's. view: (S,) whose private
             placement it shows.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -16,7 +16,8 @@ from ceres_cal.model.information import Information
 from ceres_cal.model.keys import Key, pose_keys, sigma_limits
 from ceres_cal.model.parameters import Estimate, Layout
 from ceres_cal.model.quantities import layout_of
-from ceres_cal.solve import Conflicts, Eliminated, ReducedInformation
+from ceres_cal.solve import Eliminated, ReducedInformation
+from ceres_cal.uncertainty.bent import Bends
 from ceres_cal.uncertainty.dependence import Dependence, Scatter
 from ceres_cal.uncertainty.profile import PhiProfile
 
@@ -36,6 +37,7 @@ class Posterior:
         profiles: camera -> the valley along its phi, where that is too little known for the quadratic picture.
         by_model: what the model alone says of the shared numbers, were every error independent of the others; None
             where that is all there is. dependence: what the rest of it rests on; None where nobody asked.
+        bends: what else leaves the quadratic picture, or None: it counts in sd, bounds and maps.
     """
 
     information: Information
@@ -44,24 +46,22 @@ class Posterior:
     profiles: Mapping[str, PhiProfile] = field(default_factory=dict)
     by_model: Information | None = None
     dependence: Dependence | None = None
+    bends: Bends | None = None
 
     @property
     def keys(self) -> tuple[Key, ...]:
         """(P) the numbers that are shared."""
         return self.information.keys
 
-    def in_doubt(self, conflicts: Conflicts) -> Posterior:
-        """The posterior that holds what is in dispute: the shift d of everything when a statement in conflict is left
-        out goes into the covariance as d d^T (into the information by Sherman and Morrison), so that no number is
-        stated better than to what it would move.
+    def in_doubt(self, keys: Sequence[Key], shifts: Sequence[Array]) -> Posterior:
+        """The posterior that holds what is in dispute: each shift d (K,) of some numbers, when something is left out,
+        goes into the covariance as d d^T, so that no number is stated better than to what it would move.
         """
-        matrix, at = self.information.matrix, self.information.columns(self.information.among(conflicts.keys))
-        own = [conflicts.keys.index(self.keys[column]) for column in at]
-        for shift in conflicts.shifts:
-            pull = matrix[:, at] @ shift[own]
-            matrix = matrix - np.outer(pull, pull) / (1.0 + shift[own] @ pull[at])
-        information = Information(self.keys, matrix)
-        placements = self.placements
+        if not len(shifts):
+            return self
+        common, whole = self.information.among(keys), np.zeros((len(shifts), len(self.keys)))
+        whole[:, self.information.columns(common)] = np.array(shifts)[:, [list(keys).index(key) for key in common]]
+        information, placements = self.information.widened(whole), self.placements
         if isinstance(placements, _Placements):
             placements = replace(placements, shared=information)
         return replace(self, information=information, placements=placements)
@@ -79,7 +79,10 @@ class Posterior:
     @cached_property
     def sd(self) -> Array:
         """(P,) standard deviations in the units of the keys, infinite where unknown."""
-        return self.spread.sd
+        variance = self.spread.sd**2
+        if self.bends is not None:
+            variance[self.information.columns(self.bends.keys)] += np.sum(self.bends.excesses**2, axis=0)
+        return np.asarray(np.sqrt(variance))
 
     @cached_property
     def factors(self) -> Array:
@@ -96,12 +99,16 @@ class Posterior:
     @cached_property
     def bounds(self) -> Array:
         """(P, 2) 95 % bounds of the shared numbers, from the estimate; infinite on a side that is open."""
-        bounds = self.half_width * self.sd[:, None] * (-1.0, 1.0)
+        return self.bounds_at(self.half_width)
+
+    def bounds_at(self, width: float) -> Array:
+        """(P, 2) the same so many standard deviations up, at most three."""
+        bounds = width * self.sd[:, None] * (-1.0, 1.0)
         for profile in self.profiles.values():
             across = [information.spread.sd for information in profile.across]
             sds = np.column_stack([np.zeros(len(across)), across])
             at = self.information.columns(profile.keys)
-            bounds[at] = np.column_stack(profile.bounds(profile.steps, sds, self.half_width))
+            bounds[at] = np.column_stack(profile.bounds(profile.steps, sds, width))
         return np.asarray(bounds)
 
     def layout(self, estimate: Estimate) -> Layout:

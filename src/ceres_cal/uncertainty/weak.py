@@ -13,6 +13,7 @@ from ceres_cal.model.keys import PLACEMENT_QUANTITIES, Key
 from ceres_cal.model.parameters import Estimate
 from ceres_cal.model.quantities import natural_sizes, values_of
 from ceres_cal.uncertainty.posterior import Posterior
+from ceres_cal.uncertainty.profile import FARTHER
 
 KNOWN, WEAK = 0.01, 0.3
 """Relative sigmas: up to the first a number is known (phi of 868 px to 9 px, a height of 4 m to 40 mm, a turn to 0.6
@@ -66,6 +67,8 @@ def verdicts(estimate: Estimate, posterior: Posterior) -> tuple[Verdict, ...]:
     """One for each shared number, in the order of the posterior's keys."""
     bounds, values = posterior.bounds, values_of(estimate, posterior.keys)
     half = (bounds[:, 1] - bounds[:, 0]) / (2.0 * posterior.half_width)
+    if posterior.profiles:  # a valley that widens farther out is no better known than there
+        half = np.maximum(half, np.ptp(posterior.bounds_at(FARTHER), axis=1) / (2.0 * FARTHER))
     relative = half / natural_sizes(estimate, posterior.keys)
     low, high = values + bounds[:, 0], values + bounds[:, 1]
     followed = np.zeros(len(values), dtype=bool)
