@@ -1,70 +1,26 @@
-"""How the kernels are compiled and where the machine code is kept.
-
-numba's cache looks at the file of the compiled function alone, not at the files it calls into. So the kernels are kept
-in a folder named after all their sources: change one line of one of them and all are compiled anew.
-"""
+"""How the kernels are compiled."""
 
 from __future__ import annotations
 
-import hashlib
 import inspect
-import os
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from types import FunctionType
 from typing import Any
 
-from numba import cfunc, config, njit
+from numba import njit
+from numba.core.ccallback import CFunc
 
-_CONFIG: Any = config  # numba makes its settings at import; no stub knows them
-_NJIT: Any = njit  # nor `_nrt`: whether references are counted
-_CFUNC: Any = cfunc
+from ceres_cal.kernels.store import IS_KEPT, KernelStore, digest
 
-
-def _cache_folder() -> Path:
-    base = _CONFIG.CACHE_DIR or os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(base) / "ceres-cal" / _digest(Path(__file__).parent.glob("*.py"))
-
-
-def _digest(paths: Iterable[Path]) -> str:
-    sources = hashlib.sha256()
-    for path in sorted(paths):
-        sources.update(path.read_bytes())
-    return sources.hexdigest()[:16]
-
-
-CACHE_FOLDER = _cache_folder()
-
-
-def _is_writable(folder: Path) -> bool:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError:
-        return False
-    return os.access(folder, os.W_OK)
-
-
-_CACHED = _is_writable(CACHE_FOLDER)
-
+_NJIT: Any = njit  # no stub knows `_nrt`: whether references are counted
 
 _OPTIONS: dict[str, Any] = {"error_model": "numpy", "fastmath": {"reassoc", "contract", "nsz"}}
 
 
-@contextmanager
-def _cached_in(folder: Path) -> Iterator[None]:
-    others = _CONFIG.CACHE_DIR
-    _CONFIG.CACHE_DIR = str(folder)
-    try:
-        yield
-    finally:
-        _CONFIG.CACHE_DIR = others
-
-
 def jit(function: Callable[..., Any], counted: bool = True) -> Callable[..., Any]:
     """Compile without the GIL; reassoc and contract let sums be vectorised, NaN and infinity keep their meaning."""
-    with _cached_in(CACHE_FOLDER):
-        compiled: Callable[..., Any] = _NJIT(cache=_CACHED, nogil=True, _nrt=counted, **_OPTIONS)(function)
+    compiled: Callable[..., Any] = _kept(_NJIT(nogil=True, _nrt=counted, **_OPTIONS)(function), function, set())
     return compiled
 
 
@@ -82,9 +38,18 @@ def compile_callback(function: Callable[..., Any], signature: Any) -> Any:
     """
     files: set[Path] = set()
     whole = _with_callees(function, files)
-    readable = all(path.is_file() for path in files)  # what was typed into an interpreter is compiled each time
-    with _cached_in(CACHE_FOLDER / _digest(files) if readable else CACHE_FOLDER):
-        return _CFUNC(signature, cache=_CACHED and readable, _nrt=False, **_OPTIONS)(whole)
+    taken = signature.args, signature.return_type
+    callback: Any = CFunc(whole, taken, locals={}, options={"_nrt": False, **_OPTIONS})
+    _kept(callback, whole, files).compile()
+    return callback
+
+
+def _kept(compiled: Any, function: Callable[..., Any], files: set[Path]) -> Any:
+    """The same, which is not compiled yet, with what it becomes kept in files; it comes from `files` and its own."""
+    files = {*files, Path(inspect.getfile(function))}
+    if IS_KEPT and all(path.is_file() for path in files):  # what was typed into an interpreter is compiled each time
+        compiled._cache = KernelStore(function, digest(files))
+    return compiled
 
 
 def _with_callees(function: Any, files: set[Path]) -> FunctionType:
