@@ -37,10 +37,8 @@ _LIBRARY: Any = JITCodeLibrary  # no stub knows what it inherits
 _LLVM: Any = llvm
 _CONFIG: Any = numba.config  # numba makes its settings at import
 
-# The kernels that come with the package are compiled for this, which ten years of machines have; the features are
-# those that tell such a machine.
-_CARRIED_FOR = {"x86_64": ("x86-64-v3", ("avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt", "movbe"))}
-CARRIED_FOLDER = _HERE / "carried"
+# What the kernels that come with the package are compiled for, by machine: ten years of processors have these features.
+BASELINES = {"x86_64": ("x86-64-v3", ("avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt", "movbe"))}
 
 
 def digest(paths: Iterable[Path]) -> str:
@@ -78,15 +76,24 @@ def _is_writable(folder: Path) -> bool:
 IS_KEPT = _is_writable(CACHE_FOLDER)
 
 
+CARRIED_FOLDER = _HERE / "carried" / f"{_RELEASE}-{BASELINES.get(platform.machine(), ('none',))[0]}"
+"""Machine code that comes with the package: see scripts/carry_kernels.py."""
+
+
 @cache
 def _carried() -> Path | None:
     """The folder of the machine code that came with the package, where it is this version's and runs here."""
-    name, needed = _CARRIED_FOR.get(platform.machine(), ("", ()))
-    folder = CARRIED_FOLDER / f"{_RELEASE}-{name}"
-    if not folder.is_dir():
+    if not CARRIED_FOLDER.is_dir():
         return None
     features = _LLVM.get_host_cpu_features()
-    return folder if all(features.get(feature) for feature in needed) else None
+    return CARRIED_FOLDER if all(features.get(feature) for feature in BASELINES[platform.machine()][1]) else None
+
+
+@cache
+def _own_folder(codegen: Any) -> Path:
+    """Of what was compiled here, for this processor."""
+    processor = codegen.magic_tuple()
+    return CACHE_FOLDER / f"{processor[1]}-{hashlib.sha256(repr(processor).encode()).hexdigest()[:8]}"
 
 
 class KernelStore:
@@ -109,29 +116,28 @@ class KernelStore:
 
     def load_overload(self, signature: Any, target: Any) -> Any:
         """The compiled function; None, with the lock taken, where it must be compiled."""
-        for folder in filter(None, (_carried(), CACHE_FOLDER)):
-            loaded = _loaded(folder / self._file_name(signature, target.codegen(), folder), target)
-            if loaded is not None:
-                return loaded
-        self.lock()
-        loaded = _loaded(CACHE_FOLDER / self._file_name(signature, target.codegen(), CACHE_FOLDER), target)
-        if loaded is not None:  # somebody else compiled it meanwhile
-            self.unlock()
-        else:
-            _say_that_it_takes_time()
+        name, own = self._file_name(signature), _own_folder(target.codegen())
+        carried = _carried()
+        loaded = (carried and _loaded(carried / name, target)) or _loaded(own / name, target)
+        if loaded is None:
+            self.lock()
+            loaded = _loaded(own / name, target)
+            if loaded is not None:  # somebody else compiled it meanwhile
+                self.unlock()
+            else:
+                _say_that_it_takes_time()
         return loaded
 
     def save_overload(self, signature: Any, compiled: Any) -> None:
         """Keep a compiled function; what cannot be kept, on a full disk for one, is used all the same."""
         try:
             with suppress(OSError):
-                _save(compiled, CACHE_FOLDER / self._file_name(signature, compiled.codegen, CACHE_FOLDER))
+                _save(compiled, _own_folder(compiled.codegen) / self._file_name(signature))
         finally:
             self.unlock()
 
-    def _file_name(self, signature: Any, codegen: Any, folder: Path) -> str:
-        processor = codegen.magic_tuple() if folder == CACHE_FOLDER else ()
-        key = hashlib.sha256(repr((self._key, str(signature), processor)).encode()).hexdigest()
+    def _file_name(self, signature: Any) -> str:
+        key = hashlib.sha256(repr((self._key, str(signature))).encode()).hexdigest()
         return f"{self._name}-{key[:24]}.nbc"
 
     @staticmethod
@@ -168,7 +174,7 @@ def _say_that_it_takes_time() -> None:
     """One line on standard error in a process that compiles, unless the caller has logging do otherwise."""
     import logging
 
-    some = next(CACHE_FOLDER.glob("*.nbc"), None) is not None
+    some = _carried() or next(CACHE_FOLDER.rglob("*.nbc"), None)
     how_long = "some seconds each" if some else "one or two minutes in all"
     logging.getLogger("ceres_cal").warning("ceres-cal: compiling kernels for this machine, once: %s", how_long)
 
@@ -199,6 +205,7 @@ def _save(compiled: Any, path: Path) -> None:
     things = [*module.functions, *module.global_variables]
     symbols = frozenset(one.name for one in things if not one.is_declaration)
     temporary = path.with_suffix(f".{uuid4().hex[:16]}")
+    path.parent.mkdir(exist_ok=True)
     try:
         temporary.write_bytes(dumps(((name, *code, symbols), *others)))  # type: ignore[no-untyped-call]
         temporary.replace(path)
