@@ -11,7 +11,7 @@ from typing import Any
 from numba import njit
 from numba.core.ccallback import CFunc
 
-from ceres_cal.kernels.store import IS_KEPT, KernelStore, digest
+from ceres_cal.kernels.store import KernelStore, digest
 
 _NJIT: Any = njit  # no stub knows `_nrt`: whether references are counted
 
@@ -47,7 +47,7 @@ def compile_callback(function: Callable[..., Any], signature: Any) -> Any:
 def _kept(compiled: Any, function: Callable[..., Any], files: set[Path]) -> Any:
     """The same, which is not compiled yet, with what it becomes kept in files; it comes from `files` and its own."""
     files = {*files, Path(inspect.getfile(function))}
-    if IS_KEPT and all(path.is_file() for path in files):  # what was typed into an interpreter is compiled each time
+    if all(path.is_file() for path in files):  # what was typed into an interpreter is compiled each time
         compiled._cache = KernelStore(function, digest(files))
     return compiled
 

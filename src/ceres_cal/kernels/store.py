@@ -63,19 +63,6 @@ def _cache_folder() -> Path:
 
 
 CACHE_FOLDER = _cache_folder()
-
-
-def _is_writable(folder: Path) -> bool:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError:
-        return False
-    return os.access(folder, os.W_OK)
-
-
-IS_KEPT = _is_writable(CACHE_FOLDER)
-
-
 CARRIED_FOLDER = _HERE / "carried" / f"{_RELEASE}-{BASELINES.get(platform.machine(), ('none',))[0]}"
 """Machine code that comes with the package: see scripts/carry_kernels.py."""
 
@@ -129,7 +116,7 @@ class KernelStore:
         return loaded
 
     def save_overload(self, signature: Any, compiled: Any) -> None:
-        """Keep a compiled function; what cannot be kept, on a full disk for one, is used all the same."""
+        """Keep a compiled function; what cannot be kept, in a home that is read-only for one, is used all the same."""
         try:
             with suppress(OSError):
                 _save(compiled, _own_folder(compiled.codegen) / self._file_name(signature))
@@ -145,6 +132,7 @@ class KernelStore:
         """Wait until no other process compiles."""
         if KernelStore._depth == 0:
             with suppress(OSError):
+                CACHE_FOLDER.mkdir(parents=True, exist_ok=True)
                 KernelStore._handle = os.open(CACHE_FOLDER / "lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
                 _wait_for(KernelStore._handle)
         KernelStore._depth += 1
@@ -205,7 +193,7 @@ def _save(compiled: Any, path: Path) -> None:
     things = [*module.functions, *module.global_variables]
     symbols = frozenset(one.name for one in things if not one.is_declaration)
     temporary = path.with_suffix(f".{uuid4().hex[:16]}")
-    path.parent.mkdir(exist_ok=True)
+    path.parent.mkdir(parents=True, exist_ok=True)
     try:
         temporary.write_bytes(dumps(((name, *code, symbols), *others)))  # type: ignore[no-untyped-call]
         temporary.replace(path)
