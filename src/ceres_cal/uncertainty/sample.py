@@ -14,7 +14,7 @@ import numpy as np
 
 from ceres_cal import kernels
 from ceres_cal.base.arrays import AnyArray, Array, Indices, Mask
-from ceres_cal.model.equations import Equations, write_equations
+from ceres_cal.model.equations import Equations, of_observations, write_equations
 from ceres_cal.model.parameters import Estimate
 from ceres_cal.model.residuals import Residuals
 from ceres_cal.observations import Observations
@@ -156,9 +156,9 @@ def _some_rows(view: AnyArray, chosen: Mask) -> Mask:
 def _weights(observations: Observations, problem: Problem, equations: Equations, there: Residuals) -> Weights:
     """Of each equation, the root of its robust weight in its standard deviation."""
     weighting, at = problem.weighting, equations.observation
-    points, curves = observations.points.sigma_px, observations.curves.sigma_px
-    sigma = np.concatenate([weighting.point_scale * points, weighting.curve_scale * curves])[at]
-    squared = (np.concatenate(there.lengths)[at] / sigma) ** 2
+    scale = np.where(equations.is_curve, weighting.curve_scale, weighting.point_scale)
+    sigma = scale * of_observations(at, observations.points.sigma_px, observations.curves.sigma_px)
+    squared = (of_observations(at, *there.lengths) / sigma) ** 2
     robust = kernels.loss_weights(kernels.Loss(kernels.LOSS_CODES[weighting.loss], weighting.loss_scale), squared)
     everything = np.ones(len(equations))
     return Weights(np.sqrt(robust) / sigma, everything > 0.0, everything)
