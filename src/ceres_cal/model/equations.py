@@ -93,6 +93,11 @@ def write_equations(observations: Observations, sights: Sights, estimate: Estima
     sights = sights.used(np.isfinite(x + y), np.isfinite(there.curves))
     if not len(sights):
         raise SolutionError("the calibration can show none of the observations: give those it was made from")
+    return equations_of(observations, sights, estimate, there)
+
+
+def equations_of(observations: Observations, sights: Sights, estimate: Estimate, there: Residuals) -> Equations:
+    """The equations of some sights, all of whose residuals are finite."""
     poses = estimate.pose_stack(sights.keys)
     parts = [
         part

@@ -176,23 +176,25 @@ def _is_loud(sample: Sample, family: _Family) -> bool:
     independent errors, of which the fit took up the part U U'.
     """
     gap, longest = family.gap, family.longest
-    taken = family.columns(np.column_stack([sample.private, sample.shared]))
-    left = family.columns(sample.left[:, None])
+    columns = family.columns(np.column_stack([sample.private, sample.shared, sample.left]))
+    taken, left = columns[..., :-1], columns[..., -1]
     noise = np.sum(left**2) / max(np.count_nonzero(family.filled) - np.sum(taken**2), 1.0)
     if gap == 0.0 or noise < _NO_NOISE:
         return False
     left /= np.sqrt(noise)
+    private = sample.private.shape[1]
     for length in (gap, np.sqrt(gap * longest), _ASIDE * longest):
         together = np.exp(-family.distance / length) * (family.distance > 0.0)
         squares = np.sum(together**2, axis=(1, 2))[family.same].sum()
         together = together if len(together) == 1 else together[family.same]
-        along = together @ taken
-        total = float(np.sum(left * (together @ left)) + np.sum(taken * along))
+        along = together @ columns
+        hat = taken * along[..., :-1]
+        total = float(np.sum(left * along[..., -1]) + np.sum(hat))
+        along = along[..., :-1]
         inner = np.swapaxes(taken, 1, 2) @ along
         variance = 2.0 * (squares - 2.0 * np.sum(along**2) + np.sum(inner**2))
         sd = float(np.sqrt(max(variance, 0.2 * squares)))
-        shared = np.s_[:, :, sample.private.shape[1] :]
-        widening = total / squares * float(np.sum(taken[shared] * along[shared]) / np.sum(taken[shared] ** 2))
+        widening = total / squares * float(np.sum(hat[..., private:]) / np.sum(taken[..., private:] ** 2))
         if total > _LOUD * sd and widening > _MATTERS:
             return True
     return False

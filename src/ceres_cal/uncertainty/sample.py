@@ -14,7 +14,7 @@ import numpy as np
 
 from ceres_cal import kernels
 from ceres_cal.base.arrays import AnyArray, Array, Indices, Mask
-from ceres_cal.model.equations import Equations, of_observations, write_equations
+from ceres_cal.model.equations import Equations, equations_of, of_observations
 from ceres_cal.model.parameters import Estimate
 from ceres_cal.model.residuals import Residuals
 from ceres_cal.observations import Observations
@@ -22,7 +22,7 @@ from ceres_cal.observations.sights import Sights
 from ceres_cal.solve import Problem, ReducedInformation
 from ceres_cal.solve.linear_model import Weights, inverse_root, without_shared
 
-_MOST_VIEWS = 20  # of a camera
+_MOST_VIEWS = 16  # of a camera
 _MOST_ROWS = 1_500  # of a kind in a view
 _DETERMINED = 1e-11  # eigenvalue, at unit diagonal, from which on a direction counts as determined
 
@@ -105,7 +105,7 @@ def take_sample(
     information = reduced.shared.matrix
     if not len(information):
         return None
-    equations = write_equations(observations, _some(observations, problem.sights), estimate, there)
+    equations = equations_of(observations, _some(observations, problem.sights), estimate, there)
     blank, columns = without_shared(problem, estimate, equations, _weights(observations, problem, equations, there))
     placed = blank.beyond_private(np.column_stack([columns, blank.score]))
     root = inverse_root(information, np.diagonal(information), _DETERMINED)
@@ -131,7 +131,9 @@ def _some(observations: Observations, sights: Sights) -> Sights:
             view for key, views in zip(sights.keys, sights.views, strict=True) if key.camera == camera for view in views
         ]
         chosen[np.array(views)[evenly(len(views), _MOST_VIEWS)]] = True
-    if chosen.all() and max(len(sights.point_rows), len(sights.curve_rows)) <= _MOST_ROWS:
+    sights = sights.take(np.flatnonzero([chosen[list(views)].any() for views in sights.views]))
+    rows = max(np.diff(sights.point_bounds).max(), np.diff(sights.curve_bounds).max())
+    if rows <= _MOST_ROWS and all(chosen[list(views)].all() for views in sights.views):
         return sights
     points, curves = (_some_rows(column.view, chosen) for column in (observations.points, observations.curves))
     return sights.used(points, curves)
