@@ -329,7 +329,7 @@ class _Court:
         single, curves, largest = self._kinds[0], self._observations.curves, np.zeros(len(self._observations.views))
         own = single.of[len(self._observations.points) :]
         sigmas = end.residuals.curves / (end.inliers.curve_scale * curves.sigma_px)
-        inside = np.where(end.inliers.curves, sigmas, 0.0)
+        inside = np.where(end.inliers.curves & np.isfinite(sigmas), sigmas, 0.0)
         mean = np.abs(np.bincount(own, inside)) / np.sqrt(np.maximum(np.bincount(own, end.inliers.curves), 1.0))
         np.maximum.at(largest, curves.view, mean[own])
         return largest
