@@ -20,7 +20,8 @@ from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import gather_sights
 from ceres_cal.scene.camera import Camera
 from ceres_cal.solve import Problem, Progress, RobustSolution, Solution, information, solve_robustly
-from ceres_cal.solve.competing import Explanation, compete
+from ceres_cal.solve.competing import compete
+from ceres_cal.solve.explanation import Explanation
 from ceres_cal.solve.noise import Inliers, visible_from
 from ceres_cal.solve.possible import require_possible
 from ceres_cal.start.baseline import four_point_baseline
