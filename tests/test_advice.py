@@ -340,7 +340,7 @@ def test_the_command_says_what_to_do_first(file: str, capsys: pytest.CaptureFixt
     assert text.startswith(
         "advice    measure the camera's height to 10 mm: the worst error at 150 mm falls from 111.7 to 2.2 mm"
     )
-    assert "today     station 'overhead' at 150 mm: worst 111.7 mm at (4.5, -3.0 m), mean 35.9 mm" in text
+    assert "today     station 'overhead' at 150 mm: worst 111.7 mm at (4.5, -3.0 m), mean 60.4 mm" in text
     assert "that is still more than the 0.1 mm asked for" in text
     assert "phi of 'overhead' and its height trade off" in text
     assert max(map(len, text.splitlines())) <= 130
