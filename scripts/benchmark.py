@@ -241,9 +241,10 @@ def uncertainty_share(frames: int, repeat: int) -> float:
     """What the standard deviations of everything, placements too, add to a calibration's seconds (median of turns)."""
     from ceres_cal.calibrating import calibrate
     from ceres_cal.model.parameters import Options, make_layout
+    from ceres_cal.model.residuals import residuals
     from ceres_cal.observations.sights import gather_sights
     from ceres_cal.solve import Problem, Weighting, information
-    from ceres_cal.uncertainty import assess
+    from ceres_cal.uncertainty import assess, measure_scatter
 
     observations, options = corner_observations(wide_lens(frames).corners), Options(lens="brown", free_aspect=True)
     calibrate(observations, options)
@@ -253,7 +254,9 @@ def uncertainty_share(frames: int, repeat: int) -> float:
         calibration = calibrate(observations, options)
         middle = time.perf_counter()
         whole = Problem(sights, layout, (), Weighting(calibration.fit.point_scale), options)
-        _, posterior = assess(whole, calibration.estimate, information(whole, calibration.estimate), np.inf)
+        estimate, reduced = calibration.estimate, information(whole, calibration.estimate)
+        there = residuals(observations, sights, estimate)
+        _, posterior = assess(whole, estimate, reduced, np.inf, partial(measure_scatter, observations, whole, there))
         assessed = time.perf_counter() - middle
         known = len(posterior.placements)  # works them all out
         everything = time.perf_counter() - middle

@@ -252,16 +252,6 @@ def test_new_data_tell_a_camera_that_was_bumped(turned_deg: float, found: str) -
     assert ("would move it by" in page) == (turned_deg > 0.0)
 
 
-def test_neighbours_that_agree_make_every_sigma_larger() -> None:
-    calibration, observations = sample()
-    found = diagnose(calibration, observations)
-    noise = tuple(replace(one, effective=one.observations / 4.0) for one in found.noise)
-    agree = replace(found.findings[0], kind="correlated")
-    chapter = verdict_chapter(Material(calibration, observations, replace(found, findings=(agree,), noise=noise)))
-    assert chapter.level == "care"
-    assert "take every standard deviation 2 times as large" in "".join(piece.html() for piece in chapter.pieces)
-
-
 # ---- what is drawn --------------------------------------------------------------------------------------------------
 
 

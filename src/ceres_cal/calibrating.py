@@ -12,18 +12,18 @@ from ceres_cal.base.errors import SolutionError
 from ceres_cal.base.threads import at_most, meanwhile, single_threaded_blas
 from ceres_cal.base.words import bounds_text
 from ceres_cal.calibration import Calibration, Fit, Rejected
-from ceres_cal.model.parameters import Layout, Options, make_layout
+from ceres_cal.model.parameters import Estimate, Layout, Options, make_layout
 from ceres_cal.model.priors import gather_priors
 from ceres_cal.model.residuals import residuals
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import gather_sights
 from ceres_cal.scene.camera import Camera
-from ceres_cal.solve import Problem, Progress, RobustSolution, Solution, information, solve_robustly
+from ceres_cal.solve import Problem, Progress, ReducedInformation, RobustSolution, Solution, information, solve_robustly
 from ceres_cal.solve.noise import Inliers, visible_from
 from ceres_cal.solve.possible import require_possible
 from ceres_cal.start.baseline import four_point_baseline
 from ceres_cal.start.initialise import Start, initialise
-from ceres_cal.uncertainty import Posterior, Uncertainty, assess
+from ceres_cal.uncertainty import Posterior, Scatter, Uncertainty, assess, measure_scatter
 
 # Of the image's diagonal, 24 px of 1600: half of a camera's observations farther off is no calibration, while a lens
 # that is too simple stays below a few pixels. Nothing changes from half to double.
@@ -143,7 +143,13 @@ def _assess(
     estimate = end.solution.estimate
     reduced = end.reduced if again is None else None
     reduced = reduced or information(known, estimate)
-    assessed, posterior = assess(known, estimate, reduced, end.inliers.degrees_of_freedom)
+
+    def scatter_at(there: Estimate, says: ReducedInformation) -> Scatter | None:
+        at_end = there is estimate
+        found = end.residuals if at_end else residuals(observations, known.sights, there, end.residuals.feet)
+        return measure_scatter(observations, known, found, there, says)
+
+    assessed, posterior = assess(known, estimate, reduced, end.inliers.degrees_of_freedom, scatter_at)
     return (end if assessed is estimate else end.moved_to(assessed, observations, problem)), posterior
 
 

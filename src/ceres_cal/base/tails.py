@@ -42,6 +42,17 @@ def upper_tail(value: float, degrees: int, freedom: float = math.inf) -> float:
     return float(np.average(np.exp(log_chi2_tail(values, degrees)), weights=np.exp(-0.5 * z * z)))
 
 
+def student_95(degrees_of_freedom: float) -> float:
+    """Half width of the 95 % interval of Student's t, by the series of Cornish and Fisher: 0.1 % from 5 degrees on."""
+    z, n = NORMAL_95, max(degrees_of_freedom, 1.0)
+    terms = (
+        (z**3 + z) / 4.0,
+        (5.0 * z**5 + 16.0 * z**3 + 3.0 * z) / 96.0,
+        (3.0 * z**7 + 19.0 * z**5 + 17.0 * z**3 - 15.0 * z) / 384.0,
+    )
+    return z + sum(term / n**power for power, term in enumerate(terms, start=1))
+
+
 def log_chi2_tail(value: ArrayLike, freedom: ArrayLike) -> Array:
     """log P(chi-squared with `freedom` degrees of freedom > value)."""
     x, a = np.broadcast_arrays(0.5 * np.asarray(value, dtype=float), 0.5 * np.asarray(freedom, dtype=float))

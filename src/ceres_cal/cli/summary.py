@@ -243,6 +243,8 @@ def _uncertainty_lines(quality: Quality) -> Iterator[tuple[str, list[str]]]:
             seams.append(f"{measured} (rms of {count} points and stretches that both observed)")
     if seams:
         yield "seam", seams
+    if quality.uncertainty.widening:
+        yield "widened", [quality.uncertainty.widening]
     weak = [direction.words for direction in quality.uncertainty.weak_directions]
     if weak:
         more = [f"and {len(weak) - _MOST_DIRECTIONS} more (--json)"] if len(weak) > _MOST_DIRECTIONS else []
@@ -271,6 +273,8 @@ def _uncertainty_data(quality: Quality) -> dict[str, Any] | None:
         return None
     return {
         "numbers": [{**asdict(v), "key": v.key._asdict()} for v in uncertainty.verdicts],
+        "widening": uncertainty.widening,
+        "dependence": uncertainty.posterior.dependence,
         "weak_directions": [
             {"words": d.words, "relative": d.relative, "shares": [[*key[:3], share] for key, share in d.shares]}
             for d in uncertainty.weak_directions

@@ -10,20 +10,20 @@ from ceres_cal import kernels
 from ceres_cal.base.errors import InputError
 from ceres_cal.calibration import Calibration
 from ceres_cal.diagnostics.diagnostic import Case, Tested
-from ceres_cal.diagnostics.equations import Equations, write_equations
 from ceres_cal.diagnostics.findings import Finding
 from ceres_cal.diagnostics.labels import find_mislabelled
 from ceres_cal.diagnostics.leftover import Noise, measure_noise
-from ceres_cal.diagnostics.linear_model import Weights, make_linear_model
 from ceres_cal.diagnostics.of_new_data import with_newcomers_placed
 from ceres_cal.diagnostics.of_target import recalled
 from ceres_cal.diagnostics.registry import DIAGNOSTICS, all_families
 from ceres_cal.diagnostics.scores import select
 from ceres_cal.diagnostics.summaries import Summaries, summarise
 from ceres_cal.diagnostics.table import ResidualTable, make_table
+from ceres_cal.model.equations import Equations, write_equations
 from ceres_cal.model.parameters import Options
 from ceres_cal.model.residuals import Residuals, residuals
 from ceres_cal.observations import Observations
+from ceres_cal.solve.linear_model import Weights, make_linear_model
 from ceres_cal.solve.noise import USUAL_EQUATIONS, Inliers, Redundancy, judge, relative_lengths
 
 FALSE_ALARM_RATE = 0.01

@@ -13,16 +13,16 @@ import numpy as np
 from ceres_cal.base.arrays import Array, Indices, Mask
 from ceres_cal.base.words import two_digits
 from ceres_cal.calibration import Calibration
-from ceres_cal.diagnostics.equations import Equations
 from ceres_cal.diagnostics.findings import Amount, Finding, Wrong
 from ceres_cal.diagnostics.labels import Mislabelling
 from ceres_cal.diagnostics.leftover import Noise
-from ceres_cal.diagnostics.linear_model import LinearModel
 from ceres_cal.diagnostics.scores import Family, Score, Selection
 from ceres_cal.diagnostics.table import ResidualTable, plane_shift
+from ceres_cal.model.equations import Equations
 from ceres_cal.model.parameters import Estimate
 from ceres_cal.observations import Observations
 from ceres_cal.solve import Problem
+from ceres_cal.solve.linear_model import LinearModel
 from ceres_cal.solve.noise import Inliers
 
 _LN_10 = float(np.log(10.0))

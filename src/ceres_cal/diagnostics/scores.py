@@ -15,7 +15,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask
 from ceres_cal.base.tails import log_f_tail
-from ceres_cal.diagnostics.linear_model import LEAST_LEFT, LinearModel, inverse_root
+from ceres_cal.solve.linear_model import LEAST_LEFT, LinearModel, inverse_root
 
 _MOST = 12  # causes that are named; more than that is not a calibration with faults but none
 # Of the first cause's statistic: below it the error of its linear picture speaks. At half of it one of seven planted

@@ -9,9 +9,9 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask
 from ceres_cal.diagnostics.diagnostic import Case
-from ceres_cal.diagnostics.linear_model import LinearModel
 from ceres_cal.diagnostics.table import ResidualTable, numbers_of
 from ceres_cal.scene.camera import Camera
+from ceres_cal.solve.linear_model import LinearModel
 
 REGIONS = (6, 4)
 """Columns and rows of equal parts into which an image is divided."""

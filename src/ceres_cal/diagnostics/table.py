@@ -14,10 +14,10 @@ import numpy as np
 from ceres_cal.base.arrays import AnyArray, Array, Codes, Indices, Mask
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import write_bytes, write_json
-from ceres_cal.diagnostics.equations import Equations
-from ceres_cal.diagnostics.linear_model import LinearModel
+from ceres_cal.model.equations import Equations
 from ceres_cal.observations import Observations
 from ceres_cal.scene.camera import Camera
+from ceres_cal.solve.linear_model import LinearModel
 from ceres_cal.solve.noise import Inliers
 
 FORMAT, VERSION = "ceres-cal/residuals", 1

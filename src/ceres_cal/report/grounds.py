@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from ceres_cal.base.words import counted, first_of, mm, sentence, short
+from ceres_cal.base.words import counted, first_of, mm, sentence
 from ceres_cal.diagnostics import Finding
 from ceres_cal.report.material import Material
 
@@ -80,14 +80,13 @@ def _of_findings(material: Material) -> Iterator[tuple[str, str]]:
             "no" if off_mm > GOOD_MM else "care",
             f"A refit to these new data would move it by {mm(off_mm)} rms: was the camera bumped?",
         )
-    if any(finding.kind == "correlated" for finding in diagnosis.findings):
-        factor = max(one.inflation for one in diagnosis.noise) ** 0.5
-        yield "care", f"Neighbouring residuals agree: take every standard deviation {short(factor)} times as large."
 
 
 def _of_knowledge(material: Material) -> Iterator[tuple[str, str]]:
     if material.uncertainty is None:
         return
+    if material.uncertainty.widening:
+        yield "", f"{sentence(material.uncertainty.widening)}."
     weak = [direction.words for direction in material.uncertainty.weak_directions]
     level = "" if material.maps else "care"  # what they do to places is in the maps
     yield from ((level, f"{sentence(words)}.") for words in weak[:_MOST_LINES])

@@ -80,13 +80,17 @@ def weak_axes(information: Information, estimate: Estimate, keys: Sequence[Key])
     return np.asarray(vectors[:, weak] * np.sqrt(values[weak]) * sizes[:, None])
 
 
-def bends(problem: Problem, estimate: Estimate, information: Information, half_width: float) -> Bends | None:
+def bends(
+    problem: Problem, estimate: Estimate, known: tuple[Information, Information], half_width: float
+) -> Bends | None:
     """What the numbers of the information do at the ends of its weak directions, and, of few observations, where other
     minima are that fit as well; None where it has no such direction.
 
     Args:
-        problem: that the information is of; the estimate is where its cost is least.
+        problem: whose cost is least at the estimate. known: what is said of the numbers, and what the problem alone
+            says, were its errors independent.
     """
+    information, model = known
     keys, sizes = information.keys, natural_sizes(estimate, information.keys)
     axes = half_width * weak_axes(information, estimate, keys)
     if not axes.shape[1]:
@@ -95,13 +99,13 @@ def bends(problem: Problem, estimate: Estimate, information: Information, half_w
     few = problem.sights.equations < _FEW
     steps, excesses = [], []
     for axis in axes.T:
-        found = []
+        found, rise = [], float(axis @ model.matrix @ axis)
         for step in (axis, -axis):
             for factor in (1.0, _FAR_OUT) if few else (1.0,):
                 end = _end(problem, estimate, keys, factor * step)
-                found.append((step / sizes, _excess(end, factor, step / sizes, least, half_width)))
+                found.append((step / sizes, _excess(end, factor, step / sizes, least, rise)))
                 other = _minimum(problem, end) if factor > 1.0 else None
-                if other is not None and 2.0 * other.cost <= least + half_width**2:
+                if other is not None and 2.0 * other.cost <= least + rise:
                     steps.append(np.zeros(len(keys)))
                     excesses.append(difference(other.estimate, estimate, keys) / sizes)
         step, excess = max(found, key=lambda one: float(np.linalg.norm(np.clip(one[1], -1.0, 1.0))))
@@ -148,7 +152,7 @@ def _minimum(problem: Problem, end: _End | None) -> Solution | None:
     return None if end is None else _solved(problem, end.estimate)
 
 
-def _excess(end: _End | None, factor: float, step: Array, least: float, half_width: float) -> Array:
+def _excess(end: _End | None, factor: float, step: Array, least: float, rise: float) -> Array:
     """(K,) in natural sizes: the end of so many steps, brought to where the cost has risen as it should by one, less
     that.
     """
@@ -156,7 +160,7 @@ def _excess(end: _End | None, factor: float, step: Array, least: float, half_wid
         return np.zeros(len(step))
     if end is None:
         return (_FARTHEST - 1.0) * step
-    reach = half_width / np.sqrt(max(end.cost - least, 1e-12))
+    reach = np.sqrt(rise / max(end.cost - least, 1e-12))
     excess = end.off * np.clip(reach, 1.0 / _FARTHEST, _FARTHEST) - step
     along = step / np.linalg.norm(step)
     return np.asarray(excess - min(float(along @ excess), 0.0) * along)  # that it ends earlier narrows nothing

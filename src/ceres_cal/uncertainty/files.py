@@ -11,6 +11,7 @@ from ceres_cal.base.errors import InputError
 from ceres_cal.model.information import Information
 from ceres_cal.model.keys import Key, pose_keys
 from ceres_cal.uncertainty.bent import Bends
+from ceres_cal.uncertainty.dependence import Dependence
 from ceres_cal.uncertainty.posterior import Posterior
 from ceres_cal.uncertainty.profile import PhiProfile
 
@@ -75,6 +76,8 @@ class PosteriorFile(msgspec.Struct, forbid_unknown_fields=True):
     placements: dict[str, list[float]]
     freedom: float | None
     profiles: dict[str, ProfileFile]
+    by_model: list[float] | None = None
+    dependence: Dependence | None = None
     bends: BendsFile | None = None
 
     @classmethod
@@ -87,6 +90,8 @@ class PosteriorFile(msgspec.Struct, forbid_unknown_fields=True):
             {name: lower_triangle(information) for name, information in posterior.placements.items()},
             degrees if np.isfinite(degrees) else None,
             {name: ProfileFile.of(profile) for name, profile in posterior.profiles.items()},
+            None if posterior.by_model is None else lower_triangle(posterior.by_model),
+            posterior.dependence,
             None if posterior.bends is None else BendsFile.of(posterior.bends),
         )
 
@@ -99,7 +104,9 @@ class PosteriorFile(msgspec.Struct, forbid_unknown_fields=True):
         information = information_from(self.information, self.keys, "posterior.information")
         profiles = {name: entry.profile(name) for name, entry in self.profiles.items()}
         bends = None if self.bends is None else self.bends.bends(self.keys)
-        return Posterior(information, placements, np.inf if self.freedom is None else self.freedom, profiles, bends)
+        by_model = self.by_model and information_from(self.by_model, self.keys, "posterior.by_model")
+        freedom = np.inf if self.freedom is None else self.freedom
+        return Posterior(information, placements, freedom, profiles, by_model or None, self.dependence, bends)
 
 
 def lower_triangle(information: Information) -> list[float]:

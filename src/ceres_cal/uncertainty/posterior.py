@@ -11,13 +11,14 @@ import numpy as np
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.spread import Spread, without
-from ceres_cal.base.tails import NORMAL_95
+from ceres_cal.base.tails import student_95
 from ceres_cal.model.information import Information
 from ceres_cal.model.keys import Key, pose_keys, sigma_limits
 from ceres_cal.model.parameters import Estimate, Layout
 from ceres_cal.model.quantities import layout_of
 from ceres_cal.solve import Eliminated, ReducedInformation
 from ceres_cal.uncertainty.bent import Bends
+from ceres_cal.uncertainty.dependence import Dependence, Scatter
 from ceres_cal.uncertainty.profile import PhiProfile
 
 
@@ -25,14 +26,17 @@ from ceres_cal.uncertainty.profile import PhiProfile
 class Posterior:
     """What observations and priors say together, about the solution, at the noise that was estimated.
 
-    It is kept as information because a covariance does not exist where something is unknown. It holds as far as the
-    model does: a lens with too few coefficients or a field painted amiss are not in it.
+    It is kept as information because a covariance does not exist where something is unknown. Errors that go together
+    count together, as far as the residuals show it (`dependence`); what all views have in common, such as a field
+    painted amiss, is not in it.
 
     Attributes:
         information: about the P numbers that are shared.
         placements: name -> information about each placement that one station alone sees, all else integrated out.
         degrees_of_freedom: spare equations behind the estimated noise; infinite where the sigmas were taken as stated.
         profiles: camera -> the valley along its phi, where that is too little known for the quadratic picture.
+        by_model: what the model alone says of the shared numbers, were every error independent of the others; None
+            where that is all there is. dependence: what the rest of it rests on; None where nobody asked.
         bends: what else leaves the quadratic picture, or None: it counts in sd, bounds and maps.
     """
 
@@ -40,6 +44,8 @@ class Posterior:
     placements: Mapping[str, Information] = field(default_factory=dict)
     degrees_of_freedom: float = np.inf
     profiles: Mapping[str, PhiProfile] = field(default_factory=dict)
+    by_model: Information | None = None
+    dependence: Dependence | None = None
     bends: Bends | None = None
 
     @property
@@ -64,6 +70,13 @@ class Posterior:
         if self.bends is not None:
             variance[self.information.columns(self.bends.keys)] += np.sum(self.bends.excesses**2, axis=0)
         return np.asarray(np.sqrt(variance))
+
+    @cached_property
+    def factors(self) -> Array:
+        """(P,) standard deviations over what the model alone gives; 1 where both are infinite."""
+        if self.by_model is None:
+            return np.ones(len(self.keys))
+        return widths_over(self.spread, self.by_model.spread)
 
     @property
     def half_width(self) -> float:
@@ -131,33 +144,44 @@ class Posterior:
         return self.information.marginal(keys).spread
 
 
-def student_95(degrees_of_freedom: float) -> float:
-    """Half width of the 95 % interval of Student's t, by the series of Cornish and Fisher: 0.1 % from 5 degrees on."""
-    z, n = NORMAL_95, max(degrees_of_freedom, 1.0)
-    terms = (
-        (z**3 + z) / 4.0,
-        (5.0 * z**5 + 16.0 * z**3 + 3.0 * z) / 96.0,
-        (3.0 * z**7 + 19.0 * z**5 + 17.0 * z**3 - 15.0 * z) / 384.0,
-    )
-    return z + sum(term / n**power for power, term in enumerate(terms, start=1))
+def widths_over(spread: Spread, other: Spread) -> Array:
+    """(n,) standard deviations of one spread over those of another of the same numbers; 1 where either is infinite."""
+    both = np.isfinite(spread.sd) & np.isfinite(other.sd)
+    return np.where(both, spread.sd, 1.0) / np.where(both, other.sd, 1.0)
 
 
-def make_posterior(reduced: ReducedInformation, degrees_of_freedom: float) -> Posterior:
-    """The posterior of everything shared, and of the placements that were eliminated."""
-    shared = reduced.shared
-    return Posterior(shared, _Placements(reduced.eliminated, shared), degrees_of_freedom)
+def make_posterior(reduced: ReducedInformation, degrees_of_freedom: float, scatter: Scatter | None = None) -> Posterior:
+    """The posterior of everything shared, and of the placements that were eliminated.
+
+    Args:
+        degrees_of_freedom: spare equations behind the estimated noise, infinite where the sigmas were taken as stated.
+        scatter: how the data scatter; without it errors are independent.
+    """
+    model = reduced.shared
+    if scatter is None:
+        return Posterior(model, _Placements(reduced.eliminated, model), degrees_of_freedom)
+    shared, found = scatter.widened(model), scatter.found
+    inverse = 1.0 / degrees_of_freedom + found.inverse_freedom if degrees_of_freedom > 0.0 else np.inf
+    degrees_of_freedom = 1.0 / inverse if inverse > 0.0 else np.inf
+    placements = _Placements(reduced.eliminated, shared, found.private)
+    return Posterior(shared, placements, degrees_of_freedom, by_model=model, dependence=found)
 
 
 @dataclass(frozen=True, eq=False)
 class _Placements(Mapping[str, Information]):
-    """Information about each eliminated placement, worked out when the first one is asked for."""
+    """Information about each eliminated placement, worked out when the first one is asked for.
+
+    Attributes:
+        shared: about what they follow. inflation: factor on the variance that their own observations leave.
+    """
 
     eliminated: tuple[Eliminated, ...]
     shared: Information
+    inflation: float = 1.0
 
     @cached_property
     def _matrices(self) -> dict[str, Array]:
-        parts = ((part.names, _placement_information(part, self.shared)) for part in self.eliminated)
+        parts = ((part.names, _placement_information(part, self.shared, self.inflation)) for part in self.eliminated)
         return {name: matrix for names, matrices in parts for name, matrix in zip(names, matrices, strict=True)}
 
     def __getitem__(self, name: str) -> Information:
@@ -170,7 +194,7 @@ class _Placements(Mapping[str, Information]):
         return len(self._matrices)
 
 
-def _placement_information(part: Eliminated, shared: Information) -> Array:
+def _placement_information(part: Eliminated, shared: Information, inflation: float) -> Array:
     """(S, 6, 6) information about each placement, everything shared integrated out.
 
     A placement follows the shared numbers by -G, and deviates from that by what its own observations leave open:
@@ -181,11 +205,13 @@ def _placement_information(part: Eliminated, shared: Information) -> Array:
     informations, gains = np.empty_like(part.own), part.gains[regular]
     at = shared.columns(part.keys)
     covariance = shared.spread.covariance[np.ix_(at, at)]
-    informations[regular] = np.linalg.inv(part.inverses[regular] + gains @ covariance @ np.swapaxes(gains, 1, 2))
+    informations[regular] = np.linalg.inv(
+        inflation * part.inverses[regular] + gains @ covariance @ np.swapaxes(gains, 1, 2)
+    )
     if np.all(regular):
         return np.asarray(0.5 * (informations + np.swapaxes(informations, 1, 2)))
     marginal, limits = shared.marginal(part.keys).matrix, sigma_limits(part.keys)
     for s in np.flatnonzero(~regular):
-        own, gain = part.own[s], part.gains[s]
+        own, gain = part.own[s] / inflation, part.gains[s]
         informations[s] = without(own, gain.T @ own, marginal + gain.T @ own @ gain, limits)
     return np.asarray(0.5 * (informations + np.swapaxes(informations, 1, 2)))

@@ -35,6 +35,7 @@ class Verdict:
             of the bounds in sigmas. low, high: 95 % bounds, infinite where open. relative: sd over the natural size,
             infinite also for phi and height where the valley is open.
         verdict: "known", "weak" or "unknown" (see KNOWN and WEAK). by_profile: whether the bounds are the profile's.
+        factor: standard deviation as the data scatter over that by the model alone.
     """
 
     key: Key
@@ -45,6 +46,7 @@ class Verdict:
     relative: float
     verdict: str
     by_profile: bool
+    factor: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -77,10 +79,10 @@ def verdicts(estimate: Estimate, posterior: Posterior) -> tuple[Verdict, ...]:
             along = [column for column in at if posterior.keys[column].quantity in ("phi", "height")]
             relative[along], low[along] = np.inf, np.maximum(low[along], 0.0)
     sd = np.where(followed, half, posterior.sd)
-    columns = (c.tolist() for c in (values, sd, low, high, relative, followed))
+    columns = (c.tolist() for c in (values, sd, low, high, relative, followed, posterior.factors))
     return tuple(
-        Verdict(key, value, sigma, bottom, top, share, _word(key, share), by_profile)
-        for key, value, sigma, bottom, top, share, by_profile in zip(posterior.keys, *columns, strict=True)
+        Verdict(key, value, sigma, bottom, top, share, _word(key, share), by_profile, factor)
+        for key, value, sigma, bottom, top, share, by_profile, factor in zip(posterior.keys, *columns, strict=True)
     )
 
 
