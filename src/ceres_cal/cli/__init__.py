@@ -20,6 +20,7 @@ from ceres_cal.cli.detect_field import COMMANDS as DETECT_FIELD
 from ceres_cal.cli.detect_rings import COMMANDS as DETECT_RINGS
 from ceres_cal.cli.diagnose import COMMANDS as DIAGNOSE
 from ceres_cal.cli.export import COMMANDS as EXPORT
+from ceres_cal.cli.foreign import COMMANDS as FOREIGN
 from ceres_cal.cli.locate import COMMANDS as LOCATE
 from ceres_cal.cli.refit import COMMANDS as REFIT
 from ceres_cal.cli.simulate import COMMANDS as SIMULATE
@@ -29,7 +30,7 @@ from ceres_cal.cli.undistort import COMMANDS as UNDISTORT
 _GROUPS = (
     *(DETECT_BOARD, DETECT_RINGS, DETECT_FIELD),
     *(CALIBRATE, DIAGNOSE, ADVISE, REFIT, CHECK, COMPARE),
-    *(LOCATE, UNDISTORT, EXPORT, SIMULATE, TARGETS),
+    *(LOCATE, UNDISTORT, EXPORT, FOREIGN, SIMULATE, TARGETS),
 )
 COMMANDS = {command.name: command for group in _GROUPS for command in group}
 _BEGINNINGS = {"", *(name.partition(" ")[0] for name in COMMANDS if " " in name)}
@@ -94,7 +95,7 @@ def _run(arguments: list[str]) -> int:
 
 def _choose(arguments: list[str]) -> tuple[Command, list[str]]:
     """The command that the first one or two arguments name, and the arguments after it."""
-    for words in (1, 2):
+    for words in (2, 1):
         command = COMMANDS.get(" ".join(arguments[:words]))
         if command is not None:
             return command, arguments[words:]
