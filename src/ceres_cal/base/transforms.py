@@ -59,6 +59,20 @@ def rotation_log(rotation: ArrayLike) -> Array:
     return np.asarray(2.0 * np.arctan2(sine, q[0]) / sine * q[1:])
 
 
+def quaternion(rotation: ArrayLike) -> Array:
+    """(x, y, z, w) of a rotation matrix, of unit length, w not below 0."""
+    half = 0.5 * rotation_log(rotation)
+    angle = float(np.linalg.norm(half))
+    return np.array([*(np.sinc(angle / np.pi) * half), np.cos(angle)])
+
+
+def rotation_of(quaternion: ArrayLike) -> Array:
+    """The rotation matrix of (x, y, z, w), of any length but 0."""
+    x, y, z, w = np.asarray(quaternion, dtype=float)
+    sine = float(np.sqrt(x * x + y * y + z * z))
+    return rotation_exp(np.array([x, y, z]) * (2.0 * np.arctan2(sine, w) / sine if sine > 0.0 else 0.0))
+
+
 def left_jacobian(rotation_vector: ArrayLike) -> Array:
     """J with exp(w + dw) = exp(J dw) exp(w) to first order, shape (3, 3)."""
     w = np.asarray(rotation_vector, dtype=float)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import read_bytes
-from ceres_cal.formats import lookup, opencv, ssl_geometry, ssl_settings
+from ceres_cal.formats import colmap, kalibr, lookup, mrcal, opencv, paper, ros, ssl_geometry, ssl_settings
 from ceres_cal.formats.export_format import Exported, ExportFormat, ExportRequest
 from ceres_cal.formats.import_format import ImportFormat, ImportRequest
 
@@ -25,6 +25,11 @@ EXPORT_FORMATS: dict[str, ExportFormat] = {
         ssl_geometry.GEOMETRY_YML,
         ssl_settings.FORMAT,
         opencv.FORMAT,
+        ros.FORMAT,
+        kalibr.FORMAT,
+        mrcal.FORMAT,
+        colmap.FORMAT,
+        paper.FORMAT,
     )
 }
 IMPORT_FORMATS: dict[str, ImportFormat] = {
@@ -34,6 +39,11 @@ IMPORT_FORMATS: dict[str, ImportFormat] = {
         ssl_geometry.IMPORT_YML,
         ssl_settings.IMPORT,
         opencv.IMPORT,
+        ros.IMPORT,
+        kalibr.IMPORT,
+        mrcal.IMPORT,
+        colmap.IMPORT,
+        paper.IMPORT,
     )
 }
 
@@ -145,7 +155,7 @@ def _import_format(path: Path, content: bytes, name: str | None) -> ImportFormat
             raise InputError(f"there is no format {name!r} to read: choose one of {known}")
         return IMPORT_FORMATS[name]
     for form in IMPORT_FORMATS.values():
-        if path.name.endswith(form.endings) and form.recognises(content):
+        if (path.name.endswith(form.endings) if form.endings else path.is_dir()) and form.recognises(content):
             return form
     raise InputError(f"{path}: of no format that is known by its ending and content: name one of {known}")
 

@@ -16,7 +16,7 @@ import numpy as np
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.least_squares import least_squares
-from ceres_cal.base.transforms import Pose, rotation_exp, rotation_log
+from ceres_cal.base.transforms import Pose, quaternion, rotation_exp, rotation_of
 from ceres_cal.formats.export_format import ExportRequest, Loss
 from ceres_cal.formats.loss import Box, camera_loss, field_pixels
 from ceres_cal.formats.opencv import parse_size
@@ -124,10 +124,8 @@ def _nearest(camera: Camera, box_m: Box | None) -> Camera:
 
 def to_entry(camera: Camera, number: int) -> dict[str, Any]:
     """SSL_GeometryCameraCalibration of a camera with a radial lens of power 3, in float32."""
-    half = 0.5 * rotation_log(camera.cam_from_world.rotation)
-    angle = float(np.linalg.norm(half))
-    quaternion = [*(np.sinc(angle / np.pi) * half), np.cos(angle)]
-    numbers = [camera.phi, *camera.principal_point, camera.lens.values[0] * camera.phi**2, *quaternion]
+    numbers = [camera.phi, *camera.principal_point, camera.lens.values[0] * camera.phi**2]
+    numbers += quaternion(camera.cam_from_world.rotation).tolist()
     numbers += [*(1e3 * camera.cam_from_world.translation), *(1e3 * camera.position)]
     single = {name: _single(value) for name, value in zip((*NAMES, *_POSITION), numbers, strict=True)}
     width, height = camera.image_size
@@ -153,18 +151,11 @@ def to_camera(entry: Mapping[str, Any], image_size: str = "") -> Camera:
         except (KeyError, TypeError, ValueError):
             raise InputError(f"{here}: {name} is no number, but {entry.get(name)!r}") from None
     f, cx, cy, d, *rest = values
-    quaternion, shift = np.array(rest[:4]), np.array(rest[4:])
-    norm = float(np.linalg.norm(quaternion))
+    turn, shift = np.array(rest[:4]), np.array(rest[4:])
+    norm = float(np.linalg.norm(turn))
     if not (np.all(np.isfinite(values)) and f > 0.0 and abs(norm - 1.0) < 0.05):
         raise InputError(f"{here}: focal_length {f:g}, or the length {norm:g} of its quaternion, makes no camera")
     sizes = [entry.get("pixel_image_width"), entry.get("pixel_image_height")]
     width, height = (int(float(size)) for size in sizes) if all(sizes) else parse_size(image_size)  # type: ignore[arg-type]
-    pose = Pose(_rotation(quaternion / norm), 1e-3 * shift)
+    pose = Pose(rotation_of(turn), 1e-3 * shift)
     return Camera((width, height), f, (cx, cy), Radial((d / f**2,), (3,)), 1.0, pose)
-
-
-def _rotation(quaternion: Array) -> Array:
-    """Of (x, y, z, w), of unit length."""
-    axis, w = quaternion[:3], float(quaternion[3])
-    sine = float(np.linalg.norm(axis))
-    return rotation_exp(axis * (2.0 * np.arctan2(sine, w) / sine if sine > 0.0 else 0.0))

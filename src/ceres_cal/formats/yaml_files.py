@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
+
+from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
 
 
@@ -30,3 +33,18 @@ def yaml_text(data: Mapping[str, Any]) -> str:
     import yaml
 
     return str(yaml.safe_dump(dict(data), sort_keys=False, default_flow_style=None, width=120))
+
+
+def numbers_at(values: Any, where: str, count: int | None = None) -> Array:
+    """A list of finite numbers, of lists of them, too, as one array (N,).
+
+    Raises:
+        InputError: naming `where`: something else, or another count.
+    """
+    try:
+        numbers = np.array(values, dtype=float).ravel()
+    except (TypeError, ValueError):
+        numbers = np.full(1, np.nan)
+    if not np.all(np.isfinite(numbers)) or (count is not None and len(numbers) != count):
+        raise InputError(f"{where} must be {count if count is not None else 'some'} finite numbers, not {values}")
+    return numbers

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from ceres_cal.base.arrays import Array, Array32, Mask
 from ceres_cal.base.errors import DegenerateError, InputError
 from ceres_cal.base.transforms import Pose, rotation_log
-from ceres_cal.scene.foreign import FISHEYE, OPENCV_MODELS, ForeignCamera, OpenCvCamera, image_grid
+from ceres_cal.scene.foreign import FISHEYE, OPENCV_MODELS, ForeignCamera, OpenCvCamera, image_grid, lens_fitted
 from ceres_cal.scene.lens import KannalaBrandt, Lens
 
 
@@ -195,19 +195,37 @@ class Camera:
         """The camera in one of these models (see `ForeignCamera`): exactly where one holds its lens, else as the best
         fit over the image.
         """
-        pixels = image_grid(self.image_size)
-        rays = self.rays(pixels)
-        known = np.isfinite(rays[:, 0])
-        fits = []
+        blanks = []
         for model in models:
             count = 4 if model == FISHEYE else OPENCV_MODELS[model]
             focal, values = (self.phi, self.phi * self.aspect), (*self.lens.values, *[0.0] * count)[:count]
             same = ForeignCamera(self.image_size, focal, self.principal_point, model, values, self.cam_from_world)
             if same.lens == self.lens:
                 return same
-            blank = replace(same, coefficients=(0.0,) * count)
-            fits.append(ForeignCamera.fitted(blank, rays[known], pixels[known]))
+            blanks.append(replace(same, coefficients=(0.0,) * count))
+        pixels = image_grid(self.image_size)
+        rays = self.rays(pixels)
+        known = np.isfinite(rays[:, 0])
+        fits = [ForeignCamera.fitted(blank, rays[known], pixels[known]) for blank in blanks]
         return min(fits, key=lambda fit: fit.error_px[0])
+
+    def nearest(self, lens: Lens) -> Camera:
+        """The camera with another lens, its coefficients and the other intrinsics fitted over the image.
+
+        Raises:
+            InputError: that lens would fold inside the image.
+        """
+        if (lens.kind, lens.names) == (self.lens.kind, self.lens.names):
+            return self
+        focal = (self.phi, self.phi * self.aspect)
+        start = ForeignCamera(self.image_size, focal, self.principal_point, FISHEYE, (0.0,) * 4)
+        pixels = image_grid(self.image_size)
+        rays = self.rays(pixels)
+        known = rays[:, 2] > 0.0
+        fit = lens_fitted(start, lens, rays[known], pixels[known])
+        if fit is None:
+            raise InputError(f"no {lens.kind} lens is near: it would fold over inside the image")
+        return Camera(**fit[0], cam_from_world=self.cam_from_world)
 
     @classmethod
     def from_foreign(cls, foreign: ForeignCamera) -> tuple[Camera, tuple[float, float]]:

@@ -149,7 +149,7 @@ class ForeignCamera:
         if np.count_nonzero(chosen) < 20:
             raise InputError(f"its {self.model} model shows nothing of its image: correct its numbers")
         pixels, shown = seen[chosen], rays[chosen]
-        fits = [_lens_fitted(self, lens, shown, pixels) for lens in _LENSES]
+        fits = [lens_fitted(self, lens, shown, pixels) for lens in _LENSES]
         return min((fit for fit in fits if fit is not None), key=lambda fit: fit[1][0])
 
 
@@ -173,7 +173,7 @@ def _all_directions() -> Array:
     return np.stack([across * np.cos(turn), across * np.sin(turn), depth], axis=-1)
 
 
-def _lens_fitted(
+def lens_fitted(
     foreign: ForeignCamera, lens: Lens, rays: Array, pixels: Array
 ) -> tuple[dict[str, Any], tuple[float, float]] | None:
     """Our lens nearest to what a foreign camera shows; None where it has no answer for some of it."""
