@@ -119,7 +119,7 @@ def euler_from_rotation(rotation: ArrayLike) -> tuple[float, float, float]:
     return float(alpha), float(np.arctan2(-r[0, 2], cos_beta)), float(gamma)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Pose:
     """A rigid transform b_from_a: x_b = rotation @ x_a + translation.
 
@@ -138,6 +138,10 @@ class Pose:
                 raise ValueError(f"{name} must have shape {shape}, not {value.shape}")
             value.setflags(write=False)
             object.__setattr__(self, name, value)
+
+    def __repr__(self) -> str:
+        turn, shift = (", ".join(f"{v:.3f}" for v in part) for part in np.split(self.log(), 2))
+        return f"Pose(rotation vector ({turn}) rad, translation ({shift}) m)"
 
     @classmethod
     def identity(cls) -> Pose:

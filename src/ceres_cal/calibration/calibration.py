@@ -6,12 +6,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
+import msgspec
 import numpy as np
 
 from ceres_cal.base.arrays import Mask
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.files import convert, read_json, write_json
+from ceres_cal.base.files import PIXEL_ORIGIN, UNITS, convert, read_json, write_json
 from ceres_cal.base.transforms import Pose
 from ceres_cal.calibration.file import (
     FORMAT,
@@ -34,7 +36,7 @@ from ceres_cal.solve import Problem, Weighting
 from ceres_cal.uncertainty import Disagreement, Posterior, PosteriorFile, Uncertainty, disagreement
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Calibration:
     """Calibrated cameras and where they stood.
 
@@ -49,6 +51,7 @@ class Calibration:
         posterior: what is known of every number; None where nothing was minimised, or a file says nothing of it.
         options: how it was solved. digest: SHA-256 of the observations. versions: of the packages that solved it.
         refitted: how it came from an earlier calibration; None for one from scratch.
+        notes: whatever somebody wants to keep with it, plain data.
     """
 
     estimate: Estimate
@@ -66,6 +69,11 @@ class Calibration:
     posterior: Posterior | None = None
     versions: Mapping[str, str] = field(default_factory=package_versions)
     refitted: Refitted | None = None
+    notes: Mapping[str, Any] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        cameras = ", ".join(f"{name!r}: {camera!r}" for name, camera in self.stations.items())
+        return f"Calibration({cameras}; {self.rms_px:.3f} px rms)"
 
     @property
     def cameras(self) -> Mapping[str, Camera]:
@@ -167,8 +175,8 @@ class Calibration:
         return CalibrationFile(
             format=FORMAT,
             version=VERSION,
-            units="metres, radians, pixels",
-            pixel_origin="centre of the top-left pixel",
+            units=UNITS,
+            pixel_origin=PIXEL_ORIGIN,
             cameras={name: CameraFile.of(camera) for name, camera in estimate.cameras.items()},
             stations={name: StationFile.of_station(station) for name, station in estimate.stations.items()},
             placements={name: PoseFile.of(pose) for name, pose in estimate.placements.items()},
@@ -187,6 +195,7 @@ class Calibration:
             versions=dict(self.versions),
             posterior=None if self.posterior is None else PosteriorFile.of(self.posterior),
             refitted=None if self.refitted is None else RefittedFile.of(self.refitted),
+            notes=dict(self.notes) or msgspec.UNSET,
         )
 
     @classmethod
@@ -210,4 +219,5 @@ class Calibration:
             None if data.posterior is None else data.posterior.posterior(),
             data.versions,
             None if data.refitted is None else data.refitted.refitted(),
+            data.notes if isinstance(data.notes, dict) else {},
         )

@@ -65,7 +65,7 @@ def _freeze(columns: Columns) -> None:
         object.__setattr__(columns, name, column)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Points:
     """Columns of the point observations: index of the view, index into the target's point names, pixel, its sigma."""
 
@@ -80,8 +80,11 @@ class Points:
     def __len__(self) -> int:
         return len(self.view)
 
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({len(self)})"
 
-@dataclass(frozen=True, eq=False)
+
+@dataclass(frozen=True, eq=False, repr=False)
 class Curves:
     """Columns of the curve observations; `side` is 0 for the centre of the paint, +1 for left, -1 for right."""
 
@@ -96,6 +99,9 @@ class Curves:
 
     def __len__(self) -> int:
         return len(self.view)
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({len(self)})"
 
 
 _NOBODY, _NOWHERE = np.empty(0, np.int32), np.empty((0, 2))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import zipfile
 from collections.abc import Mapping, Sequence
+from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,7 +14,17 @@ import numpy as np
 
 from ceres_cal.base.arrays import AnyArray, Codes
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.files import check_header, convert, parse_json, read_bytes, write_bytes
+from ceres_cal.base.files import (
+    PIXEL_ORIGIN,
+    UNITS,
+    PixelOrigin,
+    Units,
+    check_header,
+    convert,
+    parse_json,
+    read_bytes,
+    write_bytes,
+)
 from ceres_cal.observations.columns import NO_CURVES, NO_POINTS, TYPES, Curves, Points, Prior, View, choices, view_label
 from ceres_cal.scene.targets import SIDES, Target, target_from_spec
 
@@ -30,12 +41,22 @@ class Content(NamedTuple):
     points: Points = NO_POINTS
     curves: Curves = NO_CURVES
     priors: tuple[Prior, ...] = ()
+    notes: Mapping[str, Any] = {}
 
 
 class _PointsFile(msgspec.Struct, forbid_unknown_fields=True):
     features: list[str]
     pixels: list[tuple[float, float]]
     sigma_px: float | list[float] = 1.0
+    counts: list[int] | msgspec.UnsetType = msgspec.UNSET
+
+    def each(self, here: str) -> list[str]:
+        """The feature of each pixel; InputError where `counts` does not fit."""
+        if not isinstance(self.counts, list):
+            return self.features
+        if len(self.counts) != len(self.features) or min(self.counts, default=1) < 1:
+            raise InputError(f"{here}: counts must be a whole number above 0 for each of its features")
+        return [name for name, count in zip(self.features, self.counts, strict=True) for _ in range(count)]
 
 
 class _CurvesFile(_PointsFile, forbid_unknown_fields=True):
@@ -63,12 +84,13 @@ class _CameraFile(msgspec.Struct, forbid_unknown_fields=True):
 class _ObservationsFile(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
     format: str
     version: int
-    units: str = "metres, radians, pixels"
-    pixel_origin: str = "centre of the top-left pixel"
+    units: Units = UNITS
+    pixel_origin: PixelOrigin = PIXEL_ORIGIN
     targets: dict[str, Any]
     cameras: dict[str, _CameraFile]
     views: list[_ViewFile]
     priors: list[dict[str, Any]] = []
+    notes: dict[str, Any] | msgspec.UnsetType = msgspec.UNSET
 
     def content(self) -> Content:
         """All but the columns; InputError naming the place."""
@@ -77,6 +99,7 @@ class _ObservationsFile(msgspec.Struct, forbid_unknown_fields=True, kw_only=True
             {name: camera.image_size for name, camera in self.cameras.items()},
             tuple(entry.view() for entry in self.views),
             priors=tuple(prior_from_json(entry, f"prior {i}") for i, entry in enumerate(self.priors)),
+            notes=self.notes if isinstance(self.notes, dict) else {},
         )
 
 
@@ -105,6 +128,7 @@ def header_of(content: Content) -> _ObservationsFile:
         cameras={name: _CameraFile(size) for name, size in content.cameras.items()},
         views=[_ViewFile(**vars(view)) for view in content.views],
         priors=[prior_to_json(prior) for prior in content.priors],
+        notes=dict(content.notes) or msgspec.UNSET,
     )
 
 
@@ -185,12 +209,14 @@ def _columns(
     view, feature, sigma = [], [], []
     pixels: list[tuple[float, float]] = []
     for number, entry in entries:
-        here, count = view_label(number, views), len(entry.features)
+        here = view_label(number, views)
+        features = entry.each(here)
+        count = len(features)
         if len(entry.pixels) != count:
             raise InputError(f"{here}: {count} {kind} features but {len(entry.pixels)} pixels")
         names = index[views[number].target]
         try:
-            feature.append([names[name] for name in entry.features])
+            feature.append([names[name] for name in features])
         except KeyError as error:
             raise InputError(
                 f"{here}: {kind} feature {error.args[0]!r} is unknown in target {views[number].target!r}: "
@@ -210,10 +236,10 @@ def _columns(
 
 
 def _sides(entry: _CurvesFile, here: str) -> list[int]:
-    side = entry.side or "centre"
-    names = side if isinstance(side, list) else [side] * len(entry.features)
-    if len(names) != len(entry.features):
-        raise InputError(f"{here}: {len(entry.features)} curve features but {len(names)} sides")
+    side, count = entry.side or "centre", len(entry.each(here))
+    names = side if isinstance(side, list) else [side] * count
+    if len(names) != count:
+        raise InputError(f"{here}: {count} curve features but {len(names)} sides")
     for name in names:
         if name not in SIDES:
             raise InputError(f"{here}: side {name!r} is unknown: {', '.join(SIDES)}")
@@ -233,8 +259,11 @@ def _to_json(content: Content) -> bytes:
         if len(rows):
             side = _side_names(content.curves.side[rows])
             names = content.targets[entry.target].curve_names
-            entry.curves = _CurvesFile(*_features(content.curves, rows, names), side)
-    plain = msgspec.structs.asdict(data)
+            features, pixels, sigma_px = _features(content.curves, rows, names)
+            runs = [(name, len(list(same))) for name, same in groupby(features)]
+            once, counts = [name for name, _ in runs], [count for _, count in runs]
+            entry.curves = _CurvesFile(once, pixels, sigma_px, counts, side)
+    plain = {name: value for name, value in msgspec.structs.asdict(data).items() if value is not msgspec.UNSET}
     del plain["views"]
     head = msgspec.json.format(msgspec.json.encode(plain), indent=1).rstrip(b"}\n")
     lines = b",\n  ".join(msgspec.json.encode(entry) for entry in data.views)

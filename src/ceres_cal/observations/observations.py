@@ -7,23 +7,25 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ceres_cal.base.arrays import Mask
 from ceres_cal.base.errors import InputError
 from ceres_cal.observations.bounds import stray_pixels
 from ceres_cal.observations.columns import Columns, Curves, Points, Prior, View, choices, taken, view_label
 from ceres_cal.observations.files import Content, header_of, read_content, write_content
+from ceres_cal.observations.from_points import gathered
 from ceres_cal.scene.targets import Target
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Observations:
     """Everything that was observed.
 
@@ -35,7 +37,7 @@ class Observations:
             pixel. `sigma_px` is the standard deviation of each coordinate, 1 where nobody stated one (only ratios
             matter then: the solve estimates the scale).
         curves: curve observations, in the order of their views; `sigma_px` is that of the distance to the curve.
-        priors: what is known beforehand.
+        priors: what is known beforehand. notes: whatever somebody wants to keep with them, plain data.
 
     Raises:
         InputError: on construction, naming the view and the feature: a name that is not there, a number that is not
@@ -48,6 +50,11 @@ class Observations:
     points: Points
     curves: Curves
     priors: tuple[Prior, ...] = ()
+    notes: Mapping[str, Any] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        counts = f"{len(self.points)} points, {len(self.curves)} curve observations in {len(self.views)} views"
+        return f"Observations({counts} of {', '.join(self.stations) or 'nothing'})"
 
     def __post_init__(self) -> None:
         self._check_names()
@@ -59,6 +66,32 @@ class Observations:
                 raise InputError(f"camera {name!r} has no observation: add views of it or remove the camera")
         for prior in self.priors:
             self.require_owner(prior)
+
+    @classmethod
+    def from_points(
+        cls,
+        pixels: ArrayLike | Sequence[ArrayLike] | Mapping[str, ArrayLike],
+        points: Target | ArrayLike,
+        image_size: tuple[int, int],
+        *,
+        camera: str = "camera",
+        sigma_px: float = 1.0,
+        moves: bool | None = None,
+    ) -> Observations:
+        """Of one camera that saw the points of one target, in one frame or in many.
+
+        Args:
+            pixels: of one frame (N, 2) or OpenCV's (N, 1, 2), a list of those, or by name of the frame; a row for each
+                of the points, NaN where it was not seen.
+            points: a target, such as `checkerboard(9, 6, 0.025)` with corners row by row, or places (N, 3) or (N, 2) m.
+            image_size: (width, height) px.
+            moves: whether it lay elsewhere in every frame; by default as the target has it. Places do not move: they
+                are the world.
+
+        Raises:
+            InputError: shapes or counts that do not fit; naming the frame.
+        """
+        return cls(*gathered(pixels, points, image_size, camera, sigma_px, moves))
 
     # ---- files --------------------------------------------------------------------------------------------------
 
@@ -85,7 +118,7 @@ class Observations:
     @cached_property
     def digest(self) -> str:
         """SHA-256 of the content, the same for the JSON and the NPZ file: where a calibration came from."""
-        content = hashlib.sha256(msgspec.json.encode(header_of(self._content)))
+        content = hashlib.sha256(msgspec.json.encode(header_of(self._content._replace(notes={}))))
         for column in (self.points, self.curves):
             for array in vars(column).values():
                 content.update(np.ascontiguousarray(array).data)
@@ -93,7 +126,7 @@ class Observations:
 
     @property
     def _content(self) -> Content:
-        return Content(self.targets, self.cameras, self.views, self.points, self.curves, self.priors)
+        return Content(self.targets, self.cameras, self.views, self.points, self.curves, self.priors, self.notes)
 
     # ---- reading ------------------------------------------------------------------------------------------------
 
