@@ -11,6 +11,7 @@ from collections.abc import Sequence
 
 from ceres_cal.base.errors import CalibrationError, InputError, SolutionError
 from ceres_cal.cli.advise import COMMANDS as ADVISE
+from ceres_cal.cli.audit import COMMANDS as AUDIT
 from ceres_cal.cli.calibrate import COMMANDS as CALIBRATE
 from ceres_cal.cli.check import COMMANDS as CHECK
 from ceres_cal.cli.command import Command, print_answer
@@ -29,7 +30,7 @@ from ceres_cal.cli.undistort import COMMANDS as UNDISTORT
 
 _GROUPS = (
     *(DETECT_BOARD, DETECT_RINGS, DETECT_FIELD),
-    *(CALIBRATE, DIAGNOSE, ADVISE, REFIT, CHECK, COMPARE),
+    *(CALIBRATE, DIAGNOSE, ADVISE, REFIT, CHECK, COMPARE, AUDIT),
     *(LOCATE, UNDISTORT, EXPORT, FOREIGN, SIMULATE, TARGETS),
 )
 COMMANDS = {command.name: command for group in _GROUPS for command in group}

@@ -1,5 +1,6 @@
 """After a move: refit, check and compare calibrations."""
 
+from ceres_cal.moves.auditing import StationAudit, audit
 from ceres_cal.moves.checking import FALSE_ALARMS, Check, StationCheck, check
 from ceres_cal.moves.comparison import StationComparison, compare
 from ceres_cal.moves.refitting import movements, refit
@@ -7,8 +8,10 @@ from ceres_cal.moves.refitting import movements, refit
 __all__ = [
     "FALSE_ALARMS",
     "Check",
+    "StationAudit",
     "StationCheck",
     "StationComparison",
+    "audit",
     "check",
     "compare",
     "movements",
