@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import read_bytes
-from ceres_cal.formats import colmap, kalibr, lookup, mrcal, opencv, paper, ros, ssl_geometry, ssl_settings
+from ceres_cal.formats import colmap, detections, kalibr, lookup, mrcal, opencv, paper, ros, ssl_geometry, ssl_settings
 from ceres_cal.formats.export_format import Exported, ExportFormat, ExportRequest
 from ceres_cal.formats.import_format import ImportFormat, ImportRequest
 
@@ -44,6 +44,7 @@ IMPORT_FORMATS: dict[str, ImportFormat] = {
         mrcal.IMPORT,
         colmap.IMPORT,
         paper.IMPORT,
+        *detections.FORMATS,
     )
 }
 
