@@ -65,7 +65,8 @@ def test_named_columns(tmp_path: Path) -> None:
         "X_m": [0.0, 1.0, 1.0],
         "Y_m": [0.0, 0.0, 2.0],
     }
-    np.savez(tmp_path / "a.npz", **{name: np.array(values) for name, values in columns.items()})
+    arrays: Any = {name: np.array(values) for name, values in columns.items()}
+    np.savez(tmp_path / "a.npz", **arrays)
     places = import_observations(tmp_path / "a.npz", image_size="640x480")
     assert places.targets["target"].points["1 2 0"] == (1.0, 2.0, 0.0)
     assert places.points.pixels.tolist() == [[1.0, 4.0], [2.0, 5.0], [3.0, 6.0]]

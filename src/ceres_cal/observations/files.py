@@ -81,7 +81,9 @@ class _CameraFile(msgspec.Struct, forbid_unknown_fields=True):
     image_size: tuple[int, int]
 
 
-class _ObservationsFile(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
+class ObservationsFile(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
+    """Observations, but for the columns of an NPZ."""
+
     format: str
     version: int
     units: Units = UNITS
@@ -119,9 +121,9 @@ def write_content(content: Content, path: Path) -> None:
         raise InputError(f"{path}: observations are written as .json or .npz: give one of these endings")
 
 
-def header_of(content: Content) -> _ObservationsFile:
+def header_of(content: Content) -> ObservationsFile:
     """Everything but the columns, as a file has it."""
-    return _ObservationsFile(
+    return ObservationsFile(
         format=FORMAT,
         version=VERSION,
         targets={name: target.spec for name, target in content.targets.items()},
@@ -172,10 +174,10 @@ def _numbers(value: Any, size: int, where: str, *, spread: bool = False) -> tupl
 
 def _from_json(content: bytes, where: str) -> Content:
     try:
-        data = msgspec.json.decode(content, type=_ObservationsFile)  # several times faster than by way of plain data
+        data = msgspec.json.decode(content, type=ObservationsFile)  # several times faster than by way of plain data
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
         plain = check_header(parse_json(content, where), where, FORMAT, VERSION)
-        data = convert(plain, _ObservationsFile, where)
+        data = convert(plain, ObservationsFile, where)
     check_header({"format": data.format, "version": data.version}, where, FORMAT, VERSION)
     header = data.content()
     targets, views = header.targets, header.views
@@ -265,7 +267,7 @@ def _to_json(content: Content) -> bytes:
             entry.curves = _CurvesFile(once, pixels, sigma_px, counts, side)
     plain = {name: value for name, value in msgspec.structs.asdict(data).items() if value is not msgspec.UNSET}
     del plain["views"]
-    head = msgspec.json.format(msgspec.json.encode(plain), indent=1).rstrip(b"}\n")
+    head = msgspec.json.format(msgspec.json.encode(plain), indent=1).removesuffix(b"\n}")
     lines = b",\n  ".join(msgspec.json.encode(entry) for entry in data.views)
     return head + b',\n "views": [\n  ' + lines + b"\n ]\n}\n"
 
@@ -331,7 +333,7 @@ def _from_npz(packed: bytes, where: str) -> Content:
     if header is None or header.dtype != np.uint8:
         raise InputError(f"{where}: no header: this is not a file of observations")
     plain = check_header(parse_json(header.tobytes(), where), where, FORMAT, VERSION)
-    content = convert(plain, _ObservationsFile, where).content()
+    content = convert(plain, ObservationsFile, where).content()
     names = ("view", "feature", "pixels", "sigma_px")
     points = Points(**_taken(arrays, "points", names, where))
     curves = Curves(**_taken(arrays, "curves", (*names, "side"), where))
