@@ -83,7 +83,7 @@ def in_a_shell(command: str, **settings: Any) -> subprocess.CompletedProcess[str
 def test_help_lists_every_command(say: Say) -> None:
     said = say("--help")
     assert said.code == 0 and said.err == ""
-    assert all(f"  {name:12}  {command.summary}\n" in said.out for name, command in COMMANDS.items())
+    assert all(f"  {name:14}  {command.summary}\n" in said.out for name, command in COMMANDS.items())
     assert set(COMMANDS) == {
         "detect board",
         "detect rings",
@@ -100,6 +100,11 @@ def test_help_lists_every_command(say: Say) -> None:
         "export-table",
         "simulate",
         "targets",
+        "targets import",
+        "import",
+        "publish",
+        "listen",
+        "audit",
         "undistort",
     }
     assert say("detect", "-h").out.count("board") > 0

@@ -79,8 +79,9 @@ def _fail(message: str, exit_code: int) -> int:
 
 
 def _run(arguments: list[str]) -> int:
-    if arguments[-1:] in (["-h"], ["--help"]) and " ".join(arguments[:-1]) in _BEGINNINGS:
-        print(_overview(" ".join(arguments[:-1])))
+    beginning = " ".join(arguments[:-1])
+    if arguments[-1:] in (["-h"], ["--help"]) and beginning in _BEGINNINGS and beginning not in COMMANDS:
+        print(_overview(beginning))
         return 0
     if arguments[:1] == ["--version"]:
         from ceres_cal.calibration import package_versions

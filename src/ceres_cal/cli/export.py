@@ -124,7 +124,7 @@ def _data(exported: Exported, args: Namespace) -> dict[str, Any]:
 
 
 def _text(exported: Exported, args: Namespace) -> str:
-    lines = [f"{args.to:10}{exported.words}, written to {args.output}"]
+    lines = [f"{args.to:9} {exported.words}, written to {args.output}"]
     for loss in exported.losses:
         of = f"{loss.station}: " if len(exported.losses) > 1 else ""
         if loss.image_px is not None:

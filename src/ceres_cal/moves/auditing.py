@@ -271,8 +271,9 @@ def _root_mean_square(values: Array) -> float:
 
 def _words(cause: str | None, what_to_do: str, off_mm: dict[float, tuple[float, float]], posed: bool) -> str:
     sizes = [f"{rms:.2g} mm rms and {worst:.2g} mm at most {at_height(h)}" for h, (rms, worst) in off_mm.items()]
-    off = f", within {', '.join(sizes)} of ours" if sizes else ""
     placed = "" if posed else " (from the pose that is best for it: it says none)"
     if cause is None:
+        off = f", within {', '.join(sizes)} of ours" if sizes else ""
         return f"explains the observations as well as a calibration of its own would{placed}{off}"
-    return f"does not explain the observations{placed}: {cause}: {what_to_do}{off.replace('within', 'as it is')}"
+    off = f"; it is off by {', '.join(sizes)}" if sizes else ""
+    return f"does not explain the observations{placed}: {cause}: {what_to_do}{off}"
