@@ -6,10 +6,11 @@ from functools import cache
 from pathlib import Path
 
 import audit as planted
+import cv2
 import numpy as np
 import pytest
 
-from ceres_cal import Calibration, InputError, Observations, audit, calibrate
+from ceres_cal import Calibration, Camera, InputError, Observations, audit, calibrate, checkerboard
 from ceres_cal.base.transforms import Pose
 from ceres_cal.cli import main
 from ceres_cal.formats import export
@@ -70,3 +71,25 @@ def test_other_stations_are_refused() -> None:
     two = ImportedCameras({"a": sound().station(), "b": sound().station()}).calibration("a test")
     with pytest.raises(InputError, match="has stations 'a', 'b', the observations 'overhead': name them alike"):
         audit(two, seen(4))
+
+
+def test_opencvs_own_calibration_of_real_photographs(real_data: Path) -> None:
+    """Made by OpenCV from every other photograph, audited against the rest."""
+    board = checkerboard(9, 6, 0.025)
+    corners = {}
+    for path in sorted((real_data / "opencv_left_right").glob("left*.jpg")):
+        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        assert image is not None
+        found, rough = cv2.findChessboardCorners(image, (9, 6))
+        assert found
+        corners[path.stem] = cv2.cornerSubPix(image, rough, (5, 5), (-1, -1), (3, 100, 1e-6))
+    names = list(corners)
+    seen = Observations.from_points({name: corners[name] for name in names[1::2]}, board, (640, 480), sigma_px=0.2)
+    places = [board.point_array.astype(np.float32)] * len(names[::2])
+    few = cv2.CALIB_FIX_K2 + cv2.CALIB_FIX_K3 + cv2.CALIB_ZERO_TANGENT_DIST
+    for flags, cause in ((0, None), (few, "too few coefficients")):
+        nothing = np.empty(0)
+        made = cv2.calibrateCamera(places, [corners[n] for n in names[::2]], (640, 480), nothing, nothing, flags=flags)
+        given = Camera.from_opencv((640, 480), made[1], made[2])
+        answer = audit(ImportedCameras({"camera": given}).calibration("OpenCV"), seen)["camera"]
+        assert answer.cause == cause and not answer.posed and answer.off_mm == {}

@@ -74,19 +74,8 @@ class ImportedCameras:
         from ceres_cal.calibration import Calibration, Fit
         from ceres_cal.model.parameters import Estimate, Options, Station
         from ceres_cal.model.structure import EXACT
-        from ceres_cal.scene.camera import Camera
 
-        warnings, cameras = [*self.warnings], {}
-        for name, given in self.cameras.items():
-            if isinstance(given, Camera):
-                cameras[name] = given
-                continue
-            cameras[name], (rms, worst) = Camera.from_foreign(given)
-            if worst > 0.0:
-                what = f"its {given.model} model is held as the nearest {cameras[name].lens.kind} lens"
-                warnings.append(f"camera {name!r}: {what}, off by {rms:.2g} px rms and {worst:.2g} px at most")
-            if given.cam_from_world is None:
-                warnings.append(f"camera {name!r}: the file has no pose of it over a field: the camera is the world")
+        cameras, warnings = self._ours()
         stations = {name: Station(name, camera.cam_from_world) for name, camera in cameras.items()}
         bare = {name: camera.at(type(camera.cam_from_world).identity()) for name, camera in cameras.items()}
         lens = next(iter(cameras.values())).lens
@@ -105,3 +94,20 @@ class ImportedCameras:
             options,
             "",
         )
+
+    def _ours(self) -> tuple[dict[str, Camera], list[str]]:
+        """Each camera as ours, and what to know of them."""
+        from ceres_cal.scene.camera import Camera
+
+        warnings, cameras = [*self.warnings], {}
+        for name, given in self.cameras.items():
+            if isinstance(given, Camera):
+                cameras[name] = given
+                continue
+            cameras[name], (rms, worst) = Camera.from_foreign(given)
+            if worst > 0.0:
+                what = f"its {given.model} model is held as the nearest {cameras[name].lens.kind} lens"
+                warnings.append(f"camera {name!r}: {what}, off by {rms:.2g} px rms and {worst:.2g} px at most")
+            if given.cam_from_world is None:
+                warnings.append(f"camera {name!r}: the file has no pose of it over a field: the camera is the world")
+        return cameras, warnings

@@ -132,8 +132,9 @@ def _export(request: ExportRequest) -> Exported:
     if request.existing is None:
         raise InputError("ssl-vision's settings are edited in place: name its robocup-ssl.xml (or a copy), with "
                          "ssl-vision closed")  # fmt: skip
-    there = _cameras(_values(request.existing))
-    entries, losses, warnings = to_entries(request, field_box(request.calibration.targets))
+    values = _values(request.existing)
+    there, box = _cameras(values), field_box(request.calibration.targets)
+    entries, losses, warnings = to_entries(request, box or field_box({"field": settings_target(values)}))
     changes: list[tuple[_Var, str]] = []
     for number, entry in entries.items():
         if number not in there:
