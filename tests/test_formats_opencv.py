@@ -11,6 +11,7 @@ from ceres_cal import Camera, InputError
 from ceres_cal.base.arrays import Array
 from ceres_cal.formats import export, import_calibration
 from ceres_cal.scene.foreign import ForeignCamera
+from ceres_cal.scene.lens import Brown
 
 ENDINGS = (".yml", ".xml", ".json")
 EXACT = ("brown", "kannala-brandt")
@@ -73,6 +74,20 @@ def test_a_stereo_file_of_opencv_alone_stands_at_its_first_camera(tmp_path: Path
     assert np.array_equal(back.station("camera0").cam_from_world.matrix, np.eye(3, 4))
     one, other = (two_cameras("brown").station(f"camera{n}").position for n in (0, 1))
     assert np.linalg.norm(back.station("camera1").position) == pytest.approx(np.linalg.norm(one - other))
+
+
+def test_what_opencvs_inverse_misses_is_said(tmp_path: Path) -> None:
+    camera = with_lens("brown")
+    (warning,) = export(over_field(camera), "opencv", tmp_path / "a.yml").warnings
+    assert "cv2.undistortPoints stops after five rounds, here up to" in warning and "give it criteria=" in warning
+    matrix, distortion, _, _ = camera.to_opencv()
+    pixels = places(camera)[1]
+    end = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 100, 1e-9)
+    straight = cv2.undistortPoints(pixels[:, None], matrix, distortion, criteria=end)[:, 0]
+    rays = camera.rays(pixels)
+    assert np.abs(straight - rays[:, :2] / rays[:, 2:]).max() < 1e-7
+    mild = with_lens(Brown((-0.02, 0.0, 0.0, 0.0, 0.0)))
+    assert export(over_field(mild), "opencv", tmp_path / "b.yml").warnings == ()
 
 
 def test_the_rational_model_comes_back_with_its_error(tmp_path: Path) -> None:

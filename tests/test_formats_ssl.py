@@ -5,6 +5,7 @@ their published equations, and sent over the loopback.
 import re
 import shutil
 import threading
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ import numpy as np
 import pytest
 import yaml
 from foreign_cases import LENSES, SSL_LENS, over_field, places, same_camera, two_cameras, with_lens
-from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+from google.protobuf import descriptor_pb2, descriptor_pool, json_format, message_factory
 
 from ceres_cal import Calibration, InputError
 from ceres_cal.base.arrays import Array
@@ -36,8 +37,9 @@ FIELD = (
 _KINDS = {"F": 2, "I": 5, "U": 13}
 
 
-def published(name: str) -> Any:
-    """The message classes, from the published numbers."""
+@cache
+def pool() -> Any:
+    """All message classes, from the published numbers."""
     file = descriptor_pb2.FileDescriptorProto(name="published.proto", syntax="proto2")
     for title, fields in (("Calib", CALIB), ("Field", FIELD)):
         message = file.message_type.add(name=title)
@@ -52,9 +54,14 @@ def published(name: str) -> Any:
     wrapper = file.message_type.add(name="Wrapper")
     wrapper.field.add(name="geometry", number=2, type=11, type_name=".Data", label=1)
     wrapper.field.add(name="source", number=3, type=5, label=1)
-    pool = descriptor_pool.DescriptorPool()
-    pool.Add(file)
-    return message_factory.GetMessageClass(pool.FindMessageTypeByName(name))
+    every = descriptor_pool.DescriptorPool()
+    every.Add(file)
+    return every
+
+
+def published(name: str) -> Any:
+    """One of the message classes."""
+    return message_factory.GetMessageClass(pool().FindMessageTypeByName(name))
 
 
 def rotation(calib: Any) -> Array:
@@ -129,6 +136,17 @@ def test_a_negative_distortion_is_said_out_loud(tmp_path: Path) -> None:
     (warning,) = export(over_field(bent), "ssl-vision", tmp_path / "a.pb").warnings
     assert "station 'overhead': its distortion is negative: ssl-vision locates with it but draws" in warning
     assert any("negative" in text for text in import_calibration(tmp_path / "a.pb").warnings)
+
+
+def test_geometry_yml_parses_as_vision_processor_parses_it(tmp_path: Path) -> None:
+    """By json_format.ParseDict, into the published message."""
+    export(two_cameras(SSL_LENS), "vision-processor", tmp_path / "geometry.yml")
+    given = yaml.safe_load((tmp_path / "geometry.yml").read_text())
+    assert {line["type"] for line in given["field"]["field_lines"]} <= {*ssl_field("B").curves}
+    message = json_format.ParseDict(given, published("Data")(), ignore_unknown_fields=True)  # the lines, see above
+    assert message.IsInitialized() and [calib.camera_id for calib in message.calib] == [0, 1]
+    export(two_cameras(SSL_LENS), "ssl-vision", tmp_path / "a.pb")
+    assert list(published("Data").FromString((tmp_path / "a.pb").read_bytes()).calib) == list(message.calib)
 
 
 @pytest.mark.parametrize("to, name", [("ssl-vision", "a.pb"), ("vision-processor", "a.yml")])

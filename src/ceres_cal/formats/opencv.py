@@ -18,11 +18,12 @@ from ceres_cal.base.transforms import Pose
 from ceres_cal.formats.export_format import Exported, ExportFormat, ExportRequest, Loss
 from ceres_cal.formats.import_format import ImportedCameras, ImportFormat, ImportRequest
 from ceres_cal.formats.loss import as_foreign, field_box, loss_words
-from ceres_cal.scene.foreign import FISHEYE, ForeignCamera
+from ceres_cal.scene.foreign import FISHEYE, ForeignCamera, image_grid
 
 _ENDINGS = (".yml", ".yaml", ".xml", ".json")
 _MATRIX = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "M1", "K")
 _COEFFICIENTS = ("distortion_coefficients", "Distortion_Coefficients", "distCoeffs", "dist_coeffs", "D1", "D")
+_ROUGH_PX = 0.05  # from which on OpenCV's own inverse is worth a word
 _WIDTH, _HEIGHT = ("image_width", "image_Width"), ("image_height", "image_Height")
 
 
@@ -50,12 +51,25 @@ def _export(request: ExportRequest) -> Exported:
     if request.ending in (".yml", ".yaml"):  # what readers older than OpenCV 5 know
         content = re.sub(r"^%YAML[^\n]*", "%YAML:1.0", content)
     models_used = " and ".join(camera.model for camera in cameras)
-    warnings = [
-        f"station {name!r}: its numbers are those of cv2.fisheye, which a file cannot say: `distortion_model` does"
-        for name, camera in zip(request.stations, cameras, strict=True)
-        if camera.model == FISHEYE
-    ]
+    named = zip(request.stations, cameras, strict=True)
+    warnings = [f"station {name!r}: {text}" for name, camera in named for text in _reader_traps(camera)]
     return Exported(content.encode(), tuple(losses), f"K, {models_used}, pose", {}, tuple(warnings))
+
+
+def _reader_traps(camera: ForeignCamera) -> list[str]:
+    """What OpenCV makes of a camera."""
+    import cv2
+
+    if camera.model == FISHEYE:
+        return ["its numbers are those of cv2.fisheye, which a file cannot say: `distortion_model` does"]
+    pixels, coefficients = image_grid(camera.image_size), np.array(camera.coefficients)
+    straight = cv2.undistortPoints(pixels[:, None], camera.matrix, coefficients)[:, 0]
+    rays = np.column_stack([straight, np.ones(len(straight))])
+    worst = float(np.max(np.linalg.norm(camera.project_rays(rays) - pixels, axis=1)))
+    if worst <= _ROUGH_PX:
+        return []
+    end = "criteria=(cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 100, 1e-9)"
+    return [f"cv2.undistortPoints stops after five rounds, here up to {worst:.2g} px off: give it {end}"]
 
 
 def _numbers(camera: ForeignCamera) -> tuple[Array, Array, Array]:
