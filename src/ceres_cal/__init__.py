@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from ceres_cal.formats import import_calibration as import_calibration
     from ceres_cal.formats import import_observations as import_observations
     from ceres_cal.model.parameters import Options as Options
+    from ceres_cal.moves import RefitOptions as RefitOptions
     from ceres_cal.moves import audit as audit
     from ceres_cal.moves import check as check
     from ceres_cal.moves import compare as compare
@@ -48,6 +49,7 @@ _HOME = {
     "InputError": "base.errors",
     "SolutionError": "base.errors",
     "refit": "moves",
+    "RefitOptions": "moves",
     "check": "moves",
     "audit": "moves",
     "compare": "moves",

@@ -150,7 +150,7 @@ def _of_camera(posterior: Posterior, estimate: Estimate, camera: str) -> Posteri
     """What is known of a camera, its stations and the targets as built, all else integrated out."""
     owners = {("camera", camera), *(("station", name) for name, s in estimate.stations.items() if s.camera == camera)}
     keys = [key for key in posterior.keys if key[:2] in owners or key.kind == "structure"]
-    return replace(posterior, information=posterior.information.marginal(keys))
+    return replace(posterior, information=posterior.information.marginal(keys), bends=None)
 
 
 def _weighting(fit: Fit) -> Weighting:
@@ -162,7 +162,6 @@ def _weighting(fit: Fit) -> Weighting:
 
 
 def _board(targets: Mapping[str, Target], board: Target | None) -> tuple[str, Target]:
-    """The board to show, and a name for it."""
     for name, target in targets.items():
         if target.grid is not None and board in (None, target):
             return name, target

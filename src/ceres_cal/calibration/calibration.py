@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 
 from ceres_cal.base.arrays import Mask
-from ceres_cal.base.errors import InputError
+from ceres_cal.base.errors import InputError, naming
 from ceres_cal.base.files import PIXEL_ORIGIN, UNITS, convert, read_json, write_json
 from ceres_cal.base.transforms import Pose
 from ceres_cal.calibration.file import (
@@ -24,16 +24,23 @@ from ceres_cal.calibration.file import (
     options_from_json,
     options_to_json,
 )
-from ceres_cal.calibration.origin import Fit, Refitted, Rejected, package_versions
+from ceres_cal.calibration.origin import COPY, Fit, Refitted, Rejected, package_versions
+from ceres_cal.model.keys import Key
 from ceres_cal.model.parameters import Estimate, Options, make_layout
-from ceres_cal.model.priors import gather_priors, gather_stated, tolerances
-from ceres_cal.observations import Observations, taken
+from ceres_cal.model.priors import GaussianPrior, gather_priors
+from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import gather_sights
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.files import CameraFile, PoseFile
 from ceres_cal.scene.targets import Target, target_from_spec
-from ceres_cal.solve import Problem, Weighting
+from ceres_cal.solve import Conflict, Problem, Weighting
 from ceres_cal.uncertainty import Disagreement, Posterior, PosteriorFile, Uncertainty, disagreement
+
+_ALIKE = (
+    *("fit", "rejected", "termination", "converged", "rounds", "history"),
+    *("phi_from", "warnings", "digest", "versions", "conflicts"),
+)
+"""What the file has as it is."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -51,6 +58,7 @@ class Calibration:
         posterior: what is known of every number; None where nothing was minimised, or a file says nothing of it.
         options: how it was solved. digest: SHA-256 of the observations. versions: of the packages that solved it.
         refitted: how it came from an earlier calibration; None for one from scratch.
+        conflicts: what was known beforehand and everything else contradicts; what is in dispute is in the posterior.
         notes: whatever somebody wants to keep with it, plain data.
     """
 
@@ -69,6 +77,7 @@ class Calibration:
     posterior: Posterior | None = None
     versions: Mapping[str, str] = field(default_factory=package_versions)
     refitted: Refitted | None = None
+    conflicts: tuple[Conflict, ...] = ()
     notes: Mapping[str, Any] = field(default_factory=dict)
 
     def __repr__(self) -> str:
@@ -118,9 +127,7 @@ class Calibration:
         if observations.digest != self.digest:
             raise InputError("these are not the observations that the calibration was made from: give those")
         points, curves = self.inlier_masks(observations)
-        used = replace(
-            observations, points=taken(observations.points, points), curves=taken(observations.curves, curves)
-        )
+        used = observations.part(points, curves)
         return disagreement(used, self.estimate, self.uncertainty.posterior, self.fit.scales, (first, second))
 
     def inlier_masks(self, observations: Observations) -> tuple[Mask, Mask]:
@@ -129,6 +136,11 @@ class Calibration:
         for entry in self.rejected:
             masks[entry.kind == "curve"][entry.row] = False
         return masks
+
+    @property
+    def outliers(self) -> tuple[Rejected, ...]:
+        """What was taken out for its residual: all that was but copies of other observations."""
+        return tuple(entry for entry in self.rejected if not entry.reason.startswith(COPY))
 
     def problem(self, observations: Observations, *, new_data: bool = False) -> Problem:
         """The problem of which this is the solution, of all the observations, at the noise that was found.
@@ -142,10 +154,12 @@ class Calibration:
         if new_data or prior is None or self.posterior is None:
             priors = gather_priors(observations, options, self.estimate.structure)
             return Problem(sights, make_layout(observations, options), priors, weighting, options)
-        lenses = {name: camera.lens for name, camera in self.cameras.items()}
-        fresh = tolerances(self.estimate.structure, prior.keys)
-        priors = (prior, *gather_stated(observations, options, lenses), *fresh)
+        priors = gather_priors(observations, options, self.estimate.structure, prior, self.cameras)
         return Problem(sights, self.posterior.layout(self.estimate), priors, weighting, options)
+
+    def prior_of(self, keys: Sequence[Key]) -> GaussianPrior:
+        """What the posterior says of some numbers, all others integrated out, as the prior of the next solve."""
+        return GaussianPrior.about(self.uncertainty.posterior.information.marginal(keys), self.estimate)
 
     @property
     def rms_px(self) -> float:
@@ -164,10 +178,8 @@ class Calibration:
             InputError: one line that names the file and the place; also for a radial lens that folds inside the image.
         """
         data = convert(read_json(path, FORMAT, VERSION), CalibrationFile, str(path))
-        try:
+        with naming(path):
             return cls.from_file(data)
-        except InputError as error:
-            raise InputError(f"{path}: {error}") from None
 
     def to_file(self) -> CalibrationFile:
         """The calibration as its file has it."""
@@ -182,20 +194,11 @@ class Calibration:
             placements={name: PoseFile.of(pose) for name, pose in estimate.placements.items()},
             targets={name: target.spec for name, target in self.targets.items()},
             structure_m=dict(zip(estimate.structure.names, estimate.structure.values.tolist(), strict=True)),
-            fit=self.fit,
-            rejected=self.rejected,
-            termination=self.termination,
-            converged=self.converged,
-            rounds=self.rounds,
-            history=self.history,
-            phi_from=dict(self.phi_from),
-            warnings=self.warnings,
             options=options_to_json(self.options),
-            digest=self.digest,
-            versions=dict(self.versions),
             posterior=None if self.posterior is None else PosteriorFile.of(self.posterior),
             refitted=None if self.refitted is None else RefittedFile.of(self.refitted),
             notes=dict(self.notes) or msgspec.UNSET,
+            **{name: getattr(self, name) for name in _ALIKE},
         )
 
     @classmethod
@@ -206,18 +209,9 @@ class Calibration:
         return cls(
             data.estimate(targets, options),
             targets,
-            data.fit,
-            data.rejected,
-            data.termination,
-            data.converged,
-            data.rounds,
-            data.history,
-            data.phi_from,
-            data.warnings,
-            options,
-            data.digest,
-            None if data.posterior is None else data.posterior.posterior(),
-            data.versions,
-            None if data.refitted is None else data.refitted.refitted(),
-            data.notes if isinstance(data.notes, dict) else {},
+            options=options,
+            posterior=None if data.posterior is None else data.posterior.posterior(),
+            refitted=None if data.refitted is None else data.refitted.refitted(),
+            notes=data.notes if isinstance(data.notes, dict) else {},
+            **{name: getattr(data, name) for name in _ALIKE},
         )

@@ -1,4 +1,4 @@
-"""Calibrations in JSON files (design, section 9): every number comes back exactly."""
+"""Calibrations in JSON files (docs/files.md): every number comes back exactly."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from ceres_cal.model.structure import EXACT, make_structure
 from ceres_cal.observations import prior_from_json, prior_to_json
 from ceres_cal.scene.files import CameraFile, Matrix, PoseFile, Vector
 from ceres_cal.scene.targets import Target
+from ceres_cal.solve import Conflict
 from ceres_cal.uncertainty import PosteriorFile, information_from, lower_triangle
 
 FORMAT, VERSION = "ceres-cal/calibration", 1
@@ -119,6 +120,7 @@ class CalibrationFile(msgspec.Struct, forbid_unknown_fields=True):
     versions: dict[str, str]
     posterior: PosteriorFile | None = None
     refitted: RefittedFile | None = None
+    conflicts: tuple[Conflict, ...] = ()
     notes: dict[str, Any] | msgspec.UnsetType = msgspec.UNSET
 
     def estimate(self, targets: Mapping[str, Target], options: Options) -> Estimate:

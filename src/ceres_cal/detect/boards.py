@@ -96,7 +96,9 @@ def detect_boards(
         NothingShownError: no image shows the board.
     """
     paths = [Path(path) for path in images]
-    placements, squares = _placement_names(paths), _squares_of(board)
+    placements, squares = _placement_names(paths), board.grid
+    if squares is None or not squares.checkered:
+        raise InputError(f"target of kind {board.kind!r}: boards are detected with a target of kind 'checkerboard'")
     size, grids, missed = _find_all(paths, _finder(squares, corners), progress)
     if not grids:
         raise NothingShownError(
@@ -140,13 +142,6 @@ def _find_all(
         if progress is not None:
             progress(number, len(paths), path.name)
     return size, grids, missed
-
-
-def _squares_of(board: Target) -> Grid:
-    """How the squares of a checkerboard meet; InputError where it is none."""
-    if board.grid is None or not board.grid.checkered:
-        raise InputError(f"target of kind {board.kind!r}: boards are detected with a target of kind 'checkerboard'")
-    return board.grid
 
 
 def _finder(squares: Grid, corners: CharucoSpec | str) -> Finder:
@@ -201,10 +196,10 @@ def _find_chessboard(image: Image8, columns: int, rows: int) -> Array | None:
         how = cv2.INTER_AREA if scale < 1.0 else cv2.INTER_CUBIC
         scaled = image if scale == 1.0 else cv2.resize(image, None, fx=scale, fy=scale, interpolation=how)
         # The newer detector is the better one, but blind where it is dark.
-        found, corners = cv2.findChessboardCornersSB(scaled, (columns, rows))
-        if not found:
-            found, corners = cv2.findChessboardCorners(scaled, (columns, rows), flags=legacy)
-        if found:
+        shown, corners = cv2.findChessboardCornersSB(scaled, (columns, rows))
+        if not shown:
+            shown, corners = cv2.findChessboardCorners(scaled, (columns, rows), flags=legacy)
+        if shown:
             ratio = np.array(image.shape[::-1]) / np.array(scaled.shape[::-1])
             return np.asarray((corners.reshape(rows, columns, 2).astype(float) + 0.5) * ratio - 0.5)
     return None

@@ -7,7 +7,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ceres_cal.base.errors import InputError
+from ceres_cal.base.errors import InputError, naming
 from ceres_cal.base.files import read_bytes
 from ceres_cal.formats import colmap, detections, kalibr, lookup, mrcal, opencv, paper, ros, ssl_geometry, ssl_settings
 from ceres_cal.formats.export_format import Exported, ExportFormat, ExportRequest
@@ -115,10 +115,8 @@ def read_foreign(path: str | Path, form: str | None = None, **options: Any) -> C
     path = Path(path)
     content = b"" if path.is_dir() else read_bytes(path)
     chosen = _import_format(path, content, form)
-    try:
+    with naming(path):
         return chosen.read(ImportRequest(path, content, chosen.options(**_known_options(chosen, options))))
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
 
 
 def import_calibration(path: str | Path, form: str | None = None, **options: Any) -> Calibration:

@@ -13,4 +13,6 @@ def file_schemas() -> dict[str, dict[str, Any]]:
     from ceres_cal.observations.files import ObservationsFile
 
     kinds = {"calibration": CalibrationFile, "observations": ObservationsFile}
-    return {f"{name}.schema.json": msgspec.json.schema(kind) for name, kind in kinds.items()}
+    schemas = {f"{name}.schema.json": msgspec.json.schema(kind) for name, kind in kinds.items()}
+    plain: dict[str, dict[str, Any]] = msgspec.json.decode(msgspec.json.encode(schemas))  # defaults are tuples
+    return plain

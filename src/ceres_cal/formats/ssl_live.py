@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ceres_cal.base.errors import InputError
+from ceres_cal.base.errors import naming
 from ceres_cal.base.files import read_bytes
 from ceres_cal.formats.export_format import Exported, ExportRequest
 from ceres_cal.formats.ssl_cameras import SslOptions
@@ -58,7 +58,5 @@ def read_ssl_target(path: str | Path) -> Target:
         InputError: naming the file; it is none of these, or has no field.
     """
     content = read_bytes(path)
-    try:
+    with naming(path):
         return settings_field(content) if b"<VarXML" in content else ssl_target(read_geometry(content))
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None

@@ -138,7 +138,7 @@ def _audited(name: str, given: Camera, observations: Observations) -> StationAud
     degrees = len(free) + (6 if posed else 0)
     cost, as_it_is = case.least(camera, pose=not posed)
     cause, words = (None, "") if _sound(cost - best, degrees) else _cause(case, camera, best, degrees, posed)
-    size = sum(len(c) for c in (observations.points, observations.curves))
+    size = case.ours.fit.points + case.ours.fit.curves
     noise = float(np.hypot(*case.ours.fit.noise_px))
     off_mm = _off_mm(as_it_is, here, case.ours)
     return StationAudit(
@@ -166,8 +166,8 @@ def _case(observations: Observations, given: Camera) -> _Case:
             failure = failure or error
             continue
         count = ours.fit.points * 2 + ours.fit.curves
-        rejected = len(ours.rejected)  # each of them as a residual of five sigmas
-        misfit = count * np.log(ours.fit.rms_px**2) + 25.0 * rejected
+        outliers = len(ours.outliers)  # each of them as a residual of five sigmas
+        misfit = count * np.log(ours.fit.rms_px**2) + 25.0 * outliers
         found.append((misfit + len(ours.station().lens.names) * np.log(count), ours))
     if not found:
         raise failure or InputError("nothing was observed")

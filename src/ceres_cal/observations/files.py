@@ -1,13 +1,14 @@
-"""Observations in JSON and NPZ files (design, section 9): every number comes back exactly."""
+"""Observations in JSON and NPZ files (docs/files.md): every number comes back exactly."""
 
 from __future__ import annotations
 
 import io
 import zipfile
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import groupby
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -25,23 +26,42 @@ from ceres_cal.base.files import (
     read_bytes,
     write_bytes,
 )
-from ceres_cal.observations.columns import NO_CURVES, NO_POINTS, TYPES, Curves, Points, Prior, View, choices, view_label
+from ceres_cal.observations.columns import (
+    NO_CURVES,
+    NO_POINTS,
+    TYPES,
+    Columns,
+    Curves,
+    Points,
+    Prior,
+    View,
+    choices,
+    view_label,
+)
 from ceres_cal.scene.targets import SIDES, Target, target_from_spec
 
 FORMAT, VERSION = "ceres-cal/observations", 1
 _SIDE_NAMES = {value: name for name, value in SIDES.items()}
 
 
-class Content(NamedTuple):
-    """What a file holds: the fields of `Observations`."""
+@dataclass(frozen=True, eq=False)
+class Content:
+    """What a file holds, not checked: see `Observations`."""
 
     targets: Mapping[str, Target]
     cameras: Mapping[str, tuple[int, int]]
     views: tuple[View, ...]
-    points: Points = NO_POINTS
-    curves: Curves = NO_CURVES
+    points: Points
+    curves: Curves
     priors: tuple[Prior, ...] = ()
-    notes: Mapping[str, Any] = {}
+    notes: Mapping[str, Any] = field(default_factory=dict)
+
+    def feature_name(self, kind: str, row: int) -> str:
+        """Name of the feature that observation `row` of the points (kind "point") or curves ("curve") shows."""
+        column: Columns = self.points if kind == "point" else self.curves
+        target = self.targets[self.views[int(column.view[row])].target]
+        names = target.point_names if kind == "point" else target.curve_names
+        return names[int(column.feature[row])]
 
 
 class _PointsFile(msgspec.Struct, forbid_unknown_fields=True):
@@ -100,8 +120,10 @@ class ObservationsFile(msgspec.Struct, forbid_unknown_fields=True, kw_only=True)
             {name: target_from_spec(spec, f"target {name!r}") for name, spec in self.targets.items()},
             {name: camera.image_size for name, camera in self.cameras.items()},
             tuple(entry.view() for entry in self.views),
-            priors=tuple(prior_from_json(entry, f"prior {i}") for i, entry in enumerate(self.priors)),
-            notes=self.notes if isinstance(self.notes, dict) else {},
+            NO_POINTS,
+            NO_CURVES,
+            tuple(prior_from_json(entry, f"prior {i}") for i, entry in enumerate(self.priors)),
+            self.notes if isinstance(self.notes, dict) else {},
         )
 
 
@@ -191,7 +213,8 @@ def _from_json(content: bytes, where: str) -> Content:
     point_index = {name: {f: i for i, f in enumerate(target.point_names)} for name, target in targets.items()}
     curve_index = {name: {f: i for i, f in enumerate(target.curve_names)} for name, target in targets.items()}
     sides = [_sides(entry, view_label(i, views)) for i, entry in curves]
-    return header._replace(
+    return replace(
+        header,
         points=Points(**_columns(points, views, point_index, "point")),
         curves=Curves(**_columns(curves, views, curve_index, "curve"), side=_concatenate(sides, np.int8)),
     )
@@ -254,17 +277,16 @@ def _same_or_list(values: AnyArray) -> Any:
 
 def _to_json(content: Content) -> bytes:
     data = header_of(content)
-    for rows, entry in zip(_rows_by_view(content.points, len(data.views)), data.views, strict=True):
-        if len(rows):
-            entry.points = _PointsFile(*_features(content.points, rows, content.targets[entry.target].point_names))
-    for rows, entry in zip(_rows_by_view(content.curves, len(data.views)), data.views, strict=True):
-        if len(rows):
-            side = _side_names(content.curves.side[rows])
-            names = content.targets[entry.target].curve_names
-            features, pixels, sigma_px = _features(content.curves, rows, names)
+    points, curves = (_rows_by_view(columns, len(data.views)) for columns in (content.points, content.curves))
+    for p, c, entry in zip(points, curves, data.views, strict=True):
+        target = content.targets[entry.target]
+        if len(p):
+            entry.points = _PointsFile(*_features(content.points, p, target.point_names))
+        if len(c):
+            features, pixels, sigma_px = _features(content.curves, c, target.curve_names)
             runs = [(name, len(list(same))) for name, same in groupby(features)]
             once, counts = [name for name, _ in runs], [count for _, count in runs]
-            entry.curves = _CurvesFile(once, pixels, sigma_px, counts, side)
+            entry.curves = _CurvesFile(once, pixels, sigma_px, counts, _side_names(content.curves.side[c]))
     plain = {name: value for name, value in msgspec.structs.asdict(data).items() if value is not msgspec.UNSET}
     del plain["views"]
     head = msgspec.json.format(msgspec.json.encode(plain), indent=1).removesuffix(b"\n}")
@@ -300,7 +322,6 @@ def _to_npz(content: Content) -> bytes:
 
 
 def _arrays(content: bytes, where: str) -> dict[str, AnyArray]:
-    """What an NPZ file holds, by name."""
     reason = "it is cut short or no NPZ file"
     try:
         if zipfile.is_zipfile(io.BytesIO(content)):
@@ -313,7 +334,6 @@ def _arrays(content: bytes, where: str) -> dict[str, AnyArray]:
 
 
 def _taken(arrays: dict[str, AnyArray], kind: str, names: Sequence[str], where: str) -> dict[str, Any]:
-    """The columns of one kind, taken out of the arrays."""
     columns = {}
     for name in names:
         array, dtype, ndim = arrays.pop(f"{kind}_{name}", None), np.dtype(TYPES[name]), 2 if name == "pixels" else 1
@@ -339,4 +359,4 @@ def _from_npz(packed: bytes, where: str) -> Content:
     curves = Curves(**_taken(arrays, "curves", (*names, "side"), where))
     if arrays:
         raise InputError(f"{where}: unknown column {min(arrays)!r}")
-    return content._replace(points=points, curves=curves)
+    return replace(content, points=points, curves=curves)

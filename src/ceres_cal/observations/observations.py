@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -17,16 +17,17 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ceres_cal.base.arrays import Mask
-from ceres_cal.base.errors import InputError
+from ceres_cal.base.errors import InputError, naming
 from ceres_cal.observations.bounds import stray_pixels
 from ceres_cal.observations.columns import Columns, Curves, Points, Prior, View, choices, taken, view_label
+from ceres_cal.observations.copies import Copies, find_copies
 from ceres_cal.observations.files import Content, header_of, read_content, write_content
 from ceres_cal.observations.from_points import gathered
 from ceres_cal.scene.targets import Target
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Observations:
+class Observations(Content):
     """Everything that was observed.
 
     Attributes:
@@ -43,14 +44,6 @@ class Observations:
         InputError: on construction, naming the view and the feature: a name that is not there, a number that is not
             finite, a camera without any observation.
     """
-
-    targets: Mapping[str, Target]
-    cameras: Mapping[str, tuple[int, int]]
-    views: tuple[View, ...]
-    points: Points
-    curves: Curves
-    priors: tuple[Prior, ...] = ()
-    notes: Mapping[str, Any] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         counts = f"{len(self.points)} points, {len(self.curves)} curve observations in {len(self.views)} views"
@@ -91,55 +84,54 @@ class Observations:
         Raises:
             InputError: shapes or counts that do not fit; naming the frame.
         """
-        return cls(*gathered(pixels, points, image_size, camera, sigma_px, moves))
+        return cls(**vars(gathered(pixels, points, image_size, camera, sigma_px, moves)))
 
     # ---- files --------------------------------------------------------------------------------------------------
 
     @classmethod
     def load(cls, path: str | Path) -> Observations:
-        """Read `.json` or `.npz` (design, section 9).
+        """Read `.json` or `.npz` (docs/files.md).
 
         Raises:
             InputError: one line that names the file, the view and the feature; also for pixels outside their images.
         """
-        path = Path(path)
-        try:
-            observations = cls(*read_content(path))
+        with naming(path):
+            observations = cls(**vars(read_content(Path(path))))
             observations.require_inside()
             return observations
-        except InputError as error:
-            text = str(error)
-            raise InputError(text if text.startswith(f"{path}: ") else f"{path}: {text}") from None
 
     def save(self, path: str | Path) -> None:
         """Write `.json` or, for large sets, `.npz`; every number comes back exactly."""
-        write_content(self._content, Path(path))
+        write_content(self, Path(path))
 
     @cached_property
     def digest(self) -> str:
         """SHA-256 of the content, the same for the JSON and the NPZ file: where a calibration came from."""
-        content = hashlib.sha256(msgspec.json.encode(header_of(self._content._replace(notes={}))))
+        content = hashlib.sha256(msgspec.json.encode(header_of(replace(self, notes={}))))
         for column in (self.points, self.curves):
             for array in vars(column).values():
                 content.update(np.ascontiguousarray(array).data)
         return content.hexdigest()
 
-    @property
-    def _content(self) -> Content:
-        return Content(self.targets, self.cameras, self.views, self.points, self.curves, self.priors, self.notes)
-
     # ---- reading ------------------------------------------------------------------------------------------------
 
     @cached_property
+    def copies(self) -> Copies:
+        """Which observations repeat others to the last bit: they count once."""
+        return find_copies(self.views, self.points, self.curves)
+
+    @cached_property
     def warnings(self) -> tuple[str, ...]:
-        """What to know of the observations before using them, each one line: strays outside an image."""
-        return self.require_inside()
+        """What to know of the observations before using them, each one line: strays outside an image, copies."""
+        return (*self.require_inside(), *self.copies.words(self.views, (self.points, self.curves)))
 
     @cached_property
     def shown_views(self) -> tuple[View, ...]:
-        """The views with observations; what the others name is not there for the solve."""
-        counts = sum(np.bincount(column.view, minlength=len(self.views)) for column in (self.points, self.curves))
-        return tuple(self.views[number] for number in np.flatnonzero(counts))
+        """The views with observations that are no copies; what the others name is not there for the solve."""
+        points, curves = self.copies.originals
+        shown = np.zeros(len(self.views), dtype=bool)
+        shown[self.points.view[points]] = shown[self.curves.view[curves]] = True
+        return tuple(self.views[number] for number in np.flatnonzero(shown))
 
     @property
     def stations(self) -> dict[str, str]:
@@ -151,12 +143,11 @@ class Observations:
         """Names of the placements, in order of appearance."""
         return tuple(dict.fromkeys(view.placement for view in self.views if view.placement is not None))
 
-    def feature_name(self, kind: str, row: int) -> str:
-        """Name of the feature that observation `row` of the points (kind "point") or curves ("curve") shows."""
-        column: Columns = self.points if kind == "point" else self.curves
-        target = self.targets[self.views[int(column.view[row])].target]
-        names = target.point_names if kind == "point" else target.curve_names
-        return names[int(column.feature[row])]
+    @property
+    def counts(self) -> dict[str, int]:
+        """How many views, cameras, stations, placements, points and curve observations there are."""
+        names = ("views", "cameras", "stations", "placements", "points", "curves")
+        return {name: len(getattr(self, name)) for name in names}
 
     # ---- parts --------------------------------------------------------------------------------------------------
 
@@ -244,7 +235,7 @@ class Observations:
 
     @cached_property
     def _strays(self) -> tuple[str, ...]:
-        return stray_pixels(self._content)
+        return stray_pixels(self)
 
     def require_owner(self, prior: Prior) -> None:
         """Raise InputError where a prior names a camera or station that is not there."""

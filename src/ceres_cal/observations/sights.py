@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Container, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -157,14 +157,15 @@ class Sights(Sequence["Sights"]):
         c = bounds_of(curves[self.curve_rows])[self.curve_bounds]
         return np.asarray((np.diff(p) + np.diff(c)) / (np.diff(self.point_bounds) + np.diff(self.curve_bounds)))
 
-    def reach_px(self, camera: Camera) -> float:
-        """Distance from the principal point to the farthest observation of the sights, which are the camera's."""
-        farthest = 0.0
-        for pixels in (self.pixels, self.curve_pixels):
-            for at in range(0, len(pixels), _BLOCK):
-                x, y = camera.offsets(pixels[at : at + _BLOCK]).T
-                farthest = max(farthest, float(np.max(x * x + y * y)))
-        return float(np.sqrt(farthest))
+    def about(self, camera: Camera) -> Sights:
+        """The sights, which are the camera's, with pixels as offsets from its principal point on square pixels."""
+        return replace(self, pixels=camera.offsets(self.pixels), curve_pixels=camera.offsets(self.curve_pixels))
+
+    @property
+    def reach_px(self) -> float:
+        """Largest length of a pixel: of sights `about` their camera how far observations reach from the centre."""
+        columns = (self.pixels.T, self.curve_pixels.T)
+        return float(np.sqrt(max(np.max(x * x + y * y, initial=0.0) for x, y in columns)))
 
     def part(self, number: int, count: int) -> Sights:
         """The number-th of `count` about equal parts of the observations of a single sight."""
@@ -233,8 +234,12 @@ def ranges(bounds: Indices, numbers: Indices) -> Indices:
     return np.asarray(starts + np.arange(sizes.sum()))
 
 
-def gather_sights(observations: Observations) -> Sights:
-    """The sights of all observations; a sight without any observation is left out."""
+def gather_sights(observations: Observations, *, predicted: bool = False) -> Sights:
+    """The sights of all observations that are no copies of others; a sight without any is left out.
+
+    Args:
+        predicted: that they were never measured: without noise frames of a static camera look like copies.
+    """
     keys = [SightKey(view.camera, view.station, view.placement) for view in observations.views]
     order = {key: number for number, key in enumerate(dict.fromkeys(keys))}
     sight_of_view = np.array([order[key] for key in keys], dtype=np.int64)
@@ -273,7 +278,8 @@ def gather_sights(observations: Observations) -> Sights:
         np.concatenate([np.tile(t.is_arc, 3) for t in targets]),
     )
     filled = np.flatnonzero(np.diff(point_bounds) + np.diff(curve_bounds))
-    return every if len(filled) == len(every) else every.take(filled)
+    every = every if len(filled) == len(every) else every.take(filled)
+    return every if predicted else every.used(*observations.copies.originals)
 
 
 def _grouped(columns: Columns, sight_of_view: Indices, count: int) -> tuple[Indices | slice, Indices]:

@@ -78,13 +78,19 @@ def detect_known(
     paths, posed = [Path(path) for path in images], calibration.station(station)
     name = station or next(iter(calibration.stations))
     names = calibration.estimate.stations[name].camera, name
-    wanted = {what: t for what, t in calibration.targets.items() if is_painted(t) or (boards and _is_chessboard(t))}
+    wanted = {
+        what: target
+        for what, target in calibration.targets.items()
+        if is_painted(target) or (boards and target.grid is not None and target.grid.checkered)
+    }
     if not wanted:
         raise InputError(
             f"the calibration's targets ({', '.join(calibration.targets)}) have no painted lines"
             f"{' and are no chessboards' if boards else ''}: give a file of observations instead of images"
         )
-    _require_known(calibration, not_painted)
+    known = {curve for target in calibration.targets.values() for curve in target.curves}
+    if unknown := sorted(set(not_painted) - known):
+        raise InputError(f"curve {unknown[0]!r} is not one of the calibration's targets': see `ceres-cal targets`")
     parts: list[Observations] = []
     shown: dict[str, int] = {}
     reasons: dict[str, list[str]] = {str(path): [] for path in paths}
@@ -126,6 +132,7 @@ def check_photographs(
     station: str | None = None,
     false_alarms: float = FALSE_ALARMS,
     *,
+    checks: int = 1,
     not_painted: Collection[str] = (),
     progress: ImageProgress | None = None,
 ) -> tuple[Check, KnownDetections]:
@@ -136,12 +143,14 @@ def check_photographs(
     """
     detections = detect_known(calibration, images, station, not_painted=not_painted, boards=False, progress=progress)
     if detections.observations is not None:
-        return check(calibration, detections.observations, false_alarms), detections
+        return check(calibration, detections.observations, false_alarms, checks), detections
     words = (
         f"not found: no field within {_REACH} of where it was in {_counted(len(images))}: the camera has moved "
         "farther, or it sees no field (dark, covered, other lines): look at the picture"
     )
-    return Check(false_alarms, {detections.station: StationCheck.unknown(detections.station, words)}), detections
+    return Check(
+        false_alarms, checks, {detections.station: StationCheck.unknown(detections.station, words)}
+    ), detections
 
 
 def is_painted(target: Target) -> bool:
@@ -149,18 +158,8 @@ def is_painted(target: Target) -> bool:
     return any(curve.width_m > 0.0 for curve in target.curves.values())
 
 
-def _is_chessboard(target: Target) -> bool:
-    return target.grid is not None and target.grid.checkered
-
-
 def _counted(images: int) -> str:
     return "the photograph" if images == 1 else f"any of {images} photographs"
-
-
-def _require_known(calibration: Calibration, not_painted: Collection[str]) -> None:
-    known = {curve for target in calibration.targets.values() for curve in target.curves}
-    if unknown := sorted(set(not_painted) - known):
-        raise InputError(f"curve {unknown[0]!r} is not one of the calibration's targets': see `ceres-cal targets`")
 
 
 def _counting_on(progress: ImageProgress | None, turn: int, turns: int) -> ImageProgress:
@@ -174,7 +173,6 @@ def _counting_on(progress: ImageProgress | None, turn: int, turns: int) -> Image
 
 
 def _renamed(detected: Observations, target: str) -> Observations:
-    """What was found under the name that the calibration has for its target."""
     (known,) = detected.targets.values()
     views = tuple(replace(view, target=target) for view in detected.views)
     return replace(detected, targets={target: known}, views=views)

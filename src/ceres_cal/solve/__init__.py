@@ -6,11 +6,15 @@ and its placement; each prior is one small block. What Ceres minimises is the sa
 """
 
 from ceres_cal.solve.bundle import Progress, Solution, placement_costs, solve, with_placements_at_best
+from ceres_cal.solve.conflicts import Conflicts, find_conflicts
 from ceres_cal.solve.information import Eliminated, ReducedInformation, information
 from ceres_cal.solve.problem import Problem, Weighting
 from ceres_cal.solve.robust import RobustSolution, solve_robustly
+from ceres_cal.solve.stated import Conflict
 
 __all__ = [
+    "Conflict",
+    "Conflicts",
     "Eliminated",
     "Problem",
     "Progress",
@@ -18,6 +22,7 @@ __all__ = [
     "RobustSolution",
     "Solution",
     "Weighting",
+    "find_conflicts",
     "information",
     "placement_costs",
     "solve",

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.words import two_digits
 from ceres_cal.model.parameters import Estimate
 from ceres_cal.scene.targets import Target
 from ceres_cal.uncertainty.maps import FieldMap, Grid, PointSpread, field_map, spread_of_points
@@ -27,6 +28,7 @@ from ceres_cal.uncertainty.weak import (
 )
 
 _GRID = 36  # steps along the longer side
+_WIDENED = 1.1  # factor on standard deviations that is worth a word
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,6 +78,14 @@ class Uncertainty:
     def unknown_placements(self) -> dict[str, tuple[str, ...]]:
         """Placements of which some number is not known at all, and which."""
         return unknown_placements(self.posterior)
+
+    @property
+    def widening(self) -> str:
+        """Why standard deviations are larger than by the model alone, in a line; "" where they are not."""
+        found, factor = self.posterior.dependence, float(np.median(self.posterior.factors))
+        if found is None or not found.causes or factor < _WIDENED:
+            return ""
+        return f"{' and '.join(found.causes)}: standard deviations {two_digits(factor)} times as large as without"
 
     def ratio_sd(self, station: str) -> float:
         """Relative standard deviation of phi over the station's height."""
