@@ -125,11 +125,12 @@ def take_sample(
 
 def _some(observations: Observations, sights: Sights) -> Sights:
     """Of each camera some views, evenly, and of each of them some rows."""
-    chosen = np.zeros(len(observations.views), dtype=bool)
+    chosen, shown = np.zeros((2, len(observations.views)), dtype=bool)
+    shown[observations.points.view[sights.point_rows]] = True
+    shown[observations.curves.view[sights.curve_rows]] = True
     for camera in sights.cameras:
-        views = [
-            view for key, views in zip(sights.keys, sights.views, strict=True) if key.camera == camera for view in views
-        ]
+        own = (views for key, views in zip(sights.keys, sights.views, strict=True) if key.camera == camera)
+        views = [view for views in own for view in views if shown[view]]
         chosen[np.array(views)[evenly(len(views), _MOST_VIEWS)]] = True
     sights = sights.take(np.flatnonzero([chosen[list(views)].any() for views in sights.views]))
     rows = max(np.diff(sights.point_bounds).max(), np.diff(sights.curve_bounds).max())
