@@ -16,9 +16,9 @@ from ceres_cal.model.residuals import Residuals
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights
 
+_BEYOND = 100.0  # an exponent: no observation is so rare
 # Spare equations below which a spread says nothing: its own error is 25 % at 8. At 4 the errors of fits to ten points
 # are 1.46 of their stated sigmas, at 16 they are 0.8 (1.16 at 8), because the stated sigmas are then taken.
-_BEYOND = 100.0  # an exponent: no observation is so rare
 _LEAST_SPARE = 8.0
 # Spare equations that the other kind's noise counts as: a handful of points beside many curve observations, which the
 # fit nearly goes through, must not seem exact (without it their scale fell to 0.04 of the truth and less).
