@@ -206,7 +206,7 @@ def test_bounds_in_words(low: float, high: float, words: str) -> None:
 @pytest.mark.parametrize("name", ["tilt 25 deg", "tilt 3 deg", "tilt 1 deg", "tilt 1 deg, height", "boards"])
 def test_intervals_hold_what_they_say(name: str) -> None:
     """Four standard errors around 0.95; scripts/coverage.py has 500 runs of each, 0.943 to 0.964 measured. (25 degrees:
-    0.98 in these 30, 0.955 in 150; where nearly all hold a sample's own error is too small.)
+    0.98 in these 60, 0.955 in 150; where nearly all hold a sample's own error is too small.)
     """
     found = cover(CASES[name], range(RUNS))
     assert found.failed == 0
