@@ -30,8 +30,9 @@ from ceres_cal.solve import (
     information,
     solve_robustly,
 )
-from ceres_cal.solve.competing import Explanation, compete
+from ceres_cal.solve.competing import compete
 from ceres_cal.solve.conflicts import contradicted_by
+from ceres_cal.solve.explanation import Explanation
 from ceres_cal.solve.noise import Inliers, visible_from
 from ceres_cal.solve.possible import require_possible
 from ceres_cal.start.baseline import four_point_baseline

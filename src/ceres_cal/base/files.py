@@ -6,13 +6,18 @@ import json
 import os
 import tempfile
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import msgspec
 
 from ceres_cal.base.errors import InputError
 
 T = TypeVar("T")
+Units = Literal["metres, radians, pixels"]
+PixelOrigin = Literal["centre of the top-left pixel"]
+UNITS: Units = "metres, radians, pixels"
+PIXEL_ORIGIN: PixelOrigin = "centre of the top-left pixel"
+"""What files of ours state, and are refused for where they state anything else."""
 
 
 def read_bytes(path: str | Path) -> bytes:

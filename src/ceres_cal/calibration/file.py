@@ -1,4 +1,4 @@
-"""Calibrations in JSON files (design, section 9): every number comes back exactly."""
+"""Calibrations in JSON files (docs/files.md): every number comes back exactly."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.files import convert
+from ceres_cal.base.files import PixelOrigin, Units, convert
 from ceres_cal.base.transforms import euler_from_rotation
 from ceres_cal.calibration.origin import Fit, LensChoice, Refitted, Rejected
 from ceres_cal.model.keys import Key
@@ -27,18 +27,20 @@ FORMAT, VERSION = "ceres-cal/calibration", 1
 
 
 class StationFile(PoseFile, forbid_unknown_fields=True):
-    """A station; position and Euler angles (the paper's) are there for people."""
+    """A station; position, Euler angles and H of the floor (the paper's) are there for people and other programs."""
 
     camera: str
     position_m: Vector
     euler_rad: Vector
+    homography: Matrix | msgspec.UnsetType = msgspec.UNSET
 
     @classmethod
     def of_station(cls, station: Station) -> StationFile:
         """As a file has it."""
         pose = station.cam_from_world
         rotation, translation, position = (part.tolist() for part in (pose.rotation, pose.translation, pose.position))
-        return cls(rotation, translation, station.camera, position, euler_from_rotation(pose.rotation))
+        homography = np.column_stack([pose.rotation[:, :2], pose.translation]).tolist()
+        return cls(rotation, translation, station.camera, position, euler_from_rotation(pose.rotation), homography)
 
 
 class PriorFile(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True):
@@ -98,8 +100,8 @@ class CalibrationFile(msgspec.Struct, forbid_unknown_fields=True):
 
     format: str
     version: int
-    units: str
-    pixel_origin: str
+    units: Units
+    pixel_origin: PixelOrigin
     cameras: dict[str, CameraFile]
     stations: dict[str, StationFile]
     placements: dict[str, PoseFile]
@@ -120,6 +122,7 @@ class CalibrationFile(msgspec.Struct, forbid_unknown_fields=True):
     refitted: RefittedFile | None = None
     conflicts: tuple[Conflict, ...] = ()
     lens_choice: LensChoice | None = None
+    notes: dict[str, Any] | msgspec.UnsetType = msgspec.UNSET
 
     def estimate(self, targets: Mapping[str, Target], options: Options) -> Estimate:
         """Cameras, stations, placements and the targets as built; InputError where one does not fit the others."""

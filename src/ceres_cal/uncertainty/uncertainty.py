@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -42,6 +43,23 @@ class Uncertainty:
     def verdicts(self) -> tuple[Verdict, ...]:
         """Known, weak or unknown, of each shared number."""
         return verdicts(self.estimate, self.posterior)
+
+    def table(self) -> list[dict[str, Any]]:
+        """Each shared number as a row of a table: `pandas.DataFrame(known.table())`."""
+        return [
+            {
+                "kind": one.key.kind,
+                "owner": one.key.owner,
+                "quantity": one.key.quantity,
+                "unit": one.key.unit,
+                "value": float(one.value),
+                "sd": float(one.sd),
+                "low": float(one.low),
+                "high": float(one.high),
+                "verdict": one.verdict,
+            }
+            for one in self.verdicts
+        ]
 
     def verdict(self, kind: str, owner: str, quantity: str) -> Verdict:
         """Of one number.
