@@ -26,6 +26,7 @@ FLOORS = {
     "solve": 5,
     "uncertainty": 6,
     "calibration": 7,
+    "lens_choice": 7,
     "calibrating": 8,
     "advice": 9,
     "diagnostics": 9,

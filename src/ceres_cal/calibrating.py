@@ -1,4 +1,4 @@
-"""The steps, in order: initialise, solve, reject, solve, let explanations compete, assess."""
+"""The steps, in order: choose a lens (where that is asked for), initialise, solve, reject, solve, compete, assess."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from ceres_cal.base.errors import CalibrationError, DegenerateError, SolutionErr
 from ceres_cal.base.threads import at_most, meanwhile, single_threaded_blas
 from ceres_cal.base.words import bounds_text
 from ceres_cal.calibration import COPY, Calibration, Fit, Rejected
-from ceres_cal.model.parameters import Estimate, Layout, Options, make_layout
+from ceres_cal.lens_choice import choose_lens
+from ceres_cal.model.parameters import AUTO, Estimate, Layout, Options, make_layout
 from ceres_cal.model.priors import gather_priors
 from ceres_cal.model.quantities import difference
 from ceres_cal.model.residuals import residuals
@@ -83,6 +84,9 @@ def _calibrated(
 ) -> Calibration:
     """See `calibrate`."""
     observations.require_inside()
+    if options.lens == AUTO:
+        chosen, lens_choice = choose_lens(observations, options)
+        return replace(_calibrated(observations, chosen, progress), lens_choice=lens_choice)
     sights, layout = gather_sights(observations), make_layout(observations, options)
     start = initialise(observations, sights, options)
     priors = gather_priors(observations, options, start.estimate.structure)

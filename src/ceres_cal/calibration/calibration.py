@@ -24,7 +24,7 @@ from ceres_cal.calibration.file import (
     options_from_json,
     options_to_json,
 )
-from ceres_cal.calibration.origin import COPY, Fit, Refitted, Rejected, package_versions
+from ceres_cal.calibration.origin import COPY, Fit, LensChoice, Refitted, Rejected, package_versions
 from ceres_cal.model.keys import Key
 from ceres_cal.model.parameters import Estimate, Options, make_layout
 from ceres_cal.model.priors import GaussianPrior, gather_priors
@@ -38,7 +38,7 @@ from ceres_cal.uncertainty import Disagreement, Posterior, PosteriorFile, Uncert
 
 _ALIKE = (
     *("fit", "rejected", "termination", "converged", "rounds", "history"),
-    *("phi_from", "warnings", "digest", "versions", "conflicts"),
+    *("phi_from", "warnings", "digest", "versions", "conflicts", "lens_choice"),
 )
 """What the file has as it is."""
 
@@ -59,6 +59,7 @@ class Calibration:
         options: how it was solved. digest: SHA-256 of the observations. versions: of the packages that solved it.
         refitted: how it came from an earlier calibration; None for one from scratch.
         conflicts: what was known beforehand and everything else contradicts; what is in dispute is in the posterior.
+        lens_choice: how the lens was chosen; None where it was given.
         notes: whatever somebody wants to keep with it, plain data.
     """
 
@@ -78,6 +79,7 @@ class Calibration:
     versions: Mapping[str, str] = field(default_factory=package_versions)
     refitted: Refitted | None = None
     conflicts: tuple[Conflict, ...] = ()
+    lens_choice: LensChoice | None = None
     notes: Mapping[str, Any] = field(default_factory=dict)
 
     def __repr__(self) -> str:

@@ -12,7 +12,7 @@ import numpy as np
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import PixelOrigin, Units, convert
 from ceres_cal.base.transforms import euler_from_rotation
-from ceres_cal.calibration.origin import Fit, Refitted, Rejected
+from ceres_cal.calibration.origin import Fit, LensChoice, Refitted, Rejected
 from ceres_cal.model.keys import Key
 from ceres_cal.model.parameters import Estimate, Options, Station
 from ceres_cal.model.priors import GaussianPrior
@@ -121,6 +121,7 @@ class CalibrationFile(msgspec.Struct, forbid_unknown_fields=True):
     posterior: PosteriorFile | None = None
     refitted: RefittedFile | None = None
     conflicts: tuple[Conflict, ...] = ()
+    lens_choice: LensChoice | None = None
     notes: dict[str, Any] | msgspec.UnsetType = msgspec.UNSET
 
     def estimate(self, targets: Mapping[str, Target], options: Options) -> Estimate:

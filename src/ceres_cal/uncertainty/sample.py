@@ -106,7 +106,8 @@ def take_sample(
     if not len(information):
         return None
     equations = equations_of(observations, _some(observations, problem.sights), estimate, there)
-    blank, columns = without_shared(problem, estimate, equations, _weights(observations, problem, equations, there))
+    weights = robust_weights(observations, problem, equations, there)
+    blank, columns = without_shared(problem, estimate, equations, weights)
     placed = blank.beyond_private(np.column_stack([columns, blank.score]))
     root = inverse_root(information, np.diagonal(information), _DETERMINED)
     curves, grouped = equations.is_curve, _groups(equations)
@@ -156,7 +157,7 @@ def _some_rows(view: AnyArray, chosen: Mask) -> Mask:
     return rows
 
 
-def _weights(observations: Observations, problem: Problem, equations: Equations, there: Residuals) -> Weights:
+def robust_weights(observations: Observations, problem: Problem, equations: Equations, there: Residuals) -> Weights:
     """Of each equation, the root of its robust weight in its standard deviation."""
     weighting, at = problem.weighting, equations.observation
     scale = np.where(equations.is_curve, weighting.curve_scale, weighting.point_scale)
