@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -11,13 +10,20 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
+from ceres_cal.base.archives import Column, read_npz
 from ceres_cal.base.arrays import AnyArray, Codes
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.files import check_header, convert, parse_json, read_bytes, write_bytes
+from ceres_cal.base.files import check_header, convert, decode_json, parse_json, read_bytes, write_bytes
 from ceres_cal.observations.columns import NO_CURVES, NO_POINTS, TYPES, Curves, Points, Prior, View, choices, view_label
-from ceres_cal.scene.targets import SIDES, Target, target_from_spec
+from ceres_cal.scene.targets import SIDES, Target, targets_from_specs
 
 FORMAT, VERSION = "ceres-cal/observations", 1
+_COLUMNS = {"header": Column(np.uint8, ("bytes",))} | {
+    f"{kind}_{name}": Column(dtype, (kind, 2) if name == "pixels" else (kind,))
+    for kind in ("points", "curves")
+    for name, dtype in TYPES.items()
+    if (kind, name) != ("points", "side")
+}
 _SIDE_NAMES = {value: name for name, value in SIDES.items()}
 
 
@@ -73,7 +79,7 @@ class _ObservationsFile(msgspec.Struct, forbid_unknown_fields=True, kw_only=True
     def content(self) -> Content:
         """All but the columns; InputError naming the place."""
         return Content(
-            {name: target_from_spec(spec, f"target {name!r}") for name, spec in self.targets.items()},
+            targets_from_specs(self.targets),
             {name: camera.image_size for name, camera in self.cameras.items()},
             tuple(entry.view() for entry in self.views),
             priors=tuple(prior_from_json(entry, f"prior {i}") for i, entry in enumerate(self.priors)),
@@ -147,9 +153,8 @@ def _numbers(value: Any, size: int, where: str, *, spread: bool = False) -> tupl
 
 
 def _from_json(content: bytes, where: str) -> Content:
-    try:
-        data = msgspec.json.decode(content, type=_ObservationsFile)  # several times faster than by way of plain data
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+    data = decode_json(content, _ObservationsFile, where)
+    if data is None:
         plain = check_header(parse_json(content, where), where, FORMAT, VERSION)
         data = convert(plain, _ObservationsFile, where)
     check_header({"format": data.format, "version": data.version}, where, FORMAT, VERSION)
@@ -268,44 +273,12 @@ def _to_npz(content: Content) -> bytes:
     return stream.getvalue()
 
 
-def _arrays(content: bytes, where: str) -> dict[str, AnyArray]:
-    """What an NPZ file holds, by name."""
-    reason = "it is cut short or no NPZ file"
-    try:
-        if zipfile.is_zipfile(io.BytesIO(content)):
-            with np.load(io.BytesIO(content), allow_pickle=False) as archive:
-                return {name: archive[name] for name in archive.files}
-    except Exception as error:  # zipfile, zlib and NumPy raise a dozen kinds for a broken archive
-        if "allow_pickle" in str(error):
-            reason = "it holds pickled objects"
-    raise InputError(f"{where}: cannot be read, {reason}: write it again with Observations.save")
-
-
-def _taken(arrays: dict[str, AnyArray], kind: str, names: Sequence[str], where: str) -> dict[str, Any]:
-    """The columns of one kind, taken out of the arrays."""
-    columns = {}
-    for name in names:
-        array, dtype, ndim = arrays.pop(f"{kind}_{name}", None), np.dtype(TYPES[name]), 2 if name == "pixels" else 1
-        if array is None:
-            raise InputError(f"{where}: column {kind}_{name} is missing")
-        if array.dtype != dtype or array.ndim != ndim:
-            raise InputError(
-                f"{where}: column {kind}_{name} must be {dtype} in {ndim} dimensions, not {array.dtype} in {array.ndim}"
-            )
-        columns[name] = array
-    return columns
-
-
 def _from_npz(packed: bytes, where: str) -> Content:
-    arrays = _arrays(packed, where)
-    header = arrays.pop("header", None)
-    if header is None or header.dtype != np.uint8:
-        raise InputError(f"{where}: no header: this is not a file of observations")
-    plain = check_header(parse_json(header.tobytes(), where), where, FORMAT, VERSION)
+    arrays = read_npz(packed, _COLUMNS, where)
+    plain = check_header(parse_json(arrays.pop("header").tobytes(), where), where, FORMAT, VERSION)
     content = convert(plain, _ObservationsFile, where).content()
-    names = ("view", "feature", "pixels", "sigma_px")
-    points = Points(**_taken(arrays, "points", names, where))
-    curves = Curves(**_taken(arrays, "curves", (*names, "side"), where))
-    if arrays:
-        raise InputError(f"{where}: unknown column {min(arrays)!r}")
-    return content._replace(points=points, curves=curves)
+    points, curves = (
+        {name.removeprefix(kind): array for name, array in arrays.items() if name.startswith(kind)}
+        for kind in ("points_", "curves_")
+    )
+    return content._replace(points=Points(**points), curves=Curves(**curves))
