@@ -36,7 +36,6 @@ from ceres_cal.model.structure import make_structure
 from ceres_cal.moves import check, refit
 from ceres_cal.moves.carried import make_plan, refit_problem
 from ceres_cal.observations import Observations, combine, taken
-from ceres_cal.observations.sights import gather_sights
 from ceres_cal.photographs import FieldOptions, check_photographs, detect_field
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.heights import HEIGHTS_M
@@ -171,8 +170,8 @@ def thinned(observations: Observations, points: Sequence[str], curves: int, seed
 def bound_of(calibration: Calibration, clean: Observations, pose: Pose) -> tuple[tuple[Key, ...], Array]:
     """Keys and covariance that data and prior together allow, at the truth."""
     truth = truth_of(calibration, pose)
-    plan = make_plan(calibration, clean, "pose", None, False)
-    problem, known = refit_problem(plan, "pose", gather_sights(plan.observations), truth)
+    plan = make_plan(calibration, clean, "pose")
+    problem, known = refit_problem(plan, "pose", truth)
     problem = replace(problem, layout=known, weighting=Weighting(1.0, 1.0, "trivial"))
     found = information(problem, truth).shared
     return found.keys, np.asarray(np.linalg.inv(found.matrix))

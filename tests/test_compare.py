@@ -32,7 +32,7 @@ def test_repetitions_differ_as_expected(calibration: Calibration) -> None:
     """
     every = [calibrated_at_home(seed) for seed in range(1, 25)]
     pairs = [compare(a, b)[0] for a, b in zip(every[::2], every[1::2], strict=True)]
-    ratio = [np.nanmean(pair.length_mm**2) / np.nanmean(pair.expected_mm**2) for pair in pairs]
+    ratio = [np.nanmean(pair.errors_mm**2) / np.nanmean(pair.expected_mm**2) for pair in pairs]
     assert 0.4 < np.mean(ratio) < 2.0  # 0.9
     probabilities = np.sort([pair.probability for pair in pairs if pair.probability is not None])
     assert len(probabilities) == 12
@@ -49,7 +49,7 @@ def test_a_move_is_found(calibration: Calibration) -> None:
     pixel = calibration.station().project(place)
     expected = 1e3 * (moved.station().locate(pixel) - place[:, :2])
     np.testing.assert_allclose(found.difference_mm[row, column], expected[0], rtol=1e-9)
-    assert np.isnan(found.length_mm[:, -1]).all()  # the far end of the field is not in the picture
+    assert np.isnan(found.errors_mm[:, -1]).all()  # the far end of the field is not in the picture
 
 
 def test_without_uncertainty_nothing_is_explained(calibration: Calibration) -> None:

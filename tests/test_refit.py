@@ -35,7 +35,7 @@ from ceres_cal.model.parameters import Layout, Options, Station
 from ceres_cal.model.priors import GaussianPrior
 from ceres_cal.model.quantities import difference, moved
 from ceres_cal.model.structure import Tolerance
-from ceres_cal.moves import refit
+from ceres_cal.moves import RefitOptions, refit
 from ceres_cal.moves.carried import carried_prior, make_plan
 from ceres_cal.moves.labels import MIRRORED, TURNED, relabelled
 from ceres_cal.moves.poses import movement
@@ -262,8 +262,8 @@ def test_turned_labels_are_refused_or_turned_back(calibration: Calibration, obse
     with pytest.raises(SolutionError, match="turned by 180 degrees"):
         refit(calibration, turned)
     for labels, there in (("turned", observations), ("as-given", turned)):
-        result = refit(calibration, turned, labels=labels)
-        best = refit(calibration, there, labels="as-given")
+        result = refit(calibration, turned, options=RefitOptions(labels=labels))
+        best = refit(calibration, there, options=RefitOptions(labels="as-given"))
         shift_m, turn = movement(result.station().cam_from_world, best.station().cam_from_world)
         assert shift_m < 1e-6 and turn < 1e-6
 
@@ -331,7 +331,7 @@ def test_the_moved_one_of_two_cameras(two_cameras: tuple[Calibration, dict[str, 
     assert np.all(sd < 1.001 * old)
     shift_m, turn = movement(result.estimate.stations["right"].cam_from_world, pose)
     assert shift_m < 0.05 and turn < 0.01  # 0.010 m, 0.0017 rad
-    held = refit(calibration, observed, moved=["right"], hold_others=True)
+    held = refit(calibration, observed, moved=["right"], options=RefitOptions(hold_others=True))
     assert held.cameras["left"] == calibration.cameras["left"]
     assert held.estimate.stations["left"] == calibration.estimate.stations["left"]
     assert any(key.owner == "left" for key in held.posterior.keys)  # type: ignore[union-attr]
@@ -351,5 +351,5 @@ def test_names_that_do_not_fit(calibration: Calibration, observations: Observati
     result = refit(calibration, replace(observations, views=views))
     assert list(result.stations) == ["second"]  # the camera is not where it was
     assert result.refitted is not None and "is new" in result.refitted.explanation
-    plan = make_plan(calibration, observations, "pose", None, False)
+    plan = make_plan(calibration, observations, "pose")
     assert plan.loosened("zoom") == {("camera", "overhead", "phi", "px")}

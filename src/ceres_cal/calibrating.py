@@ -17,7 +17,6 @@ from ceres_cal.model.priors import gather_priors
 from ceres_cal.model.residuals import residuals
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import gather_sights
-from ceres_cal.scene.camera import Camera
 from ceres_cal.solve import Problem, Progress, RobustSolution, Solution, information, solve_robustly
 from ceres_cal.solve.noise import Inliers, visible_from
 from ceres_cal.solve.possible import require_possible
@@ -163,22 +162,17 @@ def _require_fits(end: RobustSolution, problem: Problem) -> None:
     """Raise SolutionError where the solve failed, or its end explains too little."""
     if end.solution.failed:
         raise SolutionError(f"the solve failed ({end.solution.termination}): check labels and target dimensions")
-    for name, camera in end.solution.estimate.cameras.items():
-        _require_fit(name, camera, end, problem)
-
-
-def _require_fit(name: str, camera: Camera, end: RobustSolution, problem: Problem) -> None:
-    """Raise SolutionError where half of a camera's observations are missed by more than any lens could explain."""
-    own = problem.sights.of_camera(name)
-    limit_px = _NO_FIT * float(np.hypot(*camera.image_size))
     points, curves = end.residuals.lengths
-    met = np.count_nonzero(points[own.point_rows] <= limit_px)  # NaN is not
-    met += np.count_nonzero(curves[own.curve_rows] <= limit_px)
-    if 2 * met < len(own.point_rows) + len(own.curve_rows):
-        raise SolutionError(
-            f"camera {name!r}: the best solution misses half of its observations by more than {limit_px:.0f} px: "
-            "check labels, target dimensions and which lens it is"
-        )
+    for name, camera in end.solution.estimate.cameras.items():
+        own = problem.sights.of_camera(name)
+        limit_px = _NO_FIT * float(np.hypot(*camera.image_size))
+        met = np.count_nonzero(points[own.point_rows] <= limit_px)  # NaN is not
+        met += np.count_nonzero(curves[own.curve_rows] <= limit_px)
+        if 2 * met < len(own.point_rows) + len(own.curve_rows):
+            raise SolutionError(
+                f"camera {name!r}: the best solution misses half of its observations by more than {limit_px:.0f} px: "
+                "check labels, target dimensions and which lens it is"
+            )
 
 
 def _require_usable(end: RobustSolution, problem: Problem) -> tuple[str, ...]:
@@ -189,7 +183,7 @@ def _require_usable(end: RobustSolution, problem: Problem) -> tuple[str, ...]:
             continue
         fold, corner = camera.lens.monotone_radius(camera.phi), camera.corner_radius
         where = f"camera {name!r}: the solved {camera.lens.kind} lens folds {fold:.0f} px from the principal point"
-        farthest = end.problem.sights.of_camera(name).reach_px(camera)
+        farthest = end.problem.sights.of_camera(name).about(camera).reach_px
         if not camera.lens.may_fold or fold <= farthest:
             raise SolutionError(
                 f"{where}, inside the image (corner at {corner:.0f} px): "

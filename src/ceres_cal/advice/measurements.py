@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-import numpy as np
-
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.transforms import Pose
 from ceres_cal.model.information import Information
@@ -15,7 +13,7 @@ from ceres_cal.model.parameters import Estimate
 from ceres_cal.model.priors import stated_prior, tolerances
 from ceres_cal.model.quantities import layout_of
 from ceres_cal.model.structure import Tolerance, make_structure
-from ceres_cal.observations import Curves, Observations, Points, Prior
+from ceres_cal.observations import NO_CURVES, NO_POINTS, Observations, Prior
 from ceres_cal.observations.sights import gather_sights
 from ceres_cal.scene.targets import Target
 from ceres_cal.simulate import Scene, ViewPlan, simulate
@@ -107,10 +105,7 @@ class Ground:
 
 def _observed(estimate: Estimate, targets: Mapping[str, Target], views: tuple[ViewPlan, ...]) -> Observations:
     """What the views would show where everything is as estimated, without noise, in units of sigma 1."""
-    no_rows, no_pixels = np.empty(0, np.int32), np.empty((0, 2))
-    points = Points(no_rows, no_rows, no_pixels, np.empty(0))
-    curves = Curves(no_rows, no_rows, no_pixels, np.empty(0), np.empty(0, np.int8))
-    unseen = Observations(targets, {}, (), points, curves)
+    unseen = Observations(targets, {}, (), NO_POINTS, NO_CURVES)
     if not views:
         return unseen
     stations = {plan.station: estimate.stations[plan.station] for plan in views}

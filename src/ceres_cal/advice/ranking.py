@@ -162,7 +162,6 @@ def _weighting(fit: Fit) -> Weighting:
 
 
 def _board(targets: Mapping[str, Target], board: Target | None) -> tuple[str, Target]:
-    """The board to show, and a name for it."""
     for name, target in targets.items():
         if target.grid is not None and board in (None, target):
             return name, target

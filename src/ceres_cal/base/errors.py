@@ -1,5 +1,10 @@
 """What can go wrong, as errors whose text is written for people: one line, what is wrong, what to do."""
 
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 
 class CalibrationError(Exception):
     """Base of every failure of the package. `str(error)` is one line; `exit_code` is what the commands exit with."""
@@ -34,3 +39,13 @@ class SolutionError(CalibrationError):
     """The solve ended without a usable camera."""
 
     exit_code = 3
+
+
+@contextmanager
+def naming(where: object) -> Iterator[None]:
+    """Put `where`, a file or a place in one, before the line of an InputError that does not begin with it."""
+    try:
+        yield
+    except InputError as error:
+        text = str(error)
+        raise InputError(text if text.startswith((f"{where}: ", f"{where}.")) else f"{where}: {text}") from None

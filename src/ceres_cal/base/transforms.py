@@ -152,6 +152,10 @@ class Pose:
         r = np.asarray(rotation, dtype=float)
         return cls(r, -r @ np.asarray(position, dtype=float))
 
+    def turned(self, turn: ArrayLike) -> Pose:
+        """cam_from_world of the camera turned by a rotation vector about its own axes, where it stands."""
+        return Pose.looking(self.position, rotation_exp(turn) @ self.rotation)
+
     @cached_property
     def position(self) -> Array:
         """Where frame b's origin lies in frame a, (3,) metres: of cam_from_world, the camera's position (paper's t)."""

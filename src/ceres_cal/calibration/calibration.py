@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
 from ceres_cal.base.arrays import Mask
-from ceres_cal.base.errors import InputError
+from ceres_cal.base.errors import InputError, naming
 from ceres_cal.base.files import convert, read_json, write_json
 from ceres_cal.base.transforms import Pose
 from ceres_cal.calibration.file import (
@@ -23,15 +23,22 @@ from ceres_cal.calibration.file import (
     options_to_json,
 )
 from ceres_cal.calibration.origin import Fit, Refitted, Rejected, package_versions
+from ceres_cal.model.keys import Key
 from ceres_cal.model.parameters import Estimate, Options, make_layout
-from ceres_cal.model.priors import gather_priors, gather_stated, tolerances
-from ceres_cal.observations import Observations, taken
+from ceres_cal.model.priors import GaussianPrior, gather_priors, gather_stated, tolerances
+from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import gather_sights
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.files import CameraFile, PoseFile
 from ceres_cal.scene.targets import Target, targets_from_specs
 from ceres_cal.solve import Problem, Weighting
 from ceres_cal.uncertainty import Disagreement, Posterior, PosteriorFile, Uncertainty, disagreement
+
+_ALIKE = (
+    *("fit", "rejected", "termination", "converged", "rounds", "history"),
+    *("phi_from", "warnings", "digest", "versions"),
+)
+"""What the file has as it is."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,9 +117,7 @@ class Calibration:
         if observations.digest != self.digest:
             raise InputError("these are not the observations that the calibration was made from: give those")
         points, curves = self.inlier_masks(observations)
-        used = replace(
-            observations, points=taken(observations.points, points), curves=taken(observations.curves, curves)
-        )
+        used = observations.part(points, curves)
         return disagreement(used, self.estimate, self.uncertainty.posterior, self.fit.scales, (first, second))
 
     def inlier_masks(self, observations: Observations) -> tuple[Mask, Mask]:
@@ -139,6 +144,10 @@ class Calibration:
         priors = (prior, *gather_stated(observations, options, lenses), *fresh)
         return Problem(sights, self.posterior.layout(self.estimate), priors, weighting, options)
 
+    def prior_of(self, keys: Sequence[Key]) -> GaussianPrior:
+        """What the posterior says of some numbers, all others integrated out, as the prior of the next solve."""
+        return GaussianPrior.about(self.uncertainty.posterior.information.marginal(keys), self.estimate)
+
     @property
     def rms_px(self) -> float:
         """Root mean square residual over all observations that took part, px."""
@@ -156,10 +165,8 @@ class Calibration:
             InputError: one line that names the file and the place; also for a radial lens that folds inside the image.
         """
         data = convert(read_json(path, FORMAT, VERSION), CalibrationFile, str(path))
-        try:
+        with naming(path):
             return cls.from_file(data)
-        except InputError as error:
-            raise InputError(f"{path}: {error}") from None
 
     def to_file(self) -> CalibrationFile:
         """The calibration as its file has it."""
@@ -174,19 +181,10 @@ class Calibration:
             placements={name: PoseFile.of(pose) for name, pose in estimate.placements.items()},
             targets={name: target.spec for name, target in self.targets.items()},
             structure_m=dict(zip(estimate.structure.names, estimate.structure.values.tolist(), strict=True)),
-            fit=self.fit,
-            rejected=self.rejected,
-            termination=self.termination,
-            converged=self.converged,
-            rounds=self.rounds,
-            history=self.history,
-            phi_from=dict(self.phi_from),
-            warnings=self.warnings,
             options=options_to_json(self.options),
-            digest=self.digest,
-            versions=dict(self.versions),
             posterior=None if self.posterior is None else PosteriorFile.of(self.posterior),
             refitted=None if self.refitted is None else RefittedFile.of(self.refitted),
+            **{name: getattr(self, name) for name in _ALIKE},
         )
 
     @classmethod
@@ -197,17 +195,8 @@ class Calibration:
         return cls(
             data.estimate(targets, options),
             targets,
-            data.fit,
-            data.rejected,
-            data.termination,
-            data.converged,
-            data.rounds,
-            data.history,
-            data.phi_from,
-            data.warnings,
-            options,
-            data.digest,
-            None if data.posterior is None else data.posterior.posterior(),
-            data.versions,
-            None if data.refitted is None else data.refitted.refitted(),
+            options=options,
+            posterior=None if data.posterior is None else data.posterior.posterior(),
+            refitted=None if data.refitted is None else data.refitted.refitted(),
+            **{name: getattr(data, name) for name in _ALIKE},
         )

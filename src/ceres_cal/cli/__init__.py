@@ -93,7 +93,6 @@ def _run(arguments: list[str]) -> int:
 
 
 def _choose(arguments: list[str]) -> tuple[Command, list[str]]:
-    """The command that the first one or two arguments name, and the arguments after it."""
     for words in (1, 2):
         command = COMMANDS.get(" ".join(arguments[:words]))
         if command is not None:
@@ -106,7 +105,6 @@ def _choose(arguments: list[str]) -> tuple[Command, list[str]]:
 
 
 def _overview(beginning: str) -> str:
-    """Help on all commands that begin so."""
     summaries = {name: command.summary for name, command in COMMANDS.items() if name.startswith(beginning)}
     width = max(map(len, summaries))
     return "\n".join(

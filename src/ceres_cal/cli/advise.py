@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
-from ceres_cal.base.errors import InputError
+from ceres_cal.base.errors import InputError, naming
 from ceres_cal.cli.arguments import add_calibration, add_station, height_m, parse_number
 from ceres_cal.cli.command import Answer, Command
 from ceres_cal.cli.inputs import read_calibration, station_of
@@ -42,10 +42,8 @@ def _run(args: Namespace) -> Answer:
 
     calibration = read_calibration(args)
     station = station_of(args, calibration)
-    try:
+    with naming(args.calibration):
         advice = advise(calibration, station, height, enough, board)
-    except InputError as error:
-        raise InputError(f"{args.calibration}: {error}") from None
     weak = [direction.words for direction in calibration.uncertainty.weak_directions]
     return Answer(_data(advice, weak), lambda: _text(advice, weak))
 
@@ -80,7 +78,6 @@ def _text(advice: Advice, weak: list[str]) -> str:
 
 
 def _verdict(advice: Advice) -> Iterator[str]:
-    """What to do, in a sentence or two."""
     before, best, enough = advice.before, advice.best, advice.good_enough_mm
     worst = f"the worst error at {1e3 * advice.height_m:.0f} mm"
     if best is None:

@@ -86,7 +86,6 @@ def _text(one: StationComparison) -> str:
 
 
 def _table(one: StationComparison) -> list[str]:
-    """The map at a few places."""
     import numpy as np
 
     from ceres_cal.report.maps import evenly
@@ -94,7 +93,7 @@ def _table(one: StationComparison) -> list[str]:
     columns, rows = evenly(len(one.x_m), _COLUMNS), evenly(len(one.y_m), _ROWS)[::-1]
     lines = [f"{'mm':>10}" + "".join(f"{one.x_m[c]:8.2f}" for c in columns) + "  x, m"]
     for row in rows:
-        values = one.length_mm[row, columns]
+        values = one.errors_mm[row, columns]
         cells = "".join(f"{value:8.2f}" if np.isfinite(value) else f"{'.':>8}" for value in values)
         lines.append(f"{one.y_m[row]:10.2f}{cells}")
     return lines

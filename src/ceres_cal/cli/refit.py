@@ -58,17 +58,16 @@ def _run(args: Namespace) -> Answer:
     calibration = read_calibration(args)
     detections = _photographed(args, calibration, images) if images else None
     observations = read_observations(args.inputs) if detections is None else detections.require()
-    from ceres_cal.moves import refit
+    from ceres_cal.moves import RefitOptions, refit
 
     photographs = report_photographs(args, observations, calibration, images)
+    priors = tuple(parse_prior(spec, observations, PriorNames(("height_m",))) for spec in args.prior)
     result = refit(
         calibration,
         observations,
         args.what,
         moved=args.moved,
-        hold_others=args.hold_others,
-        labels=args.labels,
-        priors=tuple(parse_prior(spec, observations, PriorNames(("height_m",))) for spec in args.prior),
+        options=RefitOptions(args.hold_others, args.labels, priors),
     )
     write_results(args, result.save, report_page(args, result, observations, photographs))
     data = _data(result, calibration, observations, args) | photographs_data(detections)

@@ -40,7 +40,7 @@ def calibration_data(
         "calibration": calibration.to_file(),
         "inputs": list(inputs),
         **written_data(args),
-        "counts": _counts(observations),
+        "counts": observations.counts,
         "rms_px": calibration.rms_px,
         "tilt_deg": {name: camera.tilt_deg for name, camera in calibration.stations.items()},
         "uncertainty": _uncertainty_data(Quality(calibration, observations)),
@@ -73,19 +73,8 @@ def calibration_text(
     return "\n".join([*sections, *written(args)])
 
 
-def _counts(observations: Observations) -> dict[str, int]:
-    return {
-        "views": len(observations.views),
-        "cameras": len(observations.cameras),
-        "stations": len(observations.stations),
-        "placements": len(observations.placements),
-        "points": len(observations.points),
-        "curves": len(observations.curves),
-    }
-
-
 def _counted(observations: Observations) -> list[str]:
-    count = _counts(observations)
+    count = observations.counts
     owners = [plural(count[f"{word}s"], word) for word in ("view", "camera", "station", "placement")]
     return [
         ", ".join(owners),
@@ -229,7 +218,6 @@ def with_sd(value: float, unit: str, verdict: Verdict | None) -> str:
 
 
 def _uncertainty_lines(quality: Quality) -> Iterator[tuple[str, list[str]]]:
-    """Title and lines of what people should know before they use it."""
     if quality.uncertainty is None:
         return
     if quality.maps:
@@ -265,7 +253,6 @@ def _sd_at_heights(maps: Sequence[FieldMap]) -> str:
 
 
 def _uncertainty_data(quality: Quality) -> dict[str, Any] | None:
-    """Everything, for --json."""
     uncertainty = quality.uncertainty
     if uncertainty is None:
         return None

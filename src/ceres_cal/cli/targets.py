@@ -41,7 +41,6 @@ COMMANDS = (Command("targets", "the kinds of targets and the names of their feat
 
 
 def _targets(wanted: str) -> dict[str, Target]:
-    """The targets of a kind, a name or a file."""
     from ceres_cal.scene.targets import TARGET_KINDS, targets_by_name
 
     if wanted in TARGET_KINDS:

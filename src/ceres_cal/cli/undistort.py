@@ -287,7 +287,6 @@ def _top_view(args: Namespace, calibration: Calibration) -> _PictureMaker:
 
 
 def _field(calibration: Calibration) -> tuple[float, float, float, float]:
-    """The box around what lies in the world, and a margin."""
     from ceres_cal.uncertainty.uncertainty import field_grid
 
     try:

@@ -201,10 +201,10 @@ def _find_chessboard(image: Image8, columns: int, rows: int) -> Array | None:
         how = cv2.INTER_AREA if scale < 1.0 else cv2.INTER_CUBIC
         scaled = image if scale == 1.0 else cv2.resize(image, None, fx=scale, fy=scale, interpolation=how)
         # The newer detector is the better one, but blind where it is dark.
-        found, corners = cv2.findChessboardCornersSB(scaled, (columns, rows))
-        if not found:
-            found, corners = cv2.findChessboardCorners(scaled, (columns, rows), flags=legacy)
-        if found:
+        shown, corners = cv2.findChessboardCornersSB(scaled, (columns, rows))
+        if not shown:
+            shown, corners = cv2.findChessboardCorners(scaled, (columns, rows), flags=legacy)
+        if shown:
             ratio = np.array(image.shape[::-1]) / np.array(scaled.shape[::-1])
             return np.asarray((corners.reshape(rows, columns, 2).astype(float) + 0.5) * ratio - 0.5)
     return None

@@ -158,7 +158,6 @@ def window_px(course: Course) -> Array:
 
 
 def _shape(windows: Windows, edges: Array, bright: Array) -> tuple[float, float]:
-    """Blur and stretch, from the clearest windows."""
     rows = np.flatnonzero(windows.inside)
     if not len(rows):
         return 1.0, 1.0

@@ -72,7 +72,7 @@ def shifted(course: Course, near: Nearness, image_size: tuple[int, int], reach_p
     """
     middle = 0.5 * np.array(image_size)
     steps = np.arange(-reach_px, reach_px + 1.0, 2.5 * near.reduced)
-    away, found = course.pixels - middle, []
+    away, scored = course.pixels - middle, []
     for turn, scale in product(np.deg2rad(_TURNS_DEG), _SCALES):
         cosine, sine = scale * np.cos(turn), scale * np.sin(turn)
         turned = middle + away @ np.array([[cosine, sine], [-sine, cosine]])
@@ -81,10 +81,10 @@ def shifted(course: Course, near: Nearness, image_size: tuple[int, int], reach_p
             score[row] = near.at(turned[:, 0] + steps[:, None], turned[:, 1] + dy).mean(axis=1)
         best = int(np.argmax(score))
         shift = np.array([steps[best % len(steps)], steps[best // len(steps)]])
-        found.append((float(score.flat[best]), turned + shift))
-    found.sort(key=lambda one: -one[0])
+        scored.append((float(score.flat[best]), turned + shift))
+    scored.sort(key=lambda one: -one[0])
     chosen: list[Array] = []
-    for _, places in found:
+    for _, places in scored:
         if all(np.mean(np.linalg.norm(places - other, axis=1)) > _APART_PX for other in chosen):
             chosen.append(places)
         if len(chosen) == most:

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Array32, Indices32, Mask
-from ceres_cal.base.errors import InputError
+from ceres_cal.base.errors import InputError, naming
 from ceres_cal.detect.images import read_grey
 from ceres_cal.detect.profiles import Windows, cut_windows, fit_profiles, fit_shape
 from ceres_cal.detect.ring_centre import ring_centre
@@ -82,14 +82,12 @@ def detect_rings(
     """
     sheet = rings(radii_m)
     grey = read_grey(image).astype(np.float32)
-    try:
+    with naming(image):
         centre = ring_centre(grey)
         tracks = _follow(grey, centre, len(radii_m))
         edges, blur = _measured(grey, centre, tracks)
         _require_all_seen(grey, centre, tracks, len(radii_m))
         polynomial, rms = _polynomial(edges, centre, np.array(sheet.spec["radii_m"]))
-    except InputError as error:
-        raise InputError(f"{image}: {error}") from None
     observations = _observations(edges, sheet, grey, Path(image).stem, camera, station or camera)
     # The first ring's own middle: farther out, tilt makes the gradients miss the centre.
     own = tracks[0].series[[1, 1 + _HARMONICS]]
@@ -177,9 +175,9 @@ def _next_edges(slope: Array, inner: Array, limit: float, rises: bool | None) ->
     return np.where(peak.any(axis=1), first * _STEP_PX, np.nan), rises
 
 
-def _smooth(found: tuple[Array, bool], angle: Array, reach: Array) -> _Track | None:
+def _smooth(edges: tuple[Array, bool], angle: Array, reach: Array) -> _Track | None:
     """The smooth course of most of the edges; None where too few rays have one."""
-    radius, rises = found
+    radius, rises = edges
     seen = np.isfinite(radius)
     if np.count_nonzero(seen) < 8:
         return None
@@ -235,9 +233,9 @@ def _measured(grey: Array32, centre: Array, tracks: Sequence[_Track]) -> tuple[_
     for number, (track, mean) in enumerate(zip(tracks, radii, strict=True)):
         every = max(1, int(np.ceil((2 * _HALF_WIDTH_PX + 2) * RAYS / (2.0 * np.pi * float(mean.min())))))
         half = min(_HALF_LENGTH_PX, 0.5 * float(min(gap[number], gap[number + 1])) - 0.5)
-        found = _measured_ring(grey, centre, track, angle[::every], max(half, 2.0))
-        blurs.append(found[2])
-        parts.append((np.full(len(angle[::every]), number, np.int32), *found[:2]))
+        measured = _measured_ring(grey, centre, track, angle[::every], max(half, 2.0))
+        blurs.append(measured[2])
+        parts.append((np.full(len(angle[::every]), number, np.int32), *measured[:2]))
     ring, pixels, sigma = (np.concatenate(column) for column in zip(*parts, strict=True))
     radius = np.linalg.norm(pixels - centre, axis=1)
     kept = _usual(ring, radius, sigma, np.arctan2(*(pixels - centre).T[::-1]))

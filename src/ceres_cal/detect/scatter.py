@@ -29,8 +29,8 @@ def scatter_px(grids: Iterable[Array]) -> float:
     Returns:
         The median over the boards; USUAL_PX where none has corners enough to tell.
     """
-    told = [found for grid in grids if (found := _of_board(grid)) is not None]
-    return max(float(np.median(told)), _LEAST_PX) if told else USUAL_PX
+    scatters = [one for grid in grids if (one := _of_board(grid)) is not None]
+    return max(float(np.median(scatters)), _LEAST_PX) if scatters else USUAL_PX
 
 
 def _of_board(grid: Array) -> float | None:

@@ -52,14 +52,14 @@ def drawn(strokes: Strokes, image_size: tuple[int, int]) -> Mask:
 
 def find_strokes(grey: Array32) -> Strokes:
     """Every stroke of a photograph, of paint up to some 12 px wide."""
-    found = []
+    by_scale = []
     for scale in _SCALES:
         plane = (
             grey if scale == 1 else cv2.resize(grey, None, fx=1.0 / scale, fy=1.0 / scale, interpolation=cv2.INTER_AREA)
         )
         strokes = _strokes(_ridge_points(np.asarray(plane, np.float32)))
-        found.append(Strokes((strokes.ends + 0.5) * scale - 0.5, strokes.strength))
-    return found[0] if np.sum(found[0].length_px) > 0.7 * np.sum(found[1].length_px) else found[1]
+        by_scale.append(Strokes((strokes.ends + 0.5) * scale - 0.5, strokes.strength))
+    return by_scale[0] if np.sum(by_scale[0].length_px) > 0.7 * np.sum(by_scale[1].length_px) else by_scale[1]
 
 
 @dataclass(frozen=True, eq=False)

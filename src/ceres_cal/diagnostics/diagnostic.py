@@ -100,11 +100,12 @@ class Diagnostic(ABC):
     """A kind of finding.
 
     Attributes:
-        kind: its name. wrong: see `Finding`.
+        kind: its name. wrong: see `Finding`. widens: whether standard deviations are too small where it is found.
     """
 
     kind: ClassVar[str]
     wrong: ClassVar[Wrong] = "model"
+    widens: ClassVar[bool] = False
 
     def tests(self, case: Case) -> int:
         """How many tests it makes besides score tests: all share one rate of false alarms."""

@@ -108,6 +108,7 @@ class Correlated(_OfNoise):
     """Neighbouring residuals that agree."""
 
     kind = "correlated"
+    widens = True
 
     def about(self, noise: Noise) -> tuple[float, float, Words]:
         sentence = (

@@ -10,7 +10,7 @@ import io
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -81,21 +81,8 @@ class LookupTable:
         """The content of its NPZ file."""
         stream = io.BytesIO()
         errors = [(height_m, *error) for height_m, error in self.error_mm.items()]
-        np.savez_compressed(
-            stream,
-            format=np.array(FILE_FORMAT),
-            version=np.array(VERSION),
-            station=np.array(self.station),
-            image_size=np.array(self.image_size),
-            step_px=np.array(self.step_px),
-            x_px=self.x_px,
-            y_px=self.y_px,
-            floor_m=self.floor_m,
-            per_height=self.per_height,
-            error_mm=np.array(errors),
-            homography=self.homography,
-            third_column=self.third_column,
-        )
+        content: dict[str, Any] = {**vars(self), "error_mm": errors}
+        np.savez_compressed(stream, format=FILE_FORMAT, version=VERSION, **content)
         return stream.getvalue()
 
     def save(self, path: str | Path) -> None:

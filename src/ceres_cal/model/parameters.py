@@ -159,12 +159,14 @@ class Estimate:
 
     def pose_stack(self, keys: Sequence[SightKey]) -> Array:
         """cam_from_frame of each sight as [R t], (S, 3, 4)."""
-        return chained(self._station_stack(keys), Poses.of(self.placements).of_names([key.placement for key in keys]))
+        stations = self._station_stack(keys)
+        return chained(stations, Poses.of(self.placements).of_names([key.placement for key in keys]))
 
     def with_placements(self, keys: Sequence[SightKey], cam_from_target: Array) -> Estimate:
         """The estimate with the placement of each key where its station sees it, cam_from_target (S, 3, 4)."""
         names = [key.placement for key in keys if key.placement is not None]
-        moved = chained(inverted(self._station_stack(keys)), cam_from_target)
+        stations = self._station_stack(keys)
+        moved = chained(inverted(stations), cam_from_target)
         return replace(self, placements=Poses.of(self.placements).updated(names, moved))
 
     def _station_stack(self, keys: Sequence[SightKey]) -> Array:

@@ -17,6 +17,9 @@ from ceres_cal.observations.sights import Sights, nearest_feet
 from ceres_cal.scene.camera import Camera
 
 _POINT_NS = 10.0
+# Share of observations that may be anywhere in the image: as many as are wrong in the simulated days of
+# scripts/moves.py. Nothing changes from half to double.
+_STRAY = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,6 +40,29 @@ class Residuals:
         """Lengths of the residuals of points (N,) and of curves (M,), px."""
         x, y = self.points.T
         return np.sqrt(x * x + y * y), np.abs(self.curves)
+
+    def in_sigmas(self, sights: Sights, scales: tuple[float, float]) -> tuple[Array, Array]:
+        """(N,) of the sights' points and (M,) of their curve observations: lengths of the residuals at these noise
+        scales, in standard deviations.
+        """
+        points = np.linalg.norm(self.points[sights.point_rows], axis=1) / (scales[0] * sights.sigma_px)
+        return points, np.abs(self.curves[sights.curve_rows]) / (scales[1] * sights.curve_sigma_px)
+
+    def misfit(self, sights: Sights, camera: Camera, scales: tuple[float, float]) -> float:
+        """Negative log likelihood of a camera's sights at these noise scales, each observation a stray with a small
+        probability; in nats.
+        """
+        width, height = camera.image_size
+        points, curves = self.in_sigmas(sights, scales)
+        p, c = sights.sigma_px * scales[0], sights.curve_sigma_px * scales[1]
+        total = 0.0
+        for lengths, inside, stray in (
+            (points, 1.0 / (2.0 * np.pi * p**2), 1.0 / (width * height)),
+            (curves, 1.0 / (np.sqrt(2.0 * np.pi) * c), 1.0 / np.hypot(width, height)),
+        ):
+            likely = (1.0 - _STRAY) * inside * np.exp(-0.5 * np.minimum(np.nan_to_num(lengths, nan=1e3), 1e3) ** 2)
+            total -= float(np.sum(np.log(likely + _STRAY * stray)))
+        return total
 
 
 def camera_optics(camera: Camera) -> kernels.Optics:

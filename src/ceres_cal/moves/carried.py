@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,11 +16,35 @@ from ceres_cal.model.parameters import Estimate, Layout, Options, Station, intri
 from ceres_cal.model.priors import GaussianPrior, gather_stated, tolerances
 from ceres_cal.model.quantities import intrinsic_keys
 from ceres_cal.model.structure import Structure, make_structure
+from ceres_cal.moves.labels import TURNED, relabelled
 from ceres_cal.observations import Observations, Prior
-from ceres_cal.observations.sights import Sights
+from ceres_cal.observations.sights import Sights, gather_sights
 from ceres_cal.solve import Problem
 
 WHAT = ("pose", "pose-only", "zoom", "iris", "everything")
+LABELS = ("check", "as-given", "turned")
+
+
+@dataclass(frozen=True)
+class RefitOptions:
+    """What a refit takes for granted.
+
+    Attributes:
+        hold_others: hold stations that stay and their cameras exactly; their posterior still learns.
+        labels: "check" them against a turn by 180 degrees, take them "as-given", or "turned".
+        priors: new knowledge, such as a height measured after the move.
+
+    Raises:
+        InputError: unknown labels.
+    """
+
+    hold_others: bool = False
+    labels: str = "check"
+    priors: tuple[Prior, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.labels not in LABELS:
+            raise InputError(f"labels={self.labels!r} is unknown: choose one of {', '.join(LABELS)}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,22 +52,25 @@ class RefitPlan:
     """A refit as it was asked for.
 
     Attributes:
-        calibration: the old one. observations: the new ones, with the targets of both. options: of the solves.
-        what: one of WHAT. stations: the observed stations and their cameras. moved: those whose poses are sought.
+        calibration: the old one. observations: the new ones, with the targets of both. sights: theirs.
+        options: of the solves. what: one of WHAT. asked: how.
+        stations: the observed stations and their cameras. moved: those whose poses are sought.
         stays: stations of the old calibration that are where they were, under its posterior.
-        hold_others: whether `stays` and their cameras are held, too.
+        known: the old cameras, structure and stations that stay; those that moved at no particular pose.
         prior: what is known beforehand, `what` not yet taken into account. scales: noise scales of points and curves
             seen before.
     """
 
     calibration: Calibration
     observations: Observations
+    sights: Sights
     options: Options
     what: str
+    asked: RefitOptions
     stations: dict[str, str]
     moved: frozenset[str]
     stays: frozenset[str]
-    hold_others: bool
+    known: Estimate
     prior: GaussianPrior
     scales: tuple[float, float]
 
@@ -70,9 +97,8 @@ def make_plan(
     calibration: Calibration,
     observations: Observations,
     what: str,
-    moved: Collection[str] | None,
-    hold_others: bool,
-    priors: tuple[Prior, ...] = (),
+    moved: Collection[str] | None = None,
+    asked: RefitOptions | None = None,
 ) -> RefitPlan:
     """Who moved, who stays, and what is known of everything.
 
@@ -92,13 +118,40 @@ def make_plan(
         raise InputError(f"station {name!r} is to stay where it was, but the calibration has no such station")
     elsewhere = {stations[name] for name in stations}  # a camera that was observed is where it was observed
     stays = frozenset(n for n, s in old.items() if n not in chosen and (n in stations or s.camera not in elsewhere))
-    observed = replace(observations, targets={**calibration.targets, **observations.targets})
+    asked = asked or RefitOptions()
+    given = _turned(observations) if asked.labels == "turned" else observations
+    observed = replace(given, targets={**calibration.targets, **observations.targets})
     same = calibration.digest == observations.digest  # then the question is the same, too
-    options = replace(calibration.options, priors=priors or (calibration.options.priors if same else ()))
-    prior = carried_prior(calibration, observations, stays)
-    before = calibration.refitted
-    scales = before.scales if same and before is not None else calibration.fit.scales
-    return RefitPlan(calibration, observed, options, what, stations, chosen, stays, hold_others, prior, scales)
+    options = replace(calibration.options, priors=asked.priors or (calibration.options.priors if same else ()))
+    scales = calibration.refitted.scales if same and calibration.refitted else calibration.fit.scales
+    placed = {name: old[name] for name in old if name in stays}
+    placed |= {name: Station(stations[name], Pose.identity()) for name in chosen}
+    return RefitPlan(
+        calibration,
+        observed,
+        gather_sights(observed),
+        options,
+        what,
+        asked,
+        stations,
+        chosen,
+        stays,
+        Estimate(
+            calibration.cameras,
+            {name: placed[name] for name in dict.fromkeys([*old, *stations]) if name in placed},
+            {},
+            with_structure(calibration.estimate, observed, options),
+        ),
+        carried_prior(calibration, observations, stays),
+        scales,
+    )
+
+
+def _turned(observations: Observations) -> Observations:
+    turned = relabelled(observations, TURNED)
+    if turned is None:
+        raise InputError("labels turned: some observed feature has no counterpart half a turn away: label anew")
+    return turned
 
 
 def require_same_things(calibration: Calibration, observations: Observations) -> None:
@@ -140,27 +193,22 @@ def carried_prior(calibration: Calibration, observations: Observations, stays: f
         before = calibration.refitted.prior if calibration.refitted is not None else None
         before = before or GaussianPrior(Information.nothing(), np.empty(0))
         return before.without([key for key in before.keys if not _is_kept(key, stays)])
-    return posterior_of(calibration, [k for k in calibration.uncertainty.posterior.keys if _is_kept(k, stays)])
-
-
-def posterior_of(calibration: Calibration, keys: Sequence[Key]) -> GaussianPrior:
-    """What the posterior says of some numbers, all others integrated out, as the prior of the next solve."""
-    return GaussianPrior.about(calibration.uncertainty.posterior.information.marginal(keys), calibration.estimate)
+    return calibration.prior_of([key for key in calibration.uncertainty.posterior.keys if _is_kept(key, stays)])
 
 
 def _is_kept(key: Key, stays: frozenset[str]) -> bool:
     return key.kind in ("camera", "structure") or (key.kind == "station" and key.owner in stays)
 
 
-def refit_problem(plan: RefitPlan, what: str, sights: Sights, start: Estimate) -> tuple[Problem, Layout]:
+def refit_problem(plan: RefitPlan, what: str, start: Estimate) -> tuple[Problem, Layout]:
     """What is solved, and the layout of what is known at all: the posterior speaks of everything, held or not."""
     everything = plan.calibration.uncertainty.posterior.layout(plan.calibration.estimate)
     free, stations = everything.free, plan.moved | (plan.stays & everything.stations)
     known = Layout(free, stations, frozenset(start.placements))
-    held = {name for name in free if what == "pose-only" or (plan.hold_others and name not in plan.moved_cameras)}
-    moving = plan.moved if plan.hold_others else stations
+    held = {name for name in free if what == "pose-only" or (plan.asked.hold_others and name not in plan.moved_cameras)}
+    moving = plan.moved if plan.asked.hold_others else stations
     solved = replace(known, free={n: f[:0] if n in held else f for n, f in free.items()}, stations=moving)
-    return Problem(sights, solved, _priors(plan, what, start), options=plan.options), known
+    return Problem(plan.sights, solved, _priors(plan, what, start), options=plan.options), known
 
 
 def _priors(plan: RefitPlan, what: str, start: Estimate) -> tuple[GaussianPrior, ...]:
@@ -170,19 +218,6 @@ def _priors(plan: RefitPlan, what: str, start: Estimate) -> tuple[GaussianPrior,
     return (carried, *stated, *tolerances(start.structure, carried.keys))
 
 
-def first_estimate(plan: RefitPlan, poses: dict[str, Pose], placements: dict[str, Pose]) -> Estimate:
-    """The old cameras, structure and stations that stay, with poses for what is sought."""
-    old = plan.calibration.estimate
-    stations = {name: old.stations[name] for name in old.stations if name in plan.stays}
-    stations |= {name: Station(plan.stations[name], pose) for name, pose in poses.items()}
-    structure = with_structure(old, plan.observations, plan.options)
-    return Estimate(old.cameras, _ordered(stations, [*old.stations, *plan.stations]), placements, structure)
-
-
 def with_structure(old: Estimate, observations: Observations, options: Options) -> Structure:
     """The targets as they were found built, in the order of the observations' targets; new ones as drawn."""
     return make_structure(observations.targets, options.tolerances).carrying(old.structure)
-
-
-def _ordered(stations: dict[str, Station], names: Sequence[str]) -> dict[str, Station]:
-    return {name: stations[name] for name in dict.fromkeys(names) if name in stations}

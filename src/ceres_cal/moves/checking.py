@@ -20,8 +20,8 @@ from ceres_cal.model.keys import Key
 from ceres_cal.model.parameters import Estimate
 from ceres_cal.model.priors import GaussianPrior, tolerances
 from ceres_cal.model.quantities import layout_of
-from ceres_cal.moves.carried import posterior_of, require_same_things, with_structure
-from ceres_cal.moves.poses import PoseCandidate, PoseSearch, in_sigmas, movement, pose_candidates
+from ceres_cal.moves.carried import require_same_things, with_structure
+from ceres_cal.moves.poses import PoseCandidate, PoseSearch, movement, pose_candidates
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights, gather_sights
 from ceres_cal.scene.camera import Camera
@@ -173,7 +173,7 @@ def _case(calibration: Calibration, observed: Observations, sight: Sights) -> _C
     estimate = Estimate({key.camera: old.cameras[key.camera]}, {key.station: old.stations[key.station]}, {}, structure)
     tested = tuple(k for k in own if k.kind == "station" or k.quantity == "phi")
     kept = [k for k in posterior.keys if k in own or k.kind == "structure"]
-    return _Case(calibration, sight, estimate, posterior_of(calibration, kept), tested)
+    return _Case(calibration, sight, estimate, calibration.prior_of(kept), tested)
 
 
 @dataclass(frozen=True)
@@ -227,7 +227,7 @@ def _inliers(search: PoseSearch, near: PoseCandidate) -> tuple[Mask, Mask]:
     observations, sight = search.observations, search.sight
     points, curves = (np.zeros(len(c), dtype=bool) for c in (observations.points, observations.curves))
     limit = _INLIER_SIGMA * max(1.0, min(near.scale, 2.0))
-    in_points, in_curves = in_sigmas(sight, search.residuals(near.pose), search.scales)
+    in_points, in_curves = search.residuals(near.pose).in_sigmas(sight, search.scales)
     points[sight.point_rows], curves[sight.curve_rows] = in_points <= limit, in_curves <= limit  # NaN is not
     return points, curves
 

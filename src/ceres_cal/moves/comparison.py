@@ -16,7 +16,7 @@ from ceres_cal.calibration import Calibration
 from ceres_cal.model.parameters import Estimate
 from ceres_cal.model.quantities import difference
 from ceres_cal.moves.poses import movement
-from ceres_cal.uncertainty.maps import Grid, field_map, visible_pixels
+from ceres_cal.uncertainty.maps import ErrorMap, Grid, field_map, visible_pixels
 from ceres_cal.uncertainty.uncertainty import field_grid
 
 # Probability below which uncertainty alone does not explain a difference; that often two sound calibrations differ.
@@ -25,7 +25,7 @@ _DOUBTFUL = 0.01
 
 
 @dataclass(frozen=True, eq=False)
-class StationComparison(Grid):
+class StationComparison(ErrorMap):
     """One station in two calibrations, a and b, and a map of their difference.
 
     Attributes:
@@ -46,21 +46,9 @@ class StationComparison(Grid):
     probability: float | None
 
     @property
-    def length_mm(self) -> Array:
-        """(Y, X) length of the difference."""
+    def errors_mm(self) -> Array:
+        """(Y, X) length of the difference; NaN where a does not show the place."""
         return np.asarray(np.linalg.norm(self.difference_mm, axis=2))
-
-    @property
-    def mean_mm(self) -> float:
-        """Mean length over what a shows; NaN where it shows nothing."""
-        lengths = self.length_mm[np.isfinite(self.length_mm)]
-        return float(np.mean(lengths)) if len(lengths) else np.nan
-
-    @property
-    def worst_mm(self) -> float:
-        """Largest length."""
-        lengths = self.length_mm[np.isfinite(self.length_mm)]
-        return float(np.max(lengths)) if len(lengths) else np.nan
 
     @property
     def explained(self) -> bool | None:

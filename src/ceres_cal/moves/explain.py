@@ -20,7 +20,7 @@ from ceres_cal.model.residuals import residuals
 from ceres_cal.model.structure import make_structure
 from ceres_cal.moves.carried import RefitPlan
 from ceres_cal.moves.labels import MIRRORED, TURNED, mistaken_targets, relabelled
-from ceres_cal.moves.poses import PoseCandidate, PoseSearch, misfit, movement, pose_candidates
+from ceres_cal.moves.poses import PoseCandidate, PoseSearch, movement, pose_candidates
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import gather_sights
 
@@ -232,7 +232,7 @@ def _changes(plan: RefitPlan, what: str, result: Calibration) -> str:
 
 def _scores(plan: RefitPlan, results: Mapping[str, Calibration]) -> dict[str, float]:
     """Misfit of observations and prior, and half the logarithm of the count for every number let go; in nats."""
-    sights = gather_sights(plan.observations)
+    sights = plan.sights
     fits = [result.fit for result in results.values()]
     scales = (
         max(plan.scales[0], min(fit.point_scale for fit in fits)),
@@ -244,6 +244,6 @@ def _scores(plan: RefitPlan, results: Mapping[str, Calibration]) -> dict[str, fl
         there = residuals(plan.observations, sights, result.estimate)
         total = 0.5 * judged(plan, what, result).strain + 0.5 * len(plan.loosened(what)) * np.log(count)
         for name in sights.cameras:
-            total += misfit(sights.of_camera(name), result.cameras[name], there, scales)
+            total += there.misfit(sights.of_camera(name), result.cameras[name], scales)
         scores[what] = float(total)
     return scores

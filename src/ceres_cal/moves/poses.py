@@ -13,7 +13,7 @@ from itertools import product
 import numpy as np
 
 from ceres_cal.base.arrays import Array
-from ceres_cal.base.transforms import Pose, rotation_exp
+from ceres_cal.base.transforms import Pose
 from ceres_cal.model.parameters import Estimate
 from ceres_cal.model.residuals import Residuals, residuals
 from ceres_cal.observations import Observations
@@ -27,10 +27,9 @@ from ceres_cal.start.planes import plane_sight
 # changes from half to double.
 _WIDE = (60.0, 12.0)
 _FARTHEST_M = 1e3
-_GRID_DEG = (-24.0, 0.0, 24.0)  # of turns about each axis of the camera; neighbours' basins overlap
-# Share of observations that may be anywhere in the image: as many as are wrong in the simulated days of
-# scripts/moves.py. Nothing changes from half to double.
-_STRAY = 0.05
+_TURNS = [(0.0, 0.0, angle) for angle in (np.pi, np.pi / 2, -np.pi / 2)]
+# Turns about each axis of the camera; neighbours' basins overlap.
+_GRID = list(product(np.deg2rad((-24.0, 0.0, 24.0)), repeat=3))
 # m and rad: candidates nearer than this end in one minimum. Nothing changes from half to double.
 _ALIKE = (0.02, 0.01)
 # A pose fits where that share of the observations lies within so many standard deviations, at a noise of at most so
@@ -107,25 +106,13 @@ def pose_candidates(search: PoseSearch, old: Sequence[Pose], patience: int = 2) 
         old: where the camera stood before. patience: 0 tries the old poses, their turns and the closed form alone; 1
             the grid around them as well, where none of those fits.
     """
-    seeds = [*old, *(turn for pose in old for turn in _turned(pose))]
     closed = closed_form(search)
+    seeds = [*old, *(pose.turned(turn) for pose in old for turn in _TURNS)]
     candidates = _refined(search, [*seeds, *([closed] if closed is not None else [])])
     if patience and not (candidates and candidates[0].fits):
-        around = [turn for pose in seeds for turn in _grid(pose)]
+        around = [pose.turned(turn) for pose in seeds for turn in _GRID]
         candidates = _distinct([*candidates, *_refined(search, around)])
     return candidates
-
-
-def _turned(pose: Pose) -> list[Pose]:
-    """The camera turned by a half and by quarters about its own axis, where it stands."""
-    return [
-        Pose.looking(pose.position, rotation_exp((0, 0, a)) @ pose.rotation) for a in (np.pi, np.pi / 2, -np.pi / 2)
-    ]
-
-
-def _grid(pose: Pose) -> list[Pose]:
-    angles = np.deg2rad(_GRID_DEG)
-    return [Pose.looking(pose.position, rotation_exp(turn) @ pose.rotation) for turn in product(angles, repeat=3)]
 
 
 def equations(sight: Sights) -> int:
@@ -177,51 +164,22 @@ def _searched(search: PoseSearch, stack: Array, weighting: Weighting, tolerance:
 def candidate_at(search: PoseSearch, pose: Pose) -> PoseCandidate:
     """How well a pose explains the sight."""
     there = search.residuals(pose)
-    points, curves = in_sigmas(search.sight, there, search.scales)
+    points, curves = there.in_sigmas(search.sight, search.scales)
     lengths = np.nan_to_num(np.concatenate([points / 1.1774, curves / 0.6745]), nan=np.inf)
     scale = float(np.median(lengths))
     sigmas = np.nan_to_num(np.concatenate([points, curves]), nan=np.inf)
     share = float(np.mean(sigmas <= _FITS_SIGMA * np.clip(scale, 1.0, _FITS_SCALE)))
-    return PoseCandidate(pose, misfit(search.sight, search.camera, there, search.scales), scale, share)
-
-
-def in_sigmas(sights: Sights, there: Residuals, scales: tuple[float, float]) -> tuple[Array, Array]:
-    """(N,) of the sights' points and (M,) of their curve observations: lengths of the residuals at these noise scales,
-    in standard deviations.
-    """
-    points = np.linalg.norm(there.points[sights.point_rows], axis=1) / (scales[0] * sights.sigma_px)
-    return points, np.abs(there.curves[sights.curve_rows]) / (scales[1] * sights.curve_sigma_px)
-
-
-def misfit(sights: Sights, camera: Camera, there: Residuals, scales: tuple[float, float]) -> float:
-    """Negative log likelihood of a camera's residuals at these noise scales, each observation a stray with a small
-    probability; in nats.
-    """
-    width, height = camera.image_size
-    points, curves = in_sigmas(sights, there, scales)
-    p, c = sights.sigma_px * scales[0], sights.curve_sigma_px * scales[1]
-    total = 0.0
-    for lengths, inside, stray in (
-        (points, 1.0 / (2.0 * np.pi * p**2), 1.0 / (width * height)),
-        (curves, 1.0 / (np.sqrt(2.0 * np.pi) * c), 1.0 / np.hypot(width, height)),
-    ):
-        likely = (1.0 - _STRAY) * inside * np.exp(-0.5 * np.minimum(np.nan_to_num(lengths, nan=1e3), 1e3) ** 2)
-        total -= float(np.sum(np.log(likely + _STRAY * stray)))
-    return total
+    return PoseCandidate(pose, there.misfit(search.sight, search.camera, search.scales), scale, share)
 
 
 def _distinct(candidates: Sequence[PoseCandidate]) -> list[PoseCandidate]:
     """The candidates, best first, without repetitions."""
     kept: list[PoseCandidate] = []
     for candidate in sorted(candidates, key=lambda c: c.misfit):
-        if not any(_alike(candidate.pose, other.pose) for other in kept):
+        moves = [movement(candidate.pose, other.pose) for other in kept]
+        if not any(shift_m < _ALIKE[0] and turn < _ALIKE[1] for shift_m, turn in moves):
             kept.append(candidate)
     return kept
-
-
-def _alike(a: Pose, b: Pose) -> bool:
-    shift_m, turn = movement(a, b)
-    return shift_m < _ALIKE[0] and turn < _ALIKE[1]
 
 
 def movement(a: Pose, b: Pose) -> tuple[float, float]:

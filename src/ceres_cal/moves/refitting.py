@@ -11,12 +11,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from ceres_cal.base.errors import DegenerateError, InputError, SolutionError
+from ceres_cal.base.errors import DegenerateError, SolutionError
 from ceres_cal.base.transforms import Pose
 from ceres_cal.calibrating import Again, solved_from
 from ceres_cal.calibration import Calibration, Refitted
-from ceres_cal.model.parameters import Estimate
-from ceres_cal.moves.carried import RefitPlan, first_estimate, make_plan, refit_problem
+from ceres_cal.model.parameters import Estimate, Station
+from ceres_cal.moves.carried import RefitOptions, RefitPlan, make_plan, refit_problem
 from ceres_cal.moves.explain import (
     judged,
     old_poses,
@@ -25,14 +25,12 @@ from ceres_cal.moves.explain import (
     why_nothing_fits,
     zoomed_search,
 )
-from ceres_cal.moves.labels import TURNED, relabelled
 from ceres_cal.moves.poses import PoseSearch, equations, movement, pose_candidates
-from ceres_cal.observations import Observations, Prior
-from ceres_cal.observations.sights import Sights, gather_sights
+from ceres_cal.observations import Observations
+from ceres_cal.observations.sights import Sights
 from ceres_cal.solve import Progress
 from ceres_cal.start.initialise import Start
 
-LABELS = ("check", "as-given", "turned")
 # Poses whose likelihoods differ by less compete: a factor of 20 000 decides. Nothing changes from half to double.
 _NATS_ALIKE = 10.0
 # Equations with which a pose is the only one: six numbers, and two that contradict a wrong one. Nothing changes at
@@ -47,9 +45,7 @@ def refit(
     what: str = "pose",
     *,
     moved: Collection[str] | None = None,
-    hold_others: bool = False,
-    labels: str = "check",
-    priors: tuple[Prior, ...] = (),
+    options: RefitOptions | None = None,
     progress: Callable[[Progress], None] | None = None,
 ) -> Calibration:
     """A calibration after cameras were moved, from few new observations and all that was known.
@@ -65,33 +61,26 @@ def refit(
             counts in the new posterior), "zoom" (nothing is known of phi any more), "iris" (nothing of the lens's
             coefficients), "everything" (nothing of the intrinsics).
         moved: observed stations that moved; by default all. The other observed ones stay under their posterior.
-        hold_others: hold stations that stay and their cameras exactly; their posterior still learns.
-        labels: "check" them against a turn by 180 degrees, take them "as-given", or "turned".
-        priors: new knowledge, such as a height measured after the move.
 
     Raises:
         InputError: names that do not fit the calibration, or one that does not say how well it is known.
         DegenerateError: the observations cannot tell a pose, or not for sure after so large a move.
         SolutionError: no explanation fits, or another one than `what` allows for does; the message says which.
     """
-    if labels not in LABELS:
-        raise InputError(f"labels={labels!r} is unknown: choose one of {', '.join(LABELS)}")
-    given = _turned(observations) if labels == "turned" else observations
-    plan = make_plan(calibration, observations, what, moved, hold_others, priors)
-    if given is not observations:
-        plan = replace(plan, observations=replace(given, targets=plan.observations.targets))
-    sights = gather_sights(plan.observations)
-    estimate = _start(plan, sights, check_labels=labels == "check")
+    plan = make_plan(calibration, observations, what, moved, options)
+    estimate = _start(plan)
+    zoomed = plan.moved_cameras if what in ("zoom", "everything") else ()
+    phi_from = {name: "views" if name in zoomed else "posterior" for name in calibration.cameras}
 
     def attempt(what: str, start: Estimate, *, assessed: bool = False) -> Calibration:
-        problem, known = refit_problem(plan, what, sights, start)
+        problem, known = refit_problem(plan, what, start)
         again = Again(known, plan.scales, assessed)
-        return solved_from(Start(start, _phi_from(plan)), plan.observations, problem, again, progress)
+        return solved_from(Start(start, phi_from), plan.observations, problem, again, progress)
 
     result = attempt(what, estimate, assessed=True)
     others = require_supported(plan, result, attempt)
     if others:
-        raise why_nothing_fits(plan, [_search_of(plan, sight, estimate) for sight in _moved_sights(plan, sights)])
+        raise why_nothing_fits(plan, [_search_of(plan, sight, estimate) for sight in _moved_sights(plan)])
     _require_known(plan, result)
     explanation = _explained(plan, result)
     seen = (*calibration.refitted.digests, calibration.digest) if calibration.refitted else (calibration.digest,)
@@ -105,31 +94,22 @@ def refit(
 _TWICE = "these observations are in the old calibration's past already: what they say counts twice now"
 
 
-def _turned(observations: Observations) -> Observations:
-    turned = relabelled(observations, TURNED)
-    if turned is None:
-        raise InputError("labels turned: some observed feature has no counterpart half a turn away: label anew")
-    return turned
-
-
-def _start(plan: RefitPlan, sights: Sights, *, check_labels: bool) -> Estimate:
+def _start(plan: RefitPlan) -> Estimate:
     """Poses of everything that is sought, lenses as they were (or zoomed, where that may be)."""
-    old = plan.calibration.estimate
     poses: dict[str, Pose] = {}
-    cameras = dict(old.cameras)
-    empty = first_estimate(plan, {name: Pose.identity() for name in plan.moved}, {})
-    for sight in _moved_sights(plan, sights):
-        search, pose = _sought(plan, _search_of(plan, sight, empty))
+    cameras = dict(plan.known.cameras)
+    for sight in _moved_sights(plan):
+        search, pose = _sought(plan, _search_of(plan, sight, plan.known))
         poses[sight.key.station], cameras[sight.key.camera] = pose, search.camera
-    if check_labels:
+    if plan.asked.labels == "check":
         require_labels(plan, poses)
-    estimate = replace(first_estimate(plan, poses, {}), cameras=cameras)
-    return replace(estimate, placements=_placements(plan, sights, estimate))
+    placed = {name: Station(plan.stations[name], pose) for name, pose in poses.items()}
+    estimate = replace(plan.known, cameras=cameras, stations={**plan.known.stations, **placed})
+    return replace(estimate, placements=_placements(plan, estimate))
 
 
-def _moved_sights(plan: RefitPlan, sights: Sights) -> list[Sights]:
-    """What each station that moved sees of the world."""
-    moved = {name: sight for name, sight in sights.of_world.items() if name in plan.moved}
+def _moved_sights(plan: RefitPlan) -> list[Sights]:
+    moved = {name: sight for name, sight in plan.sights.of_world.items() if name in plan.moved}
     for name in sorted(plan.moved - moved.keys()):
         raise DegenerateError(
             f"station {name!r} sees nothing that lies in the world: observe lines or points of the field with it"
@@ -147,7 +127,9 @@ def _sought(plan: RefitPlan, search: PoseSearch) -> tuple[PoseSearch, Pose]:
     candidates = pose_candidates(search, old)
     fitting = [c for c in candidates if c.fits and c.misfit <= candidates[0].misfit + _NATS_ALIKE]
     if fitting:
-        pose = min(fitting, key=lambda candidate: _far(candidate.pose, old)).pose
+        # Of explanations that fit alike the one of the smallest move is taken.
+        far = [min((sum(movement(one.pose, before)) for before in old), default=0.0) for one in fitting]
+        pose = fitting[int(np.argmin(far))].pose
         _require_unique(search, pose, old)
         return search, pose
     if plan.what in ("zoom", "iris", "everything"):
@@ -160,7 +142,8 @@ def _sought(plan: RefitPlan, search: PoseSearch) -> tuple[PoseSearch, Pose]:
 def _require_unique(search: PoseSearch, pose: Pose, old: list[Pose]) -> None:
     """Raise DegenerateError where so few features cannot tell a large move from another one."""
     known = equations(search.sight)
-    if known >= _UNIQUE or any(_is_small(*movement(pose, before)) for before in old):
+    moves = [movement(pose, before) for before in old]
+    if known >= _UNIQUE or any(shift_m < _SMALL[0] and turn < _SMALL[1] for shift_m, turn in moves):
         return
     raise DegenerateError(
         f"station {search.sight.key.station!r}: its points, lines and arcs give {known} equations, which tell a small "
@@ -168,31 +151,18 @@ def _require_unique(search: PoseSearch, pose: Pose, old: list[Pose]) -> None:
     )
 
 
-def _is_small(shift_m: float, turn: float) -> bool:
-    return shift_m < _SMALL[0] and turn < _SMALL[1]
-
-
-def _phi_from(plan: RefitPlan) -> dict[str, str]:
-    free = plan.moved_cameras if plan.what in ("zoom", "everything") else ()
-    return {name: "views" if name in free else "posterior" for name in plan.calibration.cameras}
-
-
-def _far(pose: Pose, old: list[Pose]) -> float:
-    """How large a move is: of explanations that fit alike the nearest is taken."""
-    return min((sum(movement(pose, before)) for before in old), default=0.0)
-
-
-def _placements(plan: RefitPlan, sights: Sights, estimate: Estimate) -> dict[str, Pose]:
+def _placements(plan: RefitPlan, estimate: Estimate) -> dict[str, Pose]:
     """Every placement that the observations show, from the first sight that can tell its pose."""
     poses: dict[str, Pose] = {}
-    for number, key in enumerate(sights.keys):
+    for sight in plan.sights:
+        key = sight.key
         if key.placement is None or key.placement in poses:
             continue
-        search = _search_of(plan, sights[number], replace(estimate, placements={}))
+        search = _search_of(plan, sight, estimate)
         candidates = pose_candidates(search, [], patience=0)
         if candidates:
             poses[key.placement] = estimate.stations[key.station].cam_from_world.inverse @ candidates[0].pose
-    for key in sights.keys:
+    for key in plan.sights.keys:
         if key.placement is not None and key.placement not in poses:
             raise DegenerateError(f"{key}: its pose cannot be told: show at least four points, not on one line")
     return poses
@@ -216,7 +186,6 @@ def _require_known(plan: RefitPlan, result: Calibration) -> None:
 
 
 def _explained(plan: RefitPlan, result: Calibration) -> str:
-    """What has happened to each station that was sought, in words."""
     words, moves = [], movements(plan.calibration, result)
     for name in sorted(plan.moved):
         how = "is new" if name not in moves else f"moved by {1e3 * moves[name][0]:.1f} mm and {moves[name][1]:.3f} deg"
@@ -240,7 +209,6 @@ def movements(before: Calibration, after: Calibration) -> dict[str, tuple[float,
 
 
 def _warnings(plan: RefitPlan, result: Calibration) -> tuple[str, ...]:
-    """Those of the solve, and what the noise says."""
     judgement = judged(plan, plan.what, result)
     noisy = f"the noise is {judgement.noise:.1f} times that of the calibration before"
     return (*result.warnings, noisy) if judgement.noisy else result.warnings

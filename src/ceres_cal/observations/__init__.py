@@ -20,8 +20,6 @@ __all__ = [
     "Prior",
     "View",
     "combine",
-    "no_curves",
-    "no_points",
     "prior_from_json",
     "prior_to_json",
     "taken",

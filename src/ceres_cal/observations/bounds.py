@@ -57,7 +57,6 @@ def _all_inside(content: Content) -> bool:
 
 
 def _end(size: Sequence[int] | Array) -> Array:
-    """The last pixel that may be seen in an image of that size."""
     return np.asarray(size) - 1.0 + _MARGIN_PX
 
 
@@ -81,7 +80,6 @@ def _cause(pixels: Array, size: Sequence[int]) -> str:
 
 
 def _first(content: Content, points: Mask, curves: Mask) -> str:
-    """The first of these observations, as messages name it."""
     column: Columns = content.points if points.any() else content.curves
     row = int(np.argmax(points if points.any() else curves))
     kind = "curve" if isinstance(column, Curves) else "point"

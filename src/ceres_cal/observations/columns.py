@@ -57,17 +57,9 @@ class Prior:
 TYPES = {"view": np.int32, "feature": np.int32, "pixels": np.float64, "sigma_px": np.float64, "side": np.int8}
 
 
-def _freeze(columns: Columns) -> None:
-    """Own, read-only columns of the types that the files have."""
-    for name, values in vars(columns).items():
-        column = np.array(values, dtype=TYPES[name])
-        column.setflags(write=False)
-        object.__setattr__(columns, name, column)
-
-
 @dataclass(frozen=True, eq=False)
-class Points:
-    """Columns of the point observations: index of the view, index into the target's point names, pixel, its sigma."""
+class Columns:
+    """Columns of observations, read-only: index of the view, index into the target's names, pixel, its sigma."""
 
     view: Indices32
     feature: Indices32
@@ -75,33 +67,29 @@ class Points:
     sigma_px: Array
 
     def __post_init__(self) -> None:
-        _freeze(self)
+        for name, values in vars(self).items():
+            column = np.array(values, dtype=TYPES[name])
+            column.setflags(write=False)
+            object.__setattr__(self, name, column)
 
     def __len__(self) -> int:
         return len(self.view)
 
 
-@dataclass(frozen=True, eq=False)
-class Curves:
-    """Columns of the curve observations; `side` is 0 for the centre of the paint, +1 for left, -1 for right."""
+class Points(Columns):
+    """The point observations."""
 
-    view: Indices32
-    feature: Indices32
-    pixels: Array
-    sigma_px: Array
+
+@dataclass(frozen=True, eq=False)
+class Curves(Columns):
+    """The curve observations; `side` is 0 for the centre of the paint, +1 for left, -1 for right."""
+
     side: Codes
-
-    def __post_init__(self) -> None:
-        _freeze(self)
-
-    def __len__(self) -> int:
-        return len(self.view)
 
 
 _NOBODY, _NOWHERE = np.empty(0, np.int32), np.empty((0, 2))
 NO_POINTS = Points(_NOBODY, _NOBODY, _NOWHERE, np.empty(0))
 NO_CURVES = Curves(_NOBODY, _NOBODY, _NOWHERE, np.empty(0), np.empty(0, np.int8))
-Columns = Points | Curves
 C = TypeVar("C")
 
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -27,14 +28,15 @@ _COLUMNS = {"header": Column(np.uint8, ("bytes",))} | {
 _SIDE_NAMES = {value: name for name, value in SIDES.items()}
 
 
-class Content(NamedTuple):
-    """What a file holds: the fields of `Observations`."""
+@dataclass(frozen=True, eq=False)
+class Content:
+    """What a file holds, not checked: see `Observations`."""
 
     targets: Mapping[str, Target]
     cameras: Mapping[str, tuple[int, int]]
     views: tuple[View, ...]
-    points: Points = NO_POINTS
-    curves: Curves = NO_CURVES
+    points: Points
+    curves: Curves
     priors: tuple[Prior, ...] = ()
 
 
@@ -82,7 +84,9 @@ class _ObservationsFile(msgspec.Struct, forbid_unknown_fields=True, kw_only=True
             targets_from_specs(self.targets),
             {name: camera.image_size for name, camera in self.cameras.items()},
             tuple(entry.view() for entry in self.views),
-            priors=tuple(prior_from_json(entry, f"prior {i}") for i, entry in enumerate(self.priors)),
+            NO_POINTS,
+            NO_CURVES,
+            tuple(prior_from_json(entry, f"prior {i}") for i, entry in enumerate(self.priors)),
         )
 
 
@@ -170,7 +174,8 @@ def _from_json(content: bytes, where: str) -> Content:
     point_index = {name: {f: i for i, f in enumerate(target.point_names)} for name, target in targets.items()}
     curve_index = {name: {f: i for i, f in enumerate(target.curve_names)} for name, target in targets.items()}
     sides = [_sides(entry, view_label(i, views)) for i, entry in curves]
-    return header._replace(
+    return replace(
+        header,
         points=Points(**_columns(points, views, point_index, "point")),
         curves=Curves(**_columns(curves, views, curve_index, "curve"), side=_concatenate(sides, np.int8)),
     )
@@ -231,14 +236,14 @@ def _same_or_list(values: AnyArray) -> Any:
 
 def _to_json(content: Content) -> bytes:
     data = header_of(content)
-    for rows, entry in zip(_rows_by_view(content.points, len(data.views)), data.views, strict=True):
-        if len(rows):
-            entry.points = _PointsFile(*_features(content.points, rows, content.targets[entry.target].point_names))
-    for rows, entry in zip(_rows_by_view(content.curves, len(data.views)), data.views, strict=True):
-        if len(rows):
-            side = _side_names(content.curves.side[rows])
-            names = content.targets[entry.target].curve_names
-            entry.curves = _CurvesFile(*_features(content.curves, rows, names), side)
+    points, curves = (_rows_by_view(columns, len(data.views)) for columns in (content.points, content.curves))
+    for p, c, entry in zip(points, curves, data.views, strict=True):
+        target = content.targets[entry.target]
+        if len(p):
+            entry.points = _PointsFile(*_features(content.points, p, target.point_names))
+        if len(c):
+            side = _side_names(content.curves.side[c])
+            entry.curves = _CurvesFile(*_features(content.curves, c, target.curve_names), side)
     plain = msgspec.structs.asdict(data)
     del plain["views"]
     head = msgspec.json.format(msgspec.json.encode(plain), indent=1).rstrip(b"}\n")
@@ -281,4 +286,4 @@ def _from_npz(packed: bytes, where: str) -> Content:
         {name.removeprefix(kind): array for name, array in arrays.items() if name.startswith(kind)}
         for kind in ("points_", "curves_")
     )
-    return content._replace(points=Points(**points), curves=Curves(**curves))
+    return replace(content, points=Points(**points), curves=Curves(**curves))

@@ -6,7 +6,7 @@ The row of an observation in `points` or `curves` is its permanent id: nothing h
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -16,7 +16,7 @@ import msgspec
 import numpy as np
 
 from ceres_cal.base.arrays import Mask
-from ceres_cal.base.errors import InputError
+from ceres_cal.base.errors import InputError, naming
 from ceres_cal.observations.bounds import stray_pixels
 from ceres_cal.observations.columns import Columns, Curves, Points, Prior, View, choices, taken, view_label
 from ceres_cal.observations.files import Content, header_of, read_content, write_content
@@ -24,7 +24,7 @@ from ceres_cal.scene.targets import Target
 
 
 @dataclass(frozen=True, eq=False)
-class Observations:
+class Observations(Content):
     """Everything that was observed.
 
     Attributes:
@@ -41,13 +41,6 @@ class Observations:
         InputError: on construction, naming the view and the feature: a name that is not there, a number that is not
             finite, a camera without any observation.
     """
-
-    targets: Mapping[str, Target]
-    cameras: Mapping[str, tuple[int, int]]
-    views: tuple[View, ...]
-    points: Points
-    curves: Curves
-    priors: tuple[Prior, ...] = ()
 
     def __post_init__(self) -> None:
         self._check_names()
@@ -69,31 +62,23 @@ class Observations:
         Raises:
             InputError: one line that names the file, the view and the feature; also for pixels outside their images.
         """
-        path = Path(path)
-        try:
-            observations = cls(*read_content(path))
+        with naming(path):
+            observations = cls(**vars(read_content(Path(path))))
             observations.require_inside()
             return observations
-        except InputError as error:
-            text = str(error)
-            raise InputError(text if text.startswith(f"{path}: ") else f"{path}: {text}") from None
 
     def save(self, path: str | Path) -> None:
         """Write `.json` or, for large sets, `.npz`; every number comes back exactly."""
-        write_content(self._content, Path(path))
+        write_content(self, Path(path))
 
     @cached_property
     def digest(self) -> str:
         """SHA-256 of the content, the same for the JSON and the NPZ file: where a calibration came from."""
-        content = hashlib.sha256(msgspec.json.encode(header_of(self._content)))
+        content = hashlib.sha256(msgspec.json.encode(header_of(self)))
         for column in (self.points, self.curves):
             for array in vars(column).values():
                 content.update(np.ascontiguousarray(array).data)
         return content.hexdigest()
-
-    @property
-    def _content(self) -> Content:
-        return Content(self.targets, self.cameras, self.views, self.points, self.curves, self.priors)
 
     # ---- reading ------------------------------------------------------------------------------------------------
 
@@ -117,6 +102,12 @@ class Observations:
     def placements(self) -> tuple[str, ...]:
         """Names of the placements, in order of appearance."""
         return tuple(dict.fromkeys(view.placement for view in self.views if view.placement is not None))
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """How many views, cameras, stations, placements, points and curve observations there are."""
+        names = ("views", "cameras", "stations", "placements", "points", "curves")
+        return {name: len(getattr(self, name)) for name in names}
 
     def feature_name(self, kind: str, row: int) -> str:
         """Name of the feature that observation `row` of the points (kind "point") or curves ("curve") shows."""
@@ -211,7 +202,7 @@ class Observations:
 
     @cached_property
     def _strays(self) -> tuple[str, ...]:
-        return stray_pixels(self._content)
+        return stray_pixels(self)
 
     def require_owner(self, prior: Prior) -> None:
         """Raise InputError where a prior names a camera or station that is not there."""

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Container, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -157,14 +157,15 @@ class Sights(Sequence["Sights"]):
         c = bounds_of(curves[self.curve_rows])[self.curve_bounds]
         return np.asarray((np.diff(p) + np.diff(c)) / (np.diff(self.point_bounds) + np.diff(self.curve_bounds)))
 
-    def reach_px(self, camera: Camera) -> float:
-        """Distance from the principal point to the farthest observation of the sights, which are the camera's."""
-        farthest = 0.0
-        for pixels in (self.pixels, self.curve_pixels):
-            for at in range(0, len(pixels), _BLOCK):
-                x, y = camera.offsets(pixels[at : at + _BLOCK]).T
-                farthest = max(farthest, float(np.max(x * x + y * y)))
-        return float(np.sqrt(farthest))
+    def about(self, camera: Camera) -> Sights:
+        """The sights, which are the camera's, with pixels as offsets from its principal point on square pixels."""
+        return replace(self, pixels=camera.offsets(self.pixels), curve_pixels=camera.offsets(self.curve_pixels))
+
+    @property
+    def reach_px(self) -> float:
+        """Largest length of a pixel: of sights `about` their camera how far observations reach from the centre."""
+        columns = (self.pixels.T, self.curve_pixels.T)
+        return float(np.sqrt(max(np.max(x * x + y * y, initial=0.0) for x, y in columns)))
 
     def part(self, number: int, count: int) -> Sights:
         """The number-th of `count` about equal parts of the observations of a single sight."""

@@ -112,7 +112,6 @@ def _optics(upright: Upright, stroke_map: StrokeMap) -> Camera:
 
 
 def _upright_of(camera: Camera, search: FieldSearch) -> Upright:
-    """A camera's turn, and the one coefficient that is nearest to its lens."""
     share, unit = np.linspace(0.1, 1.0, 30), search.stroke_map.unit_px
     rays = camera.lens.undistort(np.column_stack([share * unit, np.zeros(30)]), camera.phi)
     ahead = np.isfinite(rays[:, 2]) & (rays[:, 2] > 0.0)

@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 
 from ceres_cal.base.arrays import Array
-from ceres_cal.base.errors import DegenerateError, InputError
+from ceres_cal.base.errors import DegenerateError, InputError, naming
 from ceres_cal.base.files import check_header, convert, read_json
 from ceres_cal.observations import Prior
 from ceres_cal.photographs.follow import FreeIntrinsics
@@ -64,10 +64,8 @@ def load_clicks(path: str | Path) -> Clicks:
 def clicks_from_json(data: Mapping[str, Any], where: str) -> Clicks:
     """The clicks that a file describes; InputError that names `where`."""
     file = convert(check_header(data, where, FORMAT, VERSION), _ClicksFile, where)
-    try:
+    with naming(where):
         return Clicks(file.points)
-    except InputError as error:
-        raise InputError(f"{where}: {error}") from None
 
 
 def starts_from_clicks(

@@ -108,7 +108,6 @@ def distinguishing_feature(target: Target, curves: Collection[str]) -> str:
 
 
 def _place(feature: str, target: Target) -> Array:
-    """(2,) a point, or the middle of a curve."""
     if feature in target.points:
         return np.array(target.points[feature][:2])
     return np.asarray(curve_points(target.curves[feature], 0, 2)[1, :2])

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ceres_cal.base.arrays import Array32, Mask
-from ceres_cal.base.errors import InputError, NothingShownError
+from ceres_cal.base.errors import InputError, NothingShownError, naming
 from ceres_cal.base.progress import ImageProgress
 from ceres_cal.detect.crossings import find_crossings
 from ceres_cal.detect.images import read_grey
@@ -119,10 +119,8 @@ def _looked_for(
 ) -> SearchResult:
     """The field from where the last image showed it, or from the start that was given, or from none."""
     if isinstance(start, Auto):
-        try:
+        with naming(path):
             return search(grey, target, painted, start)
-        except InputError as error:
-            raise InputError(f"{path}: {error}") from None
     starts, free = _starts(start, target, (int(grey.shape[1]), int(grey.shape[0])), path)
     followed = follow(grey, target, starts, painted, free)
     return SearchResult(followed) if followed.holds else SearchResult(None, why_missed(followed, target, started=True))
@@ -165,7 +163,6 @@ def _observations(frame: str, followed: Followed, target: Target, options: Field
 
 
 def _curves(lines: Lines, taken: Mask, edges: bool) -> Curves:
-    """The middles of the paint, or both its edges, at the places taken."""
     rows = np.flatnonzero(taken)
     sides = (1, -1) if edges else (0,)
     pixels = [lines.edge(side) if edges else lines.pixels for side in sides]

@@ -203,7 +203,6 @@ class _Tracker:
         return measure(self.grey, course.take(clear), _LAST_REACH_PX)
 
     def _observed(self, lines: Lines, camera: Camera) -> Observations:
-        """The places where paint was found, as one view."""
         rows = lines.found
         return observations_of(
             self.target, camera.image_size, lines.course.curve[rows], lines.pixels[rows], lines.sigma_px[rows]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array
 from ceres_cal.detect.courses import predict
 from ceres_cal.photographs.candidates import FieldSearch
 from ceres_cal.photographs.follow import LEAST_SHARE, Followed
@@ -91,12 +90,8 @@ def same_labels(search: FieldSearch, one: Followed, other: Followed) -> bool:
     pixels = one.lines.pixels[one.lines.found]
     here, there = (np.column_stack([c.locate(pixels), np.zeros(len(pixels))]) for c in (one.camera, other.camera))
     extent = float(np.max(np.ptp(here, axis=0)))
-    away = [float(np.nanmedian(_distances(turn.inverse.transform(here), there))) for turn in search.turns]
-    return min(away) < _SAME_FLOOR * extent
-
-
-def _distances(a: Array, b: Array) -> Array:
-    return np.asarray(np.nan_to_num(np.linalg.norm(a - b, axis=1), nan=np.inf))
+    away = [np.linalg.norm(turn.inverse.transform(here) - there, axis=1) for turn in search.turns]
+    return min(float(np.median(np.nan_to_num(one, nan=np.inf))) for one in away) < _SAME_FLOOR * extent
 
 
 def detected_curves(search: FieldSearch, followed: Followed) -> list[str]:

@@ -78,7 +78,11 @@ def detect_known(
     paths, posed = [Path(path) for path in images], calibration.station(station)
     name = station or next(iter(calibration.stations))
     names = calibration.estimate.stations[name].camera, name
-    wanted = {what: t for what, t in calibration.targets.items() if is_painted(t) or (boards and _is_chessboard(t))}
+    wanted = {
+        what: target
+        for what, target in calibration.targets.items()
+        if is_painted(target) or (boards and target.grid is not None and target.grid.checkered)
+    }
     if not wanted:
         raise InputError(
             f"the calibration's targets ({', '.join(calibration.targets)}) have no painted lines"
@@ -149,10 +153,6 @@ def is_painted(target: Target) -> bool:
     return any(curve.width_m > 0.0 for curve in target.curves.values())
 
 
-def _is_chessboard(target: Target) -> bool:
-    return target.grid is not None and target.grid.checkered
-
-
 def _counted(images: int) -> str:
     return "the photograph" if images == 1 else f"any of {images} photographs"
 
@@ -174,7 +174,6 @@ def _counting_on(progress: ImageProgress | None, turn: int, turns: int) -> Image
 
 
 def _renamed(detected: Observations, target: str) -> Observations:
-    """What was found under the name that the calibration has for its target."""
     (known,) = detected.targets.values()
     views = tuple(replace(view, target=target) for view in detected.views)
     return replace(detected, targets={target: known}, views=views)

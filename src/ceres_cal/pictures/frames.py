@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Mask
+from ceres_cal.base.arrays import Mask
 from ceres_cal.base.errors import InputError
 from ceres_cal.calibration import Calibration
-from ceres_cal.observations import Observations
+from ceres_cal.observations import Columns, Observations
 from ceres_cal.pictures.model import Model, model_seen
 from ceres_cal.pictures.overlay import TAKEN_OUT, USED, Marks
 
@@ -31,9 +31,9 @@ class Frame:
 
 def frames_of(observations: Observations) -> tuple[Frame, ...]:
     """The frames of each station, in the order of their views."""
-    found: dict[tuple[str, str], list[int]] = {}
+    rows_of: dict[tuple[str, str], list[int]] = {}
     for number, view in enumerate(observations.views):
-        found.setdefault((view.frame, view.station), []).append(number)
+        rows_of.setdefault((view.frame, view.station), []).append(number)
     return tuple(
         Frame(
             name,
@@ -41,7 +41,7 @@ def frames_of(observations: Observations) -> tuple[Frame, ...]:
             tuple((view.target, view.placement) for view in map(observations.views.__getitem__, rows)),
             tuple(rows),
         )
-        for (name, station), rows in found.items()
+        for (name, station), rows in rows_of.items()
     )
 
 
@@ -70,11 +70,11 @@ def photographs_by_frame(images: Iterable[Path]) -> dict[str, Path]:
     Raises:
         InputError: two images of one stem.
     """
-    found: dict[str, Path] = {}
+    by_frame: dict[str, Path] = {}
     for path in images:
-        if found.setdefault(path.stem, path) != path:
-            raise InputError(f"{path}: has the same name as {found[path.stem]}: give the images of one folder")
-    return found
+        if by_frame.setdefault(path.stem, path) != path:
+            raise InputError(f"{path}: has the same name as {by_frame[path.stem]}: give the images of one folder")
+    return by_frame
 
 
 def model_of(calibration: Calibration, frame: Frame, height_m: float = 0.0) -> Model:
@@ -99,18 +99,12 @@ def marks_of(calibration: Calibration, observations: Observations, frame: Frame)
     """What was observed in a frame: what took part and, where the calibration was made from these observations, what
     was taken out.
     """
-    own = observations.digest == calibration.digest
-    pixels: list[Array] = []
-    out: list[Mask] = []
-    for kind, columns in (("point", observations.points), ("curve", observations.curves)):
-        rejected = np.zeros(len(columns), dtype=bool)
-        rejected[[entry.row for entry in calibration.rejected if own and entry.kind == kind]] = True
-        here = np.isin(columns.view, frame.views)
-        pixels.append(columns.pixels[here])
-        out.append(rejected[here])
-    every, taken_out = np.concatenate(pixels), np.concatenate(out)
-    found = (
-        Marks(every[~taken_out], "observed", USED),
-        Marks(every[taken_out], "taken out", TAKEN_OUT, crosses=True),
-    )
-    return tuple(marks for marks in found if len(marks.pixels))
+    both: tuple[Columns, Columns] = observations.points, observations.curves
+    inliers: Sequence[Mask] = [np.ones(len(columns), dtype=bool) for columns in both]
+    if observations.digest == calibration.digest:
+        inliers = calibration.inlier_masks(observations)
+    here = [np.isin(columns.view, frame.views) for columns in both]
+    pixels = np.concatenate([columns.pixels[rows] for columns, rows in zip(both, here, strict=True)])
+    used = np.concatenate([mask[rows] for mask, rows in zip(inliers, here, strict=True)])
+    marks = Marks(pixels[used], "observed", USED), Marks(pixels[~used], "taken out", TAKEN_OUT, crosses=True)
+    return tuple(one for one in marks if len(one.pixels))

@@ -112,7 +112,6 @@ def _fixed(pixels: Array) -> Indices32:
 
 
 def _with_legend(canvas: Image8, entries: Sequence[tuple[str, Colour]], thick: float) -> Image8:
-    """The legend in the lower left corner, on a ground that lets the photograph through."""
     scale, pad, row = _LETTER_PX * thick / _FONT_PX / 1.4, _PAD_PX * thick, 1.3 * _LETTER_PX * thick
     stroke = max(1, round(thick))
     texts = [label.encode("ascii", "replace").decode() for label, _ in entries]  # the font has no other letters

@@ -98,9 +98,9 @@ def straighten(
 
     def places(pixels: Array) -> Array:
         across = (pixels - centre) / new_phi
-        found = optics.project(np.column_stack([across, np.ones(len(across))]))
-        found[np.hypot(across[:, 0], across[:, 1]) > region.slope] = np.nan
-        return found
+        there = optics.project(np.column_stack([across, np.ones(len(across))]))
+        there[np.hypot(across[:, 0], across[:, 1]) > region.slope] = np.nan
+        return there
 
     warp = make_warp(new_size, camera.image_size, places)
     return Straight(straight, warp, _share_shown(camera, straight, region.slope), region.limit_deg)

@@ -88,13 +88,13 @@ def make_warp(size: tuple[int, int], photograph_size: tuple[int, int], places: C
 def _placed(size: tuple[int, int], places: Callable[[Array], Array]) -> tuple[Array32, Array32]:
     """Places of all pixels and of one more around them."""
     across, down = (np.arange(-1.0, count + 1.0) for count in size)
-    found = np.empty((len(down), len(across), 2), dtype=np.float32)
+    there = np.empty((len(down), len(across), 2), dtype=np.float32)
     rows = max(1, _BLOCK // len(across))
     for top in range(0, len(down), rows):
         part = down[top : top + rows]
         pixels = np.column_stack([np.tile(across, len(part)), np.repeat(part, len(across))])
-        found[top : top + rows] = places(pixels).reshape(len(part), len(across), 2)
-    return found[..., 0], found[..., 1]
+        there[top : top + rows] = places(pixels).reshape(len(part), len(across), 2)
+    return there[..., 0], there[..., 1]
 
 
 def _divided(plane: Array32, fine: int) -> Array32:

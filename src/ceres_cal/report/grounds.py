@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from ceres_cal.base.words import counted, first_of, mm, sentence, short
-from ceres_cal.diagnostics import Finding
+from ceres_cal.diagnostics import DIAGNOSTICS, Finding
 from ceres_cal.report.material import Material
 
 GOOD_MM, CARE_MM = 10.0, 50.0
@@ -80,7 +80,7 @@ def _of_findings(material: Material) -> Iterator[tuple[str, str]]:
             "no" if off_mm > GOOD_MM else "care",
             f"A refit to these new data would move it by {mm(off_mm)} rms: was the camera bumped?",
         )
-    if any(finding.kind == "correlated" for finding in diagnosis.findings):
+    if any(DIAGNOSTICS[finding.kind].widens for finding in diagnosis.findings):
         factor = max(one.inflation for one in diagnosis.noise) ** 0.5
         yield "care", f"Neighbouring residuals agree: take every standard deviation {short(factor)} times as large."
 

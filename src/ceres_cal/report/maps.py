@@ -90,7 +90,6 @@ class MapDrawing:
         self._bar(axes, colors, norm)
 
     def _bar(self, axes: Axes, colors: object, norm: object) -> None:
-        """The scale of colours, beneath."""
         from matplotlib.cm import ScalarMappable
 
         figure = axes.get_figure()
@@ -160,16 +159,14 @@ def _reading(one: FieldMap) -> str:
 
 
 def _grid_table(one: FieldMap) -> Table:
-    """The map at a few places."""
     columns, rows = evenly(len(one.x_m), _TABLE_COLUMNS), evenly(len(one.y_m), _TABLE_ROWS)[::-1]
     return Table(
         ("mm at y \\ x", *(f"{one.x_m[c]:.1f} m" for c in columns)),
-        tuple((f"{one.y_m[r]:.1f} m", *(_cell(float(one.sd_mm[r, c])) for c in columns)) for r in rows),
+        tuple(
+            (f"{one.y_m[r]:.1f} m", *("∞" if np.isinf(sd) else short(sd) for sd in one.sd_mm[r, columns].tolist()))
+            for r in rows
+        ),
     )
-
-
-def _cell(sd_mm: float) -> str:
-    return "∞" if np.isinf(sd_mm) else short(sd_mm)
 
 
 def evenly(count: int, most: int) -> list[int]:
@@ -188,8 +185,8 @@ def comparison_svg(comparison: StationComparison, before: Calibration) -> str:
     map_drawing = MapDrawing(
         comparison.x_m,
         comparison.y_m,
-        comparison.length_mm,
-        levels_of(comparison.length_mm),
+        comparison.errors_mm,
+        levels_of(comparison.errors_mm),
         f"{comparison.station}, {where}: difference, mm ({comparison.mean_mm:.2f} on average)",
         [line[:, :2] for line in paint_of(fields)],
         image_border(camera, comparison.height_m),

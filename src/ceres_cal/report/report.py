@@ -106,20 +106,9 @@ def _solve(material: Material) -> Chapter:
 
 
 def _about(material: Material) -> str:
-    observations = material.observations
-    counts = [
-        counted(number, word)
-        for number, word in (
-            (len(observations.views), "view"),
-            (len(observations.cameras), "camera"),
-            (len(observations.stations), "station"),
-            (len(observations.placements), "placement"),
-            (len(observations.points), "point observation"),
-            (len(observations.curves), "curve observation"),
-        )
-        if number
-    ]
-    return ", ".join(counts)
+    words = ("view", "camera", "station", "placement", "point observation", "curve observation")
+    counts = zip(material.observations.counts.values(), words, strict=True)
+    return ", ".join(counted(number, word) for number, word in counts if number)
 
 
 def _foot(calibration: Calibration) -> str:

@@ -98,6 +98,8 @@ def convergence(material: Material) -> Figure | None:
     floor = max(1e-16 * float(history.min()), 1e-300)
     shown = np.maximum(above, floor)
     steps = np.arange(len(history))
+    falls = ("", *(f"{fall:.3g}" for fall in history[:-1] - history[1:]))
+    rows = tuple(zip(map(str, steps), map("{:.10g}".format, history), falls, strict=True))
 
     def draw(axes: Axes, width_in: float) -> None:
         from matplotlib.ticker import MaxNLocator
@@ -116,13 +118,8 @@ def convergence(material: Material) -> Figure | None:
         f"A sound solve falls steeply and ends: a long flat tail means that some direction is hardly told. {how} after "
         f"{counted(solved.rounds, 'solve')}; this is the last one, to a cost of {history[-1]:.6g}.",
         Drawing(draw, 0.66),
-        Table(("iteration", "cost", "fall"), tuple(_cost_row(history, i) for i in range(len(history)))),
+        Table(("iteration", "cost", "fall"), rows),
     )
-
-
-def _cost_row(history: Array, number: int) -> tuple[str, ...]:
-    fall = f"{history[number - 1] - history[number]:.3g}" if number else ""
-    return str(number), f"{history[number]:.10g}", fall
 
 
 # ---- closed form against bundle -------------------------------------------------------------------------------------

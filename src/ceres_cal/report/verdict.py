@@ -67,7 +67,6 @@ def verdict_chapter(material: Material) -> Chapter:
 
 
 def _headline(material: Material, every: tuple[Reach, ...], reasons: str) -> tuple[str, str]:
-    """Level and headline."""
     if material.uncertainty is None:
         return "no", "Not to be used: nothing was minimised, this is the paper's closed form alone."
     if not every:

@@ -79,7 +79,6 @@ def _painted(target: Target, curves: Collection[str]) -> list[Curve]:
 
 
 def _samples(curves: Collection[Curve]) -> Array:
-    """(N, 3) places on the curves."""
     return np.concatenate([curve_points(curve, 0, _PIECES) for curve in curves])
 
 

@@ -7,12 +7,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from ceres_cal.base.arrays import Indices32, Mask
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import make_folder, write_bytes
+from ceres_cal.detect.images import encoded
 from ceres_cal.observations import taken
 from ceres_cal.simulate.files import write_simulation
 from ceres_cal.simulate.photograph import Photograph, frames, photograph
@@ -71,19 +71,13 @@ def take_album(
     for number, (station, frame) in enumerate(every, start=1):
         shot = photograph(scene, station, frame, taken, simulation.seed)
         name = "/".join([FOLDER, *([station] if len(scene.stations) > 1 else []), f"{frame}.{ending}"])
-        images[name] = _encoded(shot, ending, how.jpeg_quality or 95)
+        images[name] = encoded(shot.image, f".{ending}", how.jpeg_quality or 95)
         truth[name] = _truth(shot)
         points &= ~_hidden_rows(simulation, shot, simulation.points, simulation.observations.points.view)
         curves &= ~_hidden_rows(simulation, shot, simulation.curves, simulation.observations.curves.view)
         if progress is not None:
             progress(number, len(every), name)
     return Album(_without(simulation, points, curves), images, truth)
-
-
-def _encoded(shot: Photograph, ending: str, quality: int) -> bytes:
-    settings = [cv2.IMWRITE_JPEG_QUALITY, quality] if ending == "jpg" else []
-    _, content = cv2.imencode(f".{ending}", shot.image, settings)
-    return content.tobytes()
 
 
 def _hidden_rows(simulation: Simulation, shot: Photograph, truth: Truth, view: Indices32) -> Mask:
@@ -95,7 +89,6 @@ def _hidden_rows(simulation: Simulation, shot: Photograph, truth: Truth, view: I
 
 
 def _without(simulation: Simulation, points: Mask, curves: Mask) -> Simulation:
-    """A simulation with these rows only."""
     return replace(
         simulation,
         observations=simulation.observations.part(points, curves),
@@ -111,14 +104,13 @@ def _truth(shot: Photograph) -> dict[str, Any]:
         "things": [{"kind": type(thing).__name__.lower(), **_rounded(vars(thing))} for thing in shot.things],
         "shadows": [_rounded(vars(shadow)) for shadow in shot.shadows],
         "hidden_m": {
-            target: {curve: [_rounded(stretch) for stretch in found] for curve, found in stretches.items()}
+            target: {curve: [_rounded(stretch) for stretch in covered] for curve, covered in stretches.items()}
             for target, stretches in shot.hidden.items()
         },
     }
 
 
 def _rounded(values: Any) -> Any:
-    """Numbers to a micrometre or microradian."""
     if isinstance(values, dict):
         return {name: _rounded(value) for name, value in values.items()}
     if isinstance(values, tuple):

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
 from typing import Any, TypeVar
@@ -13,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ceres_cal.base.arrays import Array
-from ceres_cal.base.errors import InputError
+from ceres_cal.base.errors import InputError, naming
 from ceres_cal.base.files import check_header, convert, make_folder, read_json, write_json
 from ceres_cal.base.transforms import Pose, euler_from_rotation, rotation_exp, rotation_from_euler, rotation_log
 from ceres_cal.model.parameters import Station
@@ -58,15 +57,6 @@ class _SceneFile(msgspec.Struct, forbid_unknown_fields=True):
     units: str = UNITS
 
 
-@contextmanager
-def _naming(where: str) -> Iterator[None]:
-    """Put `where` before the line of an InputError."""
-    try:
-        yield
-    except InputError as error:
-        raise InputError(f"{where}: {error}") from None
-
-
 # ---- reading a scene ------------------------------------------------------------------------------------------------
 
 
@@ -94,7 +84,7 @@ def scene_from_json(data: Mapping[str, Any], where: str) -> tuple[Scene, Disturb
         InputError: one line that names `where` and the place in it.
     """
     file = convert(check_header(data, where, SCENE_FORMAT, SCENE_VERSION), _SceneFile, where)
-    with _naming(where):
+    with naming(where):
         scene = Scene(
             targets_from_specs(file.targets),
             {name: _camera(entry, f"camera {name!r}") for name, entry in file.cameras.items()},
@@ -108,7 +98,7 @@ def scene_from_json(data: Mapping[str, Any], where: str) -> tuple[Scene, Disturb
 
 def _camera(entry: Any, here: str) -> Camera:
     file = convert(entry, CameraFile, here)
-    with _naming(here):
+    with naming(here):
         return file.camera()
 
 
@@ -131,7 +121,6 @@ def _placement(entry: Any, here: str) -> Pose:
 
 
 def _named(kind: type[Settings], entry: dict[str, Any], here: str) -> Settings:
-    """The disturbance, the photography or the view that a file describes."""
     known = [field.name for field in fields(kind)]
     for name in entry:
         if name not in known:
@@ -165,14 +154,13 @@ def scene_to_json(scene: Scene, disturbance: Disturbance | None = None) -> dict[
             }
             for name, pose in scene.placements.items()
         },
-        "views": [_without_defaults(plan) for plan in scene.views],
+        "views": [
+            {one.name: value for one in fields(plan) if (value := getattr(plan, one.name)) != one.default}
+            for plan in scene.views
+        ],
         "disturbance": vars(disturbance or Disturbance()).copy(),
         **({} if scene.photography is None else {"photography": vars(scene.photography).copy()}),
     }
-
-
-def _without_defaults(plan: ViewPlan) -> dict[str, Any]:
-    return {one.name: value for one in fields(plan) if (value := getattr(plan, one.name)) != one.default}
 
 
 def truth_to_json(simulations: Mapping[str, Simulation]) -> dict[str, Any]:
@@ -196,7 +184,10 @@ def truth_to_json(simulations: Mapping[str, Simulation]) -> dict[str, Any]:
         scene = simulation.scene
         truth["cameras"] |= {name: camera_to_json(camera) for name, camera in scene.cameras.items()}
         truth["stations"] |= {name: _station_truth(station) for name, station in scene.stations.items()}
-        truth["placements"] |= {name: _placement_truth(pose) for name, pose in scene.placements.items()}
+        truth["placements"] |= {
+            name: {"translation_m": _tidy(pose.translation), "rotation": _tidy(pose.rotation)}
+            for name, pose in scene.placements.items()
+        }
         truth["files"][file_name] = {
             "seed": simulation.seed,
             "disturbance": vars(simulation.disturbance).copy(),
@@ -214,10 +205,6 @@ def _station_truth(station: Station) -> dict[str, Any]:
         "rotation": _tidy(pose.rotation),
         "euler_rad": _tidy(euler_from_rotation(pose.rotation)),
     }
-
-
-def _placement_truth(pose: Pose) -> dict[str, Any]:
-    return {"translation_m": _tidy(pose.translation), "rotation": _tidy(pose.rotation)}
 
 
 def _tidy(numbers: ArrayLike) -> Any:

@@ -110,14 +110,14 @@ def _placed(camera: Camera, how: Photography, rng: np.random.Generator) -> tuple
 
 def _places(camera: Camera, count: int, apart_m: float, rng: np.random.Generator) -> list[tuple[float, float]]:
     """Places on the floor that the camera sees, not too near to each other; fewer where there is no room."""
-    found: list[tuple[float, float]] = []
+    chosen: list[tuple[float, float]] = []
     pixels = rng.uniform((0.0, 0.0), camera.image_size, size=(_TRIES + 10 * count, 2))
     for x, y in camera.locate(pixels).tolist():
-        if len(found) == count:
+        if len(chosen) == count:
             break
-        if np.isfinite(x) and all(np.hypot(x - u, y - v) >= apart_m for u, v in found):
-            found.append((x, y))
-    return found
+        if np.isfinite(x) and all(np.hypot(x - u, y - v) >= apart_m for u, v in chosen):
+            chosen.append((x, y))
+    return chosen
 
 
 def _drawn(things: Sequence[Thing], camera: Camera) -> tuple[Image8, Image8]:
@@ -253,10 +253,11 @@ def _covered(cover: Image8, pixels: Array) -> Mask:
 
 
 def _hidden(scene: Scene, name: str, placement: str | None, camera: Camera, cover: Image8) -> Stretches:
-    """The stretches of each curve of a target that are covered."""
     target = scene.targets[name]
     before = camera.at(camera.cam_from_world @ scene.world_from_target(placement))
-    return {curve: found for curve in target.curves if (found := _hidden_stretches(target, curve, before, cover))}
+    return {
+        curve: stretches for curve in target.curves if (stretches := _hidden_stretches(target, curve, before, cover))
+    }
 
 
 def _hidden_stretches(target: Target, name: str, camera: Camera, cover: Image8) -> tuple[tuple[float, float], ...]:

@@ -68,15 +68,12 @@ def paint_curves(canvas: Canvas, target: Target, camera: Camera) -> None:
     for curve in target.curves.values():
         if curve.width_m <= 0.0:
             continue
-        for squares in _squares(_near(curve, camera), camera, _height_m(curve)):
+        height_m = curve.start[2] if isinstance(curve, Segment) else curve.centre[2]
+        for squares in _squares(_near(curve, camera), camera, height_m):
             share = _strip(curve, squares)
             there = squares.rows, squares.columns
             # Where strips overlap their borders are one line or cross: the larger share is the union's.
             canvas[there] = np.maximum(canvas[there], share)
-
-
-def _height_m(curve: Curve) -> float:
-    return curve.start[2] if isinstance(curve, Segment) else curve.centre[2]
 
 
 def _near(curve: Curve, camera: Camera) -> Image8:

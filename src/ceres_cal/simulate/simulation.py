@@ -118,7 +118,6 @@ def _project_seen(scene: Scene, plan: ViewPlan, camera: Camera, points: Array) -
 
 
 def _chosen(names: tuple[str, ...] | None, known: tuple[str, ...]) -> Indices32:
-    """Indices of the chosen features, ascending."""
     if names is None:
         return np.arange(len(known), dtype=np.int32)
     index = {name: i for i, name in enumerate(known)}
@@ -197,7 +196,6 @@ def _hidden_stretches(in_view: _InView, frames: int, disturbance: Disturbance, r
 def _observe(
     in_view: _InView, hidden: Mask, first_view: int, disturbance: Disturbance, rng: np.random.Generator
 ) -> _Rows:
-    """The observations of all frames of a plan."""
     frame, place = np.nonzero(~hidden)
     sigma_px = disturbance.points_sigma_px if in_view.position_m is None else disturbance.curves_sigma_px
     lot = rng.random(len(place))

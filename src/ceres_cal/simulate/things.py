@@ -76,15 +76,15 @@ def patches(thing: Thing, camera: Camera) -> list[Patch]:
     middle = np.array([thing.x_m, thing.y_m])
     cosine, sine = np.cos(thing.heading_rad), np.sin(thing.heading_rad)
     turn = np.array([[cosine, -sine], [sine, cosine]])
-    found = [
+    polygons = [
         (outline(thing, camera), _BODY),
         (_disc(middle, ROBOT_RADIUS_M, camera), _COVER),
         (_disc(middle, _MARKER_RADII_M[0], camera), _TEAMS[thing.pattern % 2]),
     ]
     for number, place in enumerate(_MARKER_PLACES_M):
         colour = _MARKERS[(thing.pattern >> (number + 1)) % 2]
-        found.append((_disc(middle + turn @ place, _MARKER_RADII_M[1], camera), colour))
-    return found
+        polygons.append((_disc(middle + turn @ place, _MARKER_RADII_M[1], camera), colour))
+    return polygons
 
 
 def shadow_outline(shadow: Shadow, camera: Camera) -> Array:

@@ -52,8 +52,10 @@ def initialise(observations: Observations, sights: Sights, options: Options) -> 
     numbers, poses = [], []
     priors = (*observations.priors, *options.priors)
     for name, image_size in observations.cameras.items():
+        blank = _blank_camera(name, image_size, options, priors)
         own = sights.numbers(camera=name)
-        start = _start_camera(name, image_size, sights.take(own), options, priors)
+        seen = sights.take(own).about(blank)
+        start = _start_camera(blank, seen, options, [p for p in priors if _concerns(p, name, seen)])
         cameras[name], phi_from[name] = start.camera, start.phi_from
         numbers.append(own[start.sights])
         poses.append(start.poses)
@@ -73,17 +75,13 @@ class _CameraStart:
     poses: Array
 
 
-def _start_camera(
-    name: str, image_size: tuple[int, int], sights: Sights, options: Options, priors: Sequence[Prior]
-) -> _CameraStart:
-    blank = _blank_camera(name, image_size, options, priors)
-    if set(blank.lens.names) <= set(options.fixed) and not blank.lens.may_fold:
-        blank.require_monotone(name)
+def _start_camera(blank: Camera, sights: Sights, options: Options, priors: Sequence[Prior]) -> _CameraStart:
+    """From the sights of one camera about its principal point, and the priors that concern it."""
     unit = unit_px(blank)
-    profile, homographies = profile_and_homographies(sights, blank, unit)
-    phi, phi_from = _choose_phi(sights, homographies, unit, options, [p for p in priors if _concerns(p, name, sights)])
-    reach = sights.reach_px(blank)
-    camera = replace(blank, phi=phi, lens=_fit_lens(blank.lens, profile, phi, reach, options.fixed))
+    profile, homographies = profile_and_homographies(sights, unit)
+    phi, phi_from = _choose_phi(sights, homographies, unit, options, priors)
+    lens = _fit_lens(blank.lens, profile, phi, sights.reach_px, options.fixed)
+    camera = replace(blank, phi=phi, lens=lens)
     return _CameraStart(camera, phi_from, homographies.sights, _poses_at(homographies, phi))
 
 
@@ -113,7 +111,10 @@ def _blank_camera(name: str, image_size: tuple[int, int], options: Options, prio
             elif prior.quantity == "aspect":
                 aspect = prior.value[0]
     cx, cy = options.fixed.get("cx", centre[0]), options.fixed.get("cy", centre[1])
-    return Camera(image_size, 1.0, (cx, cy), options.blank_lens, aspect)
+    blank = Camera(image_size, 1.0, (cx, cy), options.blank_lens, aspect)
+    if set(blank.lens.names) <= set(options.fixed) and not blank.lens.may_fold:
+        blank.require_monotone(name)
+    return blank
 
 
 # ---- phi and lens ---------------------------------------------------------------------------------------------------

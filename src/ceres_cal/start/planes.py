@@ -15,7 +15,6 @@ from ceres_cal.base.arrays import Array, Indices, Mask
 from ceres_cal.base.errors import DegenerateError
 from ceres_cal.kernels import grouped_scatter
 from ceres_cal.observations.sights import Sights, bounds_of, ranges
-from ceres_cal.scene.camera import Camera
 from ceres_cal.start.closed_forms import (
     PlaneData,
     RadialProfile,
@@ -48,7 +47,7 @@ class PlaneSight:
 
     Attributes:
         points: (N, 2) m. lines: (2 N + L, 3) two through each point, x = const first, then the segments'.
-        pixels: (2 N + L, 2).
+        pixels: (2 N + L, 2), as the sight has them.
     """
 
     sight: Sights
@@ -67,9 +66,10 @@ class PlaneSight:
         """What the sight can say of a homography's eight numbers: two for each point, two for each line."""
         return 2 * len(np.unique(self.points, axis=0)) + 2 * self.segments
 
-    def size_px(self, camera: Camera) -> float:
+    @property
+    def size_px(self) -> float:
         """Spread of the observations over the image; 0 where there are none on the plane."""
-        offsets = camera.offsets(self.pixels[len(self.points) :])
+        offsets = self.pixels[len(self.points) :]
         if not len(offsets):
             return 0.0
         return float(np.sqrt(np.mean(np.sum((offsets - offsets.mean(axis=0)) ** 2, axis=1))))
@@ -123,8 +123,8 @@ class Homographies:
 _NONE = Homographies(np.empty(0, np.int64), np.empty((0, 3, 3)), np.empty(0), np.empty(0))
 
 
-def profile_and_homographies(sights: Sights, camera: Camera, unit: float) -> tuple[RadialProfile, Homographies]:
-    """The camera's radial profile and the homography of each of its sights that determines one."""
+def profile_and_homographies(sights: Sights, unit: float) -> tuple[RadialProfile, Homographies]:
+    """A camera's radial profile and the homography of each of its sights that determines one; sights about it."""
     pure = _flat_sights_of_points(sights)
     rest = np.delete(np.arange(len(sights)), pure)
     planes = {int(i): plane_sight(sights[int(i)]) for i in rest}
@@ -132,36 +132,33 @@ def profile_and_homographies(sights: Sights, camera: Camera, unit: float) -> tup
     profile: RadialProfile | None = None
     board = sights.take(pure)
     if len(pure):
-        data = _plane_data(board, _spread_rows(board.point_bounds), camera)
-        profile = _profile_of_boards(board, data, camera, unit)
+        data = _plane_data(board, _spread_rows(board.point_bounds))
+        profile = _profile_of_boards(board, data, unit)
     for i, plane in planes.items():
         if plane.equations == 0 and len(sights[i].on_arc) and sights[i].on_arc.all():
-            ring, matrices[i] = _from_rings(sights[i], camera, unit)
+            ring, matrices[i] = _from_rings(sights[i], unit)
             profile = profile or ring
     mixed = [i for i, plane in planes.items() if plane.equations >= 8]
-    offsets = {i: camera.offsets(planes[i].pixels) for i in mixed}
-    lined = [(planes[i].lines, offsets[i]) for i in mixed]
+    lined = [(planes[i].lines, planes[i].pixels) for i in mixed]
     # Boards in a corner of the image may say nothing of the rest of it.
     if profile is None or any(fit_lines(seen, profile.lift(p), rounds=2)[1] > _NO_FIT for seen, p in lined):
         profile = _profile_from_lines(lined, unit)
-    matrices |= {i: _homography_of(planes[i], profile.lift(offsets[i])) for i in mixed}
-    parts = [_NONE, *(_of_plane(i, planes[i], camera, matrix) for i, matrix in matrices.items())]
+    matrices |= {i: _homography_of(planes[i], profile) for i in mixed}
+    parts = [_NONE, *(_of_plane(i, planes[i], matrix) for i, matrix in matrices.items())]
     if len(pure):
-        parts.append(_of_boards(pure, board, data, camera, profile))
+        parts.append(_of_boards(pure, board, data, profile))
     names = ("sights", "matrices", "heights_m", "sizes_px")
     return profile, Homographies(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
 
-def _of_plane(number: int, plane: PlaneSight, camera: Camera, matrix: Array) -> Homographies:
-    height, size = np.array([plane.height_m]), np.array([plane.size_px(camera)])
+def _of_plane(number: int, plane: PlaneSight, matrix: Array) -> Homographies:
+    height, size = np.array([plane.height_m]), np.array([plane.size_px])
     return Homographies(np.array([number]), matrix[None], height, size)
 
 
-def _of_boards(
-    numbers: Indices, board: Sights, data: PlaneData, camera: Camera, profile: RadialProfile
-) -> Homographies:
+def _of_boards(numbers: Indices, board: Sights, data: PlaneData, profile: RadialProfile) -> Homographies:
     """The homographies of sights of points that send the plane to more than a point or a line."""
-    matrices = _homographies_of_boards(board, data, camera, profile)
+    matrices = _homographies_of_boards(board, data, profile)
     sizes = np.sqrt(np.trace(grouped_scatter(data.offsets, data.bounds), axis1=1, axis2=2))
     heights = board.points[board.point_bounds[:-1], 2]
     b = matrices[:, :, :2]
@@ -181,7 +178,7 @@ def _flat_sights_of_points(sights: Sights) -> Indices:
     return np.asarray(candidates[flat & (xx * yy - xy**2 > 1e-12 * (xx + yy) ** 2)])
 
 
-def _profile_of_boards(board: Sights, data: PlaneData, camera: Camera, unit: float) -> RadialProfile:
+def _profile_of_boards(board: Sights, data: PlaneData, unit: float) -> RadialProfile:
     """By radial alignment on some points of some sights; on all points of these, with more patience, where not all fit.
 
     A profile needs no more: every other homography follows from it.
@@ -197,7 +194,7 @@ def _profile_of_boards(board: Sights, data: PlaneData, camera: Camera, unit: flo
     if np.mean(wrong) < 0.02 and np.median(first.error_px) < _ROUGH_PX:
         return first.profile
     some = board.take(numbers)
-    return radial_alignment(_plane_data(some, np.arange(len(some.points)), camera), unit, terms, rounds=8).profile
+    return radial_alignment(_plane_data(some, np.arange(len(some.points))), unit, terms, rounds=8).profile
 
 
 def _spread_rows(bounds: Indices) -> Indices:
@@ -211,18 +208,17 @@ def _spread_rows(bounds: Indices) -> Indices:
     return np.flatnonzero(order[place] < np.repeat(_ENOUGH_POINTS / sizes, sizes))
 
 
-def _plane_data(board: Sights, rows: Indices, camera: Camera) -> PlaneData:
-    """Of some points of the sights, given by their rows there."""
+def _plane_data(board: Sights, rows: Indices) -> PlaneData:
     return PlaneData(
         np.searchsorted(rows, board.point_bounds),
         np.ascontiguousarray(board.points.take(rows, axis=0)[:, :2]),
-        camera.offsets(board.pixels.take(rows, axis=0)),
+        board.pixels.take(rows, axis=0),
     )
 
 
-def _homography_of(plane: PlaneSight, lifted: Array) -> Array:
+def _homography_of(plane: PlaneSight, profile: RadialProfile) -> Array:
     """H of one sight: plane (x, y, 1) m to (p in px, w)."""
-    homography, _ = fit_lines(plane.lines, lifted, rounds=6)
+    homography, _ = fit_lines(plane.lines, profile.lift(plane.pixels), rounds=6)
     if homography is None:
         raise DegenerateError(
             f"{plane.sight.key}: its {len(plane.points)} points and {plane.segments} lines "
@@ -268,10 +264,12 @@ class RingRadii:
     ring_m: Array
 
 
-def ring_radii(sight: Sights, camera: Camera) -> RingRadii:
-    """Radii of the observed rings around their own centre, which need not be the principal point (paper, section 2)."""
+def ring_radii(sight: Sights) -> RingRadii:
+    """Radii of the rings that a sight about its camera shows, around their own centre: it need not be the principal
+    point (paper, section 2).
+    """
     on_ring = sight.on_arc
-    offsets = camera.offsets(sight.curve_pixels)[on_ring]
+    offsets = sight.curve_pixels[on_ring]
     radii = np.linalg.norm(sight.tracks[sight.track_index[on_ring], 1], axis=1)
     _, ring = np.unique(radii, return_inverse=True)
     centre = offsets.mean(axis=0)
@@ -284,9 +282,8 @@ def ring_radii(sight: Sights, camera: Camera) -> RingRadii:
     return RingRadii(centre, np.linalg.norm(offsets - centre, axis=1), radii)
 
 
-def _from_rings(sight: Sights, camera: Camera, unit: float) -> tuple[RadialProfile, Array]:
-    """Profile and homography of concentric rings seen about frontally."""
-    radii = ring_radii(sight, camera)
+def _from_rings(sight: Sights, unit: float) -> tuple[RadialProfile, Array]:
+    radii = ring_radii(sight)
     profile, kappa = ring_profile(radii.measured_px, radii.ring_m, unit)
     if len(np.unique(radii.ring_m)) < 3:
         profile = RadialProfile((0.0, 0.0), unit)
@@ -294,7 +291,7 @@ def _from_rings(sight: Sights, camera: Camera, unit: float) -> tuple[RadialProfi
     return profile, np.array([[kappa, 0.0, cx], [0.0, kappa, cy], [0.0, 0.0, 1.0]])
 
 
-def _homographies_of_boards(board: Sights, data: PlaneData, camera: Camera, profile: RadialProfile) -> Array:
+def _homographies_of_boards(board: Sights, data: PlaneData, profile: RadialProfile) -> Array:
     """The homographies, by LO-RANSAC (pycolmap) where some points of a sight lie far off while most fit."""
     homographies, error_px = homographies_of_sights(data, profile)
     limit = max(_SUSPICIOUS * float(np.median(error_px)), 2.0)
@@ -302,7 +299,7 @@ def _homographies_of_boards(board: Sights, data: PlaneData, camera: Camera, prof
     sizes = np.diff(data.bounds)
     for number in np.flatnonzero((far > 0.1 * sizes) & (sizes >= 8)):
         sight = board[int(number)]
-        homography = consensus_homography(sight.points[:, :2], profile.lift(camera.offsets(sight.pixels)), limit)
+        homography = consensus_homography(sight.points[:, :2], profile.lift(sight.pixels), limit)
         if homography is not None:
             homographies[number] = homography
     return homographies

@@ -6,6 +6,7 @@ with too few coefficients, a field painted amiss) is not in them.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -162,7 +163,29 @@ class Grid:
 
 
 @dataclass(frozen=True, eq=False)
-class FieldMap(Grid):
+class ErrorMap(Grid, ABC):
+    """Errors of one station over a grid."""
+
+    @property
+    @abstractmethod
+    def errors_mm(self) -> Array:
+        """(Y, X); NaN where the image does not show the place."""
+
+    @property
+    def mean_mm(self) -> float:
+        """Mean over what the image shows; NaN where it shows nothing."""
+        visible = self.errors_mm[~np.isnan(self.errors_mm)]
+        return float(np.mean(visible)) if len(visible) else np.nan
+
+    @property
+    def worst_mm(self) -> float:
+        """Largest over what the image shows."""
+        visible = self.errors_mm[~np.isnan(self.errors_mm)]
+        return float(np.max(visible)) if len(visible) else np.nan
+
+
+@dataclass(frozen=True, eq=False)
+class FieldMap(ErrorMap):
     """How well one station locates points at one height, over a grid.
 
     Attributes:
@@ -175,16 +198,8 @@ class FieldMap(Grid):
     radius_95_mm: Array
 
     @property
-    def mean_mm(self) -> float:
-        """Mean standard deviation over what the image shows; NaN where it shows nothing."""
-        visible = self.sd_mm[~np.isnan(self.sd_mm)]
-        return float(np.mean(visible)) if len(visible) else np.nan
-
-    @property
-    def worst_mm(self) -> float:
-        """Largest standard deviation over what the image shows."""
-        visible = self.sd_mm[~np.isnan(self.sd_mm)]
-        return float(np.max(visible)) if len(visible) else np.nan
+    def errors_mm(self) -> Array:
+        return self.sd_mm
 
     @property
     def worst_place_m(self) -> tuple[float, float]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from ceres_cal.base.errors import InputError
+from ceres_cal.base.errors import InputError, naming
 from ceres_cal.scene.targets import checkerboards, custom_targets, ring_sheets, ssl_fields
 from ceres_cal.scene.targets.target import Target, TargetKind, require_size
 
@@ -27,11 +27,8 @@ def target_from_spec(spec: Any, where: str) -> Target:
     kind = spec.get("kind") if isinstance(spec, dict) else None
     if not isinstance(kind, str) or kind not in TARGET_KINDS:
         raise InputError(f"{where}: unknown kind {kind!r}: choose one of {', '.join(TARGET_KINDS)}")
-    try:
+    with naming(where):
         return TARGET_KINDS[kind].from_spec(spec, where)
-    except InputError as error:
-        text = str(error)
-        raise InputError(text if text.startswith(where) else f"{where}: {text}") from None
 
 
 def targets_from_specs(specs: Mapping[str, Any], where: str = "") -> dict[str, Target]:
