@@ -56,7 +56,9 @@ def say(capsys: pytest.CaptureFixture[str]) -> Say:
 def refused(said: Said, code: int = 2) -> str:
     """The one line of an error, with nothing else said."""
     assert said.code == code, said
-    assert said.out == ""
+    if said.out:  # with --json
+        error = said.err.removeprefix("ceres-cal: ").removesuffix("\n")
+        assert json.loads(said.out) == {"error": error, "exit_code": code}
     assert said.err.startswith("ceres-cal: ") and said.err.endswith("\n") and said.err.count("\n") == 1, said.err
     return said.err
 

@@ -511,7 +511,10 @@ BAD_ARRAYS: list[tuple[Callable[[dict[str, Any]], object], tuple[str, ...]]] = [
         lambda a: a.update(points_pixels=a["points_pixels"][:2]),
         ("column points_pixels has a shape, (2, 2), that does not fit others",),
     ),
-    (lambda a: a.update(curves_side=a["curves_side"][:1]), ("column curves_side has a shape, (1,), that does not fit",)),
+    (
+        lambda a: a.update(curves_side=a["curves_side"][:1]),
+        ("curves_side has a shape, (1,), that does not",),
+    ),
     (lambda a: a.pop("points_sigma_px"), ("column points_sigma_px is missing",)),
     (
         lambda a: a.update(points_view=a["points_view"] * 1.0),

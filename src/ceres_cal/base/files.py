@@ -21,6 +21,7 @@ from typing import Any, TypeVar
 import msgspec
 
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.written import note
 
 T = TypeVar("T")
 
@@ -205,6 +206,7 @@ def write_bytes(path: str | Path, content: bytes) -> None:
             os.fsync(handle)
             _keep_owner(handle, target)
             beside.replace(target)
+        note(path)
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: cannot be written: {getattr(error, 'strerror', None) or error}") from None
 
@@ -216,9 +218,9 @@ def _beside(target: Path) -> Iterator[tuple[int, Path]]:
     It is locked while somebody writes it: one without a lock was left by a killed run.
     """
     start, end = f".{target.name[:150]}.", ".part"
-    for name in os.listdir(target.parent):
-        if name.startswith(start) and name.endswith(end):
-            _remove_stale(target.parent / name)
+    for entry in os.scandir(target.parent):
+        if entry.name.startswith(start) and entry.name.endswith(end):
+            _remove_stale(target.parent / entry.name)
     while True:
         beside = target.parent / f"{start}{secrets.token_hex(6)}{end}"
         handle = os.open(beside, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)

@@ -40,7 +40,6 @@ class StationFile(PoseFile, forbid_unknown_fields=True):
         rotation, translation, position = (part.tolist() for part in (pose.rotation, pose.translation, pose.position))
         return cls(rotation, translation, station.camera, position, euler_from_rotation(pose.rotation))
 
-
     def station(self) -> Station:
         """The station; InputError where what is there for people says something else than the pose."""
         station = Station(self.camera, self.pose())
@@ -143,9 +142,9 @@ class CalibrationFile(msgspec.Struct, forbid_unknown_fields=True):
             with naming(f"station {name!r}"):
                 stations[name] = station.station()
         placements = {}
-        for name, entry in self.placements.items():
+        for name, placement in self.placements.items():
             with naming(f"placement {name!r}"):
-                placements[name] = entry.pose()
+                placements[name] = placement.pose()
         structure = make_structure(targets, options.tolerances)
         if structure.names != tuple(self.structure_m):
             raise InputError("structure_m does not fit the targets and the tolerances: calibrate again")

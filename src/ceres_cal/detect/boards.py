@@ -15,6 +15,7 @@ import numpy as np
 from ceres_cal.base.arrays import Array, Image, Image8
 from ceres_cal.base.errors import InputError, NothingShownError
 from ceres_cal.base.progress import ImageProgress
+from ceres_cal.base.words import frame_of, printable
 from ceres_cal.detect.images import read_grey
 from ceres_cal.detect.saddles import REACH, measure_saddles
 from ceres_cal.detect.scatter import scatter_px
@@ -104,7 +105,7 @@ def detect_boards(
             f"(count the corners between squares, not the squares); {missed[0][0]}: {missed[0][1]}",
             tuple(missed),
         )
-    views = tuple(View(path.stem, camera, station or camera, TARGET_NAME, placements[path]) for path in grids)
+    views = tuple(View(frame_of(path), camera, station or camera, TARGET_NAME, placements[path]) for path in grids)
     points = _points(list(grids.values()), board)
     observations = Observations({TARGET_NAME: board}, {camera: size}, views, points, NO_CURVES)
     return BoardDetections(observations, tuple(map(str, grids)), tuple(missed))
@@ -281,12 +282,13 @@ def _placement_names(paths: Sequence[Path]) -> dict[Path, str]:
     if len(set(paths)) < len(paths):
         twice = next(path for number, path in enumerate(paths) if path in paths[:number])
         raise InputError(f"{twice}: given twice: name every image once")
-    names = {path: path.stem for path in paths}
+    names = {path: frame_of(path) for path in paths}
     for depth in range(2, max(len(path.parts) for path in paths) + 2):
         taken = list(names.values())
         for path in paths:
             if taken.count(names[path]) > 1:
-                names[path] = "/".join((*path.parts[-depth:-1], path.stem if depth <= len(path.parts) else path.name))
+                own = path.stem if depth <= len(path.parts) else path.name
+                names[path] = printable("/".join((*path.parts[-depth:-1], own)))
     return names
 
 

@@ -55,7 +55,7 @@ _LONGEST_S = 600
 _OPTIONS: dict[str, Any] = {"error_model": "numpy", "fastmath": {"reassoc", "contract", "nsz"}}
 
 
-class _SharedCache(FunctionCache):  # type: ignore[misc] # numba's own has no lock
+class _SharedCache(FunctionCache):
     """numba's cache for several processes: one compiles, the others wait and take what it made.
 
     Without the lock each would compile everything, and one's machine code could end up under another's signature.
@@ -78,13 +78,13 @@ class _SharedCache(FunctionCache):  # type: ignore[misc] # numba's own has no lo
         """See numba; what cannot be kept, on a full disk for one, is used all the same."""
         try:
             with suppress(OSError):
-                super().save_overload(sig, data)
+                super().save_overload(sig, data)  # type: ignore[no-untyped-call]
         finally:
             self.unlock()
 
     def _loaded(self, sig: Any, target_context: Any) -> Any:
         try:
-            return super().load_overload(sig, target_context)
+            return super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
         except Exception:  # a damaged file unpickles to anything
             return None
 
@@ -120,7 +120,7 @@ def _wait_for(handle: int) -> None:
 def _shared(compiled: Any, function: Callable[..., Any]) -> Any:
     """The same, which is not compiled yet, kept in the cache that processes share."""
     if _CACHED:
-        compiled._cache = _SharedCache(function)
+        compiled._cache = _SharedCache(function)  # type: ignore[no-untyped-call]
     return compiled
 
 

@@ -19,7 +19,7 @@ def checkerboard(columns: int, rows: int, square_m: float) -> Target:
     """The inner corners of a checkerboard: feature "c,r" lies at (c, r, 0) squares, c < columns, r < rows.
 
     Raises:
-        InputError: fewer than 2 corners a side, more than 100,000 in all, or a square that is not a positive number of metres.
+        InputError: fewer than 2 corners a side, more than MOST_FEATURES, or a square that is no positive number.
     """
     if columns < 2 or rows < 2:
         raise InputError(f"checkerboard: columns and rows count inner corners, at least 2, not {columns} and {rows}")

@@ -14,7 +14,6 @@ from ceres_cal.base.errors import InputError
 from ceres_cal.scene.curves import Arc, Curve
 from ceres_cal.scene.targets.paper import Paper
 
-
 MOST_FEATURES = 100_000
 """Points and curves of all targets of a file; ten boards of 100 x 100 corners."""
 
