@@ -5,7 +5,8 @@
 
 A file holds observations, or is a photograph in which the field is found from where the calibration has it.
 Every event is one line of JSON on standard output, or in --log: "holds", "refitted", "refused" (nothing was changed;
-the reason says what to do) or "unreadable". The calibration is replaced in one step, and the one before is kept in
+the reason says what to do), "unreadable", or "folder" (the watched one has gone, or is back). Ctrl-C and SIGTERM end
+the watch when the file in hand is done. The calibration is replaced in one step, and the one before is kept in
 previous/ beside it. Exits with 0 when the calibration is right at the end, 3 when the last file was refused or could
 not be read.
 """
@@ -13,31 +14,32 @@ not be read.
 from __future__ import annotations
 
 import argparse
-import json
+import os
 import signal
 import sys
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from watching import Folder, Journal
+
 import ceres_cal as cc
-from ceres_cal.base.files import read_bytes, write_bytes
+from ceres_cal.base.files import make_folder, read_bytes, write_bytes
 from ceres_cal.cli.inputs import IMAGE_ENDINGS
 from ceres_cal.detect.images import read_grey
 from ceres_cal.moves import FALSE_ALARMS, Check, movements
+from ceres_cal.moves.carried import WHAT
 from ceres_cal.photographs import check_photographs
 from ceres_cal.scene.heights import ROBOT_TOP_M
-
-PATIENCE = 3  # times that a file is read before it counts as unreadable: it may still be on its way
 
 
 def handle(place: Path, source: Path, given: argparse.Namespace) -> dict[str, Any]:
     """Check the calibration at `place` against a file, refit it where it does not hold; the event."""
     begin = time.perf_counter()
-    event: dict[str, Any] = {"time": datetime.now(UTC).isoformat(), "file": str(source)}
+    event: dict[str, Any] = {"time": now(), "file": str(source)}
     try:
         content = read(source)
     except cc.InputError as error:
@@ -56,10 +58,10 @@ def handle(place: Path, source: Path, given: argparse.Namespace) -> dict[str, An
         if not all(value <= given.limit_mm for value in worst.values()):
             reason = f"known to {max(worst.values()):.1f} mm at robot height only, asked for are {given.limit_mm:g} mm"
             return {**event, "event": "refused", "reason": f"{reason}: observe more lines and corners"}
+        event["kept"] = str(keep(place))
+        new.save(place)
     except cc.CalibrationError as error:
         return {**event, "event": "refused", "reason": str(error)}
-    event["kept"] = str(keep(place))
-    new.save(place)
     explanation = new.refitted.explanation if new.refitted else ""
     moves = {name: {"mm": 1e3 * shift_m, "deg": deg} for name, (shift_m, deg) in movements(old, new).items()}
     event |= {"explanation": explanation, "moved": moves, "warnings": list(new.warnings), "rms_px": new.rms_px}
@@ -91,58 +93,51 @@ def told(found: Check) -> dict[str, str]:
 
 def keep(place: Path) -> Path:
     """A copy of the calibration in previous/, named after the moment."""
-    folder = place.parent / "previous"
-    folder.mkdir(exist_ok=True)
+    folder = make_folder(place.parent / "previous")
     copy = folder / f"{place.stem}-{datetime.now(UTC):%Y%m%dT%H%M%S%f}{place.suffix}"
     write_bytes(copy, read_bytes(place))
     return copy
 
 
-def appearing(folder: Path, every_s: float, stopped: threading.Event) -> Iterator[Path]:
-    """Files that appear in a folder, in the order of their times, until stopped; one that changes comes again."""
-    done = {path: stamp(path) for path in files_in(folder)}
-    before = dict(done)
-    while not stopped.wait(every_s):
-        now = {path: stamp(path) for path in files_in(folder)}
-        # A file that is still being written has grown since the last look.
-        ready = [path for path in now if now[path] != done.get(path) and now[path] == before.get(path)]
-        before = now
-        for path in sorted(ready, key=lambda p: now[p]):
-            if not stopped.is_set():
-                done[path] = now[path]
-                yield path
-
-
-def files_in(folder: Path) -> list[Path]:
-    endings = {".json", ".npz", *IMAGE_ENDINGS}
-    return [p for p in folder.iterdir() if p.suffix.lower() in endings and not p.name.startswith(".")]
-
-
-def stamp(path: Path) -> tuple[int, int]:
-    """Time and size; nothing for a file that has just gone."""
-    try:
-        found = path.stat()
-    except FileNotFoundError:
-        return (0, 0)
-    return (found.st_mtime_ns, found.st_size)
-
-
 def events(given: argparse.Namespace) -> Iterator[dict[str, Any]]:
     def answer(source: Path) -> dict[str, Any]:
-        return handle(given.calibration, source, given)
+        try:
+            return handle(given.calibration, source, given)
+        except Exception as error:  # a week of watching does not end with one odd file
+            return {"file": str(source), "event": "refused", "reason": f"unexpected {error!r}: please report it"}
 
     yield from map(answer, given.files)
-    if given.watch is None:
-        return
+    if given.watch is not None:
+        yield from watched(given, answer)
+
+
+def watched(given: argparse.Namespace, answer: Callable[[Path], dict[str, Any]]) -> Iterator[dict[str, Any]]:
+    """What comes of the files that appear in the folder, until Ctrl-C or SIGTERM: the file in hand is done first."""
     stopped = threading.Event()
-    signal.signal(signal.SIGINT, lambda *_: stopped.set())  # Ctrl-C ends the watch when the file in hand is done
-    for source in appearing(given.watch, given.every_s, stopped):
-        for attempt in range(PATIENCE):
+
+    def stop(*_: object) -> None:
+        if stopped.is_set():
+            raise KeyboardInterrupt  # somebody means it
+        stopped.set()
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, stop)
+    folder, was_there = Folder(given.watch, {".json", ".npz", *IMAGE_ENDINGS}), True
+    while not stopped.wait(given.every_s):
+        ready = folder.look()
+        if folder.is_there != was_there:
+            was_there = folder.is_there
+            yield {"time": now(), "event": "folder", "reason": f"{given.watch} is {'back' if was_there else 'gone'}"}
+        for source in ready:
+            if stopped.is_set():
+                return
             event = answer(source)
-            if event["event"] != "unreadable" or attempt == PATIENCE - 1:
+            if event["event"] != "unreadable" or not folder.again(source):
                 yield event
-                break
-            stopped.wait(given.every_s)
+
+
+def now() -> str:
+    return datetime.now(UTC).isoformat()
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -151,7 +146,9 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("files", type=Path, nargs="*", help="new observations or photographs, one after the other")
     parser.add_argument("--watch", type=Path, metavar="FOLDER", help="then wait for files that appear there")
     parser.add_argument("--every-s", type=float, default=0.5, help="how often to look (default 0.5 s)")
-    parser.add_argument("--what", default="pose", help="what is free in a refit, see `ceres-cal refit --help`")
+    parser.add_argument(
+        "--what", default="pose", choices=WHAT, help="what is free in a refit, see `ceres-cal refit --help`"
+    )
     parser.add_argument("--false-alarms", type=float, default=FALSE_ALARMS, help="of each check (default 0.01)")
     parser.add_argument("--limit-mm", type=float, default=20.0, help="worst sigma at 150 mm still used (default 20)")
     parser.add_argument("--station", help="station that takes the photographs (default: the only one)")
@@ -163,16 +160,15 @@ def main(arguments: Sequence[str]) -> int:
         parser.error(f"{given.watch}: no such folder")
     if not given.files and given.watch is None:
         parser.error("name files of observations or photographs, or a folder to --watch")
-    last = 0
+    if not given.every_s > 0.0:
+        parser.error("--every-s must be above 0")
+    if given.log is not None and not os.access(given.log if given.log.exists() else given.log.parent, os.W_OK):
+        parser.error(f"{given.log}: cannot be written")
+    journal, last = Journal(given.log), 0
     try:
         for event in events(given):
-            line = json.dumps(event)
             last = 0 if event["event"] in ("holds", "refitted") else 3
-            if given.log is None:
-                print(line, flush=True)
-            else:
-                with given.log.open("a", encoding="utf-8") as log:
-                    log.write(line + "\n")
+            journal.write(event)
     except KeyboardInterrupt:
         return 130
     return last if given.watch is None else 0

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -15,6 +15,8 @@ from ceres_cal.observations.files import Content
 _MARGIN_PX = 1.5
 # Of a camera's observations: more of them outside, and its image has another size.
 _FEW = 0.01
+# The largest playing fields end at 60 m; the smallest board in millimetres reaches as far.
+_LARGE_M = 100.0
 
 
 def stray_pixels(content: Content) -> tuple[str, ...]:
@@ -91,3 +93,12 @@ def _first(content: Content, points: Mask, curves: Mask) -> str:
 def _names(content: Content, view: View, kind: str) -> Sequence[str]:
     target: Mapping[str, object] = getattr(content.targets[view.target], f"{kind}s")
     return tuple(target)
+
+
+def odd_sizes(content: Content) -> Iterator[str]:
+    """A line for each target so large that its numbers may be millimetres."""
+    for name, target in content.targets.items():
+        ends = target.tracks[0, :, :2].reshape(-1, 3)  # where curves begin, or their centres, and along them
+        reach_m = max(np.max(np.abs(places), initial=0.0) for places in (target.point_array, ends))
+        if reach_m > _LARGE_M:
+            yield f"target {name!r} reaches {reach_m:.0f} m from its origin: are its numbers metres, or millimetres?"

@@ -17,7 +17,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import Mask
 from ceres_cal.base.errors import InputError, naming
-from ceres_cal.observations.bounds import stray_pixels
+from ceres_cal.observations.bounds import odd_sizes, stray_pixels
 from ceres_cal.observations.columns import Columns, Curves, Points, Prior, View, choices, taken, view_label
 from ceres_cal.observations.files import Content, header_of, read_content, write_content
 from ceres_cal.scene.targets import Target
@@ -84,8 +84,8 @@ class Observations(Content):
 
     @cached_property
     def warnings(self) -> tuple[str, ...]:
-        """What to know of the observations before using them, each one line: strays outside an image."""
-        return self.require_inside()
+        """What to know of the observations before using them, each one line: strays outside an image, odd sizes."""
+        return (*self.require_inside(), *odd_sizes(self))
 
     @cached_property
     def shown_views(self) -> tuple[View, ...]:
