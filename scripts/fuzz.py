@@ -43,8 +43,9 @@ from ceres_cal.simulate.files import scene_to_json
 DATA = Path(__file__).resolve().parents[1] / "data"
 LONGEST_S, MOST_MB = 10, 1024
 FAILURES = ("unexpected", "warning", "changed", "many lines", "slow", "died", "memory")
-TOKENS = b'0 -1 1 2 1e400 -0.0 1e308 5e-324 NaN -Infinity 9000000000 1000000000000000000000000 null true [] {} "" "a"'.split()
+TOKENS = b'0 -1 1 2 1e400 -0.0 1e308 5e-324 NaN -Infinity 9000000000 1e24 null true [] {} "" "a"'.split()
 TOKENS += [b'"\\ud800"', b'"\\u0000"', b'"' + b"x" * 300 + b'"', b"[" * 500, b"1" + b"0" * 400, b"[[1,2],[3]]"]
+NUMBER = re.compile(rb"-?[0-9]+(\.[0-9]+)?(e-?[0-9]+)?")
 WORD = re.compile(rb'"(?:[^"\\]|\\.)*"|-?[0-9][0-9.eE+-]*|true|false|null|[\[\]{}:,]')
 
 Reader = Callable[[Path], object]
@@ -127,6 +128,8 @@ def words_changed(content: bytes, rng: np.random.Generator) -> bytes:
     for _ in range(int(rng.integers(1, 4))):
         first, last = places[int(rng.integers(0, len(places)))]
         other = content[slice(*places[int(rng.integers(0, len(places)))])]
+        if NUMBER.fullmatch(content[first:last]):
+            other = repr(float(content[first:last]) * rng.choice([-1.0, 0.0, 0.5, 1e-9, 1e3, 1e9, 1e200])).encode()
         word = [TOKENS[int(rng.integers(0, len(TOKENS)))], other, b"", content[first:last] * 2][int(rng.integers(0, 4))]
         content = content[:first] + word + content[last:]
         places = [(a, b) for a, b in places if b <= first] or places[:1]
@@ -148,7 +151,19 @@ def columns_changed(content: bytes, rng: np.random.Generator) -> bytes:
 
 
 def header_changed(column: bytes, rng: np.random.Generator) -> bytes:
-    words = [b"<f8", b"<i8", b"|O", b"<U9", b"True", b"(1000000000000,)", b"(-1,)", b"()", b"(0,)", b"(2, 2)", b"<M8[s]"]
+    words = [
+        b"<f8",
+        b"<i8",
+        b"|O",
+        b"<U9",
+        b"True",
+        b"(1000000000000,)",
+        b"(-1,)",
+        b"()",
+        b"(0,)",
+        b"(2, 2)",
+        b"<M8[s]",
+    ]
     old = re.findall(rb"'[<|>][a-zA-Z][0-9]*'|False|\([0-9, ]*\)", column[:120]) or [b"{"]
     chosen, word = old[int(rng.integers(0, len(old)))], words[int(rng.integers(0, len(words)))]
     return column.replace(chosen, word if word[:1] in b"(T" else b"'" + word + b"'", 1)
@@ -200,7 +215,9 @@ def work(folder: Path, names: Sequence[str], seed: int, end: float, answers: Any
         answers.send((name, what, words, seconds, peak_mb))
 
 
-def fuzz(folder: Path, minutes: float, seed: int, keep: Path | None, names: Sequence[str] = ()) -> Counter[tuple[str, str]]:
+def fuzz(
+    folder: Path, minutes: float, seed: int, keep: Path | None, names: Sequence[str] = ()
+) -> Counter[tuple[str, str]]:
     """How often each reader came to each outcome."""
     names = names or tuple(READERS)
     counts: Counter[tuple[str, str]] = Counter()

@@ -99,13 +99,18 @@ def parse_json(content: bytes, where: str) -> Any:
     """
     _require_few_marks(content, where)
     try:
-        data = json.loads(content.decode("utf-8-sig"))
+        data = json.loads(content.decode("utf-8-sig"), parse_int=_whole)
         if _SURROGATE.search(content):
             msgspec.json.encode(data)  # half a surrogate pair is no letter that could be written again
     except (ValueError, RecursionError) as error:
         raise InputError(f"{where}: not valid JSON (cut short?): {error}") from None
     _require_unique_keys(content, where)
     return data
+
+
+def _whole(text: str) -> int | float:
+    """A whole number; one that no machine word holds is none, and the checks behind say whose it is."""
+    return int(text) if len(text) < 19 else float(text)
 
 
 def decode_json(content: bytes, kind: type[T], where: str) -> T | None:

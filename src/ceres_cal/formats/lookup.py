@@ -136,10 +136,11 @@ def make_lookup_table(
         x_m, y_m: the box of the field over which errors count is the one around these.
 
     Raises:
-        InputError: a step below 1, or no step of 1 px or more keeps to the error.
+        InputError: a step below 1 or beyond the image, or no step of 1 px or more keeps to the error.
     """
-    if step_px is not None and step_px < 1:
-        raise InputError(f"step_px must be 1 or more, not {step_px}")
+    widest = min(camera.image_size)
+    if step_px is not None and not 1 <= step_px <= widest:
+        raise InputError(f"step_px must be from 1 to {widest}, not {step_px}")
     table = None
     for step in _STEPS_PX if step_px is None else (step_px,):
         table = _table(camera, station, step, x_m, y_m)
