@@ -213,6 +213,8 @@ def work(folder: Path, names: Sequence[str], seed: int, end: float, answers: Any
         peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
         what = "slow" if seconds > LONGEST_S else "memory" if peak_mb > MOST_MB else what
         answers.send((name, what, words, seconds, peak_mb))
+        if what == "memory":  # whose peak would be that of all that follow
+            return
 
 
 def fuzz(

@@ -152,6 +152,7 @@ def test_images_that_claim_more_than_they_hold(tmp_path: Path) -> None:
         ("huge.png", _png(32_000, 32_000), "would take 3072 MB"),
         ("large.png", _png(10_000, 10_000), "10000 x 10000 px, as it says, do not fit into"),
         ("huge.bmp", bytes(huge), "would take 2700 MB"),
+        ("chunk.png", _png(64, 48).replace(struct.pack(">I", 17), b"\xfe\xff\xff\xff"), "not an image"),
         ("none.tif", b"II*\0\x08\0\0\0\x01", "not an image"),
     ):
         (tmp_path / name).write_bytes(content)

@@ -20,7 +20,7 @@ def claimed_size(content: bytes) -> tuple[int, int] | None:
 
 def _size(content: bytes) -> tuple[int, int] | None:
     if content.startswith(b"\x89PNG\r\n\x1a\n"):
-        return _unpack(">II", content, 16)
+        return _png(content)
     if content.startswith(b"BM"):
         width, height = _unpack("<HH" if content[14:15] == b"\x0c" else "<ii", content, 18)
         return width, abs(height)  # negative from the top down
@@ -41,6 +41,17 @@ def _size(content: bytes) -> tuple[int, int] | None:
 def _unpack(form: str, content: bytes, at: int) -> tuple[int, int]:
     first, second = struct.unpack_from(form, content, at)
     return first, second
+
+
+def _png(content: bytes) -> tuple[int, int] | None:
+    """Its decoder makes room for whatever length a chunk claims."""
+    at = 8
+    while at + 8 <= len(content):
+        (length,) = struct.unpack_from(">I", content, at)
+        at += 12 + length
+        if at > len(content):
+            return None
+    return _unpack(">II", content, 16)
 
 
 def _jpeg(content: bytes) -> tuple[int, int] | None:
