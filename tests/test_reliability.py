@@ -13,7 +13,7 @@ import sys
 import time
 import zipfile
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -27,16 +27,20 @@ import pytest
 import refit_after_move
 import watching
 
-from ceres_cal.base.errors import InputError
+from ceres_cal.base.errors import CalibrationError, InputError
 from ceres_cal.base.files import LIMIT, read_bytes, write_bytes
 from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
 from ceres_cal.cli import main
 from ceres_cal.detect.images import read_grey
 from ceres_cal.formats import LookupTable
+from ceres_cal.model.parameters import Options
 from ceres_cal.observations import Observations
-from ceres_cal.scene.targets import checkerboard, ssl_field
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.lens import Radial
+from ceres_cal.scene.targets import checkerboard, custom, ssl_field
 from ceres_cal.scene.targets.target import MOST_FEATURES
+from ceres_cal.simulate import Disturbance, Station, field_scene, overhead_pose, simulate
 
 ROOT = Path(__file__).resolve().parents[1]
 SAMPLE = ROOT / "data" / "ssl_field_moved" / "observations.json"
@@ -278,6 +282,51 @@ def test_a_field_in_millimetres(observations: Observations) -> None:
     }  # fmt: skip
     large = replace(observations, targets={name: ssl_field(None, **lengths)}, priors=())
     assert f"target {name!r} reaches 4500 m from its origin: are its numbers metres" in calibrate(large).warnings[0]
+
+
+@pytest.mark.parametrize("scale", [0.001, 1000.0])
+@pytest.mark.parametrize("phi", [100.0, 100_000.0])
+def test_scenes_of_a_centimetre_and_of_kilometres(scale: float, phi: float) -> None:
+    """9 mm and 9 km wide: the truth within 1.7 sd; pytest turns warnings of NumPy into errors."""
+    field = ssl_field("B")
+    points = {name: (scale * x, scale * y, 0.0) for name, (x, y, _) in field.points.items()}
+    camera = Camera((round(1.5 * phi), round(1.1 * phi)), phi, (0.75 * phi, 0.55 * phi), Radial((0.0, 0.0)))
+    pose = overhead_pose(-0.5 * scale, -1.2 * scale, 6.0 * scale, -14.0, -11.5, 4.0)
+    scene = field_scene(custom(points), {"c": camera}, {"c": Station("c", pose)})
+    noise_px = 1e-4 * phi
+    seen = simulate(scene, Disturbance(noise_px, noise_px)).observations
+    found = calibrate(seen, Options(free_principal_point=False))
+    known = found.uncertainty.verdict("camera", "c", "phi")
+    assert abs(known.value - phi) < 4.0 * known.sd < 0.1 * phi
+
+
+def _nearly_singular(observations: Observations) -> Iterator[Observations]:
+    """Few, equal, collinear, exact and worthless observations."""
+    points, curves = observations.points, observations.curves
+    none = np.zeros(len(curves), bool)
+    for count in range(1, 9):
+        yield observations.part(np.arange(len(points)) < count, none)
+    yield replace(observations, points=replace(points, pixels=np.full_like(points.pixels, 100.0)))
+    line = np.column_stack([np.linspace(0.0, 900.0, len(points)), np.linspace(0.0, 500.0, len(points))])
+    yield replace(observations, points=replace(points, pixels=line)).part(np.ones(len(points), bool), none)
+    for sigma_px in (1e-12, 1e12):
+        yield replace(observations, points=replace(points, sigma_px=np.full(len(points), sigma_px)))
+
+
+@pytest.mark.parametrize("sigma_px", [1e-200, 1e200])
+def test_a_sigma_beyond_all_measure(observations: Observations, sigma_px: float) -> None:
+    points = replace(observations.points, sigma_px=np.full(len(observations.points), sigma_px))
+    with pytest.raises(InputError, match="its sigma_px must be positive and finite, 1e-12 to 1e12: correct"):
+        replace(observations, points=points)
+
+
+def test_what_is_nearly_singular_is_answered_or_named(observations: Observations) -> None:
+    for number, odd in enumerate(_nearly_singular(observations)):
+        try:
+            found = calibrate(odd)
+        except CalibrationError:
+            continue
+        assert all(np.isfinite(camera.phi) for camera in found.cameras.values()), number
 
 
 def test_a_table_without_nodes(good: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -181,10 +181,11 @@ class Observations(Content):
         self._check_numbers(kind, column)
 
     def _check_numbers(self, kind: str, column: Columns) -> None:
+        sigma = np.where(column.sigma_px > 0.0, column.sigma_px, np.inf)
         side = column.side if isinstance(column, Curves) else np.zeros(1, np.int8)
         for what, bad in (
             ("its pixel is not finite", ~np.all(np.isfinite(column.pixels), axis=1)),
-            ("its sigma_px must be positive and finite", ~(np.isfinite(column.sigma_px) & (column.sigma_px > 0.0))),
+            ("its sigma_px must be positive and finite, 1e-12 to 1e12", ~(np.abs(np.log10(sigma)) <= 12.0)),
             ("its side must be 0, 1 or -1", (side < -1) | (side > 1)),
         ):
             if np.any(bad):
