@@ -354,6 +354,22 @@ def test_children_after_a_calibration_in_the_parent(method: str, calibration: Ca
         assert [answer.result(60) for answer in [pool.submit(_phi, str(SAMPLE)) for _ in range(2)]] == [mine] * 2
 
 
+def test_processes_share_one_cache(tmp_path: Path) -> None:
+    """One compiles a kernel, the others wait and take it: eight, and one machine code."""
+    code = (
+        "import time; from ceres_cal.kernels import jit\n"
+        "def slow(x): return 2.0 * x + 1.0\n"
+        "kernel = jit.jit(slow); kernel(1.0); print(sum(kernel.stats.cache_misses.values()))"
+    )
+    module = tmp_path / "module.py"
+    module.write_text(code)
+    environment = {**ENVIRONMENT, "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    command = [sys.executable, str(module)]
+    running = [subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) for _ in range(8)]
+    assert sum(int(process.communicate(timeout=120)[0]) for process in running) == 1
+    assert len(list((tmp_path / "cache").rglob("*.nbc"))) == 1
+
+
 def test_threads_that_calibrate_at_once(calibration: Calibration) -> None:
     with ThreadPoolExecutor(4) as pool:
         assert len({answer.result(60) for answer in [pool.submit(_phi, str(SAMPLE)) for _ in range(4)]}) == 1
