@@ -26,6 +26,7 @@ CORNER_FITS = ("opencv", "saddle")
 MIN_CORNERS = 6
 TARGET_NAME = "board"
 _LARGE_PX = 2e6  # larger images are searched at this size first: faster, and with less of noise and blur
+_MOST_PX = 1.6e7  # and at this size at most: on noise OpenCV takes minutes, and 50 MB for every megapixel
 _SUBPIX_HALF_WINDOW_PX = 5  # at most; a third of the spacing keeps the neighbouring corners out of it
 _SMALL_PX = 2e6  # smaller ones also at twice their size, where the squares are few pixels wide
 
@@ -214,7 +215,7 @@ def _find_chessboard(image: Image8, columns: int, rows: int) -> Array | None:
 def _scales(pixels: int) -> Iterator[float]:
     if pixels > _LARGE_PX:
         yield float(np.sqrt(_LARGE_PX / pixels))
-    yield 1.0
+    yield min(1.0, float(np.sqrt(_MOST_PX / pixels)))
     if pixels <= _SMALL_PX:
         yield 2.0
 
