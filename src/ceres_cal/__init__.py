@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from ceres_cal.calibrating import calibrate as calibrate
     from ceres_cal.calibration import Calibration as Calibration
     from ceres_cal.model.parameters import Options as Options
+    from ceres_cal.moves import RefitOptions as RefitOptions
     from ceres_cal.moves import check as check
     from ceres_cal.moves import compare as compare
     from ceres_cal.moves import refit as refit
@@ -34,6 +35,7 @@ _HOME = {
     "InputError": "base.errors",
     "SolutionError": "base.errors",
     "refit": "moves",
+    "RefitOptions": "moves",
     "check": "moves",
     "compare": "moves",
     "Observations": "observations",

@@ -25,7 +25,7 @@ from ceres_cal.calibration.file import (
 from ceres_cal.calibration.origin import Fit, Refitted, Rejected, package_versions
 from ceres_cal.model.keys import Key
 from ceres_cal.model.parameters import Estimate, Options, make_layout
-from ceres_cal.model.priors import GaussianPrior, gather_priors, gather_stated, tolerances
+from ceres_cal.model.priors import GaussianPrior, gather_priors
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import gather_sights
 from ceres_cal.scene.camera import Camera
@@ -139,9 +139,7 @@ class Calibration:
         if new_data or prior is None or self.posterior is None:
             priors = gather_priors(observations, options, self.estimate.structure)
             return Problem(sights, make_layout(observations, options), priors, weighting, options)
-        lenses = {name: camera.lens for name, camera in self.cameras.items()}
-        fresh = tolerances(self.estimate.structure, prior.keys)
-        priors = (prior, *gather_stated(observations, options, lenses), *fresh)
+        priors = gather_priors(observations, options, self.estimate.structure, prior, self.cameras)
         return Problem(sights, self.posterior.layout(self.estimate), priors, weighting, options)
 
     def prior_of(self, keys: Sequence[Key]) -> GaussianPrior:

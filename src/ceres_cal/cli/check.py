@@ -33,15 +33,15 @@ def _add_arguments(parser: ArgumentParser) -> None:
 def _run(args: Namespace) -> Answer:
     level = _share(args.false_alarms)
     images = photographs_in(args)
-    answer, detections = _photographed(args, images, level) if images else (_observed(args, level), None)
+    detections = None
+    if images:
+        answer, detections = _photographed(args, images, level)
+    else:
+        from ceres_cal.moves import check
+
+        answer = check(read_calibration(args), read_observations(args.inputs), level)
     data = _data(answer) | photographs_data(detections)
     return Answer(data, lambda: _text(answer, detections), 0 if answer.holds else 1)
-
-
-def _observed(args: Namespace, level: float) -> Check:
-    from ceres_cal.moves import check
-
-    return check(read_calibration(args), read_observations(args.inputs), level)
 
 
 def _photographed(args: Namespace, images: list[Path], level: float) -> tuple[Check, KnownDetections]:

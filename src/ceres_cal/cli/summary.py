@@ -63,7 +63,8 @@ def calibration_text(
         sections.append(section("camera", [f"{name}, {camera.image_size[0]} x {camera.image_size[1]} px", *lines]))
     for name, camera in calibration.stations.items():
         pose = _pose(name, camera, name in anchored, quality)
-        sections.append(section("station", [f"{name}{_of_camera(calibration, name)}", *pose]))
+        owner = calibration.estimate.stations[name].camera
+        sections.append(section("station", [name if owner == name else f"{name}, camera {owner}", *pose]))
     if len(calibration.estimate.structure.names):
         sections.append(section("as built", _structure(calibration)))
     sections += [section(title, lines) for title, lines in _uncertainty_lines(quality)]
@@ -119,11 +120,6 @@ def _intrinsics(name: str, camera: Camera, options: Options, phi_from: str, qual
         rows.append((coefficient, f"{value!r}{_plus_minus(quality, name, coefficient)}{held(coefficient)}"))
     lines = [f"{title:16}{value}" for title, value in rows]
     return [*lines, camera.lens.note] if camera.lens.note else lines
-
-
-def _of_camera(calibration: Calibration, station: str) -> str:
-    camera = calibration.estimate.stations[station].camera
-    return "" if camera == station else f", camera {camera}"
 
 
 def _plus_minus(quality: Quality, camera: str, quantity: str) -> str:

@@ -98,7 +98,9 @@ def detect_boards(
         NothingShownError: no image shows the board.
     """
     paths = [Path(path) for path in images]
-    placements, squares = _placement_names(paths), _squares_of(board)
+    placements, squares = _placement_names(paths), board.grid
+    if squares is None or not squares.checkered:
+        raise InputError(f"target of kind {board.kind!r}: boards are detected with a target of kind 'checkerboard'")
     size, grids, missed = _find_all(paths, _finder(squares, corners), progress)
     if not grids:
         raise NothingShownError(
@@ -142,13 +144,6 @@ def _find_all(
         if progress is not None:
             progress(number, len(paths), path.name)
     return size, grids, missed
-
-
-def _squares_of(board: Target) -> Grid:
-    """How the squares of a checkerboard meet; InputError where it is none."""
-    if board.grid is None or not board.grid.checkered:
-        raise InputError(f"target of kind {board.kind!r}: boards are detected with a target of kind 'checkerboard'")
-    return board.grid
 
 
 def _finder(squares: Grid, corners: CharucoSpec | str) -> Finder:

@@ -19,8 +19,6 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, Array32, Mask
 
-"""(height, width) grey levels."""
-
 LEAST_BLUR_PX, MOST_BLUR_PX = 0.3, 4.0
 _SHAPE_RANGE = (np.log([LEAST_BLUR_PX, 0.4]), np.log([MOST_BLUR_PX, 2.5]))
 _SHAPE_SIGMA = np.array([1.0, 0.3])  # of the logarithms of blur and stretch, beforehand

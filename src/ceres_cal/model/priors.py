@@ -21,6 +21,7 @@ from ceres_cal.model.parameters import Estimate, Options, intrinsic_names
 from ceres_cal.model.quantities import intrinsic_keys, values_of
 from ceres_cal.model.structure import Structure
 from ceres_cal.observations import Observations, Prior
+from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Lens
 
 _QUANTITIES = {"principal_point": ("cx", "cy"), "height_m": ("height",), "position_m": ("x", "y", "height")}
@@ -76,25 +77,27 @@ class GaussianPrior:
         return np.asarray(self.information.root @ self.offsets(estimate))
 
 
-def gather_priors(observations: Observations, options: Options, structure: Structure) -> tuple[GaussianPrior, ...]:
-    """Everything that is known beforehand of a calibration: the priors of observations and options, and the tolerances.
+def gather_priors(
+    observations: Observations,
+    options: Options,
+    structure: Structure,
+    carried: GaussianPrior | None = None,
+    cameras: Mapping[str, Camera] | None = None,
+) -> tuple[GaussianPrior, ...]:
+    """Everything that is known beforehand: an old posterior, the priors of observations and options, and tolerances.
+
+    Args:
+        cameras: where their lenses are not those of the options.
 
     Raises:
         InputError: a prior names a camera, a station or a quantity that is not there.
     """
-    lenses = dict.fromkeys(observations.cameras, options.blank_lens)
-    return (*gather_stated(observations, options, lenses), *tolerances(structure))
-
-
-def gather_stated(observations: Observations, options: Options, lenses: Mapping[str, Lens]) -> Iterator[GaussianPrior]:
-    """The priors of observations and options. `lenses`: of the cameras, by name.
-
-    Raises:
-        InputError: see `gather_priors`.
-    """
+    lenses = {name: camera.lens for name, camera in (cameras or {}).items()}
+    stated = []
     for prior in (*observations.priors, *options.priors):
         observations.require_owner(prior)
-        yield stated_prior(prior, lenses.get(prior.name, options.blank_lens))
+        stated.append(stated_prior(prior, lenses.get(prior.name, options.blank_lens)))
+    return (*([carried] if carried else []), *stated, *tolerances(structure, carried.keys if carried else ()))
 
 
 def stated_prior(prior: Prior, lens: Lens) -> GaussianPrior:

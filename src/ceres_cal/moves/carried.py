@@ -13,9 +13,9 @@ from ceres_cal.calibration import Calibration
 from ceres_cal.model.information import Information
 from ceres_cal.model.keys import Key
 from ceres_cal.model.parameters import Estimate, Layout, Options, Station, intrinsic_names
-from ceres_cal.model.priors import GaussianPrior, gather_stated, tolerances
+from ceres_cal.model.priors import GaussianPrior, gather_priors
 from ceres_cal.model.quantities import intrinsic_keys
-from ceres_cal.model.structure import Structure, make_structure
+from ceres_cal.model.structure import make_structure
 from ceres_cal.moves.labels import TURNED, relabelled
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.observations.sights import Sights, gather_sights
@@ -124,6 +124,7 @@ def make_plan(
     same = calibration.digest == observations.digest  # then the question is the same, too
     options = replace(calibration.options, priors=asked.priors or (calibration.options.priors if same else ()))
     scales = calibration.refitted.scales if same and calibration.refitted else calibration.fit.scales
+    prior = carried_prior(calibration, observations, stays)
     placed = {name: old[name] for name in old if name in stays}
     placed |= {name: Station(stations[name], Pose.identity()) for name in chosen}
     return RefitPlan(
@@ -140,9 +141,9 @@ def make_plan(
             calibration.cameras,
             {name: placed[name] for name in dict.fromkeys([*old, *stations]) if name in placed},
             {},
-            with_structure(calibration.estimate, observed, options),
+            make_structure(observed.targets, options.tolerances).carrying(calibration.estimate.structure),
         ),
-        carried_prior(calibration, observations, stays),
+        prior,
         scales,
     )
 
@@ -208,16 +209,6 @@ def refit_problem(plan: RefitPlan, what: str, start: Estimate) -> tuple[Problem,
     held = {name for name in free if what == "pose-only" or (plan.asked.hold_others and name not in plan.moved_cameras)}
     moving = plan.moved if plan.asked.hold_others else stations
     solved = replace(known, free={n: f[:0] if n in held else f for n, f in free.items()}, stations=moving)
-    return Problem(plan.sights, solved, _priors(plan, what, start), options=plan.options), known
-
-
-def _priors(plan: RefitPlan, what: str, start: Estimate) -> tuple[GaussianPrior, ...]:
-    """The old posterior, what was measured since, and tolerances of what is new among the targets."""
-    carried = plan.prior_for(what)
-    stated = gather_stated(plan.observations, plan.options, {n: c.lens for n, c in plan.calibration.cameras.items()})
-    return (carried, *stated, *tolerances(start.structure, carried.keys))
-
-
-def with_structure(old: Estimate, observations: Observations, options: Options) -> Structure:
-    """The targets as they were found built, in the order of the observations' targets; new ones as drawn."""
-    return make_structure(observations.targets, options.tolerances).carrying(old.structure)
+    cameras = plan.calibration.cameras
+    priors = gather_priors(plan.observations, plan.options, start.structure, plan.prior_for(what), cameras)
+    return Problem(plan.sights, solved, priors, options=plan.options), known

@@ -20,7 +20,8 @@ from ceres_cal.model.keys import Key
 from ceres_cal.model.parameters import Estimate
 from ceres_cal.model.priors import GaussianPrior, tolerances
 from ceres_cal.model.quantities import layout_of
-from ceres_cal.moves.carried import require_same_things, with_structure
+from ceres_cal.model.structure import make_structure
+from ceres_cal.moves.carried import require_same_things
 from ceres_cal.moves.poses import PoseCandidate, PoseSearch, movement, pose_candidates
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights, gather_sights
@@ -169,7 +170,7 @@ def _case(calibration: Calibration, observed: Observations, sight: Sights) -> _C
     own = posterior.keys_of(old, key.station)
     if not posterior.knows_station(key.station):
         raise InputError(f"station {key.station!r} was held as the world: it cannot be said to have moved")
-    structure = with_structure(old, observed, calibration.options)
+    structure = make_structure(observed.targets, calibration.options.tolerances).carrying(old.structure)
     estimate = Estimate({key.camera: old.cameras[key.camera]}, {key.station: old.stations[key.station]}, {}, structure)
     tested = tuple(k for k in own if k.kind == "station" or k.quantity == "phi")
     kept = [k for k in posterior.keys if k in own or k.kind == "structure"]

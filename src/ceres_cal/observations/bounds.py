@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.errors import InputError
-from ceres_cal.observations.columns import Columns, Curves, View, view_label
+from ceres_cal.observations.columns import Columns, Curves, view_label
 from ceres_cal.observations.files import Content
 
 # The image ends half a pixel beyond the centres of its outermost ones; a detector that interpolates may go one further.
@@ -85,14 +85,8 @@ def _first(content: Content, points: Mask, curves: Mask) -> str:
     column: Columns = content.points if points.any() else content.curves
     row = int(np.argmax(points if points.any() else curves))
     kind = "curve" if isinstance(column, Curves) else "point"
-    feature = _names(content, content.views[column.view[row]], kind)[int(column.feature[row])]
-    x, y = column.pixels[row]
+    feature, (x, y) = content.feature_name(kind, row), column.pixels[row]
     return f"{view_label(column.view[row], content.views)}, {kind} {feature!r}: pixel ({x:.1f}, {y:.1f})"
-
-
-def _names(content: Content, view: View, kind: str) -> Sequence[str]:
-    target: Mapping[str, object] = getattr(content.targets[view.target], f"{kind}s")
-    return tuple(target)
 
 
 def odd_sizes(content: Content) -> Iterator[str]:

@@ -15,7 +15,18 @@ from ceres_cal.base.archives import Column, read_npz
 from ceres_cal.base.arrays import AnyArray, Codes
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import check_header, convert, decode_json, parse_json, read_bytes, write_bytes
-from ceres_cal.observations.columns import NO_CURVES, NO_POINTS, TYPES, Curves, Points, Prior, View, choices, view_label
+from ceres_cal.observations.columns import (
+    NO_CURVES,
+    NO_POINTS,
+    TYPES,
+    Columns,
+    Curves,
+    Points,
+    Prior,
+    View,
+    choices,
+    view_label,
+)
 from ceres_cal.scene.targets import SIDES, Target, targets_from_specs
 
 FORMAT, VERSION = "ceres-cal/observations", 1
@@ -38,6 +49,13 @@ class Content:
     points: Points
     curves: Curves
     priors: tuple[Prior, ...] = ()
+
+    def feature_name(self, kind: str, row: int) -> str:
+        """Name of the feature that observation `row` of the points (kind "point") or curves ("curve") shows."""
+        column: Columns = self.points if kind == "point" else self.curves
+        target = self.targets[self.views[int(column.view[row])].target]
+        names = target.point_names if kind == "point" else target.curve_names
+        return names[int(column.feature[row])]
 
 
 class _PointsFile(msgspec.Struct, forbid_unknown_fields=True):

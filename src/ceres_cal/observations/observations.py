@@ -109,13 +109,6 @@ class Observations(Content):
         names = ("views", "cameras", "stations", "placements", "points", "curves")
         return {name: len(getattr(self, name)) for name in names}
 
-    def feature_name(self, kind: str, row: int) -> str:
-        """Name of the feature that observation `row` of the points (kind "point") or curves ("curve") shows."""
-        column: Columns = self.points if kind == "point" else self.curves
-        target = self.targets[self.views[int(column.view[row])].target]
-        names = target.point_names if kind == "point" else target.curve_names
-        return names[int(column.feature[row])]
-
     # ---- parts --------------------------------------------------------------------------------------------------
 
     def part(self, points: Mask, curves: Mask) -> Observations:

@@ -88,7 +88,9 @@ def detect_known(
             f"the calibration's targets ({', '.join(calibration.targets)}) have no painted lines"
             f"{' and are no chessboards' if boards else ''}: give a file of observations instead of images"
         )
-    _require_known(calibration, not_painted)
+    known = {curve for target in calibration.targets.values() for curve in target.curves}
+    if unknown := sorted(set(not_painted) - known):
+        raise InputError(f"curve {unknown[0]!r} is not one of the calibration's targets': see `ceres-cal targets`")
     parts: list[Observations] = []
     shown: dict[str, int] = {}
     reasons: dict[str, list[str]] = {str(path): [] for path in paths}
@@ -155,12 +157,6 @@ def is_painted(target: Target) -> bool:
 
 def _counted(images: int) -> str:
     return "the photograph" if images == 1 else f"any of {images} photographs"
-
-
-def _require_known(calibration: Calibration, not_painted: Collection[str]) -> None:
-    known = {curve for target in calibration.targets.values() for curve in target.curves}
-    if unknown := sorted(set(not_painted) - known):
-        raise InputError(f"curve {unknown[0]!r} is not one of the calibration's targets': see `ceres-cal targets`")
 
 
 def _counting_on(progress: ImageProgress | None, turn: int, turns: int) -> ImageProgress:

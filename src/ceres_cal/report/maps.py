@@ -134,7 +134,7 @@ def map_figure(material: Material, station: str, number: int) -> Figure:
         drawn.sd_mm,
         levels_of(*(each.sd_mm for each in (*maps, *material.drawn_maps[station]))),
         "standard deviation of a located point, mm",
-        [line[:, :2] for line in material.paint()],
+        [line[:, :2] for line in paint_of(material.fields)],
         image_border(material.calibration.stations[station], one.height_m),
         material.calibration.stations[station].position,
         one.worst_place_m if np.isfinite(one.worst_mm) else None,

@@ -110,10 +110,6 @@ class Material(Quality):
         owners = np.array([view["camera"] == camera for view in self.diagnosis.table.views])
         return np.asarray(owners[self.diagnosis.table.view])
 
-    def paint(self) -> Iterator[Array]:
-        """Each curve of what lies in the world as a polyline (S, 3) m."""
-        return paint_of(self.fields)
-
 
 def paint_of(targets: Iterable[Target]) -> Iterator[Array]:
     """Each curve of targets that lie in the world as a polyline (S, 3) m."""

@@ -15,7 +15,7 @@ from ceres_cal.diagnostics import ResidualTable, Summary
 from ceres_cal.diagnostics.summaries import RadiusTrend
 from ceres_cal.report import canvas
 from ceres_cal.report.canvas import CURVE, INK, OUTLIER, PAINT, POINT, QUIET, Drawing
-from ceres_cal.report.material import Material
+from ceres_cal.report.material import Material, paint_of
 from ceres_cal.report.page import Figure, Table
 from ceres_cal.scene.camera import Camera
 
@@ -165,7 +165,7 @@ def _paint_in_image(material: Material, camera: str) -> list[Array]:
     if not seen:
         return []
     posed = material.calibration.estimate.camera_at(seen[0])
-    lines = [posed.project(curve) for curve in material.paint()]
+    lines = [posed.project(curve) for curve in paint_of(material.fields)]
     with np.errstate(invalid="ignore"):
         inside = [np.all((line > -1.0) & (line < posed.image_size), axis=1) for line in lines]
     return [np.where(keep[:, None], line, np.nan) for line, keep in zip(lines, inside, strict=True)]

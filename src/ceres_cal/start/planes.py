@@ -126,12 +126,11 @@ _NONE = Homographies(np.empty(0, np.int64), np.empty((0, 3, 3)), np.empty(0), np
 
 def profile_and_homographies(sights: Sights, unit: float) -> tuple[RadialProfile, Homographies]:
     """A camera's radial profile and the homography of each of its sights that determines one; sights about it."""
-    pure = _flat_sights_of_points(sights)
+    pure, board = _flat_sights_of_points(sights)
     rest = np.delete(np.arange(len(sights)), pure)
     planes = {int(i): plane_sight(sights[int(i)]) for i in rest}
     matrices: dict[int, Array] = {}
     profile: RadialProfile | None = None
-    board = sights.take(pure)
     if len(pure):
         data = _plane_data(board, _spread_rows(board.point_bounds))
         profile = _profile_of_boards(board, data, unit)
@@ -145,16 +144,14 @@ def profile_and_homographies(sights: Sights, unit: float) -> tuple[RadialProfile
     if profile is None or any(fit_lines(seen, profile.lift(p), rounds=2)[1] > _NO_FIT for seen, p in lined):
         profile = _profile_from_lines(lined, unit)
     matrices |= {i: _homography_of(planes[i], profile) for i in mixed}
-    parts = [_NONE, *(_of_plane(i, planes[i], matrix) for i, matrix in matrices.items())]
+    parts = [_NONE]
+    for i, matrix in matrices.items():
+        height, size = np.array([planes[i].height_m]), np.array([planes[i].size_px])
+        parts.append(Homographies(np.array([i]), matrix[None], height, size))
     if len(pure):
         parts.append(_of_boards(pure, board, data, profile))
     names = ("sights", "matrices", "heights_m", "sizes_px")
     return profile, Homographies(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
-
-
-def _of_plane(number: int, plane: PlaneSight, matrix: Array) -> Homographies:
-    height, size = np.array([plane.height_m]), np.array([plane.size_px])
-    return Homographies(np.array([number]), matrix[None], height, size)
 
 
 def _of_boards(numbers: Indices, board: Sights, data: PlaneData, profile: RadialProfile) -> Homographies:
@@ -168,15 +165,15 @@ def _of_boards(numbers: Indices, board: Sights, data: PlaneData, profile: Radial
     return Homographies(numbers[posed], matrices[posed], heights[posed], sizes[posed])
 
 
-def _flat_sights_of_points(sights: Sights) -> Indices:
-    """Numbers of the sights that show at least six points of one plane, not on one line, and no curve."""
+def _flat_sights_of_points(sights: Sights) -> tuple[Indices, Sights]:
+    """Those that show at least six points of one plane, not on one line, and no curve; by number, and themselves."""
     few = (np.diff(sights.point_bounds) >= 6) & (np.diff(sights.curve_bounds) == 0)
     candidates = np.flatnonzero(few)
     board = sights.take(candidates)
     scatter = grouped_scatter(board.points, board.point_bounds)
     xx, xy, yy = scatter[:, 0, 0], scatter[:, 0, 1], scatter[:, 1, 1]
-    flat = scatter[:, 2, 2] < 1e-18
-    return np.asarray(candidates[flat & (xx * yy - xy**2 > 1e-12 * (xx + yy) ** 2)])
+    flat = np.flatnonzero((scatter[:, 2, 2] < 1e-18) & (xx * yy - xy**2 > 1e-12 * (xx + yy) ** 2))
+    return candidates[flat], board.take(flat)
 
 
 def _profile_of_boards(board: Sights, data: PlaneData, unit: float) -> RadialProfile:
