@@ -42,7 +42,7 @@ class Trial:
     def problem(self, observations: Observations) -> solve.Problem:
         """What somebody solves who knows every sigma, and which observations are wrong."""
         return solve.Problem(
-            self.used(gather_sights(observations)),
+            self.used(gather_sights(observations, predicted=True)),
             make_layout(self.clean, self.options),
             gather_priors(observations, self.options, self.truth.structure),
             solve.Weighting(1.0, 1.0, "trivial"),

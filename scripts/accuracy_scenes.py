@@ -34,6 +34,7 @@ CLEAN_NOISE = Disturbance(points_sigma_px=0.3, curves_sigma_px=0.3)
 GROSS_NOISE = replace(CLEAN_NOISE, outliers=0.2)
 SSL_NOISE = Disturbance(points_sigma_px=0.5, curves_sigma_px=0.3)
 PAINT_SIGMA_M = 0.008
+RADIAL = Radial((-5.2e-5, 6.1e-7))
 _SPACING_M = 0.15
 
 
@@ -47,7 +48,7 @@ class Problem:
 
 
 def _camera() -> Camera:
-    return Camera((1280, 960), 868.0, (646.5, 473.8), Radial((-5.2e-5, 6.1e-7)))
+    return Camera((1280, 960), 868.0, (646.5, 473.8), RADIAL)
 
 
 def _height(scene: Scene, station: str, sigma_m: float) -> Prior:
@@ -58,11 +59,11 @@ def _height(scene: Scene, station: str, sigma_m: float) -> Prior:
 # ---- against the Cramer-Rao bound -----------------------------------------------------------------------------------
 
 
-def boards(phi: float, lens: Lens) -> Problem:
-    """A board at 20 places before one camera."""
+def boards(phi: float, lens: Lens, count: int = 20) -> Problem:
+    """A board at some places before one camera."""
     cameras = {"camera": Camera((1280, 960), phi, (646.5, 473.8), lens)}
     stations = {"camera": Station("camera", Pose.identity())}
-    scene = board_scene(checkerboard(9, 6, 0.05), cameras, stations, count=20, seed=3, held=Held((0.5, 1.5)))
+    scene = board_scene(checkerboard(9, 6, 0.05), cameras, stations, count=count, seed=3, held=Held((0.5, 1.5)))
     return Problem(scene, Options(lens=lens.kind))
 
 
@@ -88,7 +89,7 @@ def two_cameras() -> Problem:
 
 
 PROBLEMS: dict[str, Callable[[], Problem]] = {
-    "boards, radial": partial(boards, 868.0, Radial((-5.2e-5, 6.1e-7))),
+    "boards, radial": partial(boards, 868.0, RADIAL),
     "boards, brown": partial(boards, 825.0, Brown((-0.24, 0.082, 4e-4, -3e-4, -0.011))),
     "field": over_the_field,
     "two cameras": two_cameras,

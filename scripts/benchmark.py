@@ -241,9 +241,10 @@ def uncertainty_share(frames: int, repeat: int) -> float:
     """What the standard deviations of everything, placements too, add to a calibration's seconds (median of turns)."""
     from ceres_cal.calibrating import calibrate
     from ceres_cal.model.parameters import Options, make_layout
+    from ceres_cal.model.residuals import residuals
     from ceres_cal.observations.sights import gather_sights
     from ceres_cal.solve import Problem, Weighting, information
-    from ceres_cal.uncertainty import assess
+    from ceres_cal.uncertainty import assess, measure_scatter
 
     observations, options = corner_observations(wide_lens(frames).corners), Options(lens="brown", free_aspect=True)
     calibrate(observations, options)
@@ -251,14 +252,18 @@ def uncertainty_share(frames: int, repeat: int) -> float:
     for _ in range(repeat):
         start = time.perf_counter()
         calibration = calibrate(observations, options)
-        middle = time.perf_counter()
+        calibrated = time.perf_counter() - start
+        estimate, there = calibration.estimate, residuals(observations, sights, calibration.estimate)
+        assert len(there.lengths[0])  # calibrate() has them at hand
+        start = time.perf_counter()
         whole = Problem(sights, layout, (), Weighting(calibration.fit.point_scale), options)
-        _, posterior = assess(whole, calibration.estimate, information(whole, calibration.estimate), np.inf)
-        assessed = time.perf_counter() - middle
+        reduced, scatter_at = information(whole, estimate), partial(measure_scatter, observations, whole, there)
+        _, posterior = assess(whole, estimate, reduced, np.inf, scatter_at)
+        assessed = time.perf_counter() - start
         known = len(posterior.placements)  # works them all out
-        everything = time.perf_counter() - middle
+        everything = time.perf_counter() - start
         assert known == frames
-        shares.append(everything / (middle - start - assessed))  # calibrate() assesses what is shared
+        shares.append(everything / (calibrated - assessed))  # calibrate() assesses what is shared
     return median(shares)
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ceres_cal.base.arrays import Array
 from ceres_cal.base.transforms import Pose
 from ceres_cal.model.parameters import Options
 from ceres_cal.model.structure import Tolerance
@@ -165,6 +166,63 @@ def agreeing(seed: int) -> Observations:
     return replace(seen, curves=replace(seen.curves, pixels=pixels + 0.3 * noise))
 
 
+def _displaced(seed: int, shift: Callable[[Array], Array]) -> Observations:
+    """Every pixel where a displacement (N, 2) of its offsets from the principal point puts it."""
+    seen = simulate(overhead(), NOISE, seed).observations
+    middle = overhead().cameras["overhead"].principal_point
+    points, curves = (
+        np.clip(column.pixels + shift(column.pixels - middle), 0.0, (1279.0, 959.0))
+        for column in (seen.points, seen.curves)
+    )
+    return replace(seen, points=replace(seen.points, pixels=points), curves=replace(seen.curves, pixels=curves))
+
+
+def skewed(seed: int) -> Observations:
+    """Pixels whose axes lean by 4 mrad."""
+    return _displaced(seed, lambda away: away[:, 1:] * (0.004, 0.0))
+
+
+def decentred(seed: int) -> Observations:
+    """Brown's tangential displacement, 1 px at half the image diagonal, before a lens that has none."""
+
+    def shift(away: Array) -> Array:
+        x, y = away.T / 800.0
+        return np.column_stack([2.0 * x * y, x * x + 3.0 * y * y])
+
+    return _displaced(seed, shift)
+
+
+def _on_floor(seed: int, height_m: Callable[[Array], Array]) -> Observations:
+    """The field on a floor of this height (N,) at places (N, 2)."""
+    scene = overhead()
+    seen = simulate(scene, NOISE, seed).observations
+    camera, drawn = scene.camera_at("overhead"), scene.targets["field"]
+    world = np.array([view.target == "field" for view in seen.views])
+    own, kept = world[seen.points.view], seen.points.pixels.copy()
+    ground = drawn.point_array[seen.points.feature[own]], _on_ground(camera, seen.curves.pixels)
+    for pixels, rows, places in ((kept, own, ground[0]), (curves := seen.curves.pixels.copy(), slice(None), ground[1])):
+        higher = places + np.column_stack([np.zeros((len(places), 2)), height_m(places[:, :2])])
+        pixels[rows] += camera.project(higher) - camera.project(places)
+    points, curves = (np.clip(pixels, 0.0, (1279.0, 959.0)) for pixels in (kept, curves))
+    return replace(seen, points=replace(seen.points, pixels=points), curves=replace(seen.curves, pixels=curves))
+
+
+def _on_ground(camera: Camera, pixels: Array) -> Array:
+    """(N, 3) where rays meet z = 0."""
+    rays = camera.rays(pixels) @ camera.cam_from_world.rotation
+    return np.asarray(camera.position - rays * (camera.position[2] / rays[:, 2:]))
+
+
+def bowed_floor(seed: int) -> Observations:
+    """A floor that is 15 mm lower at the ends of the half that is seen."""
+    return _on_floor(seed, lambda place: -0.015 * ((place[:, 0] + 2.25) / 2.25) ** 2)
+
+
+def bump(seed: int) -> Observations:
+    """A floor with a bump of 20 mm, 1 m wide, on the touch line."""
+    return _on_floor(seed, lambda place: 0.02 * np.exp(-2.0 * np.sum((place - (-2.0, 3.0)) ** 2, axis=1) / 0.25))
+
+
 FAULTS: dict[str, tuple[Problem, str, str]] = {
     "polynomial too short (r^2)": (Problem(short_polynomial, Options(powers=(3,))), "radius", "overhead"),
     "polynomial too short (r^5)": (Problem(longer_polynomial, Options()), "radius", "overhead"),
@@ -172,6 +230,10 @@ FAULTS: dict[str, tuple[Problem, str, str]] = {
     "one mislabelled corner": (Problem(wrong_label, Options()), "wrong label", "field/LeftFieldRightPenaltyCorner"),
     "bumped by 0.05 degrees after frame 5": (Problem(bumped, Options()), "moved after", "overhead"),
     "noise of points twice what was stated": (Problem(noisier, Options()), "noise", "points"),
+    "pixels lean by 4 mrad": (Problem(skewed, Options()), "skew", "overhead"),
+    "tangential displacement of 1 px": (Problem(decentred, Options()), "decentring", "overhead"),
+    "floor bowed by 15 mm": (Problem(bowed_floor, Options()), "floor bowed", "field"),
+    "bump of 20 mm": (Problem(bump, Options()), "floor uneven", "field at x -2.0, y 3.0 m"),
     "neighbours along lines agree": (Problem(agreeing, Options()), "correlated", "curves"),
 }
 """Name -> problem, and kind and subject of the one finding it must give."""

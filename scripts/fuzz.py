@@ -9,6 +9,7 @@ the process, and what does not come back. Exits with 1 when there is one; --keep
 from __future__ import annotations
 
 import argparse
+import base64
 import io
 import json
 import multiprocessing
@@ -34,7 +35,7 @@ from ceres_cal.base.files import write_json
 from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
 from ceres_cal.detect.images import read_colour, read_grey
-from ceres_cal.formats import LookupTable, make_lookup_table
+from ceres_cal.formats import LookupTable, export, make_lookup_table, read_foreign
 from ceres_cal.observations import Observations
 from ceres_cal.photographs.clicks import load_clicks
 from ceres_cal.simulate import built_in_scene, load_scene
@@ -45,6 +46,7 @@ LONGEST_S, MOST_MB = 10, 1024
 FAILURES = ("unexpected", "warning", "changed", "many lines", "slow", "died", "memory")
 TOKENS = b'0 -1 1 2 1e400 -0.0 1e308 5e-324 NaN -Infinity 9000000000 1e24 null true [] {} "" "a"'.split()
 TOKENS += [b'"\\ud800"', b'"\\u0000"', b'"' + b"x" * 300 + b'"', b"[" * 500, b"1" + b"0" * 400, b"[[1,2],[3]]"]
+WORDY = (".json", ".yml", ".yaml", ".xml", ".cameramodel", ".txt", ".vnl", ".csv")
 NUMBER = re.compile(rb"-?[0-9]+(\.[0-9]+)?(e-?[0-9]+)?")
 WORD = re.compile(rb'"(?:[^"\\]|\\.)*"|-?[0-9][0-9.eE+-]*|true|false|null|[\[\]{}:,]')
 
@@ -59,7 +61,24 @@ def _image(path: Path) -> None:
     read_colour(path)
 
 
+def _foreign(form: str, **options: Any) -> Reader:
+    return lambda path: read_foreign(path, form, **options)
+
+
+EXPORTED = {"opencv.yml": "opencv", "opencv.xml": "opencv", "opencv.json": "opencv", "ros.yaml": "ros"}
+EXPORTED |= {"chain.yaml": "kalibr", "own.cameramodel": "mrcal", "paper.txt": "paper"}
+EXPORTED |= {"geometry.pb": "ssl-vision", "geometry.yml": "vision-processor"}
+BOARD: dict[str, Any] = {"columns": 2, "rows": 2, "square": 0.1, "image_size": "640x480"}
+OTHERS = {
+    "corners.vnl": b"# filename x y level\n" + b"".join(b"a.png %d 20 %d\n" % (10 * n, n % 2) for n in range(4)),
+    "table.csv": b"frame,point,curve,x_px,y_px,sigma_px\n1,TopLeftCorner,,9,5,0.3\n1,,TopTouchLine,12,5,\n",
+}
 READERS: dict[str, Reader] = {
+    **{name: _foreign(form) for name, form in EXPORTED.items()},
+    "corners.vnl": _foreign("corners-vnl", **BOARD),
+    "table.csv": _foreign("csv", target="ssl-b", image_size="640x480"),
+    "columns.npz": _foreign("npz-columns", image_size="640x480"),
+    "boards.cameramodel": _foreign("mrcal-observations"),
     "observations.json": Observations.load,
     "observations.npz": Observations.load,
     "calibration.json": Calibration.load,
@@ -80,6 +99,10 @@ def corpus(folder: Path) -> None:
     x, y = np.array([-4.5, 4.5]), np.array([-3.0, 3.0])
     station = next(iter(calibration.stations))
     make_lookup_table(calibration.stations[station], station, x, y, step_px=128).save(folder / "table.npz")
+    for name, form in EXPORTED.items():
+        options: dict[str, Any] = {"camera_id": "0"} if "geometry" in name else {}
+        export(calibration, form, folder / name, [station], **options)
+    foreign_observations(folder)
     write_json(folder / "scene.json", scene_to_json(*built_in_scene("ssl-field")))
     corners = {name: [10.0 * number, 20.0] for number, name in enumerate("abcd")}
     write_json(folder / "corners.json", {"format": "ceres-cal/corners", "version": 1, "points": corners})
@@ -89,11 +112,25 @@ def corpus(folder: Path) -> None:
         cv2.imwrite(str(folder / f"image{ending}"), small if ending != ".pgm" else small[:, :, 0])
 
 
+def foreign_observations(folder: Path) -> None:
+    for name, content in OTHERS.items():
+        (folder / name).write_bytes(content)
+    x, y = np.arange(4.0), np.ones(4)
+    np.savez(folder / "columns.npz", x_px=x, y_px=y, X_m=x, Y_m=y)
+    stream, sizes = io.BytesIO(), np.array([[640, 480]])
+    inputs: dict[str, Any] = {"observations_board": np.ones((1, 2, 2, 3)), "calibration_object_spacing": np.array(0.1)}
+    indices = np.array([[0, 0, -1]])
+    np.savez(stream, **inputs, imagersizes=sizes, indices_frame_camintrinsics_camextrinsics=indices)
+    packed = {"optimization_inputs": base64.b85encode(stream.getvalue())}
+    (folder / "boards.cameramodel").write_text(repr(packed))
+
+
 def round_trip(loaded: object, path: Path) -> bool:
     """Whether what was accepted comes back from a file of its own, to the last byte."""
     if not isinstance(loaded, Observations | Calibration | LookupTable):
         return True
-    again = [path.with_name(f"again{number}{path.suffix}") for number in (1, 2)]
+    ending = ".npz" if path.suffix == ".npz" else ".json"
+    again = [path.with_name(f"again{number}{ending}") for number in (1, 2)]
     loaded.save(again[0])
     type(loaded).load(again[0]).save(again[1])
     return again[0].read_bytes() == again[1].read_bytes()
@@ -170,7 +207,7 @@ def header_changed(column: bytes, rng: np.random.Generator) -> bytes:
 
 
 def mutated(name: str, content: bytes, rng: np.random.Generator) -> bytes:
-    special = {".json": words_changed, ".npz": columns_changed}.get(Path(name).suffix)
+    special = columns_changed if name.endswith(".npz") else words_changed if name.endswith(WORDY) else None
     return (special if special is not None and rng.random() < 0.7 else bytes_changed)(content, rng)
 
 

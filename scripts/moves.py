@@ -33,7 +33,7 @@ from ceres_cal.model.keys import Key
 from ceres_cal.model.parameters import Estimate
 from ceres_cal.model.quantities import difference
 from ceres_cal.model.structure import make_structure
-from ceres_cal.moves import check, refit
+from ceres_cal.moves import refit
 from ceres_cal.moves.carried import make_plan, refit_problem
 from ceres_cal.observations import Observations, combine, taken
 from ceres_cal.photographs import FieldOptions, check_photographs, detect_field
@@ -187,7 +187,7 @@ def bound_case(runs: int) -> Iterator[Row]:
         calibration = calibrated(seed)
         simulation = seen(TILTED, NOISE, seed, spacing_m=0.12)
         few = thinned(simulation.observations, CORNERS, 30, seed)
-        pixels = thinned(_clean(simulation), CORNERS, 30, seed)
+        pixels = thinned(clean(simulation), CORNERS, 30, seed)
         result = refit(calibration, few)
         truth = truth_of(calibration, TILTED)
         keys, covariance = bound_of(calibration, pixels, TILTED)
@@ -213,7 +213,7 @@ def bound_case(runs: int) -> Iterator[Row]:
     yield Row("30 line points, 4 corners", "smaller than from scratch, 150 mm", gain, least=3.0, note=note)
 
 
-def _clean(simulation: Simulation) -> Observations:
+def clean(simulation: Simulation) -> Observations:
     found = simulation.observations
     points = replace(found.points, pixels=simulation.points.pixels)
     return replace(found, points=points, curves=replace(found.curves, pixels=simulation.curves.pixels))
@@ -227,37 +227,11 @@ def _from_scratch(observations: Observations, seed: int) -> Calibration | None:
         return None
 
 
-# ---- does it still hold? --------------------------------------------------------------------------------------------
+# ---- does it still hold, by photographs? (by observations: checks.py) --------------------------------------------
 
-LINE_POINTS = 100
 ALARMS = 0.01
 SMALL_TILT = Pose.looking(HOME.position, rotation_exp((np.deg2rad(0.05), 0.0, 0.0)) @ HOME.rotation)
 SMALL_SHIFT = Pose.looking(HOME.position + np.array([0.003, 0.0, 0.0]), HOME.rotation)
-
-
-def check_case(runs: int) -> Iterator[Row]:
-    """How often an unmoved camera is called moved, and small moves are found, from 100 line points."""
-    false = _alarms(HOME, 2 * runs, 0)
-    error = float(np.sqrt(ALARMS * (1.0 - ALARMS) / (2 * runs)))
-    yield Row("check", "false alarms at 1 %", false, error, 0.005, 0.02, f"{2 * runs} unmoved cases")
-    count = max(runs // 2, 1)
-    for what, pose in (("0.05 deg of tilt found", SMALL_TILT), ("3 mm at 4 m found", SMALL_SHIFT)):
-        found = _alarms(pose, count, 1)
-        error = float(np.sqrt(max(found * (1.0 - found), 0.01 / count) / count))
-        yield Row("check", what, found, error, least=0.99, note=f"{count} cases")
-
-
-def _alarms(pose: Pose, runs: int, kind: int) -> float:
-    """Share of cases in which the calibration is said not to hold, each with a calibration of its own."""
-    alarms = 0
-    for seed in range(runs):
-        simulation = seen(pose, DAY, 10_000 * (kind + 1) + seed, spacing_m=0.12)
-        observations = thinned(simulation.observations, (), LINE_POINTS, seed)
-        alarms += not check(calibrated(seed), observations, ALARMS).holds
-    return alarms / runs
-
-
-# ---- does it still hold, by photographs? ----------------------------------------------------------------------------
 
 BOARD = checkerboard(9, 6, 0.1)
 FIELD_SHOTS, BOARD_SHOTS, CHECKS = 2, 6, 10  # photographs that a calibration is made from, and checked with
@@ -387,7 +361,6 @@ def again_case(runs: int) -> Iterator[Row]:
 CASES: dict[str, Callable[[int], Iterator[Row]]] = {
     "moves": moves_case,
     "bound": bound_case,
-    "check": check_case,
     "photographs": photographs_case,
     "again": again_case,
     "time": time_case,

@@ -3,23 +3,29 @@
     python scripts/refit_after_move.py calibration.json new.json photograph.jpg   # these files, once
     python scripts/refit_after_move.py calibration.json --watch incoming/         # every file that appears there
 
-A file holds observations, or is a photograph in which the field is found from where the calibration has it.
-Every event is one line of JSON on standard output, or in --log: "holds", "refitted", "refused" (nothing was changed;
-the reason says what to do), "unreadable", or "folder" (the watched one has gone, or is back). Ctrl-C and SIGTERM end
-the watch when the file in hand is done. The calibration is replaced in one step, and the one before is kept in
-previous/ beside it. Exits with 0 when the calibration is right at the end, 3 when the last file was refused or could
-not be read.
+A file holds observations, or is a photograph in which the field is found from where the calibration has it. It asks
+twice before it acts: when a file says that a camera has moved, the calibration is "suspected", and only when the next
+one says so, too, it is refitted from that. In --checks checks (720: hourly for a month) an unmoved camera is refitted
+with a probability of --false-alarms at most, if errors of different files are independent of each other.
+Every event is one line of JSON on standard output, or in --log: "holds", "suspected", "refitted", "refused" (nothing
+was changed; the reason says what to do), "unreadable", or "folder" (the watched one has gone, or is back). With --log a
+suspicion lasts from one run to the next. Ctrl-C and SIGTERM end the watch when the file in hand is done. The
+calibration is replaced in one step, and the one before is kept in previous/ beside it. Exits with 0 when the
+calibration is right at the end, 3 when the last file raised a suspicion, was refused or could not be read.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
+import math
 import os
 import signal
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -35,9 +41,11 @@ from ceres_cal.moves.carried import WHAT
 from ceres_cal.photographs import check_photographs
 from ceres_cal.scene.heights import ROBOT_TOP_M
 
+SUSPICIOUS = ("suspected", "refused")  # of a file that was checked
 
-def handle(place: Path, source: Path, given: argparse.Namespace) -> dict[str, Any]:
-    """Check the calibration at `place` against a file, refit it where it does not hold; the event."""
+
+def handle(place: Path, source: Path, given: argparse.Namespace, suspected: bool) -> dict[str, Any]:
+    """Check the calibration at `place` against a file, refit it where it does not hold and was suspected; the event."""
     begin = time.perf_counter()
     event: dict[str, Any] = {"time": now(), "file": str(source)}
     try:
@@ -48,8 +56,12 @@ def handle(place: Path, source: Path, given: argparse.Namespace) -> dict[str, An
         old = cc.Calibration.load(place)
         found, observations = checked(old, source, content, given)
         event["check"] = told(found)
+        event["false_alarms"] = {"of_this_check": found.false_alarms, "refits": given.false_alarms, "in": given.checks}
         if found.holds:
             return {**event, "event": "holds", "seconds": round(time.perf_counter() - begin, 3)}
+        if not suspected:
+            reason = "; ".join(told(found).values())
+            return {**event, "event": "suspected", "reason": f"{reason}; asked again with the next file"}
         if observations is None:
             return {**event, "event": "refused", "reason": "; ".join(told(found).values())}
         new = cc.refit(old, observations, given.what)
@@ -81,9 +93,14 @@ def checked(
 ) -> tuple[Check, cc.Observations | None]:
     """The answer to a file, and its observations; None where a photograph shows no field."""
     if content is not None:
-        return cc.check(old, content, given.false_alarms), content
-    found, seen = check_photographs(old, [source], given.station, given.false_alarms)
+        return cc.check(old, content, level(given)), content
+    found, seen = check_photographs(old, [source], given.station, level(given))
     return found, seen.observations
+
+
+def level(given: argparse.Namespace) -> float:
+    """False alarms of one check such that two of them, one after the other, are as rare as asked for in all checks."""
+    return math.sqrt(float(given.false_alarms) / int(given.checks))
 
 
 def told(found: Check) -> dict[str, str]:
@@ -99,12 +116,30 @@ def keep(place: Path) -> Path:
     return copy
 
 
+def is_suspected(log: Path | None) -> bool:
+    """Whether the last file that was checked, by the log, was no longer explained by the calibration."""
+    lines = log.read_text(encoding="utf-8", errors="replace").splitlines() if log is not None and log.is_file() else []
+    for line in reversed(lines):
+        with suppress(ValueError):  # half a line of a run that was killed
+            event = json.loads(line)
+            if isinstance(event, dict) and "check" in event:
+                return event.get("event") in SUSPICIOUS
+    return False
+
+
 def events(given: argparse.Namespace) -> Iterator[dict[str, Any]]:
+    suspected = is_suspected(given.log)
+
     def answer(source: Path) -> dict[str, Any]:
+        nonlocal suspected
         try:
-            return handle(given.calibration, source, given)
+            event = handle(given.calibration, source, given, suspected)
         except Exception as error:  # a week of watching does not end with one odd file
-            return {"file": str(source), "event": "refused", "reason": f"unexpected {error!r}: please report it"}
+            reason = f"unexpected {error!r}: please report it"
+            return {"time": now(), "file": str(source), "event": "refused", "reason": reason}
+        if "check" in event:
+            suspected = event["event"] in SUSPICIOUS
+        return event
 
     yield from map(answer, given.files)
     if given.watch is not None:
@@ -149,7 +184,8 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument(
         "--what", default="pose", choices=WHAT, help="what is free in a refit, see `ceres-cal refit --help`"
     )
-    parser.add_argument("--false-alarms", type=float, default=FALSE_ALARMS, help="of each check (default 0.01)")
+    parser.add_argument("--false-alarms", type=float, default=FALSE_ALARMS, help="refits of nothing (default 0.01)")
+    parser.add_argument("--checks", type=int, default=720, help="in so many checks (default 720, hourly for a month)")
     parser.add_argument("--limit-mm", type=float, default=20.0, help="worst sigma at 150 mm still used (default 20)")
     parser.add_argument("--station", help="station that takes the photographs (default: the only one)")
     parser.add_argument("--log", type=Path, help="add the events to this file instead of printing them")
@@ -158,6 +194,8 @@ def main(arguments: Sequence[str]) -> int:
         parser.error(f"{given.calibration}: no such file")
     if given.watch is not None and not given.watch.is_dir():
         parser.error(f"{given.watch}: no such folder")
+    if not (0.0 < given.false_alarms < 1.0 and given.checks >= 1):
+        parser.error("--false-alarms must lie between 0 and 1, --checks must be 1 or more")
     if not given.files and given.watch is None:
         parser.error("name files of observations or photographs, or a folder to --watch")
     if not given.every_s > 0.0:

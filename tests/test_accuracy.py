@@ -77,7 +77,7 @@ def test_bound_by_differences() -> None:
     trial = limit.make_trial(problem, scenes.CLEAN_NOISE, 0)
     known = limit.bound(trial)
     keys, matrix = known.keys, known.matrix
-    sights = gather_sights(trial.clean)
+    sights = gather_sights(trial.clean, predicted=True)
     height = problem.priors[0].sigma[0]
 
     def misfit(step: Array) -> Array:

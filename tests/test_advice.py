@@ -84,7 +84,9 @@ def test_what_is_told_is_what_the_observations_would_tell(name: str) -> None:
             placements={**estimate.placements, **added.placements},
         )
         priors = gather_priors(seen, options, there.structure)
-        found = information(Problem(gather_sights(seen), make_layout(seen, options), priors, weighting), there).shared
+        found = information(
+            Problem(gather_sights(seen, predicted=True), make_layout(seen, options), priors, weighting), there
+        ).shared
         at = found.columns(ground.keys)
         if len(at) == len(found.keys):
             return found.given(ground.keys).matrix
@@ -158,7 +160,7 @@ def test_what_would_be_left_is_the_map_of_what_would_be_known(name: str) -> None
     ground = Ground(known.estimate, known.posterior.keys, calibration.targets, tolerances, weighting)
     for promise in first_of(advice).values():
         more = known.posterior.information + ground.information_of(promise.measurement)
-        there = Uncertainty(known.estimate, replace(known.posterior, information=more), calibration.targets)
+        there = Uncertainty(known.estimate, replace(known.posterior, information=more, bends=None), calibration.targets)
         expected = there.map_sd_mm(advice.station, 0.15)
         assert promise.after.worst_mm == pytest.approx(expected.worst_mm, rel=1e-6)
         assert promise.after.mean_mm == pytest.approx(expected.mean_mm, rel=1e-6)
@@ -180,12 +182,16 @@ def test_a_promise_is_kept(name: str) -> None:
         found = followed(promise.measurement, calibration, observed(name), scene, 7)
         stated = found.uncertainty.map_sd_mm(None, 0.15)
         worst, mean = promised_for(promise, found.cameras["overhead"].phi)
-        scale = found.fit.curve_scale / calibration.fit.curve_scale  # more observations find another noise
+        scale = _noise(found) / _noise(calibration)  # more observations find another noise, and another dependence
         limit = 0.05 if kind in ("tape", "board", "pole") else 0.1
         assert stated.worst_mm == pytest.approx(worst * scale, rel=limit), kind
         assert stated.mean_mm == pytest.approx(mean * scale, rel=limit), kind
         low, high = promise.worst_range_mm
         assert 0.9 * low * scale <= stated.worst_mm <= 1.1 * high * scale, kind
+
+
+def _noise(calibration: Calibration) -> float:
+    return calibration.fit.curve_scale * float(np.median(calibration.uncertainty.posterior.factors))
 
 
 def test_the_map_is_off_by_what_was_promised() -> None:
@@ -201,8 +207,8 @@ def test_the_map_is_off_by_what_was_promised() -> None:
             problem.scene,
         )
     figures = {row.what.split(": ")[1]: row.value for row in kept.rows("", "tape")}
-    assert figures["worst stated"] == pytest.approx(1.0, abs=0.02)  # 1.003
-    assert figures["mean stated"] == pytest.approx(1.0, abs=0.02)
+    assert figures["worst stated"] == pytest.approx(1.0, abs=0.04)  # 1.022
+    assert figures["mean stated"] == pytest.approx(1.0, abs=0.04)
     assert figures["worst in fact"] == pytest.approx(1.0, abs=0.4)
     assert figures["mean in fact"] == pytest.approx(1.0, abs=0.4)
     assert figures["in the range"] == 1.0
@@ -338,15 +344,15 @@ def test_the_command_says_what_to_do_first(file: str, capsys: pytest.CaptureFixt
     assert main(["advise", file, "--good-enough-mm", "0.1"]) == 0
     text = capsys.readouterr().out
     assert text.startswith(
-        "advice    measure the camera's height to 10 mm: the worst error at 150 mm falls from 66.2 to 2.2 mm"
+        "advice    measure the camera's height to 10 mm: the worst error at 150 mm falls from 118.6 to 2.3 mm"
     )
-    assert "today     station 'overhead' at 150 mm: worst 66.2 mm at (4.5, -3.0 m), mean 35.9 mm" in text
+    assert "today     station 'overhead' at 150 mm: worst 118.6 mm at (4.5, -3.0 m), mean 64.1 mm" in text
     assert "that is still more than the 0.1 mm asked for" in text
     assert "phi of 'overhead' and its height trade off" in text
     assert max(map(len, text.splitlines())) <= 130
-    assert main(["advise", file, "--good-enough-mm", "70"]) == 0
+    assert main(["advise", file, "--good-enough-mm", "120"]) == 0
     assert (
-        "nothing needs to be measured: the worst error at 150 mm is 66.2 mm, and 70 mm are" in capsys.readouterr().out
+        "nothing needs to be measured: the worst error at 150 mm is 118.6 mm, and 120 mm are" in capsys.readouterr().out
     )
 
 

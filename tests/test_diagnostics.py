@@ -20,13 +20,13 @@ from ceres_cal.calibration import Calibration
 from ceres_cal.cli import main
 from ceres_cal.detect.boards import BoardDetections
 from ceres_cal.diagnostics import Diagnosis, choose, cross_validate, diagnose
-from ceres_cal.diagnostics.equations import Equations, whole_structure, write_equations
-from ceres_cal.diagnostics.linear_model import Weights, make_linear_model
+from ceres_cal.model.equations import Equations, whole_structure, write_equations
 from ceres_cal.model.parameters import Options, intrinsics_vector, with_intrinsics
 from ceres_cal.model.residuals import residuals
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.observations.sights import gather_sights
 from ceres_cal.simulate import Disturbance, simulate
+from ceres_cal.solve.linear_model import Weights, make_linear_model
 
 PLAIN = Options(loss="trivial")
 

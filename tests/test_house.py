@@ -44,6 +44,8 @@ DOORS = {
     "cv2": {"detect", "simulate", "pictures", "formats"},
     "pycolmap": {"start", "formats"},
     "matplotlib": {"report"},
+    "google": {"formats"},  # protobuf
+    "yaml": {"formats"},
     "scipy": set(),  # for the tests only
 }
 

@@ -25,7 +25,7 @@ Document = dict[str, Any]
 
 
 def document() -> Document:
-    """The file of design, section 9, with the names that the targets have."""
+    """The file of docs/files.md, with the names that the targets have."""
     return {
         "format": "ceres-cal/observations",
         "version": 1,

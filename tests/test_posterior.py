@@ -14,6 +14,7 @@ from scipy.stats import t as student
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.spread import Spread
+from ceres_cal.base.tails import student_95
 from ceres_cal.base.transforms import Pose, left_jacobian, skew
 from ceres_cal.calibrating import calibrate
 from ceres_cal.model.keys import Key, pose_keys
@@ -29,7 +30,6 @@ from ceres_cal.solve.bundle import _Blocks
 from ceres_cal.solve.costs import Run, SightCost
 from ceres_cal.solve.prior_cost import PriorCost
 from ceres_cal.uncertainty import make_posterior
-from ceres_cal.uncertainty.posterior import student_95
 
 NOISE = Disturbance(points_sigma_px=0.3, curves_sigma_px=0.3)
 WEIGHTING = Weighting(0.3, 0.3, "cauchy", 3.0)  # a loss whose bend the blocks leave out, as the posterior does
@@ -223,7 +223,8 @@ def test_a_calibration_knows_how_well_it_is_known(noise_scale: str) -> None:
     told = calibrate(observations, Options(noise_scale="stated", loss="trivial", reject_sigma=50.0)).posterior
     found = calibrate(stated, Options(noise_scale=noise_scale, loss="trivial", reject_sigma=50.0))
     assert told is not None and found.posterior is not None
-    ratio = found.posterior.sd / told.sd
+    assert found.posterior.by_model is not None and told.by_model is not None
+    ratio = found.posterior.by_model.spread.sd / told.by_model.spread.sd
     assert ratio == pytest.approx(np.full(11, 0.25 * found.fit.curve_scale), rel=1e-3)
     assert (found.posterior.degrees_of_freedom < np.inf) == (noise_scale == "estimate")
 

@@ -38,21 +38,39 @@ def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, li
 def test_one_file_after_the_other(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     calibration = place / "calibration.json"
     before = calibration.read_bytes()
-    names = ["same.json", "mirrored.json", "after.json", "after.json", "broken.json"]
+    names = ["same.json", "mirrored.json", "mirrored.json", "after.json", "after.json", "broken.json"]
     code, events = run(capsys, calibration, *(place / name for name in names))
-    assert [event["event"] for event in events] == ["holds", "refused", "refitted", "holds", "unreadable"]
+    kinds = ["holds", "suspected", "refused", "refitted", "holds", "unreadable"]
+    assert [event["event"] for event in events] == kinds
     assert code == 3  # of the last one
-    assert "mirrored labels" in str(events[1]["reason"]) and "not valid JSON" in str(events[4]["reason"])
-    assert Path(str(events[2]["kept"])).read_bytes() == before
+    assert "mirrored labels" in str(events[2]["reason"]) and "not valid JSON" in str(events[5]["reason"])
+    assert Path(str(events[3]["kept"])).read_bytes() == before
     after = Calibration.load(calibration)
     assert after.refitted is not None
     assert check(after, seen(MOVED, NOISE, 5).observations).holds
 
 
+def test_it_asks_twice(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """One file changes nothing; what is to be rare in all checks is rare in two of them, one after the other."""
+    calibration, log = place / "calibration.json", place / "events.jsonl"
+    before = calibration.read_bytes()
+    code, events = run(capsys, calibration, place / "after.json", place / "same.json", place / "after.json")
+    assert [event["event"] for event in events] == ["suspected", "holds", "suspected"] and code == 3
+    assert calibration.read_bytes() == before and "asked again" in str(events[0]["reason"])
+    stated = events[0]["false_alarms"]
+    assert isinstance(stated, dict) and stated["refits"] == 0.01 and stated["in"] == 720
+    assert 720 * stated["of_this_check"] ** 2 == pytest.approx(0.01)
+    for _ in range(2):  # two runs, with a log between them
+        assert run(capsys, calibration, place / "after.json", "--log", log)[1] == []
+    kinds = [json.loads(line)["event"] for line in log.read_text().splitlines()]
+    assert kinds == ["suspected", "refitted"]
+
+
 def test_what_is_known_too_little_is_not_used(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before = (place / "calibration.json").read_bytes()
-    code, events = run(capsys, place / "calibration.json", place / "after.json", "--limit-mm", 0.1)
-    assert code == 3 and events[0]["event"] == "refused" and "asked for are 0.1 mm" in str(events[0]["reason"])
+    files = [place / "after.json"] * 2
+    code, events = run(capsys, place / "calibration.json", *files, "--limit-mm", 0.1)
+    assert code == 3 and events[1]["event"] == "refused" and "asked for are 0.1 mm" in str(events[1]["reason"])
     assert (place / "calibration.json").read_bytes() == before and not (place / "previous").exists()
 
 
@@ -67,14 +85,14 @@ def test_a_folder_is_watched(place: Path) -> None:
         time.sleep(0.5)
         (incoming / "new.json").write_bytes((place / "after.json").read_bytes())
         deadline = time.monotonic() + 120.0  # kernels may have to be compiled first
-        while time.monotonic() < deadline and not (log.exists() and log.read_text().endswith("\n")):
+        while time.monotonic() < deadline and not (log.exists() and log.read_text().count("\n") >= 2):
             (incoming / "new.json").touch()  # it may have come before the watch began
             time.sleep(0.3)
         events = [json.loads(line) for line in log.read_text().splitlines()]
     finally:
         process.send_signal(signal.SIGINT)
         assert process.wait(120) in (0, -signal.SIGINT)
-    assert events[0]["event"] == "refitted"
+    assert [event["event"] for event in events[:2]] == ["suspected", "refitted"]
 
 
 def test_a_killed_refit_leaves_a_whole_calibration(place: Path) -> None:

@@ -290,7 +290,8 @@ def test_scenes_of_a_centimetre_and_of_kilometres(scale: float, phi: float) -> N
     """9 mm and 9 km wide: the truth within 1.7 sd; pytest turns warnings of NumPy into errors."""
     field = ssl_field("B")
     points = {name: (scale * x, scale * y, 0.0) for name, (x, y, _) in field.points.items()}
-    camera = Camera((round(1.5 * phi), round(1.1 * phi)), phi, (0.75 * phi, 0.55 * phi), Radial((0.0, 0.0)))
+    centre = (0.75 * phi - 0.5, 0.55 * phi - 0.5)  # where it is held
+    camera = Camera((round(1.5 * phi), round(1.1 * phi)), phi, centre, Radial((0.0, 0.0)))
     pose = overhead_pose(-0.5 * scale, -1.2 * scale, 6.0 * scale, -14.0, -11.5, 4.0)
     scene = field_scene(custom(points), {"c": camera}, {"c": Station("c", pose)})
     noise_px = 1e-4 * phi

@@ -23,10 +23,11 @@ from ceres_cal.base.words import at_precision, short
 from ceres_cal.cli import main
 from ceres_cal.diagnostics import diagnose
 from ceres_cal.report import make_report
-from ceres_cal.report.grounds import level_of, worst
+from ceres_cal.report.grounds import judge_quality, level_of, worst
 from ceres_cal.report.lens_picture import ideal_radii
 from ceres_cal.report.maps import levels_of
 from ceres_cal.report.material import Material
+from ceres_cal.report.quality import quality_of
 from ceres_cal.report.residual_pictures import significant_means
 from ceres_cal.report.verdict import verdict_chapter
 from ceres_cal.scene.lens import Radial
@@ -199,10 +200,41 @@ def test_a_frontal_view_is_trusted_on_the_floor_alone() -> None:
 def test_a_wrong_model_is_never_simply_trusted() -> None:
     observations = sample()[1]
     page = make_report(calibrate(observations, Options(powers=(3,))), observations)
-    assert headline(page).startswith("care: Use it with care: ")
-    assert "but the model is wrong by" in headline(page) and "No standard deviation on this page contains that" in page
+    assert headline(page).startswith("care: Use it with care, no accuracy can be stated: the model is wrong by ")
+    assert "No standard deviation on this page contains that" in page
     cards = re.findall(r'<article class="card (\w+)"><h3>(.*?)</h3>', page)
     assert cards[0][0] == "no" and "residuals follow the radius" in cards[0][1]
+
+
+def test_no_accuracy_is_stated_where_the_noise_is_three_times_the_stated_one() -> None:
+    observations = sample()[1]
+    points, curves = observations.points, observations.curves
+    stated = replace(
+        observations,
+        points=replace(points, sigma_px=points.sigma_px / 3.5),
+        curves=replace(curves, sigma_px=curves.sigma_px / 3.5),
+    )
+    judged = judge_quality(quality_of(calibrate(stated), stated))
+    assert judged.level == "care"
+    assert judged.headline == "Use it with care, no accuracy can be stated: the noise is 3.5 times what was stated."
+
+
+def test_very_many_observations_are_diagnosed_by_a_sample() -> None:
+    calibration, observations = sample()
+    assert quality_of(calibration, observations).diagnosis is not None
+    views = [replace(view, frame=f"{view.frame} {n}") for n in range(4) for view in observations.views]
+    rng, count = np.random.default_rng(0), len(observations.views)
+    copies = [
+        type(column)(
+            **{name: np.concatenate([values] * 4) for name, values in vars(column).items()}
+            | {"view": np.concatenate([column.view + n * count for n in range(4)])}
+            | {"pixels": np.concatenate([column.pixels] * 4) + rng.normal(0.0, 1e-3, (4 * len(column), 2))}
+        )
+        for column in (observations.points, observations.curves)
+    ]
+    many = Observations(observations.targets, observations.cameras, tuple(views), *copies)  # type: ignore[arg-type]
+    few = quality_of(calibration, many).diagnosis
+    assert few is not None and few.new_data and 1000 < len(few.table) <= 5_500 < 4 * 2271
 
 
 def test_boards_alone_tell_no_places() -> None:
@@ -250,16 +282,6 @@ def test_new_data_tell_a_camera_that_was_bumped(turned_deg: float, found: str) -
     page = make_report(calibration, observations, diagnose(calibration, observations, new_data=True))
     assert headline(page).startswith(found)
     assert ("would move it by" in page) == (turned_deg > 0.0)
-
-
-def test_neighbours_that_agree_make_every_sigma_larger() -> None:
-    calibration, observations = sample()
-    found = diagnose(calibration, observations)
-    noise = tuple(replace(one, effective=one.observations / 4.0) for one in found.noise)
-    agree = replace(found.findings[0], kind="correlated")
-    chapter = verdict_chapter(Material(calibration, observations, replace(found, findings=(agree,), noise=noise)))
-    assert chapter.level == "care"
-    assert "take every standard deviation 2 times as large" in "".join(piece.html() for piece in chapter.pieces)
 
 
 # ---- what is drawn --------------------------------------------------------------------------------------------------

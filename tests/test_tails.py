@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from ceres_cal.base.tails import log_binomial_tail, log_chi2_tail, log_f_tail, upper_tail
+from ceres_cal.base.tails import log_binomial_tail, log_chi2_tail, log_f_tail, quadratic_tail, upper_tail
 
 
 @pytest.mark.parametrize("degrees", [1, 2, 6, 7, 14])
@@ -61,3 +61,17 @@ def test_many_at_once_are_as_each_alone() -> None:
         assert together.shape == (4, 3)
         alone = [[float(tail(value, freedom)) for freedom in freedoms] for value in values[:, 0]]
         np.testing.assert_allclose(together, alone, rtol=1e-13)
+
+
+@pytest.mark.parametrize("freedom", [np.inf, 60.0])
+def test_quadratic_tails(freedom: float) -> None:
+    """Against a central and a noncentral variable of scipy's, and a sum of unlike ones that is drawn."""
+    one = np.ones(5)
+    expected = stats.chi2.sf(15.0, 5) if np.isinf(freedom) else stats.f.sf(3.0, 5, freedom)
+    assert quadratic_tail(15.0, one, 0.0 * one, freedom) == pytest.approx(float(expected), rel=0.02)  # 1e-5; 0.3 %
+    shifted = stats.ncx2.sf(30.0, 5, 5.0) if np.isinf(freedom) else stats.ncf.sf(6.0, 5, freedom, 5.0)
+    assert quadratic_tail(30.0, one, one, freedom) == pytest.approx(float(shifted), rel=0.15)
+    assert quadratic_tail(1.0, one[:0], one[:0], freedom) == 1.0
+    rng, variances, squares = np.random.default_rng(0), np.array([0.2, 0.6, 1.0]), np.array([2.0, 1.0, 0.0])
+    drawn = np.sum((np.sqrt(variances) * rng.standard_normal((200_000, 3)) + np.sqrt(squares)) ** 2, axis=1)
+    assert quadratic_tail(14.0, variances, squares) == pytest.approx(float(np.mean(drawn > 14.0)), rel=0.1)

@@ -1,28 +1,42 @@
-"""The steps, in order: initialise, solve, reject, solve, assess."""
+"""The steps, in order: initialise, solve, reject, solve, let explanations compete, assess."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array
-from ceres_cal.base.errors import SolutionError
+from ceres_cal.base.errors import CalibrationError, DegenerateError, SolutionError
 from ceres_cal.base.threads import at_most, meanwhile, single_threaded_blas
 from ceres_cal.base.words import bounds_text
-from ceres_cal.calibration import Calibration, Fit, Rejected
-from ceres_cal.model.parameters import Layout, Options, make_layout
+from ceres_cal.calibration import COPY, Calibration, Fit, Rejected
+from ceres_cal.model.parameters import Estimate, Layout, Options, make_layout
 from ceres_cal.model.priors import gather_priors
+from ceres_cal.model.quantities import difference
 from ceres_cal.model.residuals import residuals
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import gather_sights
-from ceres_cal.solve import Problem, Progress, RobustSolution, Solution, information, solve_robustly
+from ceres_cal.solve import (
+    Conflicts,
+    Problem,
+    Progress,
+    ReducedInformation,
+    RobustSolution,
+    Solution,
+    find_conflicts,
+    information,
+    solve_robustly,
+)
+from ceres_cal.solve.competing import compete
+from ceres_cal.solve.conflicts import contradicted_by
+from ceres_cal.solve.explanation import Explanation
 from ceres_cal.solve.noise import Inliers, visible_from
 from ceres_cal.solve.possible import require_possible
 from ceres_cal.start.baseline import four_point_baseline
 from ceres_cal.start.initialise import Start, initialise
-from ceres_cal.uncertainty import Posterior, Uncertainty, assess
+from ceres_cal.uncertainty import Posterior, Scatter, Uncertainty, assess, measure_scatter
 
 # Of the image's diagonal, 24 px of 1600: half of a camera's observations farther off is no calibration, while a lens
 # that is too simple stays below a few pixels. Nothing changes from half to double.
@@ -32,6 +46,10 @@ _OFF_CENTRE = 0.15
 _UNKNOWN = (
     "camera {!r}: its views are too frontal to tell phi, which is {} at 95 %, and its heights go with phi: the floor "
     "is right, what is above it is not: add boards tilted by 20 degrees, or a prior on height_m where it sees the field"
+)
+_OTHERWISE = (
+    "no calibration agrees with what was stated beforehand, though the observations make one without it: check the "
+    "priors and their units"
 )
 
 
@@ -52,14 +70,45 @@ def calibrate(
     """
     options = options or Options()
     with single_threaded_blas(), at_most(options.threads):
-        observations.require_inside()
-        sights, layout = gather_sights(observations), make_layout(observations, options)
-        start = initialise(observations, sights, options)
-        priors = gather_priors(observations, options, start.estimate.structure)
-        problem = Problem(sights, layout, priors, options=options)
-        if options.closed_form_only:
-            return _closed_form(start, observations, problem)
-        return solved_from(start, observations, problem, progress=progress)
+        try:
+            return _calibrated(observations, options, progress)
+        except (DegenerateError, SolutionError):
+            free = _without_priors(observations, options)
+            if free is None:
+                raise
+            words = _contradicted(observations, options, free)
+            raise SolutionError(words or _OTHERWISE) from None
+
+
+def _calibrated(
+    observations: Observations, options: Options, progress: Callable[[Progress], None] | None = None
+) -> Calibration:
+    """See `calibrate`."""
+    observations.require_inside()
+    sights, layout = gather_sights(observations), make_layout(observations, options)
+    start = initialise(observations, sights, options)
+    priors = gather_priors(observations, options, start.estimate.structure)
+    problem = Problem(sights, layout, priors, options=options)
+    if options.closed_form_only:
+        return _closed_form(start, observations, problem)
+    return solved_from(start, observations, problem, progress=progress)
+
+
+def _without_priors(observations: Observations, options: Options) -> Calibration | None:
+    """None where nothing was stated, or the observations make no calibration by themselves either."""
+    if not (observations.priors or options.priors):
+        return None
+    try:
+        return _calibrated(replace(observations, priors=()), replace(options, priors=()))
+    except CalibrationError:
+        return None
+
+
+def _contradicted(observations: Observations, options: Options, free: Calibration) -> str | None:
+    """What the priors that no calibration came out of contradict, when one comes out without them."""
+    stated = gather_priors(observations, options, free.estimate.structure)
+    posterior = free.uncertainty.posterior
+    return contradicted_by(stated, free.estimate, posterior.information, posterior.degrees_of_freedom)
 
 
 @dataclass(frozen=True)
@@ -84,7 +133,7 @@ def solved_from(
     again: Again | None = None,
     progress: Callable[[Progress], None] | None = None,
 ) -> Calibration:
-    """Solve, reject, solve, assess, from a start.
+    """Solve, reject, solve, let explanations compete, assess, from a start.
 
     Raises:
         CalibrationError: see `calibrate`.
@@ -92,17 +141,24 @@ def solved_from(
     digest = meanwhile(lambda: observations.digest)
     usual = again.scales if again else None
     end = solve_robustly(problem, observations, start.estimate, usual, progress)
+
+    def solved(others: Problem) -> RobustSolution:
+        return solve_robustly(others, observations, _start_of(others, problem, observations, start, again), usual)
+
+    end, explanations = compete(problem, observations, end, solved)
     _require_fits(end, problem)
     require_possible(observations, problem.sights, end.solution.estimate, end.residuals)
-    warnings: tuple[str, ...] = ()
-    posterior = None
+    warnings = tuple(one.warning for one in explanations)
+    posterior, conflicts = None, Conflicts()
     if again is None or again.assessed:
+        conflicts = find_conflicts(problem, observations, end, usual)
         end, posterior = _assess(end, observations, problem, again)
-        warnings = tuple(_unknown(end, posterior))
+        posterior = _with_doubts(posterior.in_doubt(conflicts.keys, conflicts.shifts), end, explanations)
+        warnings = (*warnings, *(one.words for one in conflicts.every), *_unknown(end, posterior))
     digest.result()  # which the observations remember
-    calibration = _calibration(start, observations, problem, end)
-    warnings = (*calibration.warnings, *_require_usable(end, problem), *warnings)
-    return replace(calibration, warnings=warnings, posterior=posterior)
+    calibration = _calibration(start, observations, problem, end, explanations)
+    warnings = (*calibration.warnings, *_require_usable(end, problem, explanations), *warnings)
+    return replace(calibration, warnings=warnings, posterior=posterior, conflicts=conflicts.every)
 
 
 def _closed_form(start: Start, observations: Observations, problem: Problem) -> Calibration:
@@ -115,13 +171,19 @@ def _closed_form(start: Start, observations: Observations, problem: Problem) -> 
     return _calibration(start, observations, problem, end)
 
 
-def _calibration(start: Start, observations: Observations, problem: Problem, end: RobustSolution) -> Calibration:
+def _calibration(
+    start: Start,
+    observations: Observations,
+    problem: Problem,
+    end: RobustSolution,
+    explanations: Sequence[Explanation] = (),
+) -> Calibration:
     """What came out, not assessed."""
     return Calibration(
         end.solution.estimate,
         observations.targets,
         _fit(end, problem.layout),
-        _rejected(observations, end.inliers),
+        _rejected(observations, end.inliers, explanations),
         end.solution.termination,
         end.solution.converged,
         end.rounds,
@@ -144,8 +206,30 @@ def _assess(
     estimate = end.solution.estimate
     reduced = end.reduced if again is None else None
     reduced = reduced or information(known, estimate)
-    assessed, posterior = assess(known, estimate, reduced, end.inliers.degrees_of_freedom)
+
+    def scatter_at(there: Estimate, says: ReducedInformation) -> Scatter | None:
+        at_end = there is estimate
+        found = end.residuals if at_end else residuals(observations, known.sights, there, end.residuals.feet)
+        return measure_scatter(observations, known, found, there, says)
+
+    assessed, posterior = assess(known, estimate, reduced, end.inliers.degrees_of_freedom, scatter_at)
     return (end if assessed is estimate else end.moved_to(assessed, observations, problem)), posterior
+
+
+def _start_of(
+    others: Problem, problem: Problem, observations: Observations, start: Start, again: Again | None
+) -> Estimate:
+    """A start for some of the observations that the rest had no part in; the one there is where it was known before."""
+    if again is not None or set(others.sights.keys) != set(problem.sights.keys):
+        return start.estimate
+    return initialise(observations, others.sights, problem.options).estimate
+
+
+def _with_doubts(posterior: Posterior, end: RobustSolution, explanations: Sequence[Explanation]) -> Posterior:
+    """The posterior with what the less probable explanations say in it."""
+    doubtful = [one for one in explanations if one.is_doubtful]
+    shifts = [one.doubt**0.5 * difference(one.other, end.solution.estimate, posterior.keys) for one in doubtful]
+    return posterior.in_doubt(posterior.keys, shifts)
 
 
 def _unknown(end: RobustSolution, posterior: Posterior) -> Iterator[str]:
@@ -177,7 +261,7 @@ def _require_fits(end: RobustSolution, problem: Problem) -> None:
             )
 
 
-def _require_usable(end: RobustSolution, problem: Problem) -> tuple[str, ...]:
+def _require_usable(end: RobustSolution, problem: Problem, explanations: Sequence[Explanation]) -> tuple[str, ...]:
     """Warnings about the solution; SolutionError where it must not be used."""
     warnings = []
     for name, camera in end.solution.estimate.cameras.items():
@@ -202,12 +286,15 @@ def _require_usable(end: RobustSolution, problem: Problem) -> tuple[str, ...]:
             f"{where}: from there to the corner ({corner:.0f} px) pixels have no answer; "
             f"observations reach {farthest:.0f} px"
         )
-    return (*warnings, *_lost(end.inliers, problem))
+    return (*warnings, *_lost(end.inliers, problem, explanations))
 
 
-def _lost(inliers: Inliers, problem: Problem) -> Iterator[str]:
-    """Sights most of whose observations were taken out: they were not understood, whatever the rest says."""
-    shares = problem.sights.used_share(inliers.points, inliers.curves)
+def _lost(inliers: Inliers, problem: Problem, explanations: Sequence[Explanation]) -> Iterator[str]:
+    """Sights most of whose observations were taken out one by one: they were not understood, whatever the rest says."""
+    used = np.concatenate([inliers.points, inliers.curves])
+    for one in explanations:
+        used |= one.rows & one.is_taken
+    shares = problem.sights.used_share(used[: len(inliers.points)], used[len(inliers.points) :])
     for number in np.flatnonzero(shares < 0.5):
         out = f"{100.0 * (1.0 - shares[number]):.0f} % of its observations were taken out"
         yield f"{problem.sights.keys[number]}: {out}: check its labels, do not use its pose"
@@ -238,14 +325,20 @@ def _rms(values: Array) -> float:
     return float(np.sqrt(values @ values / max(len(values), 1)))
 
 
-def _rejected(observations: Observations, inliers: Inliers) -> tuple[Rejected, ...]:
-    entries = []
-    for kind, mask, sigmas, column in (
-        ("point", inliers.points, inliers.point_sigmas, observations.points),
-        ("curve", inliers.curves, inliers.curve_sigmas, observations.curves),
+def _rejected(
+    observations: Observations, inliers: Inliers, explanations: Sequence[Explanation]
+) -> tuple[Rejected, ...]:
+    wholes = [one for one in explanations if one.is_taken]
+    entries, views, copies = [], observations.views, observations.copies
+    for kind, mask, sigmas, column, copy_of, first in (
+        ("point", inliers.points, inliers.point_sigmas, observations.points, copies.points, 0),
+        ("curve", inliers.curves, inliers.curve_sigmas, observations.curves, copies.curves, len(observations.points)),
     ):
         for row in np.flatnonzero(~mask):
             reason = f"{sigmas[row]:.1f} sigma off" if np.isfinite(sigmas[row]) else "cannot be seen from there"
-            frame = observations.views[column.view[row]].frame
+            reason = next((one.words for one in wholes if one.rows[first + row]), reason)
+            if copy_of[row] >= 0:
+                reason = f"{COPY} of frame {views[copy_of[row]].frame!r}"
+            frame = views[column.view[row]].frame
             entries.append(Rejected(kind, int(row), frame, observations.feature_name(kind, int(row)), reason))
     return tuple(entries)

@@ -89,7 +89,7 @@ class Ground:
         lenses = {name: camera.lens for name, camera in estimate.cameras.items()}
         stated = (stated_prior(prior, lenses[estimate.stations[prior.name].camera]) for prior in measurement.priors)
         priors = (*stated, *tolerances(estimate.structure, self.keys))
-        problem = Problem(gather_sights(observations), layout, priors, self.weighting)
+        problem = Problem(gather_sights(observations, predicted=True), layout, priors, self.weighting)
         return information(problem, estimate).shared.marginal(self.keys)
 
     def _with(self, measurement: Measurement, targets: Mapping[str, Target]) -> Estimate:

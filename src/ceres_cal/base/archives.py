@@ -32,39 +32,54 @@ def read_npz(content: bytes, columns: Mapping[str, Column], where: str) -> dict[
         InputError: no NPZ file, cut short, pickled objects, a column that is missing, unknown, there twice, too large,
             or of another type or shape.
     """
-    try:
-        with zipfile.ZipFile(io.BytesIO(content)) as archive, warnings.catch_warnings(action="ignore"):
-            arrays = {name: _column(archive, name, columns[name], where) for name in _names(archive, columns, where)}
-    except InputError:
-        raise
-    except Exception as error:  # zipfile, zlib, lzma and NumPy raise a dozen kinds for a broken archive
-        raise InputError(f"{where}: cannot be read, it is cut short or no NPZ file ({error}): write it again") from None
+    arrays = _read(content, columns, where)
     _require_fitting(arrays, columns, where)
     return arrays
 
 
-def _names(archive: zipfile.ZipFile, columns: Mapping[str, Column], where: str) -> list[str]:
+def read_foreign_npz(content: bytes, where: str) -> dict[str, AnyArray]:
+    """The columns of an NPZ file that others wrote, whatever they are.
+
+    Raises:
+        InputError: no NPZ file, cut short, pickled objects, a column that is there twice, or too large.
+    """
+    return _read(content, None, where)
+
+
+def _read(content: bytes, columns: Mapping[str, Column] | None, where: str) -> dict[str, AnyArray]:
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive, warnings.catch_warnings(action="ignore"):
+            names = _names(archive, columns, where)
+            return {name: _column(archive, name, None if columns is None else columns[name], where) for name in names}
+    except InputError:
+        raise
+    except Exception as error:  # zipfile, zlib, lzma and NumPy raise a dozen kinds for a broken archive
+        raise InputError(f"{where}: cannot be read, it is cut short or no NPZ file ({error}): write it again") from None
+
+
+def _names(archive: zipfile.ZipFile, columns: Mapping[str, Column] | None, where: str) -> list[str]:
     names = [entry.filename.removesuffix(".npy") for entry in archive.infolist()]
     for name in names:
-        if name not in columns:
+        if columns is not None and name not in columns:
             raise InputError(f"{where}: unknown column {name[:100]!r}")
     if len(set(names)) < len(names):
         raise InputError(f"{where}: a column is there twice: write it again")
-    for name in columns:
+    for name in columns or ():
         if name not in names:
             raise InputError(f"{where}: column {name} is missing: is this another kind of file?")
     require_room(sum(entry.file_size for entry in archive.infolist()), where)
     return names
 
 
-def _column(archive: zipfile.ZipFile, name: str, column: Column, where: str) -> AnyArray:
+def _column(archive: zipfile.ZipFile, name: str, column: Column | None, where: str) -> AnyArray:
     """One column: its header first, then as many bytes as that says."""
     entry = next(entry for entry in archive.infolist() if entry.filename.removesuffix(".npy") == name)
     with archive.open(entry) as stream:
         shape, in_columns, dtype = _header(stream)
         if dtype.hasobject:
             raise InputError(f"{where}: cannot be read, it holds pickled objects: write it again")
-        _require_type(name, dtype, shape, column, where)
+        if column is not None:
+            _require_type(name, dtype, shape, column, where)
         size = math.prod(shape) * dtype.itemsize
         data = stream.read() if size == entry.file_size - stream.tell() else b""
     if size != len(data):

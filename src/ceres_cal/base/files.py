@@ -16,7 +16,7 @@ import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import msgspec
 
@@ -24,6 +24,11 @@ from ceres_cal.base.errors import InputError
 from ceres_cal.base.written import note
 
 T = TypeVar("T")
+Units = Literal["metres, radians, pixels"]
+PixelOrigin = Literal["centre of the top-left pixel"]
+UNITS: Units = "metres, radians, pixels"
+PIXEL_ORIGIN: PixelOrigin = "centre of the top-left pixel"
+"""What files of ours state, and are refused for where they state anything else."""
 
 LIMIT = "CERES_CAL_MOST_MB"
 _MOST_MB = 512  # 10 million observations in an NPZ file, one million in JSON, a photograph of 500 megapixels in grey

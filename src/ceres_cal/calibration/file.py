@@ -1,4 +1,4 @@
-"""Calibrations in JSON files (design, section 9): every number comes back exactly."""
+"""Calibrations in JSON files (docs/files.md): every number comes back exactly."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 
 from ceres_cal.base.errors import InputError, naming
-from ceres_cal.base.files import convert
+from ceres_cal.base.files import PixelOrigin, Units, convert
 from ceres_cal.base.transforms import euler_from_rotation, rotation_from_euler
 from ceres_cal.calibration.origin import Fit, Refitted, Rejected
 from ceres_cal.model.keys import Key
@@ -20,6 +20,7 @@ from ceres_cal.model.structure import EXACT, make_structure
 from ceres_cal.observations import prior_from_json, prior_to_json
 from ceres_cal.scene.files import CameraFile, Matrix, PoseFile, Vector, rotation_of
 from ceres_cal.scene.targets import Target
+from ceres_cal.solve import Conflict
 from ceres_cal.uncertainty import PosteriorFile, information_from, lower_triangle
 
 FORMAT, VERSION = "ceres-cal/calibration", 1
@@ -27,18 +28,20 @@ _ALIKE = 1e-5  # somebody who edits a file rounds
 
 
 class StationFile(PoseFile, forbid_unknown_fields=True):
-    """A station; position and Euler angles (the paper's) are there for people."""
+    """A station; position, Euler angles and H of the floor (the paper's) are there for people and other programs."""
 
     camera: str
     position_m: Vector
     euler_rad: Vector
+    homography: Matrix | msgspec.UnsetType = msgspec.UNSET
 
     @classmethod
     def of_station(cls, station: Station) -> StationFile:
         """As a file has it."""
         pose = station.cam_from_world
         rotation, translation, position = (part.tolist() for part in (pose.rotation, pose.translation, pose.position))
-        return cls(rotation, translation, station.camera, position, euler_from_rotation(pose.rotation))
+        homography = np.column_stack([pose.rotation[:, :2], pose.translation]).tolist()
+        return cls(rotation, translation, station.camera, position, euler_from_rotation(pose.rotation), homography)
 
     def station(self) -> Station:
         """The station; InputError where what is there for people says something else than the pose."""
@@ -107,8 +110,8 @@ class CalibrationFile(msgspec.Struct, forbid_unknown_fields=True):
 
     format: str
     version: int
-    units: str
-    pixel_origin: str
+    units: Units
+    pixel_origin: PixelOrigin
     cameras: dict[str, CameraFile]
     stations: dict[str, StationFile]
     placements: dict[str, PoseFile]
@@ -127,6 +130,8 @@ class CalibrationFile(msgspec.Struct, forbid_unknown_fields=True):
     versions: dict[str, str]
     posterior: PosteriorFile | None = None
     refitted: RefittedFile | None = None
+    conflicts: tuple[Conflict, ...] = ()
+    notes: dict[str, Any] | msgspec.UnsetType = msgspec.UNSET
 
     def estimate(self, targets: Mapping[str, Target], options: Options) -> Estimate:
         """Cameras, stations, placements and the targets as built; InputError where one does not fit the others."""

@@ -8,6 +8,9 @@ from importlib.metadata import PackageNotFoundError, version
 
 from ceres_cal.model.priors import GaussianPrior
 
+COPY = "a copy"
+"""How the reason begins of an observation that repeats another one, and was not taken out for its residual."""
+
 
 @dataclass(frozen=True)
 class Rejected:
@@ -18,6 +21,11 @@ class Rejected:
     frame: str
     feature: str
     reason: str
+
+    @property
+    def is_of_whole(self) -> bool:
+        """Whether it was taken out with all others of its line, frame or placement; the reason then says which."""
+        return self.reason.startswith("the whole of ")
 
 
 @dataclass(frozen=True)

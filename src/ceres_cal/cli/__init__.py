@@ -15,6 +15,7 @@ from ceres_cal.base.errors import CalibrationError, InputError, SolutionError
 from ceres_cal.base.words import first_of
 from ceres_cal.base.written import noting
 from ceres_cal.cli.advise import COMMANDS as ADVISE
+from ceres_cal.cli.audit import COMMANDS as AUDIT
 from ceres_cal.cli.calibrate import COMMANDS as CALIBRATE
 from ceres_cal.cli.check import COMMANDS as CHECK
 from ceres_cal.cli.command import Command, print_answer
@@ -24,6 +25,7 @@ from ceres_cal.cli.detect_field import COMMANDS as DETECT_FIELD
 from ceres_cal.cli.detect_rings import COMMANDS as DETECT_RINGS
 from ceres_cal.cli.diagnose import COMMANDS as DIAGNOSE
 from ceres_cal.cli.export import COMMANDS as EXPORT
+from ceres_cal.cli.foreign import COMMANDS as FOREIGN
 from ceres_cal.cli.locate import COMMANDS as LOCATE
 from ceres_cal.cli.program import TERMINATED, Terminated, as_a_program, ended
 from ceres_cal.cli.refit import COMMANDS as REFIT
@@ -33,8 +35,8 @@ from ceres_cal.cli.undistort import COMMANDS as UNDISTORT
 
 _GROUPS = (
     *(DETECT_BOARD, DETECT_RINGS, DETECT_FIELD),
-    *(CALIBRATE, DIAGNOSE, ADVISE, REFIT, CHECK, COMPARE),
-    *(LOCATE, UNDISTORT, EXPORT, SIMULATE, TARGETS),
+    *(CALIBRATE, DIAGNOSE, ADVISE, REFIT, CHECK, COMPARE, AUDIT),
+    *(LOCATE, UNDISTORT, EXPORT, FOREIGN, SIMULATE, TARGETS),
 )
 COMMANDS = {command.name: command for group in _GROUPS for command in group}
 _BEGINNINGS = {"", *(name.partition(" ")[0] for name in COMMANDS if " " in name)}
@@ -101,8 +103,9 @@ def _fail(message: str, exit_code: int, as_json: bool) -> int:
 
 
 def _run(arguments: list[str]) -> int:
-    if arguments[-1:] in (["-h"], ["--help"]) and " ".join(arguments[:-1]) in _BEGINNINGS:
-        print(_overview(" ".join(arguments[:-1])))
+    beginning = " ".join(arguments[:-1])
+    if arguments[-1:] in (["-h"], ["--help"]) and beginning in _BEGINNINGS and beginning not in COMMANDS:
+        print(_overview(beginning))
         return 0
     if arguments[:1] == ["--version"]:
         from ceres_cal.calibration import package_versions
@@ -117,7 +120,7 @@ def _run(arguments: list[str]) -> int:
 
 
 def _choose(arguments: list[str]) -> tuple[Command, list[str]]:
-    for words in (1, 2):
+    for words in (2, 1):
         command = COMMANDS.get(" ".join(arguments[:words]))
         if command is not None:
             return command, arguments[words:]

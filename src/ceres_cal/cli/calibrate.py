@@ -126,15 +126,16 @@ def _run(args: Namespace) -> Answer:
         if next(CACHE_FOLDER.rglob("*.nbi"), None) is None:
             bar.say("compiling the kernels (first run only)")
         from ceres_cal.calibrating import calibrate
+        from ceres_cal.report.quality import quality_of
 
         calibration = calibrate(observations, options, _solve_progress(bar, options.max_iterations))
         if args.report is not None:
             bar.update(0, 1, "drawing the report")
         page = report_page(args, calibration, observations, photographs)
+        quality = quality_of(calibration, observations)
     write_results(args, calibration.save, page)
     return Answer(
-        calibration_data(calibration, observations, args.observations, args),
-        lambda: calibration_text(calibration, observations, args.observations, args),
+        calibration_data(quality, args.observations, args), lambda: calibration_text(quality, args.observations, args)
     )
 
 

@@ -28,6 +28,13 @@ def _add_arguments(parser: ArgumentParser) -> None:
         metavar="SHARE",
         help="how often unmoved cameras may be said to have moved, such as 0.01 or 1%%; default: 0.01",
     )
+    parser.add_argument(
+        "--checks",
+        type=int,
+        default=1,
+        metavar="N",
+        help="that is at least once in N checks of this calibration: 720 for an hourly check over a month; default: 1",
+    )
 
 
 def _run(args: Namespace) -> Answer:
@@ -39,7 +46,7 @@ def _run(args: Namespace) -> Answer:
     else:
         from ceres_cal.moves import check
 
-        answer = check(read_calibration(args), read_observations(args.inputs), level)
+        answer = check(read_calibration(args), read_observations(args.inputs), level, args.checks)
     data = _data(answer) | photographs_data(detections)
     return Answer(data, lambda: _text(answer, detections), 0 if answer.holds else 1)
 
@@ -49,7 +56,15 @@ def _photographed(args: Namespace, images: list[Path], level: float) -> tuple[Ch
 
     calibration, not_painted = read_calibration(args), parse_names(args.not_painted)
     with progress_bar(args) as bar:
-        return check_photographs(calibration, images, args.station, level, not_painted=not_painted, progress=bar.update)
+        return check_photographs(
+            calibration,
+            images,
+            args.station,
+            level,
+            checks=args.checks,
+            not_painted=not_painted,
+            progress=bar.update,
+        )
 
 
 COMMANDS = (Command("check", "does a calibration still hold? exit code 0 yes, 1 no", _add_arguments, _run),)
@@ -65,7 +80,8 @@ def _share(text: str) -> float:
 
 def _data(answer: Check) -> dict[str, Any]:
     stations = {name: _station_data(one) for name, one in answer.stations.items()}
-    return {"holds": answer.holds, "false_alarms": answer.false_alarms, "stations": stations}
+    stated = {"false_alarms": answer.false_alarms, "checks": answer.checks}
+    return {"holds": answer.holds, **stated, "stations": stations}
 
 
 def _station_data(one: StationCheck) -> dict[str, Any]:
@@ -74,7 +90,8 @@ def _station_data(one: StationCheck) -> dict[str, Any]:
 
 
 def _text(answer: Check, detections: KnownDetections | None) -> str:
-    holds = f"{'yes' if answer.holds else 'no'} ({100.0 * answer.false_alarms:g} % false alarms)"
+    often = "" if answer.checks == 1 else f", any in {answer.checks} checks"
+    holds = f"{'yes' if answer.holds else 'no'} ({100.0 * answer.false_alarms:g} % false alarms{often})"
     stations = (section("station", _station_lines(one)) for one in answer.stations.values())
     return "\n".join([section("check", [holds]), *photographs_text(detections), *stations])
 

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
+from typing import TYPE_CHECKING
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.cli.arguments import add_calibration, add_output, add_report, parse_number
 from ceres_cal.cli.command import Answer, Command
 from ceres_cal.cli.inputs import read_calibration, read_observations
 from ceres_cal.cli.outputs import report_page, report_photographs, require_ending, require_outputs, write_results
+
+if TYPE_CHECKING:
+    from ceres_cal.diagnostics import Diagnosis
 
 
 def _add_arguments(parser: ArgumentParser) -> None:
@@ -24,6 +28,7 @@ def _add_arguments(parser: ArgumentParser) -> None:
         help="also calibrate with other powers or coefficients, on some frames to predict the others, and say which "
         "lens predicts best",
     )
+    add("--strict", action="store_true", help="exit with 1 for any finding, also one that does no harm")
     add("--folds", type=int, default=5, metavar="K", help="parts into which frames go for --held-out; default: 5")
     add(
         "--false-alarms",
@@ -47,11 +52,19 @@ def _run(args: Namespace) -> Answer:
     return Answer(
         diagnosis_data(diagnosis, choice, args),
         lambda: diagnosis_text(diagnosis, choice, args),
-        1 if diagnosis.findings else 0,
+        1 if _is_no(diagnosis, strict=args.strict) else 0,
     )
 
 
 COMMANDS = (Command("diagnose", "what the residuals say: faults by name, noise, outliers", _add_arguments, _run),)
+
+
+def _is_no(diagnosis: Diagnosis, *, strict: bool) -> bool:
+    """Whether the answer is no: wrong labels that were taken out do no harm, and a noise is estimated."""
+    from ceres_cal.report.grounds import is_against
+
+    against = [finding for finding in diagnosis.findings if strict or is_against(finding)]
+    return bool(against or diagnosis.conflicts)
 
 
 def _require_fitting(args: Namespace) -> float:

@@ -30,6 +30,7 @@ def diagnosis_data(diagnosis: Diagnosis, choice: Choice | None, args: Namespace)
     return {
         "verdict": _verdict(diagnosis),
         "model_error": diagnosis.model_error,
+        "conflicts": [asdict(conflict) for conflict in diagnosis.conflicts],
         "new_data": diagnosis.new_data,
         "tests": diagnosis.tests,
         "false_alarm_rate": diagnosis.false_alarm_rate,
@@ -57,6 +58,7 @@ def diagnosis_text(diagnosis: Diagnosis, choice: Choice | None, args: Namespace)
     """A page: the verdict, the findings by size, then tables."""
     table, summaries = diagnosis.table, diagnosis.summaries
     sections = [section("verdict", wrapped(*_verdict(diagnosis)))]
+    sections += [section("conflict", wrapped(conflict.words)) for conflict in diagnosis.conflicts]
     sections += [
         section(f"finding {number}", _finding(finding)) for number, finding in enumerate(diagnosis.findings, start=1)
     ]
@@ -83,6 +85,13 @@ def _verdict(diagnosis: Diagnosis) -> list[str]:
             "new data: residuals are those of the calibration as it stands; the findings are what would be left if it "
             "were refitted to them"
         )
+    if diagnosis.conflicts:
+        lines.append(
+            "what was known beforehand is contradicted: its standard deviations hold what is in dispute, and findings "
+            "may follow from it"
+        )
+    if not diagnosis.findings and diagnosis.conflicts:
+        return [*lines, f"nothing else: what is left over looks like noise ({rate})"]
     if not diagnosis.findings:
         return [*lines, f"sound: what is left over looks like noise ({rate})"]
     return [
@@ -130,7 +139,7 @@ def _errors(one: HeldOut) -> str:
 
 
 def _rejected(table: ResidualTable) -> Counter[str]:
-    names = np.array(table.features)[table.feature[~table.inlier]]
+    names = np.array(table.features)[table.feature[table.outlier]]
     return Counter(names.tolist())
 
 

@@ -15,8 +15,8 @@ from ceres_cal.cli.progress import progress_bar
 
 if TYPE_CHECKING:
     from ceres_cal.calibration import Calibration
-    from ceres_cal.observations import Observations
     from ceres_cal.photographs import KnownDetections
+    from ceres_cal.report.quality import Quality
 
 _HELP = {
     "pose": "poses, the intrinsics under what is known of them (default)",
@@ -59,6 +59,7 @@ def _run(args: Namespace) -> Answer:
     detections = _photographed(args, calibration, images) if images else None
     observations = read_observations(args.inputs) if detections is None else detections.require()
     from ceres_cal.moves import RefitOptions, refit
+    from ceres_cal.report.quality import quality_of
 
     photographs = report_photographs(args, observations, calibration, images)
     priors = tuple(parse_prior(spec, observations, PriorNames(("height_m",))) for spec in args.prior)
@@ -70,8 +71,9 @@ def _run(args: Namespace) -> Answer:
         options=RefitOptions(args.hold_others, args.labels, priors),
     )
     write_results(args, result.save, report_page(args, result, observations, photographs))
-    data = _data(result, calibration, observations, args) | photographs_data(detections)
-    return Answer(data, lambda: _text(result, observations, detections, args))
+    quality = quality_of(result, observations)
+    data = _data(quality, calibration, args) | photographs_data(detections)
+    return Answer(data, lambda: _text(quality, detections, args))
 
 
 def _photographed(args: Namespace, calibration: Calibration, images: list[Path]) -> KnownDetections:
@@ -85,21 +87,23 @@ def _photographed(args: Namespace, calibration: Calibration, images: list[Path])
 COMMANDS = (Command("refit", "after a move: poses anew, everything else under what was known", _add_arguments, _run),)
 
 
-def _data(result: Calibration, before: Calibration, observations: Observations, args: Namespace) -> dict[str, Any]:
+def _data(quality: Quality, before: Calibration, args: Namespace) -> dict[str, Any]:
     from ceres_cal.cli.summary import calibration_data
     from ceres_cal.moves import movements
 
+    result = quality.calibration
     moves = {name: {"mm": 1e3 * shift_m, "deg": deg} for name, (shift_m, deg) in movements(before, result).items()}
     refitted = result.refitted
     assert refitted is not None
-    summary = calibration_data(result, observations, args.inputs, args)
+    summary = calibration_data(quality, args.inputs, args)
     return {**summary, "what": refitted.what, "explanation": refitted.explanation, "moved": moves}
 
 
-def _text(result: Calibration, observations: Observations, detections: KnownDetections | None, args: Namespace) -> str:
+def _text(quality: Quality, detections: KnownDetections | None, args: Namespace) -> str:
     from ceres_cal.cli.summary import calibration_text
 
-    assert result.refitted is not None
-    explanation = section("refit", result.refitted.explanation.split("; "))
-    summary = calibration_text(result, observations, args.inputs, args)
+    refitted = quality.calibration.refitted
+    assert refitted is not None
+    explanation = section("refit", refitted.explanation.split("; "))
+    summary = calibration_text(quality, args.inputs, args)
     return "\n".join([explanation, *photographs_text(detections), summary])

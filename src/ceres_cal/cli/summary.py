@@ -16,12 +16,13 @@ from ceres_cal.calibration import Calibration
 from ceres_cal.cli.outputs import section, wrapped, written, written_data
 from ceres_cal.model.parameters import Options, anchored_stations
 from ceres_cal.observations import Observations
+from ceres_cal.report.grounds import disputed, is_against, judge_quality
 from ceres_cal.report.quality import Quality
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.heights import at_height
 from ceres_cal.uncertainty import FieldMap, Verdict
 
-_MOST_FEATURES, _MOST_DIRECTIONS = 6, 4
+_MOST_FEATURES, _MOST_DIRECTIONS, _MOST_FINDINGS = 6, 4, 3
 _MANY_OUTLIERS, _LARGE_SCALE = 0.3, 4.0  # from where on a warning is due
 _PHI_FROM = {
     "fixed": "held",
@@ -32,28 +33,33 @@ _PHI_FROM = {
 }
 
 
-def calibration_data(
-    calibration: Calibration, observations: Observations, inputs: Sequence[str], args: Namespace
-) -> dict[str, Any]:
+def calibration_data(quality: Quality, inputs: Sequence[str], args: Namespace) -> dict[str, Any]:
     """Everything, for --json."""
+    calibration, observations, judged = quality.calibration, quality.observations, judge_quality(quality)
+    findings = () if quality.diagnosis is None else quality.diagnosis.findings
     return {
+        "verdict": {
+            "level": judged.level,
+            "headline": judged.headline,
+            "reasons": [{"level": level, "text": text} for level, text in judged.reasons],
+            "findings": [asdict(finding) for finding in findings],
+        },
         "calibration": calibration.to_file(),
         "inputs": list(inputs),
         **written_data(args),
         "counts": observations.counts,
         "rms_px": calibration.rms_px,
         "tilt_deg": {name: camera.tilt_deg for name, camera in calibration.stations.items()},
-        "uncertainty": _uncertainty_data(Quality(calibration, observations)),
+        "uncertainty": _uncertainty_data(quality),
         "outliers": dict(_outliers(calibration).most_common()),
         "warnings": list(_warnings(calibration, observations)),
     }
 
 
-def calibration_text(
-    calibration: Calibration, observations: Observations, inputs: Sequence[str], args: Namespace
-) -> str:
-    """A short table for people."""
-    anchored, quality = anchored_stations(observations), Quality(calibration, observations)
+def calibration_text(quality: Quality, inputs: Sequence[str], args: Namespace) -> str:
+    """A short table for people; the verdict comes last."""
+    calibration, observations = quality.calibration, quality.observations
+    anchored = anchored_stations(observations)
     sections = [
         section("read", [", ".join(map(str, inputs)), *_counted(observations)]),
         section("fit", _fit(calibration)),
@@ -71,7 +77,20 @@ def calibration_text(
     sections.append(section("outliers", _outlier_lines(calibration)))
     sections.append(section("stopped", _stop(calibration)))
     sections.extend(section("warning", wrapped(text)) for text in _warnings(calibration, observations))
+    sections.append(section("verdict", list(_verdict(quality))))
     return "\n".join([*sections, *written(args)])
+
+
+def _verdict(quality: Quality) -> Iterator[str]:
+    """The headline of the report, and what stands behind it and was not said yet."""
+    judged, findings = judge_quality(quality), () if quality.diagnosis is None else quality.diagnosis.findings
+    yield from wrapped(judged.headline)
+    cause = disputed(quality)
+    for finding in [one for one in findings if is_against(one) and not cause][:_MOST_FINDINGS]:
+        yield from wrapped(f"{finding.kind}: {finding.sentence}")
+    if findings:
+        whence = " may follow from that" if cause else ": `ceres-cal diagnose` says what to do"
+        yield f"{plural(len(findings), 'finding')}{whence}"
 
 
 def _counted(observations: Observations) -> list[str]:
@@ -147,15 +166,19 @@ def _pose(name: str, camera: Camera, anchored: bool, quality: Quality) -> list[s
 
 
 def _outliers(calibration: Calibration) -> Counter[str]:
-    return Counter(f"{entry.kind} {entry.feature}" for entry in calibration.rejected)
+    wholes = (entry.reason.partition(":")[0] for entry in calibration.outliers if entry.is_of_whole)
+    single = (f"{entry.kind} {entry.feature}" for entry in calibration.outliers if not entry.is_of_whole)
+    return Counter(wholes) + Counter(single)
 
 
 def _outlier_lines(calibration: Calibration) -> list[str]:
-    fit, total, features = calibration.fit, len(calibration.rejected), _outliers(calibration)
+    fit, total, features = calibration.fit, len(calibration.outliers), _outliers(calibration)
     everything = fit.points + fit.curves + total
     if not total:
         return [f"none of {everything}"]
-    lines = [f"{total} of {everything} taken out ({calibration.options.reject_sigma:g} sigma and more)"]
+    lines = [
+        f"{total} of {everything} taken out ({calibration.options.reject_sigma:g} sigma and more, or a whole line)"
+    ]
     lines += [f"{count:5}  {name}" for name, count in features.most_common(_MOST_FEATURES)]
     rest = len(features) - _MOST_FEATURES
     if rest > 0:
@@ -181,7 +204,8 @@ def _warnings(calibration: Calibration, observations: Observations) -> Iterator[
         return
     if not calibration.converged:
         yield "the solve did not come to rest: raise --max-iterations"
-    if len(calibration.rejected) > _MANY_OUTLIERS * (len(observations.points) + len(observations.curves)):
+    out = len(calibration.outliers)
+    if out > _MANY_OUTLIERS * (calibration.fit.points + calibration.fit.curves + out):
         yield "so many observations were taken out: check labels, target dimensions and the choice of lens"
     scale = max(calibration.fit.point_scale, calibration.fit.curve_scale)
     if scale > _LARGE_SCALE:
@@ -227,6 +251,8 @@ def _uncertainty_lines(quality: Quality) -> Iterator[tuple[str, list[str]]]:
             seams.append(f"{measured} (rms of {count} points and stretches that both observed)")
     if seams:
         yield "seam", seams
+    if quality.uncertainty.widening:
+        yield "widened", [quality.uncertainty.widening]
     weak = [direction.words for direction in quality.uncertainty.weak_directions]
     if weak:
         more = [f"and {len(weak) - _MOST_DIRECTIONS} more (--json)"] if len(weak) > _MOST_DIRECTIONS else []
@@ -254,6 +280,8 @@ def _uncertainty_data(quality: Quality) -> dict[str, Any] | None:
         return None
     return {
         "numbers": [{**asdict(v), "key": v.key._asdict()} for v in uncertainty.verdicts],
+        "widening": uncertainty.widening,
+        "dependence": uncertainty.posterior.dependence,
         "weak_directions": [
             {"words": d.words, "relative": d.relative, "shares": [[*key[:3], share] for key, share in d.shares]}
             for d in uncertainty.weak_directions

@@ -6,24 +6,23 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ceres_cal import kernels
 from ceres_cal.base.errors import InputError
 from ceres_cal.calibration import Calibration
 from ceres_cal.diagnostics.diagnostic import Case, Tested
-from ceres_cal.diagnostics.equations import Equations, write_equations
 from ceres_cal.diagnostics.findings import Finding
 from ceres_cal.diagnostics.labels import find_mislabelled
 from ceres_cal.diagnostics.leftover import Noise, measure_noise
-from ceres_cal.diagnostics.linear_model import Weights, make_linear_model
 from ceres_cal.diagnostics.of_new_data import with_newcomers_placed
 from ceres_cal.diagnostics.of_target import recalled
 from ceres_cal.diagnostics.registry import DIAGNOSTICS, all_families
 from ceres_cal.diagnostics.scores import select
 from ceres_cal.diagnostics.summaries import Summaries, summarise
 from ceres_cal.diagnostics.table import ResidualTable, make_table
-from ceres_cal.model.parameters import Options
+from ceres_cal.model.equations import write_equations
 from ceres_cal.model.residuals import Residuals, residuals
 from ceres_cal.observations import Observations
+from ceres_cal.solve import Conflict
+from ceres_cal.solve.linear_model import Weights, equation_weights, make_linear_model
 from ceres_cal.solve.noise import USUAL_EQUATIONS, Inliers, Redundancy, judge, relative_lengths
 
 FALSE_ALARM_RATE = 0.01
@@ -39,6 +38,7 @@ class Diagnosis:
         table: every observation. summaries: the same by frame, feature, image region and radius.
         noise: of points and of curves, with the findings taken off; without any it is the calibration's own.
         degrees_of_freedom: spare equations behind it, the calibration's own; infinite where sigmas are as stated.
+        conflicts: what was known beforehand and everything else contradicts, the calibration's own.
         new_data: whether the observations are others than those the calibration was made from. tests: how many
             alternatives were tested, and false_alarm_rate: the probability that sound data get any finding at all,
             Bonferroni over all of them. It holds for normal noise; what it does not hold for is said by "correlated".
@@ -53,6 +53,7 @@ class Diagnosis:
     new_data: bool
     tests: int
     false_alarm_rate: float
+    conflicts: tuple[Conflict, ...] = ()
 
     @property
     def model_error(self) -> bool:
@@ -92,6 +93,7 @@ def diagnose(
         observations.digest != calibration.digest,
         tested.selection.tests,
         false_alarm_rate,
+        calibration.conflicts,
     )
 
 
@@ -122,7 +124,7 @@ def _case(calibration: Calibration, observations: Observations, new_data: bool) 
     there = residuals(observations, problem.sights, estimate)
     inliers = _judged(calibration, observations, there, new_data)
     equations = write_equations(observations, problem.sights, estimate, there)
-    weights = _weights(observations, problem.options, inliers, equations)
+    weights = equation_weights(observations, problem.options, inliers, equations)
     model = make_linear_model(problem, estimate, equations, weights)
     if calibration.refitted is not None and not new_data:
         model = replace(model, known_noise=USUAL_EQUATIONS)
@@ -148,18 +150,6 @@ def _judged(calibration: Calibration, observations: Observations, there: Residua
     return Inliers(
         inliers[0] & np.isfinite(points), inliers[1] & np.isfinite(curves), p, c, points / p, curves / c, degrees
     )
-
-
-def _weights(observations: Observations, options: Options, inliers: Inliers, equations: Equations) -> Weights:
-    """Of each equation."""
-    sigma = np.concatenate(
-        [inliers.point_scale * observations.points.sigma_px, inliers.curve_scale * observations.curves.sigma_px]
-    )
-    lengths = np.concatenate([inliers.point_sigmas, inliers.curve_sigmas])
-    squared = np.where(np.isfinite(lengths), lengths, 0.0) ** 2
-    robust = kernels.loss_weights(kernels.Loss(kernels.LOSS_CODES[options.loss], options.loss_scale), squared)
-    inlier, at = np.concatenate([inliers.points, inliers.curves]), equations.observation
-    return Weights(1.0 / sigma[at], inlier[at], robust[at])
 
 
 def _tested(case: Case, rate: float) -> Tested:

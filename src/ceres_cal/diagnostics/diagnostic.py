@@ -11,18 +11,18 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask
-from ceres_cal.base.words import two_digits
+from ceres_cal.base.words import first_of, two_digits
 from ceres_cal.calibration import Calibration
-from ceres_cal.diagnostics.equations import Equations
 from ceres_cal.diagnostics.findings import Amount, Finding, Wrong
 from ceres_cal.diagnostics.labels import Mislabelling
 from ceres_cal.diagnostics.leftover import Noise
-from ceres_cal.diagnostics.linear_model import LinearModel
 from ceres_cal.diagnostics.scores import Family, Score, Selection
 from ceres_cal.diagnostics.table import ResidualTable, plane_shift
+from ceres_cal.model.equations import Equations
 from ceres_cal.model.parameters import Estimate
 from ceres_cal.observations import Observations
 from ceres_cal.solve import Problem
+from ceres_cal.solve.linear_model import LinearModel
 from ceres_cal.solve.noise import Inliers
 
 _LN_10 = float(np.log(10.0))
@@ -100,12 +100,11 @@ class Diagnostic(ABC):
     """A kind of finding.
 
     Attributes:
-        kind: its name. wrong: see `Finding`. widens: whether standard deviations are too small where it is found.
+        kind: its name. wrong: see `Finding`.
     """
 
     kind: ClassVar[str]
     wrong: ClassVar[Wrong] = "model"
-    widens: ClassVar[bool] = False
 
     def tests(self, case: Case) -> int:
         """How many tests it makes besides score tests: all share one rate of false alarms."""
@@ -189,6 +188,9 @@ class ScoreTest(Diagnostic):
         effect = case.effect(shift, rows)
         ratio = effect.px / case.noise_px(tested.selection.model.left_over, rows)
         sentence, advice, mending = self.words(Evidence(case, score, others, shift, effect, ratio))
+        if score.rivals:
+            names = first_of([f"{one.family.kind} ({one.subject})" for one in score.rivals], 3)
+            sentence += f"; these data cannot tell it from {names}"
         return Finding(
             self.kind, self.wrong, score.subject, score.frame, sentence, advice, effect.px, effect.mm, ratio, mending,
             tested.log10_p(score.log_p), effect.observations,

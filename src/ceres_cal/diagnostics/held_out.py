@@ -17,8 +17,8 @@ from ceres_cal.base.errors import CalibrationError, DegenerateError, InputError
 from ceres_cal.base.transforms import Pose
 from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
-from ceres_cal.diagnostics.equations import write_equations
 from ceres_cal.diagnostics.table import error_mm
+from ceres_cal.model.equations import write_equations
 from ceres_cal.model.parameters import Estimate, Layout, Options
 from ceres_cal.model.residuals import residuals
 from ceres_cal.model.structure import make_structure

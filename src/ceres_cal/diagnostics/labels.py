@@ -66,12 +66,13 @@ def find_mislabelled(
     def sight(target: str, station: str, placement: str | None) -> _Sight:
         return _Sight(observations.targets[target], estimate.camera_at(station, placement))
 
+    points, curves = observations.copies.originals
     both: tuple[tuple[Columns, Mask, float], ...] = (
-        (observations.points, inliers.points, inliers.point_scale),
-        (observations.curves, inliers.curves, inliers.curve_scale),
+        (observations.points, points & ~inliers.points, inliers.point_scale),
+        (observations.curves, curves & ~inliers.curves, inliers.curve_scale),
     )
-    for column, inlier, scale in both:
-        rows = np.flatnonzero(~inlier)
+    for column, rejected, scale in both:
+        rows = np.flatnonzero(rejected)
         rows = rows[:: max(1, len(rows) // _MOST)]
         for number in np.unique(column.view[rows]):
             own, view = rows[column.view[rows] == number], observations.views[number]

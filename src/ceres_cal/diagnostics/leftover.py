@@ -8,9 +8,9 @@ import numpy as np
 
 from ceres_cal.base.arrays import AnyArray, Indices, Mask
 from ceres_cal.base.tails import log_chi2_tail
-from ceres_cal.diagnostics.linear_model import LinearModel
 from ceres_cal.observations import Observations
 from ceres_cal.scene.curves import nearest_on_track
+from ceres_cal.solve.linear_model import LinearModel
 from ceres_cal.solve.noise import Inliers
 
 # Noise within so much of what was stated is as stated: sigmas are guessed to a tenth or two. Below 1 every sound

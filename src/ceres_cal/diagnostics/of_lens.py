@@ -122,6 +122,29 @@ def _decentring_columns(case: Case, camera: str) -> Array:
     return np.column_stack([np.sum(case.equations.direction * field, axis=1) for field in (first, second)])
 
 
+class Skew(ScoreTest):
+    """The axes of the pixels are not perpendicular: x grows with y."""
+
+    kind = "skew"
+    absorbed = True
+
+    def families(self, case: Case) -> Iterator[Family]:
+        down = np.empty(len(case.equations))
+        for number, name in enumerate(case.cameras):
+            own = case.camera == number
+            down[own] = case.estimate.cameras[name].offsets(case.equations.pixel[own])[:, 1]
+        yield Family(self.kind, (case.equations.direction[:, 0] * down)[:, None], case.camera, case.cameras)
+
+    def words(self, evidence: Evidence) -> Words:
+        skew, sd = 1e3 * evidence.score.amount, 1e3 * evidence.score.sd
+        return Words(
+            f"camera {evidence.score.subject!r}: the axes of its pixels lean by {skew[0]:.2f} ± {sd[0]:.2f} mrad "
+            f"({evidence.size})",
+            "no lens here has skew: take pictures as the sensor gives them, neither warped nor stabilised",
+            amounts(["skew"], skew, sd, "mrad"),
+        )
+
+
 class Held(ScoreTest):
     """Numbers of the pixels that are held; places: theirs in the intrinsics vector."""
 

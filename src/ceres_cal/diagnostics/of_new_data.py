@@ -67,7 +67,7 @@ def with_newcomers_placed(observations: Observations, problem: Problem, calibrat
         DegenerateError: one of them cannot be posed: fewer than six points, or points in disagreement.
     """
     estimate = calibration.estimate
-    new = frozenset(observations.placements) - set(estimate.placements)
+    new = frozenset(key.placement for key in problem.sights.keys if key.placement) - set(estimate.placements)
     if not new:
         return estimate
     fit, options = calibration.fit, calibration.options

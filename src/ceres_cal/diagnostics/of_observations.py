@@ -108,7 +108,6 @@ class Correlated(_OfNoise):
     """Neighbouring residuals that agree."""
 
     kind = "correlated"
-    widens = True
 
     def about(self, noise: Noise) -> tuple[float, float, Words]:
         sentence = (
@@ -116,6 +115,6 @@ class Correlated(_OfNoise):
             f"{noise.observations} observations say as much as {noise.effective:.0f} independent ones"
         )
         amount = Amount("correlation", noise.correlation, 1.0 / float(np.sqrt(noise.observations)), "")
-        advice = "take every standard deviation of the calibration larger by the square root of that ratio"
+        advice = "look for what shifts whole features; the standard deviations have it in them"
         shared_px = noise.sigma_px * float(np.sqrt(max(noise.correlation, 0.0)))
         return noise.correlation_log_p, shared_px, Words(sentence, advice, (amount,))

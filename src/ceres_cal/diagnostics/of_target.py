@@ -10,9 +10,9 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask
 from ceres_cal.diagnostics.diagnostic import Case, Evidence, ScoreTest, Words
-from ceres_cal.diagnostics.equations import whole_structure
 from ceres_cal.diagnostics.findings import amounts
 from ceres_cal.diagnostics.scores import Family, grouped
+from ceres_cal.model.equations import whole_structure
 from ceres_cal.scene.targets import Arc, Segment
 
 # Observations that say whether a curve lies aside: three numbers of an arc, and as many left to contradict them.

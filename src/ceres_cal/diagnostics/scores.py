@@ -15,8 +15,10 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask
 from ceres_cal.base.tails import log_f_tail
-from ceres_cal.diagnostics.linear_model import LEAST_LEFT, LinearModel, inverse_root
+from ceres_cal.solve.linear_model import LEAST_LEFT, LinearModel, inverse_root
 
+# Nats of log p: alternatives nearer than that are told apart by luck. Of what is planted the right name is first by 20.
+_ALIKE = 7.0
 _MOST = 12  # causes that are named; more than that is not a calibration with faults but none
 # Of the first cause's statistic: below it the error of its linear picture speaks. At half of it one of seven planted
 # faults has a second finding beside it, at double nothing changes.
@@ -64,6 +66,7 @@ class Score:
         family, number: which. statistic: decrease of the squared residuals, in variances. rank: numbers it can tell.
         log_p: natural logarithm of the probability of as much in mere noise, not corrected for how many were tested.
         amount: (Q,) what would mend it. sd: (Q,) standard deviations, infinite for a number it cannot tell at all.
+        rivals: alternatives of other kinds that explain nearly as much, and nothing more beside it.
     """
 
     family: Family
@@ -73,6 +76,7 @@ class Score:
     log_p: float
     amount: Array
     sd: Array
+    rivals: tuple[Score, ...] = ()
 
     @property
     def subject(self) -> str:
@@ -229,12 +233,25 @@ def select(
         best = min(scores, key=lambda score: score.log_p)
         if best.log_p > log_level or (chosen and best.statistic < _LEAST_SHARE * chosen[0].statistic):
             break
-        chosen.append(best)
-        extended = extended.with_columns(best.columns)
+        before, extended = scores, extended.with_columns(best.columns)
         scores = score_all(extended, families, inflation)
+        chosen.append(replace(best, rivals=_rivals(best, before, scores, log_level)))
     if chosen:
         together = model.freed(np.hstack([score.columns for score in chosen]))
         ends = np.cumsum([len(score.amount) for score in chosen])[:-1]
         parts = zip(chosen, np.split(together.amount, ends), np.split(together.sd, ends), strict=True)
         chosen = [replace(score, amount=amount, sd=sd) for score, amount, sd in parts]
     return Selection(tuple(chosen), tests, log_level, extended)
+
+
+def _rivals(best: Score, before: Sequence[Score], after: Sequence[Score], log_level: float) -> tuple[Score, ...]:
+    """Alternatives of other kinds that were about as probable as the best one, and are nothing beside it."""
+    left = {(id(score.family), score.number): score.log_p for score in after}
+    near = [
+        score
+        for score in before
+        if score.family.kind != best.family.kind
+        and score.log_p < best.log_p + _ALIKE
+        and left.get((id(score.family), score.number), 0.0) > log_level
+    ]
+    return tuple(sorted(near, key=lambda score: score.log_p))

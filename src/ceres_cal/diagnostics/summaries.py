@@ -9,9 +9,9 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask
 from ceres_cal.diagnostics.diagnostic import Case
-from ceres_cal.diagnostics.linear_model import LinearModel
 from ceres_cal.diagnostics.table import ResidualTable, numbers_of
 from ceres_cal.scene.camera import Camera
+from ceres_cal.solve.linear_model import LinearModel
 
 REGIONS = (6, 4)
 """Columns and rows of equal parts into which an image is divided."""
@@ -104,7 +104,7 @@ def _summary(table: ResidualTable, group: Indices, names: list[str]) -> Summary:
 
     numbers = np.where(table.is_curve, 1.0, 2.0)
     sigmas = table.distance_px / (table.sigma_px * table.scale * np.sqrt(numbers))
-    counts = np.stack([count(points), count(curves), count(~inlier)])
+    counts = np.stack([count(points), count(curves), count(table.outlier)])
     filled = np.flatnonzero(counts.sum(axis=0))
     measures = (
         rms(points, table.distance_px),

@@ -14,15 +14,15 @@ import numpy as np
 from ceres_cal.base.arrays import AnyArray, Array, Codes, Indices, Mask
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import write_bytes, write_json
-from ceres_cal.diagnostics.equations import Equations
-from ceres_cal.diagnostics.linear_model import LinearModel
+from ceres_cal.model.equations import Equations
 from ceres_cal.observations import Observations
 from ceres_cal.scene.camera import Camera
+from ceres_cal.solve.linear_model import LinearModel
 from ceres_cal.solve.noise import Inliers
 
 FORMAT, VERSION = "ceres-cal/residuals", 1
-INLIER, TOO_FAR, NOT_SEEN = 0, 1, 2
-REASONS = ("", "too far off", "cannot be seen from there")
+INLIER, TOO_FAR, NOT_SEEN, COPIED = 0, 1, 2, 3
+REASONS = ("", "too far off", "cannot be seen from there", "a copy of another")
 """Why an observation was taken out, by its code in `ResidualTable.reason`."""
 
 
@@ -72,6 +72,11 @@ class ResidualTable:
     @property
     def inlier(self) -> Mask:
         return np.asarray(self.reason == INLIER)
+
+    @property
+    def outlier(self) -> Mask:
+        """(N,) what was taken out for its residual; copies of other observations were taken out, too."""
+        return np.asarray((self.reason == TOO_FAR) | (self.reason == NOT_SEEN))
 
     def id_of(self, number: int) -> str:
         """How messages name an observation: "point 17" or "curve 4"."""
@@ -156,6 +161,7 @@ def make_table(
     np.add.at(residual, equations.observation, equations.direction * equations.residual[:, None])
     distance = np.where(is_curve, _spread_out(equations, equations.residual, count), np.linalg.norm(residual, axis=1))
     inlier = np.concatenate([inliers.points, inliers.curves])
+    original = np.concatenate(observations.copies.originals)
     seen = np.isfinite(residual[:, 0])
     return ResidualTable(
         is_curve,
@@ -174,7 +180,7 @@ def make_table(
         _mean_leverage(model, count),
         _standardised(model, count),
         _radii(observations, view, pixel, cameras),
-        np.where(inlier, INLIER, np.where(seen, TOO_FAR, NOT_SEEN)).astype(np.int8),
+        np.select([inlier, seen, original], [INLIER, TOO_FAR, NOT_SEEN], COPIED).astype(np.int8),
     )
 
 

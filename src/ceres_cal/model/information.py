@@ -81,6 +81,17 @@ class Information:
         whole.matrix[np.ix_(at, at)] = self.matrix
         return whole
 
+    def widened(self, shifts: Array) -> Information:
+        """With a covariance that is larger by d d^T for each of the shifts d (S, K) (Woodbury)."""
+        if not len(shifts):
+            return self
+        through = self.matrix @ shifts.T
+        middle = np.eye(len(shifts)) + shifts @ through
+        unit = np.sqrt(np.diagonal(middle))
+        scaled = through / unit
+        matrix = self.matrix - scaled @ np.linalg.solve(middle / unit[:, None] / unit, scaled.T)
+        return Information(self.keys, 0.5 * (matrix + matrix.T))
+
     def __add__(self, other: Information) -> Information:
         """Both together, over the keys of either."""
         if self.keys == other.keys:

@@ -1,33 +1,38 @@
-"""Does a calibration still hold? A test of each station's pose and phi against new observations.
+"""Does a calibration still hold? A test of each station's pose and phi against new observations (design, section 10).
 
-The old numbers are known to within the old posterior only. So what is asked is by how much the least cost of posterior
-and new observations together falls when the station may stand elsewhere, with another phi, than it did: for an unmoved
-camera that fall is a chi-squared variable, whatever the posterior leaves open.
+What was known and what the new observations say are two statements about the same numbers; whether they differ in pose
+and phi by more than both leave open is asked at the noise, and with the dependence, that the new observations show. The
+calibration's own error is the same in every check: it counts as large as it may be.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.errors import CalibrationError, InputError
-from ceres_cal.base.tails import upper_tail
 from ceres_cal.base.transforms import Pose
 from ceres_cal.calibration import Calibration
+from ceres_cal.model.information import Information
 from ceres_cal.model.keys import Key
 from ceres_cal.model.parameters import Estimate
 from ceres_cal.model.priors import GaussianPrior, tolerances
 from ceres_cal.model.quantities import layout_of
+from ceres_cal.model.residuals import residuals
 from ceres_cal.model.structure import make_structure
 from ceres_cal.moves.carried import require_same_things
+from ceres_cal.moves.contrast import Contrast, Statement, contrast
 from ceres_cal.moves.poses import PoseCandidate, PoseSearch, movement, pose_candidates
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights, gather_sights
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.heights import HEIGHTS_M
 from ceres_cal.solve import Problem, Weighting, information, solve
+from ceres_cal.uncertainty import measure_scatter
 from ceres_cal.uncertainty.maps import Grid, visible_pixels
 from ceres_cal.uncertainty.uncertainty import field_grid
 
@@ -40,8 +45,8 @@ _LEAST_SHARE = 0.5
 _MANY_OUTLIERS = 0.25
 # Fall of twice the cost that a phi at its place exceeds one time in a thousand. Nothing changes from half to double.
 _WILL_DO = 10.8
-# How rare a noise must be to be believed larger than that of the calibration. Nothing changes from half to double.
-_NOISY = 1e-3
+# Spare equations that the calibration's noise counts as: a few new ones that agree by chance do not make it 0.
+_USUAL_EQUATIONS = 4.0
 
 
 @dataclass(frozen=True)
@@ -50,8 +55,9 @@ class StationCheck:
 
     Attributes:
         holds: whether the probability is not below the false-alarm rate of one station, and the observations are
-            understood. probability: of such observations, or stranger ones, from an unmoved camera.
-        statistic: fall of twice the cost. degrees: of freedom that it has.
+            understood. probability: of such observations, or stranger ones, from an unmoved camera whose calibration
+            is as far off as one in 20 is.
+        statistic: squared distance, in standard deviations. degrees: numbers, or directions of them, that were tested.
         used, outliers: observations. noise: times that of the calibration.
         moved_mm, turned_deg: best estimate of the movement. phi_change: relative; both with phi under what is known
             of it, unless that does not explain the observations.
@@ -87,10 +93,12 @@ class Check:
     """The answer for all stations together.
 
     Attributes:
-        false_alarms: probability that an unmoved set of cameras is said to have moved. stations: by name.
+        false_alarms: probability that an unmoved set of cameras is said to have moved at least once in so many
+            checks. stations: by name.
     """
 
     false_alarms: float
+    checks: int
     stations: dict[str, StationCheck]
 
     @property
@@ -99,15 +107,19 @@ class Check:
         return all(station.holds for station in self.stations.values())
 
 
-def check(calibration: Calibration, observations: Observations, false_alarms: float = FALSE_ALARMS) -> Check:
+def check(
+    calibration: Calibration, observations: Observations, false_alarms: float = FALSE_ALARMS, checks: int = 1
+) -> Check:
     """Test whether a calibration still holds for new observations of its stations.
 
-    Seven numbers of each station that was observed are tested at once: its pose and its camera's phi. The noise is that
-    of the calibration, unless the new observations show beyond doubt that it is larger now. Outliers are those that no
-    pose near by explains. A yes means that these observations show no movement, not that there is none: see the sizes.
+    Seven numbers of each station that was observed are tested at once: its pose and its camera's phi. Noise and
+    dependence are those of the new observations. Outliers are those that no pose near by explains. A yes means that
+    these observations show no movement, not that there is none: see the sizes.
 
     Args:
-        false_alarms: how often an unmoved set of cameras may be said to have moved; shared among the stations.
+        false_alarms: how often an unmoved set of cameras may be said to have moved at least once in so many `checks`
+            with the same calibration; shared among checks and stations. One calibration in 20 is so far off that it
+            may come more often.
 
     Raises:
         InputError: a station that the calibration does not have, or that it says nothing of.
@@ -115,6 +127,8 @@ def check(calibration: Calibration, observations: Observations, false_alarms: fl
     """
     if not 0.0 < false_alarms < 1.0:
         raise InputError(f"false_alarms must be a probability between 0 and 1, not {false_alarms}")
+    if checks < 1:
+        raise InputError(f"checks must be 1 or more, not {checks}")
     require_same_things(calibration, observations)
     for name in observations.stations:
         if name not in calibration.estimate.stations:
@@ -126,8 +140,9 @@ def check(calibration: Calibration, observations: Observations, false_alarms: fl
     for name in observations.stations:
         if name not in world:
             raise InputError(f"station {name!r} sees nothing that lies in the world: observe the field with it")
-    level = false_alarms / len(world)
-    return Check(false_alarms, {name: _checked(calibration, observed, sight, level) for name, sight in world.items()})
+    level = false_alarms / (len(world) * checks)
+    stations = {name: _checked(calibration, observed, sight, level) for name, sight in world.items()}
+    return Check(false_alarms, checks, stations)
 
 
 # ---- one station ----------------------------------------------------------------------------------------------------
@@ -138,6 +153,7 @@ class _Case:
     """One station's new observations and what was known of its numbers."""
 
     calibration: Calibration
+    observed: Observations
     sight: Sights
     estimate: Estimate
     prior: GaussianPrior
@@ -147,22 +163,40 @@ class _Case:
     def name(self) -> str:
         return self.sight.key.station
 
-    def problem(self, used: Sights, prior: GaussianPrior) -> Problem:
-        """The station's pose and its camera's intrinsics from what is used, under a prior."""
+    @property
+    def station_keys(self) -> tuple[Key, ...]:
+        """The tested numbers that are the station's."""
+        return tuple(key for key in self.tested if key.kind == "station")
+
+    def problem(self, used: Sights, freed: Collection[Key] = (), noise: float = 1.0) -> Problem:
+        """The station's pose and its camera's intrinsics from what is used, under what was known of all but the freed
+        numbers. `noise`: times that of the calibration.
+        """
         layout = layout_of(self.prior.keys, self.estimate)
         fresh = tolerances(self.estimate.structure, self.prior.keys)
-        weighting = Weighting(*self.calibration.fit.scales, "trivial")
-        return Problem(used, layout, (prior, *fresh), weighting, self.calibration.options)
+        points, curves = self.calibration.fit.scales
+        weighting = Weighting(noise * points, noise * curves, "trivial")
+        return Problem(used, layout, (self.prior.without(freed), *fresh), weighting, self.calibration.options)
 
-    def least(self, used: Sights, prior: GaussianPrior, pose: Pose) -> tuple[float, Estimate] | None:
-        """Twice the least cost under a prior, and where, from a pose; None where the solver does not get there."""
+    def least(self, used: Sights, freed: Collection[Key], pose: Pose) -> tuple[float, Estimate] | None:
+        """Twice the least cost, and where, from a pose; None where the solver does not get there."""
         station = replace(self.estimate.stations[self.name], cam_from_world=pose)
         start = replace(self.estimate, stations={self.name: station})
         try:
-            solution = solve(self.problem(used, prior), start)
+            solution = solve(self.problem(used, freed), start)
         except CalibrationError:
             return None
         return None if solution.failed else (2.0 * solution.cost, solution.estimate)
+
+    def known(
+        self, used: Sights, freed: Collection[Key], estimate: Estimate, keys: tuple[Key, ...]
+    ) -> tuple[Information, Array]:
+        """What was known before of all but the freed numbers, over some keys: information, and estimate less mean."""
+        whole, offsets = Information.nothing(keys), np.zeros(len(keys))
+        for prior in self.problem(used, freed).priors_at(estimate):  # no two of them speak of the same number
+            whole += prior.information
+            offsets[whole.columns(prior.keys)] = prior.offsets(estimate)
+        return whole, offsets
 
 
 def _case(calibration: Calibration, observed: Observations, sight: Sights) -> _Case:
@@ -174,7 +208,7 @@ def _case(calibration: Calibration, observed: Observations, sight: Sights) -> _C
     estimate = Estimate({key.camera: old.cameras[key.camera]}, {key.station: old.stations[key.station]}, {}, structure)
     tested = tuple(k for k in own if k.kind == "station" or k.quantity == "phi")
     kept = [k for k in posterior.keys if k in own or k.kind == "structure"]
-    return _Case(calibration, sight, estimate, calibration.prior_of(kept), tested)
+    return _Case(calibration, observed, sight, estimate, calibration.prior_of(kept), tested)
 
 
 @dataclass(frozen=True)
@@ -196,31 +230,39 @@ def _checked(calibration: Calibration, observed: Observations, sight: Sights, le
     near = pose_candidates(search, [case.estimate.stations[case.name].cam_from_world], patience=0)
     used = sight.used(*_inliers(search, near[0])) if near else sight[:0]
     inside, count = (len(s.point_rows) + len(s.curve_rows) for s in (used, sight))
-    free = case.prior.without(case.tested)
-    anew = case.least(used, free, near[0].pose) if inside >= _LEAST_SHARE * count else None
-    if anew is None:
+    # With phi under what is known of it: next to it a height says little, and far along that valley nothing is linear.
+    posed = case.least(used, case.station_keys, near[0].pose) if inside >= _LEAST_SHARE * count else None
+    if posed is None:
         return _not_understood(case, inside, count)
-    test = _tested(case, used, anew, level, count - inside)
-    # Sizes are stated with phi under what is known of it, where that will do: next to it a height says little.
-    posed = case.least(used, case.prior.without([k for k in case.tested if k.kind == "station"]), near[0].pose)
-    return _answer(case, test, posed[1] if posed is not None and posed[0] - anew[0] < _WILL_DO else anew[1])
+    noise, apart = _apart(case, used, *posed)
+    holds = apart.probability >= level
+    test = _Test(holds, apart.probability, apart.statistic, apart.degrees, inside, count - inside, noise)
+    zoomed = None if holds else case.least(used, case.tested, near[0].pose)
+    will_do = zoomed is None or posed[0] - zoomed[0] < _WILL_DO * noise**2
+    return _answer(case, test, posed[1] if will_do or zoomed is None else zoomed[1])
 
 
-def _tested(case: _Case, used: Sights, anew: tuple[float, Estimate], level: float, outliers: int) -> _Test:
-    """By how much the cost falls from the least one with the old pose and phi under what was known of them to that
-    with both free, `anew`, and how often it would fall as far.
+def _apart(case: _Case, used: Sights, least: float, estimate: Estimate) -> tuple[float, Contrast]:
+    """The noise, in that of the calibration, and how far what was known and what is seen now are apart.
+
+    Args:
+        least: twice the least cost with the pose free. estimate: there.
     """
-    least, estimate = anew
-    degrees = _degrees(case, used, estimate)
-    spare = used.equations - degrees
-    noise = float(np.sqrt(least / spare)) if spare > 0 else 1.0
-    noisy = spare > 0 and upper_tail(least, spare) < _NOISY
-    as_was = case.least(used, case.prior, case.estimate.stations[case.name].cam_from_world)
-    statistic = np.inf if as_was is None else max(as_was[0] - least, 0.0) / (noise**2 if noisy else 1.0)
-    spare_of_noise = float(spare) if noisy else case.calibration.uncertainty.posterior.degrees_of_freedom
-    probability = 0.0 if np.isinf(statistic) else upper_tail(statistic, degrees, spare_of_noise)
-    inside = len(used.point_rows) + len(used.curve_rows)
-    return _Test(probability >= level, probability, float(statistic), degrees, inside, outliers, noise)
+    freedom = max(used.equations - len(case.station_keys), 0) + _USUAL_EQUATIONS
+    noise = math.sqrt((least + _USUAL_EQUATIONS) / freedom)
+    problem = case.problem(used, case.station_keys, noise)
+    told = information(problem, estimate)
+    seen, keys = told.points + told.curves, told.shared.keys
+    # At its end the solve's priors pull as much as the observations do, at the noise that they had there.
+    pull, offsets = case.known(used, case.station_keys, estimate, keys)
+    best = seen.inverse @ (pull.matrix @ offsets) / noise**2
+    scatter = measure_scatter(case.observed, problem, residuals(case.observed, used, estimate), estimate, told)
+    if scatter is not None:
+        seen = Information(keys, scatter.widened(told.shared).matrix - pull.matrix)
+        freedom = 1.0 / (1.0 / freedom + scatter.found.inverse_freedom)
+    before = case.calibration.uncertainty.posterior.degrees_of_freedom
+    old = Statement(*case.known(used, (), estimate, keys), before)
+    return noise, contrast(old, Statement(seen, -best, freedom), case.tested)
 
 
 def _inliers(search: PoseSearch, near: PoseCandidate) -> tuple[Mask, Mask]:
@@ -231,13 +273,6 @@ def _inliers(search: PoseSearch, near: PoseCandidate) -> tuple[Mask, Mask]:
     in_points, in_curves = search.residuals(near.pose).in_sigmas(sight, search.scales)
     points[sight.point_rows], curves[sight.curve_rows] = in_points <= limit, in_curves <= limit  # NaN is not
     return points, curves
-
-
-def _degrees(case: _Case, used: Sights, estimate: Estimate) -> int:
-    """How many of the tested numbers' directions both the old posterior and the new observations determine."""
-    new = information(case.problem(used, case.prior.without(case.tested)), estimate).shared
-    ranks = [about.marginal(case.tested).known_rank for about in (new, case.prior.information)]
-    return max(min(ranks), 1)
 
 
 # ---- in words -------------------------------------------------------------------------------------------------------

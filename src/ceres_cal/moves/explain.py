@@ -125,7 +125,7 @@ def _others(plan: RefitPlan, search: PoseSearch) -> Iterator[str]:
     except CalibrationError:
         return
     noise = max(fresh.fit.point_scale / search.scales[0], fresh.fit.curve_scale / search.scales[1])
-    if noise < _NOISIER and len(fresh.rejected) < _FEW * (fresh.fit.points + fresh.fit.curves):
+    if noise < _NOISIER and len(fresh.outliers) < _FEW * (fresh.fit.points + fresh.fit.curves):
         yield f"with another lens they do: {WORDS['everything']}: calibrate it anew"
 
 

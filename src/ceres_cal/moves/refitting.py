@@ -78,9 +78,14 @@ def refit(
         return solved_from(Start(start, phi_from), plan.observations, problem, again, progress)
 
     result = attempt(what, estimate, assessed=True)
-    others = require_supported(plan, result, attempt)
-    if others:
-        raise why_nothing_fits(plan, [_search_of(plan, sight, estimate) for sight in _moved_sights(plan)])
+    try:
+        if require_supported(plan, result, attempt):
+            raise why_nothing_fits(plan, [_search_of(plan, sight, estimate) for sight in _moved_sights(plan)])
+    except SolutionError as error:
+        stated = [conflict.words for conflict in result.conflicts if conflict.kind == "prior"]
+        if not stated:
+            raise
+        raise SolutionError(f"{stated[0]}; or else {error}") from None
     _require_known(plan, result)
     explanation = _explained(plan, result)
     seen = (*calibration.refitted.digests, calibration.digest) if calibration.refitted else (calibration.digest,)

@@ -1,10 +1,11 @@
-"""Observations in JSON and NPZ files (design, section 9): every number comes back exactly."""
+"""Observations in JSON and NPZ files (docs/files.md): every number comes back exactly."""
 
 from __future__ import annotations
 
 import io
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,18 @@ import numpy as np
 from ceres_cal.base.archives import Column, read_npz
 from ceres_cal.base.arrays import AnyArray, Codes
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.files import check_header, convert, decode_json, parse_json, read_bytes, write_bytes
+from ceres_cal.base.files import (
+    PIXEL_ORIGIN,
+    UNITS,
+    PixelOrigin,
+    Units,
+    check_header,
+    convert,
+    decode_json,
+    parse_json,
+    read_bytes,
+    write_bytes,
+)
 from ceres_cal.observations.columns import (
     NO_CURVES,
     NO_POINTS,
@@ -49,6 +61,7 @@ class Content:
     points: Points
     curves: Curves
     priors: tuple[Prior, ...] = ()
+    notes: Mapping[str, Any] = field(default_factory=dict)
 
     def feature_name(self, kind: str, row: int) -> str:
         """Name of the feature that observation `row` of the points (kind "point") or curves ("curve") shows."""
@@ -62,6 +75,17 @@ class _PointsFile(msgspec.Struct, forbid_unknown_fields=True):
     features: list[str]
     pixels: list[tuple[float, float]]
     sigma_px: float | list[float] = 1.0
+    counts: list[int] | msgspec.UnsetType = msgspec.UNSET
+
+    def each(self, here: str) -> list[str]:
+        """The feature of each pixel; InputError where `counts` does not fit."""
+        if not isinstance(self.counts, list):
+            return self.features
+        if len(self.counts) != len(self.features) or min(self.counts, default=1) < 1:
+            raise InputError(f"{here}: counts must be a whole number above 0 for each of its features")
+        if sum(self.counts) != len(self.pixels):
+            raise InputError(f"{here}: counts add up to {sum(self.counts)}, but there are {len(self.pixels)} pixels")
+        return [name for name, count in zip(self.features, self.counts, strict=True) for _ in range(count)]
 
 
 class _CurvesFile(_PointsFile, forbid_unknown_fields=True):
@@ -86,15 +110,18 @@ class _CameraFile(msgspec.Struct, forbid_unknown_fields=True):
     image_size: tuple[int, int]
 
 
-class _ObservationsFile(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
+class ObservationsFile(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
+    """Observations, but for the columns of an NPZ."""
+
     format: str
     version: int
-    units: str = "metres, radians, pixels"
-    pixel_origin: str = "centre of the top-left pixel"
+    units: Units = UNITS
+    pixel_origin: PixelOrigin = PIXEL_ORIGIN
     targets: dict[str, Any]
     cameras: dict[str, _CameraFile]
     views: list[_ViewFile]
     priors: list[dict[str, Any]] = []
+    notes: dict[str, Any] | msgspec.UnsetType = msgspec.UNSET
 
     def content(self) -> Content:
         """All but the columns; InputError naming the place."""
@@ -105,6 +132,7 @@ class _ObservationsFile(msgspec.Struct, forbid_unknown_fields=True, kw_only=True
             NO_POINTS,
             NO_CURVES,
             tuple(prior_from_json(entry, f"prior {i}") for i, entry in enumerate(self.priors)),
+            self.notes if isinstance(self.notes, dict) else {},
         )
 
 
@@ -124,15 +152,16 @@ def write_content(content: Content, path: Path) -> None:
         raise InputError(f"{path}: observations are written as .json or .npz: give one of these endings")
 
 
-def header_of(content: Content) -> _ObservationsFile:
+def header_of(content: Content) -> ObservationsFile:
     """Everything but the columns, as a file has it."""
-    return _ObservationsFile(
+    return ObservationsFile(
         format=FORMAT,
         version=VERSION,
         targets={name: target.spec for name, target in content.targets.items()},
         cameras={name: _CameraFile(size) for name, size in content.cameras.items()},
         views=[_ViewFile(**vars(view)) for view in content.views],
         priors=[prior_to_json(prior) for prior in content.priors],
+        notes=dict(content.notes) or msgspec.UNSET,
     )
 
 
@@ -175,10 +204,10 @@ def _numbers(value: Any, size: int, where: str, *, spread: bool = False) -> tupl
 
 
 def _from_json(content: bytes, where: str) -> Content:
-    data = decode_json(content, _ObservationsFile, where)
+    data = decode_json(content, ObservationsFile, where)
     if data is None:
         plain = check_header(parse_json(content, where), where, FORMAT, VERSION)
-        data = convert(plain, _ObservationsFile, where)
+        data = convert(plain, ObservationsFile, where)
     check_header({"format": data.format, "version": data.version}, where, FORMAT, VERSION)
     header = data.content()
     targets, views = header.targets, header.views
@@ -213,12 +242,14 @@ def _columns(
     view, feature, sigma = [], [], []
     pixels: list[tuple[float, float]] = []
     for number, entry in entries:
-        here, count = view_label(number, views), len(entry.features)
+        here = view_label(number, views)
+        features = entry.each(here)
+        count = len(features)
         if len(entry.pixels) != count:
             raise InputError(f"{here}: {count} {kind} features but {len(entry.pixels)} pixels")
         names = index[views[number].target]
         try:
-            feature.append([names[name] for name in entry.features])
+            feature.append([names[name] for name in features])
         except KeyError as error:
             raise InputError(
                 f"{here}: {kind} feature {error.args[0]!r} is unknown in target {views[number].target!r}: "
@@ -238,10 +269,10 @@ def _columns(
 
 
 def _sides(entry: _CurvesFile, here: str) -> list[int]:
-    side = entry.side or "centre"
-    names = side if isinstance(side, list) else [side] * len(entry.features)
-    if len(names) != len(entry.features):
-        raise InputError(f"{here}: {len(entry.features)} curve features but {len(names)} sides")
+    side, count = entry.side or "centre", len(entry.each(here))
+    names = side if isinstance(side, list) else [side] * count
+    if len(names) != count:
+        raise InputError(f"{here}: {count} curve features but {len(names)} sides")
     for name in names:
         if name not in SIDES:
             raise InputError(f"{here}: side {name!r} is unknown: {', '.join(SIDES)}")
@@ -260,11 +291,13 @@ def _to_json(content: Content) -> bytes:
         if len(p):
             entry.points = _PointsFile(*_features(content.points, p, target.point_names))
         if len(c):
-            side = _side_names(content.curves.side[c])
-            entry.curves = _CurvesFile(*_features(content.curves, c, target.curve_names), side)
-    plain = msgspec.structs.asdict(data)
+            features, pixels, sigma_px = _features(content.curves, c, target.curve_names)
+            runs = [(name, len(list(same))) for name, same in groupby(features)]
+            once, counts = [name for name, _ in runs], [count for _, count in runs]
+            entry.curves = _CurvesFile(once, pixels, sigma_px, counts, _side_names(content.curves.side[c]))
+    plain = {name: value for name, value in msgspec.structs.asdict(data).items() if value is not msgspec.UNSET}
     del plain["views"]
-    head = msgspec.json.format(msgspec.json.encode(plain), indent=1).rstrip(b"}\n")
+    head = msgspec.json.format(msgspec.json.encode(plain), indent=1).removesuffix(b"\n}")
     lines = b",\n  ".join(msgspec.json.encode(entry) for entry in data.views)
     return head + b',\n "views": [\n  ' + lines + b"\n ]\n}\n"
 
@@ -299,7 +332,7 @@ def _to_npz(content: Content) -> bytes:
 def _from_npz(packed: bytes, where: str) -> Content:
     arrays = read_npz(packed, _COLUMNS, where)
     plain = check_header(parse_json(arrays.pop("header").tobytes(), where), where, FORMAT, VERSION)
-    content = convert(plain, _ObservationsFile, where).content()
+    content = convert(plain, ObservationsFile, where).content()
     points, curves = (
         {name.removeprefix(kind): array for name, array in arrays.items() if name.startswith(kind)}
         for kind in ("points_", "curves_")

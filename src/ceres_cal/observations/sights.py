@@ -234,8 +234,12 @@ def ranges(bounds: Indices, numbers: Indices) -> Indices:
     return np.asarray(starts + np.arange(sizes.sum()))
 
 
-def gather_sights(observations: Observations) -> Sights:
-    """The sights of all observations; a sight without any observation is left out."""
+def gather_sights(observations: Observations, *, predicted: bool = False) -> Sights:
+    """The sights of all observations that are no copies of others; a sight without any is left out.
+
+    Args:
+        predicted: that they were never measured: without noise frames of a static camera look like copies.
+    """
     keys = [SightKey(view.camera, view.station, view.placement) for view in observations.views]
     order = {key: number for number, key in enumerate(dict.fromkeys(keys))}
     sight_of_view = np.array([order[key] for key in keys], dtype=np.int64)
@@ -274,7 +278,8 @@ def gather_sights(observations: Observations) -> Sights:
         np.concatenate([np.tile(t.is_arc, 3) for t in targets]),
     )
     filled = np.flatnonzero(np.diff(point_bounds) + np.diff(curve_bounds))
-    return every if len(filled) == len(every) else every.take(filled)
+    every = every if len(filled) == len(every) else every.take(filled)
+    return every if predicted else every.used(*observations.copies.originals)
 
 
 def _grouped(columns: Columns, sight_of_view: Indices, count: int) -> tuple[Indices | slice, Indices]:

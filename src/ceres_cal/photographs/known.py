@@ -132,6 +132,7 @@ def check_photographs(
     station: str | None = None,
     false_alarms: float = FALSE_ALARMS,
     *,
+    checks: int = 1,
     not_painted: Collection[str] = (),
     progress: ImageProgress | None = None,
 ) -> tuple[Check, KnownDetections]:
@@ -142,12 +143,14 @@ def check_photographs(
     """
     detections = detect_known(calibration, images, station, not_painted=not_painted, boards=False, progress=progress)
     if detections.observations is not None:
-        return check(calibration, detections.observations, false_alarms), detections
+        return check(calibration, detections.observations, false_alarms, checks), detections
     words = (
         f"not found: no field within {_REACH} of where it was in {_counted(len(images))}: the camera has moved "
         "farther, or it sees no field (dark, covered, other lines): look at the picture"
     )
-    return Check(false_alarms, {detections.station: StationCheck.unknown(detections.station, words)}), detections
+    return Check(
+        false_alarms, checks, {detections.station: StationCheck.unknown(detections.station, words)}
+    ), detections
 
 
 def is_painted(target: Target) -> bool:

@@ -1,18 +1,27 @@
-"""What speaks for a calibration and against it, each with its level: good, care, no, or "" where it is only said."""
+"""May a calibration be trusted, for what, to how many mm: the one verdict of screens, reports and `--json`.
+
+What speaks for it and against it has a level each: good, care, no, or "" where it is only said.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 
 from ceres_cal.base.words import counted, first_of, mm, sentence, short
-from ceres_cal.diagnostics import DIAGNOSTICS, Finding
-from ceres_cal.report.material import Material
+from ceres_cal.diagnostics import Finding
+from ceres_cal.observations.copies import COUNTED_ONCE
+from ceres_cal.report.quality import Quality
+from ceres_cal.scene.heights import HEIGHTS_M
+from ceres_cal.uncertainty import FieldMap, Verdict
 
 GOOD_MM, CARE_MM = 10.0, 50.0
 """95 % of located points nearer than the first is good (the width of a painted line), than the second to be used with
 care, beyond it not to be used."""
+LARGE_NOISE = 3.0
+"""Times the stated sigmas, from which on something else than noise is in it: no number of mm is promised."""
 _MANY_OUTLIERS = 0.3
 _MOST_LINES = 6
 _ORDER = ("good", "care", "no")
@@ -28,42 +37,92 @@ def worst(*levels: str) -> str:
     return max(levels, key=_ORDER.index)
 
 
+@dataclass(frozen=True)
+class Judgement:
+    """The verdict.
+
+    Attributes:
+        level: good, care or no. headline: one sentence. reasons: level and line of each.
+    """
+
+    level: str
+    headline: str
+    reasons: tuple[tuple[str, str], ...]
+
+
+def judge_quality(quality: Quality) -> Judgement:
+    """The verdict on a calibration."""
+    reasons = tuple(grounds(quality))
+    level, headline = _headline(quality, reaches(quality), worst("good", *(mark for mark, _ in reasons if mark)))
+    return Judgement(level, headline, reasons)
+
+
 def is_against(finding: Finding) -> bool:
-    """Whether it says that the calibration is wrong, not only that some observation or its noise is."""
+    """Whether it says that the calibration is wrong: a wrong label did no harm, noise and dependence of errors
+    are in the standard deviations.
+    """
     return finding.wrong in ("model", "calibration")
 
 
-def model_error_mm(material: Material) -> float:
+def _findings(quality: Quality) -> tuple[Finding, ...]:
+    return () if quality.diagnosis is None else quality.diagnosis.findings
+
+
+def disputed(quality: Quality) -> bool:
+    """Whether what was known beforehand is contradicted; a tolerance alone leaves the calibration as it is."""
+    return any(conflict.kind != "tolerance" for conflict in quality.calibration.conflicts)
+
+
+def noise_ratio(quality: Quality) -> float:
+    """The noise over what was stated, the larger one of points and curves; 0 where nothing was stated."""
+    every = () if quality.diagnosis is None else quality.diagnosis.noise
+    return max((one.scale for one in every if np.isfinite(one.stated_px)), default=0.0)
+
+
+def model_error_mm(quality: Quality) -> float:
     """The largest effect of what is wrong with the model, rms mm; 0 where nothing is known to be."""
-    return _largest_mm([finding for finding in material.diagnosis.findings if finding.is_model_error])
+    return _largest_mm([finding for finding in _findings(quality) if finding.is_model_error])
 
 
-def misfit_mm(material: Material) -> float:
+def misfit_mm(quality: Quality) -> float:
     """By how much a refit to new data would move it, rms mm; 0 where it holds on them, or they are its own."""
-    return _largest_mm([finding for finding in material.diagnosis.findings if finding.wrong == "calibration"])
+    return _largest_mm([finding for finding in _findings(quality) if finding.wrong == "calibration"])
 
 
 def _largest_mm(findings: list[Finding]) -> float:
     return float(np.nanmax([0.0, *(finding.effect_mm for finding in findings)]))
 
 
-def grounds(material: Material) -> Iterator[tuple[str, str]]:
+def grounds(quality: Quality) -> Iterator[tuple[str, str]]:
     """Level and line of each."""
-    calibration, table = material.calibration, material.diagnosis.table
+    calibration, diagnosis = quality.calibration, quality.diagnosis
     if calibration.converged:
         yield "good", "The solve came to rest."
     elif calibration.rounds:
         yield "no", "The solve did not come to rest: raise --max-iterations."
-    yield from _of_findings(material)
-    out = 1.0 - float(np.mean(table.inlier)) if len(table) else 0.0
+    yield from _of_findings(quality)
+    for conflict in calibration.conflicts:
+        yield "care" if conflict.kind == "tolerance" else "no", f"{sentence(conflict.words)}."
+    if noise_ratio(quality) >= LARGE_NOISE:
+        yield (
+            "care",
+            f"The noise is {short(noise_ratio(quality))} times what was stated: is it the right lens, are labels and "
+            "dimensions right?",
+        )
+    out = float(np.mean(diagnosis.table.outlier)) if diagnosis is not None and len(diagnosis.table) else 0.0
     if out > _MANY_OUTLIERS:
         yield "care", f"{100.0 * out:.0f} % of the observations were taken out: check labels, dimensions and the lens."
-    yield from _of_knowledge(material)
-    yield from (("care", f"{sentence(text)}.") for text in calibration.warnings)
+    yield from _of_knowledge(quality)
+    known = [conflict.words for conflict in calibration.conflicts]
+    for text in calibration.warnings:
+        if text not in known:
+            yield "" if text.endswith(COUNTED_ONCE) else "care", f"{sentence(text)}."
 
 
-def _of_findings(material: Material) -> Iterator[tuple[str, str]]:
-    diagnosis, wrong_mm, off_mm = material.diagnosis, model_error_mm(material), misfit_mm(material)
+def _of_findings(quality: Quality) -> Iterator[tuple[str, str]]:
+    diagnosis, wrong_mm, off_mm = quality.diagnosis, model_error_mm(quality), misfit_mm(quality)
+    if diagnosis is None:
+        return
     wrong = [f"{finding.kind} ({finding.subject})" for finding in diagnosis.findings if finding.is_model_error]
     if not diagnosis.findings:
         yield "good", "What the model leaves over looks like noise."
@@ -80,22 +139,106 @@ def _of_findings(material: Material) -> Iterator[tuple[str, str]]:
             "no" if off_mm > GOOD_MM else "care",
             f"A refit to these new data would move it by {mm(off_mm)} rms: was the camera bumped?",
         )
-    if any(DIAGNOSTICS[finding.kind].widens for finding in diagnosis.findings):
-        factor = max(one.inflation for one in diagnosis.noise) ** 0.5
-        yield "care", f"Neighbouring residuals agree: take every standard deviation {short(factor)} times as large."
 
 
-def _of_knowledge(material: Material) -> Iterator[tuple[str, str]]:
-    if material.uncertainty is None:
+def _of_knowledge(quality: Quality) -> Iterator[tuple[str, str]]:
+    if quality.uncertainty is None:
         return
-    weak = [direction.words for direction in material.uncertainty.weak_directions]
-    level = "" if material.maps else "care"  # what they do to places is in the maps
+    if quality.uncertainty.widening:
+        yield "", f"{sentence(quality.uncertainty.widening)}."
+    weak = [direction.words for direction in quality.uncertainty.weak_directions]
+    level = "" if quality.maps else "care"  # what they do to places is in the maps
     yield from ((level, f"{sentence(words)}.") for words in weak[:_MOST_LINES])
     if len(weak) > _MOST_LINES:
         yield level, f"{len(weak) - _MOST_LINES} more such directions: see the numbers."
     if not weak:
         yield "good", "Every number of the cameras and stations is known to 1 % or better."
-    lost = material.uncertainty.unknown_placements
+    lost = quality.uncertainty.unknown_placements
     if lost:
         named = first_of([f"{' and '.join(parts)} of {name}" for name, parts in lost.items()], 3)
         yield "", f"Not known of placements: {named}. The cameras do not need it."
+
+
+# ---- the headline -------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Reach:
+    """How well places at one height are told, over all stations.
+
+    Attributes:
+        height_m: of the places. radius_mm: 95 % of the points located at the worst place are nearer, infinite where it
+            cannot be told, NaN where no image shows any. level: "good", "care" or "no".
+    """
+
+    height_m: float
+    radius_mm: float
+    level: str
+
+    @property
+    def where(self) -> str:
+        return "on the floor" if self.height_m == 0.0 else f"at robot height ({mm(1e3 * self.height_m)})"
+
+
+def reaches(quality: Quality) -> tuple[Reach, ...]:
+    """One for each of HEIGHTS_M; none where no station sees the world."""
+    if not quality.maps:
+        return ()
+    radii = [worst_radius(*(maps[number] for maps in quality.maps.values())) for number in range(len(HEIGHTS_M))]
+    return tuple(Reach(height, radius, level_of(radius)) for height, radius in zip(HEIGHTS_M, radii, strict=True))
+
+
+def worst_radius(*maps: FieldMap) -> float:
+    """The largest of their 95 % radii, mm; NaN where they show nothing."""
+    radii = np.concatenate([one.radius_95_mm.ravel() for one in maps])
+    shown = radii[~np.isnan(radii)]
+    return float(shown.max()) if len(shown) else np.nan
+
+
+def focal(quality: Quality) -> Iterator[Verdict]:
+    """What is known of phi of each camera."""
+    for name in quality.observations.cameras:
+        verdict = quality.verdicts.get(("camera", name, "phi"))
+        if verdict is not None:
+            yield verdict
+
+
+def level_of_verdict(verdict: Verdict) -> str:
+    """Good where it is known, care where it is weak."""
+    return {"known": "good", "weak": "care", "unknown": "no"}[verdict.verdict]
+
+
+def _headline(quality: Quality, every: tuple[Reach, ...], reasons: str) -> tuple[str, str]:
+    """Level and headline."""
+    if quality.uncertainty is None:
+        return "no", "Not to be used: nothing was minimised, this is the paper's closed form alone."
+    if not every:
+        level = worst(reasons, *(level_of_verdict(verdict) for verdict in focal(quality)))
+        how = {"good": "can be trusted", "care": "are to be used with care", "no": "cannot be trusted"}[level]
+        return level, f"The intrinsics {how}. No station sees a field: places in the world cannot be told."
+    if misfit_mm(quality) > GOOD_MM:
+        return "no", f"It does not hold: on these new data it is off by {mm(misfit_mm(quality))} (rms)."
+    floor, above = every
+    doubt = _doubt(quality)
+    if reasons == "no" or floor.level == "no":
+        return "no", f"Do not trust this calibration{f': {doubt}' if doubt else ''}."
+    if doubt:
+        return "care", f"Use it with care, no accuracy can be stated: {doubt}."
+    promised = " and ".join(f"to {mm(r.radius_mm)} {r.where}" for r in every if r.level != "no")
+    if above.level == "no":
+        how = f"are known to {mm(above.radius_mm)} only" if np.isfinite(above.radius_mm) else "cannot be told"
+        return "care", f"Trust it on the floor alone, to {mm(floor.radius_mm)}: places {above.where} {how}."
+    level = worst(reasons, floor.level, above.level)
+    return level, f"{'This calibration can be trusted' if level == 'good' else 'Use it with care'}: {promised}."
+
+
+def _doubt(quality: Quality) -> str:
+    """What keeps a headline from promising anything; "" where nothing does."""
+    if disputed(quality):
+        return "what was known beforehand is contradicted"
+    if noise_ratio(quality) >= LARGE_NOISE:
+        return f"the noise is {short(noise_ratio(quality))} times what was stated"
+    off, wrong = misfit_mm(quality), model_error_mm(quality)
+    if off:
+        return f"on these new data it is off by {mm(off)} (rms)"
+    return f"the model is wrong by {mm(wrong)} (rms)" if wrong else ""

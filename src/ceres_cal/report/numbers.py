@@ -16,9 +16,9 @@ from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.heights import HEIGHTS_M, at_height
 from ceres_cal.uncertainty import Verdict
 
-_HEAD = ("", "value", "± sd", "95 % bounds", "verdict")
+_HEAD = ("", "value", "± sd", "by the model alone", "95 % bounds", "verdict")
 _MOST_OFFSETS = 40
-_Row = tuple[str, str, str, str, str]
+_Row = tuple[str, ...]
 
 
 def numbers(material: Material) -> Chapter:
@@ -61,16 +61,21 @@ def _row(name: str, value: float, unit: str, verdict: Verdict | None) -> _Row:
     """A number; without a verdict it was held, or nothing was minimised."""
     space = f" {unit}" if unit else ""
     if verdict is None:
-        return name, f"{value:.10g}{space}", "", "", "not free"
-    if verdict.key.kind == "camera" and not unit:
-        shown, width = repr(value), f"{verdict.sd:.2g}" if np.isfinite(verdict.sd) else "unknown"
-    elif unit == "m":
-        shown, width = f"{at_precision(value, verdict.sd, unit)} m", mm(1e3 * verdict.sd)
-    else:
-        shown = f"{at_precision(value, verdict.sd, unit)}{space}"
-        width = f"{short(verdict.sd)}{space}" if np.isfinite(verdict.sd) else "unknown"
+        return name, f"{value:.10g}{space}", "", "", "", "not free"
+    plain = verdict.key.kind == "camera" and not unit
+    shown = repr(value) if plain else f"{at_precision(value, verdict.sd, unit)}{space}"
+    sds = (_width(sd, unit, plain) for sd in (verdict.sd, verdict.sd / verdict.factor))
     by = " (by its profile)" if verdict.by_profile and verdict.verdict != "known" else ""
-    return name, shown, width, bounds(verdict, unit), verdict.verdict + by
+    return name, shown, *sds, bounds(verdict, unit), verdict.verdict + by
+
+
+def _width(sd: float, unit: str, plain: bool) -> str:
+    """A standard deviation; `plain`: of a coefficient."""
+    if unit == "m":
+        return mm(1e3 * sd)
+    if not np.isfinite(sd):
+        return "unknown"
+    return f"{sd:.2g}" if plain else short(sd) + (f" {unit}" if unit else "")
 
 
 def bounds(verdict: Verdict, unit: str = "") -> str:
@@ -96,15 +101,15 @@ def _station(material: Material, name: str) -> Table:
     ]  # fmt: skip
     angles = np.degrees(euler_from_rotation(camera.cam_from_world.rotation))
     for word, angle in zip(("alpha", "beta", "gamma"), angles.tolist(), strict=True):
-        rows.append((f"{word}, the paper's", f"{angle:.4f}°", "", "", ""))
-    rows.append(("tilt from straight down", f"{camera.tilt_deg:.3f}°", "", "", ""))
+        rows.append((f"{word}, the paper's", f"{angle:.4f}°", "", "", "", ""))
+    rows.append(("tilt from straight down", f"{camera.tilt_deg:.3f}°", "", "", "", ""))
     for axis in "xyz":
         verdict = material.verdicts.get(("station", name, f"turn_{axis}"))
         if verdict is not None:
             sd = float(np.degrees(verdict.sd))
             limits = f"± {short(0.5 * float(np.degrees(verdict.high - verdict.low)))}°"
-            width = f"{short(sd)}°" if np.isfinite(sd) else "unknown"
-            rows.append((f"turn about the camera's {axis}", "", width, limits, verdict.verdict))
+            sds = (f"{short(one)}°" if np.isfinite(one) else "unknown" for one in (sd, sd / verdict.factor))
+            rows.append((f"turn about the camera's {axis}", "", *sds, limits, verdict.verdict))
     return Table(_HEAD, tuple(rows), caption, stacked=True)
 
 

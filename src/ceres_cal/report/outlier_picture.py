@@ -22,7 +22,7 @@ _MOST_BARS = 12
 def outliers(material: Material) -> Figure | None:
     """Which features were taken out, how often; None where nothing was."""
     table = material.diagnosis.table
-    rows = np.flatnonzero(~table.inlier)
+    rows = np.flatnonzero(table.outlier)
     if not len(rows):
         return None
     totals = Counter(table.features[i] for i in table.feature.tolist())

@@ -9,11 +9,16 @@ from itertools import combinations
 
 import numpy as np
 
+from ceres_cal.base.errors import CalibrationError
 from ceres_cal.calibration import Calibration
+from ceres_cal.diagnostics import Diagnosis, diagnose
+from ceres_cal.diagnostics.held_out import thinned
 from ceres_cal.observations import Observations
 from ceres_cal.scene.heights import HEIGHTS_M
 from ceres_cal.scene.targets import Target
 from ceres_cal.uncertainty import Disagreement, FieldMap, Uncertainty, Verdict
+
+_DIAGNOSED = 5_000  # observations that a calibration's own answer reads; `diagnose` and the report read all
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,12 +30,29 @@ class Seam:
     measured: Disagreement
 
 
+def quality_of(calibration: Calibration, observations: Observations, diagnosis: Diagnosis | None = None) -> Quality:
+    """A calibration diagnosed on its own observations, on a sample of very many; not where nothing was minimised."""
+    if not calibration.rounds:
+        return Quality(calibration, observations, diagnosis)
+    try:
+        few = thinned(observations, _DIAGNOSED)
+        diagnosis = diagnosis or diagnose(calibration, few, new_data=few is not observations)
+    except CalibrationError:
+        diagnosis = None
+    return Quality(calibration, observations, diagnosis)
+
+
 @dataclass(frozen=True, eq=False)
 class Quality:
-    """A calibration, the observations beside it, and how well it is known."""
+    """A calibration, the observations beside it, and how well it is known.
+
+    Attributes:
+        diagnosis: what the residuals say; None where they cannot be read.
+    """
 
     calibration: Calibration
     observations: Observations
+    diagnosis: Diagnosis | None
 
     @cached_property
     def uncertainty(self) -> Uncertainty | None:

@@ -49,7 +49,7 @@ def vectors(material: Material, name: str) -> Figure:
     """Residual vectors over one camera's image."""
     table, camera = material.diagnosis.table, material.calibration.cameras[name]
     own = material.of_camera(name)
-    inliers, outliers = np.flatnonzero(own & table.inlier), np.flatnonzero(own & ~table.inlier)
+    inliers, outliers = np.flatnonzero(own & table.inlier), np.flatnonzero(own & table.outlier)
     step = stride(material, len(inliers) + len(outliers))
     typical = float(np.median(np.abs(table.distance_px[inliers]))) if len(inliers) else 1.0
     means = significant_means(table, inliers, camera)

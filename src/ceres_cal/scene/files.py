@@ -35,18 +35,26 @@ class CameraFile(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
     principal_point: tuple[float, float]
     aspect: float = 1.0
     lens: LensFile
+    camera_matrix: Matrix | msgspec.UnsetType = msgspec.UNSET
+    """K, for other programs: phi, aspect and principal point once more."""
 
     @classmethod
     def of(cls, camera: Camera) -> CameraFile:
         """As a file has it."""
         lens = LensFile(camera.lens.kind, camera.lens.powers or None, camera.lens.coefficients)
         size, centre = camera.image_size, camera.principal_point
-        return cls(image_size=size, phi=camera.phi, principal_point=centre, aspect=camera.aspect, lens=lens)
+        k = camera.matrix.tolist()
+        return cls(
+            image_size=size, phi=camera.phi, principal_point=centre, aspect=camera.aspect, lens=lens, camera_matrix=k
+        )
 
     def camera(self) -> Camera:
         """The camera, at no particular pose; InputError where it is none."""
         lens = make_lens(self.lens.kind, self.lens.powers or (2, 3), self.lens.coefficients)
-        return Camera(self.image_size, self.phi, self.principal_point, lens, self.aspect)
+        camera = Camera(self.image_size, self.phi, self.principal_point, lens, self.aspect)
+        if self.camera_matrix and not np.allclose(camera.matrix, self.camera_matrix, rtol=1e-9):
+            raise InputError("camera_matrix is another than that of phi, aspect and principal_point: correct one")
+        return camera
 
 
 class PoseFile(msgspec.Struct, forbid_unknown_fields=True):

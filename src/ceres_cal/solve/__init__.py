@@ -11,11 +11,15 @@ with kept_signals():
     import pyceres  # noqa: F401
 
 from ceres_cal.solve.bundle import Progress, Solution, placement_costs, solve, with_placements_at_best
+from ceres_cal.solve.conflicts import Conflicts, find_conflicts
 from ceres_cal.solve.information import Eliminated, ReducedInformation, information
 from ceres_cal.solve.problem import Problem, Weighting
 from ceres_cal.solve.robust import RobustSolution, solve_robustly
+from ceres_cal.solve.stated import Conflict
 
 __all__ = [
+    "Conflict",
+    "Conflicts",
     "Eliminated",
     "Problem",
     "Progress",
@@ -23,6 +27,7 @@ __all__ = [
     "RobustSolution",
     "Solution",
     "Weighting",
+    "find_conflicts",
     "information",
     "placement_costs",
     "solve",

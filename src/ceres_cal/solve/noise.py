@@ -16,6 +16,7 @@ from ceres_cal.model.residuals import Residuals
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights
 
+_BEYOND = 100.0  # an exponent: no observation is so rare
 # Spare equations below which a spread says nothing: its own error is 25 % at 8. At 4 the errors of fits to ten points
 # are 1.46 of their stated sigmas, at 16 they are 0.8 (1.16 at 8), because the stated sigmas are then taken.
 _LEAST_SPARE = 8.0
@@ -25,6 +26,10 @@ _BORROWED = 4.0
 # Spare equations that a scale seen before stands for: few exact ones must not make it 0. Nothing changes from half to
 # double.
 USUAL_EQUATIONS = 10.0
+# Share by which rows kept may outnumber those that their scale was taken from, and still be the tail of the same noise:
+# of Student's t with two degrees of freedom it is 1 %, of outliers more.
+_TAIL = 0.02
+_MOST_WIDER = 5
 _ENOUGH = 5_000
 _LEAST_SCALE_PX = 1e-4  # no image is measured better than that
 _RAYLEIGH_MEDIAN = 1.177410022515474  # of the length of a two-dimensional standard normal
@@ -122,19 +127,23 @@ def judge(
 ) -> Inliers:
     """Noise scales and inliers at one estimate.
 
-    The median gives a first scale that half the data may not spoil, the inliers' own spread the final one.
+    The median gives a first scale that half the data may not spoil, the spread of the inliers the final one: where the
+    noise has tails, these are more than lie within the bound by the first scale.
 
     Args:
         options: how far off an outlier is, and whether the stated sigmas hold (scale 1).
         usual: scales of points and curves seen before; they count as much as a few spare equations do.
     """
     points, curves = relative_lengths(observations, residuals)
-    reject_sigma = options.reject_sigma
     if options.noise_scale == "stated":
-        return Inliers(points <= reject_sigma, curves <= reject_sigma, 1.0, 1.0, points, curves)
+        inside = points <= options.reject_sigma, curves <= options.reject_sigma
+        return Inliers(*inside, 1.0, 1.0, points, curves)
     floor = usual or (0.0, 0.0)
-    point_spread = _spread(points, _RAYLEIGH_MEDIAN, reject_sigma, floor[0])
-    curve_spread = _spread(curves, _NORMAL_MEDIAN, reject_sigma, floor[1])
+    finite = np.count_nonzero(np.isfinite(points)), np.count_nonzero(np.isfinite(curves))
+    spare_of_all = 2.0 * redundancy.points * finite[0] + redundancy.curves * finite[1]
+    reject_sigma = _as_rare(options.reject_sigma, spare_of_all + (USUAL_EQUATIONS if usual else 0.0))
+    point_spread = _spread(points, _RAYLEIGH_MEDIAN, reject_sigma, floor[0], 2.0 * redundancy.points)
+    curve_spread = _spread(curves, _NORMAL_MEDIAN, reject_sigma, floor[1], redundancy.curves)
     spare = 2.0 * redundancy.points * point_spread.count, redundancy.curves * curve_spread.count
     degrees = spare[0] + spare[1]
     if usual is not None:
@@ -148,6 +157,16 @@ def judge(
         if degrees < _LEAST_SPARE:
             p, c, degrees = 1.0, 1.0, np.inf
     return Inliers(points <= reject_sigma * p, curves <= reject_sigma * c, p, c, points / p, curves / c, degrees)
+
+
+def _as_rare(sigmas: float, degrees: float) -> float:
+    """The length that is as rare among residuals over a scale that was estimated from so few spare equations as
+    `sigmas` is over a known one: (1 + length^2 / degrees)^(-degrees / 2) = exp(-sigmas^2 / 2), that of Student's t in
+    two dimensions. Where the stated sigmas are taken it is `sigmas`.
+    """
+    if degrees < _LEAST_SPARE:
+        return sigmas
+    return float(np.sqrt(degrees * np.expm1(min(sigmas**2 / degrees, _BEYOND))))
 
 
 @dataclass(frozen=True)
@@ -168,8 +187,25 @@ class _Spread:
         return float(np.sqrt((self.squares + USUAL_EQUATIONS * usual**2) / (max(spare, 0.0) + USUAL_EQUATIONS)))
 
 
-def _spread(lengths: Array, median_of_one: float, reject_sigma: float, least: float) -> _Spread:
+def _spread(lengths: Array, median_of_one: float, reject_sigma: float, least: float, degrees: float) -> _Spread:
+    """Of the lengths that the scale they have keeps.
+
+    Args:
+        least: a scale that theirs is no smaller than. degrees: spare equations of each.
+    """
     finite = np.isfinite(lengths)
     seen = lengths if finite.all() else lengths[finite]
-    inside = seen <= reject_sigma * max(_median_scale(seen, median_of_one), least)
-    return _Spread(int(np.count_nonzero(inside)), float(np.sum(seen**2, where=inside)))
+    spread = _within(seen, reject_sigma * max(_median_scale(seen, median_of_one), least))
+    for _ in range(_MOST_WIDER):
+        if degrees <= 0.0 or not spread.count:
+            break
+        wider = _within(seen, reject_sigma * float(np.sqrt(spread.squares / (degrees * spread.count))))
+        if not spread.count < wider.count <= (1.0 + _TAIL) * spread.count:
+            break
+        spread = wider
+    return spread
+
+
+def _within(lengths: Array, bound: float) -> _Spread:
+    inside = lengths <= bound
+    return _Spread(int(np.count_nonzero(inside)), float(np.sum(lengths**2, where=inside)))

@@ -1,6 +1,7 @@
 """How well a calibration is known: covariance, weak directions, bounds beyond the quadratic picture, maps in mm."""
 
 from ceres_cal.uncertainty.assess import assess
+from ceres_cal.uncertainty.dependence import Dependence, Scatter, measure_scatter
 from ceres_cal.uncertainty.files import PosteriorFile, information_from, lower_triangle
 from ceres_cal.uncertainty.maps import FieldMap, PointSpread
 from ceres_cal.uncertainty.posterior import Posterior, make_posterior
@@ -10,12 +11,14 @@ from ceres_cal.uncertainty.uncertainty import Uncertainty
 from ceres_cal.uncertainty.weak import Verdict, WeakDirection
 
 __all__ = [
+    "Dependence",
     "Disagreement",
     "FieldMap",
     "PhiProfile",
     "PointSpread",
     "Posterior",
     "PosteriorFile",
+    "Scatter",
     "Uncertainty",
     "Verdict",
     "WeakDirection",
@@ -24,4 +27,5 @@ __all__ = [
     "information_from",
     "lower_triangle",
     "make_posterior",
+    "measure_scatter",
 ]

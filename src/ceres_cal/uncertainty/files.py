@@ -10,6 +10,8 @@ import numpy as np
 from ceres_cal.base.errors import InputError
 from ceres_cal.model.information import Information
 from ceres_cal.model.keys import Key, pose_keys
+from ceres_cal.uncertainty.bent import Bends
+from ceres_cal.uncertainty.dependence import Dependence
 from ceres_cal.uncertainty.posterior import Posterior
 from ceres_cal.uncertainty.profile import PhiProfile
 
@@ -43,6 +45,29 @@ class ProfileFile(msgspec.Struct, forbid_unknown_fields=True):
         return PhiProfile(camera, tuple(self.keys), self.phi_px, steps, rises, across, self.open_below, self.open_above)
 
 
+class BendsFile(msgspec.Struct, forbid_unknown_fields=True):
+    """What leaves the quadratic picture, in a calibration's file: see `Bends`."""
+
+    keys: list[Key]
+    steps: list[list[float]]
+    ends: list[list[float]]
+    half_width: float
+
+    @classmethod
+    def of(cls, bends: Bends) -> BendsFile:
+        """As a file has it."""
+        return cls(list(bends.keys), bends.steps.tolist(), bends.ends.tolist(), bends.half_width)
+
+    def bends(self, known: Sequence[Key]) -> Bends:
+        """The bends; InputError where their numbers do not fit each other, or those that are known."""
+        rows = [*self.steps, *self.ends]
+        if len(self.steps) != len(self.ends) or any(len(row) != len(self.keys) for row in rows):
+            raise InputError("posterior.bends: steps, ends and keys do not fit each other: calibrate again")
+        if not set(self.keys) <= set(known):
+            raise InputError("posterior.bends names keys that the posterior does not have: calibrate again")
+        return Bends(tuple(self.keys), np.array(self.steps), np.array(self.ends), self.half_width)
+
+
 class PosteriorFile(msgspec.Struct, forbid_unknown_fields=True):
     """The posterior in a calibration's file; freedom is null where the sigmas were taken as stated."""
 
@@ -51,6 +76,9 @@ class PosteriorFile(msgspec.Struct, forbid_unknown_fields=True):
     placements: dict[str, list[float]]
     freedom: float | None
     profiles: dict[str, ProfileFile]
+    by_model: list[float] | None = None
+    dependence: Dependence | None = None
+    bends: BendsFile | None = None
 
     @classmethod
     def of(cls, posterior: Posterior) -> PosteriorFile:
@@ -62,6 +90,9 @@ class PosteriorFile(msgspec.Struct, forbid_unknown_fields=True):
             {name: lower_triangle(information) for name, information in posterior.placements.items()},
             degrees if np.isfinite(degrees) else None,
             {name: ProfileFile.of(profile) for name, profile in posterior.profiles.items()},
+            None if posterior.by_model is None else lower_triangle(posterior.by_model),
+            posterior.dependence,
+            None if posterior.bends is None else BendsFile.of(posterior.bends),
         )
 
     def posterior(self) -> Posterior:
@@ -72,7 +103,10 @@ class PosteriorFile(msgspec.Struct, forbid_unknown_fields=True):
         }
         information = information_from(self.information, self.keys, "posterior.information")
         profiles = {name: entry.profile(name) for name, entry in self.profiles.items()}
-        return Posterior(information, placements, np.inf if self.freedom is None else self.freedom, profiles)
+        by_model = self.by_model and information_from(self.by_model, self.keys, "posterior.by_model")
+        freedom = np.inf if self.freedom is None else self.freedom
+        bends = None if self.bends is None else self.bends.bends(self.keys)
+        return Posterior(information, placements, freedom, profiles, by_model or None, self.dependence, bends)
 
 
 def lower_triangle(information: Information) -> list[float]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,7 +19,9 @@ from ceres_cal.base.tails import NORMAL_95, NORMAL_95_ONE_SIDED
 from ceres_cal.model.keys import STATION_QUANTITIES, Key
 from ceres_cal.model.parameters import Estimate
 from ceres_cal.model.quantities import camera_moved, moved, natural_sizes
+from ceres_cal.uncertainty.bent import weak_axes
 from ceres_cal.uncertainty.posterior import Posterior
+from ceres_cal.uncertainty.profile import FARTHER
 
 _STEP = 1e-5  # of each number's natural size: the differences are good to 1e-9 of the slope
 
@@ -108,13 +111,45 @@ def spread_of_points(
     if estimate.stations[station].camera in posterior.profiles:
         return _by_profile(estimate, posterior, station, pixels, height_m)
     located = estimate.camera_at(station).locate(pixels, height_m)
-    slopes = np.zeros((len(pixels), 2, len(posterior.keys)))
-    slopes[:, :, posterior.information.columns(keys)] = locate_slopes(estimate, keys, station, pixels, height_m)
+    slopes, at = np.zeros((len(pixels), 2, len(posterior.keys))), posterior.information.columns(keys)
+    slopes[:, :, at] = locate_slopes(estimate, keys, station, pixels, height_m)
     covariance = posterior.spread.through(slopes)
+    if posterior.bends is not None:
+        own = [posterior.bends.keys.index(key) for key in keys]
+        steps, ends = posterior.bends.steps[:, own], posterior.bends.ends[:, own]
+        bend = _bend(estimate, keys, (steps, ends), (station, pixels, height_m), slopes[:, :, at])
+        covariance += bend / posterior.half_width**2
     variance = np.diagonal(covariance, axis1=1, axis2=2)
     reach = posterior.half_width * np.sqrt(variance)
     radius = radius_95(covariance) * posterior.half_width / NORMAL_95
     return PointSpread(located, located - reach, located + reach, radius, np.sqrt(np.sum(variance, axis=1)))
+
+
+def _bend(
+    estimate: Estimate,
+    keys: Sequence[Key],
+    steps: tuple[Array, Array],
+    asked: tuple[str, Array, float],
+    slopes: Array,
+) -> Array:
+    """(N, 2, 2) squares of how much farther off places are than their slopes (N, 2, K) say, summed over directions;
+    infinite where a place is lost on the way.
+
+    Args:
+        steps: (B, K) what the slopes take, and where the numbers really go. asked: station, pixels (N, 2), height in m.
+    """
+    station, pixels, height_m = asked
+    located = estimate.camera_at(station).locate(pixels, height_m)
+    total = np.zeros((len(pixels), 2, 2))
+    for step, end in zip(*steps, strict=True):
+        off = np.full((len(pixels), 2), np.nan)
+        with suppress(InputError):  # no camera there
+            off = moved(estimate, keys, end).camera_at(station).locate(pixels, height_m) - located - slopes @ step
+        total += off[:, :, None] * off[:, None, :]
+    lost = np.isnan(total).any(axis=(1, 2))
+    total[lost] = np.nan
+    total[lost, 0, 0] = total[lost, 1, 1] = np.inf
+    return total
 
 
 def _by_profile(estimate: Estimate, posterior: Posterior, station: str, pixels: Array, height_m: float) -> PointSpread:
@@ -126,7 +161,10 @@ def _by_profile(estimate: Estimate, posterior: Posterior, station: str, pixels: 
         there = moved(estimate, profile.keys, step)
         offsets.append(there.camera_at(station).locate(pixels, height_m) - located)
         slopes = locate_slopes(there, profile.keys[1:], station, pixels, height_m)
-        covariances.append(across.spread.through(slopes))
+        axes = width * weak_axes(across, there, across.keys).T
+        steps = np.concatenate([axes, -axes])
+        bend = 0.5 * _bend(there, across.keys, (steps, steps), (station, pixels, height_m), slopes)
+        covariances.append(across.spread.through(slopes) + bend / width**2)
     values, known = np.array(offsets), np.array(covariances)
     nowhere = np.asarray(np.isnan(values).any(axis=(0, 2)))  # from some node of the valley nothing is seen there
     sds = np.sqrt(np.diagonal(known, axis1=2, axis2=3))
@@ -135,10 +173,14 @@ def _by_profile(estimate: Estimate, posterior: Posterior, station: str, pixels: 
     low = np.where(nowhere[:, None], -np.inf, below.reshape(-1, 2))
     high = np.where(nowhere[:, None], np.inf, above.reshape(-1, 2))
     circles = np.array([radius_95(part) for part in known]) / NORMAL_95
-    weights, widths = profile.reaches(width)
-    away = np.linalg.norm(np.einsum("mn,npk->mpk", weights, values), axis=2)
     unknown = ~np.isfinite(circles).all(axis=0)  # from some node of the valley
-    radius = np.max(away + widths[:, None] * (weights @ np.where(unknown, 0.0, circles)), axis=0)
+
+    def radius_at(width: float) -> Array:
+        weights, widths = profile.reaches(width)
+        away = np.linalg.norm(np.einsum("mn,npk->mpk", weights, values), axis=2)
+        return np.asarray(np.max(away + widths[:, None] * (weights @ np.where(unknown, 0.0, circles)), axis=0))
+
+    radius = np.maximum(radius_at(width), 0.5 * radius_at(FARTHER))  # of what is normal, 0.65
     radius = np.where(unknown | np.isinf(low).any(axis=1) | np.isinf(high).any(axis=1), np.inf, radius)
     return PointSpread(located, located + low, located + high, radius, radius / NORMAL_95)
 

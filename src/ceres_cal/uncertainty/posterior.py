@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -11,12 +11,14 @@ import numpy as np
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.spread import Spread, without
-from ceres_cal.base.tails import NORMAL_95
+from ceres_cal.base.tails import student_95
 from ceres_cal.model.information import Information
 from ceres_cal.model.keys import Key, pose_keys, sigma_limits
 from ceres_cal.model.parameters import Estimate, Layout
 from ceres_cal.model.quantities import layout_of
 from ceres_cal.solve import Eliminated, ReducedInformation
+from ceres_cal.uncertainty.bent import Bends
+from ceres_cal.uncertainty.dependence import Dependence, Scatter
 from ceres_cal.uncertainty.profile import PhiProfile
 
 
@@ -24,25 +26,45 @@ from ceres_cal.uncertainty.profile import PhiProfile
 class Posterior:
     """What observations and priors say together, about the solution, at the noise that was estimated.
 
-    It is kept as information because a covariance does not exist where something is unknown. It holds as far as the
-    model does: a lens with too few coefficients or a field painted amiss are not in it.
+    It is kept as information because a covariance does not exist where something is unknown. Errors that go together
+    count together, as far as the residuals show it (`dependence`); what all views have in common, such as a field
+    painted amiss, is not in it.
 
     Attributes:
         information: about the P numbers that are shared.
         placements: name -> information about each placement that one station alone sees, all else integrated out.
         degrees_of_freedom: spare equations behind the estimated noise; infinite where the sigmas were taken as stated.
         profiles: camera -> the valley along its phi, where that is too little known for the quadratic picture.
+        by_model: what the model alone says of the shared numbers, were every error independent of the others; None
+            where that is all there is. dependence: what the rest of it rests on; None where nobody asked.
+        bends: what else leaves the quadratic picture, or None: it counts in sd, bounds and maps.
     """
 
     information: Information
     placements: Mapping[str, Information] = field(default_factory=dict)
     degrees_of_freedom: float = np.inf
     profiles: Mapping[str, PhiProfile] = field(default_factory=dict)
+    by_model: Information | None = None
+    dependence: Dependence | None = None
+    bends: Bends | None = None
 
     @property
     def keys(self) -> tuple[Key, ...]:
         """(P) the numbers that are shared."""
         return self.information.keys
+
+    def in_doubt(self, keys: Sequence[Key], shifts: Sequence[Array]) -> Posterior:
+        """The posterior that holds what is in dispute: each shift d (K,) of some numbers, when something is left out,
+        goes into the covariance as d d^T, so that no number is stated better than to what it would move.
+        """
+        if not len(shifts):
+            return self
+        common, whole = self.information.among(keys), np.zeros((len(shifts), len(self.keys)))
+        whole[:, self.information.columns(common)] = np.array(shifts)[:, [list(keys).index(key) for key in common]]
+        information, placements = self.information.widened(whole), self.placements
+        if isinstance(placements, _Placements):
+            placements = replace(placements, shared=information)
+        return replace(self, information=information, placements=placements)
 
     @property
     def spread(self) -> Spread:
@@ -57,22 +79,40 @@ class Posterior:
     @cached_property
     def sd(self) -> Array:
         """(P,) standard deviations in the units of the keys, infinite where unknown."""
-        return self.spread.sd
+        variance = self.spread.sd**2
+        if self.bends is not None:
+            variance[self.information.columns(self.bends.keys)] += np.sum(self.bends.excesses**2, axis=0)
+        return np.asarray(np.sqrt(variance))
+
+    @cached_property
+    def factors(self) -> Array:
+        """(P,) standard deviations over what the model alone gives; 1 where both are infinite."""
+        if self.by_model is None:
+            return np.ones(len(self.keys))
+        return widths_over(self.spread, self.by_model.spread)
 
     @property
     def half_width(self) -> float:
-        """Standard deviations from the middle to either end of a 95 % interval: Student's t."""
-        return student_95(self.degrees_of_freedom)
+        """Standard deviations from the middle to either end of a 95 % interval: Student's t, with the degrees of
+        freedom behind the noise and behind what is known of the dependence.
+        """
+        inverse = 1.0 / max(self.degrees_of_freedom, 1.0)
+        inverse += 0.0 if self.dependence is None else self.dependence.inverse_freedom
+        return student_95(1.0 / inverse if inverse > 0.0 else np.inf)
 
     @cached_property
     def bounds(self) -> Array:
         """(P, 2) 95 % bounds of the shared numbers, from the estimate; infinite on a side that is open."""
-        bounds = self.half_width * self.sd[:, None] * (-1.0, 1.0)
+        return self.bounds_at(self.half_width)
+
+    def bounds_at(self, width: float) -> Array:
+        """(P, 2) the same so many standard deviations up, at most three."""
+        bounds = width * self.sd[:, None] * (-1.0, 1.0)
         for profile in self.profiles.values():
             across = [information.spread.sd for information in profile.across]
             sds = np.column_stack([np.zeros(len(across)), across])
             at = self.information.columns(profile.keys)
-            bounds[at] = np.column_stack(profile.bounds(profile.steps, sds, self.half_width))
+            bounds[at] = np.column_stack(profile.bounds(profile.steps, sds, width))
         return np.asarray(bounds)
 
     def layout(self, estimate: Estimate) -> Layout:
@@ -121,33 +161,42 @@ class Posterior:
         return self.information.marginal(keys).spread
 
 
-def student_95(degrees_of_freedom: float) -> float:
-    """Half width of the 95 % interval of Student's t, by the series of Cornish and Fisher: 0.1 % from 5 degrees on."""
-    z, n = NORMAL_95, max(degrees_of_freedom, 1.0)
-    terms = (
-        (z**3 + z) / 4.0,
-        (5.0 * z**5 + 16.0 * z**3 + 3.0 * z) / 96.0,
-        (3.0 * z**7 + 19.0 * z**5 + 17.0 * z**3 - 15.0 * z) / 384.0,
-    )
-    return z + sum(term / n**power for power, term in enumerate(terms, start=1))
+def widths_over(spread: Spread, other: Spread) -> Array:
+    """(n,) standard deviations of one spread over those of another of the same numbers; 1 where either is infinite."""
+    both = np.isfinite(spread.sd) & np.isfinite(other.sd)
+    return np.where(both, spread.sd, 1.0) / np.where(both, other.sd, 1.0)
 
 
-def make_posterior(reduced: ReducedInformation, degrees_of_freedom: float) -> Posterior:
-    """The posterior of everything shared, and of the placements that were eliminated."""
-    shared = reduced.shared
-    return Posterior(shared, _Placements(reduced.eliminated, shared), degrees_of_freedom)
+def make_posterior(reduced: ReducedInformation, degrees_of_freedom: float, scatter: Scatter | None = None) -> Posterior:
+    """The posterior of everything shared, and of the placements that were eliminated.
+
+    Args:
+        degrees_of_freedom: spare equations behind the estimated noise, infinite where the sigmas were taken as stated.
+        scatter: how the data scatter; without it errors are independent.
+    """
+    model = reduced.shared
+    if scatter is None:
+        return Posterior(model, _Placements(reduced.eliminated, model), degrees_of_freedom)
+    shared, found = scatter.widened(model), scatter.found
+    placements = _Placements(reduced.eliminated, shared, found.private)
+    return Posterior(shared, placements, degrees_of_freedom, by_model=model, dependence=found)
 
 
 @dataclass(frozen=True, eq=False)
 class _Placements(Mapping[str, Information]):
-    """Information about each eliminated placement, worked out when the first one is asked for."""
+    """Information about each eliminated placement, worked out when the first one is asked for.
+
+    Attributes:
+        shared: about what they follow. inflation: factor on the variance that their own observations leave.
+    """
 
     eliminated: tuple[Eliminated, ...]
     shared: Information
+    inflation: float = 1.0
 
     @cached_property
     def _matrices(self) -> dict[str, Array]:
-        parts = ((part.names, _placement_information(part, self.shared)) for part in self.eliminated)
+        parts = ((part.names, _placement_information(part, self.shared, self.inflation)) for part in self.eliminated)
         return {name: matrix for names, matrices in parts for name, matrix in zip(names, matrices, strict=True)}
 
     def __getitem__(self, name: str) -> Information:
@@ -160,7 +209,7 @@ class _Placements(Mapping[str, Information]):
         return len(self._matrices)
 
 
-def _placement_information(part: Eliminated, shared: Information) -> Array:
+def _placement_information(part: Eliminated, shared: Information, inflation: float) -> Array:
     """(S, 6, 6) information about each placement, everything shared integrated out.
 
     A placement follows the shared numbers by -G, and deviates from that by what its own observations leave open:
@@ -171,11 +220,13 @@ def _placement_information(part: Eliminated, shared: Information) -> Array:
     informations, gains = np.empty_like(part.own), part.gains[regular]
     at = shared.columns(part.keys)
     covariance = shared.spread.covariance[np.ix_(at, at)]
-    informations[regular] = np.linalg.inv(part.inverses[regular] + gains @ covariance @ np.swapaxes(gains, 1, 2))
+    informations[regular] = np.linalg.inv(
+        inflation * part.inverses[regular] + gains @ covariance @ np.swapaxes(gains, 1, 2)
+    )
     if np.all(regular):
         return np.asarray(0.5 * (informations + np.swapaxes(informations, 1, 2)))
     marginal, limits = shared.marginal(part.keys).matrix, sigma_limits(part.keys)
     for s in np.flatnonzero(~regular):
-        own, gain = part.own[s], part.gains[s]
+        own, gain = part.own[s] / inflation, part.gains[s]
         informations[s] = without(own, gain.T @ own, marginal + gain.T @ own @ gain, limits)
     return np.asarray(0.5 * (informations + np.swapaxes(informations, 1, 2)))

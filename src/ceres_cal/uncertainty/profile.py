@@ -26,6 +26,9 @@ from ceres_cal.start.initialise import PHI_RANGE
 # Rise of twice the cost at which the valley is followed no further: three sigma, well beyond any 95 % bound. Nothing
 # changes from half to double.
 _FAR = 9.0
+FARTHER = 3.0
+"""Standard deviations up to which valleys are followed: where one widens out there, that counts in standard deviations
+and radii, not only what lies within 95 %."""
 _STEPS = (0.02, 0.35)  # of log phi
 _MOST_RISE = 1.5  # from one node to the next
 _MOST_NODES = 60
@@ -44,7 +47,7 @@ class Node:
     """One point of the valley: phi held, everything else at its best.
 
     Attributes:
-        cost: twice the least cost there, with that of the priors on phi.
+        cost: twice the least cost there, with that of the priors on phi, over the factor on the variance.
         information: about everything shared, phi too, though it was held.
     """
 
@@ -124,26 +127,29 @@ class PhiProfile:
         return np.asarray(np.where(ratio < _SHRINKING, limit, going))
 
 
-def valley(camera: str, problem: Problem, estimate: Estimate) -> tuple[Node, ...]:
+def valley(camera: str, problem: Problem, estimate: Estimate, inflation: float = 1.0) -> tuple[Node, ...]:
     """Follow the valley from the estimate both ways, until it is three sigma up or phi is no lens any more.
 
+    Args:
+        inflation: factor on the variance along it: costs are divided by it.
+
     Raises:
-        SolutionError: the solve does not find back to where it ended.
+        SolutionError: the solve does not find back to where it ended, or from there to a lens that fits.
     """
     unit, phi = unit_px(estimate.cameras[camera]), estimate.cameras[camera].phi
-    first = _node(camera, problem, estimate)
+    first = least = _node(camera, problem, estimate, inflation)
     within = float(np.clip(phi, unit * PHI_RANGE[0], unit * PHI_RANGE[1]))
     while first is not None and phi != within:
         factor = within / phi
         phi = within if 0.5 <= factor <= 2.0 else phi * float(np.clip(factor, 0.5, 2.0))
-        first = _node(camera, problem, _ahead(camera, first, phi))
-    if first is None:
+        first = _node(camera, problem, _ahead(camera, first, phi), inflation)
+    if first is None or least is None or first.cost - least.cost > _FAR:
         raise SolutionError(
             f"camera {camera!r}: the least cost lies at phi {estimate.cameras[camera].phi:.1f} px, which is no lens: "
             "check labels and dimensions, add a prior on height_m or phi, or boards tilted by 20 degrees"
         )
-    down = list(_walk(camera, problem, first, -1))
-    up = list(_walk(camera, problem, first, +1))
+    down = list(_walk(camera, problem, first, -1, inflation))
+    up = list(_walk(camera, problem, first, +1, inflation))
     return (*down[::-1], first, *up)
 
 
@@ -154,7 +160,11 @@ def profile(camera: str, nodes: Sequence[Node], estimate: Estimate, half_width: 
         half_width: standard deviations from the middle to the end of a 95 % interval.
     """
     costs = np.array([node.cost for node in nodes])
-    rises = costs - costs.min()
+    phi = estimate.cameras[camera].phi
+    here = float(np.interp(phi, [node.estimate.cameras[camera].phi for node in nodes], costs))
+    # Where the valley has a second, lower place, both count: the bound reaches as high over either.
+    base = costs.min() if here - costs.min() <= half_width**2 else here
+    rises = np.maximum(costs - base, 0.0)
     keys = _keys_of(camera, estimate, nodes[0].information.keys)
     return PhiProfile(
         camera,
@@ -168,17 +178,17 @@ def profile(camera: str, nodes: Sequence[Node], estimate: Estimate, half_width: 
     )
 
 
-def _node(camera: str, problem: Problem, start: Estimate) -> Node | None:
+def _node(camera: str, problem: Problem, start: Estimate, inflation: float) -> Node | None:
     """The least cost with phi held where the start has it; None where the solver does not get there."""
     try:
         solution = solve(problem.holding(camera, 0), start)
+        known = None if solution.failed else information(problem, solution.estimate).shared
     except CalibrationError:
         return None
-    if solution.failed:
+    if known is None:
         return None
-    estimate = solution.estimate
-    cost = 2.0 * solution.cost + _cost_of_phi(camera, problem, estimate)
-    return Node(estimate, cost, information(problem, estimate).shared)
+    cost = 2.0 * solution.cost + _cost_of_phi(camera, problem, solution.estimate)
+    return Node(solution.estimate, cost / inflation, known)
 
 
 def _cost_of_phi(camera: str, problem: Problem, estimate: Estimate) -> float:
@@ -187,7 +197,7 @@ def _cost_of_phi(camera: str, problem: Problem, estimate: Estimate) -> float:
     return float(sum(np.sum(prior.residuals(estimate) ** 2) for prior in own))
 
 
-def _walk(camera: str, problem: Problem, first: Node, direction: int) -> Iterator[Node]:
+def _walk(camera: str, problem: Problem, first: Node, direction: int, inflation: float) -> Iterator[Node]:
     """Nodes on one side, each found from the one before by a step along the valley's slope."""
     unit = unit_px(first.estimate.cameras[camera])
     low, high = (unit * limit for limit in PHI_RANGE)
@@ -198,7 +208,7 @@ def _walk(camera: str, problem: Problem, first: Node, direction: int) -> Iterato
         wanted = float(np.clip(phi * np.exp(direction * step), low, high))
         if node.cost - lowest > _FAR or direction * (wanted - phi) <= 0.0:
             return
-        following = _node(camera, problem, _ahead(camera, node, wanted))
+        following = _node(camera, problem, _ahead(camera, node, wanted), inflation)
         change = np.inf if following is None else abs(following.cost - node.cost)
         if following is None or (change > _MOST_RISE and node.cost - lowest < _FAR / 2.0 and step > _STEPS[0]):
             step *= 0.5  # too far to find, or to interpolate where the bounds will lie
@@ -213,7 +223,7 @@ def _walk(camera: str, problem: Problem, first: Node, direction: int) -> Iterato
 def _first_step(camera: str, node: Node) -> float:
     """Half a standard deviation of log phi by the quadratic picture, within reason."""
     column = _phi_column(camera, node.information.keys)
-    sd = float(np.sqrt(node.information.inverse[column, column])) or np.inf
+    sd = float(np.sqrt(max(node.information.inverse[column, column], 0.0))) or np.inf
     return float(np.clip(0.5 * sd / node.estimate.cameras[camera].phi, *_STEPS))
 
 

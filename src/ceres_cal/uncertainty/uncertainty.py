@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.words import two_digits
 from ceres_cal.model.parameters import Estimate
 from ceres_cal.scene.targets import Target
 from ceres_cal.uncertainty.maps import FieldMap, Grid, PointSpread, field_map, spread_of_points
@@ -26,6 +28,7 @@ from ceres_cal.uncertainty.weak import (
 )
 
 _GRID = 36  # steps along the longer side
+_WIDENED = 1.1  # factor on standard deviations that is worth a word
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +43,23 @@ class Uncertainty:
     def verdicts(self) -> tuple[Verdict, ...]:
         """Known, weak or unknown, of each shared number."""
         return verdicts(self.estimate, self.posterior)
+
+    def table(self) -> list[dict[str, Any]]:
+        """Each shared number as a row of a table: `pandas.DataFrame(known.table())`."""
+        return [
+            {
+                "kind": one.key.kind,
+                "owner": one.key.owner,
+                "quantity": one.key.quantity,
+                "unit": one.key.unit,
+                "value": float(one.value),
+                "sd": float(one.sd),
+                "low": float(one.low),
+                "high": float(one.high),
+                "verdict": one.verdict,
+            }
+            for one in self.verdicts
+        ]
 
     def verdict(self, kind: str, owner: str, quantity: str) -> Verdict:
         """Of one number.
@@ -58,6 +78,14 @@ class Uncertainty:
     def unknown_placements(self) -> dict[str, tuple[str, ...]]:
         """Placements of which some number is not known at all, and which."""
         return unknown_placements(self.posterior)
+
+    @property
+    def widening(self) -> str:
+        """Why standard deviations are larger than by the model alone, in a line; "" where they are not."""
+        found, factor = self.posterior.dependence, float(np.median(self.posterior.factors))
+        if found is None or not found.causes or factor < _WIDENED:
+            return ""
+        return f"{' and '.join(found.causes)}: standard deviations {two_digits(factor)} times as large as without"
 
     def ratio_sd(self, station: str) -> float:
         """Relative standard deviation of phi over the station's height."""

@@ -13,6 +13,7 @@ from ceres_cal.model.keys import PLACEMENT_QUANTITIES, Key
 from ceres_cal.model.parameters import Estimate
 from ceres_cal.model.quantities import natural_sizes, values_of
 from ceres_cal.uncertainty.posterior import Posterior
+from ceres_cal.uncertainty.profile import FARTHER
 
 KNOWN, WEAK = 0.01, 0.3
 """Relative sigmas: up to the first a number is known (phi of 868 px to 9 px, a height of 4 m to 40 mm, a turn to 0.6
@@ -34,6 +35,7 @@ class Verdict:
             of the bounds in sigmas. low, high: 95 % bounds, infinite where open. relative: sd over the natural size,
             infinite also for phi and height where the valley is open.
         verdict: "known", "weak" or "unknown" (see KNOWN and WEAK). by_profile: whether the bounds are the profile's.
+        factor: standard deviation as the data scatter over that by the model alone.
     """
 
     key: Key
@@ -44,6 +46,7 @@ class Verdict:
     relative: float
     verdict: str
     by_profile: bool
+    factor: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -64,6 +67,8 @@ def verdicts(estimate: Estimate, posterior: Posterior) -> tuple[Verdict, ...]:
     """One for each shared number, in the order of the posterior's keys."""
     bounds, values = posterior.bounds, values_of(estimate, posterior.keys)
     half = (bounds[:, 1] - bounds[:, 0]) / (2.0 * posterior.half_width)
+    if posterior.profiles:  # a valley that widens farther out is no better known than there
+        half = np.maximum(half, np.ptp(posterior.bounds_at(FARTHER), axis=1) / (2.0 * FARTHER))
     relative = half / natural_sizes(estimate, posterior.keys)
     low, high = values + bounds[:, 0], values + bounds[:, 1]
     followed = np.zeros(len(values), dtype=bool)
@@ -74,10 +79,10 @@ def verdicts(estimate: Estimate, posterior: Posterior) -> tuple[Verdict, ...]:
             along = [column for column in at if posterior.keys[column].quantity in ("phi", "height")]
             relative[along], low[along] = np.inf, np.maximum(low[along], 0.0)
     sd = np.where(followed, half, posterior.sd)
-    columns = (c.tolist() for c in (values, sd, low, high, relative, followed))
+    columns = (c.tolist() for c in (values, sd, low, high, relative, followed, posterior.factors))
     return tuple(
-        Verdict(key, value, sigma, bottom, top, share, _word(key, share), by_profile)
-        for key, value, sigma, bottom, top, share, by_profile in zip(posterior.keys, *columns, strict=True)
+        Verdict(key, value, sigma, bottom, top, share, _word(key, share), by_profile, factor)
+        for key, value, sigma, bottom, top, share, by_profile, factor in zip(posterior.keys, *columns, strict=True)
     )
 
 

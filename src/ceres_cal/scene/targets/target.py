@@ -38,7 +38,7 @@ class Grid:
     checkered: bool = False
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Target:
     """A rigid thing of known geometry, in a frame of its own, in metres; a field's frame is the world.
 
@@ -72,6 +72,9 @@ class Target:
         )
 
     __hash__ = None  # type: ignore[assignment]
+
+    def __repr__(self) -> str:
+        return f"Target({self.kind}, {len(self.points)} points, {len(self.curves)} curves)"
 
     @property
     def kind(self) -> str:

@@ -14,12 +14,15 @@ from functools import cached_property
 
 import numpy as np
 
+from ceres_cal import kernels
 from ceres_cal.base.arrays import Array, Indices, Mask
-from ceres_cal.diagnostics.equations import Equations
+from ceres_cal.model.equations import Equations
 from ceres_cal.model.keys import Key, columns_by_owner
-from ceres_cal.model.parameters import Estimate, intrinsic_names, intrinsics_scales
+from ceres_cal.model.parameters import Estimate, Options, intrinsic_names, intrinsics_scales
 from ceres_cal.model.quantities import free_keys, from_placement, from_station
-from ceres_cal.solve import Problem
+from ceres_cal.observations import Observations
+from ceres_cal.solve.noise import Inliers
+from ceres_cal.solve.problem import Problem
 
 LEAST_LEFT = 1e-7
 """Share of an alternative's squared length that the free numbers must leave for it to be testable."""
@@ -104,11 +107,13 @@ class LinearModel:
     def beyond_private(self, columns: Array) -> Array:
         """Columns (E, Q), in standard deviations, without what private placements take up."""
         rest = columns.copy()
-        for start, stop in self._private_ranges():
-            basis, here = self.private[start:stop], columns[start:stop]
-            rest[start:stop] -= basis @ (basis[self.used[start:stop]].T @ here[self.used[start:stop]])
+        inside = columns if self.used.all() else columns * self.used[:, None]
+        for start, stop in self._private_ranges:
+            basis = self.private[start:stop]
+            rest[start:stop] -= basis @ (basis.T @ inside[start:stop])
         return rest
 
+    @cached_property
     def _private_ranges(self) -> list[tuple[int, int]]:
         bounds = self.equations.bounds
         filled = np.flatnonzero(np.any(self.private[bounds[:-1]] != 0.0, axis=1))
@@ -128,10 +133,19 @@ class LinearModel:
         """More numbers to be free besides: columns (E, Q), px per unit."""
         scaled = columns * self.weight[:, None]
         rest, taken = self._projected(scaled)
-        inside = rest[self.used]
-        normal = inside.T @ inside - taken.T @ taken
+        normal, slope = self._normal(rest, taken)
         root = inverse_root(normal, np.sum(scaled[self.used] ** 2, axis=0), LEAST_LEFT)
-        return Freed(rest, taken, root, root.T @ (inside.T @ self.score[self.used] - taken.T @ self.step))
+        return Freed(rest, taken, root, root.T @ slope)
+
+    def left_of(self, columns: Array) -> tuple[Array, Array]:
+        """Normal equations (Q, Q) of more numbers, columns (E, Q), px per unit, once everything free followed them; and
+        half the derivative (Q,) of the squared residuals by them.
+        """
+        return self._normal(*self._projected(columns * self.weight[:, None]))
+
+    def _normal(self, rest: Array, taken: Array) -> tuple[Array, Array]:
+        inside = rest[self.used]
+        return inside.T @ inside - taken.T @ taken, inside.T @ self.score[self.used] - taken.T @ self.step
 
     def with_columns(self, columns: Array) -> LinearModel:
         """The same model with these numbers free."""
@@ -196,54 +210,82 @@ def inverse_root(normal: Array, sizes: Array, least: float) -> Array:
     return np.asarray(scale[:, None] * vectors[:, kept] / np.sqrt(values[kept]))
 
 
+def equation_weights(observations: Observations, options: Options, inliers: Inliers, equations: Equations) -> Weights:
+    """How each equation counts at the noise that was found, with the loss of the options."""
+    sigma = np.concatenate(
+        [inliers.point_scale * observations.points.sigma_px, inliers.curve_scale * observations.curves.sigma_px]
+    )
+    lengths = np.concatenate([inliers.point_sigmas, inliers.curve_sigmas])
+    squared = np.where(np.isfinite(lengths), lengths, 0.0) ** 2
+    robust = kernels.loss_weights(kernels.Loss(kernels.LOSS_CODES[options.loss], options.loss_scale), squared)
+    inlier, at = np.concatenate([inliers.points, inliers.curves]), equations.observation
+    return Weights(1.0 / sigma[at], inlier[at], robust[at])
+
+
 def make_linear_model(problem: Problem, estimate: Estimate, equations: Equations, weights: Weights) -> LinearModel:
     """The linear model of a calibration, its priors included."""
-    used, weight = weights.used, weights.inverse_sigma
-    score = np.where(used, weights.robust * weight * equations.residual, 0.0)
-    private, count = _private_basis(equations, problem, weight, used)
     keys = free_keys(estimate, problem.layout, problem.private)
-    columns = shared_columns(equations, estimate, keys) * weight[:, None]
-    nothing = np.zeros((len(equations), 0))
-    blank = LinearModel(equations, weight, used, score, private, nothing, np.zeros(0), count, 0)
+    blank, columns = without_shared(problem, estimate, equations, weights)
     rest = blank.beyond_private(columns)
     prior_rows, prior_values = _prior_equations(problem, estimate, keys)
-    inside = rest[used]
+    inside = rest[weights.used]
     normal = inside.T @ inside + prior_rows.T @ prior_rows
-    sizes = np.sum(columns[used] ** 2, axis=0) + np.sum(prior_rows**2, axis=0)
+    sizes = np.sum(columns[weights.used] ** 2, axis=0) + np.sum(prior_rows**2, axis=0)
     root = inverse_root(normal, sizes, _SINGULAR)
-    gradient = inside.T @ score[used] + prior_rows.T @ prior_values
+    gradient = inside.T @ blank.score[weights.used] + prior_rows.T @ prior_values
     return replace(
         blank,
         shared=rest @ root,
         step=root.T @ gradient,
-        unknowns=count + root.shape[1],
+        unknowns=blank.unknowns + root.shape[1],
         prior_equations=len(prior_rows),
     )
 
 
+def without_shared(
+    problem: Problem, estimate: Estimate, equations: Equations, weights: Weights
+) -> tuple[LinearModel, Array]:
+    """The model of private placements alone, and the columns (E, P) of the shared numbers, in standard deviations."""
+    used, weight = weights.used, weights.inverse_sigma
+    score = np.where(used, weights.robust * weight * equations.residual, 0.0)
+    private, count = _private_basis(equations, problem, weight, used)
+    columns = shared_columns(equations, estimate, free_keys(estimate, problem.layout, problem.private))
+    nothing = np.zeros((len(equations), 0))
+    blank = LinearModel(equations, weight, used, score, private, nothing, np.zeros(0), count, 0)
+    return blank, columns * weight[:, None]
+
+
 def _private_basis(equations: Equations, problem: Problem, weight: Array, used: Mask) -> tuple[Array, int]:
     """(E, 6) see `LinearModel`, and how many numbers it stands for."""
-    basis, count = np.zeros((len(equations), 6)), 0
-    for number in equations.sights.numbers(placements=problem.private):
-        here = slice(equations.bounds[number], equations.bounds[number + 1])
-        columns = equations.pose[here] * weight[here, None]
-        inside = columns[used[here]]
-        normal = inside.T @ inside
-        root = inverse_root(normal, np.diag(normal), _SINGULAR)
-        basis[here, : root.shape[1]] = columns @ root
-        count += root.shape[1]
-    return basis, count
+    basis = np.zeros((len(equations), 6))
+    numbers = equations.sights.numbers(placements=problem.private)
+    if not len(numbers):
+        return basis, 0
+    columns = equations.pose * weight[:, None]
+    inside = columns if used.all() else columns * used[:, None]
+    parts = [slice(equations.bounds[number], equations.bounds[number + 1]) for number in numbers]
+    normal = np.array([inside[part].T @ inside[part] for part in parts])
+    sizes = np.diagonal(normal, axis1=1, axis2=2)
+    scale = 1.0 / np.sqrt(np.where(sizes > 0.0, sizes, 1.0))
+    values, vectors = np.linalg.eigh(scale[:, :, None] * normal * scale[:, None, :])
+    kept = values > _SINGULAR
+    roots = scale[:, :, None] * vectors * np.where(kept, values, np.inf)[:, None, :] ** -0.5
+    for part, root in zip(parts, roots, strict=True):
+        np.matmul(columns[part], root, out=basis[part])
+    return basis, int(np.count_nonzero(kept))
 
 
 def shared_columns(equations: Equations, estimate: Estimate, keys: Sequence[Key]) -> Array:
     """(E, P) px per unit of each key: what a step of the shared numbers does to every equation."""
     columns, owned = np.zeros((len(equations), len(keys))), columns_by_owner(keys)
+    scales = {name: intrinsics_scales(camera) for name, camera in estimate.cameras.items()}
+    names = {name: intrinsic_names(camera.lens) for name, camera in estimate.cameras.items()}
     for number, key in enumerate(equations.sights.keys):
         here = slice(equations.bounds[number], equations.bounds[number + 1])
-        camera, pose = estimate.cameras[key.camera], equations.poses[number : number + 1]
+        pose = equations.poses[number : number + 1]
         own = owned.get(("camera", key.camera), [])
-        at = [intrinsic_names(camera.lens).index(keys[column].quantity) for column in own]
-        columns[here, own] = equations.intrinsics[here][:, at] * intrinsics_scales(camera)[at]
+        at = [names[key.camera].index(keys[column].quantity) for column in own]
+        columns[here, own] = equations.intrinsics[here][:, at] * scales[key.camera][at]
         world = estimate.stations[key.station].cam_from_world
         if own := owned.get(("station", key.station), []):
             columns[here, own] = equations.pose[here] @ from_station(pose, world)[0]

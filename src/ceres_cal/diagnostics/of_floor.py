@@ -1,0 +1,104 @@
+"""Diagnostics of the floor: bowed as a whole, or higher at one place than around it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from ceres_cal.base.arrays import Array, Indices
+from ceres_cal.diagnostics.diagnostic import Case, Evidence, ScoreTest, Words
+from ceres_cal.diagnostics.findings import amounts
+from ceres_cal.diagnostics.scores import Family, grouped
+
+_CELL_M = 1.0  # side of a place that may be higher: a tile, a cable under the carpet; of half of it lines cross few
+# Equations that say how high a place is: one height, and as many as an outlier needs to be contradicted. Nothing
+# changes from half to double.
+_FEWEST_AT_PLACE = 8
+
+
+class _Floor(ScoreTest):
+    """What moves the places of targets that are part of the world up or down."""
+
+    wrong = "model"
+    absorbed = True
+
+
+class FloorBowed(_Floor):
+    """The floor is no plane: it sinks or rises towards its edges, or is twisted."""
+
+    kind = "floor bowed"
+
+    def families(self, case: Case) -> Iterator[Family]:
+        target, names = _target_of(case)
+        heights = np.zeros((len(target), 3))
+        for number in range(len(names)):
+            own = target == number
+            middle, reach = _extent(case.equations.place[own])
+            x, y = ((case.equations.place[own, :2] - middle) / reach).T
+            heights[own] = np.column_stack([x * x, y * y, x * y])
+        yield Family(self.kind, _raised(case)[:, None] * heights, target, names)
+
+    def words(self, evidence: Evidence) -> Words:
+        mm, sd = 1e3 * evidence.score.amount, 1e3 * evidence.score.sd
+        return Words(
+            f"{evidence.score.subject}: its floor is not flat: at its edges it rises by {mm[0]:+.1f} ± {sd[0]:.1f} "
+            f"mm along x, {mm[1]:+.1f} ± {sd[1]:.1f} mm along y, and is twisted by {mm[2]:+.1f} ± {sd[2]:.1f} mm "
+            f"({evidence.size})",
+            "measure its height at some points, and give them as points of a custom target with their z",
+            amounts(("x", "y", "twist"), mm, sd, "mm"),
+        )
+
+
+class FloorUneven(_Floor):
+    """The floor is higher or lower at one place."""
+
+    kind = "floor uneven"
+
+    def families(self, case: Case) -> Iterator[Family]:
+        target, names = _target_of(case)
+        cell = np.floor(case.equations.place[:, :2] / _CELL_M + 0.5).astype(np.int64)
+        span = 2 * int(np.abs(cell).max(initial=0)) + 1
+        key = (np.maximum(target, 0) * span + cell[:, 0] + span // 2) * span + cell[:, 1] + span // 2
+        numbers, group = grouped(key, target >= 0)
+        counts = np.bincount(group[(group >= 0) & case.model.used], minlength=len(numbers) + 1)
+        group = np.where((group >= 0) & (counts[group] >= _FEWEST_AT_PLACE), group, -1)
+        subjects = []
+        for number in numbers.tolist():
+            rest, y = divmod(number, span)
+            of, x = divmod(rest, span)
+            at = [(place - span // 2) * _CELL_M for place in (x, y)]
+            subjects.append(f"{names[of]} at x {at[0]:.1f}, y {at[1]:.1f} m")
+        yield Family(self.kind, _raised(case)[:, None], group, tuple(subjects))
+
+    def words(self, evidence: Evidence) -> Words:
+        mm, sd = 1e3 * evidence.score.amount, 1e3 * evidence.score.sd
+        return Words(
+            f"{evidence.score.subject} the floor is {abs(mm[0]):.0f} ± {sd[0]:.0f} mm "
+            f"{'higher' if mm[0] > 0.0 else 'lower'} than around it ({evidence.size})",
+            "look for what lies under the carpet, and leave out what was observed there",
+            amounts(["height"], mm, sd, "mm"),
+        )
+
+
+def _target_of(case: Case) -> tuple[Indices, tuple[str, ...]]:
+    """(E,) which target that is part of the world each equation shows, -1 for a movable one; and their names."""
+    observations = case.observations
+    names = tuple(name for name, target in observations.targets.items() if not target.movable)
+    number = {name: place for place, name in enumerate(names)}
+    of_view = np.array([number.get(view.target, -1) for view in observations.views], dtype=np.int64)
+    return np.asarray(of_view[case.equations.view]), names
+
+
+def _raised(case: Case) -> Array:
+    """(E,) px per metre that the place of each equation is higher."""
+    up = case.equations.poses[case.equations.sight, :, 2]
+    return np.asarray(np.sum(case.equations.motion * up, axis=1))
+
+
+def _extent(places: Array) -> tuple[Array, float]:
+    """Middle (2,) and half of the longer side of the box around places (N, 3), m."""
+    if not len(places):
+        return np.zeros(2), 1.0
+    low, high = places[:, :2].min(axis=0), places[:, :2].max(axis=0)
+    return 0.5 * (low + high), max(0.5 * float(np.max(high - low)), 1e-9)

@@ -1,0 +1,332 @@
+"""Competing explanations: the same observations without a line that may not belong, as a whole.
+
+A line that lies aside as a whole outvotes the others: the fit goes half of the way towards it, no row of it is an
+outlier, and good rows elsewhere become some. So it is asked of each curve in each frame, of each feature over all
+frames, of each frame and of each placement, whether the rest is better explained without it. The linear model at the
+end of all rounds names a few suspects (see `offsets`), a solve without each of them tells what the rest says of it, and
+the more probable explanation wins.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ceres_cal.base.arrays import Array, Indices, Mask
+from ceres_cal.base.errors import CalibrationError
+from ceres_cal.model.equations import write_equations
+from ceres_cal.model.residuals import residuals
+from ceres_cal.observations import Observations
+from ceres_cal.solve.bundle import with_placements_at_best
+from ceres_cal.solve.explanation import DOUBTFUL, Explanation
+from ceres_cal.solve.linear_model import LinearModel, equation_weights, make_linear_model
+from ceres_cal.solve.offsets import Offsets, measure_offsets
+from ceres_cal.solve.problem import Problem
+from ceres_cal.solve.robust import RobustSolution
+from ceres_cal.solve.wholes import FEWEST, Wholes, wholes_of
+
+# Log odds, by the linear model, from which on a whole is looked at by a solve without it: one in thirty sound scenes is
+# above -9, errors that agree along lines over 2 m reach -3, a line 1.2 px aside is above -7.
+_SUSPECT = -9.0
+# Share of a whole's observations in use below which it is looked at in any case: its other rows are good by chance.
+_LEFT = 0.5
+_MOST_VIEWS, _MOST_WHOLE_VIEWS = 8, 24  # whose features, or which, are looked at together: at the cube of the number
+_MOST_OTHERS = 16  # views besides, which tell the lens
+_MOST_ROWS = 40  # of a whole in one view
+# Standard deviations by which a view's mean square must stand out, beyond the largest of so many by noise, for views to
+# be looked at: boards whose drawing is 3 % too short in one of ten do by 2 to 4, 10 % by 17.
+_STANDS_OUT = 2.5
+_MOST_WRONG = 4  # wholes
+
+
+Solver = Callable[[Problem], RobustSolution]
+"""Solves a problem of some of the observations, from a start that the others had no part in."""
+
+
+def compete(
+    problem: Problem, observations: Observations, end: RobustSolution, solver: Solver
+) -> tuple[RobustSolution, tuple[Explanation, ...]]:
+    """The end of all rounds without the wholes that do not belong, and these; also those that are in doubt.
+
+    Args:
+        problem: of all the observations. end: of its rounds.
+    """
+    court = _Court(problem, observations, solver)
+    explanations: list[Explanation] = []
+    while court.has_any and len(explanations) < _MOST_WRONG:
+        trials = list(court.trials(end))
+        if not trials:
+            break
+        best = _best(trials)
+        if best.log_odds < -DOUBTFUL:
+            break
+        explanations += best.explanations
+        if best.log_odds < 0.0:
+            break
+        end, court.taking_part = best.end, court.taking_part & ~best.rows
+    if not court.taking_part.all():
+        end = replace(end, residuals=residuals(observations, problem.sights, end.solution.estimate))
+    return end, tuple(explanations)
+
+
+@dataclass(frozen=True, eq=False)
+class _Suspects:
+    """Wholes of one kind, by their numbers."""
+
+    wholes: Wholes
+    numbers: tuple[int, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class _Trial:
+    """What a solve without some wholes says of them.
+
+    Attributes:
+        end: of that solve. rows: (N + M,) theirs. log_odds: the least of theirs. explanations: of each.
+        next: the whole that does not belong either, where one is suspected.
+    """
+
+    end: RobustSolution
+    rows: Mask
+    log_odds: float
+    explanations: tuple[Explanation, ...]
+    next: int | None
+
+
+def _best(trials: Sequence[_Trial]) -> _Trial:
+    """The most probable one, or the largest that is sure and takes all of that along."""
+    best = max(trials, key=lambda trial: trial.log_odds)
+    wider = [one for one in trials if one.log_odds > DOUBTFUL and not np.any(best.rows & ~one.rows)]
+    return max(wider, key=lambda one: int(np.count_nonzero(one.rows)), default=best)
+
+
+class _Court:
+    """What is asked of all suspects. taking_part: (N + M,) the observations that none of them took along."""
+
+    def __init__(self, problem: Problem, observations: Observations, solver: Solver) -> None:
+        self._problem, self._observations, self._solver = problem, observations, solver
+        self._kinds = list(wholes_of(observations, problem.sights))
+        self._view = np.concatenate([observations.points.view, observations.curves.view])
+        self._tried: set[tuple[int, ...]] = set()
+        self.taking_part = np.ones(len(observations.points) + len(observations.curves), dtype=bool)
+
+    @property
+    def has_any(self) -> bool:
+        """Whether there is any whole."""
+        return bool(self._kinds)
+
+    def trials(self, end: RobustSolution) -> Iterator[_Trial]:
+        """What solves without the suspects say; also without one more, where a second one may hide the first."""
+        for suspects in self.suspects(end):
+            trial = self.tried(end, suspects)
+            if trial is not None and trial.log_odds < DOUBTFUL and trial.next is not None:
+                pair = self.tried(end, _Suspects(suspects.wholes, (*suspects.numbers, trial.next)))
+                trial = trial if pair is None or pair.log_odds < trial.log_odds else pair
+            if trial is not None:
+                yield trial
+
+    # ---- who is looked at -------------------------------------------------------------------------------------------
+
+    def suspects(self, end: RobustSolution) -> Iterator[_Suspects]:
+        """Wholes without which the rest may be better explained."""
+        for wholes in self._kinds:
+            for numbers in (*self._mostly_rejected(end, wholes), *self._by_offsets(end, wholes)):
+                rows = tuple(np.flatnonzero(wholes.among(np.array(numbers))).tolist())
+                if rows not in self._tried:
+                    self._tried.add(rows)
+                    yield _Suspects(wholes, numbers)
+
+    def _mostly_rejected(self, end: RobustSolution, wholes: Wholes) -> Iterator[tuple[int, ...]]:
+        """The one with most outliers, where most of its observations are."""
+        counts, used = wholes.count(self.taking_part), wholes.count(_inliers(end) & self.taking_part)
+        rejected = np.where((counts > FEWEST) & (used < _LEFT * counts), counts - used, 0)
+        if np.any(rejected):
+            yield (int(np.argmax(rejected)),)
+
+    def _by_offsets(self, end: RobustSolution, wholes: Wholes) -> Iterator[tuple[int, ...]]:
+        """Those that the offsets speak against: single ones, and the pair of most evidence."""
+        if not wholes.of_features:
+            excess = self._excess(end, wholes)
+            if np.max(excess) < _STANDS_OUT + np.sqrt(2.0 * np.log(np.count_nonzero(excess))):
+                return
+        chosen, offsets = self._offsets(end, wholes, ())
+        if offsets is None:
+            return
+        none, each = offsets.log_evidence(), offsets.log_evidence_with_each()
+        first = int(np.argmax(each))
+        for number in np.argsort(-each)[:2]:
+            if each[number] - none > _SUSPECT:
+                yield (int(chosen[number]),)
+        both = offsets.log_evidence_with_each((first,))
+        second = int(np.argmax(both))
+        if both[second] > max(none, each[first]):
+            yield int(chosen[first]), int(chosen[second])
+
+    # ---- what is said of them ---------------------------------------------------------------------------------------
+
+    def tried(self, end: RobustSolution, suspects: _Suspects) -> _Trial | None:
+        """What a solve without the suspects says of them; None where there is none, or they lie here and there."""
+        wholes, numbers = suspects.wholes, suspects.numbers
+        without = self._without(wholes, numbers)
+        if without is None:
+            return None
+        there = residuals(self._observations, self._problem.sights, without.solution.estimate)
+        chosen, offsets = self._offsets(replace(without, residuals=there), wholes, numbers)
+        if offsets is None:
+            return None
+        lengths, explanations = np.concatenate(there.lengths), []
+        for number in numbers:
+            odds, rival = _odds(offsets, chosen, number, numbers)
+            own = wholes.among(np.array([number])) & self.taking_part
+            other = (end if odds > 0.0 else without).solution.estimate
+            instead = "it belongs"
+            if rival is not None and abs(odds) < DOUBTFUL:
+                instead = f"the whole of {wholes.name(rival)} does not belong"
+                rivals = self._without(wholes, tuple(rival if one == number else one for one in numbers))
+                other = other if rivals is None or odds < 0.0 else rivals.solution.estimate
+            aside_px = float(np.nanmedian(lengths[own]))
+            explanations.append(Explanation(wholes.name(number), own, aside_px, odds, instead, other))
+        rows = wholes.among(np.array(numbers)) & self.taking_part
+        least = min(one.log_odds for one in explanations)
+        return _Trial(without, rows, least, tuple(explanations), _next(offsets, chosen, numbers))
+
+    def _without(self, wholes: Wholes, numbers: tuple[int, ...]) -> RobustSolution | None:
+        """The end of a solve without some wholes; None where the others determine nothing."""
+        try:
+            gone = wholes.among(np.array(numbers))
+            others = self._problem.used(*self._split(self.taking_part & ~gone))
+            end = self._solver(replace(others, layout=others.layout.of(others.sights.keys)))
+        except CalibrationError:
+            return None
+        if wholes.of_features:
+            return end
+        alone = self._problem.used(*self._split(gone)).weighted(replace(end.problem.weighting, loss="cauchy"))
+        estimate = with_placements_at_best(alone, end.solution.estimate)
+        return replace(end, solution=replace(end.solution, estimate=estimate))
+
+    def _offsets(self, end: RobustSolution, wholes: Wholes, back: tuple[int, ...]) -> tuple[Indices, Offsets | None]:
+        """Which wholes are looked at, and what is said of their offsets, with all rows of some that were left out.
+
+        None where some of these lie here and there: they are no whole.
+        """
+        recalled = wholes.among(np.array(back, dtype=np.int64)) & self.taking_part
+        rows = self._rows(end, wholes, recalled)
+        sights = self._problem.sights.used(*self._split(rows))
+        if not len(sights):
+            return np.empty(0, dtype=np.int64), None
+        equations = write_equations(self._observations, sights, end.solution.estimate, end.residuals)
+        weights = equation_weights(self._observations, self._problem.options, end.inliers, equations)
+        here = recalled[equations.observation]
+        weights = replace(weights, used=weights.used | here, robust=np.where(here, 1.0, weights.robust))
+        model = make_linear_model(self._problem, end.solution.estimate, equations, weights)
+        chosen = np.flatnonzero(wholes.count(rows & (_inliers(end) | recalled)) >= FEWEST)
+        columns, group = wholes.modes(equations, chosen)
+        agreeing = model.used.copy()
+        for number in back:
+            own = np.flatnonzero(group == np.searchsorted(chosen, number))
+            agree = _agreeing(model, columns, own, self._problem.options.reject_sigma)
+            if number not in chosen or 2 * np.count_nonzero(agree) < max(len(own), 2 * FEWEST):
+                return chosen, None
+            agreeing[own] = agree
+        if back:
+            model = make_linear_model(self._problem, end.solution.estimate, equations, replace(weights, used=agreeing))
+        return chosen, measure_offsets(model, columns, group) if len(chosen) > 1 else None
+
+    def _rows(self, end: RobustSolution, wholes: Wholes, recalled: Mask) -> Mask:
+        """(N + M,) the rows that are looked at: of some views, of each whole some."""
+        taking_part = self.taking_part & (_inliers(end) | recalled)
+        shows_some = np.bincount(self._view[taking_part & (wholes.of >= 0)], minlength=len(self._observations.views))
+        largest = self._largest(end) if wholes.of_features else self._excess(end, wholes)[self._owner(wholes)]
+        most = _MOST_VIEWS if wholes.of_features else _MOST_WHOLE_VIEWS
+        with_some, others = np.flatnonzero(shows_some), np.flatnonzero(shows_some == 0)
+        chosen = np.zeros(len(shows_some), dtype=bool)
+        chosen[np.unique(self._view[recalled])[:most]] = True
+        chosen[with_some[np.argsort(-largest[with_some], kind="stable")][: most // 2]] = True
+        chosen[with_some[:: max(1, 2 * len(with_some) // most)]] = True
+        chosen[others[:: max(1, len(others) // _MOST_OTHERS)]] = True
+        rows = np.flatnonzero(taking_part & chosen[self._view])
+        taking_part[:] = False
+        taking_part[_thinned(rows, wholes.of[rows] * len(shows_some) + self._view[rows], wholes.of[rows] >= 0)] = True
+        return taking_part
+
+    def _excess(self, end: RobustSolution, wholes: Wholes) -> Array:
+        """(size + 1,) by how many standard deviations the mean square residual of each view or placement is above the
+        median one.
+        """
+        lengths = np.concatenate([end.inliers.point_sigmas, end.inliers.curve_sigmas])
+        own = _inliers(end) & (wholes.of >= 0) & self.taking_part
+        equations = np.where(np.arange(len(lengths)) < len(end.inliers.points), 2.0, 1.0)
+        spare = np.bincount(wholes.of[own], equations[own], minlength=wholes.size + 1)
+        square = np.bincount(wholes.of[own], lengths[own] ** 2, minlength=wholes.size + 1) / np.maximum(spare, 1.0)
+        there = spare > 0.0
+        middle = float(np.median(square[there])) if np.any(there) else 1.0
+        return np.asarray((square / max(middle, 1e-12) - 1.0) / np.sqrt(2.0 / np.maximum(spare, 1.0)) * there)
+
+    def _owner(self, wholes: Wholes) -> Indices:
+        """(V,) number of the whole that each view is of; the last for none."""
+        owner = np.full(len(self._observations.views), wholes.size)
+        owner[self._view[wholes.of >= 0]] = wholes.of[wholes.of >= 0]
+        return owner
+
+    def _largest(self, end: RobustSolution) -> Array:
+        """(V,) the largest mean offset of a curve in each view, in standard deviations where errors are independent."""
+        single, curves, largest = self._kinds[0], self._observations.curves, np.zeros(len(self._observations.views))
+        own = single.of[len(self._observations.points) :]
+        sigmas = end.residuals.curves / (end.inliers.curve_scale * curves.sigma_px)
+        inside = np.where(end.inliers.curves & np.isfinite(sigmas), sigmas, 0.0)
+        mean = np.abs(np.bincount(own, inside)) / np.sqrt(np.maximum(np.bincount(own, end.inliers.curves), 1.0))
+        np.maximum.at(largest, curves.view, mean[own])
+        return largest
+
+    def _split(self, rows: Mask) -> tuple[Mask, Mask]:
+        """(N,) of points and (M,) of curve observations."""
+        count = len(self._observations.points)
+        return np.asarray(rows[:count]), np.asarray(rows[count:])
+
+
+def _inliers(end: RobustSolution) -> Mask:
+    """(N + M,) the observations that take part."""
+    return np.concatenate([end.inliers.points, end.inliers.curves])
+
+
+def _odds(offsets: Offsets, chosen: Indices, number: int, wrong: tuple[int, ...]) -> tuple[float, int | None]:
+    """Log odds that one of the wrong wholes does not belong, against that it does, or another one in its place: then
+    which.
+    """
+    at = {int(one): place for place, one in enumerate(chosen)}
+    others = [at[one] for one in wrong if one != number]
+    each = offsets.log_evidence_with_each(others)
+    evidence, none = float(each[at[number]]), offsets.log_evidence(others)
+    each[at[number]] = -np.inf
+    rival = int(np.argmax(each))
+    return evidence - max(none, float(each[rival])), int(chosen[rival]) if each[rival] > none else None
+
+
+def _next(offsets: Offsets, chosen: Indices, wrong: tuple[int, ...]) -> int | None:
+    """The whole that does not belong, either, when these do not; None where there is none."""
+    at = [int(np.flatnonzero(chosen == number)[0]) for number in wrong]
+    each = offsets.log_evidence_with_each(at)
+    best = int(np.argmax(each))
+    return int(chosen[best]) if each[best] > offsets.log_evidence(at) else None
+
+
+def _thinned(rows: Indices, key: Indices, of_whole: Mask) -> Indices:
+    """Of rows with the same key some, evenly, where they are of a whole."""
+    order = np.argsort(key, kind="stable")
+    _, starts, count = np.unique(key[order], return_index=True, return_counts=True)
+    place, size = np.arange(len(order)) - np.repeat(starts, count), np.repeat(count, count)
+    most = np.where(of_whole[order], np.minimum(size, _MOST_ROWS), size)
+    return np.asarray(rows[order[(place * most) // size != ((place - 1) * most) // size]])
+
+
+def _agreeing(model: LinearModel, columns: Array, rows: Indices, reject_sigma: float) -> Mask:
+    """(N,) which of the rows one offset brings within the bound, by least absolute deviations."""
+    own = columns[rows][:, np.any(columns[rows] != 0.0, axis=0)]
+    residual = (model.equations.residual * model.weight)[rows]
+    left = residual
+    for _ in range(20):
+        sizes = 1.0 / np.sqrt(np.maximum(np.abs(left), 1.0))
+        left = residual - own @ np.linalg.lstsq(own * sizes[:, None], residual * sizes, rcond=1e-9)[0]
+    return np.asarray(np.abs(left) <= reject_sigma)

@@ -1,0 +1,111 @@
+"""Offsets of whole features: which of them lies farther aside than the others scatter, and how surely.
+
+Each group of equations (a line in one frame, say) may lie aside by a few modes: an offset along all of it, a turn. The
+model takes up some of that, and what it leaves of all modes together, u with covariance V where errors are independent,
+is all that the residuals say of offsets. Errors that go together along a line offset it, too: offsets of variance tau^2
+in all groups make the covariance of u
+
+    V + tau^2 V V,    with V = U S U^T that of w = S^-1/2 U^T u    1 + tau^2 S,
+
+so along each direction by itself. A group that does not belong has an offset of much larger variance besides. Both
+explanations are weighed by their evidence (marginal likelihood; Kass and Raftery, JASA 90, 1995) with tau, the size of
+the wrong offset and the noise integrated out: nothing is a fault that the scatter of the others explains.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ceres_cal.base.arrays import Array, Indices
+from ceres_cal.solve.linear_model import LinearModel
+
+# Probability, before anything was seen, that some feature does not belong. From half to double the log odds change by
+# 0.7, those of a line 3 px aside are 10 to 20.
+_FAULTY = 0.01
+# Probability, before anything was seen, that errors do not go together along features. The log odds change by as much.
+_INDEPENDENT = 0.5
+# Standard deviations of offsets in those of one observation's noise: of features that belong, and of those that do not.
+_SCATTER = np.concatenate([[0.0], np.geomspace(0.1, 60.0, 14)])
+_ASIDE = np.array([10.0, 40.0, 160.0])
+_LEAST_PX = 1e-3  # noise that nothing is measured better than: of exact observations rounding is no offset
+_DETERMINED = 1e-5  # of the largest squared length of a mode: what the model leaves of directions that can be judged
+
+
+@dataclass(frozen=True, eq=False)
+class Offsets:
+    """What residuals say of the offsets of G groups, in R directions that are independent where errors are.
+
+    Attributes:
+        size: (R,) S of each direction. value: (R,) w. modes: (G, R, M) what an offset of each group does to w.
+        rest: squared residuals that no offset explains. spare: equations left over in all.
+    """
+
+    size: Array
+    value: Array
+    modes: Array
+    rest: float
+    spare: int
+
+    def log_evidence(self, wrong: Sequence[int] = ()) -> float:
+        """Of these groups not belonging, all others scattering alike."""
+        return float(self._log_evidence(self._together(wrong)[None], len(wrong))[0])
+
+    def log_evidence_with_each(self, wrong: Sequence[int] = ()) -> Array:
+        """(G,) the same with each one of the groups besides; -inf for those that are there already."""
+        known = np.broadcast_to(self._together(wrong), (len(self.modes), *self._together(wrong).shape))
+        evidence = self._log_evidence(np.concatenate([known, self.modes], axis=2), len(wrong) + 1)
+        evidence[list(wrong)] = -np.inf
+        return evidence
+
+    def _together(self, groups: Sequence[int]) -> Array:
+        """(R, K) modes of some groups side by side."""
+        return np.concatenate([np.zeros((len(self.size), 0)), *self.modes[list(groups)]], axis=1)
+
+    def _log_evidence(self, modes: Array, count: int) -> Array:
+        """(H,) of hypotheses with so many wrong groups, whose modes (H, R, K) have offsets of their own."""
+        precision = 1.0 / (1.0 + np.multiply.outer(_SCATTER**2, self.size))  # (T, R)
+        total = precision @ self.value**2
+        width = modes.shape[2]
+        pairs = (modes[:, :, :, None] * modes[:, :, None, :]).reshape(*modes.shape[:2], width * width)
+        normal = (precision @ pairs).reshape(len(modes), len(_SCATTER), width, width)
+        slope = precision @ (modes * self.value[:, None])
+        prior = np.log(np.where(_SCATTER == 0.0, _INDEPENDENT, (1.0 - _INDEPENDENT) / (len(_SCATTER) - 1)))
+        prior = prior + 0.5 * np.sum(np.log(precision), axis=1)
+        logs = []
+        for aside in _ASIDE[: len(_ASIDE) if count else 1]:
+            wider = np.eye(width) + aside**2 * normal
+            explained = aside**2 * np.sum(slope * np.linalg.solve(wider, slope[..., None])[..., 0], axis=-1)
+            left = np.log((self.rest + total - explained) / max(self.spare, 1))
+            logs.append(prior - 0.5 * np.linalg.slogdet(wider)[1] - 0.5 * self.spare * left)
+        every = np.concatenate(logs, axis=1)
+        most = np.max(every, axis=1)
+        summed = np.log(np.sum(np.exp(every - most[:, None]), axis=1) / len(logs))
+        return np.asarray(most + summed + count * np.log(_FAULTY / len(self.modes)))
+
+
+def measure_offsets(model: LinearModel, columns: Array, group: Indices) -> Offsets:
+    """What a model's residuals say of offsets.
+
+    Args:
+        columns: (E, M) of the modes, in standard deviations, of order one. group: (E,) of each equation, -1 in none.
+    """
+    groups, width = int(group.max()) + 1, columns.shape[1]
+    rows = np.flatnonzero((group >= 0) & model.used)
+    every = np.zeros((len(group), groups, width))
+    every[rows, group[rows]] = columns[rows] / model.weight[rows, None]
+    flat = every.reshape(len(group), -1)
+    there = np.flatnonzero(np.any(flat != 0.0, axis=0))
+    normal, slope = model.left_of(flat[:, there])
+    size, turns = np.linalg.eigh(normal)
+    kept = size > _DETERMINED * float(np.bincount(group[rows]).max())
+    size, turns = size[kept], turns[:, kept]
+    value = (turns.T @ slope) / np.sqrt(size)
+    modes = np.zeros((groups * width, len(size)))
+    modes[there] = turns * np.sqrt(size)
+    modes = np.swapaxes(modes.reshape(groups, width, -1), 1, 2)
+    rest = float(np.sum(model.left_over[model.used] ** 2) - value @ value)
+    least = model.spare * (_LEAST_PX * float(np.median(model.weight[rows]))) ** 2
+    return Offsets(size, value, modes, max(rest, least), model.spare)

@@ -1,0 +1,268 @@
+"""What is known beforehand is held against the observations: conflicts by name and size, in what is stated, too."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scenes import SCENES, camera
+
+from ceres_cal.base.errors import SolutionError
+from ceres_cal.calibrating import calibrate
+from ceres_cal.calibration import Calibration
+from ceres_cal.diagnostics import diagnose
+from ceres_cal.model.information import Information
+from ceres_cal.model.keys import Key
+from ceres_cal.model.parameters import Options
+from ceres_cal.model.structure import Tolerance
+from ceres_cal.moves import RefitOptions, refit
+from ceres_cal.observations import Observations, Prior
+from ceres_cal.report.grounds import Judgement, judge_quality
+from ceres_cal.report.quality import quality_of
+from ceres_cal.scene.targets import Segment, checkerboard, custom, ssl_field
+from ceres_cal.simulate import Disturbance, Station, field_scene, overhead_pose, simulate
+from ceres_cal.solve.wald import _beside
+
+HEIGHT_M = 4.02
+WRONG, RIGHT = ((value, 0.005) for value in (3.0, HEIGHT_M))
+NOISE = Disturbance(0.3, 0.3)
+
+
+@cache
+def seen(tilt_deg: float = 8.0, seed: int = 1, outliers: float = 0.0) -> Observations:
+    """A field of division B, its lines and corners, from a camera at 4.02 m."""
+    pose = overhead_pose(0.1, -0.2, HEIGHT_M, tilt_x_deg=tilt_deg, tilt_y_deg=-0.5 * tilt_deg, yaw_deg=3.0)
+    scene = field_scene(
+        ssl_field("B"), {"overhead": camera("radial-2-3")}, {"overhead": Station("overhead", pose)}, spacing_m=0.2
+    )
+    return simulate(scene, replace(NOISE, outliers=outliers), seed=seed).observations
+
+
+def height(value: float, sigma: float) -> Prior:
+    return Prior("station", "overhead", "height_m", (value,), (sigma,))
+
+
+def under(*priors: Prior, fixed: Mapping[str, float] | None = None, **options: bool) -> Options:
+    return Options(priors=priors, fixed=fixed or {}, **options)  # type: ignore[arg-type]
+
+
+@cache
+def wrong() -> Calibration:
+    return calibrate(seen(), under(height(*WRONG)))
+
+
+def verdict(calibration: Calibration, observations: Observations) -> Judgement:
+    return judge_quality(quality_of(calibration, observations))
+
+
+# ---- the row of the table -------------------------------------------------------------------------------------------
+
+
+def test_a_wrong_height_is_named_with_both_values() -> None:
+    (conflict,) = wrong().conflicts
+    free = calibrate(seen())
+    assert (conflict.kind, conflict.owner, conflict.quantity, conflict.unit) == ("prior", "overhead", "height", "m")
+    assert conflict.stated == 3.0 and conflict.stated_sd == pytest.approx(0.005)
+    # What is said of the observations is what they say by themselves, at their own noise: solved, not extrapolated.
+    assert conflict.seen == pytest.approx(free.station().position[2], abs=1e-3)  # 2.5e-5 measured, of an sd of 0.04
+    assert conflict.seen_sd == pytest.approx(
+        free.uncertainty.posterior.sd_of("station", "overhead", "height"), rel=0.02
+    )
+    assert conflict.sigmas == pytest.approx((conflict.seen - 3.0) / np.hypot(0.005, conflict.seen_sd), rel=0.15)
+    assert conflict.words in wrong().warnings
+    assert conflict.words == (
+        "the stated height of station 'overhead', 3.000 ± 0.005 m: the observations alone say 3.97 ± 0.04 m, "
+        "21 sigmas apart: correct or remove it"
+    )
+
+
+def test_nothing_is_promised_then() -> None:
+    """0.3 mm were stated at 150 mm, and "to 1 mm at robot height" promised, 27 mm off."""
+    known = wrong().uncertainty
+    assert abs(wrong().station().position[2] - HEIGHT_M) < 1.2 * known.posterior.sd_of("station", "overhead", "height")
+    assert known.verdict("station", "overhead", "height").verdict != "known"
+    assert known.map_sd_mm(height_m=0.15).mean_mm > 20.0  # 51 measured
+    judged = verdict(wrong(), seen())
+    assert judged.level == "no" and "mm" not in judged.headline
+    assert judged.headline == "Do not trust this calibration: what was known beforehand is contradicted."
+    found = diagnose(wrong(), seen())
+    assert found.conflicts == wrong().conflicts
+
+
+def test_files_keep_conflicts(tmp_path: Path) -> None:
+    wrong().save(tmp_path / "calibration.json")
+    assert Calibration.load(tmp_path / "calibration.json").conflicts == wrong().conflicts
+
+
+@pytest.mark.parametrize("tilt_deg", [1.0, 8.0])
+def test_a_right_height_is_no_conflict(tilt_deg: float) -> None:
+    calibration = calibrate(seen(tilt_deg), under(height(*RIGHT)))
+    assert calibration.conflicts == () and calibration.warnings == ()
+    assert verdict(calibration, seen(tilt_deg)).headline.startswith("This calibration can be trusted: to ")
+
+
+def test_outliers_and_rows_thrown_out_hide_nothing() -> None:
+    """The wrong height of a tilted camera throws rows out; the solve without it takes them back."""
+    (conflict,) = calibrate(seen(15.0, outliers=0.1), under(height(*WRONG))).conflicts
+    assert abs(conflict.seen - HEIGHT_M) < 4.0 * conflict.seen_sd < 0.1
+    assert conflict.sigmas > 30.0
+
+
+def test_where_nothing_tells_there_is_no_conflict() -> None:
+    """From straight above the observations know phi over height alone, and any height is as good."""
+    assert calibrate(seen(0.5), under(height(*WRONG))).conflicts == ()
+
+
+@pytest.mark.parametrize("tilt_deg", [0.0, 8.0])
+def test_two_heights_contradict_each_other(tilt_deg: float) -> None:
+    """Also where the observations say nothing of either."""
+    calibration = calibrate(seen(tilt_deg), under(height(*RIGHT), height(*WRONG)))
+    pair, *others = calibration.conflicts
+    assert pair.kind == "priors" and {pair.stated, pair.seen} == {3.0, HEIGHT_M} and pair.sigmas > 100.0
+    assert pair.words.startswith("two priors contradict each other: height of station 'overhead' is stated as 4.020 ±")
+    assert [one.stated for one in others] == ([3.0] if tilt_deg else [])  # which of them is wrong
+    off = abs(calibration.station().position[2] - HEIGHT_M)
+    assert off < 1.2 * calibration.uncertainty.posterior.sd_of("station", "overhead", "height")
+    assert verdict(calibration, seen(tilt_deg)).level == "no"
+
+
+def test_the_wrong_one_of_two_that_fight_is_named() -> None:
+    """A wrong phi makes a right height look wrong; without the phi it agrees."""
+    phi = Prior("camera", "overhead", "phi", (700.0,), (5.0,))
+    (conflict,) = calibrate(seen(), under(height(*RIGHT), phi)).conflicts
+    assert (conflict.quantity, conflict.stated) == ("phi", 700.0)
+    one, *_ = calibrate(seen(0.5), under(height(*RIGHT), phi)).conflicts
+    assert {"height", "phi"} <= set(one.words.replace(",", "").split())  # nothing tells which: both are named
+
+
+@pytest.mark.parametrize(
+    "fixed, quantity, truth",
+    [({"phi": 700.0}, "phi", 868.0), ({"cx": 600.0}, "cx", 651.3), ({"a2": 0.0}, "a2", -5.2e-5)],
+)
+def test_fixed_numbers_are_tested(fixed: dict[str, float], quantity: str, truth: float) -> None:
+    (conflict,) = calibrate(seen(), under(fixed=fixed)).conflicts
+    assert (conflict.kind, conflict.quantity, conflict.stated_sd) == ("fixed", quantity, 0.0)
+    assert conflict.stated == fixed[quantity] and abs(conflict.seen - truth) < 3.0 * conflict.seen_sd
+    assert conflict.words.startswith(f"the held {quantity} of camera 'overhead', {fixed[quantity]:g}")
+    assert calibrate(seen(), under(fixed={quantity: truth})).conflicts == ()
+
+
+def test_a_principal_point_held_at_the_middle_is_tested() -> None:
+    (conflict,) = calibrate(seen(), under(free_principal_point=False)).conflicts
+    assert conflict.kind == "fixed" and conflict.quantity in ("cx", "cy") and conflict.sigmas > 10.0
+
+
+@cache
+def askew(*lines: str) -> Observations:
+    """A field whose lines are painted 12 mm aside, and drawn as they should be."""
+    field, painted = ssl_field("B"), {}
+    for line in lines:
+        drawn = field.curves[line]
+        assert isinstance(drawn, Segment)
+        across = np.array([0.012, 0.0, 0.0] if drawn.start[0] == drawn.end[0] else [0.0, 0.012, 0.0])
+        painted[line] = Segment(tuple(drawn.start + across), tuple(drawn.end + across), drawn.width_m)
+    pose = overhead_pose(0.1, -0.2, HEIGHT_M, tilt_x_deg=8.0)
+    scene = field_scene(
+        custom({}, {**field.curves, **painted}),
+        {"overhead": camera("radial-2-3")},
+        {"overhead": Station("overhead", pose)},
+        spacing_m=0.1,
+        name="field",
+    )
+    observed = simulate(scene, NOISE, seed=0).observations
+    return replace(observed, targets={"field": custom({}, field.curves)})
+
+
+def test_a_tolerance_that_is_too_tight() -> None:
+    """The calibration keeps its word, since lines under a tolerance are solved for."""
+    observed = askew("HalfwayLine", "CenterLine", "LeftPenaltyStretch")
+    calibration = calibrate(observed, Options(tolerances={"field": Tolerance(lines_m=0.002)}))
+    conflicts = {conflict.quantity: conflict for conflict in calibration.conflicts}
+    assert {conflict.kind for conflict in conflicts.values()} == {"tolerance"}
+    assert abs(conflicts["CenterLine"].seen - 0.012) < 0.003  # 13 mm
+    assert "contradicted" not in verdict(calibration, observed).headline
+
+
+def test_one_line_aside_under_a_tolerance_is_a_whole_in_doubt() -> None:
+    calibration = calibrate(askew("HalfwayLine"), Options(tolerances={"field": Tolerance(lines_m=0.002)}))
+    assert any("the whole of line 'HalfwayLine'" in warning for warning in calibration.warnings)
+
+
+def test_a_height_measured_after_a_move_is_tested() -> None:
+    old, new = calibrate(seen(15.0)), seen(14.0, seed=3)
+    assert refit(old, new, options=RefitOptions(priors=(height(*RIGHT),))).conflicts == ()
+    with pytest.raises(SolutionError, match=r"the stated height of station 'overhead', 3.000 ± 0.005 m.*; or else "):
+        refit(old, new, options=RefitOptions(priors=(height(*WRONG),)))
+    with pytest.raises(SolutionError, match=r"stated height .*4.120 ± 0.005 m.*; or else the zoom was changed"):
+        refit(old, new, options=RefitOptions(priors=(height(HEIGHT_M + 0.1, 0.005),)))
+    (conflict,) = refit(old, new, options=RefitOptions(priors=(height(HEIGHT_M + 0.05, 0.005),))).conflicts
+    assert conflict.stated == HEIGHT_M + 0.05 and abs(conflict.seen - HEIGHT_M) < 4.0 * conflict.seen_sd
+
+
+# ---- units ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("value, hint", [(4020.0, r"is it in mm\? Give metres"), (150.0, "sigmas apart")])
+def test_a_height_in_another_unit_is_refused(value: float, hint: str) -> None:
+    """No camera comes out of it; the height is blamed, not the labels."""
+    with pytest.raises(
+        SolutionError, match=rf"(?s)the stated height of station 'overhead', {value:g}.*say 3.97 ± 0.04 m.*{hint}"
+    ):
+        calibrate(seen(), under(height(value, 5e-6 * value)))
+    with pytest.raises(SolutionError, match=r"stated beforehand.*check the priors and their units"):
+        calibrate(seen(0.0), under(height(4020.0, 0.02)))
+
+
+@pytest.mark.parametrize(
+    "name, square_m, why",
+    [
+        ("field-boards", 100.0, "target 'board' reaches 943 m from its origin: give its dimensions in metres"),
+        ("boards", 100.0, "target 'board' reaches 943 m from its origin"),
+        ("field-boards", 1.0, "target 'board' lies up to 16 m under the floor: its dimensions are too large"),
+    ],
+)
+def test_boards_in_another_unit_are_refused(name: str, square_m: float, why: str) -> None:
+    """Boards of 100 m squares under a camera at 5 m; alone they fit in any unit."""
+    observed = simulate(SCENES[f"radial-2-3/{name}"](), NOISE).observations
+    targets = {**observed.targets, "board": checkerboard(9, 6, square_m)}
+    with pytest.raises(SolutionError, match=why):
+        calibrate(replace(observed, targets=targets))
+
+
+# ---- the algebra ----------------------------------------------------------------------------------------------------
+
+
+@given(st.integers(0, 2**31), st.integers(1, 4), st.floats(1e-2, 1e2))
+@settings(max_examples=50)
+def test_what_stands_beside_a_prior(seed: int, size: int, strength: float) -> None:
+    """C^-1 - P of numbers in any units is what the others say of them, also where that is nothing of some."""
+    rng = np.random.default_rng(seed)
+    units = 10.0 ** rng.uniform(-6.0, 3.0, size)
+    rows = rng.standard_normal((int(rng.integers(0, 2 * size + 1)), size)) / units
+    rest, told = rows.T @ rows, np.diag((strength / units) ** 2)
+    beside = _beside(np.asarray(np.linalg.inv(rest + told)), np.asarray(told, dtype=float))
+    assert beside * units[:, None] * units == pytest.approx(
+        rest * units[:, None] * units, abs=1e-5 * (1.0 + strength**2)
+    )
+
+
+@given(st.integers(0, 2**31))
+@settings(max_examples=20)
+def test_what_is_in_dispute_is_in_the_covariance(seed: int) -> None:
+    """Two shifts d and e: C + d d^T + e e^T."""
+    from ceres_cal.uncertainty import Posterior
+
+    rng = np.random.default_rng(seed)
+    keys = tuple(Key("camera", "a", name, "px") for name in "abc")
+    rows = rng.standard_normal((6, 3))
+    shifts = tuple(10.0 * rng.standard_normal((2, 3)))
+    before = Posterior(Information(keys, rows.T @ rows))
+    after = before.in_doubt(keys[::-1], [shift[::-1] for shift in shifts])
+    expected = before.covariance + sum(np.outer(shift, shift) for shift in shifts)
+    assert after.covariance == pytest.approx(expected, rel=1e-6, abs=1e-6)

@@ -1,0 +1,197 @@
+"""Observations that are there twice: found bit for bit, counted once, and said."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from time import perf_counter
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scenes import SCENES
+
+from ceres_cal.base.arrays import AnyArray
+from ceres_cal.calibrating import calibrate
+from ceres_cal.calibration import Calibration
+from ceres_cal.diagnostics import diagnose
+from ceres_cal.moves import check, refit
+from ceres_cal.observations import NO_CURVES, Observations, Points, View, combine, taken
+from ceres_cal.observations.copies import find_copies
+from ceres_cal.simulate import Disturbance, simulate
+
+
+@cache
+def seen(name: str = "radial-2-3/field-boards") -> Observations:
+    """Two frames of a field and six boards."""
+    return simulate(SCENES[name](), Disturbance(0.3, 0.3)).observations
+
+
+@cache
+def calibrated(name: str = "radial-2-3/field-boards") -> Calibration:
+    return calibrate(seen(name))
+
+
+def again(observations: Observations, name: str = "again") -> Observations:
+    """The same pictures under other names, as a second detector run over copied files would give them."""
+    views = [replace(view, frame=f"{view.frame} {name}") for view in observations.views]
+    views = [v if v.placement is None else replace(v, placement=f"{v.placement} {name}") for v in views]
+    return replace(observations, views=tuple(views))
+
+
+def assert_same(one: Calibration, other: Calibration) -> None:
+    """The same numbers, and as well known, to the last bit."""
+    assert one.station() == other.station() and one.fit == other.fit
+    assert dict(one.placements) == dict(other.placements)
+    assert one.posterior is not None and other.posterior is not None
+    assert one.posterior.keys == other.posterior.keys
+    assert np.array_equal(one.posterior.sd, other.posterior.sd)
+
+
+def test_one_file_given_twice_counts_once() -> None:
+    twice = calibrate(combine([seen(), seen()]))
+    assert_same(twice, calibrated())
+    assert twice.warnings == (
+        "936 observations of frame '0001', '0002', 'board_01', ... are there more than once: counted once",
+        *calibrated().warnings,
+    )
+    assert len(twice.rejected) == 936 + len(calibrated().rejected)
+    assert twice.outliers == calibrated().rejected
+    assert {entry.reason for entry in twice.rejected if entry.frame == "0001"} == {"a copy of frame '0001'"}
+
+
+@pytest.mark.parametrize("times", [1, 99])
+def test_frames_under_other_names_count_once(times: int) -> None:
+    """The boards in them, too, whose placements are not solved for."""
+    many = calibrate(combine([seen(), *(again(seen(), f"again {n}") for n in range(times))]))
+    assert_same(many, calibrated())
+    others = f", and so do {8 * times - 1} other frames"
+    assert many.warnings[0] == f"frame '0001 again 0' repeats frame '0001' point by point{others}: counted once"
+    copies = [entry for entry in many.rejected if entry.frame == "0002 again 0"]
+    assert copies and {entry.reason for entry in copies} == {"a copy of frame '0002'"}
+
+
+def test_rows_twice_in_one_frame_count_once() -> None:
+    points = taken(seen().points, np.sort(np.concatenate([np.arange(len(seen().points)), np.arange(5, 17)])))
+    doubled = calibrate(replace(seen(), points=points))
+    assert_same(doubled, calibrated())
+    assert doubled.warnings[0] == "12 observations of frame '0001' are there more than once: counted once"
+    assert [entry.row for entry in doubled.rejected] == list(range(6, 30, 2))
+
+
+def test_files_diagnosis_and_moves_count_them_once_too(tmp_path: Path) -> None:
+    double = combine([seen(), again(seen())])
+    calibration = calibrate(double)
+    calibration.save(tmp_path / "calibration.json")
+    loaded = Calibration.load(tmp_path / "calibration.json")
+    found, expected = diagnose(loaded, double), diagnose(calibrated(), seen())
+    assert found.noise == expected.noise and found.degrees_of_freedom == expected.degrees_of_freedom
+    assert found.findings == expected.findings
+    assert np.count_nonzero(found.table.columns()["reason"] == "a copy of another") == 936
+    assert np.count_nonzero(found.table.outlier) == np.count_nonzero(expected.table.outlier)
+    diagnose(calibrated(), double, new_data=True)
+    new = simulate(SCENES["radial-2-3/field-boards"](), Disturbance(0.3, 0.3), seed=1).observations
+    once, twice = (refit(calibrated(), one) for one in (new, combine([new, again(new)])))
+    assert_same(once, twice)
+    tests = [check(calibrated(), one).stations["overhead"] for one in (new, combine([new, again(new)]))]
+    assert tests[0] == tests[1]
+
+
+# ---- what is a copy, and what is not --------------------------------------------------------------------------------
+
+
+def views_of(*frames: str) -> list[View]:
+    return [View(frame, "a", "a", "board", frame) for frame in frames]
+
+
+def points_of(*pixels: AnyArray) -> Points:
+    """A view for each array of pixels; feature 0 first."""
+    sizes = [len(rows) for rows in pixels]
+    features = np.concatenate([np.arange(size) for size in sizes])
+    return Points(np.repeat(np.arange(len(sizes)), sizes), features, np.concatenate(pixels), np.ones(sum(sizes)))
+
+
+PIXELS = np.random.default_rng(0).uniform(0.0, 900.0, (6, 2))
+
+
+def sources(views: list[View], points: Points) -> list[int]:
+    """View that each row is a copy out of."""
+    return [int(view) for view in find_copies(views, points, NO_CURVES).points]
+
+
+def test_a_view_is_a_copy_whatever_the_order_of_its_rows() -> None:
+    points = points_of(PIXELS, PIXELS)
+    rows = np.concatenate([np.arange(6), np.random.default_rng(1).permutation(6) + 6])
+    assert sources(views_of("1", "2"), taken(points, rows)) == [-1] * 6 + [0] * 6
+    assert sources(views_of("1", "2"), replace(points, sigma_px=np.arange(1.0, 13.0))) == [-1] * 6 + [0] * 6
+
+
+@given(st.integers(0, 2**31), st.integers(1, 6), st.booleans())
+def test_copies_of_any_number_in_any_order_leave_the_first(seed: int, times: int, whole: bool) -> None:
+    """Two frames, each again and again with its rows in another order: what counts are their own rows."""
+    rng = np.random.default_rng(seed)
+    own = rng.uniform(0.0, 900.0, (2, 6, 2))
+    own = np.round(own) if whole else own
+    numbers = np.concatenate([[0, 1], rng.integers(0, 2, times)])
+    points = points_of(*own[numbers])
+    mixed = np.concatenate([6 * view + (rng.permutation(6) if view > 1 else np.arange(6)) for view in range(times + 2)])
+    again = np.repeat(numbers[2:], 6).tolist()
+    assert sources(views_of(*map(str, range(times + 2))), taken(points, mixed)) == [-1] * 12 + again
+
+
+@given(st.integers(0, 2**31))
+def test_a_static_camera_of_whole_pixels_sees_other_frames(seed: int) -> None:
+    """Most of its rows come again in some other frame; its frames do not repeat each other."""
+    seen = np.round(
+        np.repeat(10.0 * PIXELS[None], 20, axis=0) + np.random.default_rng(seed).normal(0.0, 2.0, (20, 6, 2))
+    )
+    assert len(np.unique(seen.reshape(20, -1), axis=0)) == 20
+    assert sources(views_of(*map(str, range(20))), points_of(*seen)) == [-1] * 120
+
+
+def test_one_bit_makes_another_measurement() -> None:
+    other = PIXELS.copy()
+    other[3, 1] = np.nextafter(other[3, 1], 0.0)
+    assert sources(views_of("1", "2"), points_of(PIXELS, other)) == [-1] * 12
+    assert sources(views_of("1", "2", "3"), points_of(PIXELS, other, PIXELS)) == [-1] * 12 + [0] * 6
+
+
+def test_other_features_stations_and_targets_are_no_copies() -> None:
+    points = points_of(PIXELS, PIXELS)
+    shifted = replace(points, feature=np.concatenate([np.arange(6), np.arange(1, 7)]))
+    one, two = views_of("1", "2")
+    assert sources([one, two], shifted) == [-1] * 12
+    for other in (replace(two, station="b"), replace(two, target="other"), replace(two, placement=None)):
+        assert sources([one, other], points) == [-1] * 12
+
+
+def test_few_whole_pixels_may_agree() -> None:
+    """Three rows are no copy in another frame; in the same frame a single one is."""
+    assert sources(views_of("1", "2"), points_of(PIXELS[:3], PIXELS[:3])) == [-1] * 6
+    assert sources(views_of("1", "2"), points_of(PIXELS[:4], PIXELS[:4])) == [-1] * 4 + [0] * 4
+    assert sources(views_of("1", "1"), points_of(PIXELS, PIXELS[:1])) == [-1] * 6 + [0]
+
+
+def test_what_a_view_adds_counts() -> None:
+    """A frame that came twice, the second time with more in it."""
+    assert sources(views_of("1", "1"), points_of(PIXELS[:4], PIXELS)) == [-1] * 4 + [0] * 4 + [-1] * 2
+
+
+def test_the_two_sides_of_a_line_are_not_one_another() -> None:
+    lines = simulate(SCENES["radial-2-3/lines-arcs"](), Disturbance(0.3, 0.3)).observations
+    pixels = np.repeat(lines.curves.pixels[:1], 3, axis=0)
+    curves = type(lines.curves)([0] * 3, [0] * 3, pixels, [1.0] * 3, [0, 1, -1])  # type: ignore[arg-type]
+    assert np.all(find_copies(lines.views, points_of(np.empty((0, 2))), curves).curves == -1)
+
+
+def test_a_thousand_frames_cost_milliseconds() -> None:
+    pixels = np.random.default_rng(0).uniform(0.0, 900.0, (1000, 54, 2))
+    views, points = views_of(*map(str, range(1000))), points_of(*pixels)
+    seconds = []
+    for _ in range(5):
+        start = perf_counter()
+        assert not np.any(find_copies(views, points, NO_CURVES).points >= 0)
+        seconds.append(perf_counter() - start)
+    assert min(seconds) < 0.01  # 0.4 to 0.6 ms measured

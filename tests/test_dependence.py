@@ -1,0 +1,208 @@
+"""Errors that belong together are counted together."""
+
+import json
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+from accuracy_scenes import CLEAN_NOISE, RADIAL, SSL_PROBLEMS, boards
+from coverage import CASES, cover, share
+from dependent_errors import Errors, along_lines, warped
+
+from ceres_cal.base.arrays import Array
+from ceres_cal.base.tails import NORMAL_95, student_95
+from ceres_cal.calibrating import calibrate
+from ceres_cal.calibration import Calibration
+from ceres_cal.moves import refit
+from ceres_cal.observations import Observations
+from ceres_cal.simulate import Disturbance, simulate
+from ceres_cal.uncertainty.between import _averaged
+from ceres_cal.uncertainty.correlation import _freedom_of_mixture
+
+HALF = SSL_PROBLEMS["half, paper's lens"]()
+TEN = boards(868.0, RADIAL, 10)
+POINTS = Disturbance(points_sigma_px=0.3)
+
+
+def half_a_field(errors: Errors, seed: int = 0) -> Observations:
+    observations = simulate(HALF.scene, POINTS, seed).observations
+    return errors(replace(observations, priors=HALF.priors), HALF.scene, seed)
+
+
+def ten_boards(errors: Errors | None, seed: int = 0) -> Observations:
+    observations = simulate(TEN.scene, CLEAN_NOISE, seed).observations
+    return observations if errors is None else errors(observations, TEN.scene, seed)
+
+
+def factors(calibration: Calibration) -> Array:
+    return calibration.uncertainty.posterior.factors
+
+
+# ---- what is found --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("length_m", [0.3, 0.6])
+def test_a_length_along_lines_is_recovered(length_m: float) -> None:
+    """Over eight runs; the grid has factors of two."""
+    lengths, shares = [], []
+    for seed in range(8):
+        calibration = calibrate(half_a_field(partial(along_lines, length_m=length_m), seed), HALF.options)
+        found = calibration.uncertainty.posterior.dependence
+        assert found is not None
+        (curves,) = found.correlations
+        assert curves.kind == "curves" and curves.probability > 0.9 and curves.length_m is not None
+        lengths.append(curves.length_m)
+        shares.append(curves.share)
+    assert np.exp(np.mean(np.log(lengths))) == pytest.approx(length_m, rel=0.5)
+    assert np.median(shares) >= 0.9  # all of the noise goes together
+
+
+def test_white_noise_stays_white() -> None:
+    every = np.concatenate([factors(calibrate(ten_boards(None, seed), TEN.options)) for seed in range(12)])
+    assert np.mean(every) == pytest.approx(1.03, abs=0.03) and np.max(every) < 1.4  # 1.03, 1.29 in one run
+
+
+def test_distorted_views_widen_everything() -> None:
+    """Where one view alone is distorted, it is taken out as a whole, or what is stated widens (scripts/coverage.py)."""
+    errors = partial(warped, sigma_px=1.0, views=3)
+    assert np.median([factors(calibrate(ten_boards(errors, seed), TEN.options)) for seed in range(6)]) > 1.1
+
+
+def test_lines_that_are_each_aside_are_named() -> None:
+    calibration = calibrate(half_a_field(partial(along_lines, length_m=50.0), 1), HALF.options)
+    assert np.median(factors(calibration)) > 1.3
+    assert "errors go together along lines" in calibration.uncertainty.widening
+
+
+def test_what_all_frames_share_does_not_shrink_with_them() -> None:
+    """The same errors in six frames of a static camera: as wide as one frame alone, not by the root of six."""
+    one = half_a_field(partial(along_lines, length_m=0.5), 3)
+    rng, count = np.random.default_rng(0), len(one.curves)
+    views = tuple(replace(one.views[0], frame=f"{n}") for n in range(6))
+    pixels = np.tile(one.curves.pixels, (6, 1)) + 0.05 * rng.standard_normal((6 * count, 2))
+    curves = replace(
+        one.curves,
+        view=np.repeat(np.arange(6, dtype=np.int32), count),
+        feature=np.tile(one.curves.feature, 6),
+        pixels=pixels,
+        sigma_px=np.ones(6 * count),
+        side=np.tile(one.curves.side, 6),
+    )
+    points = replace(one.points, view=np.zeros(len(one.points), np.int32))
+    six = calibrate(replace(one, views=views, curves=curves, points=points), HALF.options)
+    alone = calibrate(one, HALF.options)
+    ratio = six.uncertainty.posterior.sd / alone.uncertainty.posterior.sd
+    assert six.posterior is not None and six.posterior.dependence is not None
+    assert six.posterior.dependence.correlations[0].lasting
+    assert np.median(ratio) == pytest.approx(1.0, abs=0.35)  # the model alone: 0.4 and less
+
+
+# ---- it does not depend on how things are put -----------------------------------------------------------------------
+
+
+def test_the_order_of_views_does_not_matter() -> None:
+    observations = ten_boards(partial(warped, sigma_px=0.3, views=None))
+    order = np.arange(len(observations.views))[::-1]
+    points = observations.points
+    rows = np.argsort(order[points.view], kind="stable")
+    turned = replace(
+        observations,
+        views=tuple(observations.views[i] for i in order),
+        points=replace(
+            points,
+            view=order[points.view][rows].astype(np.int32),
+            feature=points.feature[rows],
+            pixels=points.pixels[rows],
+            sigma_px=points.sigma_px[rows],
+        ),
+    )
+    first, second = (calibrate(o, TEN.options).uncertainty.posterior for o in (observations, turned))
+    assert second.sd == pytest.approx(first.sd, rel=1e-3)
+
+
+def test_a_tenth_of_the_stated_sigma_is_the_same_data() -> None:
+    observations = ten_boards(partial(warped, sigma_px=0.3, views=None))
+    points = replace(observations.points, sigma_px=0.1 * observations.points.sigma_px)
+    first, second = (
+        calibrate(o, TEN.options).uncertainty.posterior for o in (observations, replace(observations, points=points))
+    )
+    assert second.sd == pytest.approx(first.sd, rel=1e-3)
+
+
+# ---- who reads it ---------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def correlated() -> tuple[Calibration, Observations]:
+    observations = half_a_field(partial(along_lines, length_m=0.5))
+    return calibrate(observations, HALF.options), observations
+
+
+def test_everybody_reads_the_wider_one(correlated: tuple[Calibration, Observations]) -> None:
+    calibration, _ = correlated
+    known, posterior = calibration.uncertainty, calibration.uncertainty.posterior
+    assert posterior.by_model is not None and np.median(posterior.factors) > 1.4
+    narrow = replace(known, posterior=replace(posterior, information=posterior.by_model, by_model=None))
+    assert known.map_sd_mm().mean_mm > 1.3 * narrow.map_sd_mm().mean_mm
+    straight, narrow = (replace(one, posterior=replace(one.posterior, bends=None)) for one in (known, narrow))
+    verdict = straight.verdict("camera", "overhead", "phi")
+    assert verdict.sd == pytest.approx(verdict.factor * narrow.verdict("camera", "overhead", "phi").sd)
+    again = refit(calibration, half_a_field(partial(along_lines, length_m=0.5), 1))
+    assert again.refitted is not None and again.refitted.prior is not None
+    prior = again.refitted.prior.information
+    assert prior.spread.sd == pytest.approx(posterior.information.marginal(prior.keys).spread.sd)
+
+
+def test_the_file_says_what_was_used_and_old_files_load(
+    correlated: tuple[Calibration, Observations], tmp_path: Path
+) -> None:
+    calibration, _ = correlated
+    path = tmp_path / "calibration.json"
+    calibration.save(path)
+    back = Calibration.load(path).uncertainty.posterior
+    assert back.dependence == calibration.uncertainty.posterior.dependence
+    assert back.factors == pytest.approx(factors(calibration), rel=1e-12)
+    data = json.loads(path.read_text())
+    for name in ("by_model", "dependence"):
+        del data["posterior"][name]
+    path.write_text(json.dumps(data))
+    old = Calibration.load(path).uncertainty.posterior
+    assert old.by_model is None and np.all(old.factors == 1.0) and old.sd == pytest.approx(back.sd)
+
+
+# ---- parts ----------------------------------------------------------------------------------------------------------
+
+
+def test_few_groups_hardly_move_what_is_known() -> None:
+    """A ratio of four over two degrees of freedom is no evidence, over a hundred it is."""
+    few, likely = _averaged(4.0, 2.0, 1.0)
+    assert few < 2.6 and likely < 0.5
+    many, certain = _averaged(4.0, 100.0, 1.0)
+    assert many == pytest.approx(4.0, rel=0.1) and certain > 0.999
+    assert _averaged(1.0, 100.0, 1.0)[0] == pytest.approx(1.0, abs=0.03)
+
+
+def test_a_mixture_has_the_tails_of_its_widest_part() -> None:
+    assert _freedom_of_mixture(np.ones(1), np.ones(1)) > 1e5
+    weights, variances = np.array([0.5, 0.5]), np.array([1.0, 4.0])
+    degrees = _freedom_of_mixture(weights, variances)
+    rng = np.random.default_rng(0)
+    draws = rng.standard_normal(200_000) * np.sqrt(rng.choice(variances, 200_000))
+    half = student_95(degrees) * np.sqrt(weights @ variances)
+    assert np.mean(np.abs(draws) <= half) == pytest.approx(0.95, abs=0.003)
+    assert student_95(degrees) > NORMAL_95
+
+
+# ---- coverage, by small samples -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["lines together over 0.5 m", "ten boards, smooth errors"])
+def test_intervals_hold_where_errors_go_together(name: str) -> None:
+    """scripts/coverage.py has more runs; without it 62 % and 68 %."""
+    found = cover(CASES[name], range(15))
+    assert found.far == 0 and found.failed == 0
+    assert 0.88 < share(found.parameters)[0] < 0.995
+    for held in found.points.values():
+        assert 0.88 < share(held)[0] < 0.995

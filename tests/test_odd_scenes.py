@@ -1,0 +1,35 @@
+"""Odd scenes that once gave a wrong answer in silence: `scripts/odd_scenes.py` has the full samples."""
+
+from __future__ import annotations
+
+import pytest
+from odd_scenes import BESIDE, MOST_RADII, MOST_SIGMAS, ODD, outcome
+
+# Sigmas of the farthest "known" number, radii of the farthest place: before, and measured since.
+_MENDED = {
+    ("one board", "kannala-brandt", 16): "17780 sd: no lens on the way back from phi 70 px; refused",
+    ("one board", "brown", 248): "7.3 sd: a second place of the valley along phi; none known",
+    ("one board", "brown", 530): "9.2 sd: bent; none known",
+    ("frontal", "brown", 2292): "5.4 sd, 2.9 radii: a runaway phi; 1.9, 0.02",
+    ("frontal", "kannala-brandt", 116): "8 sd: two places of the valley; 1.3, 0.3",
+    ("points and few line points", "radial", 122): "17 sd, 24 radii: a good point was taken out; 1.1, 1.1",
+    ("few line points", "kannala-brandt", 2297): "6.1 sd, 3.4 radii: another minimum; 0, 0.7",
+    ("few line points", "kannala-brandt", 1673): "5.6 radii: the map bends; 0.9, 0.6",
+    ("few points", "kannala-brandt", 760): "3.9 radii: the map bends; 0, 0.1",
+}
+
+
+@pytest.mark.parametrize(("kind", "lens", "seed"), list(_MENDED))
+def test_no_silent_wrong_answer(kind: str, lens: str, seed: int) -> None:
+    """Refused, or no "known" number beyond 5 sd and no place beyond 2.5 radii."""
+    found = outcome(kind, ODD[kind], lens, seed)
+    assert found.sigmas < MOST_SIGMAS and found.radii < MOST_RADII
+
+
+@pytest.mark.parametrize("lens", ["radial", "brown", "kannala-brandt"])
+def test_few_points_beside_lines(lens: str) -> None:
+    """A handful of points, which the fit nearly goes through, beside some 150 line points."""
+    for seed in range(4):
+        found = outcome("5 to 8 points beside lines", BESIDE["5 to 8 points beside lines"], lens, seed)
+        assert not found.refused
+        assert found.sigmas < MOST_SIGMAS and found.radii < MOST_RADII
