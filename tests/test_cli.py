@@ -56,7 +56,9 @@ def say(capsys: pytest.CaptureFixture[str]) -> Say:
 def refused(said: Said, code: int = 2) -> str:
     """The one line of an error, with nothing else said."""
     assert said.code == code, said
-    assert said.out == ""
+    if said.out:  # with --json
+        error = said.err.removeprefix("ceres-cal: ").removesuffix("\n")
+        assert json.loads(said.out) == {"error": error, "exit_code": code}
     assert said.err.startswith("ceres-cal: ") and said.err.endswith("\n") and said.err.count("\n") == 1, said.err
     return said.err
 
@@ -504,7 +506,7 @@ def _pickled() -> bytes:
         ("bad.json", b"x,y\n1,2\n", "not valid JSON"),
         ("bad.json", b"", "not valid JSON"),
         ("bad.json", b"[1, 2]", '"format" must be'),
-        ("bad.npz", _pickled(), "pickled"),
+        ("bad.npz", _pickled(), "is missing"),
         ("bad.npz", SAMPLE.read_bytes(), "no NPZ file"),
     ],
 )
@@ -694,7 +696,9 @@ def test_simulate_calibrate_compare(say: Say, capsys: pytest.CaptureFixture[str]
 
 def test_compare_says_no(calibrated: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     data = json.loads(calibrated.read_text())
-    data["stations"]["overhead"]["translation_m"][0] += 0.02
+    station = data["stations"]["overhead"]
+    station["translation_m"][0] += 0.02
+    station["position_m"] = (-np.array(station["rotation"]).T @ station["translation_m"]).tolist()
     (tmp_path / "moved.json").write_text(json.dumps(data))
     assert compare_with_truth([str(tmp_path / "moved.json"), str(SAMPLE.with_name("truth.json"))]) == 1
     assert compare_with_truth([str(calibrated), str(SAMPLE)]) == 2

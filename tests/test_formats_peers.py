@@ -224,3 +224,30 @@ def test_kalibrs_other_models_come_as_the_nearest_lens(model: str, own: list[flo
     assert f"its {model}-none model is held as the nearest" in held
     assert float(held.split("off by ")[1].split(" px")[0]) < 0.2
     assert set(LENSES) >= set(EXACT)
+
+
+@pytest.mark.parametrize(
+    "text, words",
+    [
+        ("image_width: 9\nimage_width: 8\n", "'image_width' is given twice"),
+        ("a: &a {b: 1}\nc: {<<: *a}\n", "'<<' is given twice or merged"),
+        ("a: &a [*a]\n", "holds itself"),
+        ("a0: &a0 [1, 1]\n" + "".join(f"a{n}: &a{n} [*a{n - 1}, *a{n - 1}]\n" for n in range(1, 40)), "would take"),
+        ("[" * 5000, "not valid YAML"),
+        ("a: 2026-99-99\n", "not valid YAML"),
+    ],
+)
+def test_yaml_that_means_no_good(text: str, words: str, tmp_path: Path) -> None:
+    (tmp_path / "a.yaml").write_text(text)
+    with pytest.raises(InputError, match=words) as caught:
+        import_calibration(tmp_path / "a.yaml", "ros")
+    assert str(caught.value).startswith(f"{tmp_path / 'a.yaml'}: ")
+
+
+def test_a_model_of_colmap_is_of_regular_files(tmp_path: Path) -> None:
+    """The library itself would wait for a pipe's writer for ever."""
+    os.mkfifo(tmp_path / "cameras.txt")
+    with pytest.raises(InputError, match="a pipe or a device"):
+        import_calibration(tmp_path, "colmap")
+    with pytest.raises(InputError, match="is a folder"):
+        import_calibration(Path(__file__), "colmap")

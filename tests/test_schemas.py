@@ -83,7 +83,7 @@ def test_curve_names_stand_once(tmp_path: Path) -> None:
     assert Observations.load(path).digest == seen.digest  # as files of today have it
     for counts, words in (
         ("[2]", "counts must be a whole number above 0"),
-        ("[2, 2]", "4 curve features but 3 pixels"),
+        ("[2, 2]", "counts add up to 4, but there are 3 pixels"),
     ):
         path.write_text(OBSERVED.replace("[2, 1]", counts))
         with pytest.raises(InputError, match=words):

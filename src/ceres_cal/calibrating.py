@@ -42,6 +42,8 @@ from ceres_cal.uncertainty import Posterior, Scatter, Uncertainty, assess, measu
 # Of the image's diagonal, 24 px of 1600: half of a camera's observations farther off is no calibration, while a lens
 # that is too simple stays below a few pixels. Nothing changes from half to double.
 _NO_FIT = 0.015
+# Of the image's diagonal, 240 px of 1600: lenses are mounted within some hundredths, unless a picture was cropped.
+_OFF_CENTRE = 0.15
 _UNKNOWN = (
     "camera {!r}: its views are too frontal to tell phi, which is {} at 95 %, and its heights go with phi: the floor "
     "is right, what is above it is not: add boards tilted by 20 degrees, or a prior on height_m where it sees the field"
@@ -267,6 +269,13 @@ def _require_usable(end: RobustSolution, problem: Problem, explanations: Sequenc
     """Warnings about the solution; SolutionError where it must not be used."""
     warnings = []
     for name, camera in end.solution.estimate.cameras.items():
+        width, height = camera.image_size
+        off_px = float(np.hypot(*(camera.principal_point - 0.5 * (np.array(camera.image_size) - 1.0))))
+        if off_px > _OFF_CENTRE * np.hypot(width, height):
+            warnings.append(
+                f"camera {name!r}: its principal point lies {off_px:.0f} px from the middle of its image: "
+                "is image_size that of the pictures, and are pixels counted from their top-left corner?"
+            )
         if not camera.folds:
             continue
         fold, corner = camera.lens.monotone_radius(camera.phi), camera.corner_radius

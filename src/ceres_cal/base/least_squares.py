@@ -13,6 +13,7 @@ _MOST_STEPS = 100
 _RESTS = 1e-9  # relative fall of the cost below which nothing is left to gain
 
 
+@np.errstate(over="ignore", invalid="ignore")  # a step there is not taken
 def least_squares(residuals: Callable[[Array], Array], start: Array, sizes: Array) -> Array:
     """The numbers (K,) that make the sum of squared residuals least, from a start (K,).
 
@@ -32,6 +33,8 @@ def least_squares(residuals: Callable[[Array], Array], start: Array, sizes: Arra
         before = cost
         while damping < 1e12:
             curved = normal + damping * np.diag(np.diag(normal) + 1e-300)
+            if not (np.all(np.isfinite(curved)) and np.all(np.isfinite(gradient))):
+                return np.asarray(scaled * sizes)  # no way on from here
             there = scaled - np.linalg.lstsq(curved, gradient, rcond=None)[0]
             moved = residuals(there * sizes)
             lower = float(moved @ moved)

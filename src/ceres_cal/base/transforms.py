@@ -133,7 +133,7 @@ class Pose:
 
     def __post_init__(self) -> None:
         for name, shape in (("rotation", (3, 3)), ("translation", (3,))):
-            value = np.array(getattr(self, name), dtype=float)
+            value = np.array(getattr(self, name), dtype=float, order="C")  # or products round otherwise
             if value.shape != shape:
                 raise ValueError(f"{name} must have shape {shape}, not {value.shape}")
             value.setflags(write=False)

@@ -32,7 +32,7 @@ from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import gather_sights
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.files import CameraFile, PoseFile
-from ceres_cal.scene.targets import Target, target_from_spec
+from ceres_cal.scene.targets import Target, targets_from_specs
 from ceres_cal.solve import Conflict, Problem, Weighting
 from ceres_cal.uncertainty import Disagreement, Posterior, PosteriorFile, Uncertainty, disagreement
 
@@ -207,7 +207,7 @@ class Calibration:
     def from_file(cls, data: CalibrationFile) -> Calibration:
         """The calibration that a file describes; InputError naming the place inside it."""
         options = options_from_json(data.options)
-        targets = {name: target_from_spec(spec, f"target {name!r}") for name, spec in data.targets.items()}
+        targets = targets_from_specs(data.targets)
         return cls(
             data.estimate(targets, options),
             targets,

@@ -33,7 +33,7 @@ def _run(args: Namespace) -> Answer:
     from ceres_cal.formats import IMPORT_FORMATS, import_calibration
     from ceres_cal.moves import audit
 
-    if args.form is None and args.file.suffix == ".json" and b"ceres-cal/calibration" in args.file.read_bytes()[:4096]:
+    if args.form is None and args.file.suffix == ".json" and _is_ours(args.file):
         given = Calibration.load(args.file)
     else:
         given = import_calibration(args.file, args.form, **format_options(args, list(IMPORT_FORMATS.values())))
@@ -42,6 +42,12 @@ def _run(args: Namespace) -> Answer:
     data = {"trusted": trusted, "stations": {name: _data(one) for name, one in stations.items()}}
     data["warnings"] = list(given.warnings)
     return Answer(data, lambda: _text(stations, given.warnings), 0 if trusted else 1)
+
+
+def _is_ours(path: Path) -> bool:
+    from ceres_cal.base.files import read_bytes
+
+    return b"ceres-cal/calibration" in read_bytes(path)[:4096]
 
 
 def _data(one: StationAudit) -> dict[str, Any]:

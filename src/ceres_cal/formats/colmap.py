@@ -14,6 +14,8 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.files import read_bytes
+from ceres_cal.base.native import kept_signals
 from ceres_cal.base.transforms import Pose
 from ceres_cal.formats.export_format import Exported, ExportFormat, ExportRequest
 from ceres_cal.formats.import_format import ImportedCameras, ImportFormat, ImportRequest
@@ -26,7 +28,8 @@ _HALF = 0.5
 
 
 def _export(request: ExportRequest) -> Exported:
-    import pycolmap
+    with kept_signals():
+        import pycolmap
 
     box, losses, models = field_box(request.calibration.targets), [], []
     model, rig, frame = pycolmap.Reconstruction(), pycolmap.Rig(rig_id=1), pycolmap.Frame(frame_id=1, rig_id=1)
@@ -58,7 +61,8 @@ def _export(request: ExportRequest) -> Exported:
 
 
 def _camera(foreign: ForeignCamera, number: int) -> Any:
-    import pycolmap
+    with kept_signals():
+        import pycolmap
 
     (width, height), name = foreign.image_size, _MODELS[foreign.model]
     values = [*foreign.coefficients, *[0.0] * 8][: _COUNTS.get(name, 4)]
@@ -69,7 +73,8 @@ def _camera(foreign: ForeignCamera, number: int) -> Any:
 
 
 def _rigid(pose: Pose) -> Any:
-    import pycolmap
+    with kept_signals():
+        import pycolmap
 
     return pycolmap.Rigid3d(pycolmap.Rotation3d(pose.rotation), pose.translation)
 
@@ -77,13 +82,25 @@ def _rigid(pose: Pose) -> Any:
 # ---- reading --------------------------------------------------------------------------------------------------------
 
 
-def _read(request: ImportRequest) -> Any:
-    import pycolmap
+def read_model(folder: Path) -> Any:
+    """COLMAP's model; InputError where the folder holds none, a pipe or a device, or too much."""
+    with kept_signals():
+        import pycolmap
 
+    if not folder.is_dir():
+        raise InputError("COLMAP's model is a folder: name that")
+    for name in ("rigs", "cameras", "frames", "images", "points3D"):
+        for path in (folder / f"{name}.bin", folder / f"{name}.txt"):
+            if path.exists():
+                read_bytes(path)  # the library opens them itself: what it would wait for is refused here
     try:
-        model = pycolmap.Reconstruction(request.path)
+        return pycolmap.Reconstruction(folder)
     except (ValueError, RuntimeError, IndexError) as error:
         raise InputError(f"not a model of COLMAP (cut short?): {str(error).splitlines()[0]}") from None
+
+
+def _read(request: ImportRequest) -> Any:
+    model = read_model(request.path)
     if not model.num_images():
         raise InputError("the model has no image: where its cameras stood is not said")
     cameras, warnings = {}, []
@@ -101,7 +118,8 @@ def _read(request: ImportRequest) -> Any:
 
 
 def _foreign(camera: Any, pose: Pose) -> ForeignCamera:
-    import pycolmap
+    with kept_signals():
+        import pycolmap
 
     size, name = (int(camera.width), int(camera.height)), str(camera.model_name)
     focal = (float(camera.focal_length_x), float(camera.focal_length_y))

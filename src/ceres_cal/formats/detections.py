@@ -14,8 +14,11 @@ from typing import Any
 
 import numpy as np
 
+from ceres_cal.base.archives import read_foreign_npz
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.files import require_room
+from ceres_cal.formats.colmap import read_model
 from ceres_cal.formats.import_format import ImportFormat, ImportRequest
 from ceres_cal.formats.mrcal import literal_of
 from ceres_cal.formats.opencv import parse_size
@@ -52,7 +55,7 @@ def _read_corners(request: ImportRequest) -> Observations:
             step = 0.0 if absent or len(words) < 4 else float(words[3])
             x, y = (np.nan, np.nan) if absent or step < 0.0 else (float(words[1]), float(words[2]))
             seen.append((x, y, 2.0**step))
-        except ValueError:
+        except (ValueError, OverflowError):
             raise InputError(f"line {number}: x, y and level must be numbers or -, not {line.strip()!r}") from None
     whole = {name: np.array(seen) for name, seen in found.items() if len(seen) > 1 or np.isfinite(seen[0][0])}
     for name, corners in whole.items():
@@ -88,20 +91,23 @@ class TableOptions:
 
 _COLUMNS = ("frame", "camera", "station", "placement", "point", "curve", "side", "x_px", "y_px", "sigma_px")
 _PLACE = ("X_m", "Y_m", "Z_m")
+_BYTES_PER_CELL = 150  # of memory, in a row by names
 
 
 def _read_csv(request: ImportRequest) -> Observations:
+    marks = request.content.count(b",") + request.content.count(b"\n")
+    require_room(_BYTES_PER_CELL * marks + 2.0 * len(request.content), str(request.path))
     reader = csv.DictReader(io.StringIO(request.text))
-    rows = list(reader)
+    try:
+        rows = list(reader)
+    except csv.Error as error:
+        raise InputError(f"not a CSV file (line {reader.line_num}): {error}") from None
     return _from_rows(rows, tuple(reader.fieldnames or ()), request.options)
 
 
 def _read_npz(request: ImportRequest) -> Observations:
-    try:
-        with np.load(io.BytesIO(request.content), allow_pickle=False) as arrays:
-            columns = {name: arrays[name] for name in arrays.files}
-    except (ValueError, OSError, KeyError) as error:
-        raise InputError(f"not an NPZ file of columns: {error}") from None
+    columns = read_foreign_npz(request.content, str(request.path))
+    require_room(float(_BYTES_PER_CELL) * sum(array.size for array in columns.values()), str(request.path))
     lengths = {array.shape for array in columns.values()}
     if len(lengths) != 1 or any(len(shape) != 1 for shape in lengths):
         raise InputError(f"the columns must be of one dimension and as long as one another, not {sorted(lengths)}")
@@ -111,6 +117,8 @@ def _read_npz(request: ImportRequest) -> Observations:
 
 def _from_rows(rows: Sequence[Mapping[str, Any]], names: tuple[str, ...], options: TableOptions) -> Observations:
     """Rows under named columns; each shows a point or a curve of the target, or a place in the world."""
+    if len(set(names)) < len(names):
+        raise InputError("a column is there twice: keep one of them")
     if unknown := [name for name in names if name not in (*_COLUMNS, *_PLACE)]:
         raise InputError(f"unknown column {unknown[0]!r}: there are {', '.join((*_COLUMNS, *_PLACE))}")
     if missing := [name for name in ("x_px", "y_px") if name not in names]:
@@ -198,14 +206,14 @@ def _read_mrcal(request: ImportRequest) -> Observations:
     if "optimization_inputs" not in data:
         raise InputError("it has no optimization_inputs: mrcal did not keep what it calibrated from")
     try:
-        packed = base64.b85decode(data["optimization_inputs"])
-        with np.load(io.BytesIO(packed), allow_pickle=False) as arrays:
-            given = {name: arrays[name] for name in arrays.files}
+        given = read_foreign_npz(base64.b85decode(data["optimization_inputs"]), str(request.path))
         boards = np.asarray(given["observations_board"], dtype=float)
         indices = np.asarray(given["indices_frame_camintrinsics_camextrinsics"], dtype=int)
         spacing, sizes = float(given["calibration_object_spacing"]), np.asarray(given["imagersizes"], dtype=int)
-        count, rows, columns, _ = boards.shape
-    except (ValueError, TypeError, KeyError, OSError) as error:
+        count, rows, columns, three = boards.shape
+        if three != 3 or indices.shape != (count, 3) or sizes.ndim != 2 or sizes.shape[1] != 2:
+            raise ValueError("its arrays do not fit each other")
+    except (ValueError, TypeError, KeyError, OverflowError) as error:
         raise InputError(f"its optimization_inputs cannot be read: {error}") from None
     views, view, feature, pixels, sigma = [], [], [], [], []
     order = np.lexsort((indices[:, 1], indices[:, 0]))
@@ -230,12 +238,7 @@ def _no_curves() -> Curves:
 
 def _read_colmap(request: ImportRequest) -> Observations:
     """The keypoints that show points of the model, in our pixels; the points count as known."""
-    import pycolmap
-
-    try:
-        model = pycolmap.Reconstruction(request.path)
-    except (ValueError, RuntimeError, IndexError) as error:
-        raise InputError(f"not a model of COLMAP (cut short?): {str(error).splitlines()[0]}") from None
+    model = read_model(request.path)
     if not model.num_points3D():
         raise InputError("the model has no points")
     names = {number: place for place, number in enumerate(model.points3D)}

@@ -6,12 +6,14 @@ src dkogan/mrcal mrcal/cameramodel.py, cameramodel-parser.re, doc/cameramodels.o
 from __future__ import annotations
 
 import ast
+import warnings
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.files import require_room
 from ceres_cal.base.transforms import Pose
 from ceres_cal.formats.export_format import Exported, ExportFormat, ExportRequest
 from ceres_cal.formats.import_format import ImportedCameras, ImportFormat, ImportRequest
@@ -20,6 +22,7 @@ from ceres_cal.formats.yaml_files import numbers_at
 from ceres_cal.scene.foreign import OPENCV_MODELS, ForeignCamera
 
 _MODELS = {f"LENSMODEL_OPENCV{count}": model for model, count in OPENCV_MODELS.items()}
+_BYTES_PER_COMMA = 1000  # of memory, for a part of the syntax tree
 _POSES = ("rt_cam_ref", "extrinsics")  # since 2.5, and before
 
 
@@ -43,9 +46,11 @@ def _export(request: ExportRequest) -> Exported:
 def literal_of(content: bytes) -> dict[str, Any]:
     """The literal of a .cameramodel; InputError where it is none."""
     text = content.decode("utf-8", errors="replace")
+    require_room(_BYTES_PER_COMMA * text.count(",") + 4.0 * len(text), "the file")
     try:
-        data = ast.literal_eval(text.strip())
-    except (ValueError, SyntaxError, RecursionError, MemoryError) as error:
+        with warnings.catch_warnings(action="ignore"):  # what the compiler thinks of its style
+            data = ast.literal_eval(text.strip())
+    except (ValueError, TypeError, SyntaxError, RecursionError, MemoryError) as error:
         raise InputError(f"not a .cameramodel (cut short?): {error}") from None
     if not isinstance(data, dict):
         raise InputError("not a .cameramodel: it holds no { names: values }")

@@ -162,7 +162,7 @@ def _camera(storage: Any, request: ImportRequest, number: str) -> ForeignCamera:
 
 def _size(storage: Any, request: ImportRequest) -> tuple[int, int]:
     sizes = [_real(storage, names) for names in (_WIDTH, _HEIGHT)]
-    if all(size is not None and size == int(size) > 0 for size in sizes):
+    if all(size is not None and size.is_integer() and size > 0.0 for size in sizes):
         return int(sizes[0] or 0), int(sizes[1] or 0)
     return parse_size(request.options.image_size)
 

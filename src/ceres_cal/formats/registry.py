@@ -112,11 +112,16 @@ def read_foreign(path: str | Path, form: str | None = None, **options: Any) -> C
     Raises:
         InputError: one line that names the file, and what is wrong with it.
     """
+    from ceres_cal.observations import Observations
+
     path = Path(path)
     content = b"" if path.is_dir() else read_bytes(path)
     chosen = _import_format(path, content, form)
     with naming(path):
-        return chosen.read(ImportRequest(path, content, chosen.options(**_known_options(chosen, options))))
+        made = chosen.read(ImportRequest(path, content, chosen.options(**_known_options(chosen, options))))
+        if isinstance(made, Observations):
+            made.require_inside()
+    return made
 
 
 def import_calibration(path: str | Path, form: str | None = None, **options: Any) -> Calibration:

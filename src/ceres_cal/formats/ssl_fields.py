@@ -43,7 +43,7 @@ def target_of(field: Mapping[str, Any]) -> Target:
     Its sizes make a field of the league; where its own lines lie elsewhere, those are the target.
 
     Raises:
-        InputError: a size that is missing or makes no field.
+        InputError: a size that is missing or makes no field, a line or an arc with something else than numbers.
     """
     for name in ("field_length", "field_width", "goal_width"):
         if not isinstance(field.get(name), (int, float)):
@@ -54,7 +54,10 @@ def target_of(field: Mapping[str, Any]) -> Target:
     nominal = ssl_field(division, **given)
     if nominal.curves == by_rule.curves and nominal.points == by_rule.points:
         nominal = by_rule
-    curves = _curves(field)
+    try:
+        curves = _curves(field)
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"a line or an arc of the field has something else than its numbers: {error}") from None
     if all(name in nominal.curves and _alike(curve, nominal.curves[name]) for name, curve in curves.items()):
         return nominal
     return custom({}, curves)

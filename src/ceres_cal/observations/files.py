@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import groupby
@@ -13,6 +12,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from ceres_cal.base.archives import Column, read_npz
 from ceres_cal.base.arrays import AnyArray, Codes
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import (
@@ -22,6 +22,7 @@ from ceres_cal.base.files import (
     Units,
     check_header,
     convert,
+    decode_json,
     parse_json,
     read_bytes,
     write_bytes,
@@ -38,9 +39,15 @@ from ceres_cal.observations.columns import (
     choices,
     view_label,
 )
-from ceres_cal.scene.targets import SIDES, Target, target_from_spec
+from ceres_cal.scene.targets import SIDES, Target, targets_from_specs
 
 FORMAT, VERSION = "ceres-cal/observations", 1
+_COLUMNS = {"header": Column(np.uint8, ("bytes",))} | {
+    f"{kind}_{name}": Column(dtype, (kind, 2) if name == "pixels" else (kind,))
+    for kind in ("points", "curves")
+    for name, dtype in TYPES.items()
+    if (kind, name) != ("points", "side")
+}
 _SIDE_NAMES = {value: name for name, value in SIDES.items()}
 
 
@@ -76,6 +83,8 @@ class _PointsFile(msgspec.Struct, forbid_unknown_fields=True):
             return self.features
         if len(self.counts) != len(self.features) or min(self.counts, default=1) < 1:
             raise InputError(f"{here}: counts must be a whole number above 0 for each of its features")
+        if sum(self.counts) != len(self.pixels):
+            raise InputError(f"{here}: counts add up to {sum(self.counts)}, but there are {len(self.pixels)} pixels")
         return [name for name, count in zip(self.features, self.counts, strict=True) for _ in range(count)]
 
 
@@ -117,7 +126,7 @@ class ObservationsFile(msgspec.Struct, forbid_unknown_fields=True, kw_only=True)
     def content(self) -> Content:
         """All but the columns; InputError naming the place."""
         return Content(
-            {name: target_from_spec(spec, f"target {name!r}") for name, spec in self.targets.items()},
+            targets_from_specs(self.targets),
             {name: camera.image_size for name, camera in self.cameras.items()},
             tuple(entry.view() for entry in self.views),
             NO_POINTS,
@@ -195,9 +204,8 @@ def _numbers(value: Any, size: int, where: str, *, spread: bool = False) -> tupl
 
 
 def _from_json(content: bytes, where: str) -> Content:
-    try:
-        data = msgspec.json.decode(content, type=ObservationsFile)  # several times faster than by way of plain data
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+    data = decode_json(content, ObservationsFile, where)
+    if data is None:
         plain = check_header(parse_json(content, where), where, FORMAT, VERSION)
         data = convert(plain, ObservationsFile, where)
     check_header({"format": data.format, "version": data.version}, where, FORMAT, VERSION)
@@ -321,42 +329,12 @@ def _to_npz(content: Content) -> bytes:
     return stream.getvalue()
 
 
-def _arrays(content: bytes, where: str) -> dict[str, AnyArray]:
-    reason = "it is cut short or no NPZ file"
-    try:
-        if zipfile.is_zipfile(io.BytesIO(content)):
-            with np.load(io.BytesIO(content), allow_pickle=False) as archive:
-                return {name: archive[name] for name in archive.files}
-    except Exception as error:  # zipfile, zlib and NumPy raise a dozen kinds for a broken archive
-        if "allow_pickle" in str(error):
-            reason = "it holds pickled objects"
-    raise InputError(f"{where}: cannot be read, {reason}: write it again with Observations.save")
-
-
-def _taken(arrays: dict[str, AnyArray], kind: str, names: Sequence[str], where: str) -> dict[str, Any]:
-    columns = {}
-    for name in names:
-        array, dtype, ndim = arrays.pop(f"{kind}_{name}", None), np.dtype(TYPES[name]), 2 if name == "pixels" else 1
-        if array is None:
-            raise InputError(f"{where}: column {kind}_{name} is missing")
-        if array.dtype != dtype or array.ndim != ndim:
-            raise InputError(
-                f"{where}: column {kind}_{name} must be {dtype} in {ndim} dimensions, not {array.dtype} in {array.ndim}"
-            )
-        columns[name] = array
-    return columns
-
-
 def _from_npz(packed: bytes, where: str) -> Content:
-    arrays = _arrays(packed, where)
-    header = arrays.pop("header", None)
-    if header is None or header.dtype != np.uint8:
-        raise InputError(f"{where}: no header: this is not a file of observations")
-    plain = check_header(parse_json(header.tobytes(), where), where, FORMAT, VERSION)
+    arrays = read_npz(packed, _COLUMNS, where)
+    plain = check_header(parse_json(arrays.pop("header").tobytes(), where), where, FORMAT, VERSION)
     content = convert(plain, ObservationsFile, where).content()
-    names = ("view", "feature", "pixels", "sigma_px")
-    points = Points(**_taken(arrays, "points", names, where))
-    curves = Curves(**_taken(arrays, "curves", (*names, "side"), where))
-    if arrays:
-        raise InputError(f"{where}: unknown column {min(arrays)!r}")
-    return replace(content, points=points, curves=curves)
+    points, curves = (
+        {name.removeprefix(kind): array for name, array in arrays.items() if name.startswith(kind)}
+        for kind in ("points_", "curves_")
+    )
+    return replace(content, points=Points(**points), curves=Curves(**curves))

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 
 from ceres_cal.base.arrays import Mask
 from ceres_cal.base.errors import InputError, naming
-from ceres_cal.observations.bounds import stray_pixels
+from ceres_cal.observations.bounds import odd_sizes, stray_pixels
 from ceres_cal.observations.columns import Columns, Curves, Points, Prior, View, choices, taken, view_label
 from ceres_cal.observations.copies import Copies, find_copies
 from ceres_cal.observations.files import Content, header_of, read_content, write_content
@@ -122,8 +122,9 @@ class Observations(Content):
 
     @cached_property
     def warnings(self) -> tuple[str, ...]:
-        """What to know of the observations before using them, each one line: strays outside an image, copies."""
-        return (*self.require_inside(), *self.copies.words(self.views, (self.points, self.curves)))
+        """What to know of the observations first, a line each: strays outside an image, odd sizes, copies."""
+        copied = self.copies.words(self.views, (self.points, self.curves))
+        return (*self.require_inside(), *odd_sizes(self), *copied)
 
     @cached_property
     def shown_views(self) -> tuple[View, ...]:
@@ -214,10 +215,11 @@ class Observations(Content):
         self._check_numbers(kind, column)
 
     def _check_numbers(self, kind: str, column: Columns) -> None:
+        sigma = np.where(column.sigma_px > 0.0, column.sigma_px, np.inf)
         side = column.side if isinstance(column, Curves) else np.zeros(1, np.int8)
         for what, bad in (
             ("its pixel is not finite", ~np.all(np.isfinite(column.pixels), axis=1)),
-            ("its sigma_px must be positive and finite", ~(np.isfinite(column.sigma_px) & (column.sigma_px > 0.0))),
+            ("its sigma_px must be positive and finite, 1e-12 to 1e12", ~(np.abs(np.log10(sigma)) <= 12.0)),
             ("its side must be 0, 1 or -1", (side < -1) | (side > 1)),
         ):
             if np.any(bad):

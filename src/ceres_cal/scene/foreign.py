@@ -132,6 +132,7 @@ class ForeignCamera:
         end = made(least_squares(residuals, numbers, sizes))
         return replace(end, error_px=_error(end.project_rays(rays), pixels))
 
+    @np.errstate(over="ignore", invalid="ignore")  # where it shows nothing
     def approximated(self) -> tuple[dict[str, Any], tuple[float, float]]:
         """The intrinsics of the camera of ours that is nearest over the image, by the names of `Camera`, and its root
         mean square and largest distance, px.
@@ -149,8 +150,10 @@ class ForeignCamera:
         if np.count_nonzero(chosen) < 20:
             raise InputError(f"its {self.model} model shows nothing of its image: correct its numbers")
         pixels, shown = seen[chosen], rays[chosen]
-        fits = [lens_fitted(self, lens, shown, pixels) for lens in _LENSES]
-        return min((fit for fit in fits if fit is not None), key=lambda fit: fit[1][0])
+        fits = [fit for lens in _LENSES if (fit := lens_fitted(self, lens, shown, pixels)) is not None]
+        if not fits:
+            raise InputError(f"no lens of ours is near its {self.model} model: correct its numbers")
+        return min(fits, key=lambda fit: fit[1][0])
 
 
 def _two(values: Array) -> tuple[float, float]:
