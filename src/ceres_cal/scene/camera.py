@@ -14,7 +14,15 @@ from numpy.typing import ArrayLike
 from ceres_cal.base.arrays import Array, Array32, Mask
 from ceres_cal.base.errors import DegenerateError, InputError
 from ceres_cal.base.transforms import Pose, rotation_log
-from ceres_cal.scene.foreign import FISHEYE, OPENCV_MODELS, ForeignCamera, OpenCvCamera, image_grid, lens_fitted
+from ceres_cal.scene.foreign import (
+    FISHEYE,
+    LARGEST_PX,
+    OPENCV_MODELS,
+    ForeignCamera,
+    OpenCvCamera,
+    image_grid,
+    lens_fitted,
+)
 from ceres_cal.scene.lens import KannalaBrandt, Lens
 
 
@@ -26,7 +34,6 @@ def _rows(values: ArrayLike, columns: int, name: str) -> Array:
 
 
 _FAR_M = 10.0  # a height of as many metres, far over its camera, is one in millimetres
-_LARGEST_PX = 10**9  # what is larger is no number of pixels
 
 
 @dataclass(frozen=True, repr=False)
@@ -52,7 +59,7 @@ class Camera:
     def __post_init__(self) -> None:
         width, height = (int(s) for s in self.image_size)
         cx, cy = (float(c) for c in self.principal_point)
-        if not (1 <= width <= _LARGEST_PX and 1 <= height <= _LARGEST_PX):
+        if not (1 <= width <= LARGEST_PX and 1 <= height <= LARGEST_PX):
             raise InputError(f"image size must be two positive whole numbers, not {self.image_size}")
         numbers = (self.phi, self.aspect, cx, cy, *self.lens.values)
         if not np.all(np.isfinite(numbers)) or self.phi <= 0.0 or self.aspect <= 0.0:

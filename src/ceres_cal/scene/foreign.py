@@ -21,6 +21,7 @@ from ceres_cal.scene.lens import Brown, KannalaBrandt, Lens, Radial
 
 OPENCV_MODELS = {"opencv4": 4, "opencv5": 5, "opencv8": 8, "opencv12": 12}
 """OpenCV's coefficients in its order, k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4]]], and how many there are."""
+LARGEST_PX = 10**9  # what is larger is no number of pixels
 FISHEYE = "fisheye"
 """OpenCV's fisheye model: k1 to k4."""
 _GRID = (41, 31)  # pixels of the image over which a fit is made
@@ -51,7 +52,11 @@ class ForeignCamera:
 
     def __post_init__(self) -> None:
         numbers = (*self.focal, *self.centre, *self.coefficients)
-        if not np.all(np.isfinite(numbers)) or min(self.focal) <= 0.0 or min(self.image_size) < 1:
+        if (
+            not np.all(np.isfinite(numbers))
+            or min(self.focal) <= 0.0
+            or not all(1 <= size <= LARGEST_PX for size in self.image_size)
+        ):
             raise InputError(
                 f"a camera needs an image size, focal lengths above 0 and finite numbers, not {self.image_size} px, "
                 f"fx, fy {self.focal}, cx, cy {self.centre}, coefficients {self.coefficients}: correct them"
