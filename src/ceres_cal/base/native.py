@@ -55,5 +55,7 @@ def interruptibly(function: Callable[[], _T], timeout_s: float | None = None) ->
 
 
 def is_busy() -> bool:
-    """Whether native work that nobody waits for goes on: a process then ends at once or not before it is done."""
-    return any(thread.is_alive() for thread in _unfinished)
+    """Whether native work was left to itself: a process then ends at once, not when that is done, or by an abort of a
+    library whose threads were still at it.
+    """
+    return bool(_unfinished)
