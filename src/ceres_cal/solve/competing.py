@@ -53,10 +53,10 @@ def compete(
     Args:
         problem: of all the observations. end: of its rounds.
     """
-    court = _Court(problem, observations, solver)
+    competition = _Competition(problem, observations, solver)
     explanations: list[Explanation] = []
-    while court.has_any and len(explanations) < _MOST_WRONG:
-        trials = list(court.trials(end))
+    while competition.has_any and len(explanations) < _MOST_WRONG:
+        trials = list(competition.trials(end))
         if not trials:
             break
         best = _best(trials)
@@ -65,8 +65,8 @@ def compete(
         explanations += best.explanations
         if best.log_odds < 0.0:
             break
-        end, court.taking_part = best.end, court.taking_part & ~best.rows
-    if not court.taking_part.all():
+        end, competition.taking_part = best.end, competition.taking_part & ~best.rows
+    if not competition.taking_part.all():
         end = replace(end, residuals=residuals(observations, problem.sights, end.solution.estimate))
     return end, tuple(explanations)
 
@@ -102,7 +102,7 @@ def _best(trials: Sequence[_Trial]) -> _Trial:
     return max(wider, key=lambda one: int(np.count_nonzero(one.rows)), default=best)
 
 
-class _Court:
+class _Competition:
     """What is asked of all suspects. taking_part: (N + M,) the observations that none of them took along."""
 
     def __init__(self, problem: Problem, observations: Observations, solver: Solver) -> None:

@@ -123,10 +123,10 @@ def _end(problem: Problem, estimate: Estimate, keys: tuple[Key, ...], step: Arra
     sizes = natural_sizes(estimate, keys)
     row = step / sizes**2 / float(np.sum((step / sizes) ** 2)) / _HELD
     with suppress(InputError):  # no camera there
-        pull = GaussianPrior.about(Information(keys, np.outer(row, row)), moved(estimate, keys, step))
-        solution = _solved(replace(problem, priors=(*problem.priors, pull)), estimate)
+        held = GaussianPrior.about(Information(keys, np.outer(row, row)), moved(estimate, keys, step))
+        solution = _solved(replace(problem, priors=(*problem.priors, held)), estimate)
         if solution is not None:
-            pulled = float(np.sum(pull.residuals(solution.estimate) ** 2))
+            pulled = float(np.sum(held.residuals(solution.estimate) ** 2))
             off = difference(solution.estimate, estimate, keys) / sizes
             return _End(solution.estimate, off, 2.0 * solution.cost - pulled)
     return None

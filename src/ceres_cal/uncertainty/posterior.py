@@ -177,9 +177,9 @@ def make_posterior(reduced: ReducedInformation, degrees_of_freedom: float, scatt
     model = reduced.shared
     if scatter is None:
         return Posterior(model, _Placements(reduced.eliminated, model), degrees_of_freedom)
-    shared, found = scatter.widened(model), scatter.found
-    placements = _Placements(reduced.eliminated, shared, found.private)
-    return Posterior(shared, placements, degrees_of_freedom, by_model=model, dependence=found)
+    shared, dependence = scatter.widened(model), scatter.dependence
+    placements = _Placements(reduced.eliminated, shared, dependence.private)
+    return Posterior(shared, placements, degrees_of_freedom, by_model=model, dependence=dependence)
 
 
 @dataclass(frozen=True, eq=False)

@@ -82,10 +82,10 @@ class Uncertainty:
     @property
     def widening(self) -> str:
         """Why standard deviations are larger than by the model alone, in a line; "" where they are not."""
-        found, factor = self.posterior.dependence, float(np.median(self.posterior.factors))
-        if found is None or not found.causes or factor < _WIDENED:
+        dependence, factor = self.posterior.dependence, float(np.median(self.posterior.factors))
+        if dependence is None or not dependence.causes or factor < _WIDENED:
             return ""
-        return f"{' and '.join(found.causes)}: standard deviations {two_digits(factor)} times as large as without"
+        return f"{' and '.join(dependence.causes)}: standard deviations {two_digits(factor)} times as large as without"
 
     def ratio_sd(self, station: str) -> float:
         """Relative standard deviation of phi over the station's height."""
