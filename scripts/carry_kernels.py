@@ -1,8 +1,8 @@
 """Compile the kernels that the package carries along: python scripts/carry_kernels.py [--help]
 
 For a baseline that every machine of the last ten years has, into src/ceres_cal/kernels/carried, from where wheels take
-them; what is there already is not made again. Which kernels: those that the commands below call. A kernel that is not
-among them is compiled where it is used.
+them; what is there already, of the same sources, is not made again. Which kernels: those that the commands below call.
+A kernel that is not among them is compiled where it is used.
 """
 
 from __future__ import annotations
@@ -58,21 +58,26 @@ def main() -> int:
     sys.path.insert(0, str(ROOT / "src"))
     if parser.parse_args().here:
         return compile_all()
-    from ceres_cal.kernels.store import BASELINES, CARRIED_FOLDER
+    from ceres_cal.kernels.store import BASELINES, CARRIED_FOLDER, digest
+
+    stamp = CARRIED_FOLDER / "sources"  # the lenses' own kernels lie elsewhere than the folder is named after
+    package = ROOT / "src" / "ceres_cal"
+    sources = digest([*package.glob("kernels/*.py"), *package.glob("scene/lens/*.py")])
 
     if platform.machine() not in BASELINES:
         print(f"no baseline for {platform.machine()}: kernels are compiled where they are used", file=sys.stderr)
         return 0
-    if CARRIED_FOLDER.is_dir():
+    if stamp.is_file() and stamp.read_text() == sources:
         return 0
     name, features = BASELINES[platform.machine()]
+    shutil.rmtree(CARRIED_FOLDER.parent, ignore_errors=True)  # or its kernels would be taken instead of compiled
     with tempfile.TemporaryDirectory() as cache:
         baseline = {"NUMBA_CPU_NAME": name, "NUMBA_CPU_FEATURES": ",".join(f"+{one}" for one in features)}
         environment = {**os.environ, **baseline, "NUMBA_CACHE_DIR": cache}
         subprocess.run([sys.executable, __file__, "--here"], env=environment, check=True)
         (compiled,) = Path(cache).glob(f"ceres-cal/*/{name}-*")
-        shutil.rmtree(CARRIED_FOLDER.parent, ignore_errors=True)
         shutil.copytree(compiled, CARRIED_FOLDER)
+        stamp.write_text(sources)
     return 0
 
 

@@ -72,7 +72,8 @@ def _of(module: str, names: str, *figures: str) -> list[Constant]:
 
 DECIDING: tuple[Constant, ...] = (
     *_of("model.parameters", "Options.loss_scale Options.reject_sigma", "calibrate", "diagnose"),
-    *_of("calibrating", "_NO_FIT", "calibrate"),
+    *_of("calibrating", "_NO_FIT _OFF_CENTRE", "calibrate"),
+    *_of("observations.bounds", "_LARGE_M", "calibrate"),
     *_of("solve.robust", "_AT_REST _ENOUGH_PLACEMENTS _MUCH_LESS", "calibrate"),
     *_of("solve.robust", "_AT_REST_AGAIN", "refit"),
     *_of("solve.noise", "_LEAST_SPARE _BORROWED", "calibrate"),
@@ -82,7 +83,8 @@ DECIDING: tuple[Constant, ...] = (
     *_of("solve.possible", "_LARGEST_M _BELOW", "calibrate"),
     *_of("solve.lost", "_LOST _FEWEST", "calibrate"),
     *_of("solve.mirrored", "_DECIDED_SIGMA _SAME _MUCH_WORSE", "calibrate"),
-    *_of("solve.competing", "_DOUBTFUL _LEFT _STANDS_OUT", "calibrate"),
+    *_of("solve.competing", "_LEFT _STANDS_OUT", "calibrate"),
+    *_of("solve.explanation", "DOUBTFUL", "calibrate"),
     *_of("solve.offsets", "_FAULTY _INDEPENDENT", "calibrate"),
     *_of("solve.wholes", "FEWEST", "calibrate"),
     *_of("solve.bundle", "_POSED", "calibrate"),
@@ -108,6 +110,7 @@ DECIDING: tuple[Constant, ...] = (
     *_of("detect.lines", "_LEAST_CLARITY _LEAST_CONTRAST _OF_NEARBY _NOISY _WANDERING _FAR", "lines"),
     *_of("detect.strokes", "_LEAST_PX _STRAIGHT_PX _NOISE _OF_BRIGHTEST", "auto"),
     *_of("detect.saddles", "_LOST _FAINT", "boards"),
+    *_of("detect.boards", "_MOST_PX", "boards"),
     *_of("detect.rings", "_FEWEST_RAYS _LEAST_CONTRAST _NOISY _FAR _MOST_MISFIT", "rings"),
     *_of("photographs.clicks", "SIGMA_PX _SQUARE", "clicks"),
     *_of("photographs.follow", "LEAST_SHARE _SURE_SHARE _ABSENT _MOST_ABSENT", "lines", "auto"),

@@ -34,7 +34,9 @@ def line_aside(observations: Observations, scene: Scene, seed: int, aside_px: fl
     rows = np.asarray(rows, dtype=np.int64)
     across = pixels[rows[-1]] - pixels[rows[0]]
     pixels += SIGMA_PX * rng.standard_normal(pixels.shape)
-    pixels[rows] += aside_px * np.array([-across[1], across[0]]) / np.linalg.norm(across)
+    normal = np.array([-across[1], across[0]]) / np.linalg.norm(across)
+    inwards = np.mean(pixels, axis=0) - np.mean(pixels[rows], axis=0)  # no pixel leaves the image
+    pixels[rows] += np.copysign(aside_px, inwards @ normal) * normal
     return replace(observations, curves=replace(observations.curves, pixels=pixels, sigma_px=np.ones(len(pixels))))
 
 

@@ -116,10 +116,11 @@ def main(arguments: list[str]) -> int:
         print(f"ceres-cal diagnose, {count} observations, whole process: {seconds:.2f} s (at most {MOST_SECONDS:g} s)")
         return int(seconds > MOST_SECONDS)
     rows, start = [], time.perf_counter()
-    for name in [*CLEAN, *FAULTS]:
+    for number, name in enumerate([*CLEAN, *FAULTS]):
         if args.case in (None, name):
             make, count = (clean_row, args.runs) if name in CLEAN else (fault_row, args.faults)
-            rows.append(make(name, range(args.seed, args.seed + count)))
+            first = args.seed + 1000 * number  # one draw of noise before two lenses is no two draws
+            rows.append(make(name, range(first, first + count)))
             if not args.json:
                 print(rows[-1], flush=True)
     clean = [row for row in rows if row.named is None]

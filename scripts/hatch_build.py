@@ -8,7 +8,7 @@ from typing import Any
 from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 
 
-class CarryKernels(BuildHookInterface):  # type: ignore[misc]
+class CarryKernels(BuildHookInterface[Any]):
     """Compiles the kernels before a wheel is put together."""
 
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:

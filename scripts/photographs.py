@@ -52,6 +52,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args(arguments)
     real = None if options.real is None else Path(options.real)
+    if real is not None and not real.is_dir():
+        parser.error(f"{real}: there is no such folder of real images")
+    if real is None and {"real", "straight"} & set(options.case or ()):
+        parser.error("real images are needed: name their folder with --real, or set CERES_CAL_REAL")
     rows = (row for case in options.case or CASES for row in rows_of(case, options.runs, real, options.picture))
     found = list(rows if options.json else printed(rows))
     if options.json:

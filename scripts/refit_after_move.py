@@ -8,7 +8,8 @@ twice before it acts: when a file says that a camera has moved, the calibration 
 one says so, too, it is refitted from that. In --checks checks (720: hourly for a month) an unmoved camera is refitted
 with a probability of --false-alarms at most, if errors of different files are independent of each other.
 Every event is one line of JSON on standard output, or in --log: "holds", "suspected", "refitted", "refused" (nothing
-was changed; the reason says what to do) or "unreadable". With --log a suspicion lasts from one run to the next. The
+was changed; the reason says what to do), "unreadable", or "folder" (the watched one has gone, or is back). With --log a
+suspicion lasts from one run to the next. Ctrl-C and SIGTERM end the watch when the file in hand is done. The
 calibration is replaced in one step, and the one before is kept in previous/ beside it. Exits with 0 when the
 calibration is right at the end, 3 when the last file raised a suspicion, was refused or could not be read.
 """
@@ -18,30 +19,35 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import os
 import signal
 import sys
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from watching import Folder, Journal
+
 import ceres_cal as cc
-from ceres_cal.base.files import read_bytes, write_bytes
+from ceres_cal.base.files import make_folder, read_bytes, write_bytes
 from ceres_cal.cli.inputs import IMAGE_ENDINGS
 from ceres_cal.detect.images import read_grey
 from ceres_cal.moves import FALSE_ALARMS, Check, movements
+from ceres_cal.moves.carried import WHAT
 from ceres_cal.photographs import check_photographs
 from ceres_cal.scene.heights import ROBOT_TOP_M
 
-PATIENCE = 3  # times that a file is read before it counts as unreadable: it may still be on its way
+SUSPICIOUS = ("suspected", "refused")  # of a file that was checked
 
 
 def handle(place: Path, source: Path, given: argparse.Namespace, suspected: bool) -> dict[str, Any]:
     """Check the calibration at `place` against a file, refit it where it does not hold and was suspected; the event."""
     begin = time.perf_counter()
-    event: dict[str, Any] = {"time": datetime.now(UTC).isoformat(), "file": str(source)}
+    event: dict[str, Any] = {"time": now(), "file": str(source)}
     try:
         content = read(source)
     except cc.InputError as error:
@@ -64,10 +70,10 @@ def handle(place: Path, source: Path, given: argparse.Namespace, suspected: bool
         if not all(value <= given.limit_mm for value in worst.values()):
             reason = f"known to {max(worst.values()):.1f} mm at robot height only, asked for are {given.limit_mm:g} mm"
             return {**event, "event": "refused", "reason": f"{reason}: observe more lines and corners"}
+        event["kept"] = str(keep(place))
+        new.save(place)
     except cc.CalibrationError as error:
         return {**event, "event": "refused", "reason": str(error)}
-    event["kept"] = str(keep(place))
-    new.save(place)
     explanation = new.refitted.explanation if new.refitted else ""
     moves = {name: {"mm": 1e3 * shift_m, "deg": deg} for name, (shift_m, deg) in movements(old, new).items()}
     event |= {"explanation": explanation, "moved": moves, "warnings": list(new.warnings), "rms_px": new.rms_px}
@@ -104,47 +110,21 @@ def told(found: Check) -> dict[str, str]:
 
 def keep(place: Path) -> Path:
     """A copy of the calibration in previous/, named after the moment."""
-    folder = place.parent / "previous"
-    folder.mkdir(exist_ok=True)
+    folder = make_folder(place.parent / "previous")
     copy = folder / f"{place.stem}-{datetime.now(UTC):%Y%m%dT%H%M%S%f}{place.suffix}"
     write_bytes(copy, read_bytes(place))
     return copy
 
 
-def appearing(folder: Path, every_s: float, stopped: threading.Event) -> Iterator[Path]:
-    """Files that appear in a folder, in the order of their times, until stopped; one that changes comes again."""
-    done = {path: stamp(path) for path in files_in(folder)}
-    before = dict(done)
-    while not stopped.wait(every_s):
-        now = {path: stamp(path) for path in files_in(folder)}
-        # A file that is still being written has grown since the last look.
-        ready = [path for path in now if now[path] != done.get(path) and now[path] == before.get(path)]
-        before = now
-        for path in sorted(ready, key=lambda p: now[p]):
-            if not stopped.is_set():
-                done[path] = now[path]
-                yield path
-
-
-def files_in(folder: Path) -> list[Path]:
-    endings = {".json", ".npz", *IMAGE_ENDINGS}
-    return [p for p in folder.iterdir() if p.suffix.lower() in endings and not p.name.startswith(".")]
-
-
-def stamp(path: Path) -> tuple[int, int]:
-    """Time and size; nothing for a file that has just gone."""
-    try:
-        found = path.stat()
-    except FileNotFoundError:
-        return (0, 0)
-    return (found.st_mtime_ns, found.st_size)
-
-
 def is_suspected(log: Path | None) -> bool:
-    """Whether the last file that could be read, by the log, was no longer explained by the calibration."""
-    lines = log.read_text(encoding="utf-8").splitlines() if log is not None and log.is_file() else []
-    kinds = [json.loads(line)["event"] for line in lines if line.startswith("{") and line.endswith("}")]
-    return next((kind in ("suspected", "refused") for kind in reversed(kinds) if kind != "unreadable"), False)
+    """Whether the last file that was checked, by the log, was no longer explained by the calibration."""
+    lines = log.read_text(encoding="utf-8", errors="replace").splitlines() if log is not None and log.is_file() else []
+    for line in reversed(lines):
+        with suppress(ValueError):  # half a line of a run that was killed
+            event = json.loads(line)
+            if isinstance(event, dict) and "check" in event:
+                return event.get("event") in SUSPICIOUS
+    return False
 
 
 def events(given: argparse.Namespace) -> Iterator[dict[str, Any]]:
@@ -152,23 +132,47 @@ def events(given: argparse.Namespace) -> Iterator[dict[str, Any]]:
 
     def answer(source: Path) -> dict[str, Any]:
         nonlocal suspected
-        event = handle(given.calibration, source, given, suspected)
-        if event["event"] != "unreadable":
-            suspected = event["event"] in ("suspected", "refused")
+        try:
+            event = handle(given.calibration, source, given, suspected)
+        except Exception as error:  # a week of watching does not end with one odd file
+            reason = f"unexpected {error!r}: please report it"
+            return {"time": now(), "file": str(source), "event": "refused", "reason": reason}
+        if "check" in event:
+            suspected = event["event"] in SUSPICIOUS
         return event
 
     yield from map(answer, given.files)
-    if given.watch is None:
-        return
+    if given.watch is not None:
+        yield from watched(given, answer)
+
+
+def watched(given: argparse.Namespace, answer: Callable[[Path], dict[str, Any]]) -> Iterator[dict[str, Any]]:
+    """What comes of the files that appear in the folder, until Ctrl-C or SIGTERM: the file in hand is done first."""
     stopped = threading.Event()
-    signal.signal(signal.SIGINT, lambda *_: stopped.set())  # Ctrl-C ends the watch when the file in hand is done
-    for source in appearing(given.watch, given.every_s, stopped):
-        for attempt in range(PATIENCE):
+
+    def stop(*_: object) -> None:
+        if stopped.is_set():
+            raise KeyboardInterrupt  # somebody means it
+        stopped.set()
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, stop)
+    folder, was_there = Folder(given.watch, {".json", ".npz", *IMAGE_ENDINGS}), True
+    while not stopped.wait(given.every_s):
+        ready = folder.look()
+        if folder.is_there != was_there:
+            was_there = folder.is_there
+            yield {"time": now(), "event": "folder", "reason": f"{given.watch} is {'back' if was_there else 'gone'}"}
+        for source in ready:
+            if stopped.is_set():
+                return
             event = answer(source)
-            if event["event"] != "unreadable" or attempt == PATIENCE - 1:
+            if event["event"] != "unreadable" or not folder.again(source):
                 yield event
-                break
-            stopped.wait(given.every_s)
+
+
+def now() -> str:
+    return datetime.now(UTC).isoformat()
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -177,7 +181,9 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("files", type=Path, nargs="*", help="new observations or photographs, one after the other")
     parser.add_argument("--watch", type=Path, metavar="FOLDER", help="then wait for files that appear there")
     parser.add_argument("--every-s", type=float, default=0.5, help="how often to look (default 0.5 s)")
-    parser.add_argument("--what", default="pose", help="what is free in a refit, see `ceres-cal refit --help`")
+    parser.add_argument(
+        "--what", default="pose", choices=WHAT, help="what is free in a refit, see `ceres-cal refit --help`"
+    )
     parser.add_argument("--false-alarms", type=float, default=FALSE_ALARMS, help="refits of nothing (default 0.01)")
     parser.add_argument("--checks", type=int, default=720, help="in so many checks (default 720, hourly for a month)")
     parser.add_argument("--limit-mm", type=float, default=20.0, help="worst sigma at 150 mm still used (default 20)")
@@ -192,16 +198,15 @@ def main(arguments: Sequence[str]) -> int:
         parser.error("--false-alarms must lie between 0 and 1, --checks must be 1 or more")
     if not given.files and given.watch is None:
         parser.error("name files of observations or photographs, or a folder to --watch")
-    last = 0
+    if not given.every_s > 0.0:
+        parser.error("--every-s must be above 0")
+    if given.log is not None and not os.access(given.log if given.log.exists() else given.log.parent, os.W_OK):
+        parser.error(f"{given.log}: cannot be written")
+    journal, last = Journal(given.log), 0
     try:
         for event in events(given):
-            line = json.dumps(event)
             last = 0 if event["event"] in ("holds", "refitted") else 3
-            if given.log is None:
-                print(line, flush=True)
-            else:
-                with given.log.open("a", encoding="utf-8") as log:
-                    log.write(line + "\n")
+            journal.write(event)
     except KeyboardInterrupt:
         return 130
     return last if given.watch is None else 0

@@ -5,11 +5,15 @@ import signal
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 from moves import DAY, HOME, MOVED, calibrated, seen
 
 from ceres_cal.detect.boards import BoardDetections, detect_boards
 from ceres_cal.moves.labels import MIRRORED, relabelled
 from ceres_cal.scene.targets import checkerboard
+
+settings.register_profile("untimed", deadline=None)  # how long an example takes is no property of it
+settings.load_profile("untimed")
 
 # A shell's background jobs get SIGINT ignored, and hand it on; the tests of Ctrl-C want it as it comes at a terminal.
 signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -165,7 +165,7 @@ CAMERA = Camera(SIZE, 800.0, (639.5, 479.5), Radial((0.0, 0.0)), 1.0, Pose.looki
 @pytest.mark.parametrize(
     "call, message",
     [
-        (lambda: CAMERA.project([1.0, 2.0, 3.0]), r"points_world must have shape \(N, 3\), not \(3,\)"),
+        (lambda: CAMERA.project([1.0, 2.0]), r"points_world must have shape \(N, 3\), not \(1, 2\)"),
         (lambda: CAMERA.project(np.zeros((4, 2))), r"points_world must have shape \(N, 3\), not \(4, 2\)"),
         (lambda: CAMERA.rays(np.zeros((4, 3))), r"pixels must have shape \(N, 2\), not \(4, 3\)"),
         (lambda: CAMERA.locate(np.zeros((1, 4, 2))), r"pixels must have shape \(N, 2\), not \(1, 4, 2\)"),

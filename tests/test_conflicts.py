@@ -158,27 +158,40 @@ def test_a_principal_point_held_at_the_middle_is_tested() -> None:
     assert conflict.kind == "fixed" and conflict.quantity in ("cx", "cy") and conflict.sigmas > 10.0
 
 
-def test_a_tolerance_that_is_too_tight() -> None:
-    """A line 30 mm aside under a tolerance of 2 mm; the calibration keeps its word, since the line is solved for."""
-    field = ssl_field("B")
-    drawn = field.curves["HalfwayLine"]
-    assert isinstance(drawn, Segment)
-    painted = Segment((0.03, *drawn.start[1:]), (0.03, *drawn.end[1:]), drawn.width_m)
+@cache
+def askew(*lines: str) -> Observations:
+    """A field whose lines are painted 12 mm aside, and drawn as they should be."""
+    field, painted = ssl_field("B"), {}
+    for line in lines:
+        drawn = field.curves[line]
+        assert isinstance(drawn, Segment)
+        across = np.array([0.012, 0.0, 0.0] if drawn.start[0] == drawn.end[0] else [0.0, 0.012, 0.0])
+        painted[line] = Segment(tuple(drawn.start + across), tuple(drawn.end + across), drawn.width_m)
     pose = overhead_pose(0.1, -0.2, HEIGHT_M, tilt_x_deg=8.0)
     scene = field_scene(
-        custom({}, {**field.curves, "HalfwayLine": painted}),
+        custom({}, {**field.curves, **painted}),
         {"overhead": camera("radial-2-3")},
         {"overhead": Station("overhead", pose)},
         spacing_m=0.1,
         name="field",
     )
     observed = simulate(scene, NOISE, seed=0).observations
-    observed = replace(observed, targets={"field": custom({}, field.curves)})
+    return replace(observed, targets={"field": custom({}, field.curves)})
+
+
+def test_a_tolerance_that_is_too_tight() -> None:
+    """The calibration keeps its word, since lines under a tolerance are solved for."""
+    observed = askew("HalfwayLine", "CenterLine", "LeftPenaltyStretch")
     calibration = calibrate(observed, Options(tolerances={"field": Tolerance(lines_m=0.002)}))
-    (conflict,) = calibration.conflicts
-    assert (conflict.kind, conflict.quantity) == ("tolerance", "HalfwayLine")
-    assert abs(abs(conflict.seen) - 0.03) < 0.003
+    conflicts = {conflict.quantity: conflict for conflict in calibration.conflicts}
+    assert {conflict.kind for conflict in conflicts.values()} == {"tolerance"}
+    assert abs(conflicts["CenterLine"].seen - 0.012) < 0.003  # 13 mm
     assert "contradicted" not in verdict(calibration, observed).headline
+
+
+def test_one_line_aside_under_a_tolerance_is_a_whole_in_doubt() -> None:
+    calibration = calibrate(askew("HalfwayLine"), Options(tolerances={"field": Tolerance(lines_m=0.002)}))
+    assert any("the whole of line 'HalfwayLine'" in warning for warning in calibration.warnings)
 
 
 def test_a_height_measured_after_a_move_is_tested() -> None:

@@ -119,3 +119,18 @@ def test_without_it_the_fault_has_no_name(
 
 def test_kinds_stand_under_their_own_names() -> None:
     assert all(kind == diagnostic.kind for kind, diagnostic in DIAGNOSTICS.items())
+
+
+class Shaking(Wave):
+    """The same displacement under another name."""
+
+    kind = "shaking"
+
+
+def test_what_the_data_cannot_tell_apart_is_named_by_both_names(
+    calibration: Calibration, swayed: Observations, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(DIAGNOSTICS, "shaking", Shaking())
+    (finding,) = diagnose(calibration, swayed).findings
+    other = {"wave": "shaking", "shaking": "wave"}[finding.kind]
+    assert finding.sentence.endswith(f"; these data cannot tell it from {other} (overhead)")

@@ -90,7 +90,7 @@ def test_sections_of_the_readme() -> None:
 
 
 def test_the_file_of_the_design_loads(tmp_path: Path) -> None:
-    text = (ROOT / "docs/design.md").read_text(encoding="utf-8")
+    text = (ROOT / "docs/files.md").read_text(encoding="utf-8")
     path = tmp_path / "observations.json"
     path.write_text(text.partition("```json\n")[2].partition("```")[0], encoding="utf-8")
     observations = Observations.load(path)

@@ -26,6 +26,7 @@ FLOORS = {
     "solve": 5,
     "uncertainty": 6,
     "calibration": 7,
+    "lens_choice": 7,
     "calibrating": 8,
     "advice": 9,
     "diagnostics": 9,
@@ -44,6 +45,8 @@ DOORS = {
     "cv2": {"detect", "simulate", "pictures", "formats"},
     "pycolmap": {"start", "formats"},
     "matplotlib": {"report"},
+    "google": {"formats"},  # protobuf
+    "yaml": {"formats"},
     "scipy": set(),  # for the tests only
 }
 

@@ -78,7 +78,7 @@ def test_starts_are_near_the_truth(name: str, disturbance: Disturbance) -> None:
     for placement, pose in scene.placements.items():
         if placement != "rings":
             assert angle_deg(start.estimate.placements[placement], pose) < 10.0  # 5 degrees measured
-    found_residuals = residuals(observations, gather_sights(observations), start.estimate)
+    found_residuals = residuals(observations, gather_sights(observations, predicted=True), start.estimate)
     lengths = np.concatenate([np.linalg.norm(found_residuals.points, axis=1), np.abs(found_residuals.curves)])
     assert np.all(np.isfinite(lengths))
     assert np.median(lengths) < 6.0

@@ -18,7 +18,7 @@ from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
 from ceres_cal.cli import main
 from ceres_cal.diagnostics import diagnose
-from ceres_cal.diagnostics.held_out import candidates, label_of
+from ceres_cal.lens_choice import candidates, label_of
 from ceres_cal.model.parameters import Options, intrinsics_vector, with_intrinsics
 from ceres_cal.model.residuals import camera_optics, residuals
 from ceres_cal.observations.sights import gather_sights

@@ -16,7 +16,6 @@ _MENDED = {
     ("few line points", "kannala-brandt", 2297): "6.1 sd, 3.4 radii: another minimum; 0, 0.7",
     ("few line points", "kannala-brandt", 1673): "5.6 radii: the map bends; 0.9, 0.6",
     ("few points", "kannala-brandt", 760): "3.9 radii: the map bends; 0, 0.1",
-    ("one curve", "kannala-brandt", 2613): "4.7 sd, 7.2 radii: the valley widens beyond 95 %; 4.2, 2.1",
 }
 
 

@@ -205,11 +205,13 @@ def test_bounds_in_words(low: float, high: float, words: str) -> None:
 
 @pytest.mark.parametrize("name", ["tilt 25 deg", "tilt 3 deg", "tilt 1 deg", "tilt 1 deg, height", "boards"])
 def test_intervals_hold_what_they_say(name: str) -> None:
-    """Four standard errors around 0.95; scripts/coverage.py has 500 runs of each, 0.943 to 0.964 measured."""
+    """Four standard errors around 0.95; scripts/coverage.py has 500 runs of each, 0.943 to 0.964 measured. (25 degrees:
+    0.98 in these 60, 0.955 in 150; where nearly all hold a sample's own error is too small.)
+    """
     found = cover(CASES[name], range(RUNS))
     assert found.failed == 0
     mean, error = share(found.parameters)
-    assert mean == pytest.approx(0.95, abs=4.0 * error) and error < 0.02
+    assert mean == pytest.approx(0.95, abs=4.0 * max(error, 0.01)) and error < 0.02
     assert np.min(np.mean(found.parameters, axis=0)) > 0.83  # 0.95 less four standard errors
     if found.points:
         assert share(found.points[0.0])[0] == pytest.approx(0.95, abs=0.04)

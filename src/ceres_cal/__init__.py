@@ -15,15 +15,29 @@ if TYPE_CHECKING:
     from ceres_cal.base.transforms import Pose as Pose
     from ceres_cal.calibrating import calibrate as calibrate
     from ceres_cal.calibration import Calibration as Calibration
+    from ceres_cal.formats import export as export
+    from ceres_cal.formats import import_calibration as import_calibration
+    from ceres_cal.formats import import_observations as import_observations
     from ceres_cal.model.parameters import Options as Options
     from ceres_cal.moves import RefitOptions as RefitOptions
+    from ceres_cal.moves import audit as audit
     from ceres_cal.moves import check as check
     from ceres_cal.moves import compare as compare
     from ceres_cal.moves import refit as refit
+    from ceres_cal.observations import Curves as Curves
     from ceres_cal.observations import Observations as Observations
+    from ceres_cal.observations import Points as Points
     from ceres_cal.observations import Prior as Prior
+    from ceres_cal.observations import View as View
     from ceres_cal.report import write_report as write_report
     from ceres_cal.scene.camera import Camera as Camera
+    from ceres_cal.scene.targets import Arc as Arc
+    from ceres_cal.scene.targets import Segment as Segment
+    from ceres_cal.scene.targets import Target as Target
+    from ceres_cal.scene.targets import checkerboard as checkerboard
+    from ceres_cal.scene.targets import custom as custom
+    from ceres_cal.scene.targets import rings as rings
+    from ceres_cal.scene.targets import ssl_field as ssl_field
 
 _HOME = {
     "advise": "advice",
@@ -37,9 +51,17 @@ _HOME = {
     "refit": "moves",
     "RefitOptions": "moves",
     "check": "moves",
+    "audit": "moves",
     "compare": "moves",
+    "export": "formats",
+    "import_calibration": "formats",
+    "import_observations": "formats",
     "Observations": "observations",
+    "View": "observations",
+    "Points": "observations",
+    "Curves": "observations",
     "Prior": "observations",
+    **dict.fromkeys(("Target", "Segment", "Arc", "checkerboard", "custom", "rings", "ssl_field"), "scene.targets"),
     "Options": "model.parameters",
     "Pose": "base.transforms",
     "write_report": "report",

@@ -1,4 +1,4 @@
-"""The steps, in order: initialise, solve, reject, solve, let explanations compete, assess."""
+"""The steps, in order: choose a lens (where that is asked for), initialise, solve, reject, solve, compete, assess."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from ceres_cal.base.errors import CalibrationError, DegenerateError, SolutionErr
 from ceres_cal.base.threads import at_most, meanwhile, single_threaded_blas
 from ceres_cal.base.words import bounds_text
 from ceres_cal.calibration import COPY, Calibration, Fit, Rejected
-from ceres_cal.model.parameters import Estimate, Layout, Options, make_layout
+from ceres_cal.lens_choice import choose_lens
+from ceres_cal.model.parameters import AUTO, Estimate, Layout, Options, make_layout
 from ceres_cal.model.priors import gather_priors
 from ceres_cal.model.quantities import difference
 from ceres_cal.model.residuals import residuals
@@ -29,8 +30,9 @@ from ceres_cal.solve import (
     information,
     solve_robustly,
 )
-from ceres_cal.solve.competing import Explanation, compete
+from ceres_cal.solve.competing import compete
 from ceres_cal.solve.conflicts import contradicted_by
+from ceres_cal.solve.explanation import Explanation
 from ceres_cal.solve.noise import Inliers, visible_from
 from ceres_cal.solve.possible import require_possible
 from ceres_cal.start.baseline import four_point_baseline
@@ -40,6 +42,8 @@ from ceres_cal.uncertainty import Posterior, Scatter, Uncertainty, assess, measu
 # Of the image's diagonal, 24 px of 1600: half of a camera's observations farther off is no calibration, while a lens
 # that is too simple stays below a few pixels. Nothing changes from half to double.
 _NO_FIT = 0.015
+# Of the image's diagonal, 240 px of 1600: lenses are mounted within some hundredths, unless a picture was cropped.
+_OFF_CENTRE = 0.15
 _UNKNOWN = (
     "camera {!r}: its views are too frontal to tell phi, which is {} at 95 %, and its heights go with phi: the floor "
     "is right, what is above it is not: add boards tilted by 20 degrees, or a prior on height_m where it sees the field"
@@ -82,6 +86,9 @@ def _calibrated(
 ) -> Calibration:
     """See `calibrate`."""
     observations.require_inside()
+    if options.lens == AUTO:
+        chosen, lens_choice = choose_lens(observations, options)
+        return replace(_calibrated(observations, chosen, progress), lens_choice=lens_choice)
     sights, layout = gather_sights(observations), make_layout(observations, options)
     start = initialise(observations, sights, options)
     priors = gather_priors(observations, options, start.estimate.structure)
@@ -262,6 +269,13 @@ def _require_usable(end: RobustSolution, problem: Problem, explanations: Sequenc
     """Warnings about the solution; SolutionError where it must not be used."""
     warnings = []
     for name, camera in end.solution.estimate.cameras.items():
+        width, height = camera.image_size
+        off_px = float(np.hypot(*(camera.principal_point - 0.5 * (np.array(camera.image_size) - 1.0))))
+        if off_px > _OFF_CENTRE * np.hypot(width, height):
+            warnings.append(
+                f"camera {name!r}: its principal point lies {off_px:.0f} px from the middle of its image: "
+                "is image_size that of the pictures, and are pixels counted from their top-left corner?"
+            )
         if not camera.folds:
             continue
         fold, corner = camera.lens.monotone_radius(camera.phi), camera.corner_radius

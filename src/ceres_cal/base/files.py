@@ -1,90 +1,187 @@
-"""Reading and writing files: one line of error that names the file, and never half a file."""
+"""Reading and writing files: one guarded door, one line of error that names the file, and never half a file.
+
+Files come from other people. Only regular ones are read, and what the content would take in memory is estimated from
+its size, headers and marks before any of it is made: more than `most_bytes` is refused.
+"""
 
 from __future__ import annotations
 
+import fcntl
 import json
+import math
 import os
-import tempfile
+import re
+import secrets
+import stat
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import msgspec
 
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.written import note
 
 T = TypeVar("T")
+Units = Literal["metres, radians, pixels"]
+PixelOrigin = Literal["centre of the top-left pixel"]
+UNITS: Units = "metres, radians, pixels"
+PIXEL_ORIGIN: PixelOrigin = "centre of the top-left pixel"
+"""What files of ours state, and are refused for where they state anything else."""
+
+LIMIT = "CERES_CAL_MOST_MB"
+_MOST_MB = 512  # 10 million observations in an NPZ file, one million in JSON, a photograph of 500 megapixels in grey
+_BYTES_PER_MARK = 80  # of memory, for what stands between two commas, colons or brackets of JSON
+_BYTES_PER_LETTER = 4  # a string takes so much for each letter once one of them is rare
+_NOT_MARKS = bytes(set(range(256)) - set(b"{}[]:,"))
+_NOT_KEYS = bytes(set(range(256)) - set(b"{}:"))
+_SURROGATE = re.compile(rb"\\u[dD][89a-fA-F]")
+
+
+# ---- limits ---------------------------------------------------------------------------------------------------------
+
+
+def most_bytes() -> float:
+    """What the content of one file may take in memory: 512 MB, or what CERES_CAL_MOST_MB says."""
+    text = os.environ.get(LIMIT, str(_MOST_MB))
+    if not text.isdecimal() or int(text) < 1:
+        raise InputError(f"{LIMIT} is {text!r}: give a whole number of megabytes")
+    return 1e6 * int(text)
+
+
+def require_room(needed: float, where: str) -> None:
+    """Raise InputError, before any of it is made, where content would take more than `most_bytes`."""
+    if needed > most_bytes():
+        raise InputError(
+            f"{where}: would take {needed / 1e6:.0f} MB, and a file may take {most_bytes() / 1e6:.0f} MB: "
+            f"give less at a time, or set {LIMIT}={math.ceil(needed / 1e6)} if that is meant"
+        )
+
+
+# ---- reading --------------------------------------------------------------------------------------------------------
 
 
 def read_bytes(path: str | Path) -> bytes:
     """The content of a file.
 
     Raises:
-        InputError: it is missing or cannot be read.
+        InputError: it is missing, cannot be read, is no regular file (reading a pipe or a device may never end), or is
+            too large.
     """
     try:
-        return Path(path).read_bytes()
+        # Opening a pipe would wait for its writer, but for O_NONBLOCK, which regular files ignore.
+        handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+        with os.fdopen(handle, "rb") as stream:
+            status = os.fstat(handle)
+            if stat.S_ISDIR(status.st_mode):
+                raise InputError(f"{path}: cannot be read: Is a directory")
+            if not stat.S_ISREG(status.st_mode):
+                raise InputError(f"{path}: cannot be read: it is a pipe or a device: save its content to a file first")
+            require_room(status.st_size, str(path))
+            return stream.read(status.st_size)
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
-
-
-def write_bytes(path: str | Path, content: bytes) -> None:
-    """Write a file beside its place and rename it, so that a crash leaves the old file or the new one, never half.
-
-    Raises:
-        InputError: the folder is missing or cannot be written.
-    """
-    try:
-        target = Path(path).resolve()  # behind a symbolic link, which stays
-        if target.exists() and not target.is_file():
-            raise InputError(f"{path}: cannot be written: it is a folder or a device")
-        handle, beside = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.", suffix=".part")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written: {error.strerror}") from None
-    try:
-        with os.fdopen(handle, "wb") as stream:
-            stream.write(content)
-            stream.flush()
-            os.fsync(stream.fileno())
-        Path(beside).chmod(0o644)
-        Path(beside).replace(target)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written: {error.strerror}") from None
-    finally:
-        Path(beside).unlink(missing_ok=True)
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
 
 
 def read_json(path: str | Path, format_name: str, version: int) -> dict[str, Any]:
-    """A JSON file of ours as plain data, its format and version checked.
+    """A JSON file of ours as plain data, its format and version checked, its numbers finite.
 
     Raises:
         InputError: not JSON, cut short, of another format, or of a version this package does not know.
     """
-    return check_header(parse_json(read_bytes(path), str(path)), str(path), format_name, version)
+    data = check_header(parse_json(read_bytes(path), str(path)), str(path), format_name, version)
+    _require_finite(data, "$", str(path))
+    return data
 
 
 def parse_json(content: bytes, where: str) -> Any:
-    """JSON text as plain data; InputError naming `where` if it is none.
+    """JSON text as plain data; InputError naming `where` if it is none, too large, or names something twice.
 
     NaN and Infinity, as Python's own writer spells them, are let through to the checks that can name their place.
     """
+    _require_few_marks(content, where)
     try:
-        return json.loads(content)
+        data = json.loads(content.decode("utf-8-sig"), parse_int=_whole)
+        if _SURROGATE.search(content):
+            msgspec.json.encode(data)  # half a surrogate pair is no letter that could be written again
     except (ValueError, RecursionError) as error:
         raise InputError(f"{where}: not valid JSON (cut short?): {error}") from None
+    _require_unique_keys(content, where)
+    return data
+
+
+def _whole(text: str) -> int | float:
+    """A whole number; one that no machine word holds is none, and the checks behind say whose it is."""
+    return int(text) if len(text) < 19 else float(text)
+
+
+def decode_json(content: bytes, kind: type[T], where: str) -> T | None:
+    """The same as a typed structure, several times faster; None where it does not fit: plain data say where."""
+    _require_few_marks(content, where)
+    try:
+        data = msgspec.json.decode(content, type=kind)
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+        return None
+    _require_unique_keys(content, where)
+    return data
+
+
+def _require_few_marks(content: bytes, where: str) -> None:
+    marks = len(content.translate(None, _NOT_MARKS))
+    require_room(_BYTES_PER_LETTER * len(content) + _BYTES_PER_MARK * marks, where)
+
+
+def _require_unique_keys(content: bytes, where: str) -> None:
+    """Raise InputError where an object of valid JSON has a key twice: parsers would quietly take the last one."""
+    plain = content.replace(rb"\\", b"\0").replace(rb"\"", b"\1")  # no control letter stands in valid JSON
+    parts = plain.split(b'"')  # strings at odd numbers, what is between them at even ones
+    objects: list[set[str]] = []
+    for number in range(0, len(parts), 2):
+        between = parts[number]
+        if between == b",":
+            continue
+        for mark in between.translate(None, _NOT_KEYS):
+            if mark == ord("{"):
+                objects.append(set())
+            elif mark == ord("}"):
+                objects.pop()
+            else:
+                key = parts[number - 1].replace(b"\0", rb"\\").replace(b"\1", rb"\"")
+                name = json.loads(b'"' + key + b'"') if b"\\" in key else key.decode()
+                if name in objects[-1]:
+                    raise InputError(f"{where}: {name!r} is given twice in one object: keep one of them")
+                objects[-1].add(name)
+
+
+def _require_finite(value: Any, place: str, where: str) -> None:
+    if isinstance(value, float):
+        if not math.isfinite(value):
+            raise InputError(f"{where}: {value} is no finite number - at `{place}`")
+    elif isinstance(value, dict):
+        for name, entry in value.items():
+            _require_finite(entry, f"{place}.{name}", where)
+    elif isinstance(value, list):
+        for number, entry in enumerate(value):
+            _require_finite(entry, f"{place}[{number}]", where)
 
 
 def check_header(data: Any, where: str, format_name: str, version: int) -> dict[str, Any]:
     """The same data once its "format" and "version" are known to be ours; InputError naming `where` otherwise."""
     stated = data.get("format") if isinstance(data, dict) else None
     if stated != format_name:
-        raise InputError(f'{where}: "format" must be "{format_name}", not {stated!r}')
+        raise InputError(f'{where}: "format" must be "{format_name}", not {_clipped(stated)}')
     if data.get("version") != version:
         raise InputError(
-            f"{where}: version {data.get('version')!r} is not known here, only {version}: update ceres-cal"
+            f"{where}: version {_clipped(data.get('version'))} is not known here, only {version}: update ceres-cal"
         )
     return dict(data)
+
+
+def _clipped(value: Any) -> str:
+    return f"{value!r:.100}"
 
 
 def convert(data: Any, kind: type[T], where: str) -> T:
@@ -93,6 +190,79 @@ def convert(data: Any, kind: type[T], where: str) -> T:
         return msgspec.convert(data, kind)
     except msgspec.ValidationError as error:
         raise InputError(f"{where}: {error}") from None
+
+
+# ---- writing --------------------------------------------------------------------------------------------------------
+
+
+def write_bytes(path: str | Path, content: bytes) -> None:
+    """Write a file beside its place and rename it, so that a crash leaves the old file or the new one, never half.
+
+    A file that is replaced keeps its mode and, as far as the system lets us, its owner; a new one has what the umask
+    leaves. What a killed run left beside the place is removed.
+
+    Raises:
+        InputError: the folder is missing or cannot be written, or the file is there and may not be written.
+    """
+    try:
+        target = Path(os.path.realpath(path))  # behind a symbolic link, which stays
+        if target.exists() and not target.is_file():
+            raise InputError(f"{path}: cannot be written: it is a folder or a device")
+        if target.exists() and not os.access(target, os.W_OK):
+            raise InputError(f"{path}: cannot be written: Permission denied")
+        with _beside(target) as (handle, beside), os.fdopen(handle, "wb") as stream:
+            stream.write(content)
+            stream.flush()
+            os.fsync(handle)
+            _keep_owner(handle, target)
+            beside.replace(target)
+        note(path)
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot be written: {getattr(error, 'strerror', None) or error}") from None
+
+
+@contextmanager
+def _beside(target: Path) -> Iterator[tuple[int, Path]]:
+    """A new file beside the target, gone at the end where it was not renamed.
+
+    It is locked while somebody writes it: one without a lock was left by a killed run.
+    """
+    start, end = f".{target.name[:150]}.", ".part"
+    for entry in os.scandir(target.parent):
+        if entry.name.startswith(start) and entry.name.endswith(end):
+            _remove_stale(target.parent / entry.name)
+    while True:
+        beside = target.parent / f"{start}{secrets.token_hex(6)}{end}"
+        handle = os.open(beside, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
+        with suppress(OSError):  # where a file system knows no locks
+            fcntl.flock(handle, fcntl.LOCK_EX)
+        if os.fstat(handle).st_nlink:  # or another run took it for stale in between
+            break
+        os.close(handle)
+    try:
+        yield handle, beside
+    finally:
+        beside.unlink(missing_ok=True)
+
+
+def _remove_stale(path: Path) -> None:
+    with suppress(OSError):
+        handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            path.unlink()
+        finally:
+            os.close(handle)
+
+
+def _keep_owner(handle: int, target: Path) -> None:
+    if not target.exists():
+        return
+    before = target.stat()
+    with suppress(OSError):  # only root may give files away
+        os.fchown(handle, before.st_uid, before.st_gid)
+    with suppress(OSError):
+        os.fchmod(handle, stat.S_IMODE(before.st_mode))
 
 
 def write_json(path: str | Path, data: Any) -> None:

@@ -38,7 +38,7 @@ def known_inverses(information: Array, limits: Array) -> Array:
     """Inverses (..., n, n) of information matrices over what is known; unknown directions are left out.
 
     Args:
-        limits: (n,) see `Spread.of`.
+        limits: (n,) or (..., n), see `Spread.of`.
     """
     scale, scaled = _scaled(information, limits)
     inverse = _regular_inverses(scaled)

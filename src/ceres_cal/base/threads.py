@@ -26,6 +26,9 @@ def _pool() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(thread_name_prefix="ceres_cal")
 
 
+os.register_at_fork(after_in_child=_pool.cache_clear)  # a child has the pool, but none of its threads
+
+
 @cache
 def _cores() -> int:
     return min(os.cpu_count() or 1, _MOST)

@@ -59,6 +59,20 @@ def rotation_log(rotation: ArrayLike) -> Array:
     return np.asarray(2.0 * np.arctan2(sine, q[0]) / sine * q[1:])
 
 
+def quaternion(rotation: ArrayLike) -> Array:
+    """(x, y, z, w) of a rotation matrix, of unit length, w not below 0."""
+    half = 0.5 * rotation_log(rotation)
+    angle = float(np.linalg.norm(half))
+    return np.array([*(np.sinc(angle / np.pi) * half), np.cos(angle)])
+
+
+def rotation_of(quaternion: ArrayLike) -> Array:
+    """The rotation matrix of (x, y, z, w), of any length but 0."""
+    x, y, z, w = np.asarray(quaternion, dtype=float)
+    sine = float(np.sqrt(x * x + y * y + z * z))
+    return rotation_exp(np.array([x, y, z]) * (2.0 * np.arctan2(sine, w) / sine if sine > 0.0 else 0.0))
+
+
 def left_jacobian(rotation_vector: ArrayLike) -> Array:
     """J with exp(w + dw) = exp(J dw) exp(w) to first order, shape (3, 3)."""
     w = np.asarray(rotation_vector, dtype=float)
@@ -105,7 +119,7 @@ def euler_from_rotation(rotation: ArrayLike) -> tuple[float, float, float]:
     return float(alpha), float(np.arctan2(-r[0, 2], cos_beta)), float(gamma)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Pose:
     """A rigid transform b_from_a: x_b = rotation @ x_a + translation.
 
@@ -119,11 +133,15 @@ class Pose:
 
     def __post_init__(self) -> None:
         for name, shape in (("rotation", (3, 3)), ("translation", (3,))):
-            value = np.array(getattr(self, name), dtype=float)
+            value = np.array(getattr(self, name), dtype=float, order="C")  # or products round otherwise
             if value.shape != shape:
                 raise ValueError(f"{name} must have shape {shape}, not {value.shape}")
             value.setflags(write=False)
             object.__setattr__(self, name, value)
+
+    def __repr__(self) -> str:
+        turn, shift = (", ".join(f"{v:.3f}" for v in part) for part in np.split(self.log(), 2))
+        return f"Pose(rotation vector ({turn}) rad, translation ({shift}) m)"
 
     @classmethod
     def identity(cls) -> Pose:

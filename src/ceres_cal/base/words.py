@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from pathlib import PurePath
 
 DASH = "\N{EN DASH}"
 _SPACE = "\N{NO-BREAK SPACE}"
@@ -99,3 +100,13 @@ def first_of(names: Sequence[str], most: int) -> str:
 def sentence(text: str) -> str:
     """The text with a capital at its beginning."""
     return f"{text[:1].upper()}{text[1:]}"
+
+
+def printable(text: str) -> str:
+    """The text with what is no letter (bytes of a file's name in another encoding) as \\udc..: it can be written."""
+    return text.encode("utf-8", "backslashreplace").decode()
+
+
+def frame_of(image: str | PurePath) -> str:
+    """What the frame of an image is called: its name without folder and ending."""
+    return printable(PurePath(image).stem)

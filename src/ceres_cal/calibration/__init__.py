@@ -2,6 +2,17 @@
 
 from ceres_cal.calibration.calibration import Calibration
 from ceres_cal.calibration.file import FORMAT, CalibrationFile
-from ceres_cal.calibration.origin import COPY, Fit, Refitted, Rejected, package_versions
+from ceres_cal.calibration.origin import COPY, Fit, LensChoice, Refitted, Rejected, TriedLens, package_versions
 
-__all__ = ["COPY", "FORMAT", "Calibration", "CalibrationFile", "Fit", "Refitted", "Rejected", "package_versions"]
+__all__ = [
+    "COPY",
+    "FORMAT",
+    "Calibration",
+    "CalibrationFile",
+    "Fit",
+    "LensChoice",
+    "Refitted",
+    "Rejected",
+    "TriedLens",
+    "package_versions",
+]

@@ -6,12 +6,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
+import msgspec
 import numpy as np
 
 from ceres_cal.base.arrays import Mask
 from ceres_cal.base.errors import InputError, naming
-from ceres_cal.base.files import convert, read_json, write_json
+from ceres_cal.base.files import PIXEL_ORIGIN, UNITS, convert, read_json, write_json
 from ceres_cal.base.transforms import Pose
 from ceres_cal.calibration.file import (
     FORMAT,
@@ -22,7 +24,7 @@ from ceres_cal.calibration.file import (
     options_from_json,
     options_to_json,
 )
-from ceres_cal.calibration.origin import COPY, Fit, Refitted, Rejected, package_versions
+from ceres_cal.calibration.origin import COPY, Fit, LensChoice, Refitted, Rejected, package_versions
 from ceres_cal.model.keys import Key
 from ceres_cal.model.parameters import Estimate, Options, make_layout
 from ceres_cal.model.priors import GaussianPrior, gather_priors
@@ -30,18 +32,18 @@ from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import gather_sights
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.files import CameraFile, PoseFile
-from ceres_cal.scene.targets import Target, target_from_spec
+from ceres_cal.scene.targets import Target, targets_from_specs
 from ceres_cal.solve import Conflict, Problem, Weighting
 from ceres_cal.uncertainty import Disagreement, Posterior, PosteriorFile, Uncertainty, disagreement
 
 _ALIKE = (
     *("fit", "rejected", "termination", "converged", "rounds", "history"),
-    *("phi_from", "warnings", "digest", "versions", "conflicts"),
+    *("phi_from", "warnings", "digest", "versions", "conflicts", "lens_choice"),
 )
 """What the file has as it is."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Calibration:
     """Calibrated cameras and where they stood.
 
@@ -57,6 +59,8 @@ class Calibration:
         options: how it was solved. digest: SHA-256 of the observations. versions: of the packages that solved it.
         refitted: how it came from an earlier calibration; None for one from scratch.
         conflicts: what was known beforehand and everything else contradicts; what is in dispute is in the posterior.
+        lens_choice: how the lens was chosen; None where it was given.
+        notes: whatever somebody wants to keep with it, plain data.
     """
 
     estimate: Estimate
@@ -75,6 +79,12 @@ class Calibration:
     versions: Mapping[str, str] = field(default_factory=package_versions)
     refitted: Refitted | None = None
     conflicts: tuple[Conflict, ...] = ()
+    lens_choice: LensChoice | None = None
+    notes: Mapping[str, Any] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        cameras = ", ".join(f"{name!r}: {camera!r}" for name, camera in self.stations.items())
+        return f"Calibration({cameras}; {self.rms_px:.3f} px rms)"
 
     @property
     def cameras(self) -> Mapping[str, Camera]:
@@ -179,8 +189,8 @@ class Calibration:
         return CalibrationFile(
             format=FORMAT,
             version=VERSION,
-            units="metres, radians, pixels",
-            pixel_origin="centre of the top-left pixel",
+            units=UNITS,
+            pixel_origin=PIXEL_ORIGIN,
             cameras={name: CameraFile.of(camera) for name, camera in estimate.cameras.items()},
             stations={name: StationFile.of_station(station) for name, station in estimate.stations.items()},
             placements={name: PoseFile.of(pose) for name, pose in estimate.placements.items()},
@@ -189,6 +199,7 @@ class Calibration:
             options=options_to_json(self.options),
             posterior=None if self.posterior is None else PosteriorFile.of(self.posterior),
             refitted=None if self.refitted is None else RefittedFile.of(self.refitted),
+            notes=dict(self.notes) or msgspec.UNSET,
             **{name: getattr(self, name) for name in _ALIKE},
         )
 
@@ -196,12 +207,13 @@ class Calibration:
     def from_file(cls, data: CalibrationFile) -> Calibration:
         """The calibration that a file describes; InputError naming the place inside it."""
         options = options_from_json(data.options)
-        targets = {name: target_from_spec(spec, f"target {name!r}") for name, spec in data.targets.items()}
+        targets = targets_from_specs(data.targets)
         return cls(
             data.estimate(targets, options),
             targets,
             options=options,
             posterior=None if data.posterior is None else data.posterior.posterior(),
             refitted=None if data.refitted is None else data.refitted.refitted(),
+            notes=data.notes if isinstance(data.notes, dict) else {},
             **{name: getattr(data, name) for name in _ALIKE},
         )

@@ -1,4 +1,4 @@
-"""Calibrations in JSON files (design, section 9): every number comes back exactly."""
+"""Calibrations in JSON files (docs/files.md): every number comes back exactly."""
 
 from __future__ import annotations
 
@@ -9,36 +9,48 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from ceres_cal.base.errors import InputError
-from ceres_cal.base.files import convert
-from ceres_cal.base.transforms import euler_from_rotation
-from ceres_cal.calibration.origin import Fit, Refitted, Rejected
+from ceres_cal.base.errors import InputError, naming
+from ceres_cal.base.files import PixelOrigin, Units, convert
+from ceres_cal.base.transforms import euler_from_rotation, rotation_from_euler
+from ceres_cal.calibration.origin import Fit, LensChoice, Refitted, Rejected
 from ceres_cal.model.keys import Key
 from ceres_cal.model.parameters import Estimate, Options, Station
 from ceres_cal.model.priors import GaussianPrior
 from ceres_cal.model.structure import EXACT, make_structure
 from ceres_cal.observations import prior_from_json, prior_to_json
-from ceres_cal.scene.files import CameraFile, Matrix, PoseFile, Vector
+from ceres_cal.scene.files import CameraFile, Matrix, PoseFile, Vector, rotation_of
 from ceres_cal.scene.targets import Target
 from ceres_cal.solve import Conflict
 from ceres_cal.uncertainty import PosteriorFile, information_from, lower_triangle
 
 FORMAT, VERSION = "ceres-cal/calibration", 1
+_ALIKE = 1e-5  # somebody who edits a file rounds
 
 
 class StationFile(PoseFile, forbid_unknown_fields=True):
-    """A station; position and Euler angles (the paper's) are there for people."""
+    """A station; position, Euler angles and H of the floor (the paper's) are there for people and other programs."""
 
     camera: str
     position_m: Vector
     euler_rad: Vector
+    homography: Matrix | msgspec.UnsetType = msgspec.UNSET
 
     @classmethod
     def of_station(cls, station: Station) -> StationFile:
         """As a file has it."""
         pose = station.cam_from_world
         rotation, translation, position = (part.tolist() for part in (pose.rotation, pose.translation, pose.position))
-        return cls(rotation, translation, station.camera, position, euler_from_rotation(pose.rotation))
+        homography = np.column_stack([pose.rotation[:, :2], pose.translation]).tolist()
+        return cls(rotation, translation, station.camera, position, euler_from_rotation(pose.rotation), homography)
+
+    def station(self) -> Station:
+        """The station; InputError where what is there for people says something else than the pose."""
+        station = Station(self.camera, self.pose())
+        again, reach_m = StationFile.of_station(station), 1.0 + float(np.linalg.norm(self.translation_m))
+        turned = np.max(np.abs(rotation_from_euler(*self.euler_rad) - station.cam_from_world.rotation))
+        if not np.allclose(again.position_m, self.position_m, rtol=0.0, atol=_ALIKE * reach_m) or turned > _ALIKE:
+            raise InputError("position_m or euler_rad is another one than that of rotation and translation_m")
+        return station
 
 
 class PriorFile(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True):
@@ -64,7 +76,7 @@ class PriorFile(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True):
         if self.mean is not None:
             if len(self.mean) != len(self.keys):
                 raise InputError("refitted.prior.mean does not fit its keys: calibrate again")
-            rotations = {name: np.array(rotation) for name, rotation in (self.rotations or {}).items()}
+            rotations = {name: rotation_of(rotation) for name, rotation in (self.rotations or {}).items()}
             return GaussianPrior(information, np.array(self.mean), rotations)
         cameras = {name: entry.camera() for name, entry in (self.cameras or {}).items()}
         stations = {name: Station("", entry.pose()) for name, entry in (self.stations or {}).items()}
@@ -98,8 +110,8 @@ class CalibrationFile(msgspec.Struct, forbid_unknown_fields=True):
 
     format: str
     version: int
-    units: str
-    pixel_origin: str
+    units: Units
+    pixel_origin: PixelOrigin
     cameras: dict[str, CameraFile]
     stations: dict[str, StationFile]
     placements: dict[str, PoseFile]
@@ -119,6 +131,8 @@ class CalibrationFile(msgspec.Struct, forbid_unknown_fields=True):
     posterior: PosteriorFile | None = None
     refitted: RefittedFile | None = None
     conflicts: tuple[Conflict, ...] = ()
+    lens_choice: LensChoice | None = None
+    notes: dict[str, Any] | msgspec.UnsetType = msgspec.UNSET
 
     def estimate(self, targets: Mapping[str, Target], options: Options) -> Estimate:
         """Cameras, stations, placements and the targets as built; InputError where one does not fit the others."""
@@ -131,8 +145,12 @@ class CalibrationFile(msgspec.Struct, forbid_unknown_fields=True):
         for name, station in self.stations.items():
             if station.camera not in cameras:
                 raise InputError(f"station {name!r} names camera {station.camera!r}, which is not there")
-            stations[name] = Station(station.camera, station.pose())
-        placements = {name: entry.pose() for name, entry in self.placements.items()}
+            with naming(f"station {name!r}"):
+                stations[name] = station.station()
+        placements = {}
+        for name, placement in self.placements.items():
+            with naming(f"placement {name!r}"):
+                placements[name] = placement.pose()
         structure = make_structure(targets, options.tolerances)
         if structure.names != tuple(self.structure_m):
             raise InputError("structure_m does not fit the targets and the tolerances: calibrate again")
@@ -147,5 +165,6 @@ def options_to_json(options: Options) -> dict[str, Any]:
 
 def options_from_json(data: Mapping[str, Any]) -> Options:
     """The options that a file describes; InputError naming what is wrong."""
-    priors = tuple(prior_from_json(entry, "options.priors") for entry in data.get("priors", []))
+    entries = convert(data.get("priors", []), list[dict[str, Any]], "options.priors")
+    priors = tuple(prior_from_json(entry, "options.priors") for entry in entries)
     return convert({**data, "priors": priors}, Options, "options")

@@ -29,6 +29,51 @@ class Rejected:
 
 
 @dataclass(frozen=True)
+class TriedLens:
+    """A lens that was compared with others.
+
+    Attributes:
+        label: kind with powers or free coefficients. coefficients: how many are free.
+        rms_px: of the errors with which views or features are predicted by all others; None where there is no answer.
+        worse: by how many standard errors of the paired difference it predicts worse than the one that was chosen.
+        failed: why there is no answer, "" where there is.
+    """
+
+    label: str
+    coefficients: int
+    rms_px: float | None = None
+    worse: float | None = None
+    failed: str = ""
+
+
+@dataclass(frozen=True)
+class LensChoice:
+    """Which lens was chosen, over what, and by how much.
+
+    Attributes:
+        chosen: its label. tried: every lens that was compared, the chosen one first, then as they predict.
+        groups: views, placements or features that were held out in turn. share: of the observations that took part.
+    """
+
+    chosen: str
+    tried: tuple[TriedLens, ...]
+    groups: int
+    share: float
+
+    @property
+    def words(self) -> str:
+        """In a line."""
+        others = [one for one in self.tried if one.worse is not None and one.label != self.chosen]
+        if not others:
+            return f"{self.chosen}, the only one that can be calibrated"
+        over = ", ".join(f"{one.label} {one.rms_px:.4f} px ({one.worse:+.1f})" for one in others[:3])
+        return (
+            f"{self.chosen} of {len(self.tried)}: predicts {self.groups} held-out parts to {self.tried[0].rms_px:.4f} "
+            f"px; next {over} (standard errors by which they predict worse)"
+        )
+
+
+@dataclass(frozen=True)
 class Fit:
     """How well the observations fit.
 

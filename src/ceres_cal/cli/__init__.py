@@ -5,12 +5,17 @@ Only argparse is imported here and at the top of the commands' modules, so that 
 
 from __future__ import annotations
 
+import json
 import os
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 
 from ceres_cal.base.errors import CalibrationError, InputError, SolutionError
+from ceres_cal.base.words import first_of
+from ceres_cal.base.written import noting
 from ceres_cal.cli.advise import COMMANDS as ADVISE
+from ceres_cal.cli.audit import COMMANDS as AUDIT
 from ceres_cal.cli.calibrate import COMMANDS as CALIBRATE
 from ceres_cal.cli.check import COMMANDS as CHECK
 from ceres_cal.cli.command import Command, print_answer
@@ -20,7 +25,9 @@ from ceres_cal.cli.detect_field import COMMANDS as DETECT_FIELD
 from ceres_cal.cli.detect_rings import COMMANDS as DETECT_RINGS
 from ceres_cal.cli.diagnose import COMMANDS as DIAGNOSE
 from ceres_cal.cli.export import COMMANDS as EXPORT
+from ceres_cal.cli.foreign import COMMANDS as FOREIGN
 from ceres_cal.cli.locate import COMMANDS as LOCATE
+from ceres_cal.cli.program import TERMINATED, Terminated, as_a_program, ended
 from ceres_cal.cli.refit import COMMANDS as REFIT
 from ceres_cal.cli.simulate import COMMANDS as SIMULATE
 from ceres_cal.cli.targets import COMMANDS as TARGETS
@@ -28,8 +35,8 @@ from ceres_cal.cli.undistort import COMMANDS as UNDISTORT
 
 _GROUPS = (
     *(DETECT_BOARD, DETECT_RINGS, DETECT_FIELD),
-    *(CALIBRATE, DIAGNOSE, ADVISE, REFIT, CHECK, COMPARE),
-    *(LOCATE, UNDISTORT, EXPORT, SIMULATE, TARGETS),
+    *(CALIBRATE, DIAGNOSE, ADVISE, REFIT, CHECK, COMPARE, AUDIT),
+    *(LOCATE, UNDISTORT, EXPORT, FOREIGN, SIMULATE, TARGETS),
 )
 COMMANDS = {command.name: command for group in _GROUPS for command in group}
 _BEGINNINGS = {"", *(name.partition(" ")[0] for name in COMMANDS if " " in name)}
@@ -44,41 +51,61 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments: those of the command line by default.
 
     Returns:
-        0 success, 1 the answer is no, 2 bad usage or input, 3 no usable solution, 130 interrupted. Every failure is one
-        line on standard error; with CERES_CAL_DEBUG set an unexpected one is raised instead.
+        0 success, 1 the answer is no, 2 bad usage or input, 3 no usable solution, 130 interrupted, 143 terminated.
+        Every failure is one line on standard error, with --json also an object on standard output; with
+        CERES_CAL_DEBUG set an unexpected one is raised instead.
     """
-    try:
-        return _run(sys.argv[1:] if arguments is None else list(arguments))
-    except CalibrationError as error:
-        return _fail(str(error), error.exit_code)
-    except SystemExit as done:  # argparse has printed its help
-        return int(done.code or 0)
-    except KeyboardInterrupt as error:
-        return _fail(f"interrupted: {str(error) or 'nothing was written'}", _INTERRUPTED)
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or Python complains when it closes the stream
-        return _PIPE_CLOSED
-    except MemoryError:
-        return _fail("out of memory: give fewer observations or images at a time", InputError.exit_code)
-    except OSError as error:
-        return _fail(
-            ": ".join(str(part) for part in (error.filename, error.strerror or error) if part), InputError.exit_code
-        )
-    except Exception as error:
-        if os.environ.get("CERES_CAL_DEBUG"):
-            raise
-        what = f"{type(error).__name__}: {error}"[:_MOST_LETTERS]
-        return _fail(f"unexpected {what}: please report it (CERES_CAL_DEBUG=1 tells more)", SolutionError.exit_code)
+    if arguments is not None:
+        return _answer(list(arguments))
+    as_a_program()
+    return ended(_answer(sys.argv[1:]))
 
 
-def _fail(message: str, exit_code: int) -> int:
-    print(f"ceres-cal: {' '.join(message.splitlines())}", file=sys.stderr)
+def _answer(arguments: list[str]) -> int:
+    """Run one command; the exit code, whatever happens."""
+    as_json = "--json" in arguments
+    with noting() as files:
+        try:
+            return _run(arguments)
+        except CalibrationError as error:
+            return _fail(str(error), error.exit_code, as_json)
+        except SystemExit as done:  # argparse has printed its help
+            return int(done.code or 0)
+        except KeyboardInterrupt as error:
+            how, code = ("terminated", TERMINATED) if isinstance(error, Terminated) else ("interrupted", _INTERRUPTED)
+            written = f"written were {first_of(files, 3)}" if files else "nothing was written"
+            return _fail(f"{how}: {written}", code, as_json)
+        except BrokenPipeError:
+            # Or Python complains when it closes the stream.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            return _PIPE_CLOSED
+        except MemoryError:
+            text = "out of memory: give fewer observations or images at a time"
+            return _fail(text, InputError.exit_code, as_json)
+        except OSError as error:
+            parts = (error.filename, error.strerror or error)
+            return _fail(": ".join(str(part) for part in parts if part), InputError.exit_code, as_json)
+        except Exception as error:
+            if os.environ.get("CERES_CAL_DEBUG"):
+                raise
+            what = f"{type(error).__name__}: {error}"[:_MOST_LETTERS]
+            text = f"unexpected {what}: please report it (CERES_CAL_DEBUG=1 tells more)"
+            return _fail(text, SolutionError.exit_code, as_json)
+
+
+def _fail(message: str, exit_code: int, as_json: bool) -> int:
+    line = " ".join(message.splitlines())
+    print(f"ceres-cal: {line}", file=sys.stderr)
+    if as_json:
+        with suppress(OSError):
+            print(json.dumps({"error": line, "exit_code": exit_code}), flush=True)
     return exit_code
 
 
 def _run(arguments: list[str]) -> int:
-    if arguments[-1:] in (["-h"], ["--help"]) and " ".join(arguments[:-1]) in _BEGINNINGS:
-        print(_overview(" ".join(arguments[:-1])))
+    beginning = " ".join(arguments[:-1])
+    if arguments[-1:] in (["-h"], ["--help"]) and beginning in _BEGINNINGS and beginning not in COMMANDS:
+        print(_overview(beginning))
         return 0
     if arguments[:1] == ["--version"]:
         from ceres_cal.calibration import package_versions
@@ -93,7 +120,7 @@ def _run(arguments: list[str]) -> int:
 
 
 def _choose(arguments: list[str]) -> tuple[Command, list[str]]:
-    for words in (1, 2):
+    for words in (2, 1):
         command = COMMANDS.get(" ".join(arguments[:words]))
         if command is not None:
             return command, arguments[words:]

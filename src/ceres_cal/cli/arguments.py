@@ -54,8 +54,14 @@ def add_report(parser: ArgumentParser) -> None:
     )
 
 
+def add_timeout(parser: ArgumentParser) -> None:
+    """The option --timeout S."""
+    parser.add_argument("--timeout", type=float, metavar="S", help="give up after so many seconds; default: never")
+
+
 def add_detection(parser: ArgumentParser) -> None:
-    """What `detect board` and `detect rings` write: --camera, --station and -o."""
+    """What `detect board` and `detect rings` share: --timeout, and of what they write --camera, --station and -o."""
+    add_timeout(parser)
     parser.add_argument("--camera", default="camera", metavar="NAME", help="name of the camera; default: camera")
     add_station(parser, "name of the station; default: that of the camera")
     add_output(parser, "the observations (.json or .npz)", required=True)

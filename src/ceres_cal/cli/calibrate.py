@@ -28,16 +28,16 @@ if TYPE_CHECKING:
     from ceres_cal.solve import Progress
 
 
-_DEFAULT_LENS = "radial"
+_DEFAULT_LENS, _AUTO = "radial", "auto"
 
 
 def _lens_kind(name: str) -> str:
     """A kind of lens that is in the table; the default is, and help and wrong usage need no table."""
-    if name != _DEFAULT_LENS:
+    if name not in (_DEFAULT_LENS, _AUTO):
         from ceres_cal.scene.lens import LENSES
 
         if name not in LENSES:
-            raise ArgumentTypeError(f"invalid choice: {name!r} (choose from {', '.join(map(repr, LENSES))})")
+            raise ArgumentTypeError(f"invalid choice: {name!r} (choose from {', '.join(map(repr, (*LENSES, _AUTO)))})")
     return name
 
 
@@ -54,7 +54,10 @@ def _add_arguments(parser: ArgumentParser) -> None:
 
 def _add_camera(parser: ArgumentParser) -> None:
     add = parser.add_argument_group("the camera").add_argument
-    kinds = "radial (the paper's), brown (OpenCV's), kannala-brandt (its fisheye), ...: `--lens ?` names all"
+    kinds = (
+        "radial (the paper's), brown (OpenCV's), kannala-brandt (its fisheye), ...: `--lens ?` names all; auto: the "
+        "simplest of all that predicts views as well as any other"
+    )
     add("--lens", type=_lens_kind, metavar="KIND", default=_DEFAULT_LENS, help=kinds)
     add("--powers", metavar="2,3", help="powers of a lens that leaves the choice; default: 2,3, the paper's")
     add(
@@ -183,10 +186,10 @@ def _fixed(specs: list[str]) -> dict[str, float]:
 def _options(
     args: Namespace, fixed: Mapping[str, float], powers: tuple[int, ...], observations: Observations
 ) -> Options:
-    from ceres_cal.model.parameters import Options, intrinsic_names
+    from ceres_cal.model.parameters import Options
 
     options = Options(lens=args.lens, powers=powers, fixed=fixed)
-    names = PriorNames(("height_m", "position_m"), (*intrinsic_names(options.blank_lens), "principal_point"))
+    names = PriorNames(("height_m", "position_m"), (*options.intrinsic_names, "principal_point"))
     return Options(
         lens=args.lens,
         powers=powers,

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any, NoReturn
 
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.words import sentence
+from ceres_cal.base.words import printable, sentence
 
 
 class Parser(argparse.ArgumentParser):
@@ -63,13 +63,25 @@ class Command:
         return parser.parse_intermixed_args(arguments)
 
 
+def _all_printable(data: Any) -> Any:
+    if isinstance(data, dict):
+        return {_all_printable(name): _all_printable(value) for name, value in data.items()}
+    if isinstance(data, list):
+        return [_all_printable(value) for value in data]
+    return printable(data) if isinstance(data, str) else data
+
+
 def print_answer(answer: Answer, *, as_json: bool) -> None:
     """Print an answer; BrokenPipeError here, not at the program's end, when nobody reads on."""
     if as_json:
         import msgspec
 
         # What is infinite or NaN becomes null; arrays and numbers of NumPy's what they hold.
-        encoded = msgspec.json.encode(answer.data, enc_hook=lambda value: value.tolist())
+        try:
+            encoded = msgspec.json.encode(answer.data, enc_hook=lambda value: value.tolist())
+        except UnicodeEncodeError:  # a file's name that is no UTF-8
+            plain = msgspec.to_builtins(answer.data, enc_hook=lambda value: value.tolist())
+            encoded = msgspec.json.encode(_all_printable(plain))
         print(msgspec.json.format(encoded, indent=1).decode())
     else:
         print(answer.text())

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.cli.arguments import add_detection, add_quiet
 from ceres_cal.cli.command import Answer, Command
+from ceres_cal.cli.detection import detected
 from ceres_cal.cli.inputs import image_files
 from ceres_cal.cli.outputs import finishing, require_observations_output
 from ceres_cal.cli.photographs import missed_data, missed_text
@@ -47,7 +49,8 @@ def _run_board(args: Namespace) -> Answer:
     board = checkerboard(args.columns, args.rows, args.square)
     corners = args.corner_fit if args.charuco is None else CharucoSpec(args.charuco, args.marker)
     with progress_bar(args) as bar:
-        detections = detect_boards(images, board, args.camera, args.station, corners, bar.update)
+        found = partial(detect_boards, images, board, args.camera, args.station, corners, bar.update)
+        detections = detected(args, found)
     with finishing():
         detections.observations.save(args.output)
     return Answer(_data(detections, args.output), lambda: _text(detections, args.output))

@@ -5,13 +5,15 @@ from __future__ import annotations
 from argparse import ArgumentParser, Namespace
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.words import plural
-from ceres_cal.cli.arguments import add_output, add_quiet, add_station, parse_names, parse_numbers
+from ceres_cal.cli.arguments import add_output, add_quiet, add_station, add_timeout, parse_names, parse_numbers
 from ceres_cal.cli.command import Answer, Command
+from ceres_cal.cli.detection import detected
 from ceres_cal.cli.inputs import image_files
 from ceres_cal.cli.outputs import finishing, require_observations_output
 from ceres_cal.cli.photographs import missed_data
@@ -38,6 +40,7 @@ def _add_arguments(parser: ArgumentParser) -> None:
     add("--camera", metavar="NAME", help="name of the camera; default: that of the calibration, or camera")
     add_station(parser, "name of the station, to start from and to write; default: likewise")
     add_output(parser, "the observations (.json or .npz)", required=True)
+    add_timeout(parser)
     add_quiet(parser)
 
 
@@ -89,7 +92,8 @@ def _run(args: Namespace) -> Answer:
     painted = [name for name in target.curves if name not in not_painted]
     options = FieldOptions(start.camera, start.station, points=not args.lines_only, edges=args.edges)
     with progress_bar(args) as bar:
-        detections = detect_field(images, target, start.start, painted, options, bar.update)
+        found = partial(detect_field, images, target, start.start, painted, options, bar.update)
+        detections = detected(args, found)
     with finishing():
         detections.observations.save(args.output)
     data = _data(detections, args.output)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.cli.arguments import add_detection, parse_number, parse_numbers
 from ceres_cal.cli.command import Answer, Command
-from ceres_cal.cli.inputs import quiet_opencv
+from ceres_cal.cli.detection import detected
 from ceres_cal.cli.outputs import finishing, require_observations_output
 
 if TYPE_CHECKING:
@@ -33,10 +34,9 @@ def _add_arguments(parser: ArgumentParser) -> None:
 def _run(args: Namespace) -> Answer:
     require_observations_output(args.output, [args.image])
     radii = _radii(args.radii)
-    quiet_opencv()
     from ceres_cal.detect.rings import detect_rings
 
-    detection = detect_rings(args.image, radii, args.camera, args.station)
+    detection = detected(args, partial(detect_rings, args.image, radii, args.camera, args.station))
     with finishing():
         detection.observations.save(args.output)
     data = _data(detection, args, len(radii))

@@ -14,7 +14,7 @@ from ceres_cal.base.arrays import Array
 from ceres_cal.base.words import chance, plural
 from ceres_cal.cli.outputs import WIDTH, section, wrapped, written, written_data
 from ceres_cal.diagnostics import Choice, Diagnosis, Finding, HeldOut, Noise, ResidualTable, Summary
-from ceres_cal.report.findings import choice_marks, chosen_lens
+from ceres_cal.report.findings import CHOSEN_BY, choice_marks, chosen_lens
 
 _MOST_ROWS = 8
 _MOST_SAID = 3  # amounts that the sentence of a finding says itself
@@ -125,7 +125,7 @@ def _choice(choice: Choice) -> list[str]:
     for number, one in enumerate(choice.candidates):
         lines.append(f"{one.label:24}{_errors(one)}  {choice_marks(choice, number)}".rstrip())
     parts = max(one.folds for one in choice.candidates)
-    rule = f"{parts} parts of the frames; chosen: the fewest coefficients within one standard error of the least error"
+    rule = f"{parts} parts of the frames; chosen: {CHOSEN_BY}"
     if choice.thinned < 1.0:
         rule += f"; on {100.0 * choice.thinned:.0f} % of the observations"
     return [*lines, rule, chosen_lens(choice)]

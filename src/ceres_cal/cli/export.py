@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from typing import TYPE_CHECKING, Any
 
 from ceres_cal.base.errors import InputError
@@ -13,7 +13,7 @@ from ceres_cal.cli.inputs import read_calibration
 from ceres_cal.cli.outputs import finishing, require_output
 
 if TYPE_CHECKING:
-    from ceres_cal.formats import Exported, ExportFormat
+    from ceres_cal.formats import Exported, ExportFormat, ImportFormat
 
 _OPTION = "option "  # before the names of a format's options: theirs may be those of the command's own arguments
 
@@ -44,11 +44,17 @@ def _add_shared_arguments(parser: ArgumentParser, forms: Collection[ExportFormat
         action="append",
         help="which station; may be left out where there is only one, or the format holds all; repeatable",
     )
+    add("--max-loss-mm", type=float, metavar="MM", help="refuse what is wrong by more anywhere on the field")
+    add_format_options(parser, forms)
+
+
+def add_format_options(parser: ArgumentParser, forms: Collection[ExportFormat] | Collection[ImportFormat]) -> None:
+    """The options of the formats themselves."""
     for name, helps in _options_of(forms).items():
-        add(_flag(name), dest=_OPTION + name, metavar="VALUE", help="; ".join(helps))
+        parser.add_argument(_flag(name), dest=_OPTION + name, metavar="VALUE", help="; ".join(helps).replace("%", "%%"))
 
 
-def _options_of(forms: Collection[ExportFormat]) -> dict[str, list[str]]:
+def _options_of(forms: Collection[ExportFormat] | Collection[ImportFormat]) -> dict[str, list[str]]:
     """Every option of the formats, with what it means to each of them."""
     from dataclasses import fields
 
@@ -69,26 +75,28 @@ def _run(args: Namespace) -> Answer:
     form = export_format(args.to)
     if form.endings:
         require_output(args.output, [args.calibration])
-    options = _options(args, form)
+    options = format_options(args, [form])
     exported = prepare_export(read_calibration(args), form.name, args.output, args.station, options)
+    exported.require_loss_mm(args.max_loss_mm)
     with finishing():
         exported.save(args.output)
     return Answer(_data(exported, args), lambda: _text(exported, args))
 
 
-def _options(args: Namespace, form: ExportFormat) -> dict[str, Any]:
-    """What was given of the format's options, of the types that they have."""
+def format_options(args: Namespace, forms: Sequence[ExportFormat] | Sequence[ImportFormat]) -> dict[str, Any]:
+    """What was given of the formats' options, of the types that they have."""
     from typing import get_type_hints
 
     import msgspec
 
     given = {name.removeprefix(_OPTION): text for name, text in vars(args).items() if name.startswith(_OPTION)}
-    types, options = get_type_hints(form.options), {}
+    types = {name: kind for form in forms for name, kind in get_type_hints(form.options).items()}
+    options = {}
     for name, text in given.items():
         if text is None:
             continue
         if name not in types:
-            raise InputError(f"{_flag(name)} is no option of format {form.name}")
+            raise InputError(f"{_flag(name)} is no option of format {forms[0].name}")
         try:
             options[name] = msgspec.convert(text, types[name], strict=False)
         except msgspec.ValidationError:
@@ -116,7 +124,7 @@ def _data(exported: Exported, args: Namespace) -> dict[str, Any]:
 
 
 def _text(exported: Exported, args: Namespace) -> str:
-    lines = [f"{args.to:10}{exported.words}, written to {args.output}"]
+    lines = [f"{args.to:9} {exported.words}, written to {args.output}"]
     for loss in exported.losses:
         of = f"{loss.station}: " if len(exported.losses) > 1 else ""
         if loss.image_px is not None:

@@ -20,13 +20,7 @@ IMAGE_ENDINGS = {".bmp", ".jp2", ".jpeg", ".jpg", ".pbm", ".pgm", ".png", ".pnm"
 
 def image_files(given: Iterable[str]) -> list[Path]:
     """The files named; those of folders, and of patterns that no shell expanded, in the order of their names."""
-    quiet_opencv()
     return [path for name in given for path in _files(name)]
-
-
-def quiet_opencv() -> None:
-    """What OpenCV warns of in an image, we say ourselves; before it is imported."""
-    os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")
 
 
 def _files(name: str) -> Iterator[Path]:
@@ -47,11 +41,12 @@ def _files(name: str) -> Iterator[Path]:
 
 def require_different(files: Iterable[str | Path]) -> None:
     """A file that counts twice would make its observations look better than they are."""
-    given: set[Path] = set()
+    given: set[str] = set()
     for file in files:
-        if Path(file).resolve() in given:
+        place = os.path.realpath(file)
+        if place in given:
             raise InputError(f"{file}: given twice: name every file once")
-        given.add(Path(file).resolve())
+        given.add(place)
 
 
 def read_calibration(args: Namespace) -> Calibration:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import threading
 from argparse import Namespace
@@ -81,21 +82,26 @@ def require_outputs(args: Namespace, inputs: Sequence[str | Path]) -> None:
     """`require_output` of output and report, and that they are two files."""
     require_output(args.output, inputs)
     require_output(args.report, inputs)
-    if args.output is not None and args.report is not None and args.output.resolve() == args.report.resolve():
+    if (
+        args.output is not None
+        and args.report is not None
+        and os.path.realpath(args.output) == os.path.realpath(args.report)
+    ):
         raise InputError(f"{args.report}: is named as output and as report: give them two names")
 
 
 @contextmanager
 def finishing() -> Iterator[None]:
-    """Hold Ctrl-C back while results are written: a command that was interrupted has written nothing."""
+    """Hold Ctrl-C and SIGTERM back while results are written: a command that was interrupted has written nothing."""
     if threading.current_thread() is not threading.main_thread():  # where Ctrl-C does not arrive
         yield
         return
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    before = {number: signal.signal(number, signal.SIG_IGN) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def write_results(args: Namespace, save: Callable[[Path], None], page: str | None) -> None:

@@ -64,6 +64,8 @@ def calibration_text(quality: Quality, inputs: Sequence[str], args: Namespace) -
         section("read", [", ".join(map(str, inputs)), *_counted(observations)]),
         section("fit", _fit(calibration)),
     ]
+    if calibration.lens_choice is not None:
+        sections.append(section("lens", wrapped(calibration.lens_choice.words)))
     for name, camera in calibration.cameras.items():
         lines = _intrinsics(name, camera, calibration.options, calibration.phi_from.get(name, ""), quality)
         sections.append(section("camera", [f"{name}, {camera.image_size[0]} x {camera.image_size[1]} px", *lines]))

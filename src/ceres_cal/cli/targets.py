@@ -58,14 +58,14 @@ def _targets_in(path: Path) -> dict[str, Target]:
     """The targets of a file of observations, even where its observations are at fault."""
     from ceres_cal.base.files import read_json
     from ceres_cal.observations import FORMAT, VERSION, Observations
-    from ceres_cal.scene.targets import target_from_spec
+    from ceres_cal.scene.targets import targets_from_specs
 
     if path.suffix == ".npz":
         return dict(Observations.load(path).targets)
     specs = read_json(path, FORMAT, VERSION).get("targets")
     if not isinstance(specs, dict) or not specs:
         raise InputError(f"{path}: it holds no targets")
-    return {name: target_from_spec(spec, f"{path}: target {name!r}") for name, spec in specs.items()}
+    return targets_from_specs(specs, f"{path}: ")
 
 
 # ---- for people -----------------------------------------------------------------------------------------------------

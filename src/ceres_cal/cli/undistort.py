@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.words import frame_of
 from ceres_cal.cli.arguments import add_calibration, add_quiet, add_station, height_m, parse_number, parse_numbers
 from ceres_cal.cli.command import Answer, Command
 from ceres_cal.cli.inputs import image_files, read_calibration
@@ -72,17 +73,13 @@ def _run(args: Namespace) -> Answer:
     lines: list[str] = []
     written: list[dict[str, Any]] = []
     about = args.output / f"{kind}.json"
-    try:
-        with progress_bar(args) as bar:
-            for number, (path, output) in enumerate(outputs.items(), start=1):
-                picture, facts, line = make.picture(path)
-                _write(output, picture)
-                lines.append(f"{output}: {line}")
-                written.append({"image": str(path), "output": str(output), **facts})
-                bar.update(number, len(outputs), path.name)
-    except KeyboardInterrupt:
-        done = f"{len(written)} of {len(outputs)} pictures are written, {about.name} is not"
-        raise KeyboardInterrupt(done if written else "") from None
+    with progress_bar(args) as bar:
+        for number, (path, output) in enumerate(outputs.items(), start=1):
+            picture, facts, line = make.picture(path)
+            _write(output, picture)
+            lines.append(f"{output}: {line}")
+            written.append({"image": str(path), "output": str(output), **facts})
+            bar.update(number, len(outputs), path.name)
     data = {"format": _FORMAT, "version": _VERSION, "calibration": str(args.calibration), "kind": kind, **make.facts}
     with finishing():
         write_json(about, {**data, "pictures": written})
@@ -318,10 +315,10 @@ def _overlay(args: Namespace, calibration: Calibration) -> _PictureMaker:
         yield Layer(model_of(calibration, frame), args.calibration.name, AFTER)
 
     def picture(path: Path) -> tuple[Image, dict[str, Any], str]:
-        image = _read(path, camera, name)
-        if observations is not None and path.stem not in known:
-            raise InputError(f"{path}: {args.observations} has no frame {path.stem!r} of station {station!r}")
-        frame = known.get(path.stem) or frame_by_name(calibration, station, path.stem)
+        image, called = _read(path, camera, name), frame_of(path)
+        if observations is not None and called not in known:
+            raise InputError(f"{path}: {args.observations} has no frame {called!r} of station {station!r}")
+        frame = known.get(called) or frame_by_name(calibration, station, called)
         drawn = list(layers(frame))
         marks = () if observations is None else marks_of(calibration, observations, frame)
         model = drawn[-1].model

@@ -15,6 +15,7 @@ import numpy as np
 from ceres_cal.base.arrays import Array, Image, Image8
 from ceres_cal.base.errors import InputError, NothingShownError
 from ceres_cal.base.progress import ImageProgress
+from ceres_cal.base.words import frame_of, printable
 from ceres_cal.detect.images import read_grey
 from ceres_cal.detect.saddles import REACH, measure_saddles
 from ceres_cal.detect.scatter import scatter_px
@@ -25,6 +26,7 @@ CORNER_FITS = ("opencv", "saddle")
 MIN_CORNERS = 6
 TARGET_NAME = "board"
 _LARGE_PX = 2e6  # larger images are searched at this size first: faster, and with less of noise and blur
+_MOST_PX = 1.6e7  # and at this size at most: on noise OpenCV takes minutes, and 50 MB for every megapixel
 _SUBPIX_HALF_WINDOW_PX = 5  # at most; a third of the spacing keeps the neighbouring corners out of it
 _SMALL_PX = 2e6  # smaller ones also at twice their size, where the squares are few pixels wide
 
@@ -106,7 +108,7 @@ def detect_boards(
             f"(count the corners between squares, not the squares); {missed[0][0]}: {missed[0][1]}",
             tuple(missed),
         )
-    views = tuple(View(path.stem, camera, station or camera, TARGET_NAME, placements[path]) for path in grids)
+    views = tuple(View(frame_of(path), camera, station or camera, TARGET_NAME, placements[path]) for path in grids)
     points = _points(list(grids.values()), board)
     observations = Observations({TARGET_NAME: board}, {camera: size}, views, points, NO_CURVES)
     return BoardDetections(observations, tuple(map(str, grids)), tuple(missed))
@@ -208,7 +210,7 @@ def _find_chessboard(image: Image8, columns: int, rows: int) -> Array | None:
 def _scales(pixels: int) -> Iterator[float]:
     if pixels > _LARGE_PX:
         yield float(np.sqrt(_LARGE_PX / pixels))
-    yield 1.0
+    yield min(1.0, float(np.sqrt(_MOST_PX / pixels)))
     if pixels <= _SMALL_PX:
         yield 2.0
 
@@ -276,12 +278,13 @@ def _placement_names(paths: Sequence[Path]) -> dict[Path, str]:
     if len(set(paths)) < len(paths):
         twice = next(path for number, path in enumerate(paths) if path in paths[:number])
         raise InputError(f"{twice}: given twice: name every image once")
-    names = {path: path.stem for path in paths}
+    names = {path: frame_of(path) for path in paths}
     for depth in range(2, max(len(path.parts) for path in paths) + 2):
         taken = list(names.values())
         for path in paths:
             if taken.count(names[path]) > 1:
-                names[path] = "/".join((*path.parts[-depth:-1], path.stem if depth <= len(path.parts) else path.name))
+                own = path.stem if depth <= len(path.parts) else path.name
+                names[path] = printable("/".join((*path.parts[-depth:-1], own)))
     return names
 
 

@@ -9,7 +9,11 @@ import numpy as np
 
 from ceres_cal.base.arrays import Image
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.files import read_bytes
+from ceres_cal.base.files import read_bytes, require_room
+from ceres_cal.detect.headers import claimed_size
+
+_BYTES_PER_PIXEL = 3
+_PIXELS_PER_BYTE = 8 * 1032  # the most that PNG's compression makes of a byte, at a bit each
 
 
 def read_grey(path: str | Path) -> Image:
@@ -27,12 +31,26 @@ def read_colour(path: str | Path) -> Image:
 
 
 def _decoded(path: str | Path, channels: int) -> Image:
-    content = np.frombuffer(read_bytes(path), np.uint8)
+    content = read_bytes(path)
+    size = claimed_size(content)
+    if size is not None:
+        _require_believable(size, len(content), str(path))
     flags = channels | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
-    image = cv2.imdecode(content, flags) if content.size else None
+    try:
+        image = None if size is None else cv2.imdecode(np.frombuffer(content, np.uint8), flags)
+    except cv2.error:
+        image = None
     if image is None:
         raise InputError(f"{path}: not an image that OpenCV can read (cut short?): convert it to PNG or leave it out")
     return image
+
+
+def _require_believable(size: tuple[int, int], length: int, path: str) -> None:
+    """Raise InputError where a header claims more pixels than there is room for, or than its file can hold."""
+    pixels = size[0] * size[1]
+    require_room(_BYTES_PER_PIXEL * pixels, f"{path}: an image of {size[0]} x {size[1]} px")
+    if pixels > _PIXELS_PER_BYTE * length:
+        raise InputError(f"{path}: {size[0]} x {size[1]} px, as it says, do not fit into {length} bytes: leave it out")
 
 
 def encoded(image: Image, ending: str, jpeg_quality: int) -> bytes:

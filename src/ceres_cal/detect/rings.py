@@ -16,6 +16,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, Array32, Indices32, Mask
 from ceres_cal.base.errors import InputError, naming
+from ceres_cal.base.words import frame_of
 from ceres_cal.detect.images import read_grey
 from ceres_cal.detect.profiles import Windows, cut_windows, fit_profiles, fit_shape
 from ceres_cal.detect.ring_centre import ring_centre
@@ -88,7 +89,7 @@ def detect_rings(
         edges, blur = _measured(grey, centre, tracks)
         _require_all_seen(grey, centre, tracks, len(radii_m))
         polynomial, rms = _polynomial(edges, centre, np.array(sheet.spec["radii_m"]))
-    observations = _observations(edges, sheet, grey, Path(image).stem, camera, station or camera)
+    observations = _observations(edges, sheet, grey, frame_of(image), camera, station or camera)
     # The first ring's own middle: farther out, tilt makes the gradients miss the centre.
     own = tracks[0].series[[1, 1 + _HARMONICS]]
     return RingsDetection(observations, centre + own, len(tracks), polynomial, rms, blur)

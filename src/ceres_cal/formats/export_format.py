@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import make_folder, write_bytes
 
 if TYPE_CHECKING:
@@ -43,6 +44,20 @@ class Exported:
     words: str
     facts: Mapping[str, Any] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
+
+    def with_content(self, content: bytes | Mapping[str, bytes]) -> Exported:
+        """The same with this content."""
+        return replace(self, content=content)
+
+    def require_loss_mm(self, most: float | None) -> None:
+        """Raise InputError where a station is wrong by more than so many mm anywhere on the field."""
+        for loss in self.losses if most is not None else ():
+            worst = max((worst for _, worst in loss.field_mm.values()), default=float("inf"))
+            if not worst <= most:  # type: ignore[operator]
+                raise InputError(
+                    f"station {loss.station!r}: the format would be wrong by {worst:.3g} mm on the field, more than "
+                    f"{most:g}: calibrate with a lens that it holds, or allow for more"
+                )
 
     def save(self, path: str | Path) -> None:
         """Write the file, or the folder with its files.

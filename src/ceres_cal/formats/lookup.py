@@ -7,6 +7,7 @@ the third column of the paper's H makes (section 4), exact for every height. So 
 from __future__ import annotations
 
 import io
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,7 +15,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ceres_cal.base.arrays import Array
+from ceres_cal.base.archives import Column, read_npz
+from ceres_cal.base.arrays import AnyArray, Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import read_bytes, write_bytes
 from ceres_cal.formats.export_format import Exported, ExportFormat, ExportRequest, Loss
@@ -25,6 +27,17 @@ if TYPE_CHECKING:
     from ceres_cal.scene.camera import Camera
 
 FILE_FORMAT, VERSION = "ceres-cal/table", 1
+_COLUMNS = {
+    **{name: Column(np.str_, ()) for name in ("format", "station")},
+    **{name: Column(np.int64, ()) for name in ("version", "step_px")},
+    "image_size": Column(np.int64, (2,)),
+    "x_px": Column(float, ("X",)),
+    "y_px": Column(float, ("Y",)),
+    **{name: Column(float, ("Y", "X", 2)) for name in ("floor_m", "per_height")},
+    "error_mm": Column(float, ("heights", 3)),
+    "homography": Column(float, (3, 3)),
+    "third_column": Column(float, (3,)),
+}
 _STEPS_PX = (64, 32, 16, 8, 4, 2, 1)
 
 
@@ -83,25 +96,35 @@ class LookupTable:
         Raises:
             InputError: it is none.
         """
+        arrays = read_npz(read_bytes(path), _COLUMNS, str(path))
         try:
-            with np.load(io.BytesIO(read_bytes(path)), allow_pickle=False) as data:
-                if str(data["format"]) != FILE_FORMAT or int(data["version"]) != VERSION:
-                    raise InputError(f"{path}: is no table of version {VERSION}: export it again")
-                width, height = (int(size) for size in data["image_size"])
-                return cls(
-                    str(data["station"]),
-                    (width, height),
-                    int(data["step_px"]),
-                    np.array(data["x_px"]),
-                    np.array(data["y_px"]),
-                    np.array(data["floor_m"]),
-                    np.array(data["per_height"]),
-                    {float(row[0]): (float(row[1]), float(row[2])) for row in data["error_mm"]},
-                    np.array(data["homography"]),
-                    np.array(data["third_column"]),
-                )
-        except (ValueError, KeyError, OSError) as error:
+            return _table_of(arrays)
+        except ValueError as error:
             raise InputError(f"{path}: is no table ({error}): export it again") from None
+
+
+def _table_of(arrays: Mapping[str, AnyArray]) -> LookupTable:
+    """The table that an NPZ file holds; ValueError where its numbers contradict each other."""
+    if (str(arrays["format"]), int(arrays["version"])) != (FILE_FORMAT, VERSION):
+        raise ValueError(f"not of format {FILE_FORMAT}, version {VERSION}")
+    nodes = {name: arrays[name] for name in ("x_px", "y_px", "floor_m", "per_height", "homography", "third_column")}
+    station, step_px = str(arrays["station"]), int(arrays["step_px"])
+    station.encode()  # or it is no text
+    size = (int(arrays["image_size"][0]), int(arrays["image_size"][1]))
+    errors = {float(height_m): (float(rms), float(worst)) for height_m, rms, worst in arrays["error_mm"]}
+    for name, length in zip(("x_px", "y_px"), size, strict=True):
+        even = nodes[name][0] + step_px * np.arange(len(nodes[name]), dtype=float)
+        if step_px < 1 or len(even) < 2 or not np.allclose(nodes[name], even, atol=1e-6, rtol=0.0):
+            raise ValueError(f"{name} is not evenly spaced by step_px")
+        if length < 1 or even[0] > -0.5 or even[-1] < length - 0.5 or even[-1] > length + 2 * step_px:
+            raise ValueError(f"{name} does not span the image")
+    if not all(np.all(np.isfinite(arrays[name])) for name in ("homography", "third_column", "error_mm")):
+        raise ValueError("a number is not finite")
+    if any(np.isinf(nodes[name]).any() for name in ("floor_m", "per_height")):
+        raise ValueError("a number is infinite")
+    if len(errors) != len(arrays["error_mm"]) or np.any(arrays["error_mm"][:, 1:] < 0.0):
+        raise ValueError("error_mm is not one row for each height")
+    return LookupTable(station, size, step_px, **nodes, error_mm=errors)
 
 
 def make_lookup_table(
@@ -113,10 +136,11 @@ def make_lookup_table(
         x_m, y_m: the box of the field over which errors count is the one around these.
 
     Raises:
-        InputError: a step below 1, or no step of 1 px or more keeps to the error.
+        InputError: a step below 1 or beyond the image, or no step of 1 px or more keeps to the error.
     """
-    if step_px is not None and step_px < 1:
-        raise InputError(f"step_px must be 1 or more, not {step_px}")
+    widest = min(camera.image_size)
+    if step_px is not None and not 1 <= step_px <= widest:
+        raise InputError(f"step_px must be from 1 to {widest}, not {step_px}")
     table = None
     for step in _STEPS_PX if step_px is None else (step_px,):
         table = _table(camera, station, step, x_m, y_m)

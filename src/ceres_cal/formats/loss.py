@@ -2,22 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array
+from ceres_cal.formats.export_format import Loss
+from ceres_cal.scene.camera import in_image
+from ceres_cal.scene.foreign import ForeignCamera, image_grid
+from ceres_cal.scene.heights import HEIGHTS_M, at_height
 
 if TYPE_CHECKING:
     from ceres_cal.scene.camera import Camera
+    from ceres_cal.scene.targets import Target
+
+_GRID = (122, 91)  # pixels: finer than that of the fit
+_ROUNDS = 8  # of bringing a place to where another camera shows it in the same pixel
+Box = tuple[Array, Array]
 
 
 def field_error_mm(
     camera: Camera,
     locate: Callable[[Array, float], Array],
     pixels: Array,
-    box_m: tuple[Array, Array],
+    box_m: Box,
     heights_m: Sequence[float],
 ) -> dict[float, tuple[float, float]]:
     """height_m -> root mean square and largest error of located pixels, mm.
@@ -33,6 +42,72 @@ def field_error_mm(
         with np.errstate(invalid="ignore"):
             on_field = np.all((true >= low) & (true <= high), axis=1)
         off = 1e3 * np.linalg.norm(locate(pixels[on_field], height_m) - true[on_field], axis=1)
-        off = np.where(np.isfinite(off), off, np.inf)
-        errors[height_m] = (float(np.sqrt(np.mean(off**2))), float(np.max(off))) if len(off) else (np.inf, np.inf)
+        errors[height_m] = _size(off)
     return errors
+
+
+def _size(off: Array) -> tuple[float, float]:
+    """Root mean square and largest; infinite where one is unknown, or none is there."""
+    off = np.where(np.isfinite(off), off, np.inf)
+    return (float(np.sqrt(np.mean(off**2))), float(np.max(off))) if len(off) else (np.inf, np.inf)
+
+
+def field_box(targets: Mapping[str, Target]) -> Box | None:
+    """x and y of a grid over what does not move; None where everything does."""
+    from ceres_cal.uncertainty.uncertainty import field_grid  # not for the command line's help
+
+    still = {name: target for name, target in targets.items() if not target.movable}
+    return field_grid(still) if still else None
+
+
+def field_pixels(camera: Camera, box_m: Box) -> Array:
+    """(N, 2) pixels in which the camera shows places evenly over the field and a little above it."""
+    x, y = (part.ravel() for part in np.meshgrid(*box_m))
+    every = [camera.project(np.column_stack([x, y, np.full(len(x), height_m)])) for height_m in HEIGHTS_M]
+    pixels = np.concatenate(every)
+    return np.asarray(pixels[in_image(pixels, camera.image_size)])
+
+
+def camera_loss(station: str, camera: Camera, project: Callable[[Array], Array], box_m: Box | None) -> Loss:
+    """What a file gets wrong about a camera.
+
+    Args:
+        project: as the file has it, points (N, 3) m -> pixels (N, 2). box_m: of the field, None where there is none.
+    """
+    pixels = image_grid(camera.image_size, _GRID)
+    rays = camera.rays(pixels)
+    known = np.isfinite(rays[:, 0])
+    depth_m = max(abs(camera.position[2]), 1.0)
+    points = camera.position + depth_m * (rays[known] @ camera.cam_from_world.rotation)
+    image_px = _size(np.linalg.norm(project(points) - pixels[known], axis=1))
+    if box_m is None:
+        return Loss(station, {}, image_px)
+
+    def locate(seen: Array, height_m: float) -> Array:
+        """Where the file's camera has these pixels: from where ours has them, by what it misses there."""
+        there = place = camera.locate(seen, height_m)
+        for _ in range(_ROUNDS):
+            shown = project(np.column_stack([place, np.full(len(place), height_m)]))
+            place = place + there - camera.locate(shown, height_m)
+        return place
+
+    return Loss(station, field_error_mm(camera, locate, field_pixels(camera, box_m), box_m, HEIGHTS_M), image_px)
+
+
+def as_foreign(camera: Camera, station: str, models: Sequence[str], box_m: Box | None) -> tuple[ForeignCamera, Loss]:
+    """A station's camera in the first of these models that holds it, else the best fit among them; what is lost."""
+    foreign = camera.to_foreign(*models)
+    if foreign.lens == camera.lens:
+        return foreign, Loss(station, {} if box_m is None else dict.fromkeys(HEIGHTS_M, (0.0, 0.0)), (0.0, 0.0))
+    pose = camera.cam_from_world
+    return foreign, camera_loss(station, camera, lambda points: foreign.project_rays(pose.transform(points)), box_m)
+
+
+def loss_words(loss: Loss) -> list[str]:
+    """What is lost, a line each, for files that have room for it."""
+    lines = []
+    if loss.image_px is not None:
+        lines.append("{}: {:.3g} px rms, {:.3g} px at most, over the image".format(loss.station, *loss.image_px))
+    for height_m, (rms, worst) in loss.field_mm.items():
+        lines.append(f"{loss.station}: {rms:.3g} mm rms, {worst:.3g} mm at most, {at_height(height_m)}")
+    return lines

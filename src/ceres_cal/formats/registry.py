@@ -1,4 +1,4 @@
-"""The table of all export formats, and the export of a calibration to one of them."""
+"""The tables of all formats, the export of a calibration to one of them, and the reading of what others wrote."""
 
 from __future__ import annotations
 
@@ -7,15 +7,46 @@ from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ceres_cal.base.errors import InputError
+from ceres_cal.base.errors import InputError, naming
 from ceres_cal.base.files import read_bytes
-from ceres_cal.formats import lookup
+from ceres_cal.formats import colmap, detections, kalibr, lookup, mrcal, opencv, paper, ros, ssl_geometry, ssl_settings
 from ceres_cal.formats.export_format import Exported, ExportFormat, ExportRequest
+from ceres_cal.formats.import_format import ImportFormat, ImportRequest
 
 if TYPE_CHECKING:
     from ceres_cal.calibration import Calibration
+    from ceres_cal.observations import Observations
 
-EXPORT_FORMATS: dict[str, ExportFormat] = {form.name: form for form in (lookup.FORMAT,)}
+EXPORT_FORMATS: dict[str, ExportFormat] = {
+    form.name: form
+    for form in (
+        lookup.FORMAT,
+        ssl_geometry.PACKET,
+        ssl_geometry.GEOMETRY_YML,
+        ssl_settings.FORMAT,
+        opencv.FORMAT,
+        ros.FORMAT,
+        kalibr.FORMAT,
+        mrcal.FORMAT,
+        colmap.FORMAT,
+        paper.FORMAT,
+    )
+}
+IMPORT_FORMATS: dict[str, ImportFormat] = {
+    form.name: form
+    for form in (
+        ssl_geometry.IMPORT_PACKET,
+        ssl_geometry.IMPORT_YML,
+        ssl_settings.IMPORT,
+        opencv.IMPORT,
+        ros.IMPORT,
+        kalibr.IMPORT,
+        mrcal.IMPORT,
+        colmap.IMPORT,
+        paper.IMPORT,
+        *detections.FORMATS,
+    )
+}
 
 
 def export_format(name: str) -> ExportFormat:
@@ -27,12 +58,18 @@ def export_format(name: str) -> ExportFormat:
 
 
 def export(
-    calibration: Calibration, to: str, path: str | Path, stations: Sequence[str] | None = None, **options: Any
+    calibration: Calibration,
+    to: str,
+    path: str | Path,
+    stations: Sequence[str] | None = None,
+    max_loss_mm: float | None = None,
+    **options: Any,
 ) -> Exported:
     """Write a calibration to a file of a format, or to a folder where the format takes one.
 
     Args:
         to: name of the format. stations: by default all where the format holds several, else the only one.
+        max_loss_mm: refuse what is wrong by more anywhere on the field, on the floor or at robot height.
         options: the format's own.
 
     Returns:
@@ -40,9 +77,11 @@ def export(
 
     Raises:
         InputError: no such format, station, option or ending of a file, several stations for a format that holds one, a
-            calibration that cannot be said in the format, or a file that cannot be written.
+            calibration that cannot be said in the format, or only with more than `max_loss_mm`, or a file that cannot
+            be written.
     """
     exported = prepare_export(calibration, to, path, stations, options)
+    exported.require_loss_mm(max_loss_mm)
     exported.save(path)
     return exported
 
@@ -61,6 +100,68 @@ def prepare_export(
             read_bytes(path) if form.edits and path.exists() else None,
         )
     )
+
+
+def read_foreign(path: str | Path, form: str | None = None, **options: Any) -> Calibration | Observations:
+    """What a file of another program holds.
+
+    Args:
+        form: name of the format, by default the one that the file's ending and content tell.
+        options: the format's own.
+
+    Raises:
+        InputError: one line that names the file, and what is wrong with it.
+    """
+    from ceres_cal.observations import Observations
+
+    path = Path(path)
+    content = b"" if path.is_dir() else read_bytes(path)
+    chosen = _import_format(path, content, form)
+    with naming(path):
+        made = chosen.read(ImportRequest(path, content, chosen.options(**_known_options(chosen, options))))
+        if isinstance(made, Observations):
+            made.require_inside()
+    return made
+
+
+def import_calibration(path: str | Path, form: str | None = None, **options: Any) -> Calibration:
+    """The calibration that a file of another program holds: see `read_foreign`.
+
+    Raises:
+        InputError: it holds observations.
+    """
+    from ceres_cal.calibration import Calibration
+
+    given = read_foreign(path, form, **options)
+    if not isinstance(given, Calibration):
+        raise InputError(f"{path}: holds observations, not cameras: calibrate them")
+    return given
+
+
+def import_observations(path: str | Path, form: str | None = None, **options: Any) -> Observations:
+    """The observations that a file of another program holds: see `read_foreign`.
+
+    Raises:
+        InputError: it holds cameras.
+    """
+    from ceres_cal.observations import Observations
+
+    given = read_foreign(path, form, **options)
+    if not isinstance(given, Observations):
+        raise InputError(f"{path}: holds cameras, not observations")
+    return given
+
+
+def _import_format(path: Path, content: bytes, name: str | None) -> ImportFormat:
+    known = ", ".join(IMPORT_FORMATS)
+    if name is not None:
+        if name not in IMPORT_FORMATS:
+            raise InputError(f"there is no format {name!r} to read: choose one of {known}")
+        return IMPORT_FORMATS[name]
+    for form in IMPORT_FORMATS.values():
+        if (path.name.endswith(form.endings) if form.endings else path.is_dir()) and form.recognises(content):
+            return form
+    raise InputError(f"{path}: of no format that is known by its ending and content: name one of {known}")
 
 
 def _stations(calibration: Calibration, form: ExportFormat, names: Sequence[str] | None) -> tuple[str, ...]:
@@ -82,7 +183,7 @@ def _ending(form: ExportFormat, path: Path) -> str:
     return max(endings, key=len, default="")
 
 
-def _known_options(form: ExportFormat, options: Mapping[str, Any]) -> Mapping[str, Any]:
+def _known_options(form: ExportFormat | ImportFormat, options: Mapping[str, Any]) -> Mapping[str, Any]:
     known = [one.name for one in fields(form.options)]
     for name in options:
         if name not in known:

@@ -89,10 +89,15 @@ def write_equations(observations: Observations, sights: Sights, estimate: Estima
     Raises:
         SolutionError: there is none.
     """
-    finite = np.all(np.isfinite(there.points), axis=1), np.isfinite(there.curves)
-    sights = sights.used(*finite)
+    x, y = there.points.T
+    sights = sights.used(np.isfinite(x + y), np.isfinite(there.curves))
     if not len(sights):
         raise SolutionError("the calibration can show none of the observations: give those it was made from")
+    return equations_of(observations, sights, estimate, there)
+
+
+def equations_of(observations: Observations, sights: Sights, estimate: Estimate, there: Residuals) -> Equations:
+    """The equations of some sights, all of whose residuals are finite."""
     poses = estimate.pose_stack(sights.keys)
     parts = [
         part
@@ -109,10 +114,17 @@ def write_equations(observations: Observations, sights: Sights, estimate: Estima
         order = np.argsort(columns["sight"], kind="stable")
         columns = {name: column[order] for name, column in columns.items()}
     bounds = np.searchsorted(columns["sight"], np.arange(len(sights) + 1))
-    view = np.concatenate([observations.points.view, observations.curves.view])
-    columns["view"] = view[columns["observation"]].astype(np.int64)
     columns["is_curve"] = columns["observation"] >= len(observations.points)
-    return Equations(sights=sights, poses=poses, bounds=bounds, **columns)
+    view = of_observations(columns["observation"], observations.points.view, observations.curves.view)
+    return Equations(sights=sights, poses=poses, bounds=bounds, view=view.astype(np.int64), **columns)
+
+
+def of_observations(numbers: Indices, points: AnyArray, curves: AnyArray) -> AnyArray:
+    """(E,) values of points (N,) and of curve observations (M,) by the number of the observation."""
+    is_curve = numbers >= len(points)
+    values = np.empty(len(numbers), dtype=points.dtype)
+    values[~is_curve], values[is_curve] = points[numbers[~is_curve]], curves[numbers[is_curve] - len(points)]
+    return values
 
 
 def _of_camera(

@@ -22,6 +22,10 @@ from ceres_cal.observations.sights import SightKey
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Lens, lens_class, make_lens
 
+AUTO = "auto"
+"""The lens that the data ask for: which it is, a calibration says in its options (`ceres_cal.lens_choice`)."""
+OF_PIXELS = ("phi", "aspect", "cx", "cy")
+"""The intrinsics that every camera has, in the order of the solver's vector."""
 LOSSES = ("trivial", "huber", "soft_l1", "cauchy", "tukey")
 
 
@@ -30,7 +34,8 @@ class Options:
     """What to solve for and how.
 
     Attributes:
-        lens: one of `scene.lens.LENSES`; powers: of a lens that leaves the choice, as "radial" does.
+        lens: one of `scene.lens.LENSES`, or "auto": the one that the data ask for. powers: of a lens that leaves the
+            choice, as "radial" does.
         free_principal_point: else it is held at the image centre, or where `fixed` says.
         free_aspect: whether fy / fx is free; else 1, or what `fixed` says.
         fixed: numbers held, by name: phi, aspect, cx, cy (px) and the lens's coefficients in the units of the files.
@@ -64,15 +69,17 @@ class Options:
     threads: int = 0
 
     def __post_init__(self) -> None:
-        lens_class(self.lens)
+        if self.lens != AUTO:
+            lens_class(self.lens)
         if self.loss not in LOSSES:
             raise InputError(f"unknown loss {self.loss!r}: choose one of {', '.join(LOSSES)}")
         if self.noise_scale not in ("estimate", "stated"):
             raise InputError(f"noise_scale must be 'estimate' or 'stated', not {self.noise_scale!r}")
-        names = intrinsic_names(self.blank_lens)
+        names = self.intrinsic_names
         for name, value in self.fixed.items():
             if name not in names:
-                raise InputError(f"cannot fix {name!r}: the {self.lens} lens has {', '.join(names)}")
+                which = "a lens that is still to be chosen" if self.lens == AUTO else f"the {self.lens} lens"
+                raise InputError(f"cannot fix {name!r}: {which} has {', '.join(names)}")
             if not np.isfinite(value):
                 raise InputError(f"cannot fix {name} at {value}: give a finite number")
         for name in ("loss_scale", "reject_sigma", "max_iterations"):
@@ -80,6 +87,11 @@ class Options:
                 raise InputError(f"{name} must be above 0, not {getattr(self, name)}")
         if self.threads < 0:
             raise InputError(f"threads must be 0 (to choose) or above, not {self.threads}")
+
+    @cached_property
+    def intrinsic_names(self) -> tuple[str, ...]:
+        """What the camera can be told of beforehand: of a lens that is still to be chosen no coefficients."""
+        return OF_PIXELS if self.lens == AUTO else intrinsic_names(self.blank_lens)
 
     @cached_property
     def blank_lens(self) -> Lens:
@@ -90,7 +102,7 @@ class Options:
 
 def intrinsic_names(lens: Lens) -> tuple[str, ...]:
     """Names of a camera's intrinsics in the order of the solver's vector."""
-    return ("phi", "aspect", "cx", "cy", *lens.names)
+    return (*OF_PIXELS, *lens.names)
 
 
 def unit_px(camera: Camera) -> float:

@@ -251,15 +251,15 @@ def _apart(case: _Case, used: Sights, least: float, estimate: Estimate) -> tuple
     freedom = max(used.equations - len(case.station_keys), 0) + _USUAL_EQUATIONS
     noise = math.sqrt((least + _USUAL_EQUATIONS) / freedom)
     problem = case.problem(used, case.station_keys, noise)
-    told = information(problem, estimate)
-    seen, keys = told.points + told.curves, told.shared.keys
+    reduced = information(problem, estimate)
+    seen, keys = reduced.points + reduced.curves, reduced.shared.keys
     # At its end the solve's priors pull as much as the observations do, at the noise that they had there.
-    pull, offsets = case.known(used, case.station_keys, estimate, keys)
-    best = seen.inverse @ (pull.matrix @ offsets) / noise**2
-    scatter = measure_scatter(case.observed, problem, residuals(case.observed, used, estimate), estimate, told)
+    earlier, offsets = case.known(used, case.station_keys, estimate, keys)
+    best = seen.inverse @ (earlier.matrix @ offsets) / noise**2
+    scatter = measure_scatter(case.observed, problem, residuals(case.observed, used, estimate), estimate, reduced)
     if scatter is not None:
-        seen = Information(keys, scatter.widened(told.shared).matrix - pull.matrix)
-        freedom = 1.0 / (1.0 / freedom + scatter.found.inverse_freedom)
+        seen = Information(keys, scatter.widened(reduced.shared).matrix - earlier.matrix)
+        freedom = 1.0 / (1.0 / freedom + scatter.dependence.inverse_freedom)
     before = case.calibration.uncertainty.posterior.degrees_of_freedom
     old = Statement(*case.known(used, (), estimate, keys), before)
     return noise, contrast(old, Statement(seen, -best, freedom), case.tested)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -15,6 +15,8 @@ from ceres_cal.observations.files import Content
 _MARGIN_PX = 1.5
 # Of a camera's observations: more of them outside, and its image has another size.
 _FEW = 0.01
+# The largest playing fields end at 60 m; the smallest board in millimetres reaches as far.
+_LARGE_M = 100.0
 
 
 def stray_pixels(content: Content) -> tuple[str, ...]:
@@ -85,3 +87,12 @@ def _first(content: Content, points: Mask, curves: Mask) -> str:
     kind = "curve" if isinstance(column, Curves) else "point"
     feature, (x, y) = content.feature_name(kind, row), column.pixels[row]
     return f"{view_label(column.view[row], content.views)}, {kind} {feature!r}: pixel ({x:.1f}, {y:.1f})"
+
+
+def odd_sizes(content: Content) -> Iterator[str]:
+    """A line for each target so large that its numbers may be millimetres."""
+    for name, target in content.targets.items():
+        starts = target.tracks[0, :, 0]  # of lines, and the centres of circles
+        reach_m = max(np.max(np.abs(places), initial=0.0) for places in (target.point_array, starts))
+        if reach_m > _LARGE_M:
+            yield f"target {name!r} reaches {reach_m:.0f} m from its origin: are its numbers metres, or millimetres?"

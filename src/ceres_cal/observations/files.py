@@ -1,20 +1,32 @@
-"""Observations in JSON and NPZ files (design, section 9): every number comes back exactly."""
+"""Observations in JSON and NPZ files (docs/files.md): every number comes back exactly."""
 
 from __future__ import annotations
 
 import io
-import zipfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
 
+from ceres_cal.base.archives import Column, read_npz
 from ceres_cal.base.arrays import AnyArray, Codes
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.files import check_header, convert, parse_json, read_bytes, write_bytes
+from ceres_cal.base.files import (
+    PIXEL_ORIGIN,
+    UNITS,
+    PixelOrigin,
+    Units,
+    check_header,
+    convert,
+    decode_json,
+    parse_json,
+    read_bytes,
+    write_bytes,
+)
 from ceres_cal.observations.columns import (
     NO_CURVES,
     NO_POINTS,
@@ -27,9 +39,15 @@ from ceres_cal.observations.columns import (
     choices,
     view_label,
 )
-from ceres_cal.scene.targets import SIDES, Target, target_from_spec
+from ceres_cal.scene.targets import SIDES, Target, targets_from_specs
 
 FORMAT, VERSION = "ceres-cal/observations", 1
+_COLUMNS = {"header": Column(np.uint8, ("bytes",))} | {
+    f"{kind}_{name}": Column(dtype, (kind, 2) if name == "pixels" else (kind,))
+    for kind in ("points", "curves")
+    for name, dtype in TYPES.items()
+    if (kind, name) != ("points", "side")
+}
 _SIDE_NAMES = {value: name for name, value in SIDES.items()}
 
 
@@ -43,6 +61,7 @@ class Content:
     points: Points
     curves: Curves
     priors: tuple[Prior, ...] = ()
+    notes: Mapping[str, Any] = field(default_factory=dict)
 
     def feature_name(self, kind: str, row: int) -> str:
         """Name of the feature that observation `row` of the points (kind "point") or curves ("curve") shows."""
@@ -56,6 +75,17 @@ class _PointsFile(msgspec.Struct, forbid_unknown_fields=True):
     features: list[str]
     pixels: list[tuple[float, float]]
     sigma_px: float | list[float] = 1.0
+    counts: list[int] | msgspec.UnsetType = msgspec.UNSET
+
+    def each(self, here: str) -> list[str]:
+        """The feature of each pixel; InputError where `counts` does not fit."""
+        if not isinstance(self.counts, list):
+            return self.features
+        if len(self.counts) != len(self.features) or min(self.counts, default=1) < 1:
+            raise InputError(f"{here}: counts must be a whole number above 0 for each of its features")
+        if sum(self.counts) != len(self.pixels):
+            raise InputError(f"{here}: counts add up to {sum(self.counts)}, but there are {len(self.pixels)} pixels")
+        return [name for name, count in zip(self.features, self.counts, strict=True) for _ in range(count)]
 
 
 class _CurvesFile(_PointsFile, forbid_unknown_fields=True):
@@ -80,25 +110,29 @@ class _CameraFile(msgspec.Struct, forbid_unknown_fields=True):
     image_size: tuple[int, int]
 
 
-class _ObservationsFile(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
+class ObservationsFile(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
+    """Observations, but for the columns of an NPZ."""
+
     format: str
     version: int
-    units: str = "metres, radians, pixels"
-    pixel_origin: str = "centre of the top-left pixel"
+    units: Units = UNITS
+    pixel_origin: PixelOrigin = PIXEL_ORIGIN
     targets: dict[str, Any]
     cameras: dict[str, _CameraFile]
     views: list[_ViewFile]
     priors: list[dict[str, Any]] = []
+    notes: dict[str, Any] | msgspec.UnsetType = msgspec.UNSET
 
     def content(self) -> Content:
         """All but the columns; InputError naming the place."""
         return Content(
-            {name: target_from_spec(spec, f"target {name!r}") for name, spec in self.targets.items()},
+            targets_from_specs(self.targets),
             {name: camera.image_size for name, camera in self.cameras.items()},
             tuple(entry.view() for entry in self.views),
             NO_POINTS,
             NO_CURVES,
             tuple(prior_from_json(entry, f"prior {i}") for i, entry in enumerate(self.priors)),
+            self.notes if isinstance(self.notes, dict) else {},
         )
 
 
@@ -118,15 +152,16 @@ def write_content(content: Content, path: Path) -> None:
         raise InputError(f"{path}: observations are written as .json or .npz: give one of these endings")
 
 
-def header_of(content: Content) -> _ObservationsFile:
+def header_of(content: Content) -> ObservationsFile:
     """Everything but the columns, as a file has it."""
-    return _ObservationsFile(
+    return ObservationsFile(
         format=FORMAT,
         version=VERSION,
         targets={name: target.spec for name, target in content.targets.items()},
         cameras={name: _CameraFile(size) for name, size in content.cameras.items()},
         views=[_ViewFile(**vars(view)) for view in content.views],
         priors=[prior_to_json(prior) for prior in content.priors],
+        notes=dict(content.notes) or msgspec.UNSET,
     )
 
 
@@ -169,11 +204,10 @@ def _numbers(value: Any, size: int, where: str, *, spread: bool = False) -> tupl
 
 
 def _from_json(content: bytes, where: str) -> Content:
-    try:
-        data = msgspec.json.decode(content, type=_ObservationsFile)  # several times faster than by way of plain data
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+    data = decode_json(content, ObservationsFile, where)
+    if data is None:
         plain = check_header(parse_json(content, where), where, FORMAT, VERSION)
-        data = convert(plain, _ObservationsFile, where)
+        data = convert(plain, ObservationsFile, where)
     check_header({"format": data.format, "version": data.version}, where, FORMAT, VERSION)
     header = data.content()
     targets, views = header.targets, header.views
@@ -208,12 +242,14 @@ def _columns(
     view, feature, sigma = [], [], []
     pixels: list[tuple[float, float]] = []
     for number, entry in entries:
-        here, count = view_label(number, views), len(entry.features)
+        here = view_label(number, views)
+        features = entry.each(here)
+        count = len(features)
         if len(entry.pixels) != count:
             raise InputError(f"{here}: {count} {kind} features but {len(entry.pixels)} pixels")
         names = index[views[number].target]
         try:
-            feature.append([names[name] for name in entry.features])
+            feature.append([names[name] for name in features])
         except KeyError as error:
             raise InputError(
                 f"{here}: {kind} feature {error.args[0]!r} is unknown in target {views[number].target!r}: "
@@ -233,10 +269,10 @@ def _columns(
 
 
 def _sides(entry: _CurvesFile, here: str) -> list[int]:
-    side = entry.side or "centre"
-    names = side if isinstance(side, list) else [side] * len(entry.features)
-    if len(names) != len(entry.features):
-        raise InputError(f"{here}: {len(entry.features)} curve features but {len(names)} sides")
+    side, count = entry.side or "centre", len(entry.each(here))
+    names = side if isinstance(side, list) else [side] * count
+    if len(names) != count:
+        raise InputError(f"{here}: {count} curve features but {len(names)} sides")
     for name in names:
         if name not in SIDES:
             raise InputError(f"{here}: side {name!r} is unknown: {', '.join(SIDES)}")
@@ -255,11 +291,13 @@ def _to_json(content: Content) -> bytes:
         if len(p):
             entry.points = _PointsFile(*_features(content.points, p, target.point_names))
         if len(c):
-            side = _side_names(content.curves.side[c])
-            entry.curves = _CurvesFile(*_features(content.curves, c, target.curve_names), side)
-    plain = msgspec.structs.asdict(data)
+            features, pixels, sigma_px = _features(content.curves, c, target.curve_names)
+            runs = [(name, len(list(same))) for name, same in groupby(features)]
+            once, counts = [name for name, _ in runs], [count for _, count in runs]
+            entry.curves = _CurvesFile(once, pixels, sigma_px, counts, _side_names(content.curves.side[c]))
+    plain = {name: value for name, value in msgspec.structs.asdict(data).items() if value is not msgspec.UNSET}
     del plain["views"]
-    head = msgspec.json.format(msgspec.json.encode(plain), indent=1).rstrip(b"}\n")
+    head = msgspec.json.format(msgspec.json.encode(plain), indent=1).removesuffix(b"\n}")
     lines = b",\n  ".join(msgspec.json.encode(entry) for entry in data.views)
     return head + b',\n "views": [\n  ' + lines + b"\n ]\n}\n"
 
@@ -291,42 +329,12 @@ def _to_npz(content: Content) -> bytes:
     return stream.getvalue()
 
 
-def _arrays(content: bytes, where: str) -> dict[str, AnyArray]:
-    reason = "it is cut short or no NPZ file"
-    try:
-        if zipfile.is_zipfile(io.BytesIO(content)):
-            with np.load(io.BytesIO(content), allow_pickle=False) as archive:
-                return {name: archive[name] for name in archive.files}
-    except Exception as error:  # zipfile, zlib and NumPy raise a dozen kinds for a broken archive
-        if "allow_pickle" in str(error):
-            reason = "it holds pickled objects"
-    raise InputError(f"{where}: cannot be read, {reason}: write it again with Observations.save")
-
-
-def _taken(arrays: dict[str, AnyArray], kind: str, names: Sequence[str], where: str) -> dict[str, Any]:
-    columns = {}
-    for name in names:
-        array, dtype, ndim = arrays.pop(f"{kind}_{name}", None), np.dtype(TYPES[name]), 2 if name == "pixels" else 1
-        if array is None:
-            raise InputError(f"{where}: column {kind}_{name} is missing")
-        if array.dtype != dtype or array.ndim != ndim:
-            raise InputError(
-                f"{where}: column {kind}_{name} must be {dtype} in {ndim} dimensions, not {array.dtype} in {array.ndim}"
-            )
-        columns[name] = array
-    return columns
-
-
 def _from_npz(packed: bytes, where: str) -> Content:
-    arrays = _arrays(packed, where)
-    header = arrays.pop("header", None)
-    if header is None or header.dtype != np.uint8:
-        raise InputError(f"{where}: no header: this is not a file of observations")
-    plain = check_header(parse_json(header.tobytes(), where), where, FORMAT, VERSION)
-    content = convert(plain, _ObservationsFile, where).content()
-    names = ("view", "feature", "pixels", "sigma_px")
-    points = Points(**_taken(arrays, "points", names, where))
-    curves = Curves(**_taken(arrays, "curves", (*names, "side"), where))
-    if arrays:
-        raise InputError(f"{where}: unknown column {min(arrays)!r}")
-    return replace(content, points=points, curves=curves)
+    arrays = read_npz(packed, _COLUMNS, where)
+    plain = check_header(parse_json(arrays.pop("header").tobytes(), where), where, FORMAT, VERSION)
+    content = convert(plain, ObservationsFile, where).content()
+    points, curves = (
+        {name.removeprefix(kind): array for name, array in arrays.items() if name.startswith(kind)}
+        for kind in ("points_", "curves_")
+    )
+    return replace(content, points=Points(**points), curves=Curves(**curves))

@@ -6,7 +6,7 @@ The row of an observation in `points` or `curves` is its permanent id: nothing h
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -14,17 +14,19 @@ from typing import Any
 
 import msgspec
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ceres_cal.base.arrays import Mask
 from ceres_cal.base.errors import InputError, naming
-from ceres_cal.observations.bounds import stray_pixels
+from ceres_cal.observations.bounds import odd_sizes, stray_pixels
 from ceres_cal.observations.columns import Columns, Curves, Points, Prior, View, choices, taken, view_label
 from ceres_cal.observations.copies import Copies, find_copies
 from ceres_cal.observations.files import Content, header_of, read_content, write_content
+from ceres_cal.observations.from_points import gathered
 from ceres_cal.scene.targets import Target
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Observations(Content):
     """Everything that was observed.
 
@@ -36,12 +38,16 @@ class Observations(Content):
             pixel. `sigma_px` is the standard deviation of each coordinate, 1 where nobody stated one (only ratios
             matter then: the solve estimates the scale).
         curves: curve observations, in the order of their views; `sigma_px` is that of the distance to the curve.
-        priors: what is known beforehand.
+        priors: what is known beforehand. notes: whatever somebody wants to keep with them, plain data.
 
     Raises:
         InputError: on construction, naming the view and the feature: a name that is not there, a number that is not
             finite, a camera without any observation.
     """
+
+    def __repr__(self) -> str:
+        counts = f"{len(self.points)} points, {len(self.curves)} curve observations in {len(self.views)} views"
+        return f"Observations({counts} of {', '.join(self.stations) or 'nothing'})"
 
     def __post_init__(self) -> None:
         self._check_names()
@@ -54,11 +60,37 @@ class Observations(Content):
         for prior in self.priors:
             self.require_owner(prior)
 
+    @classmethod
+    def from_points(
+        cls,
+        pixels: ArrayLike | Sequence[ArrayLike] | Mapping[str, ArrayLike],
+        points: Target | ArrayLike,
+        image_size: tuple[int, int],
+        *,
+        camera: str = "camera",
+        sigma_px: float = 1.0,
+        moves: bool | None = None,
+    ) -> Observations:
+        """Of one camera that saw the points of one target, in one frame or in many.
+
+        Args:
+            pixels: of one frame (N, 2) or OpenCV's (N, 1, 2), a list of those, or by name of the frame; a row for each
+                of the points, NaN where it was not seen.
+            points: a target, such as `checkerboard(9, 6, 0.025)` with corners row by row, or places (N, 3) or (N, 2) m.
+            image_size: (width, height) px.
+            moves: whether it lay elsewhere in every frame; by default as the target has it. Places do not move: they
+                are the world.
+
+        Raises:
+            InputError: shapes or counts that do not fit; naming the frame.
+        """
+        return cls(**vars(gathered(pixels, points, image_size, camera, sigma_px, moves)))
+
     # ---- files --------------------------------------------------------------------------------------------------
 
     @classmethod
     def load(cls, path: str | Path) -> Observations:
-        """Read `.json` or `.npz` (design, section 9).
+        """Read `.json` or `.npz` (docs/files.md).
 
         Raises:
             InputError: one line that names the file, the view and the feature; also for pixels outside their images.
@@ -75,7 +107,7 @@ class Observations(Content):
     @cached_property
     def digest(self) -> str:
         """SHA-256 of the content, the same for the JSON and the NPZ file: where a calibration came from."""
-        content = hashlib.sha256(msgspec.json.encode(header_of(self)))
+        content = hashlib.sha256(msgspec.json.encode(header_of(replace(self, notes={}))))
         for column in (self.points, self.curves):
             for array in vars(column).values():
                 content.update(np.ascontiguousarray(array).data)
@@ -90,8 +122,9 @@ class Observations(Content):
 
     @cached_property
     def warnings(self) -> tuple[str, ...]:
-        """What to know of the observations before using them, each one line: strays outside an image, copies."""
-        return (*self.require_inside(), *self.copies.words(self.views, (self.points, self.curves)))
+        """What to know of the observations first, a line each: strays outside an image, odd sizes, copies."""
+        copied = self.copies.words(self.views, (self.points, self.curves))
+        return (*self.require_inside(), *odd_sizes(self), *copied)
 
     @cached_property
     def shown_views(self) -> tuple[View, ...]:
@@ -182,10 +215,11 @@ class Observations(Content):
         self._check_numbers(kind, column)
 
     def _check_numbers(self, kind: str, column: Columns) -> None:
+        sigma = np.where(column.sigma_px > 0.0, column.sigma_px, np.inf)
         side = column.side if isinstance(column, Curves) else np.zeros(1, np.int8)
         for what, bad in (
             ("its pixel is not finite", ~np.all(np.isfinite(column.pixels), axis=1)),
-            ("its sigma_px must be positive and finite", ~(np.isfinite(column.sigma_px) & (column.sigma_px > 0.0))),
+            ("its sigma_px must be positive and finite, 1e-12 to 1e12", ~(np.abs(np.log10(sigma)) <= 12.0)),
             ("its side must be 0, 1 or -1", (side < -1) | (side > 1)),
         ):
             if np.any(bad):

@@ -11,6 +11,7 @@ import numpy as np
 from ceres_cal.base.arrays import Array32, Mask
 from ceres_cal.base.errors import InputError, NothingShownError, naming
 from ceres_cal.base.progress import ImageProgress
+from ceres_cal.base.words import frame_of
 from ceres_cal.detect.crossings import find_crossings
 from ceres_cal.detect.images import read_grey
 from ceres_cal.detect.lines import Lines
@@ -99,7 +100,7 @@ def detect_field(
     missed = tuple((path, result.reason) for path, result in results.items() if result.followed is None)
     if not followed:
         raise NothingShownError(f"no field in any of {len(paths)} images; {missed[0][0]}: {missed[0][1]}", missed)
-    parts = [_observations(Path(path).stem, one, target, options) for path, one in followed.items()]
+    parts = [_observations(frame_of(path), one, target, options) for path, one in followed.items()]
     searched = {path: result for path, result in results.items() if result.followed is not None and result.ways}
     return FieldDetections(combine(parts), followed, missed, searched)
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import Mask
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.words import frame_of
 from ceres_cal.calibration import Calibration
 from ceres_cal.observations import Columns, Observations
 from ceres_cal.pictures.model import Model, model_seen
@@ -72,8 +73,8 @@ def photographs_by_frame(images: Iterable[Path]) -> dict[str, Path]:
     """
     by_frame: dict[str, Path] = {}
     for path in images:
-        if by_frame.setdefault(path.stem, path) != path:
-            raise InputError(f"{path}: has the same name as {by_frame[path.stem]}: give the images of one folder")
+        if by_frame.setdefault(frame_of(path), path) != path:
+            raise InputError(f"{path}: has the same name as {by_frame[frame_of(path)]}: give the images of one folder")
     return by_frame
 
 

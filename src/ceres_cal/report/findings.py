@@ -14,6 +14,8 @@ from ceres_cal.report.page import Card, Chapter, Piece, Table, Text
 
 _MOST_CARDS = 8
 
+CHOSEN_BY = "the simplest within 1.5 standard errors of the least error; radial 2,3 wins ties"
+
 
 def findings(material: Material) -> Chapter:
     """Findings, the largest first, the noise that is left, and the held-out errors where they were computed."""
@@ -83,7 +85,7 @@ def _noise(noise: tuple[Noise, ...]) -> Table:
 
 
 def _held_out(choice: Choice) -> tuple[Table, Text]:
-    rule = f"{sentence(chosen_lens(choice))}: the fewest coefficients within one standard error of the least error."
+    rule = f"{sentence(chosen_lens(choice))}: {CHOSEN_BY}."
     thinned = f" On {100.0 * choice.thinned:.0f} % of the observations." if choice.thinned < 1.0 else ""
     rows = tuple(_candidate(choice, number, one) for number, one in enumerate(choice.candidates))
     head = ("lens", "held-out px", "mm", "fit px", "")

@@ -8,6 +8,7 @@ import numpy as np
 
 from ceres_cal.base.transforms import euler_from_rotation
 from ceres_cal.base.words import DASH, at_precision, bounds_text, fixed, grouped, mm, powered, short
+from ceres_cal.calibration import LensChoice
 from ceres_cal.model.parameters import anchored_stations
 from ceres_cal.report.material import Material
 from ceres_cal.report.page import BulletList, Chapter, Piece, Table, Text
@@ -29,10 +30,25 @@ def numbers(material: Material) -> Chapter:
             "means to 1 % or better, weak to 30 %."
         )
     ]
+    pieces += _lens_choice(material.calibration.lens_choice)
     pieces += [_camera(material, name) for name in material.observations.cameras]
     pieces += [_station(material, name) for name in material.observations.stations]
     pieces += [*_as_built(material), *_weak(material), *_seams(material), _fit(material)]
     return Chapter("numbers", "The numbers", tuple(pieces))
+
+
+def _lens_choice(choice: LensChoice | None) -> Iterator[Piece]:
+    """What was chosen, over what, by how much."""
+    if choice is None:
+        return
+    rows = tuple(
+        (one.label, str(one.coefficients), fixed(one.rms_px, 4), fixed(one.worse, 1, "+"), "")
+        if one.rms_px is not None and one.worse is not None
+        else (one.label, str(one.coefficients), DASH, DASH, one.failed)
+        for one in choice.tried
+    )
+    head = ("lens", "coefficients", "held-out px", "worse, standard errors", "")
+    yield Table(head, rows, f"The lens that the data ask for: {choice.chosen}", stacked=True)
 
 
 def _camera(material: Material, name: str) -> Table:

@@ -12,8 +12,8 @@ import numpy as np
 from ceres_cal.base.errors import CalibrationError
 from ceres_cal.calibration import Calibration
 from ceres_cal.diagnostics import Diagnosis, diagnose
-from ceres_cal.diagnostics.held_out import thinned
 from ceres_cal.observations import Observations
+from ceres_cal.observations.thinning import thinned
 from ceres_cal.scene.heights import HEIGHTS_M
 from ceres_cal.scene.targets import Target
 from ceres_cal.uncertainty import Disagreement, FieldMap, Uncertainty, Verdict

@@ -11,10 +11,19 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ceres_cal.base.arrays import Array, Mask
+from ceres_cal.base.arrays import Array, Array32, Mask
 from ceres_cal.base.errors import DegenerateError, InputError
-from ceres_cal.base.transforms import Pose
-from ceres_cal.scene.lens import Lens
+from ceres_cal.base.transforms import Pose, rotation_log
+from ceres_cal.scene.foreign import (
+    FISHEYE,
+    LARGEST_PX,
+    OPENCV_MODELS,
+    ForeignCamera,
+    OpenCvCamera,
+    image_grid,
+    lens_fitted,
+)
+from ceres_cal.scene.lens import KannalaBrandt, Lens
 
 
 def _rows(values: ArrayLike, columns: int, name: str) -> Array:
@@ -24,7 +33,10 @@ def _rows(values: ArrayLike, columns: int, name: str) -> Array:
     return rows
 
 
-@dataclass(frozen=True)
+_FAR_M = 10.0  # a height of as many metres, far over its camera, is one in millimetres
+
+
+@dataclass(frozen=True, repr=False)
 class Camera:
     """One camera at one pose.
 
@@ -47,7 +59,7 @@ class Camera:
     def __post_init__(self) -> None:
         width, height = (int(s) for s in self.image_size)
         cx, cy = (float(c) for c in self.principal_point)
-        if width < 1 or height < 1:
+        if not (1 <= width <= LARGEST_PX and 1 <= height <= LARGEST_PX):
             raise InputError(f"image size must be two positive whole numbers, not {self.image_size}")
         numbers = (self.phi, self.aspect, cx, cy, *self.lens.values)
         if not np.all(np.isfinite(numbers)) or self.phi <= 0.0 or self.aspect <= 0.0:
@@ -59,6 +71,10 @@ class Camera:
         object.__setattr__(self, "phi", float(self.phi))
         object.__setattr__(self, "aspect", float(self.aspect))
         object.__setattr__(self, "principal_point", (cx, cy))
+
+    def __repr__(self) -> str:
+        (width, height), place = self.image_size, ", ".join(f"{x:.2f}" for x in self.position)
+        return f"Camera({width} x {height} px, phi {self.phi:.1f} px, {self.lens.kind}, at ({place}) m)"
 
     @property
     def position(self) -> Array:
@@ -110,10 +126,13 @@ class Camera:
         return np.column_stack([x - cx, (y - cy) / self.aspect])  # by columns: rows of two are slow to walk
 
     def project(self, points_world: ArrayLike) -> Array:
-        """Points (N, 3) m -> pixels (N, 2); NaN behind the camera or past the lens's monotone radius.
+        """Points (N, 3) m -> pixels (N, 2), or one (3,) -> (2,); NaN behind the camera or past the lens's monotone
+        radius.
 
         A pixel may lie outside the image: nothing is cut off.
         """
+        if np.ndim(points_world) == 1:
+            return np.asarray(self.project(np.asarray(points_world)[None])[0])
         with np.errstate(invalid="ignore"):  # infinite points
             rays = self.cam_from_world.transform(_rows(points_world, 3, "points_world"))
         return np.asarray(self.lens.distort(rays, self.phi) * (1.0, self.aspect) + self.principal_point)
@@ -123,11 +142,22 @@ class Camera:
         return self.lens.undistort(self.offsets(pixels), self.phi)
 
     def locate(self, pixels: ArrayLike, height_m: float = 0.0) -> Array:
-        """Pixels (N, 2) -> where their rays meet the plane z = height_m, (N, 2) m (paper, sections 3.4 and 4).
+        """Pixels (N, 2), or one (2,), -> where their rays meet the plane z = height_m, (N, 2) or (2,) m (paper,
+        sections 3.4 and 4).
 
         NaN for a ray that does not meet the plane in front of the camera. How well the answer is known the number does
         not tell: see the calibration's uncertainty.
+
+        Raises:
+            InputError: a height far over the camera: it is one in metres.
         """
+        if abs(height_m) > max(_FAR_M, 2.0 * abs(self.position[2])):
+            raise InputError(
+                f"height_m {height_m:g} is in metres, and the camera's is {self.position[2]:.2f}: "
+                f"for {height_m:g} mm give {1e-3 * height_m:g}"
+            )
+        if np.ndim(pixels) == 1:
+            return np.asarray(self.locate(np.asarray(pixels)[None], height_m)[0])
         directions = self.rays(pixels) @ self.cam_from_world.rotation
         drop = height_m - self.position[2]
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -152,6 +182,106 @@ class Camera:
         if abs(self.position[2] - height_m) < 1e-9:  # the determinant of H
             raise DegenerateError(f"the camera lies in the plane z = {height_m} m, edge-on: ask for another height")
         return np.asarray(np.linalg.inv(self.homography(height_m)))
+
+    def undistort_maps(
+        self, matrix: ArrayLike | None = None, size: tuple[int, int] | None = None
+    ) -> tuple[Array32, Array32]:
+        """map_x, map_y (height, width) for `cv2.remap`, of whatever lens; NaN where it has no answer.
+
+        Args:
+            matrix: K (3, 3) of the straight image, by default the camera's own. size: (width, height), too.
+        """
+        inverse = np.linalg.inv(self.matrix if matrix is None else np.asarray(matrix, dtype=float))
+        width, height = size or self.image_size
+        pixels = np.stack([*np.meshgrid(np.arange(width), np.arange(height)), np.ones((height, width))], axis=-1)
+        places = self.at(Pose.identity()).project(pixels.reshape(-1, 3) @ inverse.T).reshape(height, width, 2)
+        return places[..., 0].astype(np.float32), places[..., 1].astype(np.float32)
+
+    # ---- in the words of others --------------------------------------------------------------------------------------
+
+    def to_foreign(self, *models: str) -> ForeignCamera:
+        """The camera in one of these models (see `ForeignCamera`): exactly where one holds its lens, else as the best
+        fit over the image.
+        """
+        blanks = []
+        for model in models:
+            count = 4 if model == FISHEYE else OPENCV_MODELS[model]
+            focal, values = (self.phi, self.phi * self.aspect), (*self.lens.values, *[0.0] * count)[:count]
+            same = ForeignCamera(self.image_size, focal, self.principal_point, model, values, self.cam_from_world)
+            if same.lens == self.lens:
+                return same
+            blanks.append(replace(same, coefficients=(0.0,) * count))
+        pixels = image_grid(self.image_size)
+        rays = self.rays(pixels)
+        known = np.isfinite(rays[:, 0])
+        fits = [ForeignCamera.fitted(blank, rays[known], pixels[known]) for blank in blanks]
+        return min(fits, key=lambda fit: fit.error_px[0])
+
+    def nearest(self, lens: Lens) -> Camera:
+        """The camera with another lens, its coefficients and the other intrinsics fitted over the image.
+
+        Raises:
+            InputError: that lens would fold inside the image.
+        """
+        if (lens.kind, lens.names) == (self.lens.kind, self.lens.names):
+            return self
+        focal = (self.phi, self.phi * self.aspect)
+        start = ForeignCamera(self.image_size, focal, self.principal_point, FISHEYE, (0.0,) * 4)
+        pixels = image_grid(self.image_size)
+        rays = self.rays(pixels)
+        known = rays[:, 2] > 0.0
+        fit = lens_fitted(start, lens, rays[known], pixels[known])
+        if fit is None:
+            raise InputError(f"no {lens.kind} lens is near: it would fold over inside the image")
+        return Camera(**fit[0], cam_from_world=self.cam_from_world)
+
+    @classmethod
+    def from_foreign(cls, foreign: ForeignCamera) -> tuple[Camera, tuple[float, float]]:
+        """A camera of others as ours, and by how much that misses it over the image: root mean square and largest
+        distance, px, 0 where the lens is one of ours.
+
+        Raises:
+            InputError: it shows nothing of its image.
+        """
+        pose = foreign.cam_from_world or Pose.identity()
+        lens, (fx, fy) = foreign.lens, foreign.focal
+        if lens is not None:
+            return cls(foreign.image_size, fx, foreign.centre, lens, fy / fx, pose), (0.0, 0.0)
+        intrinsics, error_px = foreign.approximated()
+        return cls(**intrinsics, cam_from_world=pose), error_px
+
+    def to_opencv(self) -> OpenCvCamera:
+        """K, coefficients, rvec and tvec as OpenCV takes them; of `radial` the best fit, with its error."""
+        fisheye = self.lens.kind == KannalaBrandt.kind
+        foreign = self.to_foreign(FISHEYE) if fisheye else self.to_foreign("opencv5", "opencv8")
+        pose = self.cam_from_world
+        vector, distortion = rotation_log(pose.rotation), np.array(foreign.coefficients)
+        return OpenCvCamera(foreign.matrix, distortion, vector, pose.translation.copy(), fisheye, foreign.error_px)
+
+    @classmethod
+    def from_opencv(
+        cls,
+        image_size: tuple[int, int],
+        matrix: ArrayLike,
+        distortion: ArrayLike,
+        rvec: ArrayLike = (0.0, 0.0, 0.0),
+        tvec: ArrayLike = (0.0, 0.0, 0.0),
+        *,
+        fisheye: bool = False,
+    ) -> Camera:
+        """A camera from OpenCV's numbers: `brown`, or `kannala-brandt` of those of its fisheye model.
+
+        Raises:
+            InputError: numbers that make no camera, or coefficients beyond k3, which no lens of ours has: read a file
+                of them, which states what the nearest camera of ours misses.
+        """
+        pose = Pose.exp(np.concatenate([np.ravel(rvec), np.ravel(tvec)]))
+        foreign = ForeignCamera.opencv(image_size, matrix, np.ravel(distortion), pose)
+        if fisheye:
+            foreign = replace(foreign, model=FISHEYE, coefficients=tuple(float(v) for v in np.ravel(distortion)))
+        if foreign.lens is None:
+            raise InputError("no lens here has OpenCV's k4 and beyond: `Camera.from_foreign` takes the nearest one")
+        return cls.from_foreign(foreign)[0]
 
 
 def in_image(pixels: Array, image_size: tuple[int, int]) -> Mask:

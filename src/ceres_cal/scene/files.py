@@ -7,9 +7,13 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from ceres_cal.base.arrays import Array
+from ceres_cal.base.errors import InputError
 from ceres_cal.base.transforms import Pose
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import make_lens
+
+_TOLERANCE = 1e-6  # numbers that somebody copied have six digits or more
 
 Vector = tuple[float, float, float]
 Matrix = tuple[Vector, Vector, Vector]
@@ -31,18 +35,26 @@ class CameraFile(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
     principal_point: tuple[float, float]
     aspect: float = 1.0
     lens: LensFile
+    camera_matrix: Matrix | msgspec.UnsetType = msgspec.UNSET
+    """K, for other programs: phi, aspect and principal point once more."""
 
     @classmethod
     def of(cls, camera: Camera) -> CameraFile:
         """As a file has it."""
         lens = LensFile(camera.lens.kind, camera.lens.powers or None, camera.lens.coefficients)
         size, centre = camera.image_size, camera.principal_point
-        return cls(image_size=size, phi=camera.phi, principal_point=centre, aspect=camera.aspect, lens=lens)
+        k = camera.matrix.tolist()
+        return cls(
+            image_size=size, phi=camera.phi, principal_point=centre, aspect=camera.aspect, lens=lens, camera_matrix=k
+        )
 
     def camera(self) -> Camera:
         """The camera, at no particular pose; InputError where it is none."""
         lens = make_lens(self.lens.kind, self.lens.powers or (2, 3), self.lens.coefficients)
-        return Camera(self.image_size, self.phi, self.principal_point, lens, self.aspect)
+        camera = Camera(self.image_size, self.phi, self.principal_point, lens, self.aspect)
+        if self.camera_matrix and not np.allclose(camera.matrix, self.camera_matrix, rtol=1e-9):
+            raise InputError("camera_matrix is another than that of phi, aspect and principal_point: correct one")
+        return camera
 
 
 class PoseFile(msgspec.Struct, forbid_unknown_fields=True):
@@ -58,7 +70,18 @@ class PoseFile(msgspec.Struct, forbid_unknown_fields=True):
 
     def pose(self) -> Pose:
         """The pose; InputError where the rotation is none."""
-        return Pose(np.array(self.rotation), np.array(self.translation_m))
+        return Pose(rotation_of(self.rotation), np.array(self.translation_m))
+
+
+def rotation_of(matrix: Matrix) -> Array:
+    """A rotation as a file has it; InputError where it is none."""
+    rotation = np.array(matrix)
+    off = max(np.max(np.abs(rotation @ rotation.T - np.eye(3))), abs(np.linalg.det(rotation) - 1.0))
+    if not off < _TOLERANCE:
+        raise InputError(
+            f"rotation is no rotation matrix: R R^T and its determinant are {off:.2g} from the identity and 1"
+        )
+    return rotation
 
 
 def camera_to_json(camera: Camera) -> dict[str, Any]:

@@ -18,7 +18,7 @@ from ceres_cal.base.transforms import Pose, euler_from_rotation, rotation_exp, r
 from ceres_cal.model.parameters import Station
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.files import CameraFile, Vector, camera_to_json
-from ceres_cal.scene.targets import target_from_spec
+from ceres_cal.scene.targets import targets_from_specs
 from ceres_cal.simulate.photography import Photography
 from ceres_cal.simulate.scene import Disturbance, Scene, ViewPlan
 from ceres_cal.simulate.simulation import OUTLIER, WRONG_LABEL, Simulation, Truth
@@ -86,7 +86,7 @@ def scene_from_json(data: Mapping[str, Any], where: str) -> tuple[Scene, Disturb
     file = convert(check_header(data, where, SCENE_FORMAT, SCENE_VERSION), _SceneFile, where)
     with naming(where):
         scene = Scene(
-            {name: target_from_spec(spec, f"target {name!r}") for name, spec in file.targets.items()},
+            targets_from_specs(file.targets),
             {name: _camera(entry, f"camera {name!r}") for name, entry in file.cameras.items()},
             {name: _station(entry, f"station {name!r}") for name, entry in file.stations.items()},
             {name: _placement(entry, f"placement {name!r}") for name, entry in file.placements.items()},

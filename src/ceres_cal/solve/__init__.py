@@ -5,6 +5,11 @@ over its free intrinsics alone; every other sight is one compressed block over i
 and its placement; each prior is one small block. What Ceres minimises is the same function either way.
 """
 
+from ceres_cal.base.native import kept_signals
+
+with kept_signals():
+    import pyceres  # noqa: F401
+
 from ceres_cal.solve.bundle import Progress, Solution, placement_costs, solve, with_placements_at_best
 from ceres_cal.solve.conflicts import Conflicts, find_conflicts
 from ceres_cal.solve.information import Eliminated, ReducedInformation, information

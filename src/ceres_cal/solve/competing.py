@@ -16,12 +16,11 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask
 from ceres_cal.base.errors import CalibrationError
-from ceres_cal.base.words import two_digits
 from ceres_cal.model.equations import write_equations
-from ceres_cal.model.parameters import Estimate
 from ceres_cal.model.residuals import residuals
 from ceres_cal.observations import Observations
 from ceres_cal.solve.bundle import with_placements_at_best
+from ceres_cal.solve.explanation import DOUBTFUL, Explanation
 from ceres_cal.solve.linear_model import LinearModel, equation_weights, make_linear_model
 from ceres_cal.solve.offsets import Offsets, measure_offsets
 from ceres_cal.solve.problem import Problem
@@ -31,8 +30,6 @@ from ceres_cal.solve.wholes import FEWEST, Wholes, wholes_of
 # Log odds, by the linear model, from which on a whole is looked at by a solve without it: one in thirty sound scenes is
 # above -9, errors that agree along lines over 2 m reach -3, a line 1.2 px aside is above -7.
 _SUSPECT = -9.0
-# Log odds between which both explanations are named: 19 to 1.
-_DOUBTFUL = 3.0
 # Share of a whole's observations in use below which it is looked at in any case: its other rows are good by chance.
 _LEFT = 0.5
 _MOST_VIEWS, _MOST_WHOLE_VIEWS = 8, 24  # whose features, or which, are looked at together: at the cube of the number
@@ -42,57 +39,6 @@ _MOST_ROWS = 40  # of a whole in one view
 # be looked at: boards whose drawing is 3 % too short in one of ten do by 2 to 4, 10 % by 17.
 _STANDS_OUT = 2.5
 _MOST_WRONG = 4  # wholes
-
-
-@dataclass(frozen=True, eq=False)
-class Explanation:
-    """That a whole does not belong.
-
-    Attributes:
-        name: of the whole. rows: (N + M,) its observations, points by row and then curves by row. aside_px: how far it
-            lies aside, the median. log_odds: natural logarithm of the odds that it does not belong.
-        instead: what the next best explanation says. other: the estimate of the less probable one of the two.
-    """
-
-    name: str
-    rows: Mask
-    aside_px: float
-    log_odds: float
-    instead: str
-    other: Estimate
-
-    @property
-    def doubt(self) -> float:
-        """Probability of the less probable explanation."""
-        return float(1.0 / (1.0 + np.exp(abs(self.log_odds))))
-
-    @property
-    def is_doubtful(self) -> bool:
-        """Whether both explanations are to be named."""
-        return abs(self.log_odds) < _DOUBTFUL
-
-    @property
-    def is_taken(self) -> bool:
-        """Whether it is the more probable one, and its observations are taken out."""
-        return self.log_odds > 0.0
-
-    @property
-    def words(self) -> str:
-        """What it says."""
-        return f"the whole of {self.name}: {np.count_nonzero(self.rows)} rows, {two_digits(self.aside_px)} px aside"
-
-    @property
-    def warning(self) -> str:
-        """What to know before the calibration is used."""
-        if not self.is_doubtful:
-            return (
-                f"{self.words} of where all others put it: taken out as one; check its label, and where it is painted"
-            )
-        chosen, other = (self.words, self.instead) if self.is_taken else ("all of it belongs", self.words)
-        return (
-            f"in doubt about {self.name}: {chosen}, or {other} ({100.0 * self.doubt:.0f} %); standard deviations hold "
-            "for either: look at it in the picture, or observe more"
-        )
 
 
 Solver = Callable[[Problem], RobustSolution]
@@ -107,20 +53,20 @@ def compete(
     Args:
         problem: of all the observations. end: of its rounds.
     """
-    court = _Court(problem, observations, solver)
+    competition = _Competition(problem, observations, solver)
     explanations: list[Explanation] = []
-    while court.has_any and len(explanations) < _MOST_WRONG:
-        trials = list(court.trials(end))
+    while competition.has_any and len(explanations) < _MOST_WRONG:
+        trials = list(competition.trials(end))
         if not trials:
             break
         best = _best(trials)
-        if best.log_odds < -_DOUBTFUL:
+        if best.log_odds < -DOUBTFUL:
             break
         explanations += best.explanations
         if best.log_odds < 0.0:
             break
-        end, court.taking_part = best.end, court.taking_part & ~best.rows
-    if not court.taking_part.all():
+        end, competition.taking_part = best.end, competition.taking_part & ~best.rows
+    if not competition.taking_part.all():
         end = replace(end, residuals=residuals(observations, problem.sights, end.solution.estimate))
     return end, tuple(explanations)
 
@@ -152,11 +98,11 @@ class _Trial:
 def _best(trials: Sequence[_Trial]) -> _Trial:
     """The most probable one, or the largest that is sure and takes all of that along."""
     best = max(trials, key=lambda trial: trial.log_odds)
-    wider = [one for one in trials if one.log_odds > _DOUBTFUL and not np.any(best.rows & ~one.rows)]
+    wider = [one for one in trials if one.log_odds > DOUBTFUL and not np.any(best.rows & ~one.rows)]
     return max(wider, key=lambda one: int(np.count_nonzero(one.rows)), default=best)
 
 
-class _Court:
+class _Competition:
     """What is asked of all suspects. taking_part: (N + M,) the observations that none of them took along."""
 
     def __init__(self, problem: Problem, observations: Observations, solver: Solver) -> None:
@@ -175,7 +121,7 @@ class _Court:
         """What solves without the suspects say; also without one more, where a second one may hide the first."""
         for suspects in self.suspects(end):
             trial = self.tried(end, suspects)
-            if trial is not None and trial.log_odds < _DOUBTFUL and trial.next is not None:
+            if trial is not None and trial.log_odds < DOUBTFUL and trial.next is not None:
                 pair = self.tried(end, _Suspects(suspects.wholes, (*suspects.numbers, trial.next)))
                 trial = trial if pair is None or pair.log_odds < trial.log_odds else pair
             if trial is not None:
@@ -236,7 +182,7 @@ class _Court:
             own = wholes.among(np.array([number])) & self.taking_part
             other = (end if odds > 0.0 else without).solution.estimate
             instead = "it belongs"
-            if rival is not None and abs(odds) < _DOUBTFUL:
+            if rival is not None and abs(odds) < DOUBTFUL:
                 instead = f"the whole of {wholes.name(rival)} does not belong"
                 rivals = self._without(wholes, tuple(rival if one == number else one for one in numbers))
                 other = other if rivals is None or odds < 0.0 else rivals.solution.estimate
@@ -329,7 +275,7 @@ class _Court:
         single, curves, largest = self._kinds[0], self._observations.curves, np.zeros(len(self._observations.views))
         own = single.of[len(self._observations.points) :]
         sigmas = end.residuals.curves / (end.inliers.curve_scale * curves.sigma_px)
-        inside = np.where(end.inliers.curves, sigmas, 0.0)
+        inside = np.where(end.inliers.curves & np.isfinite(sigmas), sigmas, 0.0)
         mean = np.abs(np.bincount(own, inside)) / np.sqrt(np.maximum(np.bincount(own, end.inliers.curves), 1.0))
         np.maximum.at(largest, curves.view, mean[own])
         return largest

@@ -27,6 +27,7 @@ from ceres_cal.observations.sights import SightKey, Sights
 from ceres_cal.solve.costs import NORMAL_NS, kernel_loss
 from ceres_cal.solve.problem import Problem
 
+_ROUNDING = 1e-13  # of a sum over a sight's rows
 _BATCH = 2_000_000  # numbers of normal equations worked on at once
 
 
@@ -155,13 +156,13 @@ class _Sums:
         world = self._estimate.stations[key.station].cam_from_world
         lead = np.concatenate([self._owned("camera", key.camera), self._structure])
         station = self._owned("station", key.station)
-        stacks, limits = [], sigma_limits(pose_keys("placement", ""))
+        stacks = []
         for poses, normals in self._normals(sights):
             chain = from_placement(poses, world)
             back = np.swapaxes(chain, 1, 2)  # the chain is orthogonal
             whole = reduce(add, normals.values())
             own = back @ whole[:, -6:, -6:] @ chain
-            inverse = known_inverses(own, limits)
+            inverse = known_inverses(own, _limits(own))
             covariance = chain @ inverse @ back
             follows = covariance @ whole[:, -6:, :-6]
             self._add_reduced(lead, normals, covariance, follows)
@@ -203,6 +204,15 @@ class _Sums:
         steps, everywhere = np.hstack(chain), np.concatenate(at)
         for kind, normal in normals.items():
             self._matrices[kind][np.ix_(everywhere, everywhere)] += steps.T @ normal @ steps
+
+
+def _limits(own: Array) -> Array:
+    """(S, 6) sigmas beyond which a placement's number is unknown: what remains of a turn about the middle of rings, in
+    sums over all of their rows, is rounding of its other turns.
+    """
+    turns, shifts = np.max(np.diagonal(own, axis1=1, axis2=2).reshape(-1, 2, 3), axis=2).T
+    largest = np.repeat(np.column_stack([turns, shifts]), 3, axis=1)
+    return np.asarray(np.minimum(sigma_limits(pose_keys("placement", "")), (_ROUNDING * largest + 1e-300) ** -0.5))
 
 
 class _Normals:

@@ -278,12 +278,14 @@ def _private_basis(equations: Equations, problem: Problem, weight: Array, used: 
 def shared_columns(equations: Equations, estimate: Estimate, keys: Sequence[Key]) -> Array:
     """(E, P) px per unit of each key: what a step of the shared numbers does to every equation."""
     columns, owned = np.zeros((len(equations), len(keys))), columns_by_owner(keys)
+    scales = {name: intrinsics_scales(camera) for name, camera in estimate.cameras.items()}
+    names = {name: intrinsic_names(camera.lens) for name, camera in estimate.cameras.items()}
     for number, key in enumerate(equations.sights.keys):
         here = slice(equations.bounds[number], equations.bounds[number + 1])
-        camera, pose = estimate.cameras[key.camera], equations.poses[number : number + 1]
+        pose = equations.poses[number : number + 1]
         own = owned.get(("camera", key.camera), [])
-        at = [intrinsic_names(camera.lens).index(keys[column].quantity) for column in own]
-        columns[here, own] = equations.intrinsics[here][:, at] * intrinsics_scales(camera)[at]
+        at = [names[key.camera].index(keys[column].quantity) for column in own]
+        columns[here, own] = equations.intrinsics[here][:, at] * scales[key.camera][at]
         world = estimate.stations[key.station].cam_from_world
         if own := owned.get(("station", key.station), []):
             columns[here, own] = equations.pose[here] @ from_station(pose, world)[0]

@@ -16,6 +16,7 @@ from ceres_cal.model.residuals import Residuals
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights
 
+_BEYOND = 100.0  # an exponent: no observation is so rare
 # Spare equations below which a spread says nothing: its own error is 25 % at 8. At 4 the errors of fits to ten points
 # are 1.46 of their stated sigmas, at 16 they are 0.8 (1.16 at 8), because the stated sigmas are then taken.
 _LEAST_SPARE = 8.0
@@ -165,7 +166,7 @@ def _as_rare(sigmas: float, degrees: float) -> float:
     """
     if degrees < _LEAST_SPARE:
         return sigmas
-    return float(np.sqrt(degrees * np.expm1(sigmas**2 / degrees)))
+    return float(np.sqrt(degrees * np.expm1(min(sigmas**2 / degrees, _BEYOND))))
 
 
 @dataclass(frozen=True)

@@ -63,6 +63,7 @@ def solve_robustly(
     estimate: Estimate,
     usual: tuple[float, float] | None = None,
     progress: Callable[[Progress], None] | None = None,
+    most_rounds: int = _MOST_ROUNDS,
 ) -> RobustSolution:
     """The minimum over the inliers, at the noise that they show.
 
@@ -72,6 +73,7 @@ def solve_robustly(
     Args:
         problem: of all the observations; its weighting is not looked at.
         usual: noise scales of points and curves that were seen before, where there are any.
+        most_rounds: solves, the rough one counted; 2 end near the minimum.
 
     Raises:
         CalibrationError: see `solve`.
@@ -80,7 +82,7 @@ def solve_robustly(
     state = rounds.first(estimate)
     undecided = frozenset(state.problem.sights.keys)
     before: Inliers | None = None
-    while state.rounds < _MOST_ROUNDS:
+    while state.rounds < most_rounds:
         at_rest = before is not None and state.inliers.same_as(before, rounds.no_change)
         if not at_rest and before is not None:
             undecided = frozenset(state.problem.sights.keys)  # another lens had decided about mirrored poses

@@ -1,6 +1,6 @@
 """Wald's test of what is stated: how far everything else is from it.
 
-With C the covariance of some numbers x, P what their priors say of them and z = sum P_j (x - mean_j) the pull of these,
+With C the covariance of some numbers x, P what their priors say of them and z = sum P_j (x - mean_j) their slope,
 everything else says M = C^-1 - P and stands at x + M^-1 z; a prior j is d = x + M^-1 z - mean_j away from that, with
 covariance M^-1 + P_j^-1, and the squared distance is Fisher's F. A number that is held is a prior without width, z the
 slope of the cost along it.
@@ -47,26 +47,26 @@ def linear_rest(statement: Statement, end: RobustSolution, observations: Observa
     estimate, freedom = end.solution.estimate, min(end.inliers.degrees_of_freedom, LARGEST_FREEDOM)
     if statement.priors:
         reduced = end.reduced or information(end.problem, estimate)
-        told = reduce(add, (prior.information for prior in statement.priors), Information.nothing(statement.keys))
-        at = reduced.shared.columns(told.keys)
-        rest = Information(told.keys, _beside(reduced.shared.inverse[np.ix_(at, at)], told.matrix))
-        pull = np.zeros(len(told.keys))
+        stated = reduce(add, (prior.information for prior in statement.priors), Information.nothing(statement.keys))
+        at = reduced.shared.columns(stated.keys)
+        rest = Information(stated.keys, _beside(reduced.shared.inverse[np.ix_(at, at)], stated.matrix))
+        slope = np.zeros(len(stated.keys))
         for prior in statement.priors:
-            pull[told.columns(prior.keys)] += prior.information.matrix @ prior.offsets(estimate)
+            slope[stated.columns(prior.keys)] += prior.information.matrix @ prior.offsets(estimate)
     else:
         freed = statement.left_out(end.problem, estimate)
         rest = information(freed, estimate).shared.marginal(statement.keys)
-        pull = -_slopes(end.problem, observations, estimate, rest)
-    step = rest.inverse @ pull
-    # The pull swells the noise that the rest is measured by, as far as the linear picture goes.
-    noise = max(freedom - float(pull @ step), 1.0) / freedom if end.inliers.degrees_of_freedom < np.inf else 1.0
+        slope = -_slopes(end.problem, observations, estimate, rest)
+    step = rest.inverse @ slope
+    # It swells the noise that the rest is measured by, as far as the linear picture goes.
+    noise = max(freedom - float(slope @ step), 1.0) / freedom if end.inliers.degrees_of_freedom < np.inf else 1.0
     return Rest(estimate, step, Information(rest.keys, rest.matrix / noise), freedom)
 
 
-def _beside(covariance: Array, told: Array) -> Array:
+def _beside(covariance: Array, stated: Array) -> Array:
     """C^-1 - P, with 0 where that is lost in rounding beside P."""
-    size = np.sqrt(np.where(np.diagonal(told) > 0.0, np.diagonal(told), 1.0))
-    values, vectors = np.linalg.eigh(told / size[:, None] / size)
+    size = np.sqrt(np.where(np.diagonal(stated) > 0.0, np.diagonal(stated), 1.0))
+    values, vectors = np.linalg.eigh(stated / size[:, None] / size)
     kept = values > _LEAST_TOLD
     root = vectors[:, kept] * np.sqrt(values[kept])
     share, turned = np.linalg.eigh(root.T @ (covariance * size[:, None] * size) @ root)
@@ -93,9 +93,9 @@ def _slopes(problem: Problem, observations: Observations, estimate: Estimate, re
     weights = kernels.loss_weights(loss, np.concatenate([np.sum(points**2, axis=1), curves**2]))
     points, curves = points * weights[: len(points), None], curves * weights[len(points) :]
     slopes = []
-    for number, told in enumerate(np.diagonal(rest.matrix)):
+    for number, stated in enumerate(np.diagonal(rest.matrix)):
         step = np.zeros(len(rest.keys))
-        step[number] = _STEP / np.sqrt(told)
+        step[number] = _STEP / np.sqrt(stated)
         above, below = (standardised(moved(estimate, rest.keys, sign * step)) for sign in (1.0, -1.0))
         change = np.sum(points * (above[0] - below[0])) + curves @ (above[1] - below[1])
         slopes.append(float(change) / (2.0 * step[number]))
@@ -123,14 +123,14 @@ def worst_test(statement: Statement, rest: Rest) -> Test:
     return min(tests, key=lambda test: test.log_p)
 
 
-def _tested(off: Array, told: Information | None, rest: Rest) -> Test:
-    """The test of numbers that are off by so much; `told` None: they were held."""
+def _tested(off: Array, stated: Information | None, rest: Rest) -> Test:
+    """The test of numbers that are off by so much; `stated` None: they were held."""
     matrix = rest.information.matrix
-    if told is not None:  # (M^-1 + P^-1)^-1, where M or P may be singular
-        both = Information(told.keys, told.matrix + matrix)
-        matrix = told.matrix - told.matrix @ both.inverse @ told.matrix
+    if stated is not None:  # (M^-1 + P^-1)^-1, where M or P may be singular
+        both = Information(stated.keys, stated.matrix + matrix)
+        matrix = stated.matrix - stated.matrix @ both.inverse @ stated.matrix
     squared = max(float(off @ matrix @ off), 0.0)
-    own = np.zeros(len(off)) if told is None else told.spread.sd
+    own = np.zeros(len(off)) if stated is None else stated.spread.sd
     others, keys = rest.information.spread.sd, rest.information.keys
     with np.errstate(invalid="ignore"):
         apart = np.nan_to_num(np.abs(off) / np.hypot(own, others))

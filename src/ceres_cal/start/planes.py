@@ -13,6 +13,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask
 from ceres_cal.base.errors import DegenerateError
+from ceres_cal.base.native import kept_signals
 from ceres_cal.kernels import grouped_scatter
 from ceres_cal.observations.sights import Sights, bounds_of, ranges
 from ceres_cal.start.closed_forms import (
@@ -308,7 +309,8 @@ def consensus_homography(plane: Array, lifted: Array, limit_px: float) -> Array 
     Args:
         plane: (N, 2) m. lifted: (N, 3) homogeneous undistorted offsets, px.
     """
-    import pycolmap
+    with kept_signals():
+        import pycolmap
 
     options = pycolmap.RANSACOptions()
     options.max_error = limit_px

@@ -87,14 +87,14 @@ def _inflation(posterior: Posterior, camera: str) -> float:
 
 def _profile(camera: str, nodes: Sequence[Node], estimate: Estimate, posterior: Posterior) -> PhiProfile:
     """The valley as seen from the estimate, across it as wide as the data scatter with phi held."""
-    found = profile(camera, nodes, estimate, posterior.half_width)
+    along = profile(camera, nodes, estimate, posterior.half_width)
     if posterior.by_model is None:
-        return found
-    others = [key for key in posterior.keys if key != found.keys[0]]
-    held, by_model = (i.given(others).marginal(found.keys[1:]) for i in (posterior.information, posterior.by_model))
+        return along
+    others = [key for key in posterior.keys if key != along.keys[0]]
+    held, by_model = (i.given(others).marginal(along.keys[1:]) for i in (posterior.information, posterior.by_model))
     factors = widths_over(held.spread, by_model.spread)
-    across = [Information(i.keys, i.matrix / factors[:, None] / factors) for i in found.across]
-    return replace(found, across=tuple(across))
+    across = [Information(i.keys, i.matrix / factors[:, None] / factors) for i in along.across]
+    return replace(along, across=tuple(across))
 
 
 def _is_lens(camera: Camera) -> bool:

@@ -58,8 +58,10 @@ def compare_groups(sample: Sample, scatter: Array, whole: Array) -> tuple[Betwee
     mean = float(np.sum(np.trace(expected, axis1=1, axis2=2)))
     ratio, degrees = float(np.sum((sample.scores @ white) ** 2)) / mean, 2.0 * mean**2 / spread
     variance, probability = _averaged(ratio, degrees, float(np.trace(whole)) / len(whole))
-    size, told = len(whole), np.trace(sample.informations, axis1=1, axis2=2)
-    alike = float(np.sum(told) ** 2 / np.sum(told**2)) - 1.0  # groups beyond the first that say as much as one another
+    size, traces = len(whole), np.trace(sample.informations, axis1=1, axis2=2)
+    alike = (
+        float(np.sum(traces) ** 2 / np.sum(traces**2)) - 1.0
+    )  # groups beyond the first that say as much as one another
     weight = probability * alike / (alike + size)
     jackknife = _jackknife(sample, expected, white, root)
     factor = (1.0 - weight) * variance * np.eye(size) + weight * jackknife

@@ -1,6 +1,7 @@
 """Errors that go together along a curve, or over a board, within one view or over all views of a sight.
 
-The covariance of a strand's residuals is R = s^2 [(1 - a) 1 + a exp(-d / l)] with d the distances on the target. The
+The covariance of a strand's residuals is R = s^2 [(1 - a) 1 + a exp(-d / l)] with d the distances on the target, and
+over boards, which bend smoothly, also with exp(-(d / l)^2 / 2). The
 restricted likelihood (Patterson and Thompson, Biometrika 58, 1971) of a grid of lengths l and shares a, private
 placements eliminated, weighs them against independent errors, and the covariance of the scores is averaged over all
 (the best alone would be too sure of itself). One set of eigenvectors serves all shares of a length. Whether there is
@@ -26,7 +27,9 @@ _SHARES = np.array([0.1, 0.25, 0.5, 0.75, 0.9, 0.97, 0.995])
 _ASIDE = 20.0  # times the longest strand: the length of what moves it as a whole
 _FEWEST_FREEDOM = 3.0  # degrees of freedom that a variance is given at least
 _NEAR, _FAR = 30, 30  # rows of a strand for the likelihood: next to one another, and over all of it
-_LOUD = 0.85  # standard deviations of a score test from which on the grid is run: one in five
+# The grid is run from so many standard deviations of a score test on (one in five of white noise), if the correlation
+# that is likely by it would widen the variance of what is shared by so much.
+_LOUD, _MATTERS = 0.85, 0.08
 _FEWEST_ROWS = 12
 _NO_NOISE = 1e-6  # mean square, in squared standard deviations, below which residuals are rounding
 _INDEFINITE, _BISECTIONS = 1e6, 50  # degrees of freedom that are as good as any number
@@ -173,21 +176,26 @@ def _is_loud(sample: Sample, family: _Family) -> bool:
     independent errors, of which the fit took up the part U U'.
     """
     gap, longest = family.gap, family.longest
-    taken = family.columns(np.column_stack([sample.private, sample.shared]))
-    left = family.columns(sample.left[:, None])
+    columns = family.columns(np.column_stack([sample.private, sample.shared, sample.left]))
+    taken, left = columns[..., :-1], columns[..., -1]
     noise = np.sum(left**2) / max(np.count_nonzero(family.filled) - np.sum(taken**2), 1.0)
     if gap == 0.0 or noise < _NO_NOISE:
         return False
     left /= np.sqrt(noise)
+    private = sample.private.shape[1]
     for length in (gap, np.sqrt(gap * longest), _ASIDE * longest):
         together = np.exp(-family.distance / length) * (family.distance > 0.0)
         squares = np.sum(together**2, axis=(1, 2))[family.same].sum()
         together = together if len(together) == 1 else together[family.same]
-        along = together @ taken
-        total = float(np.sum(left * (together @ left)) + np.sum(taken * along))
+        along = together @ columns
+        hat = taken * along[..., :-1]
+        total = float(np.sum(left * along[..., -1]) + np.sum(hat))
+        along = along[..., :-1]
         inner = np.swapaxes(taken, 1, 2) @ along
         variance = 2.0 * (squares - 2.0 * np.sum(along**2) + np.sum(inner**2))
-        if total > _LOUD * np.sqrt(max(variance, 0.2 * squares)):
+        sd = float(np.sqrt(max(variance, 0.2 * squares)))
+        widening = total / squares * float(np.sum(hat[..., private:]) / np.sum(taken[..., private:] ** 2))
+        if total > _LOUD * sd and widening > _MATTERS:
             return True
     return False
 
@@ -235,13 +243,8 @@ class _Average:
         best = 1 + int(np.argmax(self.weight[1:])) if len(self.weight) > 1 else 0
         length, longest = float(self.length_m[best]), max(family.longest for family in self.families)
         aside, probability = length > 2.0 * longest, float(1.0 - self.weight[0])
-        return Correlation(
-            kind,
-            probability,
-            None if aside else length,
-            float(self.share[best]),
-            self.families[self.family[best]].lasting,
-        )
+        share, lasting = float(self.share[best]), self.families[int(self.family[best])].lasting
+        return Correlation(kind, probability, None if aside else length, share, lasting)
 
     def change(self, sample: Sample) -> tuple[Array, float]:
         """(G, P, P) what is added to the covariance of each group's score, and the factor on private placements."""

@@ -65,12 +65,12 @@ class Scatter:
 
     Attributes:
         root: (K, P) from directions in which they are known to one by the model. matrix: (P, P) their covariance as
-            the data scatter. found: what that rests on.
+            the data scatter. dependence: what that rests on.
     """
 
     root: Array
     matrix: Array
-    found: Dependence
+    dependence: Dependence
 
     def widened(self, information: Information) -> Information:
         """What is known of the shared numbers, as the data scatter."""
@@ -105,10 +105,10 @@ def _whole(sample: Sample, scores: Array) -> Array:
     """(P, P) covariance of the score of everything: the views that were not looked at scatter like those that were."""
     seen, everything = sample.informations.sum(axis=0), np.eye(len(sample.prior)) - sample.prior
     values, vectors = np.linalg.eigh(seen)
-    told = values > 1e-6
-    back = vectors[:, told] / np.sqrt(values[told])
-    change = back.T @ scores.sum(axis=0) @ back - np.eye(int(told.sum()))
+    determined = values > 1e-6
+    back = vectors[:, determined] / np.sqrt(values[determined])
+    change = back.T @ scores.sum(axis=0) @ back - np.eye(int(determined.sum()))
     values, vectors_of = np.linalg.eigh(everything)
-    root = (vectors_of * np.sqrt(np.maximum(values, 0.0))) @ vectors_of.T @ vectors[:, told]
+    root = (vectors_of * np.sqrt(np.maximum(values, 0.0))) @ vectors_of.T @ vectors[:, determined]
     whole = np.eye(len(seen)) + root @ change @ root.T
     return np.asarray(0.5 * (whole + whole.T))

@@ -120,9 +120,10 @@ def information_from(triangle: Sequence[float], keys: Sequence[Key], where: str)
     Raises:
         InputError: not as many numbers as it takes.
     """
+    needed = len(keys) * (len(keys) + 1) // 2
+    if len(triangle) != needed:
+        raise InputError(f"{where} has {len(triangle)} numbers, not {needed}: calibrate again")
     rows, columns = np.tril_indices(len(keys))
-    if len(triangle) != len(rows):
-        raise InputError(f"{where} has {len(triangle)} numbers, not {len(rows)}: calibrate again")
     matrix = np.empty((len(keys), len(keys)))
     matrix[rows, columns] = triangle
     matrix[columns, rows] = triangle

@@ -180,7 +180,7 @@ def _by_profile(estimate: Estimate, posterior: Posterior, station: str, pixels: 
         away = np.linalg.norm(np.einsum("mn,npk->mpk", weights, values), axis=2)
         return np.asarray(np.max(away + widths[:, None] * (weights @ np.where(unknown, 0.0, circles)), axis=0))
 
-    radius = np.maximum(radius_at(width), radius_at(FARTHER) * min(width / FARTHER, 1.0))
+    radius = np.maximum(radius_at(width), 0.5 * radius_at(FARTHER))  # of what is normal, 0.65
     radius = np.where(unknown | np.isinf(low).any(axis=1) | np.isinf(high).any(axis=1), np.inf, radius)
     return PointSpread(located, located + low, located + high, radius, radius / NORMAL_95)
 

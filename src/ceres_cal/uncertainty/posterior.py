@@ -93,8 +93,12 @@ class Posterior:
 
     @property
     def half_width(self) -> float:
-        """Standard deviations from the middle to either end of a 95 % interval: Student's t."""
-        return student_95(self.degrees_of_freedom)
+        """Standard deviations from the middle to either end of a 95 % interval: Student's t, with the degrees of
+        freedom behind the noise and behind what is known of the dependence.
+        """
+        inverse = 1.0 / max(self.degrees_of_freedom, 1.0)
+        inverse += 0.0 if self.dependence is None else self.dependence.inverse_freedom
+        return student_95(1.0 / inverse if inverse > 0.0 else np.inf)
 
     @cached_property
     def bounds(self) -> Array:
@@ -173,11 +177,9 @@ def make_posterior(reduced: ReducedInformation, degrees_of_freedom: float, scatt
     model = reduced.shared
     if scatter is None:
         return Posterior(model, _Placements(reduced.eliminated, model), degrees_of_freedom)
-    shared, found = scatter.widened(model), scatter.found
-    inverse = 1.0 / degrees_of_freedom + found.inverse_freedom if degrees_of_freedom > 0.0 else np.inf
-    degrees_of_freedom = 1.0 / inverse if inverse > 0.0 else np.inf
-    placements = _Placements(reduced.eliminated, shared, found.private)
-    return Posterior(shared, placements, degrees_of_freedom, by_model=model, dependence=found)
+    shared, dependence = scatter.widened(model), scatter.dependence
+    placements = _Placements(reduced.eliminated, shared, dependence.private)
+    return Posterior(shared, placements, degrees_of_freedom, by_model=model, dependence=dependence)
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,7 @@ import numpy as np
 
 from ceres_cal import kernels
 from ceres_cal.base.arrays import AnyArray, Array, Indices, Mask
-from ceres_cal.model.equations import Equations, write_equations
+from ceres_cal.model.equations import Equations, equations_of, of_observations
 from ceres_cal.model.parameters import Estimate
 from ceres_cal.model.residuals import Residuals
 from ceres_cal.observations import Observations
@@ -22,7 +22,7 @@ from ceres_cal.observations.sights import Sights
 from ceres_cal.solve import Problem, ReducedInformation
 from ceres_cal.solve.linear_model import Weights, inverse_root, without_shared
 
-_MOST_VIEWS = 20  # of a camera
+_MOST_VIEWS = 16  # of a camera
 _MOST_ROWS = 1_500  # of a kind in a view
 _DETERMINED = 1e-11  # eigenvalue, at unit diagonal, from which on a direction counts as determined
 
@@ -105,8 +105,9 @@ def take_sample(
     information = reduced.shared.matrix
     if not len(information):
         return None
-    equations = write_equations(observations, _some(observations, problem.sights), estimate, there)
-    blank, columns = without_shared(problem, estimate, equations, _weights(observations, problem, equations, there))
+    equations = equations_of(observations, _some(observations, problem.sights), estimate, there)
+    weights = robust_weights(observations, problem, equations, there)
+    blank, columns = without_shared(problem, estimate, equations, weights)
     placed = blank.beyond_private(np.column_stack([columns, blank.score]))
     root = inverse_root(information, np.diagonal(information), _DETERMINED)
     curves, grouped = equations.is_curve, _groups(equations)
@@ -125,13 +126,16 @@ def take_sample(
 
 def _some(observations: Observations, sights: Sights) -> Sights:
     """Of each camera some views, evenly, and of each of them some rows."""
-    chosen = np.zeros(len(observations.views), dtype=bool)
+    chosen, shown = np.zeros((2, len(observations.views)), dtype=bool)
+    shown[observations.points.view[sights.point_rows]] = True
+    shown[observations.curves.view[sights.curve_rows]] = True
     for camera in sights.cameras:
-        views = [
-            view for key, views in zip(sights.keys, sights.views, strict=True) if key.camera == camera for view in views
-        ]
+        own = (views for key, views in zip(sights.keys, sights.views, strict=True) if key.camera == camera)
+        views = [view for views in own for view in views if shown[view]]
         chosen[np.array(views)[evenly(len(views), _MOST_VIEWS)]] = True
-    if chosen.all() and max(len(sights.point_rows), len(sights.curve_rows)) <= _MOST_ROWS:
+    sights = sights.take(np.flatnonzero([chosen[list(views)].any() for views in sights.views]))
+    rows = max(np.diff(sights.point_bounds).max(), np.diff(sights.curve_bounds).max())
+    if rows <= _MOST_ROWS and all(chosen[list(views)].all() for views in sights.views):
         return sights
     points, curves = (_some_rows(column.view, chosen) for column in (observations.points, observations.curves))
     return sights.used(points, curves)
@@ -153,12 +157,12 @@ def _some_rows(view: AnyArray, chosen: Mask) -> Mask:
     return rows
 
 
-def _weights(observations: Observations, problem: Problem, equations: Equations, there: Residuals) -> Weights:
+def robust_weights(observations: Observations, problem: Problem, equations: Equations, there: Residuals) -> Weights:
     """Of each equation, the root of its robust weight in its standard deviation."""
     weighting, at = problem.weighting, equations.observation
-    points, curves = observations.points.sigma_px, observations.curves.sigma_px
-    sigma = np.concatenate([weighting.point_scale * points, weighting.curve_scale * curves])[at]
-    squared = (np.concatenate(there.lengths)[at] / sigma) ** 2
+    scale = np.where(equations.is_curve, weighting.curve_scale, weighting.point_scale)
+    sigma = scale * of_observations(at, observations.points.sigma_px, observations.curves.sigma_px)
+    squared = (of_observations(at, *there.lengths) / sigma) ** 2
     robust = kernels.loss_weights(kernels.Loss(kernels.LOSS_CODES[weighting.loss], weighting.loss_scale), squared)
     everything = np.ones(len(equations))
     return Weights(np.sqrt(robust) / sigma, everything > 0.0, everything)

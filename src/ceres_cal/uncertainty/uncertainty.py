@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -43,6 +44,23 @@ class Uncertainty:
         """Known, weak or unknown, of each shared number."""
         return verdicts(self.estimate, self.posterior)
 
+    def table(self) -> list[dict[str, Any]]:
+        """Each shared number as a row of a table: `pandas.DataFrame(known.table())`."""
+        return [
+            {
+                "kind": one.key.kind,
+                "owner": one.key.owner,
+                "quantity": one.key.quantity,
+                "unit": one.key.unit,
+                "value": float(one.value),
+                "sd": float(one.sd),
+                "low": float(one.low),
+                "high": float(one.high),
+                "verdict": one.verdict,
+            }
+            for one in self.verdicts
+        ]
+
     def verdict(self, kind: str, owner: str, quantity: str) -> Verdict:
         """Of one number.
 
@@ -64,10 +82,10 @@ class Uncertainty:
     @property
     def widening(self) -> str:
         """Why standard deviations are larger than by the model alone, in a line; "" where they are not."""
-        found, factor = self.posterior.dependence, float(np.median(self.posterior.factors))
-        if found is None or not found.causes or factor < _WIDENED:
+        dependence, factor = self.posterior.dependence, float(np.median(self.posterior.factors))
+        if dependence is None or not dependence.causes or factor < _WIDENED:
             return ""
-        return f"{' and '.join(found.causes)}: standard deviations {two_digits(factor)} times as large as without"
+        return f"{' and '.join(dependence.causes)}: standard deviations {two_digits(factor)} times as large as without"
 
     def ratio_sd(self, station: str) -> float:
         """Relative standard deviation of phi over the station's height."""

@@ -12,17 +12,18 @@ from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import convert
 from ceres_cal.scene.targets.paper import Footprints, Paper, share_inside
-from ceres_cal.scene.targets.target import Grid, Target, TargetKind
+from ceres_cal.scene.targets.target import Grid, Target, TargetKind, require_size
 
 
 def checkerboard(columns: int, rows: int, square_m: float) -> Target:
     """The inner corners of a checkerboard: feature "c,r" lies at (c, r, 0) squares, c < columns, r < rows.
 
     Raises:
-        InputError: fewer than 2 corners a side, or a square that is not a positive number of metres.
+        InputError: fewer than 2 corners a side, more than MOST_FEATURES, or a square that is no positive number.
     """
     if columns < 2 or rows < 2:
         raise InputError(f"checkerboard: columns and rows count inner corners, at least 2, not {columns} and {rows}")
+    require_size(columns * rows, "checkerboard")
     if not (np.isfinite(square_m) and square_m > 0.0):
         raise InputError(f"checkerboard: square_m must be a positive number of metres, not {square_m}")
     grid = Grid(int(columns), int(rows), float(square_m), checkered=True)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 from ceres_cal.base.errors import InputError, naming
 from ceres_cal.scene.targets import checkerboards, custom_targets, ring_sheets, ssl_fields
-from ceres_cal.scene.targets.target import Target, TargetKind
+from ceres_cal.scene.targets.target import Target, TargetKind, require_size
 
 TARGET_KINDS: dict[str, TargetKind] = {
     kind.name: kind for kind in (ssl_fields.KIND, checkerboards.KIND, ring_sheets.KIND, custom_targets.KIND)
@@ -28,6 +29,16 @@ def target_from_spec(spec: Any, where: str) -> Target:
         raise InputError(f"{where}: unknown kind {kind!r}: choose one of {', '.join(TARGET_KINDS)}")
     with naming(where):
         return TARGET_KINDS[kind].from_spec(spec, where)
+
+
+def targets_from_specs(specs: Mapping[str, Any], where: str = "") -> dict[str, Target]:
+    """The targets that a file describes, by name; InputError as `target_from_spec`, or where they are too large."""
+    targets: dict[str, Target] = {}
+    for name, spec in specs.items():
+        targets[name] = target_from_spec(spec, f"{where}target {name!r}")
+        features = sum(len(target.points) + len(target.curves) for target in targets.values())
+        require_size(features, f"{where}targets up to {name!r}")
+    return targets
 
 
 def targets_by_name() -> dict[str, Target]:

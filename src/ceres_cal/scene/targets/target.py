@@ -10,8 +10,18 @@ from typing import Any
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Mask
+from ceres_cal.base.errors import InputError
 from ceres_cal.scene.curves import Arc, Curve
 from ceres_cal.scene.targets.paper import Paper
+
+MOST_FEATURES = 100_000
+"""Points and curves of all targets of a file; ten boards of 100 x 100 corners."""
+
+
+def require_size(features: float, what: str) -> None:
+    """Raise InputError where a target, or all of a file, would have more than MOST_FEATURES."""
+    if not features <= MOST_FEATURES:
+        raise InputError(f"{what}: at most {MOST_FEATURES} points and curves, not {features:.3g}: split it")
 
 
 @dataclass(frozen=True)
@@ -28,7 +38,7 @@ class Grid:
     checkered: bool = False
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Target:
     """A rigid thing of known geometry, in a frame of its own, in metres; a field's frame is the world.
 
@@ -62,6 +72,9 @@ class Target:
         )
 
     __hash__ = None  # type: ignore[assignment]
+
+    def __repr__(self) -> str:
+        return f"Target({self.kind}, {len(self.points)} points, {len(self.curves)} curves)"
 
     @property
     def kind(self) -> str:

@@ -1,0 +1,94 @@
+"""How large an image says it is, from its header: before a decoder makes room for it."""
+
+from __future__ import annotations
+
+import re
+import struct
+
+_COMMENT = rb"(?:\s+|#[^\n]*\n)+"
+_PNM = re.compile(rb"P[1-6]" + _COMMENT + rb"(\d{1,9})" + _COMMENT + rb"(\d{1,9})")
+_JPEG_SIZES = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}  # frame headers; the others are tables
+
+
+def claimed_size(content: bytes) -> tuple[int, int] | None:
+    """(width, height) of a PNG, JPEG, BMP, TIFF, WebP, JPEG 2000 or PNM file; None where it is none of them."""
+    try:
+        return _size(content)
+    except struct.error:  # cut short
+        return None
+
+
+def _size(content: bytes) -> tuple[int, int] | None:
+    if content.startswith(b"\x89PNG\r\n\x1a\n"):
+        return _png(content)
+    if content.startswith(b"BM"):
+        width, height = _unpack("<HH" if content[14:15] == b"\x0c" else "<ii", content, 18)
+        return width, abs(height)  # negative from the top down
+    if content.startswith(b"\xff\xd8\xff"):
+        return _jpeg(content)
+    if content.startswith((b"II*\0", b"MM\0*")):
+        return _tiff(content, "<" if content.startswith(b"II") else ">")
+    if content.startswith(b"RIFF") and content[8:12] == b"WEBP":
+        return _webp(content)
+    if content.startswith(b"\xff\x4f\xff\x51"):
+        return _jpeg_2000(content, 8)
+    if content[4:8] == b"jP  " and (start := content.find(b"\xff\x4f\xff\x51", 0, 100_000)) > 0:
+        return _jpeg_2000(content, start + 8)
+    match = _PNM.match(content[:10_000])
+    return (int(match[1]), int(match[2])) if match else None
+
+
+def _unpack(form: str, content: bytes, at: int) -> tuple[int, int]:
+    first, second = struct.unpack_from(form, content, at)
+    return first, second
+
+
+def _png(content: bytes) -> tuple[int, int] | None:
+    """Its decoder makes room for whatever length a chunk claims."""
+    at = 8
+    while at + 8 <= len(content):
+        (length,) = struct.unpack_from(">I", content, at)
+        at += 12 + length
+        if at > len(content):
+            return None
+    return _unpack(">II", content, 16)
+
+
+def _jpeg(content: bytes) -> tuple[int, int] | None:
+    at = 2
+    while True:
+        mark, code, length = struct.unpack_from(">BBH", content, at)
+        if mark != 0xFF:
+            return None
+        if code in _JPEG_SIZES:
+            height, width = _unpack(">HH", content, at + 5)
+            return width, height
+        at += 1 if code == 0xFF else 2 + length  # headers may begin with more of the mark
+
+
+def _tiff(content: bytes, order: str) -> tuple[int, int]:
+    sizes = {256: 0, 257: 0}
+    (start,) = struct.unpack_from(order + "I", content, 4)
+    (count,) = struct.unpack_from(order + "H", content, start)
+    for number in range(count):
+        tag, kind = struct.unpack_from(order + "HH", content, start + 2 + 12 * number)
+        if tag in sizes:
+            (value,) = struct.unpack_from(order + ("H" if kind == 3 else "I"), content, start + 10 + 12 * number)
+            sizes[tag] = max(sizes[tag], value)
+    return sizes[256], sizes[257]
+
+
+def _webp(content: bytes) -> tuple[int, int] | None:
+    kind = content[12:16]
+    if kind == b"VP8X":
+        return int.from_bytes(content[24:27], "little") + 1, int.from_bytes(content[27:30], "little") + 1
+    if kind == b"VP8L":
+        (bits,) = struct.unpack_from("<I", content, 21)
+        return (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
+    width, height = _unpack("<HH", content, 26)
+    return width & 0x3FFF, height & 0x3FFF
+
+
+def _jpeg_2000(content: bytes, at: int) -> tuple[int, int]:
+    right, bottom, left, top = struct.unpack_from(">4I", content, at)
+    return right - left, bottom - top

@@ -1,0 +1,149 @@
+"""COLMAP's text model through pycolmap: all stations as one rig in one frame. Its pixels begin at the corner of the
+first one: half a pixel is added on the way out, and taken off on the way in.
+
+src colmap/colmap doc/format.rst.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ceres_cal.base.arrays import Array
+from ceres_cal.base.errors import InputError
+from ceres_cal.base.files import read_bytes
+from ceres_cal.base.native import kept_signals
+from ceres_cal.base.transforms import Pose
+from ceres_cal.formats.export_format import Exported, ExportFormat, ExportRequest
+from ceres_cal.formats.import_format import ImportedCameras, ImportFormat, ImportRequest
+from ceres_cal.formats.loss import as_foreign, field_box
+from ceres_cal.scene.foreign import FISHEYE, ForeignCamera
+
+_MODELS = {"opencv4": "OPENCV", "opencv5": "FULL_OPENCV", "opencv8": "FULL_OPENCV", FISHEYE: "OPENCV_FISHEYE"}
+_COUNTS = {"PINHOLE": 0, "OPENCV": 4, "FULL_OPENCV": 8}  # coefficients in OpenCV's order behind fx fy cx cy
+_HALF = 0.5
+
+
+def _export(request: ExportRequest) -> Exported:
+    with kept_signals():
+        import pycolmap
+
+    box, losses, models = field_box(request.calibration.targets), [], []
+    model, rig, frame = pycolmap.Reconstruction(), pycolmap.Rig(rig_id=1), pycolmap.Frame(frame_id=1, rig_id=1)
+    first, images = request.calibration.station(request.stations[0]).cam_from_world, []
+    for number, name in enumerate(request.stations, start=1):
+        camera = request.calibration.station(name)
+        foreign, loss = as_foreign(camera, name, tuple(_MODELS), box)
+        losses.append(loss)
+        models.append(_MODELS[foreign.model])
+        model.add_camera(_camera(foreign, number))
+        sensor = model.camera(number).sensor_id
+        if number == 1:
+            rig.add_ref_sensor(sensor)
+        else:
+            rig.add_sensor(sensor, _rigid(camera.cam_from_world @ first.inverse))
+        image = pycolmap.Image(name=name, camera_id=number, image_id=number)
+        image.frame_id = 1
+        frame.add_data_id(image.data_id)
+        images.append(image)
+    frame.rig_from_world = _rigid(first)
+    model.add_rig(rig)
+    model.add_frame(frame)
+    for image in images:
+        model.add_image(image)
+    with tempfile.TemporaryDirectory() as folder:
+        model.write_text(folder)
+        content = {path.name: path.read_bytes() for path in Path(folder).iterdir()}
+    return Exported(content, tuple(losses), f"{len(models)} cameras, {' and '.join(models)}, one rig, one frame")
+
+
+def _camera(foreign: ForeignCamera, number: int) -> Any:
+    with kept_signals():
+        import pycolmap
+
+    (width, height), name = foreign.image_size, _MODELS[foreign.model]
+    values = [*foreign.coefficients, *[0.0] * 8][: _COUNTS.get(name, 4)]
+    (cx, cy), focal = foreign.centre, foreign.focal
+    camera = pycolmap.Camera(model=name, width=width, height=height, params=[*focal, cx + _HALF, cy + _HALF, *values])
+    camera.camera_id = number
+    return camera
+
+
+def _rigid(pose: Pose) -> Any:
+    with kept_signals():
+        import pycolmap
+
+    return pycolmap.Rigid3d(pycolmap.Rotation3d(pose.rotation), pose.translation)
+
+
+# ---- reading --------------------------------------------------------------------------------------------------------
+
+
+def read_model(folder: Path) -> Any:
+    """COLMAP's model; InputError where the folder holds none, a pipe or a device, or too much."""
+    with kept_signals():
+        import pycolmap
+
+    if not folder.is_dir():
+        raise InputError("COLMAP's model is a folder: name that")
+    for name in ("rigs", "cameras", "frames", "images", "points3D"):
+        for path in (folder / f"{name}.bin", folder / f"{name}.txt"):
+            if path.exists():
+                read_bytes(path)  # the library opens them itself: what it would wait for is refused here
+    try:
+        return pycolmap.Reconstruction(folder)
+    except (ValueError, RuntimeError, IndexError) as error:
+        raise InputError(f"not a model of COLMAP (cut short?): {str(error).splitlines()[0]}") from None
+
+
+def _read(request: ImportRequest) -> Any:
+    model = read_model(request.path)
+    if not model.num_images():
+        raise InputError("the model has no image: where its cameras stood is not said")
+    cameras, warnings = {}, []
+    for image in model.images.values():
+        name = Path(image.name).stem if Path(image.name).suffix else image.name
+        if not image.has_pose:
+            warnings.append(f"image {image.name!r} has no pose and was left out")
+            continue
+        pose = image.cam_from_world()
+        cameras[name] = _foreign(image.camera, Pose(pose.rotation.matrix(), pose.translation))
+    if not cameras:
+        raise InputError("none of its images has a pose")
+    warnings.append("COLMAP's lengths have the unit of whoever made the model: here they count as metres")
+    return ImportedCameras(cameras, warnings=warnings).calibration("COLMAP")
+
+
+def _foreign(camera: Any, pose: Pose) -> ForeignCamera:
+    with kept_signals():
+        import pycolmap
+
+    size, name = (int(camera.width), int(camera.height)), str(camera.model_name)
+    focal = (float(camera.focal_length_x), float(camera.focal_length_y))
+    centre = (float(camera.principal_point_x) - _HALF, float(camera.principal_point_y) - _HALF)
+    extra = np.array(camera.params)[camera.extra_params_idxs()]
+    if name.removeprefix("SIMPLE_") in ("PINHOLE", "RADIAL", "OPENCV", "FULL_OPENCV"):
+        values = np.concatenate([extra, np.zeros(4 - len(extra))]) if len(extra) < 4 else extra
+        matrix = [[focal[0], 0.0, centre[0]], [0.0, focal[1], centre[1]], [0.0, 0.0, 1.0]]
+        return ForeignCamera.opencv(size, matrix, values, pose)
+    if name == "OPENCV_FISHEYE":
+        return ForeignCamera(size, focal, centre, FISHEYE, tuple(extra.tolist()), pose)
+    bare = pycolmap.Camera(model=name, width=2, height=2, params=_at_focal_length_1(camera))
+
+    def distort(rays: Array) -> Array:
+        return np.asarray(bare.img_from_cam(rays))
+
+    return ForeignCamera(size, focal, centre, name, tuple(extra.tolist()), pose, distort=distort)
+
+
+def _at_focal_length_1(camera: Any) -> list[float]:
+    params = np.array(camera.params)
+    params[camera.focal_length_idxs()], params[camera.principal_point_idxs()] = 1.0, 0.0
+    return [float(value) for value in params]
+
+
+FORMAT = ExportFormat("colmap", "COLMAP's text model: cameras, rig, frame, images", (), _export, several_stations=True)
+IMPORT = ImportFormat("colmap", "a folder with COLMAP's model", (), lambda content: not content, _read)

@@ -1,0 +1,273 @@
+"""Observations that others wrote: mrcal's corners.vnl, a CSV or NPZ with named columns, what an mrcal .cameramodel was
+calibrated from, and the keypoints of a COLMAP model.
+"""
+
+from __future__ import annotations
+
+import base64
+import csv
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ceres_cal.base.archives import read_foreign_npz
+from ceres_cal.base.arrays import Array
+from ceres_cal.base.errors import InputError
+from ceres_cal.base.files import require_room
+from ceres_cal.formats.colmap import read_model
+from ceres_cal.formats.import_format import ImportFormat, ImportRequest
+from ceres_cal.formats.mrcal import literal_of
+from ceres_cal.formats.opencv import parse_size
+from ceres_cal.observations import Curves, Observations, Points, View
+from ceres_cal.scene.targets import SIDES, Target, checkerboard, custom, targets_by_name
+
+
+@dataclass(frozen=True)
+class CornerOptions:
+    """What the board was, and the image: the file does not say it."""
+
+    columns: int = field(default=0, metadata={"help": "corners along a row of the board"})
+    rows: int = field(default=0, metadata={"help": "rows of corners"})
+    square: float = field(default=0.0, metadata={"help": "distance of the corners, m"})
+    image_size: str = field(default="", metadata={"help": "WIDTHxHEIGHT px"})
+    camera: str = field(default="camera", metadata={"help": "name of the camera; default: camera"})
+    sigma_px: float = field(default=1.0, metadata={"help": "of a corner at level 0; default: 1"})
+
+
+def _read_corners(request: ImportRequest) -> Observations:
+    """`# filename x y level`, a line for each corner, row by row; '-' or a level below 0 was not found."""
+    options = request.options
+    if min(options.columns, options.rows) < 2 or not options.square > 0.0:
+        raise InputError("the board is not said in the file: give columns, rows and square (m)")
+    board = checkerboard(options.columns, options.rows, options.square)
+    found: dict[str, list[tuple[float, float, float]]] = {}
+    for number, line in enumerate(request.text.splitlines(), start=1):
+        words = line.partition("#")[0].split()
+        if not words:
+            continue
+        seen = found.setdefault(words[0], [])
+        try:
+            absent = len(words) < 3 or "-" in words[1:3] or (len(words) > 3 and words[3] == "-")
+            step = 0.0 if absent or len(words) < 4 else float(words[3])
+            x, y = (np.nan, np.nan) if absent or step < 0.0 else (float(words[1]), float(words[2]))
+            seen.append((x, y, 2.0**step))
+        except (ValueError, OverflowError):
+            raise InputError(f"line {number}: x, y and level must be numbers or -, not {line.strip()!r}") from None
+    whole = {name: np.array(seen) for name, seen in found.items() if len(seen) > 1 or np.isfinite(seen[0][0])}
+    for name, corners in whole.items():
+        if len(corners) != len(board.points):
+            raise InputError(f"image {name!r} has {len(corners)} corners, the board {len(board.points)}")
+    size, camera = parse_size(options.image_size), options.camera
+    frames = {Path(name).stem: corners[:, :2] for name, corners in whole.items()}
+    if len(frames) != len(whole):
+        raise InputError("two images are called alike but for their folders: import one camera at a time")
+    bare = Observations.from_points(frames, board, size, camera=camera)
+    level = np.concatenate([corners[np.isfinite(corners[:, 0]), 2] for corners in whole.values()])
+    return Observations(
+        bare.targets, bare.cameras, bare.views, _with_sigma(bare.points, options.sigma_px * level), bare.curves
+    )
+
+
+def _with_sigma(points: Points, sigma_px: Array) -> Points:
+    return Points(points.view, points.feature, points.pixels, sigma_px)
+
+
+# ---- named columns --------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class TableOptions:
+    """What the columns do not say."""
+
+    target: str = field(default="", metadata={"help": "whose features are named, such as ssl-b; without it X_m, Y_m"})
+    image_size: str = field(default="", metadata={"help": "WIDTHxHEIGHT px"})
+    camera: str = field(default="camera", metadata={"help": "name of the camera where no column says it"})
+    moves: bool = field(default=False, metadata={"help": "whether the target lay elsewhere in every frame (true)"})
+
+
+_COLUMNS = ("frame", "camera", "station", "placement", "point", "curve", "side", "x_px", "y_px", "sigma_px")
+_PLACE = ("X_m", "Y_m", "Z_m")
+_BYTES_PER_CELL = 150  # of memory, in a row by names
+
+
+def _read_csv(request: ImportRequest) -> Observations:
+    marks = request.content.count(b",") + request.content.count(b"\n")
+    require_room(_BYTES_PER_CELL * marks + 2.0 * len(request.content), str(request.path))
+    reader = csv.DictReader(io.StringIO(request.text))
+    try:
+        rows = list(reader)
+    except csv.Error as error:
+        raise InputError(f"not a CSV file (line {reader.line_num}): {error}") from None
+    return _from_rows(rows, tuple(reader.fieldnames or ()), request.options)
+
+
+def _read_npz(request: ImportRequest) -> Observations:
+    columns = read_foreign_npz(request.content, str(request.path))
+    require_room(float(_BYTES_PER_CELL) * sum(array.size for array in columns.values()), str(request.path))
+    lengths = {array.shape for array in columns.values()}
+    if len(lengths) != 1 or any(len(shape) != 1 for shape in lengths):
+        raise InputError(f"the columns must be of one dimension and as long as one another, not {sorted(lengths)}")
+    rows = [dict(zip(columns, map(str, row), strict=True)) for row in zip(*columns.values(), strict=True)]
+    return _from_rows(rows, tuple(columns), request.options)
+
+
+def _from_rows(rows: Sequence[Mapping[str, Any]], names: tuple[str, ...], options: TableOptions) -> Observations:
+    """Rows under named columns; each shows a point or a curve of the target, or a place in the world."""
+    if len(set(names)) < len(names):
+        raise InputError("a column is there twice: keep one of them")
+    if unknown := [name for name in names if name not in (*_COLUMNS, *_PLACE)]:
+        raise InputError(f"unknown column {unknown[0]!r}: there are {', '.join((*_COLUMNS, *_PLACE))}")
+    if missing := [name for name in ("x_px", "y_px") if name not in names]:
+        raise InputError(f"column {missing[0]} is missing")
+    if not rows:
+        raise InputError("it holds no row")
+    places = [_place(row, number) for number, row in enumerate(rows, start=2)] if "X_m" in names else []
+    target = _target(options.target, places)
+    views: dict[View, int] = {}
+    points, curves = [], []
+    for number, row in enumerate(rows, start=2):
+        view = views.setdefault(_view(row, options, target), len(views))
+        pixel = [_number(row, name, number) for name in ("x_px", "y_px")]
+        sigma = _number(row, "sigma_px", number) if row.get("sigma_px") else 1.0
+        if row.get("curve"):
+            side = row.get("side") or "centre"
+            if side not in SIDES:
+                raise InputError(f"line {number}: side {side!r} is unknown: {', '.join(SIDES)}")
+            curves.append((view, _index(target.curve_names, row["curve"], number), pixel, sigma, SIDES[side]))
+        else:
+            name = _place_name(places[number - 2]) if places else row.get("point") or ""
+            points.append((view, _index(target.point_names, name, number), pixel, sigma))
+    points.sort(key=lambda one: one[0])
+    curves.sort(key=lambda one: one[0])
+    size = parse_size(options.image_size)
+    cameras = dict.fromkeys((view.camera for view in views), size)
+    return Observations(
+        {"target": target}, cameras, tuple(views), Points(*_split(points, 4)), Curves(*_split(curves, 5))
+    )
+
+
+def _split(rows: Sequence[tuple[Any, ...]], count: int) -> list[Any]:
+    columns: list[Any] = [np.array([row[k] for row in rows]) for k in range(count)]
+    columns[2] = columns[2].reshape(-1, 2)
+    return columns
+
+
+def _view(row: Mapping[str, Any], options: TableOptions, target: Target) -> View:
+    frame, camera = row.get("frame") or "0", row.get("camera") or options.camera
+    moves = options.moves or target.movable
+    return View(
+        frame, camera, row.get("station") or camera, "target", row.get("placement") or (frame if moves else None)
+    )
+
+
+def _target(name: str, places: Sequence[tuple[float, float, float]]) -> Target:
+    if places:
+        return custom({_place_name(place): place for place in places})
+    if name not in targets_by_name():
+        raise InputError(f"target {name!r} is unknown: give one of {', '.join(targets_by_name())}, or columns X_m, Y_m")
+    return targets_by_name()[name]
+
+
+def _place(row: Mapping[str, Any], number: int) -> tuple[float, float, float]:
+    x, y, z = (_number(row, name, number) if row.get(name) else 0.0 for name in _PLACE)
+    return x, y, z
+
+
+def _place_name(place: tuple[float, float, float]) -> str:
+    return " ".join(f"{v:g}" for v in place)
+
+
+def _number(row: Mapping[str, Any], name: str, number: int) -> float:
+    try:
+        value = float(row[name])
+    except (KeyError, TypeError, ValueError):
+        raise InputError(f"line {number}: {name} is no number, but {row.get(name)!r}") from None
+    if not np.isfinite(value):
+        raise InputError(f"line {number}: {name} is not finite")
+    return value
+
+
+def _index(names: Sequence[str], name: str, number: int) -> int:
+    if name not in names:
+        raise InputError(f"line {number}: there is no feature {name!r}: `ceres-cal targets` lists the names")
+    return names.index(name)
+
+
+# ---- what others keep beside their cameras --------------------------------------------------------------------------
+
+
+def _read_mrcal(request: ImportRequest) -> Observations:
+    """The `optimization_inputs` of a .cameramodel: boards before static cameras."""
+    data = literal_of(request.content)
+    if "optimization_inputs" not in data:
+        raise InputError("it has no optimization_inputs: mrcal did not keep what it calibrated from")
+    try:
+        given = read_foreign_npz(base64.b85decode(data["optimization_inputs"]), str(request.path))
+        boards = np.asarray(given["observations_board"], dtype=float)
+        indices = np.asarray(given["indices_frame_camintrinsics_camextrinsics"], dtype=int)
+        spacing, sizes = float(given["calibration_object_spacing"]), np.asarray(given["imagersizes"], dtype=int)
+        count, rows, columns, three = boards.shape
+        if three != 3 or indices.shape != (count, 3) or sizes.ndim != 2 or sizes.shape[1] != 2:
+            raise ValueError("its arrays do not fit each other")
+    except (ValueError, TypeError, KeyError, OverflowError) as error:
+        raise InputError(f"its optimization_inputs cannot be read: {error}") from None
+    views, view, feature, pixels, sigma = [], [], [], [], []
+    order = np.lexsort((indices[:, 1], indices[:, 0]))
+    for number, row in enumerate(order[:count]):
+        frame, camera = f"{indices[row, 0]:04d}", f"camera{indices[row, 1]}"
+        views.append(View(frame, camera, camera, "board", frame))
+        seen = boards[row].reshape(-1, 3)
+        found = np.flatnonzero(seen[:, 2] > 0.0)  # weights; below 0 was an outlier or was not seen
+        view.append(np.full(len(found), number))
+        feature.append(found)
+        pixels.append(seen[found, :2])
+        sigma.append(1.0 / seen[found, 2])
+    names = {f"camera{number}": (int(w), int(h)) for number, (w, h) in enumerate(sizes.tolist())}
+    points = Points(*(np.concatenate(column) for column in (view, feature, pixels, sigma)))
+    used = {name: size for name, size in names.items() if any(one.camera == name for one in views)}
+    return Observations({"board": checkerboard(columns, rows, spacing)}, used, tuple(views), points, _no_curves())
+
+
+def _no_curves() -> Curves:
+    return Curves(*_split([], 5))
+
+
+def _read_colmap(request: ImportRequest) -> Observations:
+    """The keypoints that show points of the model, in our pixels; the points count as known."""
+    model = read_model(request.path)
+    if not model.num_points3D():
+        raise InputError("the model has no points")
+    names = {number: place for place, number in enumerate(model.points3D)}
+    target = custom({str(n): tuple(float(v) for v in model.points3D[n].xyz) for n in names})  # type: ignore[misc]
+    views, rows, cameras = [], [], {}
+    for image in model.images.values():
+        seen = [point for point in image.points2D if point.has_point3D()]
+        if not seen:
+            continue
+        camera = f"camera{image.camera_id}"
+        cameras[camera] = (int(image.camera.width), int(image.camera.height))
+        views.append(View(image.name, camera, image.name, "target"))
+        rows += [(len(views) - 1, names[point.point3D_id], point.xy - 0.5, 1.0) for point in seen]
+    return Observations({"target": target}, cameras, tuple(views), Points(*_split(rows, 4)), _no_curves())
+
+
+def _never(_: bytes) -> bool:
+    return False  # by its name alone: the same file is read as cameras by default
+
+
+def _any(_: bytes) -> bool:
+    return True
+
+
+_NAMED = f"columns {', '.join((*_COLUMNS, *_PLACE))}"
+FORMATS = (
+    ImportFormat("corners-vnl", "mrcal's corners.vnl", (".vnl",), _any, _read_corners, CornerOptions),
+    ImportFormat("csv", f"observations as CSV, {_NAMED}", (".csv",), _any, _read_csv, TableOptions),
+    ImportFormat("npz-columns", "the same as an array for each column", (".npz",), _any, _read_npz, TableOptions),
+    ImportFormat("mrcal-observations", "what a .cameramodel was made from", (".cameramodel",), _never, _read_mrcal),
+    ImportFormat("colmap-observations", "the keypoints of a COLMAP model", (), _never, _read_colmap),
+)

@@ -1,0 +1,133 @@
+"""Kalibr's camchain: cameras one after the other, each with its pose in the one before. It has no world: as mrcal does
+it, the first camera's T_cn_cnm1 is its pose over the field.
+
+src https://github.com/ethz-asl/kalibr/wiki/yaml-formats.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from ceres_cal.base.arrays import Array
+from ceres_cal.base.errors import InputError
+from ceres_cal.base.transforms import Pose
+from ceres_cal.formats.export_format import Exported, ExportFormat, ExportRequest
+from ceres_cal.formats.import_format import ImportedCameras, ImportFormat, ImportRequest
+from ceres_cal.formats.loss import as_foreign, field_box, loss_words
+from ceres_cal.formats.yaml_files import numbers_at, read_yaml, yaml_text
+from ceres_cal.scene.foreign import FISHEYE, ForeignCamera
+
+_MODELS = {"opencv4": "radtan", FISHEYE: "equidistant"}
+_PROJECTIONS = {"pinhole": 0, "omni": 1, "ds": 2, "eucm": 2}  # how many numbers stand before the four of K
+_DISTORTIONS = {"none": 0, "radtan": 4, "equidistant": 4, "fov": 1}
+_ROUNDING = 1e-6  # of a pose that was written with few digits
+
+
+def _export(request: ExportRequest) -> Exported:
+    box, chain, losses = field_box(request.calibration.targets), {}, []
+    before = Pose.identity()
+    for number, name in enumerate(request.stations):
+        camera = request.calibration.station(name)
+        foreign, loss = as_foreign(camera, name, tuple(_MODELS), box)
+        between = camera.cam_from_world @ before.inverse
+        before = camera.cam_from_world
+        chain[f"cam{number}"] = {
+            "camera_model": "pinhole",
+            "intrinsics": [*foreign.focal, *foreign.centre],
+            "distortion_model": _MODELS[foreign.model],
+            "distortion_coeffs": list(foreign.coefficients),
+            "T_cn_cnm1": [*between.matrix.tolist(), [0.0, 0.0, 0.0, 1.0]],
+            "resolution": list(foreign.image_size),
+            "rostopic": f"/{name}",
+        }
+        losses.append(loss)
+    comments = [f"# {line}\n" for loss in losses for line in loss_words(loss)]
+    comments.append("# T_cn_cnm1 of cam0 takes points of the field (m) to cam0, as mrcal-to-kalibr writes it\n")
+    models = " and ".join(str(one["distortion_model"]) for one in chain.values())
+    return Exported(("".join(comments) + yaml_text(chain)).encode(), tuple(losses), f"{len(chain)} cameras, {models}")
+
+
+def _read(request: ImportRequest) -> Any:
+    data = read_yaml(request.text)
+    names = sorted((key for key in data if key[:3] == "cam" and key[3:].isdigit()), key=lambda key: int(key[3:]))
+    if not names or names != [f"cam{n}" for n in range(len(names))]:
+        raise InputError(f"its cameras must be cam0, cam1, ..., not {', '.join(map(str, data)) or 'none'}")
+    cameras: dict[str, ForeignCamera] = {}
+    pose: Pose | None = None
+    for key in names:
+        entry = data[key]
+        if not isinstance(entry, dict):
+            raise InputError(f"{key} must have camera_model, intrinsics, ...")
+        if "T_cn_cnm1" in entry:
+            pose = _pose(entry, key) @ (pose or Pose.identity())
+        elif key != "cam0":
+            raise InputError(f"{key} has no T_cn_cnm1: where it stands is not said")
+        name = str(entry.get("rostopic") or key).strip("/").split("/")[0]
+        cameras[key if name in cameras else name] = _camera(entry, key, pose)
+    return ImportedCameras(cameras).calibration("a Kalibr camchain")
+
+
+def _pose(entry: Mapping[str, Any], key: str) -> Pose:
+    matrix = numbers_at(entry["T_cn_cnm1"], f"{key}.T_cn_cnm1", 16).reshape(4, 4)
+    turn = matrix[:3, :3]
+    if np.max(np.abs(turn @ turn.T - np.eye(3))) > _ROUNDING or np.linalg.det(turn) < 0.0:
+        raise InputError(f"{key}.T_cn_cnm1 holds no rotation")
+    return Pose(turn, matrix[:3, 3])
+
+
+def _camera(entry: Mapping[str, Any], key: str, pose: Pose | None) -> ForeignCamera:
+    model, bent = entry.get("camera_model"), entry.get("distortion_model", "none")
+    if model not in _PROJECTIONS or bent not in _DISTORTIONS:
+        raise InputError(f"{key}: {model!r} with distortion {bent!r} is unknown: one of {', '.join(_PROJECTIONS)} with "
+                         f"{', '.join(_DISTORTIONS)}")  # fmt: skip
+    extra = _PROJECTIONS[model]
+    values = numbers_at(entry.get("intrinsics"), f"{key}.intrinsics", 4 + extra)
+    coefficients = numbers_at(entry.get("distortion_coeffs") or [], f"{key}.distortion_coeffs", _DISTORTIONS[bent])
+    width, height = numbers_at(entry.get("resolution"), f"{key}.resolution", 2)
+    own, (fx, fy, cx, cy) = values[:extra], values[extra:]
+    size, matrix = (int(width), int(height)), np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    if model == "pinhole" and bent in ("none", "radtan"):
+        return ForeignCamera.opencv(size, matrix, coefficients, pose)
+    focal, centre = (float(fx), float(fy)), (float(cx), float(cy))
+    if model == "pinhole" and bent == "equidistant":
+        return ForeignCamera(size, focal, centre, FISHEYE, tuple(coefficients.tolist()), pose)
+    return ForeignCamera(
+        size, focal, centre, f"{model}-{bent}", (), pose, distort=_distort(model, own, bent, coefficients)
+    )
+
+
+def _distort(model: str, own: Array, bent: str, coefficients: Array) -> Callable[[Array], Array]:
+    """Kalibr's projection, then its distortion, at focal length 1."""
+
+    def distort(rays: Array) -> Array:
+        x, y, z = rays.T
+        away = np.linalg.norm(rays, axis=1)
+        if model == "omni":
+            depth = z + own[0] * away
+        elif model == "ds":
+            first = own[0] * away + z
+            depth = own[1] * np.sqrt(x * x + y * y + first * first) + (1.0 - own[1]) * first
+        elif model == "eucm":
+            depth = own[0] * np.sqrt(own[1] * (x * x + y * y) + z * z) + (1.0 - own[0]) * z
+        else:
+            depth = z
+        flat = np.column_stack([x / depth, y / depth, np.ones(len(x))])
+        flat[~(depth > 0.0)] = np.nan
+        if bent == "fov":
+            radius = np.linalg.norm(flat[:, :2], axis=1)
+            measured = np.arctan(2.0 * radius * np.tan(0.5 * coefficients[0])) / coefficients[0]
+            return np.asarray(flat[:, :2] * np.where(radius > 0.0, measured / radius, 1.0)[:, None])
+        kind = FISHEYE if bent == "equidistant" else "opencv4"
+        values = tuple(coefficients.tolist()) or (0.0,) * 4
+        return ForeignCamera((1, 1), (1.0, 1.0), (0.0, 0.0), kind, values).project_rays(flat)
+
+    return distort
+
+
+FORMAT = ExportFormat("kalibr", "Kalibr's camchain", (".yaml", ".yml"), _export, several_stations=True)
+IMPORT = ImportFormat(
+    "kalibr", "Kalibr's camchain", (".yaml", ".yml"), lambda content: b"camera_model" in content, _read
+)

@@ -1,0 +1,86 @@
+"""mrcal's .cameramodel: one camera a file, a Python literal. Files of its own calibrations also hold the observations.
+
+src dkogan/mrcal mrcal/cameramodel.py, cameramodel-parser.re, doc/cameramodels.org.
+"""
+
+from __future__ import annotations
+
+import ast
+import warnings
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from ceres_cal.base.errors import InputError
+from ceres_cal.base.files import require_room
+from ceres_cal.base.transforms import Pose
+from ceres_cal.formats.export_format import Exported, ExportFormat, ExportRequest
+from ceres_cal.formats.import_format import ImportedCameras, ImportFormat, ImportRequest
+from ceres_cal.formats.loss import as_foreign, field_box, loss_words
+from ceres_cal.formats.yaml_files import numbers_at
+from ceres_cal.scene.foreign import OPENCV_MODELS, ForeignCamera
+
+_MODELS = {f"LENSMODEL_OPENCV{count}": model for model, count in OPENCV_MODELS.items()}
+_BYTES_PER_COMMA = 1000  # of memory, for a part of the syntax tree
+_POSES = ("rt_cam_ref", "extrinsics")  # since 2.5, and before
+
+
+def _export(request: ExportRequest) -> Exported:
+    (name,) = request.stations
+    camera = request.calibration.station(name)
+    foreign, loss = as_foreign(camera, name, ("opencv5", "opencv8"), field_box(request.calibration.targets))
+    model = f"LENSMODEL_{foreign.model.upper()}"
+    pose = camera.cam_from_world.log().tolist()
+    entries = {
+        "lensmodel": model,
+        "intrinsics": [*foreign.focal, *foreign.centre, *foreign.coefficients],
+        **dict.fromkeys(reversed(_POSES), pose),
+        "imagersize": list(foreign.image_size),
+    }
+    lines = [f"# {line}\n" for line in (f"station {name}; reference: the field, metres", *loss_words(loss))]
+    body = "".join(f"    '{key}': {value!r},\n" for key, value in entries.items())
+    return Exported(("".join(lines) + "{\n" + body + "}\n").encode(), (loss,), f"{model}, pose")
+
+
+def literal_of(content: bytes) -> dict[str, Any]:
+    """The literal of a .cameramodel; InputError where it is none."""
+    text = content.decode("utf-8", errors="replace")
+    require_room(_BYTES_PER_COMMA * text.count(",") + 4.0 * len(text), "the file")
+    try:
+        with warnings.catch_warnings(action="ignore"):  # what the compiler thinks of its style
+            data = ast.literal_eval(text.strip())
+    except (ValueError, TypeError, SyntaxError, RecursionError, MemoryError) as error:
+        raise InputError(f"not a .cameramodel (cut short?): {error}") from None
+    if not isinstance(data, dict):
+        raise InputError("not a .cameramodel: it holds no { names: values }")
+    return data
+
+
+def _read(request: ImportRequest) -> Any:
+    data = literal_of(request.content)
+    kind = str(data.get("lensmodel", data.get("lens_model", data.get("distortion_model", ""))))
+    kind = kind.replace("DISTORTION_", "LENSMODEL_")
+    if kind != "LENSMODEL_PINHOLE" and kind not in _MODELS:
+        known = ", ".join(("LENSMODEL_PINHOLE", *_MODELS))
+        raise InputError(f"its lens model {kind!r} cannot be read here, only {known}")
+    count = 0 if kind == "LENSMODEL_PINHOLE" else OPENCV_MODELS[_MODELS[kind]]
+    values = numbers_at(data.get("intrinsics"), "intrinsics", 4 + count)
+    size = numbers_at(data.get("imagersize"), "imagersize", 2)
+    fx, fy, cx, cy = values[:4]
+    matrix = [[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]
+    camera = ForeignCamera.opencv([int(s) for s in size], matrix, values[4:], _pose(data))
+    return ImportedCameras({request.path.stem: camera}).calibration("an mrcal .cameramodel")
+
+
+def _pose(data: Mapping[str, Any]) -> Pose:
+    given = [numbers_at(data[name], name, 6) for name in _POSES if name in data]
+    if not given:
+        raise InputError(f"it has no pose: neither {' nor '.join(_POSES)}")
+    if len(given) == 2 and np.max(np.abs(given[0] - given[1])) > 1e-9:
+        raise InputError(f"its {' and '.join(_POSES)} differ: correct one")
+    return Pose.exp(given[0])
+
+
+FORMAT = ExportFormat("mrcal", "mrcal's .cameramodel", (".cameramodel",), _export)
+IMPORT = ImportFormat("mrcal", "mrcal's .cameramodel", (".cameramodel",), lambda _: True, _read)

@@ -1,0 +1,214 @@
+"""OpenCV's FileStorage, as YAML, XML or JSON: one camera under the names of its calibration sample, two under those of
+its stereo sample.
+
+src opencv/opencv samples/cpp/calibration.cpp, stereo_calib.cpp.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from ceres_cal.base.arrays import Array
+from ceres_cal.base.errors import InputError
+from ceres_cal.base.transforms import Pose
+from ceres_cal.formats.export_format import Exported, ExportFormat, ExportRequest, Loss
+from ceres_cal.formats.import_format import ImportedCameras, ImportFormat, ImportRequest
+from ceres_cal.formats.loss import as_foreign, field_box, loss_words
+from ceres_cal.scene.foreign import FISHEYE, ForeignCamera, image_grid
+
+_ENDINGS = (".yml", ".yaml", ".xml", ".json")
+_MATRIX = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "M1", "K")
+_COEFFICIENTS = ("distortion_coefficients", "Distortion_Coefficients", "distCoeffs", "dist_coeffs", "D1", "D")
+_ROUGH_PX = 0.05  # from which on OpenCV's own inverse is worth a word
+_WIDTH, _HEIGHT = ("image_width", "image_Width"), ("image_height", "image_Height")
+
+
+# ---- writing --------------------------------------------------------------------------------------------------------
+
+
+def _export(request: ExportRequest) -> Exported:
+    import cv2
+
+    if len(request.stations) > 2:
+        raise InputError(f"OpenCV's files hold one camera or two, not {len(request.stations)}: name the stations")
+    box = field_box(request.calibration.targets)
+    cameras, losses = [], []
+    for name in request.stations:
+        camera = request.calibration.station(name)
+        models = (FISHEYE,) if camera.lens.kind == "kannala-brandt" else ("opencv5", "opencv8")
+        foreign, loss = as_foreign(camera, name, models, box)
+        cameras.append(foreign)
+        losses.append(loss)
+    entries = _mono(cameras[0], losses[0]) if len(cameras) == 1 else _stereo(cameras)
+    storage = cv2.FileStorage(request.ending, cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
+    for key, value in {"stations": " ".join(request.stations), **entries}.items():
+        storage.write(key, value)
+    content = storage.releaseAndGetString()
+    if request.ending in (".yml", ".yaml"):  # what readers older than OpenCV 5 know
+        content = re.sub(r"^%YAML[^\n]*", "%YAML:1.0", content)
+    models_used = " and ".join(camera.model for camera in cameras)
+    named = zip(request.stations, cameras, strict=True)
+    warnings = [f"station {name!r}: {text}" for name, camera in named for text in _reader_traps(camera)]
+    return Exported(content.encode(), tuple(losses), f"K, {models_used}, pose", {}, tuple(warnings))
+
+
+def _reader_traps(camera: ForeignCamera) -> list[str]:
+    """What OpenCV makes of a camera."""
+    import cv2
+
+    if camera.model == FISHEYE:
+        return ["its numbers are those of cv2.fisheye, which a file cannot say: `distortion_model` does"]
+    pixels, coefficients = image_grid(camera.image_size), np.array(camera.coefficients)
+    straight = cv2.undistortPoints(pixels[:, None], camera.matrix, coefficients)[:, 0]
+    rays = np.column_stack([straight, np.ones(len(straight))])
+    worst = float(np.max(np.linalg.norm(camera.project_rays(rays) - pixels, axis=1)))
+    if worst <= _ROUGH_PX:
+        return []
+    end = "criteria=(cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 100, 1e-9)"
+    return [f"cv2.undistortPoints stops after five rounds, here up to {worst:.2g} px off: give it {end}"]
+
+
+def _numbers(camera: ForeignCamera) -> tuple[Array, Array, Array]:
+    """K, coefficients (1, N) and the pose (1, 6): rvec, tvec."""
+    pose = camera.cam_from_world or Pose.identity()
+    return camera.matrix, np.array([camera.coefficients]), pose.log()[None]
+
+
+def _common(camera: ForeignCamera) -> dict[str, Any]:
+    width, height = camera.image_size
+    return {"image_width": width, "image_height": height, "distortion_model": camera.model}
+
+
+def _mono(camera: ForeignCamera, loss: Loss) -> dict[str, Any]:
+    matrix, coefficients, pose = _numbers(camera)
+    named = {"camera_matrix": matrix, "distortion_coefficients": coefficients, "extrinsic_parameters": pose}
+    return _common(camera) | named | {"loss": "; ".join(loss_words(loss))}
+
+
+def _stereo(cameras: list[ForeignCamera]) -> dict[str, Any]:
+    """The names of intrinsics.yml and extrinsics.yml in one file; R, T take the first camera to the second."""
+    import cv2
+
+    first, second = cameras
+    if first.image_size != second.image_size or (first.model == FISHEYE) != (second.model == FISHEYE):
+        raise InputError("OpenCV's stereo files hold two cameras of one image size and one kind of lens")
+    entries = _common(first)
+    for number, camera in enumerate(cameras, start=1):
+        matrix, coefficients, pose = _numbers(camera)
+        entries |= {f"M{number}": matrix, f"D{number}": coefficients, f"extrinsic_parameters{number}": pose}
+    one, other = (camera.cam_from_world or Pose.identity() for camera in cameras)
+    between = other @ one.inverse
+    turn, shift = between.rotation, between.translation[:, None]
+    given = (entries["M1"], entries["D1"].T, entries["M2"], entries["D2"].T, first.image_size, turn, shift)
+    rectified: Any = cv2.fisheye.stereoRectify(*given, flags=0) if first.model == FISHEYE else cv2.stereoRectify(*given)
+    names = ("R1", "R2", "P1", "P2", "Q")
+    return entries | {"R": turn, "T": shift} | dict(zip(names, rectified[:5], strict=True))
+
+
+# ---- reading --------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class OpenCvOptions:
+    """What a file may not say."""
+
+    image_size: str = field(default="", metadata={"help": "WIDTHxHEIGHT px, where the file does not say it"})
+    camera: str = field(default="camera", metadata={"help": "name for the camera; default: camera"})
+
+
+def _read(request: ImportRequest) -> Any:
+    import cv2
+
+    try:
+        storage = cv2.FileStorage(request.text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+        names = storage.root().keys()
+    except (cv2.error, SystemError) as error:
+        raise InputError(f"not a FileStorage of OpenCV (cut short?): {str(error).splitlines()[0]}") from None
+    if not any(name in names for name in _MATRIX):
+        raise InputError(f"it has no camera matrix: none of {', '.join(_MATRIX)}")
+    stereo = "M1" in names and "M2" in names
+    stations = _text(storage, "stations").split()
+    if stereo:
+        stations = stations if len(stations) == 2 else ["left", "right"]
+        cameras = {name: _camera(storage, request, str(n)) for n, name in enumerate(stations, start=1)}
+        if cameras[stations[1]].cam_from_world is None:
+            first = cameras[stations[0]].cam_from_world or Pose.identity()
+            between = Pose(_mat(storage, ("R",), (3, 3)), _mat(storage, ("T",), (3, 1)).ravel())
+            cameras[stations[1]] = replace(cameras[stations[1]], cam_from_world=between @ first)
+        return ImportedCameras(cameras).calibration("OpenCV")
+    name = stations[0] if stations else request.options.camera
+    return ImportedCameras({name: _camera(storage, request, "")}).calibration("OpenCV")
+
+
+def _camera(storage: Any, request: ImportRequest, number: str) -> ForeignCamera:
+    matrix = _mat(storage, (f"M{number}",) if number else _MATRIX, (3, 3))
+    coefficients = _mat(storage, (f"D{number}",) if number else _COEFFICIENTS, None).ravel()
+    poses = _mat(storage, (f"extrinsic_parameters{number}",), None, needed=False)
+    pose = None
+    if poses.shape == (1, 6):  # of several, each is of one view of a board
+        pose = Pose.exp(poses[0])
+        pose = pose if np.any(poses) else None
+    camera = ForeignCamera.opencv(_size(storage, request), matrix, coefficients, pose)
+    if _text(storage, "distortion_model") == FISHEYE:
+        if len(coefficients) != 4:
+            raise InputError(f"a fisheye has 4 coefficients, not {len(coefficients)}")
+        return replace(camera, model=FISHEYE, coefficients=tuple(coefficients.tolist()))
+    return camera
+
+
+def _size(storage: Any, request: ImportRequest) -> tuple[int, int]:
+    sizes = [_real(storage, names) for names in (_WIDTH, _HEIGHT)]
+    if all(size is not None and size.is_integer() and size > 0.0 for size in sizes):
+        return int(sizes[0] or 0), int(sizes[1] or 0)
+    return parse_size(request.options.image_size)
+
+
+def parse_size(text: str) -> tuple[int, int]:
+    """WIDTHxHEIGHT; InputError where it is none."""
+    found = re.fullmatch(r"\s*(\d+)\s*[xX,]\s*(\d+)\s*", text)
+    if not found:
+        raise InputError("the image size is not there: give image_size as WIDTHxHEIGHT, such as 1280x960")
+    return int(found[1]), int(found[2])
+
+
+def _text(storage: Any, name: str) -> str:
+    node = storage.getNode(name)
+    return str(node.string()) if node.isString() else ""
+
+
+def _real(storage: Any, names: tuple[str, ...]) -> float | None:
+    nodes = [node for node in map(storage.getNode, names) if node.isInt() or node.isReal()]
+    return float(nodes[0].real()) if nodes else None
+
+
+def _mat(storage: Any, names: tuple[str, ...], shape: tuple[int, int] | None, *, needed: bool = True) -> Array:
+    import cv2
+
+    for name in names:
+        node = storage.getNode(name)
+        try:
+            matrix = node.mat() if node.isMap() else None
+        except cv2.error:
+            raise InputError(f"{name} must be a matrix: its rows and cols do not fit its data") from None
+        if matrix is None:
+            continue
+        if (shape is not None and matrix.shape != shape) or not np.all(np.isfinite(matrix)):
+            raise InputError(f"{name} must be {shape or 'finite'} numbers, not {np.asarray(matrix).tolist()}")
+        return np.asarray(matrix, dtype=float)
+    if needed:
+        raise InputError(f"it has no matrix {names[0]!r}")
+    return np.empty((0, 0))
+
+
+def _recognises(content: bytes) -> bool:
+    return b"opencv-matrix" in content or b"opencv_storage" in content
+
+
+FORMAT = ExportFormat(
+    "opencv", "OpenCV's FileStorage of one camera, or of two as stereo", _ENDINGS, _export, several_stations=True
+)
+IMPORT = ImportFormat("opencv", "OpenCV's FileStorage", _ENDINGS, _recognises, _read, OpenCvOptions)

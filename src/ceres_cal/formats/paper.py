@@ -1,0 +1,78 @@
+"""The paper's own numbers as text: a1, a2, a3, K, H, R, t and the angles (sections 2 to 3.6)."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import numpy as np
+
+from ceres_cal.base.arrays import Array
+from ceres_cal.base.errors import InputError
+from ceres_cal.base.transforms import Pose, euler_from_rotation
+from ceres_cal.formats.export_format import Exported, ExportFormat, ExportRequest
+from ceres_cal.formats.import_format import ImportedCameras, ImportFormat, ImportRequest
+from ceres_cal.formats.loss import camera_loss, field_box, loss_words
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.lens import Radial
+
+
+def _export(request: ExportRequest) -> Exported:
+    (name,) = request.stations
+    camera = request.calibration.station(name)
+    ours = camera.nearest(Radial.blank((2, 3)))
+    loss = camera_loss(name, camera, ours.project, field_box(request.calibration.targets))
+    a2, a3 = ours.lens.values
+    alpha, beta, gamma = euler_from_rotation(ours.cam_from_world.rotation)
+    rows = {
+        "image_size": np.array(ours.image_size, dtype=float),
+        "a1": np.array(1.0),
+        "a2": np.array(a2),
+        "a3": np.array(a3),
+        "phi": np.array(ours.phi),
+        "K": ours.matrix,
+        "R": ours.cam_from_world.rotation,
+        "t": ours.position,
+        "alpha_beta_gamma": np.array([alpha, beta, gamma]),
+        "H": ours.homography(),
+    }
+    comments = [
+        f"station {name}, after R. Rojas, Calibrating an Overhead Video Camera; pixels, metres, radians",
+        "r' = a1 r + a2 r^2 + a3 r^3 from the measured to the ideal radius; x_cam = R (x_world - t)",
+        "H takes (x, y, 1) of the floor to the image plane at depth 1",
+        *loss_words(loss),
+    ]
+    text = "".join(f"# {line}\n" for line in comments) + "".join(f"{key} = {_text(v)}\n" for key, v in rows.items())
+    return Exported(text.encode(), (loss,), "a1, a2, a3, phi, K, R, t, angles and H")
+
+
+def _text(values: Array) -> str:
+    return "; ".join(" ".join(repr(float(v)) for v in row) for row in np.atleast_2d(values))
+
+
+def _read(request: ImportRequest) -> Any:
+    given = dict(re.findall(r"^\s*(\w+)\s*=\s*([^#\n]*)", request.text, re.MULTILINE))
+
+    def numbers(name: str, count: int) -> Array:
+        try:
+            values = np.array([float(v) for v in given[name].replace(";", " ").split()])
+        except (KeyError, ValueError):
+            values = np.empty(0)
+        if len(values) != count or not np.all(np.isfinite(values)):
+            raise InputError(f"{name} must be {count} finite numbers, not {given.get(name, 'missing')!r}")
+        return values
+
+    (a1,), (a2,), (a3,), k = numbers("a1", 1), numbers("a2", 1), numbers("a3", 1), numbers("K", 9)
+    lens, phi = Radial.from_paper(a1, a2, a3, k[0])
+    width, height = numbers("image_size", 2)
+    turn = numbers("R", 9).reshape(3, 3)
+    if np.max(np.abs(turn @ turn.T - np.eye(3))) > 1e-6:
+        raise InputError("R is no rotation")
+    pose = Pose.looking(numbers("t", 3), turn)
+    camera = Camera((int(width), int(height)), phi, (k[2], k[5]), lens, k[4] / k[0], pose)
+    camera.require_monotone(request.path.stem)
+    return ImportedCameras({request.path.stem: camera}).calibration("the paper's numbers")
+
+
+FORMAT = ExportFormat("paper", "the paper's a1, a2, a3, K, H, R, t and angles as text", (".txt",), _export)
+IMPORT = ImportFormat("paper", "the paper's numbers as text", (".txt",), lambda content: b"a1 =" in content, _read)

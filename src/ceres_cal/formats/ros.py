@@ -1,0 +1,107 @@
+"""ROS camera_info as YAML, as its camera_calibration_parsers read it. It has no pose: that goes beside, as a static
+transform, from the optical frame to the field.
+
+src ros-perception/image_common camera_calibration_parsers/src/parse_yml.cpp.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from ceres_cal.base.arrays import Array
+from ceres_cal.base.errors import InputError
+from ceres_cal.base.transforms import Pose, quaternion, rotation_of
+from ceres_cal.formats.export_format import Exported, ExportFormat, ExportRequest
+from ceres_cal.formats.import_format import ImportedCameras, ImportFormat, ImportRequest
+from ceres_cal.formats.loss import as_foreign, field_box, loss_words
+from ceres_cal.formats.yaml_files import numbers_at, read_yaml, yaml_text
+from ceres_cal.scene.foreign import FISHEYE, ForeignCamera
+
+_MODELS = {"opencv5": "plumb_bob", "opencv8": "rational_polynomial", FISHEYE: "equidistant"}
+
+
+@dataclass(frozen=True)
+class RosOptions:
+    """Names of frames."""
+
+    world_frame: str = field(default="field", metadata={"help": "parent of the static transform; default: field"})
+
+
+def _export(request: ExportRequest) -> Exported:
+    (name,) = request.stations
+    camera = request.calibration.station(name)
+    foreign, loss = as_foreign(camera, name, tuple(_MODELS), field_box(request.calibration.targets))
+    projection = np.column_stack([foreign.matrix, np.zeros(3)])
+    (width, height), pose = foreign.image_size, camera.cam_from_world.inverse
+    frames = {"frame_id": request.options.world_frame, "child_frame_id": f"{name}_optical_frame"}
+    x, y, z = pose.translation.tolist()
+    qx, qy, qz, qw = quaternion(pose.rotation).tolist()
+    data = {
+        "image_width": width,
+        "image_height": height,
+        "camera_name": name,
+        "camera_matrix": _matrix(foreign.matrix),
+        "distortion_model": _MODELS[foreign.model],
+        "distortion_coefficients": _matrix(np.array([foreign.coefficients])),
+        "rectification_matrix": _matrix(np.eye(3)),
+        "projection_matrix": _matrix(projection),
+        "static_transform": frames | {"x": x, "y": y, "z": z, "qx": qx, "qy": qy, "qz": qz, "qw": qw},
+        "loss": "; ".join(loss_words(loss)),
+    }
+    words = f"{_MODELS[foreign.model]}, and the pose as static_transform, whose names are static_transform_publisher's"
+    warnings = ["equidistant is unknown to installations before 2021"] if foreign.model == FISHEYE else []
+    return Exported(
+        yaml_text(data).encode(), (loss,), words, {"static_transform": data["static_transform"]}, (*warnings,)
+    )
+
+
+def _matrix(values: Array) -> dict[str, Any]:
+    return {"rows": values.shape[0], "cols": values.shape[1], "data": values.ravel().tolist()}
+
+
+def _read(request: ImportRequest) -> Any:
+    data = read_yaml(request.text)
+    sizes = [data.get(name) for name in ("image_width", "image_height")]
+    if not all(isinstance(size, int) and size > 0 for size in sizes):
+        raise InputError(f"image_width and image_height must be whole numbers above 0, not {sizes}")
+    matrix = _values(data, "camera_matrix", 9).reshape(3, 3)
+    if matrix[0, 0] == 0.0:
+        raise InputError("its K is 0: this is how ROS says that a camera was never calibrated")
+    coefficients = _values(data, "distortion_coefficients", None)
+    model = data.get("distortion_model", "plumb_bob")
+    if model not in _MODELS.values():
+        raise InputError(f"distortion_model {model!r} is unknown: one of {', '.join(_MODELS.values())}")
+    camera = ForeignCamera.opencv((sizes[0] or 0, sizes[1] or 0), matrix, coefficients, _pose(data))
+    if model == "equidistant":
+        if len(coefficients) != 4:
+            raise InputError(f"equidistant has 4 coefficients, not {len(coefficients)}")
+        camera = replace(camera, model=FISHEYE, coefficients=tuple(coefficients.tolist()))
+    name = str(data.get("camera_name") or "camera")
+    return ImportedCameras({name: camera}).calibration("a ROS camera_info")
+
+
+def _values(data: Mapping[str, Any], name: str, count: int | None) -> Array:
+    entry = data.get(name)
+    if not isinstance(entry, dict):
+        raise InputError(f"it has no {name} with rows, cols and data")
+    return numbers_at(entry.get("data"), f"{name}.data", count)
+
+
+def _pose(data: Mapping[str, Any]) -> Pose | None:
+    entry = data.get("static_transform")
+    if not isinstance(entry, dict):
+        return None
+    names = ("x", "y", "z", "qx", "qy", "qz", "qw")
+    values = numbers_at([entry.get(name) for name in names], "static_transform", 7)
+    return Pose(rotation_of(values[3:]), values[:3]).inverse
+
+
+FORMAT = ExportFormat("ros", "ROS camera_info, the pose beside it", (".yaml", ".yml"), _export, RosOptions)
+IMPORT = ImportFormat(
+    "ros", "ROS camera_info", (".yaml", ".yml"), lambda content: b"distortion_model" in content and b"cols" in content
+    and b"opencv-matrix" not in content, _read
+)  # fmt: skip

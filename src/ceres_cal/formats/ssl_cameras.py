@@ -1,0 +1,161 @@
+"""Cameras as ssl-vision and vision-processor have them: one focal length, one coefficient, a quaternion, millimetres.
+
+p = Q x_field + t; u = p_xy / p_z; |u| = rd (1 + d rd^2); pixel = f u rd / |u| + centre: our `radial` with power 3
+alone, d = a3 phi^2. Of any other lens the best fit on the field is taken, the camera's position held: free, f and
+height would trade off.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ceres_cal.base.arrays import Array
+from ceres_cal.base.errors import InputError
+from ceres_cal.base.least_squares import least_squares
+from ceres_cal.base.transforms import Pose, quaternion, rotation_exp, rotation_of
+from ceres_cal.formats.export_format import ExportRequest, Loss
+from ceres_cal.formats.loss import Box, camera_loss, field_pixels
+from ceres_cal.formats.opencv import parse_size
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.heights import HEIGHTS_M
+from ceres_cal.scene.lens import Radial
+
+_QUATERNION, _SHIFT = ("q0", "q1", "q2", "q3"), ("tx", "ty", "tz")
+NAMES = ("focal_length", "principal_point_x", "principal_point_y", "distortion", *_QUATERNION, *_SHIFT)
+_POSITION = tuple(f"derived_camera_world_{name}" for name in _SHIFT)
+
+
+@dataclass(frozen=True)
+class SslOptions:
+    """Whose camera is whose."""
+
+    camera_id: str = field(
+        default="",
+        metadata={"help": "ids of the stations' cameras, with commas between; default: the number that each name ends "
+                  "in, else 0, 1, ..."},
+    )  # fmt: skip
+
+
+def camera_ids(stations: Sequence[str], given: str) -> tuple[int, ...]:
+    """The id of each station's camera.
+
+    Raises:
+        InputError: not as many different whole numbers as there are stations.
+    """
+    texts = [text.strip() for text in given.split(",")] if given else [_last_digits(name) for name in stations]
+    if not given and (not all(texts) or len(set(texts)) != len(texts)):
+        texts = [str(number) for number in range(len(stations))]
+    if len(texts) != len(stations) or len(set(texts)) != len(texts) or not all(text.isdigit() for text in texts):
+        raise InputError(f"camera_id {given!r}: give {len(stations)} different whole numbers for {', '.join(stations)}")
+    return tuple(map(int, texts))
+
+
+def _last_digits(name: str) -> str:
+    return name[len(name.rstrip("0123456789")) :]
+
+
+def to_entries(request: ExportRequest, box_m: Box | None) -> tuple[dict[int, dict[str, Any]], list[Loss], list[str]]:
+    """id -> SSL_GeometryCameraCalibration as plain data; what is lost; what to know of those who will read it."""
+    entries, losses, warnings = {}, [], []
+    ids = camera_ids(request.stations, request.options.camera_id)
+    for name, number in zip(request.stations, ids, strict=True):
+        camera = request.calibration.station(name)
+        entry = to_entry(_nearest(camera, box_m), number)
+        written = to_camera(entry)
+        entries[number] = entry
+        losses.append(camera_loss(name, camera, written.project, box_m))
+        warnings += [f"station {name!r}: {text}" for text in reader_traps(entry)]
+    return entries, losses, warnings
+
+
+def as_before(entry: Mapping[str, Any], before: Mapping[str, Any] | None) -> dict[str, Any]:
+    """An entry, with the numbers of one that was there before where both are the same camera to float32's digits."""
+    if before is None or any(name not in before for name in NAMES):
+        return dict(entry)
+    old, new = (np.array([float(e[name]) for name in NAMES]) for e in (before, entry))
+    new[4:8] *= np.sign(old[4:8] @ new[4:8])  # q and -q are one rotation
+    if np.any(np.abs(old - new) > 2e-6 * np.maximum(1.0, np.abs(old))):
+        return dict(entry)
+    return {**entry, **{name: value for name, value in before.items() if name in entry}}
+
+
+def reader_traps(entry: Mapping[str, Any]) -> list[str]:
+    """What those who read an entry make of it."""
+    if entry["distortion"] < 0.0:
+        return [
+            "its distortion is negative: ssl-vision locates with it but draws, and states its own RMSE, without "
+            "(its issue 148); vision-processor takes either sign"
+        ]
+    return []
+
+
+def _nearest(camera: Camera, box_m: Box | None) -> Camera:
+    """The camera with one focal length and one coefficient that locates most alike on the field, at the same place."""
+    if camera.lens.kind == "radial" and camera.lens.powers == (3,) and camera.aspect == 1.0:
+        return camera
+    if box_m is None:
+        raise InputError("no field to fit ssl-vision's camera over: calibrate with the field, or use a radial lens "
+                         "with power 3 alone")  # fmt: skip
+    pixels = field_pixels(camera, box_m)
+    if not len(pixels):
+        raise InputError("the camera sees nothing of the field")
+    true = [camera.locate(pixels, height_m) for height_m in HEIGHTS_M]
+    unit = 0.5 * float(np.hypot(*camera.image_size))
+
+    def made(v: Array) -> Camera:
+        turned = Pose.looking(camera.position, rotation_exp(v[4:]) @ camera.cam_from_world.rotation)
+        return Camera(camera.image_size, v[0], (v[1], v[2]), Radial((v[3],), (3,)), 1.0, turned)
+
+    def residuals(v: Array) -> Array:
+        if v[0] <= 0.0:
+            return np.full(2 * len(pixels) * len(true), np.inf)
+        there = made(v)
+        off = [there.locate(pixels, height_m) - place for height_m, place in zip(HEIGHTS_M, true, strict=True)]
+        return np.where(np.isfinite(flat := 1e3 * np.concatenate(off).ravel()), flat, 1e6)
+
+    start = np.array([camera.phi, *camera.principal_point, 0.0, 0.0, 0.0, 0.0])
+    sizes = np.array([camera.phi, unit, unit, unit**-2, 1.0, 1.0, 1.0])
+    return made(least_squares(residuals, start, sizes))
+
+
+def to_entry(camera: Camera, number: int) -> dict[str, Any]:
+    """SSL_GeometryCameraCalibration of a camera with a radial lens of power 3, in float32."""
+    numbers = [camera.phi, *camera.principal_point, camera.lens.values[0] * camera.phi**2]
+    numbers += quaternion(camera.cam_from_world.rotation).tolist()
+    numbers += [*(1e3 * camera.cam_from_world.translation), *(1e3 * camera.position)]
+    single = {name: _single(value) for name, value in zip((*NAMES, *_POSITION), numbers, strict=True)}
+    width, height = camera.image_size
+    return {"camera_id": number, **single, "pixel_image_width": width, "pixel_image_height": height}
+
+
+def _single(value: float) -> float:
+    """A number as float32 holds it, with no more digits than that takes."""
+    return float(str(np.float32(value)))
+
+
+def to_camera(entry: Mapping[str, Any], image_size: str = "") -> Camera:
+    """The camera of an SSL_GeometryCameraCalibration; an image size as WIDTHxHEIGHT for one that has none.
+
+    Raises:
+        InputError: a number that is missing, or that makes no camera.
+    """
+    here = f"camera {entry.get('camera_id', '?')}"
+    values = []
+    for name in NAMES:
+        try:
+            values.append(float(entry[name]))
+        except (KeyError, TypeError, ValueError):
+            raise InputError(f"{here}: {name} is no number, but {entry.get(name)!r}") from None
+    f, cx, cy, d, *rest = values
+    turn, shift = np.array(rest[:4]), np.array(rest[4:])
+    norm = float(np.linalg.norm(turn))
+    if not (np.all(np.isfinite(values)) and f > 0.0 and abs(norm - 1.0) < 0.05):
+        raise InputError(f"{here}: focal_length {f:g}, or the length {norm:g} of its quaternion, makes no camera")
+    sizes = [entry.get("pixel_image_width"), entry.get("pixel_image_height")]
+    width, height = (int(float(size)) for size in sizes) if all(sizes) else parse_size(image_size)  # type: ignore[arg-type]
+    pose = Pose(rotation_of(turn), 1e-3 * shift)
+    return Camera((width, height), f, (cx, cy), Radial((d / f**2,), (3,)), 1.0, pose)

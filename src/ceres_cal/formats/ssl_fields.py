@@ -1,0 +1,162 @@
+"""The field of the league's geometry message as a target, and a target as that message: millimetres there, lines whose
+ends and radii are on their centres.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from ceres_cal.base.errors import InputError
+from ceres_cal.scene.curves import Arc, Curve, Segment
+from ceres_cal.scene.targets import Target, custom, ssl_field
+
+_SIZES = {  # of the message: the target's
+    "field_length": "field_length_m",
+    "field_width": "field_width_m",
+    "goal_width": "goal_width_m",
+    "penalty_area_depth": "penalty_area_depth_m",
+    "penalty_area_width": "penalty_area_width_m",
+    "center_circle_radius": "center_circle_radius_m",
+    "line_thickness": "line_thickness_m",
+    "goal_center_to_penalty_mark": "goal_center_to_penalty_mark_m",
+}
+_A_LENGTH_MM = 10500  # between divisions B and A
+_RULES = {
+    "goal_depth": 180,
+    "goal_height": 155,
+    "boundary_width": 300,
+    "ball_radius": 21.5,
+    "max_robot_radius": 90.0,
+}
+_SAME_M = 6e-4  # sizes are whole millimetres, the lines are the truth
+_SHAPES = "CenterCircle TopTouchLine BottomTouchLine LeftGoalLine RightGoalLine HalfwayLine CenterLine"
+_PENALTY = "LeftPenalty RightPenalty LeftFieldLeftPenalty LeftFieldRightPenalty RightFieldLeftPenalty"
+_TYPES = {*_SHAPES.split(), *(f"{name}Stretch" for name in f"{_PENALTY} RightFieldRightPenalty".split())}
+
+
+def target_of(field: Mapping[str, Any]) -> Target:
+    """The target that a field message (SSL_GeometryFieldSize as plain data) describes.
+
+    Its sizes make a field of the league; where its own lines lie elsewhere, those are the target.
+
+    Raises:
+        InputError: a size that is missing or makes no field, a line or an arc with something else than numbers.
+    """
+    for name in ("field_length", "field_width", "goal_width"):
+        if not isinstance(field.get(name), (int, float)):
+            raise InputError(f"the field has no {name} in mm")
+    by_rule = ssl_field("A" if field["field_length"] > _A_LENGTH_MM else "B")
+    given = {ours: 1e-3 * float(field[name]) for name, ours in _SIZES.items() if field.get(name)}
+    division = "A" if field["field_length"] > _A_LENGTH_MM else "B"
+    nominal = ssl_field(division, **given)
+    if nominal.curves == by_rule.curves and nominal.points == by_rule.points:
+        nominal = by_rule
+    try:
+        curves = _curves(field)
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"a line or an arc of the field has something else than its numbers: {error}") from None
+    if all(name in nominal.curves and _alike(curve, nominal.curves[name]) for name, curve in curves.items()):
+        return nominal
+    return custom({}, curves)
+
+
+def _curves(field: Mapping[str, Any]) -> dict[str, Curve]:
+    curves: dict[str, Curve] = {}
+    for line in field.get("field_lines") or []:
+        start, end = ((1e-3 * line[end]["x"], 1e-3 * line[end]["y"], 0.0) for end in ("p1", "p2"))
+        curves[str(line["name"])] = Segment(start, end, 1e-3 * line["thickness"])
+    for arc in field.get("field_arcs") or []:
+        centre = (1e-3 * arc["center"]["x"], 1e-3 * arc["center"]["y"], 0.0)
+        turn = min(float(arc["a2"]), float(arc["a1"]) + 2.0 * np.pi)  # 2 pi as float32 is a little more
+        turn = float(arc["a1"]) + 2.0 * np.pi if turn - float(arc["a1"]) > 2.0 * np.pi - 1e-6 else turn
+        curves[str(arc["name"])] = Arc(centre, 1e-3 * arc["radius"], float(arc["a1"]), turn, 1e-3 * arc["thickness"])
+    return curves
+
+
+def _alike(one: Curve, other: Curve) -> bool:
+    if isinstance(one, Segment) and isinstance(other, Segment):
+        ends = np.array([other.start, other.end])
+        off = min(np.max(np.abs(np.array(e) - ends)) for e in ((one.start, one.end), (one.end, one.start)))
+        return bool(off < _SAME_M)
+    if isinstance(one, Arc) and isinstance(other, Arc):
+        off = np.max(np.abs(np.subtract((*one.centre, one.radius_m), (*other.centre, other.radius_m))))
+        return bool(off < _SAME_M and abs(one.length_m - other.length_m) < _SAME_M)
+    return False
+
+
+def field_of(target: Target) -> dict[str, Any]:
+    """The message of a target: sizes in whole millimetres, its curves as lines and arcs.
+
+    Raises:
+        InputError: it has no curve on the floor, and so is no field.
+    """
+    curves = target.curves
+    if not curves:
+        raise InputError("the target has no lines: it is no field")
+    reach = np.concatenate([_reach(curve) for curve in curves.values()])
+    length, width = (round(2e3 * float(np.max(np.abs(reach[:, axis])))) for axis in (0, 1))
+    division = "A" if length > _A_LENGTH_MM else "B"
+    rules = {name: _sizes_of(ssl_field(division))[name] for name in _SIZES}
+    sizes = {**rules, "field_length": length, "field_width": width, **_RULES, **_sizes_of(target)}
+    lines = [
+        {"name": name, "p1": _place(c.start), "p2": _place(c.end), "thickness": _mm(c.width_m), **_type(name)}
+        for name, c in curves.items()
+        if isinstance(c, Segment)
+    ]
+    arcs = [
+        {
+            "name": name,
+            "center": _place(c.centre),
+            "radius": _mm(c.radius_m),
+            "a1": c.from_rad,
+            "a2": c.to_rad,
+            "thickness": _mm(c.width_m),
+            **_type(name),
+        }
+        for name, c in curves.items()
+        if isinstance(c, Arc)
+    ]
+    return {**sizes, "field_lines": lines, "field_arcs": arcs}
+
+
+def _sizes_of(target: Target) -> dict[str, int]:
+    """The sizes of a field of the league; none of another target."""
+    if target.kind != "ssl-field":
+        return {}
+    spec = {name: value for name, value in target.spec.items() if name not in ("kind", "division")}
+    x, y = target.points["TopRightCorner"][:2]
+    px, py = (abs(v) for v in target.points["LeftFieldRightPenaltyCorner"][:2])
+    circle = target.curves["CenterCircle"]
+    found = {
+        "field_length": 2.0 * x,
+        "field_width": 2.0 * y,
+        "penalty_area_depth": x - px,
+        "penalty_area_width": 2.0 * py,
+        "center_circle_radius": circle.radius_m if isinstance(circle, Arc) else 0.5,
+        "line_thickness": circle.width_m,
+        "goal_center_to_penalty_mark": x + target.points["RightPenaltyMark"][0],
+        "goal_width": spec.get("goal_width_m", 1.8 if target.spec.get("division") == "A" else 1.0),
+    }
+    return {name: round(1e3 * value) for name, value in found.items()}
+
+
+def _reach(curve: Curve) -> Any:
+    if isinstance(curve, Segment):
+        return np.array([curve.start, curve.end])
+    size = np.array([curve.radius_m, curve.radius_m, 0.0])
+    return np.array([curve.centre - size, curve.centre + size])
+
+
+def _mm(metres: float) -> float:
+    return round(1e3 * metres, 6)
+
+
+def _place(place: tuple[float, float, float]) -> dict[str, float]:
+    return {"x": _mm(place[0]), "y": _mm(place[1])}
+
+
+def _type(name: str) -> dict[str, str]:
+    return {"type": name} if name in _TYPES else {}

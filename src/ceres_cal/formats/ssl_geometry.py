@@ -1,0 +1,159 @@
+"""SSL_GeometryData: the league's geometry message as protobuf, and as vision-processor's geometry.yml.
+
+A file that is there already keeps its field, its ball models and the cameras that are not exported; of a geometry.yml
+only the lines of `calib` are replaced.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from ceres_cal.base.errors import InputError
+from ceres_cal.formats.export_format import Exported, ExportFormat, ExportRequest
+from ceres_cal.formats.import_format import ImportedCameras, ImportFormat, ImportRequest
+from ceres_cal.formats.loss import field_box
+from ceres_cal.formats.ssl_cameras import SslOptions, as_before, reader_traps, to_camera, to_entries
+from ceres_cal.formats.ssl_fields import field_of, target_of
+from ceres_cal.formats.ssl_messages import geometry_from_bytes, to_bytes
+from ceres_cal.formats.yaml_files import read_yaml, yaml_text
+
+_YAML = (".yml", ".yaml")
+
+
+def geometry_of(request: ExportRequest, before: Mapping[str, Any]) -> tuple[dict[str, Any], Exported]:
+    """SSL_GeometryData as plain data, with the field and the other cameras of what was there before.
+
+    Raises:
+        InputError: neither a field in the calibration nor before.
+    """
+    targets = {name: target for name, target in request.calibration.targets.items() if not target.movable}
+    if "field" in before:
+        size = dict(before["field"])
+        targets = targets or {"field": target_of(size)}
+    elif targets:
+        size = field_of(next(iter(targets.values())))
+    else:
+        raise InputError("the message needs a field, and the calibration has none: export into a file that has one, "
+                         "such as one that `ceres-cal listen` wrote")  # fmt: skip
+    entries, losses, warnings = to_entries(request, field_box(targets))
+    others = {int(entry["camera_id"]): dict(entry) for entry in before.get("calib") or []}
+    written = {number: as_before(entry, others.get(number)) for number, entry in entries.items()}
+    cameras = dict(sorted({**others, **written}.items()))
+    data = {"field": size, "calib": list(cameras.values())}
+    if before.get("models"):
+        data["models"] = before["models"]
+    words = f"camera {', '.join(map(str, entries))} of {len(cameras)} in ssl-vision's model"
+    facts = {"camera_ids": dict(zip(request.stations, entries, strict=True))}
+    return data, Exported(b"", tuple(losses), words, facts, tuple(warnings))
+
+
+def _export_packet(request: ExportRequest) -> Exported:
+    before = {} if request.existing is None else geometry_from_bytes(request.existing)
+    data, exported = geometry_of(request, before)
+    return exported.with_content(to_bytes("SSL_GeometryData", data))
+
+
+def _export_yaml(request: ExportRequest) -> Exported:
+    text = "" if request.existing is None else request.existing.decode("utf-8", errors="replace")
+    before = _checked(read_yaml(text)) if text.strip() else {}
+    data, exported = geometry_of(request, before)
+    to_bytes("SSL_GeometryData", data)  # or says what a reader would refuse
+    if "field" not in before:
+        return exported.with_content(yaml_text(data).encode())
+    return exported.with_content(_with_calib(text, yaml_text({"calib": data["calib"]})).encode())
+
+
+def _with_calib(text: str, block: str) -> str:
+    """A YAML text with its block `calib:` replaced, or added."""
+    lines = text.splitlines(keepends=True)
+    first = next((n for n, line in enumerate(lines) if line.startswith("calib:")), len(lines))
+    last = next((n for n in range(first + 1, len(lines)) if lines[n][0] not in " #-\r\n\t"), len(lines))
+    head = "".join(lines[:first])
+    head = head if head.endswith("\n") or not head else head + "\n"
+    return head + block + "".join(lines[last:])
+
+
+def _checked(data: Mapping[str, Any]) -> dict[str, Any]:
+    """What of a geometry.yml is the message's."""
+    if not isinstance(data.get("field"), dict):
+        raise InputError("it has no `field`")
+    calib = data.get("calib") or []
+    if not isinstance(calib, list) or not all(isinstance(entry, dict) for entry in calib):
+        raise InputError("`calib` must be a list of cameras")
+    kept: dict[str, Any] = {"field": data["field"], "calib": calib}
+    return kept | ({"models": data["models"]} if data.get("models") else {})
+
+
+# ---- reading --------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class SslReadOptions:
+    """What a message may not say."""
+
+    image_size: str = field(default="", metadata={"help": "WIDTHxHEIGHT px of cameras that do not say theirs"})
+
+
+def read_geometry(content: bytes) -> dict[str, Any]:
+    """A geometry.yml, an SSL_GeometryData or a wrapper packet, as plain data; InputError where it is none of them."""
+    if b"field:" in content:  # a packet holds no names of fields
+        data = _checked(read_yaml(content.decode("utf-8", errors="replace")))
+        to_bytes("SSL_GeometryData", {**data, "models": data.get("models", {})})
+        return data
+    return geometry_from_bytes(content)
+
+
+def _read(request: ImportRequest) -> Any:
+    data = read_geometry(request.content)
+    cameras, warnings = {}, []
+    for entry in data.get("calib", []):
+        name = f"camera{entry['camera_id']}"
+        cameras[name] = to_camera(entry, request.options.image_size)
+        cameras[name].require_monotone(name)
+        warnings += [f"camera {name!r}: {text}" for text in reader_traps(entry)]
+    if not cameras:
+        raise InputError("it holds no calibrated camera, only a field: `ceres-cal targets import` takes that")
+    warnings.append(
+        "a message does not say whether ssl-vision's OpenCV mode wrote it: then its distortion is OpenCV's k1"
+    )
+    return ImportedCameras(cameras, {"field": target_of(data["field"])}, warnings).calibration("an SSL geometry")
+
+
+def _recognises_yaml(content: bytes) -> bool:
+    return b"field_length" in content
+
+
+def _recognises_packet(content: bytes) -> bool:
+    try:
+        geometry_from_bytes(content)
+    except InputError:
+        return False
+    return True
+
+
+PACKET = ExportFormat(
+    "ssl-vision",
+    "the league's geometry message (SSL_GeometryData, protobuf); a file that is there is edited",
+    (".pb", ".bin"),
+    _export_packet,
+    SslOptions,
+    several_stations=True,
+    edits=True,
+)
+GEOMETRY_YML = ExportFormat(
+    "vision-processor",
+    "vision-processor's geometry.yml; a file that is there is edited",
+    _YAML,
+    _export_yaml,
+    SslOptions,
+    several_stations=True,
+    edits=True,
+)
+IMPORT_PACKET = ImportFormat(
+    "ssl-vision", "the league's geometry message", (".pb", ".bin"), _recognises_packet, _read, SslReadOptions
+)
+IMPORT_YML = ImportFormat(
+    "vision-processor", "vision-processor's geometry.yml", _YAML, _recognises_yaml, _read, SslReadOptions
+)

@@ -1,0 +1,248 @@
+"""ssl-vision's settings (VarTypes XML): its cameras' values are put into an existing file, nothing else is touched.
+
+src RoboCup-SSL/ssl-vision src/shared/vartypes, src/shared/util/camera_parameters. The file is robocup-ssl.xml beside
+settings.xml. ssl-vision reads it at its start and overwrites it at its end: edit it while ssl-vision is closed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+from xml.parsers import expat
+from xml.sax.saxutils import escape
+
+from ceres_cal.base.errors import InputError
+from ceres_cal.formats.export_format import Exported, ExportFormat, ExportRequest
+from ceres_cal.formats.import_format import ImportedCameras, ImportFormat, ImportRequest
+from ceres_cal.formats.loss import field_box
+from ceres_cal.formats.ssl_cameras import NAMES, SslOptions, reader_traps, to_camera, to_entries
+from ceres_cal.formats.ssl_fields import target_of
+from ceres_cal.formats.ssl_geometry import SslReadOptions
+from ceres_cal.scene.targets import Target
+
+_CAMERA, _PARAMETERS, _FIELD = "Camera Calibrator", "Camera Parameters", "Field Configuration"
+_INDEX, _OPENCV = "camera index", "use openCV camera model"
+_MOST_TZ_MM, _DISTORTION = 6500.0, (-1.0, 2.0)  # ssl-vision clamps to these when it reads
+_XML_NAMES = {name: name.replace("_", " ") if name[0] not in "qt" else name for name in NAMES}
+_SIZES = {  # of the message: of the settings
+    "field_length": "Field Length",
+    "field_width": "Field Width",
+    "goal_width": "Goal Width",
+    "goal_depth": "Goal Depth",
+    "goal_height": "Goal Height",
+    "boundary_width": "Boundary Width Touch Line",
+    "line_thickness": "Line Thickness",
+    "penalty_area_depth": "Penalty Area Depth",
+    "penalty_area_width": "Penalty Area Width",
+    "goal_center_to_penalty_mark": "Goal Line to Penalty Mark",
+    "center_circle_radius": "Center Circle Radius",
+}
+
+
+@dataclass(frozen=True)
+class _Var:
+    """One value: the names on the way to it, its text, and which bytes of the file are its text.
+
+    Attributes:
+        owner: the number of the list that holds it.
+    """
+
+    path: tuple[str, ...]
+    owner: int
+    text: str
+    start: int
+    end: int
+
+
+def _values(content: bytes) -> list[_Var]:
+    """Every value of a settings file.
+
+    Raises:
+        InputError: it is no XML of VarTypes.
+    """
+    parser, found = expat.ParserCreate(), []
+    open_tags: list[tuple[str, int, int]] = []  # name, number, first byte of what it holds
+    count, root = 0, ""
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        nonlocal count, root
+        root = root or tag
+        count += 1
+        open_tags.append((attributes.get("name", ""), count, content.index(b">", parser.CurrentByteIndex) + 1))
+
+    def end(tag: str) -> None:
+        name, _, first = open_tags.pop()
+        last = max(parser.CurrentByteIndex, first)
+        inside = content[first:last]
+        if tag == "Var" and b"<" not in inside:
+            path = (*(one[0] for one in open_tags[1:]), name)
+            owner = open_tags[-1][1]
+            found.append(_Var(path, owner, inside.decode("utf-8", errors="replace").strip(), first, last))
+
+    parser.StartElementHandler, parser.EndElementHandler = start, end
+    try:
+        parser.Parse(content, True)
+    except (expat.ExpatError, ValueError) as error:
+        raise InputError(f"not valid XML (cut short?): {error}") from None
+    if root != "VarXML":
+        raise InputError(f"not a settings file of ssl-vision: it begins with <{root}>, not <VarXML>")
+    return found
+
+
+def _cameras(values: list[_Var]) -> dict[int, dict[str, _Var]]:
+    """camera index -> the values of its Camera Parameters by name, and those beside them."""
+    groups: dict[int, dict[str, _Var]] = {}
+    for one in values:
+        if _PARAMETERS in one.path and one.path[-2] == _PARAMETERS:
+            groups.setdefault(one.owner, {})[one.path[-1]] = one
+    owners = sorted(groups)
+    if not owners:
+        raise InputError(
+            "it holds no camera: ssl-vision keeps its cameras in robocup-ssl.xml, beside settings.xml: name that file"
+        )
+    cameras: dict[int, dict[str, _Var]] = {}
+    for place, owner in enumerate(owners):
+        first = min(one.start for one in groups[owner].values())
+        following = [min(one.start for one in groups[other].values()) for other in owners if other > owner]
+        beside = _beside(values, first, min(following, default=1 << 62))
+        index = beside.get(_INDEX)
+        number = place if index is None else int(_number(index))
+        cameras[number] = {**beside, **groups[owner]}
+    return cameras
+
+
+def _beside(values: list[_Var], first: int, last: int) -> dict[str, _Var]:
+    """Index and image size of the calibrator whose parameters begin at a byte, before those of the next."""
+    wanted = (_INDEX, "Image width", "Image height")
+    return {one.path[-1]: one for one in values if one.path[-1] in wanted and first <= one.start < last}
+
+
+def _number(one: _Var) -> float:
+    try:
+        return float(one.text.replace(",", "."))  # some locales' printf
+    except ValueError:
+        raise InputError(f"{one.path[-1]!r} is no number, but {one.text!r}") from None
+
+
+# ---- writing --------------------------------------------------------------------------------------------------------
+
+
+def _export(request: ExportRequest) -> Exported:
+    if request.existing is None:
+        raise InputError("ssl-vision's settings are edited in place: name its robocup-ssl.xml (or a copy), with "
+                         "ssl-vision closed")  # fmt: skip
+    values = _values(request.existing)
+    there, box = _cameras(values), field_box(request.calibration.targets)
+    entries, losses, warnings = to_entries(request, box or field_box({"field": settings_target(values)}))
+    changes: list[tuple[_Var, str]] = []
+    for number, entry in entries.items():
+        if number not in there:
+            raise InputError(f"it has no camera {number}, only {', '.join(map(str, sorted(there)))}: see camera_id")
+        changes += _changes(number, entry, there[number])
+    content = request.existing
+    for one, text in sorted(changes, key=lambda change: -change[0].start):
+        content = content[: one.start] + escape(text).encode() + content[one.end :]
+    warnings.append("ssl-vision reads this file at its start and overwrites it at its end: it must be closed meanwhile")
+    words = f"camera {', '.join(map(str, entries))} in ssl-vision's settings"
+    facts = {"camera_ids": dict(zip(request.stations, entries, strict=True))}
+    return Exported(content, tuple(losses), words, facts, tuple(warnings))
+
+
+def _changes(number: int, entry: Mapping[str, Any], there: Mapping[str, _Var]) -> Iterator[tuple[_Var, str]]:
+    if not 0.0 <= entry["tz"] <= _MOST_TZ_MM:
+        raise InputError(
+            f"camera {number}: its tz {entry['tz']:.0f} mm is not between 0 and {_MOST_TZ_MM:.0f}, to which ssl-vision "
+            "clamps it: such a camera cannot be loaded"
+        )
+    if not _DISTORTION[0] <= entry["distortion"] <= _DISTORTION[1]:
+        raise InputError(f"camera {number}: ssl-vision clamps its distortion {entry['distortion']:.3g} to [-1, 2]")
+    for name, label in _XML_NAMES.items():
+        if label not in there:
+            raise InputError(f"camera {number} has no {label!r}: let ssl-vision write the file once")
+        yield there[label], f"{entry[name]:.9f}"
+    if _OPENCV in there:
+        yield there[_OPENCV], "false"
+
+
+# ---- reading --------------------------------------------------------------------------------------------------------
+
+
+def _read(request: ImportRequest) -> Any:
+    values = _values(request.content)
+    cameras, warnings = {}, []
+    for number, there in sorted(_cameras(values).items()):
+        name = f"camera{number}"
+        if _OPENCV in there and there[_OPENCV].text == "true":
+            warnings.append(f"camera {name!r}: ssl-vision's OpenCV mode is on, which ignores all distortion when it "
+                            "locates: what was read are the numbers of its own model")  # fmt: skip
+        cameras[name] = to_camera(_entry(number, there), request.options.image_size)
+        cameras[name].require_monotone(name)
+        warnings += [f"camera {name!r}: {text}" for text in reader_traps(_entry(number, there))]
+    return ImportedCameras(cameras, {"field": settings_target(values)}, warnings).calibration("ssl-vision's settings")
+
+
+def _entry(number: int, there: Mapping[str, _Var]) -> dict[str, Any]:
+    """As SSL_GeometryCameraCalibration has it."""
+    numbers = {name: _number(there[label]) for name, label in _XML_NAMES.items() if label in there}
+    sizes = [_number(there[label]) if label in there else 0.0 for label in ("Image width", "Image height")]
+    return {"camera_id": number, **numbers, "pixel_image_width": sizes[0], "pixel_image_height": sizes[1]}
+
+
+def settings_field(content: bytes) -> Target:
+    """The field of a settings file."""
+    return settings_target(_values(content))
+
+
+def settings_target(values: list[_Var]) -> Target:
+    """The field of a settings file; InputError where it has none."""
+    inside = [one for one in values if _FIELD in one.path]
+    if not inside:
+        raise InputError("it holds no field: ssl-vision keeps it in robocup-ssl.xml, beside settings.xml")
+    by_name = {one.path[-1]: one for one in inside if one.path[-2] == _FIELD}
+    sizes = {name: _number(by_name[label]) for name, label in _SIZES.items() if label in by_name}
+    return target_of(
+        {**sizes, "field_lines": _shapes(inside, "Field Lines"), "field_arcs": _shapes(inside, "Field Arcs")}
+    )
+
+
+def _shapes(inside: list[_Var], of: str) -> list[dict[str, Any]]:
+    """Lines or arcs as the message has them."""
+    groups: dict[int, dict[str, _Var]] = {}
+    for one in inside:
+        if of in one.path[:-1]:
+            groups.setdefault(one.owner, {})[one.path[-1]] = one
+    return [_shape(group) for group in groups.values()]
+
+
+def _shape(group: Mapping[str, _Var]) -> dict[str, Any]:
+    def place(name: str) -> dict[str, float]:
+        return {axis: _number(group[f"{name}.{axis}"]) for axis in "xy"}
+
+    try:
+        shape: dict[str, Any] = {"name": group["Name"].text, "thickness": _number(group["Line thickness"])}
+        if "Radius" not in group:
+            return {**shape, "p1": place("P1"), "p2": place("P2")}
+        ends = {"a1": _number(group["Start angle"]), "a2": _number(group["End angle"])}
+        return {**shape, "center": place("Center"), "radius": _number(group["Radius"]), **ends}
+    except KeyError as missing:
+        raise InputError(f"a line or arc of the field lacks {missing}") from None
+
+
+FORMAT = ExportFormat(
+    "ssl-vision-xml",
+    "ssl-vision's robocup-ssl.xml, edited in place",
+    (".xml",),
+    _export,
+    SslOptions,
+    several_stations=True,
+    edits=True,
+)
+IMPORT = ImportFormat(
+    "ssl-vision-xml",
+    "ssl-vision's robocup-ssl.xml",
+    (".xml",),
+    lambda content: b"<VarXML" in content,
+    _read,
+    SslReadOptions,
+)

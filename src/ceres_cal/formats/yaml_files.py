@@ -1,0 +1,88 @@
+"""YAML of others: read with one line of complaint, written with short rows in one line."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Mapping
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from ceres_cal.base.arrays import Array
+from ceres_cal.base.errors import InputError
+from ceres_cal.base.files import require_room
+
+_BYTES_PER_LETTER = 200  # of memory, and 10 us, while YAML is read
+_BYTES_PER_VALUE = 100
+
+
+def read_yaml(text: str) -> dict[str, Any]:
+    """A YAML file of names and values.
+
+    Raises:
+        InputError: it is none.
+    """
+    import yaml
+
+    require_room(float(_BYTES_PER_LETTER * len(text)), "its YAML")
+    try:
+        data = yaml.load(text, _loader())
+        size = _size(data, {})
+    except (yaml.YAMLError, ValueError, TypeError, OverflowError, RecursionError) as error:
+        raise InputError(f"not valid YAML (cut short?): {' '.join(str(error).split())}") from None
+    if not isinstance(data, dict):
+        raise InputError("not a YAML file of names and values")
+    if math.isinf(size):
+        raise InputError("something in its YAML holds itself: correct that")
+    require_room(_BYTES_PER_VALUE * size, "its YAML")
+    return data
+
+
+@cache
+def _loader() -> Any:
+    """PyYAML's safe one, but for keys that are there twice, and for merged ones, which may multiply without end."""
+    import yaml
+
+    return type("Loader", (yaml.SafeLoader,), {"flatten_mapping": _require_unique_keys})
+
+
+def _require_unique_keys(_: Any, node: Any) -> None:
+    keys = [str(key.value) for key, _ in node.value]
+    if len(set(keys)) < len(keys) or "<<" in keys:
+        again = next((key for key, count in Counter(keys).items() if count > 1), "<<")
+        raise InputError(f"{again[:100]!r} is given twice or merged in one place: keep one of them")
+
+
+def _size(value: Any, known: dict[int, float]) -> float:
+    """How many values there are, those behind an alias each time; infinite where something holds itself."""
+    if not isinstance(value, dict | list | tuple):
+        return 1.0
+    if id(value) not in known:
+        known[id(value)] = math.inf
+        parts = value.values() if isinstance(value, dict) else value
+        known[id(value)] = 1.0 + sum(_size(part, known) for part in parts)
+    return known[id(value)]
+
+
+def yaml_text(data: Mapping[str, Any]) -> str:
+    """Names and values as YAML, in their order; lists of plain numbers in one line."""
+    import yaml
+
+    return str(yaml.safe_dump(dict(data), sort_keys=False, default_flow_style=None, width=120))
+
+
+def numbers_at(values: Any, where: str, count: int | None = None) -> Array:
+    """A list of finite numbers, of lists of them, too, as one array (N,).
+
+    Raises:
+        InputError: naming `where`: something else, or another count.
+    """
+    try:
+        numbers = np.array(values, dtype=float).ravel()
+    except (TypeError, ValueError, OverflowError):
+        numbers = np.full(1, np.nan)
+    if not np.all(np.isfinite(numbers)) or (count is not None and len(numbers) != count):
+        raise InputError(f"{where} must be {count if count is not None else 'some'} finite numbers, not {values}")
+    return numbers

@@ -1,0 +1,38 @@
+"""Some of the observations, evenly, where all of them would take too long."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ceres_cal.base.arrays import AnyArray, Indices
+from ceres_cal.observations.observations import Observations
+
+_FEWEST_FRAMES = 40
+
+
+def column_of(observations: Observations, name: str) -> AnyArray:
+    """(N + M,) one column of the points, then of the curves."""
+    return np.concatenate([getattr(observations.points, name), getattr(observations.curves, name)])
+
+
+def frames_of(observations: Observations) -> tuple[tuple[str, ...], Indices]:
+    """Names of the frames that show anything, and (N + M,) the frame's number of each observation."""
+    views = column_of(observations, "view")
+    names = dict.fromkeys(observations.views[int(view)].frame for view in np.unique(views))
+    order = {name: number for number, name in enumerate(names)}
+    return tuple(names), np.array([order.get(view.frame, -1) for view in observations.views])[views]
+
+
+def thinned(observations: Observations, most: int) -> Observations:
+    """Evenly spread frames, and of these evenly spread observations, about `most` in all."""
+    total = len(observations.points) + len(observations.curves)
+    if total <= most:
+        return observations
+    names, frame = frames_of(observations)
+    count = max(min(_FEWEST_FRAMES, len(names)), int(len(names) * most / total))
+    chosen = np.isin(frame, np.linspace(0, len(names) - 1, count).round())
+    step = max(1, round(np.count_nonzero(chosen) / most))
+    masks = np.split(chosen, [len(observations.points)])
+    for mask in masks:
+        mask[np.flatnonzero(mask)[np.arange(np.count_nonzero(mask)) % step > 0]] = False
+    return observations.part(*masks)

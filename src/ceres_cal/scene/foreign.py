@@ -1,0 +1,252 @@
+"""A camera as other programs describe it: K, a lens model of theirs with its coefficients, and a pose.
+
+Where one of our lenses is their model, both ways are exact. Elsewhere the best fit over the image is taken, and says by
+how much it misses: `error_px`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ceres_cal.base.arrays import Array
+from ceres_cal.base.errors import InputError
+from ceres_cal.base.least_squares import least_squares
+from ceres_cal.base.transforms import Pose
+from ceres_cal.scene.lens import Brown, KannalaBrandt, Lens, Radial
+
+OPENCV_MODELS = {"opencv4": 4, "opencv5": 5, "opencv8": 8, "opencv12": 12}
+"""OpenCV's coefficients in its order, k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4]]], and how many there are."""
+LARGEST_PX = 10**9  # what is larger is no number of pixels
+FISHEYE = "fisheye"
+"""OpenCV's fisheye model: k1 to k4."""
+_GRID = (41, 31)  # pixels of the image over which a fit is made
+_ANGLES, _DIRECTIONS = 120, 24  # of rays in all directions, to see what a foreign model shows
+_LENSES = (Brown(), KannalaBrandt(), Radial.blank((2, 3)), Radial.blank((3, 5, 7)))
+
+
+@dataclass(frozen=True, eq=False)
+class ForeignCamera:
+    """A camera in the words of others.
+
+    Attributes:
+        image_size: (width, height) px. focal: fx, fy. centre: cx, cy, with (0, 0) at the centre of the first pixel.
+        model: one of OPENCV_MODELS, FISHEYE, or a name that only its own program knows. coefficients: of it.
+        cam_from_world: None where the file has none.
+        error_px: root mean square and largest distance, over the image, from the camera that it is the best fit to.
+        distort: of a model that is not known here, rays (N, 3) -> measured places (N, 2) at focal length 1.
+    """
+
+    image_size: tuple[int, int]
+    focal: tuple[float, float]
+    centre: tuple[float, float]
+    model: str
+    coefficients: tuple[float, ...]
+    cam_from_world: Pose | None = None
+    error_px: tuple[float, float] = (0.0, 0.0)
+    distort: Callable[[Array], Array] | None = None
+
+    def __post_init__(self) -> None:
+        numbers = (*self.focal, *self.centre, *self.coefficients)
+        if (
+            not np.all(np.isfinite(numbers))
+            or min(self.focal) <= 0.0
+            or not all(1 <= size <= LARGEST_PX for size in self.image_size)
+        ):
+            raise InputError(
+                f"a camera needs an image size, focal lengths above 0 and finite numbers, not {self.image_size} px, "
+                f"fx, fy {self.focal}, cx, cy {self.centre}, coefficients {self.coefficients}: correct them"
+            )
+
+    @classmethod
+    def opencv(
+        cls, image_size: Sequence[int], matrix: ArrayLike, coefficients: ArrayLike, pose: Pose | None = None
+    ) -> ForeignCamera:
+        """Of OpenCV's K (3, 3) and coefficients: 0, 1, 4, 5, 8, 12 or 14 of them.
+
+        Raises:
+            InputError: another number of coefficients, a skew, or a sensor that is tilted in its camera.
+        """
+        k, values = np.asarray(matrix, dtype=float), np.asarray(coefficients, dtype=float).ravel()
+        if k.shape != (3, 3) or abs(k[0, 1]) > 1e-9 * abs(k[0, 0]) or np.any(k[2] != (0.0, 0.0, 1.0)):
+            raise InputError(f"the camera matrix must be (fx 0 cx; 0 fy cy; 0 0 1), not {k.tolist()}")
+        if len(values) not in (0, 4, 5, 8, 12, 14):
+            raise InputError(f"OpenCV's models have 4, 5, 8, 12 or 14 coefficients, not {len(values)}")
+        if np.any(values[12:]):
+            raise InputError("a sensor that is tilted in its camera (coefficients 13 and 14) cannot be read here")
+        values = values[: 12 if np.any(values[8:]) else 8 if np.any(values[5:]) else 5]
+        values = np.concatenate([values, np.zeros(max(0, 5 - len(values)))])
+        width, height = (int(s) for s in image_size)
+        return cls(
+            (width, height),
+            (float(k[0, 0]), float(k[1, 1])),
+            (float(k[0, 2]), float(k[1, 2])),
+            f"opencv{len(values)}",
+            tuple(values.tolist()),
+            pose,
+        )
+
+    @property
+    def matrix(self) -> Array:
+        """K, (3, 3)."""
+        (fx, fy), (cx, cy) = self.focal, self.centre
+        return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+    @property
+    def lens(self) -> Lens | None:
+        """Ours that is the same; None where none is."""
+        if self.model == FISHEYE:
+            return KannalaBrandt(self.coefficients)
+        if self.model in OPENCV_MODELS and not any(self.coefficients[5:]):
+            return Brown((*self.coefficients, 0.0)[:5])
+        return None
+
+    def project_rays(self, rays: Array) -> Array:
+        """Rays (N, 3) in the camera's frame -> pixels (N, 2); NaN where the model has no answer."""
+        with np.errstate(all="ignore"):
+            if self.distort is not None:
+                places = self.distort(rays)
+            elif self.model == FISHEYE:
+                places = KannalaBrandt(self.coefficients).distort(rays, 1.0)
+            else:
+                places = _opencv(rays, self.coefficients)
+        return np.asarray(places * self.focal + self.centre)
+
+    # ---- fitted ------------------------------------------------------------------------------------------------------
+
+    @classmethod
+    def fitted(cls, start: ForeignCamera, rays: Array, pixels: Array) -> ForeignCamera:
+        """The camera of the start's model that shows rays (N, 3) nearest to pixels (N, 2)."""
+        count = len(start.coefficients)
+        numbers = np.array([*start.focal, *start.centre, *start.coefficients])
+        sizes = np.array([start.focal[0]] * 2 + [start.focal[0]] * 2 + [1.0] * count)
+        ahead = rays[:, 2] > 0.0
+
+        def made(v: Array) -> ForeignCamera:
+            return replace(start, focal=_two(v[:2]), centre=_two(v[2:4]), coefficients=tuple(v[4:].tolist()))
+
+        def residuals(v: Array) -> Array:
+            if min(v[:2]) <= 0.0 or not np.all(np.isfinite(v)):
+                return np.full(2 * np.count_nonzero(ahead), np.inf)
+            return np.asarray((made(v).project_rays(rays[ahead]) - pixels[ahead]).ravel())
+
+        end = made(least_squares(residuals, numbers, sizes))
+        return replace(end, error_px=_error(end.project_rays(rays), pixels))
+
+    @np.errstate(over="ignore", invalid="ignore")  # where it shows nothing
+    def approximated(self) -> tuple[dict[str, Any], tuple[float, float]]:
+        """The intrinsics of the camera of ours that is nearest over the image, by the names of `Camera`, and its root
+        mean square and largest distance, px.
+
+        Raises:
+            InputError: it shows nothing of its image.
+        """
+        width, height = self.image_size
+        rays = _all_directions()
+        seen = self.project_rays(rays.reshape(-1, 3)).reshape(*rays.shape[:2], 2)
+        radius = np.linalg.norm(seen - self.centre, axis=2)
+        growing = np.logical_and.accumulate(np.diff(radius, axis=1, prepend=-1.0) > 0.0, axis=1)
+        inside = np.all((seen >= -0.5) & (seen <= np.array([width, height]) - 0.5), axis=2)
+        chosen = growing & inside
+        if np.count_nonzero(chosen) < 20:
+            raise InputError(f"its {self.model} model shows nothing of its image: correct its numbers")
+        pixels, shown = seen[chosen], rays[chosen]
+        fits = [fit for lens in _LENSES if (fit := lens_fitted(self, lens, shown, pixels)) is not None]
+        if not fits:
+            raise InputError(f"no lens of ours is near its {self.model} model: correct its numbers")
+        return min(fits, key=lambda fit: fit[1][0])
+
+
+def _two(values: Array) -> tuple[float, float]:
+    return float(values[0]), float(values[1])
+
+
+def _error(pixels: Array, wanted: Array) -> tuple[float, float]:
+    """Root mean square and largest distance; infinite where there is no pixel."""
+    off = np.linalg.norm(pixels - wanted, axis=1)
+    off = np.where(np.isfinite(off), off, np.inf)
+    return float(np.sqrt(np.mean(off**2))), float(np.max(off))
+
+
+def _all_directions() -> Array:
+    """(directions, angles, 3) rays from the axis outwards to 89 degrees."""
+    angle = np.radians(np.linspace(0.0, 89.0, _ANGLES))
+    turn = np.linspace(0.0, 2.0 * np.pi, _DIRECTIONS, endpoint=False)[:, None]
+    across = np.sin(angle)
+    depth = np.broadcast_to(np.cos(angle), (_DIRECTIONS, _ANGLES))
+    return np.stack([across * np.cos(turn), across * np.sin(turn), depth], axis=-1)
+
+
+def lens_fitted(
+    foreign: ForeignCamera, lens: Lens, rays: Array, pixels: Array
+) -> tuple[dict[str, Any], tuple[float, float]] | None:
+    """Our lens nearest to what a foreign camera shows; None where it has no answer for some of it."""
+    unit = 0.5 * float(np.hypot(*foreign.image_size))
+    scales = lens.scales(unit)
+    (fx, fy), centre = foreign.focal, foreign.centre
+
+    def project(v: Array) -> Array:
+        model = lens.with_values(v[4:] / scales)
+        return np.asarray(model.distort(rays, v[0]) * (1.0, v[1]) + v[2:4])
+
+    def residuals(v: Array) -> Array:
+        if min(v[:2]) <= 0.0:
+            return np.full(pixels.size, np.inf)
+        off = (project(v) - pixels).ravel()
+        return np.where(np.isfinite(off), off, 1e6)
+
+    start = np.array([fx, fy / fx, *centre, *np.zeros(len(scales))])
+    sizes = np.array([fx, 1.0, fx, fx, *np.ones(len(scales))])
+    end = least_squares(residuals, start, sizes)
+    model = lens.with_values(end[4:] / scales)
+    reach = float(np.max(np.hypot(pixels[:, 0] - end[2], (pixels[:, 1] - end[3]) / end[1])))
+    if model.monotone_radius(end[0]) < reach:
+        return None
+    intrinsics = {"phi": float(end[0]), "aspect": float(end[1]), "principal_point": _two(end[2:4]), "lens": model}
+    return {"image_size": foreign.image_size, **intrinsics}, _error(project(end), pixels)
+
+
+def _opencv(rays: Array, coefficients: Sequence[float]) -> Array:
+    """OpenCV's model with up to 12 coefficients, on places (x/z, y/z)."""
+    k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4 = (*coefficients, *[0.0] * (12 - len(coefficients)))
+    depth = np.where(rays[:, 2] > 0.0, rays[:, 2], np.nan)
+    x, y = rays[:, 0] / depth, rays[:, 1] / depth
+    r2 = x * x + y * y
+    radial = (1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1.0 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+    return np.column_stack(
+        [
+            x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x) + r2 * (s1 + r2 * s2),
+            y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y + r2 * (s3 + r2 * s4),
+        ]
+    )
+
+
+def image_grid(image_size: tuple[int, int], steps: tuple[int, int] = _GRID) -> Array:
+    """(N, 2) pixels evenly over an image, to its very edges."""
+    axes = [np.linspace(-0.5, size - 0.5, count) for size, count in zip(image_size, steps, strict=True)]
+    return np.column_stack([part.ravel() for part in np.meshgrid(*axes)])
+
+
+@dataclass(frozen=True, eq=False)
+class OpenCvCamera:
+    """A camera as OpenCV's functions take it: `K, dist, rvec, tvec = camera.to_opencv()`.
+
+    Attributes:
+        matrix: K (3, 3). distortion: its coefficients. rvec, tvec: (3,) from the world, metres.
+        fisheye: whether they are those of `cv2.fisheye`.
+        error_px: root mean square and largest distance over the image from the camera that it was made of.
+    """
+
+    matrix: Array
+    distortion: Array
+    rvec: Array
+    tvec: Array
+    fisheye: bool
+    error_px: tuple[float, float]
+
+    def __iter__(self) -> Iterator[Array]:
+        return iter((self.matrix, self.distortion, self.rvec, self.tvec))

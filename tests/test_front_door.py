@@ -1,0 +1,84 @@
+"""From arrays to a calibration and back in a few lines, as someone types them who knows OpenCV."""
+
+import cv2
+import numpy as np
+import pytest
+
+import ceres_cal
+from ceres_cal import Camera, InputError, Observations, Pose, View, calibrate, checkerboard, ssl_field
+from ceres_cal.base.arrays import Array32
+from ceres_cal.scene.lens import Brown
+from ceres_cal.simulate import overhead_pose
+
+BOARD = checkerboard(9, 6, 0.1)
+TRUE = Camera((1280, 960), 900.0, (650.0, 470.0), Brown((-0.2, 0.05, 0.0, 0.0, 0.0)))
+
+
+def corners(count: int = 8) -> list[Array32]:
+    """OpenCV's arrays, one a frame, noise 0.1 px."""
+    draw, seen = np.random.default_rng(2), []
+    for _ in range(count):
+        turn = draw.uniform(-0.5, 0.5, 3)
+        at = TRUE.at(Pose.exp((*turn, *draw.uniform((-0.5, -0.4, 1.4), (-0.2, -0.1, 2.0)))))
+        seen.append((at.project(BOARD.point_array) + draw.normal(0.0, 0.1, (54, 2)))[:, None].astype(np.float32))
+    return seen
+
+
+def test_opencvs_corners_to_a_calibration_and_back() -> None:
+    observations = Observations.from_points(corners(), BOARD, (1280, 960))
+    calibration = calibrate(observations, ceres_cal.Options(lens="brown"))
+    matrix, distortion, rvec, tvec = calibration.station().to_opencv()
+    by_opencv = cv2.calibrateCamera([BOARD.point_array.astype(np.float32)] * 8, corners(), (1280, 960), None, None)
+    assert abs(matrix[0, 0] - by_opencv[1][0, 0]) < 2.0 and abs(matrix[0, 0] - 900.0) < 5.0  # aspect is held here
+    assert distortion.shape == (5,) and rvec.shape == tvec.shape == (3,)
+    rows = calibration.uncertainty.table()
+    assert {"kind", "owner", "quantity", "unit", "value", "sd", "low", "high", "verdict"} == set(rows[0])
+    assert next(row for row in rows if row["quantity"] == "phi")["value"] == calibration.station().phi
+    for thing in (calibration, observations, observations.points, calibration.station(), BOARD, Pose.identity()):
+        assert len(repr(thing)) < 160
+    assert repr(observations) == "Observations(432 points, 0 curve observations in 8 views of camera)"
+
+
+def test_places_frames_and_what_was_not_seen() -> None:
+    places = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+    pixels = np.array([[100.0, 100.0], [200.0, 100.0], [np.nan, np.nan], [100.0, 200.0]])
+    one = Observations.from_points(pixels, places, (640, 480), sigma_px=0.3)
+    assert one.points.feature.tolist() == [0, 1, 3] and one.points.sigma_px.tolist() == [0.3] * 3
+    assert one.views == (View("0", "camera", "camera", "target"),)
+    named = Observations.from_points({"a": pixels, "b": pixels}, places, (640, 480), moves=True, camera="left")
+    assert named.views[1] == View("b", "left", "left", "target", "b")
+    with pytest.raises(InputError, match="frame 'a': 3 pixels for 4 points"):
+        Observations.from_points({"a": pixels[:3]}, places, (640, 480))
+    with pytest.raises(InputError, match=r"points must have shape \(N, 3\)"):
+        Observations.from_points(pixels, places[0], (640, 480))
+    with pytest.raises(InputError, match="frame '0': pixels must have shape"):
+        Observations.from_points([pixels.T], places, (640, 480))
+
+
+def test_one_pixel_and_metres() -> None:
+    camera = TRUE.at(overhead_pose(0.0, 0.0, 4.0, 3.0, 2.0))
+    assert camera.locate([640, 480]).shape == (2,)
+    assert np.array_equal(camera.locate([640, 480], 0.15), camera.locate([[640, 480]], 0.15)[0])
+    assert camera.project([0.1, 0.2, 0.0]).shape == (2,)
+    with pytest.raises(
+        InputError, match=r"height_m 150 is in metres, and the camera's is 4\.00: for 150 mm give 0\.15"
+    ):
+        camera.locate([640, 480], 150)
+    assert np.isnan(camera.locate([640, 480], 6.0)).all()  # over the camera, but a height
+
+
+def test_what_is_public() -> None:
+    for name in (
+        "View",
+        "Points",
+        "Curves",
+        "Target",
+        "Segment",
+        "Arc",
+        "checkerboard",
+        "rings",
+        "ssl_field",
+        "custom",
+    ):
+        assert getattr(ceres_cal, name).__module__.startswith("ceres_cal.")
+    assert len(ceres_cal.ssl_field("B").points) == len(ssl_field("B").points)

@@ -1,0 +1,124 @@
+"""The lens that the data ask for: what is chosen, over what, by how much, and where it is kept."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scenes
+
+from ceres_cal.base.errors import InputError
+from ceres_cal.calibrating import calibrate
+from ceres_cal.calibration import Calibration
+from ceres_cal.cli import main
+from ceres_cal.diagnostics import choose
+from ceres_cal.lens_choice import PAPER, choose_lens, decide, held_out_errors, label_of
+from ceres_cal.model.equations import write_equations
+from ceres_cal.model.parameters import AUTO, Options
+from ceres_cal.model.residuals import residuals
+from ceres_cal.observations import Observations
+from ceres_cal.simulate import Disturbance, simulate
+from ceres_cal.solve.linear_model import make_linear_model
+from ceres_cal.uncertainty.sample import robust_weights
+
+_NOISE = Disturbance(points_sigma_px=0.3, curves_sigma_px=0.3)
+
+
+def _seen(lens: str, mix: str, seed: int = 1) -> Observations:
+    return simulate(scenes.MIXES[mix](lens), _NOISE, seed).observations
+
+
+# ---- what is chosen -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("mix", ["boards", "lines-arcs", "field-boards"])
+def test_the_papers_lens_is_recognised(mix: str) -> None:
+    chosen = [choose_lens(_seen("radial-2-3", mix, seed), Options(lens=AUTO))[1].chosen for seed in range(5)]
+    assert chosen.count(PAPER) >= 4  # of 135 scenes of all mixes in 132
+
+
+@pytest.mark.parametrize("lens", ["brown", "kannala-brandt", "radial-3-5"])
+def test_the_map_is_as_wrong_as_it_says_under_another_lens(lens: str) -> None:
+    simulation = simulate(scenes.MIXES["rings-field"](lens), _NOISE, 3)
+    station = simulation.scene.stations["overhead"]
+    truth = simulation.scene.cameras["overhead"].at(station.cam_from_world)
+    calibration = calibrate(simulation.observations, Options(lens=AUTO))
+    known = calibration.uncertainty.map_sd_mm("overhead")
+    places = np.stack(np.meshgrid(known.x_m, known.y_m), axis=-1).reshape(-1, 2)
+    pixels = truth.project(np.column_stack([places, np.zeros(len(places))]))
+    error_mm = 1e3 * np.linalg.norm(calibration.station().locate(pixels) - places, axis=1)
+    assert np.nanmedian(error_mm / known.sd_mm.ravel()) < 1.8  # 0.5 to 1.1
+
+
+def test_few_errors_that_all_share_are_no_reason_for_a_longer_lens() -> None:
+    """Each group's gain is large, but only one of them has it: the difference is within its own scatter."""
+    plain = np.full(12, 10.0)
+    better_once, better_everywhere = plain.copy(), plain - 2.0 + 0.1 * np.arange(12) % 2
+    better_once[3] = 1.0
+    labels, counts = [PAPER, "brown k1 k2 k3"], [2, 3]
+    assert decide(labels, counts, [plain, better_once]) == (1, 0)
+    assert decide(labels, counts, [plain, better_everywhere]) == (1, 1)
+    assert decide(labels, counts, [None, better_once]) == (1, 1)
+
+
+def test_the_simplest_wins_among_equals_and_the_papers_before_it() -> None:
+    same = np.full(12, 10.0)
+    assert decide(["brown k1 k2", "kannala-brandt k1"], [2, 1], [same, same])[1] == 1
+    assert decide(["kannala-brandt k1", PAPER], [1, 2], [same, same])[1] == 1
+
+
+def test_errors_without_a_placement_are_those_of_a_solve_without_it() -> None:
+    """To second order in what it moves: held against a solve in which the placement counts nothing."""
+    observations = _seen("radial-2-3", "boards")
+    calibration = calibrate(observations, Options(loss="trivial", reject_sigma=50.0))
+    out = observations.views[2].placement
+    problem, estimate = calibration.problem(observations), calibration.estimate
+    there = residuals(observations, problem.sights, estimate)
+    equations = write_equations(observations, problem.sights, estimate, there)
+    weights = robust_weights(observations, problem, equations, there)
+    model = make_linear_model(problem, estimate, equations, weights)
+    predicted = held_out_errors(model, equations.sight)
+    rows = np.array([observations.views[v].placement == out for v in equations.view])
+    kept = np.array([view.placement != out for view in observations.views])[observations.points.view]
+    others = calibrate(observations.part(kept, np.ones(0, bool)), calibration.options)
+    placements = {**others.estimate.placements, str(out): estimate.placements[str(out)]}
+    moved = replace(others.estimate, placements=placements)
+    fresh = residuals(observations, problem.sights, moved)
+    again = write_equations(observations, problem.sights, moved, fresh)
+    posed = replace(model, score=np.where(rows, weights.inverse_sigma * again.residual, 0.0)).placed_score
+    assert np.linalg.norm(posed[rows]) == pytest.approx(np.linalg.norm(predicted[rows]), rel=0.02)
+    assert np.linalg.norm(predicted[rows]) > 1.01 * np.linalg.norm(model.left_over[rows])
+
+
+# ---- where it is kept -----------------------------------------------------------------------------------------------
+
+
+def test_the_choice_is_kept_printed_and_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    _seen("kannala-brandt", "boards").save(tmp_path / "obs.json")
+    arguments = ["calibrate", str(tmp_path / "obs.json"), "--lens", "auto", "-o", str(tmp_path / "c.json")]
+    assert main([*arguments, "--report", str(tmp_path / "r.html")]) == 0
+    out = capsys.readouterr().out
+    calibration = Calibration.load(tmp_path / "c.json")
+    choice = calibration.lens_choice
+    assert choice is not None and choice.chosen == label_of(calibration.options) == choice.tried[0].label
+    assert choice.chosen in out and "next " in out
+    assert f"The lens that the data ask for: {choice.chosen}" in (tmp_path / "r.html").read_text(encoding="utf-8")
+    assert main([*arguments, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["calibration"]["lens_choice"]["chosen"] == choice.chosen
+    with pytest.raises(InputError, match="still to be chosen"):
+        Options(lens=AUTO, fixed={"a2": 0.0})
+
+
+def test_a_lens_that_is_given_stays_and_nothing_is_compared() -> None:
+    calibration = calibrate(_seen("kannala-brandt", "boards"), Options())
+    assert calibration.lens_choice is None and label_of(calibration.options) == PAPER
+
+
+def test_held_out_frames_speak_across_kinds() -> None:
+    choice = choose(_seen("kannala-brandt", "boards"), Options(powers=(3,)), k=3)
+    kinds = {one.label.split()[0] for one in choice.candidates}
+    assert choice.candidates[choice.current].label == "radial 3" and kinds > {"radial"}
+    assert not choice.candidates[choice.chosen].label.startswith("radial 3")

@@ -1,0 +1,553 @@
+"""Hostile files, faults, forks: each ends in one clear line, or in the right answer (docs/reliability.md)."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import shutil
+import signal
+import struct
+import subprocess
+import sys
+import time
+import zipfile
+import zlib
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import fuzz
+import numpy as np
+import photographs
+import pytest
+import refit_after_move
+import watching
+
+from ceres_cal.base.errors import CalibrationError, InputError
+from ceres_cal.base.files import LIMIT, read_bytes, write_bytes
+from ceres_cal.calibrating import calibrate
+from ceres_cal.calibration import Calibration
+from ceres_cal.cli import main
+from ceres_cal.detect.images import read_grey
+from ceres_cal.formats import LookupTable
+from ceres_cal.model.parameters import Options
+from ceres_cal.observations import Observations
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.lens import Radial
+from ceres_cal.scene.targets import checkerboard, custom, ssl_field
+from ceres_cal.scene.targets.target import MOST_FEATURES
+from ceres_cal.simulate import Disturbance, Station, field_scene, overhead_pose, simulate
+
+ROOT = Path(__file__).resolve().parents[1]
+SAMPLE = ROOT / "data" / "ssl_field_moved" / "observations.json"
+ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT / "src")}
+PROGRAM = [sys.executable, "-c", "import sys; from ceres_cal.cli import main; sys.exit(main())"]
+
+
+@pytest.fixture(scope="module")
+def observations() -> Observations:
+    return Observations.load(SAMPLE)
+
+
+@pytest.fixture(scope="module")
+def calibration(observations: Observations) -> Calibration:
+    return calibrate(observations)
+
+
+@pytest.fixture(scope="module")
+def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with one good file for each reader."""
+    folder = tmp_path_factory.mktemp("good")
+    fuzz.corpus(folder)
+    return folder
+
+
+def program(*arguments: object, **settings: Any) -> subprocess.CompletedProcess[str]:
+    """A command as a program of its own."""
+    words = [*PROGRAM, *map(str, arguments)]
+    environment = ENVIRONMENT | settings.pop("env", {})
+    return subprocess.run(words, capture_output=True, text=True, timeout=120, env=environment, **settings)
+
+
+def refused(read: Callable[[Path], object], path: Path, words: str, most_s: float = 10.0) -> None:
+    """One line that names the file, soon."""
+    begin = time.perf_counter()
+    with pytest.raises(InputError) as raised:
+        read(path)
+    text = str(raised.value)
+    assert text.startswith(f"{path}") and "\n" not in text and words in text, text
+    assert time.perf_counter() - begin < most_s
+
+
+# ---- files that are none --------------------------------------------------------------------------------------------
+
+
+def test_only_regular_files_are_read(tmp_path: Path) -> None:
+    pipe, loop = tmp_path / "pipe.json", tmp_path / "loop.json"
+    os.mkfifo(pipe)
+    loop.symlink_to(loop)
+    refused(read_bytes, pipe, "it is a pipe or a device: save its content to a file first")
+    refused(Observations.load, Path("/dev/zero"), "it is a pipe or a device")
+    refused(Observations.load, loop, "Too many levels of symbolic links")
+    assert main(["calibrate", str(loop), "-o", str(loop)]) == 2
+
+
+def test_sizes_are_limited_and_the_limit_can_be_raised(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "sparse.json"
+    with path.open("wb") as stream:
+        stream.truncate(10**12)
+    refused(
+        Observations.load,
+        path,
+        f"would take 1000000 MB, and a file may take 512 MB: give less at a time, or set {LIMIT}",
+    )
+    small = tmp_path / "small.json"
+    small.write_bytes(b"[" + b"[]," * 1_000_000 + b"[]]")
+    monkeypatch.setenv(LIMIT, "100")
+    refused(Observations.load, small, f"set {LIMIT}=")
+    monkeypatch.setenv(LIMIT, "1000")
+    refused(Observations.load, small, '"format" must be')
+    monkeypatch.setenv(LIMIT, "many")
+    with pytest.raises(InputError, match="give a whole number of megabytes"):
+        read_bytes(small)
+
+
+def repacked(archive: Path, place: Path, columns: dict[str, bytes], twice: str = "") -> Path:
+    """The archive with other columns in it."""
+    with zipfile.ZipFile(archive) as old, zipfile.ZipFile(place, "w", zipfile.ZIP_DEFLATED) as new:
+        for name in (*old.namelist(), *(columns.keys() - set(old.namelist())), *([twice] if twice else [])):
+            new.writestr(name, columns.get(name) or old.read(name))
+    return place
+
+
+@pytest.mark.filterwarnings("ignore:Duplicate name")
+def test_an_archive_that_unpacks_to_gigabytes(tmp_path: Path, good: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Unknown columns are not read, known ones within the limit, and not more than the archive has bytes for."""
+    archive, path = good / "observations.npz", tmp_path / "bomb.npz"
+    zeros = bytes(200_000_000)
+    refused(Observations.load, repacked(archive, path, {"more.npy": zeros}), "unknown column 'more'")
+    monkeypatch.setenv(LIMIT, "100")
+    refused(Observations.load, repacked(archive, path, {"points_view.npy": zeros}), "would take 200 MB")
+    refused(Observations.load, repacked(archive, path, {}, "points_view.npy"), "a column is there twice")
+    text = b"{'descr': '<i4', 'fortran_order': False, 'shape': (100000000000,), }"
+    claims = b"\x93NUMPY\x01\x00" + struct.pack("<H", 118) + text.ljust(117) + b"\n" + bytes(40)
+    columns = {"points_view.npy": claims}
+    refused(Observations.load, repacked(archive, path, columns), "points_view has not as many numbers as it says")
+
+
+def _png(width: int, height: int) -> bytes:
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    start = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0))
+    return b"\x89PNG\r\n\x1a\n" + start + chunk(b"IDAT", zlib.compress(bytes(1000))) + chunk(b"IEND", b"")
+
+
+def test_images_that_claim_more_than_they_hold(tmp_path: Path) -> None:
+    ok, bmp = cv2.imencode(".bmp", np.zeros((4, 4, 3), np.uint8))
+    assert ok
+    huge = bytearray(bmp.tobytes())
+    huge[18:26] = struct.pack("<ii", 30_000, 30_000)
+    for name, content, words in (
+        ("huge.png", _png(32_000, 32_000), "would take 3072 MB"),
+        ("large.png", _png(10_000, 10_000), "10000 x 10000 px, as it says, do not fit into"),
+        ("huge.bmp", bytes(huge), "would take 2700 MB"),
+        ("chunk.png", _png(64, 48).replace(struct.pack(">I", 17), b"\xfe\xff\xff\xff"), "not an image"),
+        ("none.tif", b"II*\0\x08\0\0\0\x01", "not an image"),
+    ):
+        (tmp_path / name).write_bytes(content)
+        refused(read_grey, tmp_path / name, words)
+
+
+def test_targets_have_a_largest_size(tmp_path: Path) -> None:
+    data = json.loads(SAMPLE.read_text())
+    board = {"kind": "checkerboard", "columns": 9_000_000_000, "rows": 6_000_000_000, "square_m": 0.025}
+    path = tmp_path / "huge.json"
+    path.write_text(json.dumps(data | {"targets": data["targets"] | {"board": board}}))
+    refused(
+        Observations.load, path, f"target 'board': checkerboard: at most {MOST_FEATURES} points and curves, not 5.4e+19"
+    )
+    many = {f"board{number}": board | {"columns": 200, "rows": 200} for number in range(100)}
+    path.write_text(json.dumps(data | {"targets": data["targets"] | many}))
+    refused(Observations.load, path, "targets up to 'board2': at most")
+    with pytest.raises(InputError, match="at most"):
+        checkerboard(10**10, 10**10, 0.025)
+
+
+# ---- files that contradict themselves -------------------------------------------------------------------------------
+
+
+def changed(path: Path, change: Callable[[dict[str, Any]], object], folder: Path) -> Path:
+    data = json.loads(path.read_text())
+    change(data)
+    (folder / "changed.json").write_text(json.dumps(data))
+    return folder / "changed.json"
+
+
+@pytest.mark.parametrize(
+    "change, words",
+    [
+        (
+            lambda d: next(iter(d["cameras"].values())).update(phi=float("nan")),
+            "nan is no finite number - at `$.cameras",
+        ),
+        (lambda d: next(iter(d["stations"].values())).update(rotation=[[1, 0, 0]] * 3), "is no rotation matrix"),
+        (
+            lambda d: next(iter(d["stations"].values())).update(position_m=[0, 0, 9]),
+            "position_m or euler_rad is another",
+        ),
+        (lambda d: d["options"].update(priors=5), "options.priors: Expected `array`"),
+        (lambda d: d["options"].update(threads="two"), "Expected `int`, got `str`"),
+        (lambda d: d.update(digest="\ud800"), "not valid JSON (cut short?)"),
+        (lambda d: d.update(rounds=10**400), "inf is no finite number"),
+        (lambda d: next(iter(d["cameras"].values())).update(phi=10**400), "inf is no finite number"),
+        (lambda d: d["posterior"].update(keys=d["posterior"]["keys"] * 5000), "numbers, not"),
+    ],
+)
+def test_calibrations_that_contradict_themselves(
+    tmp_path: Path, good: Path, change: Callable[[dict[str, Any]], object], words: str
+) -> None:
+    refused(Calibration.load, changed(good / "calibration.json", change, tmp_path), words)
+
+
+def test_what_is_given_twice(tmp_path: Path, good: Path) -> None:
+    """Also under another spelling of its name; a parser would quietly take the last one."""
+    for name, read in (("calibration.json", Calibration.load), ("observations.json", Observations.load)):
+        for key in ('"version"', '"versio\\u006e"'):
+            path = tmp_path / name
+            path.write_text((good / name).read_text().replace("{", "{" + key + ": 1, ", 1))
+            refused(read, path, "'version' is given twice in one object")
+    path.write_text((good / "observations.json").read_text().replace('"frame":"', '"frame":"a \\" b: {', 1))
+    assert Observations.load(path).views[0].frame.startswith('a " b: {')
+
+
+@pytest.mark.parametrize(
+    "change, words",
+    [
+        (lambda a: a.update(x_px=a["x_px"] * 1.1), "x_px is not evenly spaced"),
+        (lambda a: a.update(x_px=a["x_px"][:-1]), "has a shape"),
+        (lambda a: a.update(image_size=np.array([64, 10**6])), "x_px does not span the image"),
+        (lambda a: a["homography"].fill(np.nan), "a number is not finite"),
+        (lambda a: a.update(step_px=np.array(0)), "not evenly spaced"),
+        (lambda a: a.update(step_px=np.array([64])), "in 0 dimensions"),
+        (lambda a: a.update(error_mm=a["error_mm"][:, :2]), "has a shape"),
+        (lambda a: a.update(more=np.zeros(3)), "unknown column 'more'"),
+        (lambda a: a.update(station=np.array(object())), "pickled objects"),
+    ],
+)
+def test_tables_that_contradict_themselves(
+    tmp_path: Path, good: Path, change: Callable[[dict[str, Any]], object], words: str
+) -> None:
+    with np.load(good / "table.npz") as archive:
+        arrays = {name: archive[name].copy() for name in archive.files}
+    change(arrays)
+    np.savez(tmp_path / "table.npz", **arrays)
+    refused(LookupTable.load, tmp_path / "table.npz", words)
+
+
+def test_damaged_files_of_every_kind(good: Path) -> None:
+    """A short run of scripts/fuzz.py: three seconds of it."""
+    counts = fuzz.fuzz(good, 0.05, 1, None)
+    assert sum(counts.values()) > 30
+    assert not {what for _, what in counts} & set(fuzz.FAILURES), counts
+
+
+# ---- numbers that cannot be right -----------------------------------------------------------------------------------
+
+
+def test_pixels_far_off_and_another_origin(observations: Observations) -> None:
+    pixels = observations.curves.pixels.copy()
+    pixels[:9] = (99999.0, -5.0)
+    with pytest.raises(InputError, match="lie outside its image"):
+        calibrate(replace(observations, curves=replace(observations.curves, pixels=pixels)))
+    moved = replace(observations.curves, pixels=observations.curves.pixels + 300.0)
+    size = next(iter(observations.cameras.values()))
+    inside = np.all(moved.pixels < size, axis=1)
+    points = replace(observations.points, pixels=observations.points.pixels + 300.0)
+    shifted = replace(observations, points=points, curves=moved)
+    shifted = shifted.part(np.all(points.pixels < size, axis=1), inside)
+    assert any("principal point lies" in line for line in calibrate(shifted).warnings)
+
+
+def test_a_field_in_millimetres(observations: Observations) -> None:
+    (name,) = observations.targets
+    lengths = {
+        "field_length_m": 9000.0, "field_width_m": 6000.0, "goal_width_m": 1000.0, "penalty_area_depth_m": 1000.0,
+        "penalty_area_width_m": 2000.0, "goal_center_to_penalty_mark_m": 6000.0, "center_circle_radius_m": 500.0,
+        "line_thickness_m": 10.0,
+    }  # fmt: skip
+    large = replace(observations, targets={name: ssl_field(None, **lengths)}, priors=())
+    assert f"target {name!r} reaches 4500 m from its origin: are its numbers metres" in calibrate(large).warnings[0]
+
+
+@pytest.mark.parametrize("scale", [0.001, 1000.0])
+@pytest.mark.parametrize("phi", [100.0, 100_000.0])
+def test_scenes_of_a_centimetre_and_of_kilometres(scale: float, phi: float) -> None:
+    """9 mm and 9 km wide: the truth within 1.7 sd; pytest turns warnings of NumPy into errors."""
+    field = ssl_field("B")
+    points = {name: (scale * x, scale * y, 0.0) for name, (x, y, _) in field.points.items()}
+    centre = (0.75 * phi - 0.5, 0.55 * phi - 0.5)  # where it is held
+    camera = Camera((round(1.5 * phi), round(1.1 * phi)), phi, centre, Radial((0.0, 0.0)))
+    pose = overhead_pose(-0.5 * scale, -1.2 * scale, 6.0 * scale, -14.0, -11.5, 4.0)
+    scene = field_scene(custom(points), {"c": camera}, {"c": Station("c", pose)})
+    noise_px = 1e-4 * phi
+    seen = simulate(scene, Disturbance(noise_px, noise_px)).observations
+    found = calibrate(seen, Options(free_principal_point=False))
+    known = found.uncertainty.verdict("camera", "c", "phi")
+    assert abs(known.value - phi) < 4.0 * known.sd < 0.1 * phi
+
+
+def _nearly_singular(observations: Observations) -> Iterator[Observations]:
+    """Few, equal, collinear, exact and worthless observations."""
+    points, curves = observations.points, observations.curves
+    none = np.zeros(len(curves), bool)
+    for count in range(1, 9):
+        yield observations.part(np.arange(len(points)) < count, none)
+    yield replace(observations, points=replace(points, pixels=np.full_like(points.pixels, 100.0)))
+    line = np.column_stack([np.linspace(0.0, 900.0, len(points)), np.linspace(0.0, 500.0, len(points))])
+    yield replace(observations, points=replace(points, pixels=line)).part(np.ones(len(points), bool), none)
+    for sigma_px in (1e-12, 1e12):
+        yield replace(observations, points=replace(points, sigma_px=np.full(len(points), sigma_px)))
+
+
+@pytest.mark.parametrize("sigma_px", [1e-200, 1e200])
+def test_a_sigma_beyond_all_measure(observations: Observations, sigma_px: float) -> None:
+    points = replace(observations.points, sigma_px=np.full(len(observations.points), sigma_px))
+    with pytest.raises(InputError, match="its sigma_px must be positive and finite, 1e-12 to 1e12: correct"):
+        replace(observations, points=points)
+
+
+def test_what_is_nearly_singular_is_answered_or_named(observations: Observations) -> None:
+    for number, odd in enumerate(_nearly_singular(observations)):
+        try:
+            found = calibrate(odd)
+        except CalibrationError:
+            continue
+        assert all(np.isfinite(camera.phi) for camera in found.cameras.values()), number
+
+
+def test_a_table_without_nodes(good: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    table = tmp_path / "table.npz"
+    assert (
+        main(["export", str(good / "calibration.json"), "--to", "table", "--step-px", "100000000", "-o", str(table)])
+        == 2
+    )
+    assert "step_px must be" in capsys.readouterr().err and not table.exists()
+
+
+# ---- processes ------------------------------------------------------------------------------------------------------
+
+
+def _phi(path: str) -> bytes:
+    found = calibrate(Observations.load(path))
+    return b"".join(np.float64(camera.phi).tobytes() for camera in found.cameras.values())
+
+
+@pytest.mark.parametrize("method", ["fork", "spawn"])
+def test_children_after_a_calibration_in_the_parent(method: str, calibration: Calibration) -> None:
+    """The pool of threads is the parent's alone; and all say the same to the last bit, but for a parent that compiled
+    its kernels itself: then to the tolerance at which solves end, 5e-8.
+    """
+    mine = _phi(str(SAMPLE))
+    with ProcessPoolExecutor(2, mp_context=multiprocessing.get_context(method)) as pool:
+        first, second = (answer.result(60) for answer in [pool.submit(_phi, str(SAMPLE)) for _ in range(2)])
+    assert first == second
+    assert np.frombuffer(first) == pytest.approx(np.frombuffer(mine), rel=0.0 if method == "fork" else 1e-6)
+
+
+def test_processes_share_one_cache(tmp_path: Path) -> None:
+    """One compiles a kernel, the others wait and take it: four, and one machine code."""
+    code = (
+        "import time; from ceres_cal.kernels import jit\n"
+        "def slow(x): return 2.0 * x + 1.0\n"
+        "kernel = jit.jit(slow); kernel(1.0); print(sum(kernel.stats.cache_misses.values()))"
+    )
+    module = tmp_path / "module.py"
+    module.write_text(code)
+    environment = {**ENVIRONMENT, "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    command = [sys.executable, str(module)]
+    running = [subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) for _ in range(4)]
+    assert sum(int(process.communicate(timeout=120)[0]) for process in running) == 1
+    assert len(list((tmp_path / "cache").rglob("*.nbc"))) == 1
+
+
+def test_threads_that_calibrate_at_once(calibration: Calibration) -> None:
+    with ThreadPoolExecutor(4) as pool:
+        assert len({answer.result(60) for answer in [pool.submit(_phi, str(SAMPLE)) for _ in range(4)]}) == 1
+
+
+def test_sigterm_is_as_clean_as_ctrl_c(tmp_path: Path) -> None:
+    """No stack of glog's, also in the middle of native work."""
+    image, rng = tmp_path / "noise.jpg", np.random.default_rng(0)
+    cv2.imwrite(str(image), cv2.resize(rng.integers(0, 255, (1200, 1600), dtype=np.uint8), (6400, 4800)))
+    board = ["detect", "board", str(image), "--columns", "9", "--rows", "6", "--square", "0.02", "-o"]
+    for number, code, word in ((signal.SIGTERM, 143, "terminated"), (signal.SIGINT, 130, "interrupted")):
+        command = [*PROGRAM, *board, str(tmp_path / "out.json"), "--json"]
+        process = subprocess.Popen(command, env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        time.sleep(2.0)
+        process.send_signal(number)
+        begin = time.monotonic()
+        out, err = process.communicate(timeout=30)
+        assert time.monotonic() - begin < 1.5
+        line = f"{word}: nothing was written"
+        assert (process.returncode, err, json.loads(out)["error"]) == (code, f"ceres-cal: {line}\n", line)
+    late = program(*board, tmp_path / "out.json", "--timeout", "1.5")
+    assert late.returncode == 2 and "--timeout: not done after 1.5 s, nothing was written" in late.stderr
+
+
+def test_a_solver_does_not_take_sigterm(tmp_path: Path) -> None:
+    code = "import os, signal, ceres_cal.solve; os.kill(os.getpid(), signal.SIGTERM); import time; time.sleep(5)"
+    run = subprocess.run([sys.executable, "-c", code], env=ENVIRONMENT, capture_output=True, timeout=60)
+    assert (run.returncode, run.stderr) == (-signal.SIGTERM, b"")
+
+
+# ---- outputs --------------------------------------------------------------------------------------------------------
+
+
+def test_mode_owner_and_umask(tmp_path: Path) -> None:
+    before = os.umask(0o027)
+    try:
+        write_bytes(tmp_path / "new", b"1")
+        (tmp_path / "old").write_bytes(b"0")
+        (tmp_path / "old").chmod(0o604)
+        if os.geteuid() == 0:
+            os.chown(tmp_path / "old", 1234, 2345)
+        write_bytes(tmp_path / "old", b"1")
+    finally:
+        os.umask(before)
+    old = (tmp_path / "old").stat()
+    assert (tmp_path / "new").stat().st_mode & 0o777 == 0o640 and old.st_mode & 0o777 == 0o604
+    assert os.geteuid() != 0 or (old.st_uid, old.st_gid) == (1234, 2345)
+
+
+def test_what_killed_runs_left_is_removed(tmp_path: Path) -> None:
+    code = (
+        "import os, sys; from ceres_cal.base.files import write_bytes\n"
+        "os.fsync = lambda handle: os.kill(os.getpid(), 9)\n"
+        "write_bytes(sys.argv[1], b'half')"
+    )
+    place = tmp_path / "a.json"
+    place.write_bytes(b"old")
+    killed = subprocess.run([sys.executable, "-c", code, str(place)], env=ENVIRONMENT, timeout=60)
+    assert killed.returncode == -9 and place.read_bytes() == b"old" and len(list(tmp_path.iterdir())) == 2
+    write_bytes(place, b"new")
+    assert place.read_bytes() == b"new" and len(list(tmp_path.iterdir())) == 1
+
+
+def test_names_in_other_encodings(tmp_path: Path) -> None:
+    """Nothing is lost because a name, or a terminal, is not of UTF-8."""
+    shot = next((ROOT / "data" / "ssl_field_moved" / "photographs").iterdir())
+    odd = tmp_path / os.fsdecode(b"caf\xe9.jpg")
+    shutil.copy(shot, odd)
+    rings = ["detect", "rings", odd, "--radii", "0.01:0.1:0.01", "-o", tmp_path / "r.json", "--json"]
+    run = program(*rings, env={"LC_ALL": "C", "PYTHONIOENCODING": "ascii"})
+    assert run.returncode in (0, 2) and "unexpected" not in run.stderr and "Traceback" not in run.stderr
+    named = tmp_path / "kalibrierung-ä.json"
+    run = program("calibrate", SAMPLE, "-o", named, env={"LC_ALL": "C", "PYTHONIOENCODING": "ascii"})
+    assert run.returncode == 0 and named.exists() and "\\xe4" in run.stdout, run
+
+
+def test_libraries_say_nothing_of_damaged_images(tmp_path: Path) -> None:
+    ok, tiff = cv2.imencode(".tif", np.random.default_rng(0).integers(0, 255, (200, 200), dtype=np.uint8))
+    assert ok
+    (tmp_path / "a.tif").write_bytes(tiff.tobytes()[: len(tiff) // 2])
+    board = [
+        "detect",
+        "board",
+        tmp_path / "a.tif",
+        "--columns",
+        9,
+        "--rows",
+        6,
+        "--square",
+        0.02,
+        "-o",
+        tmp_path / "o.json",
+    ]
+    run = program(*board)
+    assert run.returncode == 2 and run.stderr.startswith("ceres-cal: ") and run.stderr.count("\n") == 1, run.stderr
+
+
+def test_real_images_that_are_not_there(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.delenv("CERES_CAL_REAL", raising=False)
+    for more in ([], ["--real", "/nowhere"]):
+        with pytest.raises(SystemExit) as ended:
+            photographs.main(["--case", "real", *more])
+        assert ended.value.code == 2 and capsys.readouterr().err.strip()
+
+
+# ---- the watch ------------------------------------------------------------------------------------------------------
+
+
+def test_what_appears_in_a_folder(tmp_path: Path) -> None:
+    """Regular files that have stopped growing, once each; junk holds nothing up; the folder may go and come back."""
+    place = tmp_path / "incoming"
+    place.mkdir()
+    (place / "before.json").touch()
+    folder = watching.Folder(place, {".json"})
+    os.mkfifo(place / "pipe.json")
+    (place / "loop.json").symlink_to(place / "loop.json")
+    for name in ("a.json", "b.json", ".hidden.json", "a.txt"):
+        (place / name).write_text("{")
+    assert folder.look() == []  # they may be growing
+    assert {path.name for path in folder.look()} == {"a.json", "b.json"}
+    assert folder.again(place / "a.json") and folder.look() == [place / "a.json"]
+    assert folder.again(place / "a.json") and folder.look() == [place / "a.json"]
+    assert not folder.again(place / "a.json") and folder.look() == []
+    os.utime(place / "b.json", (0, 0))  # a clock that was set back
+    folder.look()
+    assert folder.look() == [place / "b.json"]
+    place.rename(tmp_path / "away")
+    assert folder.look() == [] and not folder.is_there
+    (tmp_path / "away").rename(place)
+    (place / "c.json").write_text("{")
+    folder.look()
+    assert folder.look() == [place / "c.json"] and folder.is_there
+
+
+def test_a_journal_loses_nothing(tmp_path: Path) -> None:
+    log = tmp_path / "logs" / "events.jsonl"
+    journal = watching.Journal(log)
+    journal.write({"event": 1})
+    log.parent.mkdir()
+    journal.write({"event": 2})
+    assert [json.loads(line)["event"] for line in log.read_text().splitlines()] == [1, 2]
+
+
+def test_a_watch_that_nobody_reads(good: Path, tmp_path: Path) -> None:
+    """Its folder goes, its output is closed, junk and a pipe lie in wait; a good file is answered, SIGTERM ends it."""
+    incoming, calibration = tmp_path / "incoming", tmp_path / "calibration.json"
+    incoming.mkdir()
+    shutil.copy(good / "calibration.json", calibration)
+    script = [sys.executable, str(ROOT / "scripts" / "refit_after_move.py"), str(calibration), "--watch", str(incoming)]
+    process = subprocess.Popen([*script, "--every-s", "0.05"], env=ENVIRONMENT, stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    time.sleep(2.5)
+    shutil.rmtree(incoming)
+    assert json.loads(process.stdout.readline())["event"] == "folder"
+    incoming.mkdir()
+    assert json.loads(process.stdout.readline())["event"] == "folder"
+    os.mkfifo(incoming / "pipe.json")
+    for number in range(50):
+        (incoming / f"{number}.json").write_text("{")
+    shutil.copy(SAMPLE, incoming / "good.json")
+    events = [json.loads(process.stdout.readline()) for _ in range(51)]
+    assert [Path(event["file"]).name for event in events if event["event"] != "unreadable"] == ["good.json"]
+    process.stdout.close()
+    (incoming / "more.json").write_text("{")
+    time.sleep(1.0)
+    assert process.poll() is None
+    process.send_signal(signal.SIGTERM)
+    assert process.wait(30) == 0
+
+
+def test_a_watch_refuses_what_it_cannot_do(good: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    start = [str(good / "calibration.json"), "--watch", str(good)]
+    for more in (["--what", "bogus"], ["--every-s", "0"], ["--log", "/nowhere/a.jsonl"]):
+        with pytest.raises(SystemExit) as ended:
+            refit_after_move.main([*start, *more])
+        assert ended.value.code == 2 and capsys.readouterr().err.strip()
