@@ -264,8 +264,7 @@ class _Competition:
         spare = 2.0 * np.bincount(of[:points], minlength=size) + np.bincount(of[points:], minlength=size)
         square = np.bincount(of, lengths**2, minlength=size)
         spare[-1] = square[-1] = 0.0  # of what is in none
-        square /= np.maximum(spare, 1.0)
-        there = spare > 0.0
+        square, there = square / np.maximum(spare, 1.0), spare > 0.0
         middle = float(np.median(square[there])) if np.any(there) else 1.0
         return np.asarray((square / max(middle, 1e-12) - 1.0) / np.sqrt(2.0 / np.maximum(spare, 1.0)) * there)
 
