@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from ceres_cal.uncertainty.between import INDEPENDENT
 from ceres_cal.uncertainty.likelihood import Likelihoods, likelihoods
 from ceres_cal.uncertainty.sample import Sample
 from ceres_cal.uncertainty.score_test import is_loud
-from ceres_cal.uncertainty.strands import Family, Strand, distances_of
+from ceres_cal.uncertainty.strands import Family, Strand, decay, distances_of
 
 _FEWEST_ROWS = 12
 _INDEFINITE, _BISECTIONS = 1e6, 50  # degrees of freedom that are as good as any number
@@ -69,9 +69,7 @@ def correlated(sample: Sample) -> Covariances:
         families = sample.families(is_curve)
         if not any(map(is_loud, families)):
             continue
-        if not is_curve:  # bent boards and lenses err smoothly, edges along a line do not
-            families += [replace(family, smooth=True) for family in families]
-        average = _Average.of(sample, families, rows)
+        average = _Average.of(sample, families, rows, may_be_smooth=not is_curve)
         change, factor = average.change(sample)
         scores += change
         private.append(factor)
@@ -96,10 +94,10 @@ class _Average:
     inverse_freedom: float
 
     @classmethod
-    def of(cls, sample: Sample, families: Sequence[Family], rows: Mask) -> _Average:
-        """Weighed by likelihood and prior."""
+    def of(cls, sample: Sample, families: Sequence[Family], rows: Mask, may_be_smooth: bool) -> _Average:
+        """Weighed by likelihood and prior. Bent boards and lenses err smoothly, edges along a line do not."""
         own = np.sum(sample.shared[rows] ** 2)
-        at = likelihoods(families, float(own))
+        at = likelihoods(families, may_be_smooth, float(own))
         weight = np.full(len(at.share), (1.0 - INDEPENDENT) / max(len(at.share) - 1, 1))
         weight[0] = INDEPENDENT
         variance = at.variance / at.variance[0]  # the noise scale is that of independent errors
@@ -127,7 +125,7 @@ class _Average:
             each, share = (self.weight * self.variance)[here], self.at.share[here]
             alone = float(np.sum(each * (1.0 - share))) - (1.0 if number == 0 else 0.0)
             for strands in map(family.strands.__getitem__, family.of_shape):
-                kernel = self._kernel(family, strands[0], self.at.length_m[here], each * share)
+                kernel = self._kernel(strands[0], here, each * share)
                 x = sample.columns[np.array([strand.rows for strand in strands])][..., :-1]
                 product = np.swapaxes(x, 1, 2) @ (alone * x + kernel @ x)
                 np.add.at(scores, sample.group[[strand.rows[0] for strand in strands]], product[:, 6:, 6:])
@@ -138,13 +136,14 @@ class _Average:
                 private[0] += float(np.trace(product[:, :6, :6], axis1=1, axis2=2).sum()) - common
         return scores, float(1.0 + max(private[0], 0.0) / private[1]) if private[1] > 0.0 else 1.0
 
-    @staticmethod
-    def _kernel(family: Family, strand: Strand, lengths: Array, weights: Array) -> Array:
-        """(N, N) sum of weights times the correlation over each length."""
+    def _kernel(self, strand: Strand, here: Mask, weights: Array) -> Array:
+        """(N, N) sum of weights times the correlation at some places."""
         distance = distances_of(strand.places)
-        kernel = np.zeros_like(distance)
-        for length in np.unique(lengths[weights > 0.0]):
-            kernel += float(np.sum(weights[lengths == length])) * family.correlation(distance, length)
+        kernel, used = np.zeros_like(distance), weights > 0.0
+        lengths, smooth, weights = self.at.length_m[here][used], self.at.smooth[here][used], weights[used]
+        for length, one in sorted(set(zip(lengths.tolist(), smooth.tolist(), strict=True))):
+            same = (lengths == length) & (smooth == one)
+            kernel += float(np.sum(weights[same])) * decay(distance, length, one)
         return kernel
 
 

@@ -9,12 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices
+from ceres_cal.base.arrays import Array, Indices, Mask
 from ceres_cal.uncertainty.score_test import ASIDE
-from ceres_cal.uncertainty.strands import Family
+from ceres_cal.uncertainty.strands import Family, decay
 
 # To 0.995: with 0.95 at most, lines that bend over 2 m are covered in 84 to 88 %. In parts: the next one is left out
 # where the likelihood falls over the one before it to nothing.
@@ -22,17 +23,21 @@ _SHARES = np.array([0.1, 0.25, 0.5]), np.array([0.75, 0.9, 0.97, 0.995])
 _NOTHING = 10.0  # nats below the best
 _FEWEST_FREEDOM = 3.0  # degrees of freedom that a variance is given at least
 
+_Place = tuple[int, bool, float]  # number of the family, whether errors have no edges, length
+
 
 @dataclass(frozen=True, eq=False)
 class Likelihoods:
     """N places on the grid.
 
     Attributes:
-        family: (N,) its number. length_m, share: (N,). log: (N,) the likelihood's logarithm. variance: (N,) s^2.
-        trace: (N,) of the scores' covariance. inverse_freedom: (N,) of that.
+        family: (N,) its number. smooth: (N,) whether errors have no edges. length_m, share: (N,).
+        log: (N,) the likelihood's logarithm. variance: (N,) s^2. trace: (N,) of the scores' covariance.
+        inverse_freedom: (N,) of that.
     """
 
     family: Indices
+    smooth: Mask
     length_m: Array
     share: Array
     log: Array
@@ -41,19 +46,21 @@ class Likelihoods:
     inverse_freedom: Array
 
 
-def likelihoods(families: Sequence[Family], squared: float) -> Likelihoods:
+def likelihoods(families: Sequence[Family], may_be_smooth: bool, squared: float) -> Likelihoods:
     """Of independent errors first, then of those that go together in one of the families.
 
     Args:
+        may_be_smooth: whether errors without edges are looked for, too.
         squared: sum of the squared shared columns over all rows, of which the families show some.
     """
     parts = [_independent(families[0], squared)]
     best = float(parts[0].log[0])
-    for number, family in enumerate(families):
+    for smooth, (number, family) in product((False, True)[: 1 + may_be_smooth], enumerate(families)):
         for length in _lengths(family):
-            at, falls = _Eigenbasis.of(family, length), False
+            at, falls = _Eigenbasis.of(family, length, smooth), False
             for shares in _SHARES:
-                part = (_impossible if falls else _of_shares)(family, at, shares, squared, (number, length))
+                place = number, smooth, length
+                part = (_impossible if falls else _of_shares)(family, at, shares, squared, place)
                 parts.append(part)
                 best = max(best, float(part.log.max()))
                 falls = bool(part.log[-1] < min(best - _NOTHING, part.log[-2]))
@@ -85,9 +92,9 @@ class _Eigenbasis:
     white: Array
 
     @classmethod
-    def of(cls, family: Family, length: float) -> _Eigenbasis:
+    def of(cls, family: Family, length: float, smooth: bool) -> _Eigenbasis:
         """At one length."""
-        values, vectors = np.linalg.eigh(family.correlation(family.distance, length))
+        values, vectors = np.linalg.eigh(decay(family.distance, length, smooth))
         columns = family.applied(np.swapaxes(vectors, 1, 2))
         shared = columns[..., 6:-1]
         return cls(family.per_strand(np.maximum(values, 0.0)), columns, np.einsum("smz,smz->sm", shared, shared))
@@ -98,11 +105,11 @@ def _independent(family: Family, squared: float) -> Likelihoods:
     shared = family.columns[..., 6:-1]
     white = np.einsum("smz,smz->sm", shared, shared)
     at = _Eigenbasis(family.filled.astype(float), family.columns, white)
-    return _of_shares(family, at, np.zeros(1), squared, (0, 0.0))
+    return _of_shares(family, at, np.zeros(1), squared, (0, False, 0.0))
 
 
-def _of_shares(family: Family, at: _Eigenbasis, shares: Array, squared: float, place: tuple[int, float]) -> Likelihoods:
-    """The restricted likelihood at one place, number of the family and length, for some shares (A,)."""
+def _of_shares(family: Family, at: _Eigenbasis, shares: Array, squared: float, place: _Place) -> Likelihoods:
+    """The restricted likelihood at one place for some shares (A,)."""
     diagonal = 1.0 - shares[:, None, None] * (1.0 - at.values)
     products = np.swapaxes(at.columns, 1, 2) @ (at.columns / diagonal[..., None])
     logs, reduced, taken = _without_private(products, family.group)
@@ -112,9 +119,11 @@ def _of_shares(family: Family, at: _Eigenbasis, shares: Array, squared: float, p
     few = max(count**2 / float(np.sum(at.values**2)) - (0 if taken else size), _FEWEST_FREEDOM)
     inverse = (parts[0] ** 2 / freedom + parts[1] ** 2 / few) / np.maximum(parts[0] + parts[1], 1e-300) ** 2
     scale = squared / max(float(at.white.sum()), 1e-300)  # of all rows to those looked at
+    number, smooth, length_m = (np.full(len(shares), one) for one in place)
     return Likelihoods(
-        np.full(len(shares), place[0]),
-        np.full(len(shares), place[1]),
+        number,
+        smooth,
+        length_m,
         shares,
         log - 0.5 * (np.log(diagonal).sum(axis=(1, 2)) + logs),
         variance,
@@ -123,12 +132,11 @@ def _of_shares(family: Family, at: _Eigenbasis, shares: Array, squared: float, p
     )
 
 
-def _impossible(
-    family: Family, at: _Eigenbasis, shares: Array, squared: float, place: tuple[int, float]
-) -> Likelihoods:
+def _impossible(family: Family, at: _Eigenbasis, shares: Array, squared: float, place: _Place) -> Likelihoods:
     """Shares that need not be looked at."""
-    number, length, one = np.full(len(shares), place[0]), np.full(len(shares), place[1]), np.ones(len(shares))
-    return Likelihoods(number, length, shares, -np.inf * one, one, one, one)
+    number, smooth, length = (np.full(len(shares), one) for one in place)
+    one = np.ones(len(shares))
+    return Likelihoods(number, smooth, length, shares, -np.inf * one, one, one, one)
 
 
 def _without_private(products: Array, group: Indices) -> tuple[Array, Array, int]:

@@ -68,12 +68,18 @@ def distances_of(places: Array) -> Array:
     return np.asarray(np.sqrt(squared))
 
 
+def decay(distance: Array, length: float, smooth: bool) -> Array:
+    """Correlation at distances: of a rough random function, or of a smooth one."""
+    relative = distance / length
+    return np.asarray(np.exp(-0.5 * relative**2 if smooth else -relative))
+
+
 @dataclass(frozen=True, eq=False)
 class Family:
     """S strands side by side, of M rows each at most that are looked at.
 
     Attributes:
-        lasting: whether they go over several views. smooth: whether errors have no edges: exp(-(d / l)^2 / 2).
+        lasting: whether they go over several views.
         strands: with all their rows, shape by shape. filled: (S, M) which rows there are.
         columns: (S, M, Z) what is in them: six of private placements, those of what is shared, the residual; 0 where
             there is no row.
@@ -82,7 +88,6 @@ class Family:
     """
 
     lasting: bool
-    smooth: bool
     strands: Sequence[Strand]
     filled: Mask
     columns: Array
@@ -110,9 +115,7 @@ class Family:
         # Rows first in memory: those of all strands of one shape are then multiplied as one matrix.
         side_by_side = columns[rows.T]
         side_by_side[~filled.T] = 0.0
-        return cls(
-            lasting, False, strands, filled, np.swapaxes(side_by_side, 0, 1), distance, starts, group[rows[:, 0]]
-        )
+        return cls(lasting, strands, filled, np.swapaxes(side_by_side, 0, 1), distance, starts, group[rows[:, 0]])
 
     @cached_property
     def of_shape(self) -> list[slice]:
@@ -140,11 +143,6 @@ class Family:
         """(Z, Z) of the columns over all rows."""
         flat = np.swapaxes(self.columns, 0, 1).reshape(-1, self.columns.shape[2])
         return np.asarray(flat.T @ flat)
-
-    def correlation(self, distance: Array, length: float) -> Array:
-        """At distances: of a rough random function, or of a smooth one."""
-        relative = distance / length
-        return np.asarray(np.exp(-0.5 * relative**2 if self.smooth else -relative))
 
     def applied(self, matrices: Array) -> Array:
         """(S, M, Z) the columns multiplied by matrices (D, M, M) of each shape."""
