@@ -20,7 +20,7 @@ from ceres_cal.uncertainty.strands import Family, decay
 # To 0.995: with 0.95 at most, lines that bend over 2 m are covered in 84 to 88 %. In parts: the next one is left out
 # where the likelihood falls over the one before it to nothing.
 _SHARES = np.array([0.1, 0.25, 0.5]), np.array([0.75, 0.9, 0.97, 0.995])
-_NOTHING = 10.0  # nats below the best
+_NOTHING = 6.0  # nats below the best: less than the share of a place that is left out
 _FEWEST_FREEDOM = 3.0  # degrees of freedom that a variance is given at least
 
 _Place = tuple[int, bool, float]  # number of the family, whether errors have no edges, length
