@@ -53,7 +53,7 @@ def same_camera(one: Camera, other: Camera, tolerance: float = 1e-12) -> bool:
     if one.image_size != other.image_size or one.lens.names != other.lens.names:
         return False
     first, second = (
-        np.array([c.phi, c.aspect, *c.principal_point, *c.lens.values, *c.cam_from_world.matrix.ravel()])
+        np.array([c.phi, c.aspect, c.skew, *c.principal_point, *c.lens.values, *c.cam_from_world.matrix.ravel()])
         for c in (one, other)
     )
     return bool(np.allclose(first, second, rtol=tolerance, atol=tolerance))

@@ -22,6 +22,18 @@ _LENSES: dict[str, tuple[float, Lens, float]] = {
     "kannala-brandt": (548.0, KannalaBrandt((-0.012, 0.004, -0.003, 0.0006)), 3.2),
 }
 LENSES = tuple(_LENSES)
+_RATIONAL = (0.31, -0.05, 4e-4, -3e-4, 0.01, 0.58, 0.02, 0.004, 9e-4, -4e-4, -7e-4, 3e-4)
+_MORE: dict[str, tuple[float, Lens, float]] = {
+    "brown-all": (825.0, Brown(_RATIONAL, ("rational", "prism")), 5.2),
+    "brown-rational": (825.0, Brown(_RATIONAL[:8], ("rational",)), 5.2),
+    "kannala-brandt-tangential": (
+        548.0,
+        KannalaBrandt((-0.012, 0.004, -0.003, 0.0006, 8e-4, -5e-4), ("tangential",)),
+        3.2,
+    ),
+}
+EVERY_LENS = (*_LENSES, *_MORE)
+"""Also with terms that a lens has only where they are asked for."""
 
 _SPACING_M = 0.2
 _LINES = tuple(name for name in ssl_field("B").curve_names if name != "CenterCircle")
@@ -30,7 +42,7 @@ _BOARD = checkerboard(9, 6, 0.1)
 
 def camera(lens: str) -> Camera:
     """1280 x 960 px with its principal point off the centre."""
-    phi, model, _ = _LENSES[lens]
+    phi, model, _ = (_LENSES | _MORE)[lens]
     return Camera((1280, 960), phi, (651.3, 468.9), model)
 
 

@@ -39,7 +39,7 @@ LOSSES = {
     "tukey": None,  # pyceres has none
 }
 
-each_lens = pytest.mark.parametrize("lens", scenes.LENSES)
+each_lens = pytest.mark.parametrize("lens", scenes.EVERY_LENS)
 each_loss = pytest.mark.parametrize("loss", LOSSES)
 
 TARGET = custom(
@@ -101,9 +101,9 @@ def looked_at(lens: str) -> tuple[Camera, Shown]:
     About a hundred curve observations: more than one chunk, and not a whole number of them.
     """
     rng = np.random.default_rng(4)
-    height = 3.2 if lens == "kannala-brandt" else 5.2
+    height = 3.2 if lens.startswith("kannala-brandt") else 5.2
     pose = overhead_pose(-0.5, -1.0, height, tilt_x_deg=-12.0, tilt_y_deg=-9.0, yaw_deg=25.0)
-    camera = replace(scenes.camera(lens), aspect=1.03).at(pose)
+    camera = replace(scenes.camera(lens), aspect=1.03, skew=4e-3).at(pose)
     curves = list(TARGET.curves.values())
     number = np.repeat(np.arange(3 * len(curves)), 9)  # three sides of every curve
     ranges = [curves[k % len(curves)].parameter_range for k in number[::9]]
@@ -187,7 +187,7 @@ POSE_STEPS = np.repeat([1e-3, 3e-3], 3)
 
 def intrinsics_steps(camera: Camera) -> Array:
     """A step for each number that moves pixels by about one."""
-    return np.array([1.0, 1e-3, 1.0, 1.0, *[2e-3] * len(camera.lens.values)])
+    return np.array([1.0, 1e-3, 1.0, 1.0, *[2e-3] * len(camera.lens.values), 1e-3])
 
 
 # ---- residuals ------------------------------------------------------------------------------------------------------
@@ -503,14 +503,14 @@ def test_fixed_intrinsics_have_no_column(free: list[int]) -> None:
     chosen = np.array(free, dtype=np.int64)
     block, whole = evaluate_block(camera, poses, seen, free=chosen), evaluate_block(camera, poses, seen)
     assert block is not None and whole is not None
-    kept = np.concatenate([chosen, np.arange(9, 21)])
+    kept = np.concatenate([chosen, np.arange(10, 22)])
     normal, everything = block.jacobian.T @ block.jacobian, whole.jacobian.T @ whole.jacobian
     size = np.sqrt(np.diag(normal))
     assert np.max(np.abs(normal - everything[np.ix_(kept, kept)]) / np.outer(size, size)) < 1e-12  # 2e-15 measured
     assert block.residuals @ block.residuals == pytest.approx(whole.residuals @ whole.residuals, rel=1e-12)
 
 
-@each_lens
+@pytest.mark.parametrize("lens", scenes.LENSES)  # of a rational lens the squares of so few are beyond rounding
 @pytest.mark.parametrize("what", ["one point", "one place on a line", "residuals of zero"])
 def test_blocks_of_less_than_full_rank(lens: str, what: str) -> None:
     """Zero pivots: fewer residuals than numbers, and a last column that is zero."""
@@ -540,7 +540,7 @@ def test_a_point_on_the_axis_moves_as_through_a_pinhole(lens: str) -> None:
     )
     block = evaluate_block(camera, (np.zeros(6), np.zeros(6)), seen, held=("placement",))
     assert block is not None
-    count = len(camera.lens.values)
+    count = len(camera.lens.values) + 1  # and the skew
     x = np.array([0.0, 0.0, 1.0, 0.0, *[0.0] * count, 0.0, 2.0, 0.0, 1.0, 0.0, 0.0])
     y = np.array([0.0, 0.0, 0.0, 1.0, *[0.0] * count, -2.0, 0.0, 0.0, 0.0, 1.0, 0.0])
     x[-6:], y[-6:] = x[-6:] * camera.phi / 2.0, y[-6:] * 1.03 * camera.phi / 2.0
@@ -580,7 +580,7 @@ def as_built(seen: Shown, values: Array) -> Shown:
     return seen[0]._replace(places=seen[0].places + shift), seen[1]._replace(tracks=tracks)
 
 
-@each_lens
+@pytest.mark.parametrize("lens", scenes.LENSES)
 def test_structure_knows_its_derivatives(lens: str) -> None:
     """J^T J and J^T e with the structure's numbers, against differences of every residual."""
     camera, seen = looked_at(lens)

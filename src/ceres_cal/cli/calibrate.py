@@ -13,6 +13,7 @@ from ceres_cal.cli.arguments import (
     add_output,
     add_quiet,
     add_report,
+    parse_names,
     parse_number,
     parse_prior,
 )
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
 
 
 _DEFAULT_LENS, _AUTO = "radial", "auto"
+_TERMS = "rational (OpenCV's k4 to k6) and prism (its s1 to s4) of brown, tangential (p1, p2) of kannala-brandt"
 
 
 def _lens_kind(name: str) -> str:
@@ -60,14 +62,16 @@ def _add_camera(parser: ArgumentParser) -> None:
     )
     add("--lens", type=_lens_kind, metavar="KIND", default=_DEFAULT_LENS, help=kinds)
     add("--powers", metavar="2,3", help="powers of a lens that leaves the choice; default: 2,3, the paper's")
+    add("--terms", metavar="NAME,...", default="", help="terms that a lens may have besides: " + _TERMS)
     add(
         "--fix",
         action="append",
         default=[],
         metavar="NAME=VALUE",
-        help="hold phi, aspect, cx, cy or a coefficient, such as k3=0; repeatable",
+        help="hold phi, aspect, cx, cy, skew or a coefficient, such as k3=0; repeatable",
     )
     add("--free-aspect", action="store_true", help="let fy / fx differ from 1")
+    add("--free-skew", action="store_true", help="let the pixels' columns lean against their rows")
     add("--hold-principal-point", action="store_true", help="hold it at the image's centre")
     add(
         "--tolerance",
@@ -188,13 +192,16 @@ def _options(
 ) -> Options:
     from ceres_cal.model.parameters import Options
 
-    options = Options(lens=args.lens, powers=powers, fixed=fixed)
+    terms = tuple(parse_names(args.terms))
+    options = Options(lens=args.lens, powers=powers, terms=terms, fixed=fixed)
     names = PriorNames(("height_m", "position_m"), (*options.intrinsic_names, "principal_point"))
     return Options(
         lens=args.lens,
         powers=powers,
         free_principal_point=not args.hold_principal_point,
         free_aspect=args.free_aspect,
+        free_skew=args.free_skew,
+        terms=terms,
         fixed=fixed,
         priors=tuple(parse_prior(spec, observations, names) for spec in args.prior),
         tolerances=_tolerances(args.tolerance),

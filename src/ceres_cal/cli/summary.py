@@ -136,6 +136,8 @@ def _intrinsics(name: str, camera: Camera, options: Options, phi_from: str, qual
     rows = [("phi", f"{known('phi', camera.phi)} ({_PHI_FROM.get(phi_from, phi_from)})")]
     if options.free_aspect or camera.aspect != 1.0:
         rows.append(("aspect", f"{camera.aspect:.7f}{_plus_minus(quality, name, 'aspect')}{held('aspect')}"))
+    if options.free_skew or camera.skew != 0.0:
+        rows.append(("skew", f"{camera.skew:.7f}{_plus_minus(quality, name, 'skew')}{held('skew')}"))
     rows.append(("principal point", f"{known('cx', cx)}, {known('cy', cy)}{centre}"))
     for coefficient, value in camera.lens.coefficients.items():
         rows.append((coefficient, f"{value!r}{_plus_minus(quality, name, coefficient)}{held(coefficient)}"))

@@ -11,8 +11,8 @@ from ceres_cal.base.arrays import Array
 from ceres_cal.diagnostics.diagnostic import Case, Evidence, ScoreTest, Words
 from ceres_cal.diagnostics.findings import SMALL, amounts
 from ceres_cal.diagnostics.scores import Family
-from ceres_cal.model.parameters import unit_px
-from ceres_cal.scene.lens import LENSES
+from ceres_cal.model.parameters import intrinsic_names, unit_px
+from ceres_cal.scene.lens import LENSES, Lens
 
 _RADIAL_BASIS = 3  # powers of the radius past those of the lens: enough for any smooth trend that one more power mends
 
@@ -50,11 +50,13 @@ def _longer(case: Case, camera: str, power: int) -> str:
     """How to calibrate with one more power."""
     lens = case.estimate.cameras[camera].lens
     held = [key for key, order in zip(lens.names, lens.orders, strict=True) if order == power]
-    held = [key for key in held if key not in lens.decentring]
+    held = [key for key in held if key not in _across(lens)]
     if lens.powers:
         return f"calibrate with --powers {','.join(map(str, sorted({*lens.powers, power})))}"
     if held:
         return f"let {held[0]} free (no --fix {held[0]}=...)"
+    if "rational" in lens.more_terms and "rational" not in lens.terms:
+        return "calibrate with --terms rational, which has more along the radius, or with another lens"
     growing = " or ".join(kind for kind, other in LENSES.items() if other.trial_powers)
     return f"the {lens.kind} lens has no such power: try another lens or the {growing} one with more powers"
 
@@ -62,9 +64,21 @@ def _longer(case: Case, camera: str, power: int) -> str:
 def _missing_powers(case: Case, camera: str) -> list[int]:
     """Powers of the radius that the lens does not solve for, lowest first."""
     lens = case.estimate.cameras[camera].lens
-    free = [int(i) - 4 for i in case.problem.layout.free[camera] if i >= 4]
-    solved = {lens.orders[i] for i in free if lens.names[i] not in lens.decentring}
+    free = _free_coefficients(case, camera)
+    solved = {order for name, order in zip(lens.names, lens.orders, strict=True) if name in free - _across(lens)}
     return [power for power in lens.missing_powers if power not in solved]
+
+
+def _free_coefficients(case: Case, camera: str) -> set[str]:
+    """Names of those that the lens solves for."""
+    lens = case.estimate.cameras[camera].lens
+    names = intrinsic_names(lens)
+    return {names[number] for number in case.problem.layout.free[camera]} & set(lens.names)
+
+
+def _across(lens: Lens) -> set[str]:
+    """Names of coefficients that displace across the radius, which it has or may have."""
+    return {*lens.decentring, *(name for term in ("tangential", "prism") for name in lens.more_terms.get(term, ()))}
 
 
 def _offsets(case: Case, camera: str) -> Array:
@@ -93,8 +107,8 @@ class Decentring(ScoreTest):
         columns, group = np.zeros((len(case.equations), 2)), case.camera.copy()
         for number, name in enumerate(case.cameras):
             own = case.camera == number
-            lens, free = case.estimate.cameras[name].lens, case.problem.layout.free[name].tolist()
-            if lens.decentring and all(4 + lens.names.index(part) in free for part in lens.decentring):
+            parts = _tangential(case.estimate.cameras[name].lens)
+            if parts and set(parts) <= _free_coefficients(case, name):
                 group[own] = -1
             else:
                 columns[own] = _decentring_columns(case, name)[own]
@@ -102,15 +116,25 @@ class Decentring(ScoreTest):
 
     def words(self, evidence: Evidence) -> Words:
         name, every = evidence.score.subject, np.ones(len(evidence.shift), dtype=bool)
-        own = evidence.case.estimate.cameras[name].lens.decentring
+        lens = evidence.case.estimate.cameras[name].lens
+        own = _tangential(lens)
         kind, names = next((kind, lens.decentring) for kind, lens in LENSES.items() if lens.decentring)
+        if own and not set(own) <= set(lens.names):
+            advice = f"calibrate with --terms tangential, which frees {' and '.join(own)}"
+        elif own:
+            advice = f"let {' and '.join(own)} free"
+        else:
+            advice = f"calibrate with --lens {kind}, which has {' and '.join(names)}"
         return Words(
             f"camera {name!r}: its lens is not centred: a tangential displacement of up to "
             f"{evidence.most_px(every):.2f} px ({evidence.size})",
-            f"let {' and '.join(own)} free"
-            if own
-            else f"calibrate with --lens {kind}, which has {' and '.join(names)}",
+            advice,
         )
+
+
+def _tangential(lens: type[Lens] | Lens) -> tuple[str, ...]:
+    """Names of Brown's decentring coefficients, which it has or may have."""
+    return lens.decentring or lens.more_terms.get("tangential", ())
 
 
 def _decentring_columns(case: Case, camera: str) -> Array:
@@ -122,6 +146,34 @@ def _decentring_columns(case: Case, camera: str) -> Array:
     return np.column_stack([np.sum(case.equations.direction * field, axis=1) for field in (first, second)])
 
 
+class Prism(ScoreTest):
+    """OpenCV's thin prism, where the lens does not solve for it: all is displaced one way, by r^2 and r^4."""
+
+    kind = "prism"
+    absorbed = True
+
+    def families(self, case: Case) -> Iterator[Family]:
+        columns, group = np.zeros((len(case.equations), 4)), case.camera.copy()
+        for number, name in enumerate(case.cameras):
+            own, parts = case.camera == number, case.estimate.cameras[name].lens.more_terms.get("prism", ())
+            if parts and set(parts) <= _free_coefficients(case, name):
+                group[own] = -1
+                continue
+            r2 = np.sum(_offsets(case, name)[own] ** 2, axis=1)[:, None]
+            columns[own] = np.hstack([case.equations.direction[own] * r2, case.equations.direction[own] * r2**2])
+        yield Family(self.kind, columns, group, case.cameras)
+
+    def words(self, evidence: Evidence) -> Words:
+        name, every = evidence.score.subject, np.ones(len(evidence.shift), dtype=bool)
+        kind = next(kind for kind, lens in LENSES.items() if "prism" in lens.more_terms)
+        own = evidence.case.estimate.cameras[name].lens.kind == kind
+        return Words(
+            f"camera {name!r}: its picture is displaced one way towards its rim, as by a thin prism, by up to "
+            f"{evidence.most_px(every):.2f} px ({evidence.size})",
+            f"calibrate with {'' if own else f'--lens {kind} '}--terms prism",
+        )
+
+
 class Skew(ScoreTest):
     """The axes of the pixels are not perpendicular: x grows with y."""
 
@@ -129,18 +181,22 @@ class Skew(ScoreTest):
     absorbed = True
 
     def families(self, case: Case) -> Iterator[Family]:
-        down = np.empty(len(case.equations))
+        down, group = np.zeros(len(case.equations)), case.camera.copy()
         for number, name in enumerate(case.cameras):
-            own = case.camera == number
-            down[own] = case.estimate.cameras[name].offsets(case.equations.pixel[own])[:, 1]
-        yield Family(self.kind, (case.equations.direction[:, 0] * down)[:, None], case.camera, case.cameras)
+            own, camera = case.camera == number, case.estimate.cameras[name]
+            if intrinsic_names(camera.lens).index("skew") in case.problem.layout.free[name]:
+                group[own] = -1
+            else:
+                down[own] = camera.offsets(case.equations.pixel[own])[:, 1]
+        yield Family(self.kind, (case.equations.direction[:, 0] * down)[:, None], group, case.cameras)
 
     def words(self, evidence: Evidence) -> Words:
         skew, sd = 1e3 * evidence.score.amount, 1e3 * evidence.score.sd
         return Words(
             f"camera {evidence.score.subject!r}: the axes of its pixels lean by {skew[0]:.2f} ± {sd[0]:.2f} mrad "
             f"({evidence.size})",
-            "no lens here has skew: take pictures as the sensor gives them, neither warped nor stabilised",
+            "calibrate with --free-skew, which no other program reads; better take pictures as the sensor gives them, "
+            "neither warped nor stabilised",
             amounts(["skew"], skew, sd, "mrad"),
         )
 

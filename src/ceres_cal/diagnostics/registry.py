@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from ceres_cal.diagnostics.diagnostic import Case, Diagnostic, ScoreTest
 from ceres_cal.diagnostics.of_floor import FloorBowed, FloorUneven
-from ceres_cal.diagnostics.of_lens import Aspect, Decentring, Phi, PrincipalPoint, Radius, Skew
+from ceres_cal.diagnostics.of_lens import Aspect, Decentring, Phi, PrincipalPoint, Prism, Radius, Skew
 from ceres_cal.diagnostics.of_motion import MovedAfter, MovedIn
 from ceres_cal.diagnostics.of_new_data import DoesNotHold
 from ceres_cal.diagnostics.of_observations import Correlated, LargerNoise, WrongLabel
@@ -14,8 +14,9 @@ from ceres_cal.diagnostics.scores import Family
 DIAGNOSTICS: dict[str, Diagnostic] = {
     one.kind: one
     for one in (
-        Radius(), Decentring(), Aspect(), Skew(), PrincipalPoint(), Phi(), CurveAside(), PointAside(), BoardBent(),
-        FloorBowed(), FloorUneven(), MovedAfter(), MovedIn(), WrongLabel(), LargerNoise(), Correlated(), DoesNotHold(),
+        Radius(), Decentring(), Prism(), Aspect(), Skew(), PrincipalPoint(), Phi(), CurveAside(), PointAside(),
+        BoardBent(), FloorBowed(), FloorUneven(), MovedAfter(), MovedIn(), WrongLabel(), LargerNoise(), Correlated(),
+        DoesNotHold(),
     )
 }  # fmt: skip
 

@@ -20,10 +20,16 @@ from ceres_cal.base.transforms import Pose
 from ceres_cal.formats.export_format import Exported, ExportFormat, ExportRequest
 from ceres_cal.formats.import_format import ImportedCameras, ImportFormat, ImportRequest
 from ceres_cal.formats.loss import as_foreign, field_box
-from ceres_cal.scene.foreign import FISHEYE, ForeignCamera
+from ceres_cal.scene.foreign import FISHEYE, THIN_PRISM_FISHEYE, ForeignCamera
 
-_MODELS = {"opencv4": "OPENCV", "opencv5": "FULL_OPENCV", "opencv8": "FULL_OPENCV", FISHEYE: "OPENCV_FISHEYE"}
-_COUNTS = {"PINHOLE": 0, "OPENCV": 4, "FULL_OPENCV": 8}  # coefficients in OpenCV's order behind fx fy cx cy
+_MODELS = {
+    "opencv4": "OPENCV",
+    "opencv5": "FULL_OPENCV",
+    "opencv8": "FULL_OPENCV",
+    FISHEYE: "OPENCV_FISHEYE",
+    THIN_PRISM_FISHEYE: THIN_PRISM_FISHEYE,
+}
+_COUNTS = {"FULL_OPENCV": 8, THIN_PRISM_FISHEYE: 8}  # coefficients behind fx fy cx cy; of the others four
 _HALF = 0.5
 
 

@@ -97,7 +97,7 @@ def camera_loss(station: str, camera: Camera, project: Callable[[Array], Array],
 def as_foreign(camera: Camera, station: str, models: Sequence[str], box_m: Box | None) -> tuple[ForeignCamera, Loss]:
     """A station's camera in the first of these models that holds it, else the best fit among them; what is lost."""
     foreign = camera.to_foreign(*models)
-    if foreign.lens == camera.lens:
+    if foreign.error_px == (0.0, 0.0):
         return foreign, Loss(station, {} if box_m is None else dict.fromkeys(HEIGHTS_M, (0.0, 0.0)), (0.0, 0.0))
     pose = camera.cam_from_world
     return foreign, camera_loss(station, camera, lambda points: foreign.project_rays(pose.transform(points)), box_m)

@@ -29,7 +29,7 @@ _POSES = ("rt_cam_ref", "extrinsics")  # since 2.5, and before
 def _export(request: ExportRequest) -> Exported:
     (name,) = request.stations
     camera = request.calibration.station(name)
-    foreign, loss = as_foreign(camera, name, ("opencv5", "opencv8"), field_box(request.calibration.targets))
+    foreign, loss = as_foreign(camera, name, ("opencv5", "opencv8", "opencv12"), field_box(request.calibration.targets))
     model = f"LENSMODEL_{foreign.model.upper()}"
     pose = camera.cam_from_world.log().tolist()
     entries = {

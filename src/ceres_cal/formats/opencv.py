@@ -39,7 +39,7 @@ def _export(request: ExportRequest) -> Exported:
     cameras, losses = [], []
     for name in request.stations:
         camera = request.calibration.station(name)
-        models = (FISHEYE,) if camera.lens.kind == "kannala-brandt" else ("opencv5", "opencv8")
+        models = (FISHEYE,) if camera.lens.kind == "kannala-brandt" else ("opencv5", "opencv8", "opencv12")
         foreign, loss = as_foreign(camera, name, models, box)
         cameras.append(foreign)
         losses.append(loss)

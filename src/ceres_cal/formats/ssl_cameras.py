@@ -95,7 +95,7 @@ def reader_traps(entry: Mapping[str, Any]) -> list[str]:
 
 def _nearest(camera: Camera, box_m: Box | None) -> Camera:
     """The camera with one focal length and one coefficient that locates most alike on the field, at the same place."""
-    if camera.lens.kind == "radial" and camera.lens.powers == (3,) and camera.aspect == 1.0:
+    if camera.lens.kind == "radial" and camera.lens.powers == (3,) and (camera.aspect, camera.skew) == (1.0, 0.0):
         return camera
     if box_m is None:
         raise InputError("no field to fit ssl-vision's camera over: calibrate with the field, or use a radial lens "

@@ -14,7 +14,7 @@ class Optics(NamedTuple):
 
     Attributes:
         prepare, distort, differentiate: addresses of the lens's compiled functions, see `lenses.lens_functions`.
-        intrinsics: phi, aspect, cx, cy, scaled coefficients. unit: half the image diagonal, px.
+        intrinsics: phi, aspect, cx, cy, scaled coefficients, skew. unit: half the image diagonal, px.
         state: what the lens is chosen by, and room for what it derives from its intrinsics, see `lenses.prepared`.
         work_rows: how many numbers per observation the lens keeps for its derivatives.
     """

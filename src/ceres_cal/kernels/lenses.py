@@ -64,7 +64,7 @@ _call_prepare, _call_distort, _call_differentiate = map(_calls, (_OF_PREPARE, _O
 def prepared(optics: Optics, intrinsics: Any) -> Optics:
     """The optics with these intrinsics and what the lens derives from them."""
     state = optics.state.copy()
-    _call_prepare(optics.prepare, (intrinsics, optics.unit, state))
+    _call_prepare(optics.prepare, (intrinsics[:-1], optics.unit, state))
     return Optics(
         optics.prepare, optics.distort, optics.differentiate, intrinsics, optics.unit, state, optics.work_rows
     )
@@ -72,17 +72,36 @@ def prepared(optics: Optics, intrinsics: Any) -> Optics:
 
 @borrowing
 def distort(n: int, optics: Optics, rays: Any, image: Any, work: Any) -> bool:
-    """Fill `image` and `work`; False where any ray has no answer."""
-    return _call_distort(optics.distort, (n, optics.intrinsics, optics.unit, optics.state, rays, image, work))
+    """Fill `image` and `work`; False where any ray has no answer. A skew of the pixels leans the lens's own image."""
+    of_lens, skew = optics.intrinsics[:-1], optics.intrinsics[-1]
+    for i in range(n):
+        image[7, i] = 0.0
+    good = _call_distort(optics.distort, (n, of_lens, optics.unit, optics.state, rays, image, work))
+    if skew != 0.0:
+        for i in range(n):
+            yx = image[3, i] + image[7, i]
+            image[0, i] += skew * image[1, i]
+            image[2, i] += skew * yx
+            image[3, i] += skew * image[4, i]
+            image[5, i] += skew * image[6, i]
+            image[7, i] = yx - image[3, i]
+    return good
 
 
 @borrowing
 def intrinsics_rows(n: int, optics: Optics, image: Any, work: Any, jacobian: Any) -> None:
-    """Derivatives of the distorted chunk's pixels with respect to phi, aspect, principal point and coefficients."""
-    phi, aspect = optics.intrinsics[0], optics.intrinsics[1]
+    """Derivatives of the distorted chunk's pixels with respect to phi, aspect, principal point, coefficients, skew."""
+    phi, aspect, of_lens = optics.intrinsics[0], optics.intrinsics[1], optics.intrinsics[:-1]
+    count, skew = len(of_lens), optics.intrinsics[-1]
     for i in range(n):
-        jacobian[0, 0, i], jacobian[0, 1, i] = image[0, i] / phi, aspect * image[1, i] / phi
+        jacobian[0, 0, i], jacobian[0, 1, i] = (image[0, i] - skew * image[1, i]) / phi, aspect * image[1, i] / phi
         jacobian[1, 0, i], jacobian[1, 1, i] = 0.0, image[1, i]
         jacobian[2, 0, i], jacobian[2, 1, i] = 1.0, 0.0
         jacobian[3, 0, i], jacobian[3, 1, i] = 0.0, 1.0
-    _call_differentiate(optics.differentiate, (n, optics.intrinsics, optics.unit, optics.state, image, work, jacobian))
+        jacobian[count, 0, i], jacobian[count, 1, i] = image[1, i], 0.0
+    _call_differentiate(optics.differentiate, (n, of_lens, optics.unit, optics.state, image, work, jacobian))
+    if skew != 0.0:
+        for k in range(count):
+            if not 1 <= k <= 3:
+                for i in range(n):
+                    jacobian[k, 0, i] += skew / aspect * jacobian[k, 1, i]

@@ -26,11 +26,12 @@ class Workspace(NamedTuple):
     """Where a chunk is worked on, used again and again; each has one column per observation of the chunk.
 
     Attributes:
-        jacobian: (intrinsics + 6, 2, n) rows phi, aspect, cx, cy, coefficients, pose; x and y components.
+        jacobian: (intrinsics + 6, 2, n) rows phi, aspect, cx, cy, coefficients, skew, pose; x and y
+            components.
         panel: (rows + 3, 2 n) the weighted rows, see `panel`. products: (rows + 3,) squared, of those rows.
         local, rotated, rays: (3, n) the point X in its frame, R X, and R X + t.
-        image (7, n): the offset (ox, oy) from the principal point on square pixels, its derivatives xx, xy = yx, yy
-            with respect to the ray's x and y, and xz, yz with respect to its z.
+        image (8, n): the offset (ox, oy) from the principal point on square pixels, its derivatives xx, xy, yy with
+            respect to the ray's x and y, and xz, yz with respect to its z; yx - xy.
         work: what the lens keeps for the derivatives with respect to its own numbers.
         tangents: (3, n) dC/ds. foot (8, n): tau in px (0, 1), residual vector (2, 3), step (4), the previous s and dot
             product of residual and tau (5, 6), |tau|^2 (7).
@@ -54,7 +55,7 @@ class Workspace(NamedTuple):
 @jit
 def working_space(optics: Optics, rows: int) -> Workspace:
     """For so many rows of normal equations."""
-    scratch = np.empty((27 + optics.work_rows, CHUNK))
+    scratch = np.empty((28 + optics.work_rows, CHUNK))
     return Workspace(
         np.empty((len(optics.intrinsics) + 6, 2, CHUNK)),
         np.zeros((rows + 3, 2 * CHUNK)),
@@ -62,10 +63,10 @@ def working_space(optics: Optics, rows: int) -> Workspace:
         scratch[:3],
         scratch[3:6],
         scratch[6:9],
-        scratch[9:16],
-        scratch[27:],
-        scratch[16:19],
-        scratch[19:27],
+        scratch[9:17],
+        scratch[28:],
+        scratch[17:20],
+        scratch[20:28],
         np.empty((4, 3)),
         np.empty((4, 2)),
     )
@@ -104,7 +105,7 @@ def jacobian_rows(n: int, optics: Optics, space: Workspace, alone: bool) -> None
     for c in range(2):
         scale = 1.0 if c == 0 else aspect
         for i in range(n):
-            dx = scale * (image[2, i] if c == 0 else image[3, i])
+            dx = scale * (image[2, i] if c == 0 else image[3, i] + image[7, i])
             dy = scale * (image[3, i] if c == 0 else image[4, i])
             dz = scale * image[5 + c, i]
             x, y, z = rotated[0, i], rotated[1, i], rotated[2, i]
@@ -152,7 +153,7 @@ def move_to_feet(n: int, start: int, optics: Optics, pose: Any, curves: CurveCol
             y = pose[1, 0] * tx + pose[1, 1] * ty + pose[1, 2] * tz
             z = pose[2, 0] * tx + pose[2, 1] * ty + pose[2, 2] * tz
             tau_x = image[2, i] * x + image[3, i] * y + image[5, i] * z
-            tau_y = aspect * (image[3, i] * x + image[4, i] * y + image[6, i] * z)
+            tau_y = aspect * ((image[3, i] + image[7, i]) * x + image[4, i] * y + image[6, i] * z)
             dx = cx + image[0, i] - pixels[start + i, 0]
             dy = cy + aspect * image[1, i] - pixels[start + i, 1]
             along, length2 = tau_x * dx + tau_y * dy, tau_x * tau_x + tau_y * tau_y

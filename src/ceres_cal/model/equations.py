@@ -34,7 +34,7 @@ class Equations:
         observation: (E,) number of the observation: points by row, then curves by row. view: (E,) of the observation.
         is_curve: (E,). feature: (E,) its `point_index` or, of a curve, its `track_index` (see `Sights`).
         residual: (E,) px. direction: (E, 2) the image direction it is taken along. pixel: (E, 2) where it should lie.
-        intrinsics: (E, K) px per solver's unit of [phi, aspect, cx, cy, coefficients], 0 past a camera's own.
+        intrinsics: (E, K) px per solver's unit of [phi, aspect, cx, cy, coefficients, skew], 0 past a camera's own.
         pose: (E, 6) px per left perturbation of cam_from_frame. motion: (E, 3) px per metre that the point or foot
             moves in the camera frame. place: (E, 3) where it lies in its sight's frame, m.
         built: (E, 4) px per metre of what moves it on its target: of a point x, y, first and second bow; of a segment

@@ -25,7 +25,7 @@ from ceres_cal.scene.lens import Lens, lens_class, make_lens
 AUTO = "auto"
 """The lens that the data ask for: which it is, a calibration says in its options (`ceres_cal.lens_choice`)."""
 OF_PIXELS = ("phi", "aspect", "cx", "cy")
-"""The intrinsics that every camera has, in the order of the solver's vector."""
+"""The intrinsics that every camera has, in the order of the solver's vector; skew comes behind the coefficients."""
 LOSSES = ("trivial", "huber", "soft_l1", "cauchy", "tukey")
 
 
@@ -37,8 +37,11 @@ class Options:
         lens: one of `scene.lens.LENSES`, or "auto": the one that the data ask for. powers: of a lens that leaves the
             choice, as "radial" does.
         free_principal_point: else it is held at the image centre, or where `fixed` says.
-        free_aspect: whether fy / fx is free; else 1, or what `fixed` says.
-        fixed: numbers held, by name: phi, aspect, cx, cy (px) and the lens's coefficients in the units of the files.
+        free_aspect, free_skew: whether fy / fx and the lean of the pixels' columns are free; else 1 and 0, or what
+            `fixed` says.
+        terms: of the lens, besides those that it always has: names of its `more_terms`.
+        fixed: numbers held, by name: phi, aspect, cx, cy (px), skew and the lens's coefficients in the units of the
+            files.
             They hold for every camera.
         priors: what is known beforehand, besides the observations' own.
         tolerances: target -> how far it may have been built from its drawing; none of it where a target is not named.
@@ -57,6 +60,8 @@ class Options:
     powers: tuple[int, ...] = (2, 3)
     free_principal_point: bool = True
     free_aspect: bool = False
+    free_skew: bool = False
+    terms: tuple[str, ...] = ()
     fixed: Mapping[str, float] = field(default_factory=dict)
     priors: tuple[Prior, ...] = ()
     tolerances: Mapping[str, Tolerance] = field(default_factory=dict)
@@ -71,11 +76,13 @@ class Options:
     def __post_init__(self) -> None:
         if self.lens != AUTO:
             lens_class(self.lens)
+        elif self.terms:
+            raise InputError("terms are of a lens that is named: leave them out, or name it")
         if self.loss not in LOSSES:
             raise InputError(f"unknown loss {self.loss!r}: choose one of {', '.join(LOSSES)}")
         if self.noise_scale not in ("estimate", "stated"):
             raise InputError(f"noise_scale must be 'estimate' or 'stated', not {self.noise_scale!r}")
-        names = self.intrinsic_names
+        names = self.intrinsic_names  # which refuses unknown terms, too
         for name, value in self.fixed.items():
             if name not in names:
                 which = "a lens that is still to be chosen" if self.lens == AUTO else f"the {self.lens} lens"
@@ -91,18 +98,18 @@ class Options:
     @cached_property
     def intrinsic_names(self) -> tuple[str, ...]:
         """What the camera can be told of beforehand: of a lens that is still to be chosen no coefficients."""
-        return OF_PIXELS if self.lens == AUTO else intrinsic_names(self.blank_lens)
+        return (*OF_PIXELS, "skew") if self.lens == AUTO else intrinsic_names(self.blank_lens)
 
     @cached_property
     def blank_lens(self) -> Lens:
         """The chosen lens with its fixed coefficients; the others are 0."""
-        names = make_lens(self.lens, self.powers).names
-        return make_lens(self.lens, self.powers, {k: v for k, v in self.fixed.items() if k in names})
+        names = make_lens(self.lens, self.powers, terms=self.terms).names
+        return make_lens(self.lens, self.powers, {k: v for k, v in self.fixed.items() if k in names}, self.terms)
 
 
 def intrinsic_names(lens: Lens) -> tuple[str, ...]:
     """Names of a camera's intrinsics in the order of the solver's vector."""
-    return (*OF_PIXELS, *lens.names)
+    return (*OF_PIXELS, *lens.names, "skew")
 
 
 def unit_px(camera: Camera) -> float:
@@ -111,21 +118,21 @@ def unit_px(camera: Camera) -> float:
 
 
 def intrinsics_vector(camera: Camera) -> Array:
-    """The solver's numbers of a camera, (4 + coefficients,)."""
+    """The solver's numbers of a camera, (4 + coefficients + 1,)."""
     scaled = np.asarray(camera.lens.values) * camera.lens.scales(unit_px(camera))
-    return np.array([camera.phi, camera.aspect, *camera.principal_point, *scaled])
+    return np.array([camera.phi, camera.aspect, *camera.principal_point, *scaled, camera.skew])
 
 
 def intrinsics_scales(camera: Camera) -> Array:
     """What a camera's numbers in the files' units are multiplied with to become the solver's."""
-    return np.concatenate([np.ones(4), camera.lens.scales(unit_px(camera))])
+    return np.concatenate([np.ones(4), camera.lens.scales(unit_px(camera)), np.ones(1)])
 
 
 def with_intrinsics(camera: Camera, vector: Array) -> Camera:
     """The camera with the solver's numbers put in."""
     phi, aspect, cx, cy = (float(v) for v in vector[:4])
-    lens = camera.lens.with_values(vector[4:] / camera.lens.scales(unit_px(camera)))
-    return replace(camera, phi=phi, aspect=aspect, principal_point=(cx, cy), lens=lens)
+    lens = camera.lens.with_values(vector[4:-1] / camera.lens.scales(unit_px(camera)))
+    return replace(camera, phi=phi, aspect=aspect, principal_point=(cx, cy), lens=lens, skew=float(vector[-1]))
 
 
 @dataclass(frozen=True)
@@ -225,6 +232,8 @@ def make_layout(observations: Observations, options: Options) -> Layout:
         held |= {"cx", "cy"}
     if not options.free_aspect:
         held |= {"aspect"}
+    if not options.free_skew:
+        held |= {"skew"}
     free = np.array([i for i, name in enumerate(names) if name not in held], dtype=np.int64)
     views = observations.shown_views
     return Layout(

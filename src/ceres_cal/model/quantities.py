@@ -34,7 +34,7 @@ def natural_sizes(estimate: Estimate, keys: Sequence[Key]) -> Array:
     for (kind, owner), columns in columns_by_owner(keys).items():
         if kind == "camera":
             camera = estimate.cameras[owner]
-            known = {"phi": camera.phi, "cx": camera.phi, "cy": camera.phi, "aspect": 1.0}
+            known = {"phi": camera.phi, "cx": camera.phi, "cy": camera.phi, "aspect": 1.0, "skew": 1.0}
             known |= zip(camera.lens.names, camera.lens.natural_sizes(camera.phi, unit_px(camera)), strict=True)
             sizes[columns] = [known[keys[column].quantity] for column in columns]
         elif kind == "structure":
@@ -76,7 +76,7 @@ def values_of(estimate: Estimate, keys: Sequence[Key]) -> Array:
 
 def intrinsic_keys(name: str, lens: Lens) -> list[Key]:
     """Keys of all intrinsics of a camera, in the order of the solver's vector."""
-    units = ("px", "1", "px", "px", *lens.units)
+    units = ("px", "1", "px", "px", *lens.units, "1")
     return [Key("camera", name, quantity, unit) for quantity, unit in zip(intrinsic_names(lens), units, strict=True)]
 
 

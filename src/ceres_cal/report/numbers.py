@@ -56,11 +56,12 @@ def _camera(material: Material, name: str) -> Table:
     width, height = camera.image_size
     cx, cy = camera.principal_point
     values = {"phi": (camera.phi, "px"), "cx": (cx, "px"), "cy": (cy, "px"), "aspect": (camera.aspect, "")}
+    values["skew"] = (camera.skew, "")
     values |= {key: (value, "") for key, value in camera.lens.coefficients.items()}
     rows = tuple(
         _row(_named(camera, key), value, unit, material.verdicts.get(("camera", name, key)))
         for key, (value, unit) in values.items()
-        if key != "aspect" or value != 1.0 or ("camera", name, key) in material.verdicts
+        if value != {"aspect": 1.0, "skew": 0.0}.get(key) or ("camera", name, key) in material.verdicts
     )
     return Table(_HEAD, rows, f"Camera {name}: {camera.lens.kind} lens, {width} × {height} px", stacked=True)
 

@@ -19,6 +19,7 @@ from ceres_cal.scene.foreign import (
     LARGEST,
     LARGEST_PX,
     OPENCV_MODELS,
+    TO_HOLD,
     ForeignCamera,
     OpenCvCamera,
     image_grid,
@@ -48,6 +49,8 @@ class Camera:
         lens: the lens model with its coefficients.
         aspect: fy / fx, 1 for square pixels.
         cam_from_world: the pose; identity where only the intrinsics matter.
+        skew: by how much x grows with y on square pixels, 0 where rows and columns are perpendicular; Zhang's c is
+            skew times phi.
     """
 
     image_size: tuple[int, int]
@@ -56,13 +59,14 @@ class Camera:
     lens: Lens
     aspect: float = 1.0
     cam_from_world: Pose = field(default_factory=Pose.identity)
+    skew: float = 0.0
 
     def __post_init__(self) -> None:
         width, height = (int(s) for s in self.image_size)
         cx, cy = (float(c) for c in self.principal_point)
         if not (1 <= width <= LARGEST_PX and 1 <= height <= LARGEST_PX):
             raise InputError(f"image size must be two positive whole numbers, not {self.image_size}")
-        numbers = (self.phi, self.aspect, cx, cy, *self.lens.values, *self.cam_from_world.translation)
+        numbers = (self.phi, self.aspect, cx, cy, self.skew, *self.lens.values, *self.cam_from_world.translation)
         if not np.all(np.abs(numbers) < LARGEST) or self.phi <= 0.0 or self.aspect <= 0.0:
             raise InputError(
                 f"intrinsics must be finite and below {LARGEST:g}, phi and aspect positive: phi {self.phi}, "
@@ -72,6 +76,7 @@ class Camera:
         object.__setattr__(self, "image_size", (width, height))
         object.__setattr__(self, "phi", float(self.phi))
         object.__setattr__(self, "aspect", float(self.aspect))
+        object.__setattr__(self, "skew", float(self.skew))
         object.__setattr__(self, "principal_point", (cx, cy))
 
     def __repr__(self) -> str:
@@ -93,7 +98,7 @@ class Camera:
     def matrix(self) -> Array:
         """The camera matrix K (3, 3) of the undistorted image (paper, section 3.4)."""
         cx, cy = self.principal_point
-        return np.array([[self.phi, 0.0, cx], [0.0, self.phi * self.aspect, cy], [0.0, 0.0, 1.0]])
+        return np.array([[self.phi, self.skew * self.phi, cx], [0.0, self.phi * self.aspect, cy], [0.0, 0.0, 1.0]])
 
     def at(self, cam_from_world: Pose) -> Camera:
         """The same camera at another pose."""
@@ -125,7 +130,8 @@ class Camera:
         """Pixels (N, 2) as offsets (N, 2) from the principal point on square pixels."""
         x, y = _rows(pixels, 2, "pixels").T
         cx, cy = self.principal_point
-        return np.column_stack([x - cx, (y - cy) / self.aspect])  # by columns: rows of two are slow to walk
+        down = (y - cy) / self.aspect
+        return np.column_stack([x - cx - self.skew * down, down])  # by columns: rows of two are slow to walk
 
     def project(self, points_world: ArrayLike) -> Array:
         """Points (N, 3) m -> pixels (N, 2), or one (3,) -> (2,); NaN behind the camera or past the lens's monotone
@@ -137,7 +143,9 @@ class Camera:
             return np.asarray(self.project(np.asarray(points_world)[None])[0])
         with np.errstate(invalid="ignore"):  # infinite points
             rays = self.cam_from_world.transform(_rows(points_world, 3, "points_world"))
-        return np.asarray(self.lens.distort(rays, self.phi) * (1.0, self.aspect) + self.principal_point)
+        offsets = self.lens.distort(rays, self.phi)
+        offsets[:, 0] += self.skew * offsets[:, 1]
+        return np.asarray(offsets * (1.0, self.aspect) + self.principal_point)
 
     def rays(self, pixels: ArrayLike) -> Array:
         """Pixels (N, 2) -> unit directions (N, 3) in the camera frame; NaN past the lens's monotone radius."""
@@ -207,12 +215,12 @@ class Camera:
         """
         blanks = []
         for model in models:
-            count = 4 if model == FISHEYE else OPENCV_MODELS[model]
-            focal, values = (self.phi, self.phi * self.aspect), (*self.lens.values, *[0.0] * count)[:count]
-            same = ForeignCamera(self.image_size, focal, self.principal_point, model, values, self.cam_from_world)
-            if same.lens == self.lens:
-                return same
-            blanks.append(replace(same, coefficients=(0.0,) * count))
+            focal, exact = (self.phi, self.phi * self.aspect), ForeignCamera.coefficients_of(self.lens, model)
+            numbers = exact or (0.0,) * (4 if model == FISHEYE else OPENCV_MODELS.get(model, 0))
+            one = ForeignCamera(self.image_size, focal, self.principal_point, model, numbers, self.cam_from_world)
+            if exact is not None and self.skew == 0.0:
+                return one
+            blanks += [] if model in TO_HOLD else [replace(one, coefficients=(0.0,) * len(numbers))]
         pixels = image_grid(self.image_size)
         rays = self.rays(pixels)
         known = np.isfinite(rays[:, 0])
@@ -225,7 +233,7 @@ class Camera:
         Raises:
             InputError: that lens would fold inside the image.
         """
-        if (lens.kind, lens.names) == (self.lens.kind, self.lens.names):
+        if (lens.kind, lens.names, self.skew) == (self.lens.kind, self.lens.names, 0.0):
             return self
         focal = (self.phi, self.phi * self.aspect)
         start = ForeignCamera(self.image_size, focal, self.principal_point, FISHEYE, (0.0,) * 4)
@@ -253,9 +261,11 @@ class Camera:
         return cls(**intrinsics, cam_from_world=pose), error_px
 
     def to_opencv(self) -> OpenCvCamera:
-        """K, coefficients, rvec and tvec as OpenCV takes them; of `radial` the best fit, with its error."""
+        """K, coefficients, rvec and tvec as OpenCV takes them; where it does not have the lens, or for a skew, the best
+        fit, with its error.
+        """
         fisheye = self.lens.kind == KannalaBrandt.kind
-        foreign = self.to_foreign(FISHEYE) if fisheye else self.to_foreign("opencv5", "opencv8")
+        foreign = self.to_foreign(FISHEYE) if fisheye else self.to_foreign("opencv5", "opencv8", "opencv12")
         pose = self.cam_from_world
         vector, distortion = rotation_log(pose.rotation), np.array(foreign.coefficients)
         return OpenCvCamera(foreign.matrix, distortion, vector, pose.translation.copy(), fisheye, foreign.error_px)
@@ -274,15 +284,12 @@ class Camera:
         """A camera from OpenCV's numbers: `brown`, or `kannala-brandt` of those of its fisheye model.
 
         Raises:
-            InputError: numbers that make no camera, or coefficients beyond k3, which no lens of ours has: read a file
-                of them, which states what the nearest camera of ours misses.
+            InputError: numbers that make no camera.
         """
         pose = Pose.exp(np.concatenate([np.ravel(rvec), np.ravel(tvec)]))
         foreign = ForeignCamera.opencv(image_size, matrix, np.ravel(distortion), pose)
         if fisheye:
             foreign = replace(foreign, model=FISHEYE, coefficients=tuple(float(v) for v in np.ravel(distortion)))
-        if foreign.lens is None:
-            raise InputError("no lens here has OpenCV's k4 and beyond: `Camera.from_foreign` takes the nearest one")
         return cls.from_foreign(foreign)[0]
 
 

@@ -20,7 +20,7 @@ Matrix = tuple[Vector, Vector, Vector]
 
 
 class LensFile(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True):
-    """A lens; only `radial` has powers."""
+    """A lens; only `radial` has powers. Which terms it has, its coefficients' names say."""
 
     kind: str
     powers: tuple[int, ...] | None = None
@@ -34,9 +34,10 @@ class CameraFile(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
     phi: float
     principal_point: tuple[float, float]
     aspect: float = 1.0
+    skew: float = 0.0
     lens: LensFile
     camera_matrix: Matrix | msgspec.UnsetType = msgspec.UNSET
-    """K, for other programs: phi, aspect and principal point once more."""
+    """K, for other programs: phi, aspect, skew and principal point once more."""
 
     @classmethod
     def of(cls, camera: Camera) -> CameraFile:
@@ -45,15 +46,21 @@ class CameraFile(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
         size, centre = camera.image_size, camera.principal_point
         k = camera.matrix.tolist()
         return cls(
-            image_size=size, phi=camera.phi, principal_point=centre, aspect=camera.aspect, lens=lens, camera_matrix=k
+            image_size=size,
+            phi=camera.phi,
+            principal_point=centre,
+            aspect=camera.aspect,
+            skew=camera.skew,
+            lens=lens,
+            camera_matrix=k,
         )
 
     def camera(self) -> Camera:
         """The camera, at no particular pose; InputError where it is none."""
         lens = make_lens(self.lens.kind, self.lens.powers or (2, 3), self.lens.coefficients)
-        camera = Camera(self.image_size, self.phi, self.principal_point, lens, self.aspect)
+        camera = Camera(self.image_size, self.phi, self.principal_point, lens, self.aspect, skew=self.skew)
         if self.camera_matrix and not np.allclose(camera.matrix, self.camera_matrix, rtol=1e-9):
-            raise InputError("camera_matrix is another than that of phi, aspect and principal_point: correct one")
+            raise InputError("camera_matrix is another than that of phi, aspect, skew and principal_point: correct one")
         return camera
 
 

@@ -17,14 +17,25 @@ from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.least_squares import least_squares
 from ceres_cal.base.transforms import Pose
-from ceres_cal.scene.lens import Brown, KannalaBrandt, Lens, Radial
+from ceres_cal.scene.lens import Brown, KannalaBrandt, Lens, Radial, make_lens
 
 OPENCV_MODELS = {"opencv4": 4, "opencv5": 5, "opencv8": 8, "opencv12": 12}
-"""OpenCV's coefficients in its order, k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4]]], and how many there are."""
+"""How many coefficients there are of OpenCV's, in its order: k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4]]]."""
 LARGEST_PX = 10**9  # what is larger is no number of pixels
 LARGEST = 1e100  # of any number of a camera: squares and cubes of what is larger overflow
 FISHEYE = "fisheye"
 """OpenCV's fisheye model: k1 to k4."""
+THIN_PRISM_FISHEYE = "THIN_PRISM_FISHEYE"
+"""COLMAP's: a fisheye with decentring and a thin prism."""
+_OPENCV = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4")
+_NAMES = {
+    **{model: (Brown.kind, _OPENCV[:count]) for model, count in OPENCV_MODELS.items()},
+    FISHEYE: (KannalaBrandt.kind, KannalaBrandt.above),
+    THIN_PRISM_FISHEYE: (KannalaBrandt.kind, ("k1", "k2", "p1", "p2", "k3", "k4", "", "")),
+}
+"""Model -> the kind of our lenses that it is, and the names of its coefficients there; "" of those that none has."""
+TO_HOLD = ("opencv12", THIN_PRISM_FISHEYE)
+"""Models for lenses that they hold exactly: no other lens is fitted by them."""
 _GRID = (41, 31)  # pixels of the image over which a fit is made
 _ANGLES, _DIRECTIONS = 120, 24  # of rays in all directions, to see what a foreign model shows
 _LENSES = (Brown(), KannalaBrandt(), Radial.blank((2, 3)), Radial.blank((3, 5, 7)))
@@ -102,19 +113,28 @@ class ForeignCamera:
     @property
     def lens(self) -> Lens | None:
         """Ours that is the same; None where none is."""
-        if self.model == FISHEYE:
-            return KannalaBrandt(self.coefficients)
-        if self.model in OPENCV_MODELS and not any(self.coefficients[5:]):
-            return Brown((*self.coefficients, 0.0)[:5])
-        return None
+        if self.model not in _NAMES:
+            return None
+        kind, names = _NAMES[self.model]
+        named = [(name, value) for name, value in zip(names, self.coefficients, strict=True) if value != 0.0]
+        return None if any(not name for name, _ in named) else make_lens(kind, coefficients=dict(named))
+
+    @staticmethod
+    def coefficients_of(lens: Lens, model: str) -> tuple[float, ...] | None:
+        """A lens of ours in the numbers of a model; None where that does not hold it."""
+        kind, names = _NAMES[model]
+        given = {name: value for name, value in lens.coefficients.items() if value != 0.0}
+        if lens.kind != kind or not set(given) <= set(names):
+            return None
+        return tuple(given.get(name, 0.0) for name in names)
 
     def project_rays(self, rays: Array) -> Array:
         """Rays (N, 3) in the camera's frame -> pixels (N, 2); NaN where the model has no answer."""
         with np.errstate(all="ignore"):
             if self.distort is not None:
                 places = self.distort(rays)
-            elif self.model == FISHEYE:
-                places = KannalaBrandt(self.coefficients).distort(rays, 1.0)
+            elif (lens := self.lens) is not None and lens.kind == KannalaBrandt.kind:
+                places = lens.distort(rays, 1.0)
             else:
                 places = _opencv(rays, self.coefficients)
         return np.asarray(places * self.focal + self.centre)

@@ -101,7 +101,7 @@ def _poses_at(homographies: Homographies, phi: float) -> Array:
 def _blank_camera(name: str, image_size: tuple[int, int], options: Options, priors: Sequence[Prior]) -> Camera:
     """Fixed numbers and principal point put in; phi still to come."""
     centre = [(image_size[0] - 1) / 2.0, (image_size[1] - 1) / 2.0]
-    aspect = options.fixed.get("aspect", 1.0)
+    aspect, skew = options.fixed.get("aspect", 1.0), options.fixed.get("skew", 0.0)
     for prior in priors:
         if prior.owner == "camera" and prior.name == name:
             if prior.quantity == "principal_point":
@@ -110,8 +110,10 @@ def _blank_camera(name: str, image_size: tuple[int, int], options: Options, prio
                 centre[prior.quantity == "cy"] = prior.value[0]
             elif prior.quantity == "aspect":
                 aspect = prior.value[0]
+            elif prior.quantity == "skew":
+                skew = prior.value[0]
     cx, cy = options.fixed.get("cx", centre[0]), options.fixed.get("cy", centre[1])
-    blank = Camera(image_size, 1.0, (cx, cy), options.blank_lens, aspect)
+    blank = Camera(image_size, 1.0, (cx, cy), options.blank_lens, aspect, skew=skew)
     if set(blank.lens.names) <= set(options.fixed) and not blank.lens.may_fold:
         blank.require_monotone(name)
     return blank

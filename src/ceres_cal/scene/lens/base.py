@@ -11,8 +11,9 @@ Every model has its map twice: in arrays, as one reads it, and as loops with der
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -60,6 +61,7 @@ class Lens(ABC):
         decentring: names of the coefficients that displace tangentially.
         trial_powers: of the kinds that leave the choice of powers: those worth a trial, the plainest first.
         missing_powers: of the radius that a diagnosis tries, lowest first.
+        more_terms: what it may have besides, by name, with the coefficients of each.
         work_rows: how many numbers per observation `distort_chunk` keeps for `differentiate_chunk`.
     """
 
@@ -70,6 +72,7 @@ class Lens(ABC):
     decentring: ClassVar[tuple[str, ...]] = ()
     trial_powers: ClassVar[tuple[tuple[int, ...], ...]] = ()
     missing_powers: ClassVar[tuple[int, ...]] = (3, 5, 7, 9, 11)
+    more_terms: ClassVar[Mapping[str, tuple[str, ...]]] = MappingProxyType({})
     work_rows: ClassVar[int] = 5
 
     def __post_init__(self) -> None:
@@ -95,10 +98,38 @@ class Lens(ABC):
         """The powers that it was chosen by; empty where its kind leaves no choice."""
         return ()
 
+    @property
+    def terms(self) -> tuple[str, ...]:
+        """Those of `more_terms` that it has."""
+        return ()
+
     @classmethod
     def blank(cls, powers: Sequence[int]) -> Lens:
         """The model with every coefficient 0; powers are for the kinds that leave the choice."""
         return cls()
+
+    @property
+    def names_of_terms(self) -> tuple[str, ...]:
+        """The coefficients of the terms that it has besides."""
+        return tuple(name for term, names in self.more_terms.items() if term in self.terms for name in names)
+
+    def with_terms(self, terms: Collection[str]) -> Lens:
+        """The same model with these terms besides, their coefficients 0 where it has not had them.
+
+        Raises:
+            InputError: its kind has no such terms.
+        """
+        for term in terms:
+            if term not in self.more_terms:
+                known = ", ".join(self.more_terms) or "none"
+                raise InputError(f"lens {self.kind!r} has no terms {term!r}: there are {known}")
+        ordered = tuple(term for term in self.more_terms if term in terms)
+        if ordered == self.terms:
+            return self
+        before, count = self.coefficients, len(self.names) - len(self.names_of_terms)
+        names = [*self.names[:count], *(name for term in ordered for name in self.more_terms[term])]
+        given: dict[str, Any] = {"values": tuple(before.get(name, 0.0) for name in names), "terms": ordered}
+        return replace(self, **given)
 
     @property
     def coefficients(self) -> dict[str, float]:
@@ -194,8 +225,8 @@ class Lens(ABC):
         """Fill the first n columns of `image` and `work`; False where any ray has no answer.
 
         Args:
-            rays: (3, n). image: (7, n) the offset in px, x and y, its derivatives xx, xy = yx, yy with respect to the
-                ray's x and y, and xz, yz with respect to its z. work: (work_rows, n).
+            rays: (3, n). image: (8, n) the offset in px, x and y, its derivatives xx, xy, yy with respect to the ray's
+                x and y, and xz, yz with respect to its z; yx - xy, which is 0 before the call. work: (work_rows, n).
         """
 
     @staticmethod
@@ -236,14 +267,22 @@ def lens_class(kind: str) -> type[Lens]:
     return LENSES[kind]
 
 
-def make_lens(kind: str, powers: Sequence[int] = (2, 3), coefficients: Mapping[str, float] | None = None) -> Lens:
-    """A lens by the name of its model; coefficients that are not named are 0.
+def make_lens(
+    kind: str,
+    powers: Sequence[int] = (2, 3),
+    coefficients: Mapping[str, float] | None = None,
+    terms: Collection[str] = (),
+) -> Lens:
+    """A lens by the name of its model, with the terms that are asked for or have a coefficient; coefficients that are
+    not named are 0.
 
     Raises:
-        InputError: unknown kind, unknown coefficient name, or powers that make no lens.
+        InputError: unknown kind, terms or coefficient name, or powers that make no lens.
     """
     given = dict(coefficients or {})
-    blank = lens_class(kind).blank(powers)
+    model = lens_class(kind)
+    named = {term for term, names in model.more_terms.items() if {*names} & {*given}}
+    blank = model.blank(powers).with_terms({*terms, *named})
     for name in given:
         if name not in blank.names:
             raise InputError(f"lens {kind!r} has no coefficient {name!r}: it has {', '.join(blank.names)}")

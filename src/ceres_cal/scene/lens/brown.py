@@ -1,118 +1,54 @@
-"""Brown's lens."""
+"""Brown's lens, with what OpenCV has added to it."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from types import MappingProxyType
 from typing import Any, ClassVar
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array
-from ceres_cal.scene.lens.base import Lens, LinearEquations, ahead, unit_rays
-from ceres_cal.scene.lens.polynomials import (
-    STEPS,
-    dense_polynomial,
-    growing_until,
-    horner,
-    invert_increasing,
-    monotone_limit,
-)
+from ceres_cal.scene.lens.base import LinearEquations, ahead, unit_rays
+from ceres_cal.scene.lens.planar import Decentred
+from ceres_cal.scene.lens.polynomials import growing_until
 
 _FAR = 6.0  # ideal radii: nothing is observed farther out
 
 
 @dataclass(frozen=True)
-class Brown(Lens):
-    """Brown's model as in OpenCV: k1 k2 p1 p2 k3 act on the ideal point (x/z, y/z)."""
+class Brown(Decentred):
+    """Brown's model as in OpenCV: k1 k2 p1 p2 k3 act on the ideal point (x/z, y/z), and so do, where they are asked
+    for, k4 to k6 under the line (its rational model) and s1 to s4 (its thin prism).
+    """
 
     values: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    terms: tuple[str, ...] = ()
     kind: ClassVar[str] = "brown"
     decentring: ClassVar[tuple[str, ...]] = ("p1", "p2")
+    more_terms: ClassVar[Mapping[str, tuple[str, ...]]] = MappingProxyType(
+        {"rational": ("k4", "k5", "k6"), "prism": ("s1", "s2", "s3", "s4")}
+    )
+    above: ClassVar[tuple[str, ...]] = ("k1", "k2", "k3")
+    below: ClassVar[tuple[str, ...]] = ("k4", "k5", "k6")
 
     @property
     def names(self) -> tuple[str, ...]:
-        return ("k1", "k2", "p1", "p2", "k3")
+        return ("k1", "k2", "p1", "p2", "k3", *self.names_of_terms)
 
     @property
     def orders(self) -> tuple[int, ...]:
-        return 3, 5, 2, 2, 7
+        order = {"k1": 3, "k2": 5, "p1": 2, "p2": 2, "k3": 7, "k4": 3, "k5": 5, "k6": 7}
+        return tuple(order.get(name, 2 if name in ("s1", "s3") else 4) for name in self.names)
 
-    @property
-    def _polynomial(self) -> Array:
-        # In the worst direction the decentring terms take 3 |p| r^2 off the radius. While what is left grows, the
-        # derivative of the whole map, which is symmetric, is positive definite in every direction: no two answers.
-        k1, k2, p1, p2, k3 = self.values
-        return dense_polynomial((-3.0 * np.hypot(p1, p2), k1, k2, k3), (2, 3, 5, 7))
+    @staticmethod
+    def _flat(rays: Array) -> Array:
+        return np.asarray(rays[:, :2] / ahead(rays))
 
-    @cached_property
-    def _limit(self) -> float:
-        """Where that map stops growing; infinity where it never does."""
-        return monotone_limit(self._polynomial)
-
-    @cached_property
-    def _rim(self) -> float:
-        """The map's value at its limit."""
-        return float(horner(self._polynomial, np.array(self._limit))) if np.isfinite(self._limit) else self._limit
-
-    def _map(self, ideal: Array) -> Array:
-        k1, k2, p1, p2, k3 = self.values
-        x, y = ideal[:, 0], ideal[:, 1]
-        r2 = x * x + y * y
-        radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        return np.column_stack(
-            [
-                x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),
-                y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y,
-            ]
-        )
-
-    def _jacobian(self, ideal: Array) -> tuple[Array, Array, Array]:
-        """Derivatives xx, xy = yx and yy of `_map`."""
-        k1, k2, p1, p2, k3 = self.values
-        x, y = ideal[:, 0], ideal[:, 1]
-        r2 = x * x + y * y
-        radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        slope = 2.0 * (k1 + r2 * (2.0 * k2 + r2 * 3.0 * k3))
-        xx = radial + x * x * slope + 2.0 * p1 * y + 6.0 * p2 * x
-        xy = x * y * slope + 2.0 * p1 * x + 2.0 * p2 * y
-        yy = radial + y * y * slope + 6.0 * p1 * y + 2.0 * p2 * x
-        return xx, xy, yy
-
-    def _within(self, ideal: Array) -> Array:
-        """Ideal points (N, 2), NaN past the limit."""
-        return np.where(np.hypot(ideal[:, :1], ideal[:, 1:]) <= self._limit, ideal, np.nan)
-
-    def _distort(self, rays: Array, phi: float) -> Array:
-        return np.asarray(phi * self._map(self._within(rays[:, :2] / ahead(rays))))
-
-    def _undistort(self, offsets: Array, phi: float) -> Array:
-        measured = offsets / phi
-        radius = np.hypot(measured[:, 0], measured[:, 1])
-        # Other directions reach farther than the worst: from beyond its rim, start just inside.
-        start = invert_increasing(self._polynomial, np.minimum(radius, self._rim * (1.0 - 1e-6)), self._limit)
-        ideal = self._newton(measured * np.where(radius > 0.0, start / radius, 1.0)[:, None], measured)
-        return unit_rays(self._within(ideal), 1.0)
-
-    def _newton(self, start: Array, measured: Array) -> Array:
-        """Ideal points (N, 2) whose image is `measured`; NaN where Newton's method does not get there."""
-        ideal, rows = start.copy(), np.arange(len(start))
-        for _ in range(STEPS):
-            here = ideal[rows]
-            error = self._map(here) - measured[rows]
-            xx, xy, yy = self._jacobian(here)
-            step = np.column_stack([yy * error[:, 0] - xy * error[:, 1], xx * error[:, 1] - xy * error[:, 0]])
-            step /= (xx * yy - xy * xy)[:, None]
-            ideal[rows] = here - step
-            rows = rows[np.any(np.abs(step) > 1e-13, axis=1)]
-            if not len(rows):
-                break
-        error = np.max(np.abs(self._map(ideal) - measured), axis=1)
-        solved = error <= 1e-12 * (1.0 + np.max(np.abs(measured), axis=1))
-        return np.where(solved[:, None], ideal, np.nan)
-
-    def monotone_radius(self, phi: float) -> float:
-        return phi * self._rim
+    @staticmethod
+    def _lifted(flat: Array) -> Array:
+        return unit_rays(flat, 1.0)
 
     def start_equations(self, measured: Array, ideal: Array, angle: Array, phi: float) -> LinearEquations:
         u = ideal / phi
@@ -124,34 +60,50 @@ class Brown(Lens):
 
     @property
     def state(self) -> Array:
-        """The limit, then the map u (d_0 + d_1 u + ...) of the ideal radius without decentring."""
-        return np.zeros(8)
+        """The limit, the places of k4 and s1 among the intrinsics (0: none), k1 to k6, s1 to s4, and room for two
+        polynomials u (d_0 + d_1 u + ...) of the ideal radius.
+        """
+        places = [4 + self.names.index(name) if name in self.names else 0 for name in ("k4", "s1")]
+        return np.array([0.0, *places, *[0.0] * (10 + 13 + 7)])
 
     @staticmethod
     def prepare(intrinsics: Any, unit: float, state: Any) -> None:
-        state[1], state[3], state[5], state[7] = 1.0, intrinsics[4], intrinsics[5], intrinsics[8]
-        state[0] = growing_until(state[1:], _FAR)
+        state[3], state[4], state[5] = intrinsics[4], intrinsics[5], intrinsics[8]
+        rational, prism = int(state[1]), int(state[2])
+        for k in range(3):
+            state[6 + k] = intrinsics[rational + k] if rational > 0 else 0.0
+        for k in range(4):
+            state[9 + k] = intrinsics[prism + k] if prism > 0 else 0.0
+        _fill_slopes(state[3:6], state[6:9], state[13:26], state[26:33])
+        state[0] = min(growing_until(state[13:26], _FAR), growing_until(state[26:33], _FAR))
 
     @staticmethod
     def distort_chunk(n: int, intrinsics: Any, unit: float, state: Any, rays: Any, image: Any, work: Any) -> bool:
         limit = state[0]
-        phi = intrinsics[0]
-        k1, k2, p1, p2, k3 = intrinsics[4], intrinsics[5], intrinsics[6], intrinsics[7], intrinsics[8]
+        phi, p1, p2 = intrinsics[0], intrinsics[6], intrinsics[7]
+        k1, k2, k3, k4, k5, k6 = state[3], state[4], state[5], state[6], state[7], state[8]
+        s1, s2, s3, s4 = state[9], state[10], state[11], state[12]
         good = True
         for i in range(n):
             iz = 1.0 / rays[2, i]
             u, v = rays[0, i] * iz, rays[1, i] * iz
             r2 = u * u + v * v
-            radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
-            slope = 2.0 * (k1 + r2 * (2.0 * k2 + r2 * 3.0 * k3))
-            xx = phi * (radial + u * u * slope + 2.0 * p1 * v + 6.0 * p2 * u) * iz
-            xy = phi * (u * v * slope + 2.0 * p1 * u + 2.0 * p2 * v) * iz
-            yy = phi * (radial + v * v * slope + 6.0 * p1 * v + 2.0 * p2 * u) * iz
-            image[0, i] = phi * (u * radial + 2.0 * p1 * u * v + p2 * (r2 + 2.0 * u * u))
-            image[1, i] = phi * (v * radial + p1 * (r2 + 2.0 * v * v) + 2.0 * p2 * u * v)
-            image[2, i], image[3, i], image[4, i] = xx, xy, yy
-            image[5, i], image[6, i] = -(xx * u + xy * v), -(xy * u + yy * v)
-            work[0, i], work[1, i], work[2, i] = u, v, r2
+            below = 1.0 / (1.0 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+            radial = below * (1.0 + r2 * (k1 + r2 * (k2 + r2 * k3)))
+            bend = 2.0 * below * (
+                k1 + r2 * (2.0 * k2 + r2 * 3.0 * k3) - radial * (k4 + r2 * (2.0 * k5 + r2 * 3.0 * k6))
+            )  # fmt: skip
+            first, second = 2.0 * (s1 + 2.0 * r2 * s2), 2.0 * (s3 + 2.0 * r2 * s4)
+            both = u * v * bend + 2.0 * p1 * u + 2.0 * p2 * v
+            scale = phi * iz
+            xx = scale * (radial + u * u * bend + 2.0 * p1 * v + 6.0 * p2 * u + first * u)
+            xy, yx = scale * (both + first * v), scale * (both + second * u)
+            yy = scale * (radial + v * v * bend + 6.0 * p1 * v + 2.0 * p2 * u + second * v)
+            image[0, i] = phi * (u * radial + 2.0 * p1 * u * v + p2 * (r2 + 2.0 * u * u) + r2 * (s1 + r2 * s2))
+            image[1, i] = phi * (v * radial + p1 * (r2 + 2.0 * v * v) + 2.0 * p2 * u * v + r2 * (s3 + r2 * s4))
+            image[2, i], image[3, i], image[4, i], image[7, i] = xx, xy, yy, yx - xy
+            image[5, i], image[6, i] = -(xx * u + xy * v), -(yx * u + yy * v)
+            work[0, i], work[1, i], work[2, i], work[3, i], work[4, i] = u, v, r2, below, radial
             good &= (rays[2, i] > 0.0) & (r2 < limit * limit)
         return good
 
@@ -163,8 +115,37 @@ class Brown(Lens):
         for i in range(n):
             u, v, r2 = work[0, i], work[1, i], work[2, i]
             x, y, r4 = phi * u, aspect * phi * v, r2 * r2
-            jacobian[4, 0, i], jacobian[4, 1, i] = x * r2, y * r2
-            jacobian[5, 0, i], jacobian[5, 1, i] = x * r4, y * r4
+            a, b = work[3, i] * x, work[3, i] * y
+            jacobian[4, 0, i], jacobian[4, 1, i] = a * r2, b * r2
+            jacobian[5, 0, i], jacobian[5, 1, i] = a * r4, b * r4
             jacobian[6, 0, i], jacobian[6, 1, i] = 2.0 * x * v, aspect * phi * (r2 + 2.0 * v * v)
             jacobian[7, 0, i], jacobian[7, 1, i] = phi * (r2 + 2.0 * u * u), 2.0 * u * y
-            jacobian[8, 0, i], jacobian[8, 1, i] = x * r2 * r4, y * r2 * r4
+            jacobian[8, 0, i], jacobian[8, 1, i] = a * r2 * r4, b * r2 * r4
+        rational, prism = int(state[1]), int(state[2])
+        if rational > 0:
+            for k in range(3):
+                row = 8 if k == 2 else 4 + k  # k1, k2 and k3 have the same powers over the line
+                for i in range(n):
+                    jacobian[rational + k, 0, i] = -work[4, i] * jacobian[row, 0, i]
+                    jacobian[rational + k, 1, i] = -work[4, i] * jacobian[row, 1, i]
+        if prism > 0:
+            for i in range(n):
+                d, r2 = phi * work[2, i], work[2, i]
+                jacobian[prism, 0, i], jacobian[prism, 1, i] = d, 0.0
+                jacobian[prism + 1, 0, i], jacobian[prism + 1, 1, i] = d * r2, 0.0
+                jacobian[prism + 2, 0, i], jacobian[prism + 2, 1, i] = 0.0, aspect * d
+                jacobian[prism + 3, 0, i], jacobian[prism + 3, 1, i] = 0.0, aspect * d * r2
+
+
+def _fill_slopes(above: Any, below: Any, rising: Any, under: Any) -> None:
+    """Polynomials u (d_0 + d_1 u + ...) whose slopes are the radial slope times q^2, and q, with q what is under the
+    line.
+    """
+    rising[:] = 0.0
+    under[:] = 0.0
+    for j in range(4):
+        p, q = (above[j - 1] if j > 0 else 1.0), (below[j - 1] if j > 0 else 1.0)
+        under[2 * j] = q / (2.0 * j + 1.0)
+        for k in range(4):
+            other = below[k - 1] if k > 0 else 1.0
+            rising[2 * (j + k)] += p * other * (2.0 * j + 1.0 - 2.0 * k) / (2.0 * (j + k) + 1.0)

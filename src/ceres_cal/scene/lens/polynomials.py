@@ -1,9 +1,11 @@
-"""Polynomials along a radius with value 0 and slope 1 at 0: their end, and their inverse."""
+"""Maps along a radius with value 0 and slope 1 at 0, polynomials and their ratios: their end, and their inverse."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -11,6 +13,7 @@ from ceres_cal.base.arrays import Array
 
 STEPS = 60  # a safeguard: Newton needs 4 to 8, bisection 53
 _FAR_STEPS = 96
+_SHORT = 1e-9  # of a pole: the map is finite before it
 
 
 def horner(polynomial: Array, x: Array) -> Array:
@@ -28,46 +31,88 @@ def derivative(polynomial: Array) -> Array:
     return np.asarray(polynomial[1:] * np.arange(1, len(polynomial)))
 
 
-def monotone_limit(polynomial: Array) -> float:
-    """Where a polynomial with slope 1 at 0 (lowest power first) stops growing; infinity where it never does."""
-    rising = derivative(polynomial)
-    if not np.all(np.isfinite(rising)):
+def first_root(polynomial: Array) -> float:
+    """Where a polynomial with value 1 at 0 (lowest power first) first reaches 0; infinity where it never does."""
+    if not np.all(np.isfinite(polynomial)):
         return np.nan
     # The roots of the reversed polynomial are 1 / x: its leading coefficient is 1, however small the last ones are.
-    inverse = np.roots(rising)
+    inverse = np.roots(polynomial)
     size = np.abs(inverse)
     real = (np.abs(inverse.imag) <= 1e-9 * size) & (inverse.real > 1e-15 * np.max(size, initial=0.0))
     return 1.0 / float(np.max(inverse.real[real])) if np.any(real) else np.inf
 
 
-def _reach(polynomial: Array, target: Array, limit: float) -> Array:
-    """An x (N,) where the polynomial is not below its target: the limit or, without one, found by doubling."""
-    if np.isfinite(limit):
-        return np.full_like(target, limit)
+class Profile(Protocol):
+    """A map along a radius: value 0 and slope 1 at 0, growing up to its limit."""
+
+    @property
+    def limit(self) -> float: ...
+    def value(self, x: Array) -> Array: ...
+    def slope(self, x: Array) -> Array: ...
+
+
+@dataclass(frozen=True, eq=False)
+class Ratio:
+    """p(x) / q(x): a profile of two polynomials, lowest power first, q(0) = 1; without the second, p alone.
+
+    Attributes:
+        above, below: p and q. end: it is asked for up to there.
+    """
+
+    above: Array
+    below: Array | None = None
+    end: float = np.inf
+
+    def value(self, x: Array) -> Array:
+        """At x (N,)."""
+        total = horner(self.above, x)
+        return total if self.below is None else np.asarray(total / horner(self.below, x))
+
+    def slope(self, x: Array) -> Array:
+        """Its derivative at x (N,)."""
+        total = horner(self._rising, x)
+        return total if self.below is None else np.asarray(total / horner(self.below, x) ** 2)
+
+    @cached_property
+    def _rising(self) -> Array:
+        """Its derivative times q^2."""
+        if self.below is None:
+            return derivative(self.above)
+        return np.asarray(np.polynomial.polynomial.polysub(
+            np.convolve(derivative(self.above), self.below), np.convolve(self.above, derivative(self.below))
+        ))  # fmt: skip
+
+    @cached_property
+    def limit(self) -> float:
+        """Where it stops growing or q reaches 0, or else its end."""
+        limit = min(self.end, first_root(self._rising))
+        return limit if self.below is None else min(limit, (1.0 - _SHORT) * first_root(self.below))
+
+
+def _reach(profile: Profile, target: Array) -> Array:
+    """An x (N,) where the profile is not below its target: its limit or, without one, found by doubling."""
+    if np.isfinite(profile.limit):
+        return np.full_like(target, profile.limit)
     high = target.copy()
     for _ in range(STEPS):
-        short = horner(polynomial, high) < target
+        short = profile.value(high) < target
         if not np.any(short):
             break
         high[short] *= 2.0
     return high
 
 
-def invert_increasing(polynomial: Array, target: Array, limit: float) -> Array:
-    """x in [0, limit] with polynomial(x) = target (N,), by Newton safeguarded with bisection; NaN where there is none.
-
-    The polynomial must increase on [0, limit], with value 0 and slope 1 at 0.
-    """
-    rising = derivative(polynomial)
-    high = _reach(polynomial, target, limit)
+def invert_increasing(profile: Profile, target: Array) -> Array:
+    """x up to the limit with profile(x) = target (N,), by Newton safeguarded with bisection; NaN where none is."""
+    high = _reach(profile, target)
     answer = np.full_like(target, np.nan)
-    rows = np.flatnonzero((target >= 0.0) & np.isfinite(target) & (target <= horner(polynomial, high)))
+    rows = np.flatnonzero((target >= 0.0) & np.isfinite(target) & (target <= profile.value(high)))
     target, high = target[rows], high[rows]
     low, x, last = np.zeros_like(high), np.minimum(target, high), np.full_like(high, np.inf)
     for _ in range(STEPS):
-        error = horner(polynomial, x) - target
+        error = profile.value(x) - target
         low, high = np.where(error < 0.0, x, low), np.where(error > 0.0, x, high)
-        move = -error / horner(rising, x)
+        move = -error / profile.slope(x)
         # A step that does not halve the last one may run in a circle.
         good = (x + move >= low) & (x + move <= high) & (np.abs(move) <= 0.5 * last)
         move = np.where(good, move, 0.5 * (low + high) - x)

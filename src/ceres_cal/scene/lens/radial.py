@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.scene.lens.base import Lens, LinearEquations, ahead, unit_rays
-from ceres_cal.scene.lens.polynomials import dense_polynomial, growing_until, horner, invert_increasing, monotone_limit
+from ceres_cal.scene.lens.polynomials import Ratio, dense_polynomial, growing_until, horner, invert_increasing
 
 _FAR = 6.0  # half image diagonals: nothing is observed farther out
 _TINY = 1e-150  # its square is still a number
@@ -85,9 +85,14 @@ class Radial(Lens):
         return dense_polynomial(self.values, self.powers)
 
     @cached_property
+    def _profile(self) -> Ratio:
+        """That map, as it is inverted."""
+        return Ratio(self._polynomial)
+
+    @property
     def _limit(self) -> float:
-        """Where that map stops growing; infinity where it never does."""
-        return monotone_limit(self._polynomial)
+        """Where it stops growing; infinity where it never does."""
+        return self._profile.limit
 
     def ideal_radius(self, measured_radius: ArrayLike) -> Array:
         """r' of r, both in px (paper, section 2); no check of the monotone radius."""
@@ -97,7 +102,7 @@ class Radial(Lens):
         """r of r', both in px: the inverse of `ideal_radius` up to the monotone radius, NaN beyond."""
         ideal = np.asarray(ideal_radius, dtype=float)
         with np.errstate(all="ignore"):
-            return invert_increasing(self._polynomial, ideal.ravel(), self._limit).reshape(ideal.shape)
+            return invert_increasing(self._profile, ideal.ravel()).reshape(ideal.shape)
 
     def _distort(self, rays: Array, phi: float) -> Array:
         ideal = phi * rays[:, :2] / ahead(rays)
