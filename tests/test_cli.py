@@ -205,8 +205,8 @@ def test_calibrate_tells_what_came_out(say: Say, tmp_path: Path) -> None:
     for words in (
         "20 views, 1 camera, 1 station, 12 placements",
         "680 point observations, 1591 curve observations",
-        f"phi             {camera.phi:.2f} ± 1.5 px (started from the views)",
-        f"a2              {camera.lens.values[0]!r} ± 2.2e-06",
+        f"phi             {camera.phi:.1f} ± 1.5 px (started from the views)",
+        f"a2              {camera.lens.values[0]:.2e} ± 2.2e-06",
         f"height {camera.position[2]:.3f} m ± 6.8 mm",
         "located   overhead: ± 0.21 mm on the floor (worst 0.44 at 0.8, 3.0 m), ± 0.26 mm at 150 mm",
         "deg from straight down",

@@ -10,7 +10,7 @@ from ceres_cal.base.errors import InputError
 from ceres_cal.cli.arguments import add_calibration, add_output
 from ceres_cal.cli.command import Answer, Command
 from ceres_cal.cli.inputs import read_calibration
-from ceres_cal.cli.outputs import finishing, require_output
+from ceres_cal.cli.outputs import finishing, require_output, section
 
 if TYPE_CHECKING:
     from ceres_cal.formats import Exported, ExportFormat, ImportFormat
@@ -124,16 +124,15 @@ def _data(exported: Exported, args: Namespace) -> dict[str, Any]:
 
 
 def _text(exported: Exported, args: Namespace) -> str:
-    lines = [f"{args.to:9} {exported.words}, written to {args.output}"]
-    for loss in exported.losses:
-        of = f"{loss.station}: " if len(exported.losses) > 1 else ""
-        if loss.image_px is not None:
-            rms, worst = loss.image_px
-            lines.append(f"{'error':10}{of}{rms:.4f} px rms, {worst:.4f} px at most, over the image")
-        for height_m, (rms, worst) in loss.field_mm.items():
-            where = f"{1e3 * height_m:.0f} mm above the floor"
-            lines.append(f"{'error':10}{of}{rms:.4f} mm rms, {worst:.4f} mm at most, {where}")
-    return "\n".join([*lines, *(f"{'warning':10}{warning}" for warning in exported.warnings)])
+    return "\n".join([f"{args.to:9} {exported.words}, written to {args.output}", *losses_text(exported)])
+
+
+def losses_text(exported: Exported) -> list[str]:
+    """What is lost, in px and mm, and what else to know."""
+    from ceres_cal.formats import loss_words
+
+    lines = [section("error", [text]) for loss in exported.losses for text in loss_words(loss)]
+    return lines + [section("warning", [text]) for text in exported.warnings]
 
 
 COMMANDS = (

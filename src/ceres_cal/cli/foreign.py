@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.cli.arguments import add_calibration, add_output
 from ceres_cal.cli.command import Answer, Command
-from ceres_cal.cli.export import add_format_options, format_options
+from ceres_cal.cli.export import add_format_options, format_options, losses_text
 from ceres_cal.cli.inputs import read_calibration
 from ceres_cal.cli.outputs import finishing, require_output, section
 
@@ -96,14 +96,7 @@ def _publish(args: Namespace) -> Answer:
         {"station": loss.station, "field_mm": {str(h): e for h, e in loss.field_mm.items()}} for loss in exported.losses
     ]
     data = {"sent": sent, "bytes": len(packet), "losses": losses, "warnings": list(exported.warnings)}
-    return Answer(data, lambda: "\n".join([section("published", [words]), *_losses(exported)]))
-
-
-def _losses(exported: Any) -> list[str]:
-    from ceres_cal.formats import loss_words
-
-    lines = [section("error", [text]) for loss in exported.losses for text in loss_words(loss)]
-    return lines + [section("warning", [text]) for text in exported.warnings]
+    return Answer(data, lambda: "\n".join([section("published", [words]), *losses_text(exported)]))
 
 
 def _add_listen(parser: ArgumentParser) -> None:
