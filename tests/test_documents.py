@@ -1,0 +1,48 @@
+"""What the documents say to type works, in the order in which it stands, and prints what they say."""
+
+from pathlib import Path
+
+import documents
+import pytest
+from documents import Step, agree, differences, rewritten, run, steps_of
+
+RUN = ("README.md", "docs/accuracy.md")
+
+
+@pytest.mark.parametrize("name", RUN)
+def test_every_command_works_and_prints_what_is_said(name: str) -> None:
+    found = differences(documents.ROOT / name)
+    assert not found, "\n".join([*found, f"if that is right: python scripts/documents.py --write {name}"])
+
+
+@pytest.mark.parametrize(
+    "said, now, same",
+    [
+        ("phi 868.9 ± 1.5 px", "phi  869.0 ± 1.5 px", True),  # one unit of the last digit
+        ("phi 868.9 ± 1.5 px", "phi 869.1 ± 1.5 px", False),
+        ("103 of 2271 taken out", "104 of 2271 taken out", False),  # whole numbers
+        ("a2 -4.96e-05 ± 2.2e-06", "a2 -4.97e-05 ± 2.2e-06", True),
+        ("a2 -4.96e-05 ± 2.2e-06", "a2 4.96e-05 ± 2.2e-06", False),
+        ("phi is known", "phi is weak", False),
+        ("0001.jpg: 3.5", "0002.jpg: 3.5", False),  # a name holds no number
+    ],
+)
+def test_lines_agree_to_the_last_digit(said: str, now: str, same: bool) -> None:
+    assert agree(said, now) is same
+
+
+def test_a_document_is_run_and_put_right(tmp_path: Path) -> None:
+    text = "Say\n\n```console\n$ x=3\n$ echo $x \\\n    more\n2 more\n```\n\n```python\nprint('unseen')\n```\n"
+    assert steps_of(text) == [Step("x=3"), Step("echo $x \\\n    more", ("2 more",)), Step("print('unseen')\n")]
+    runs = run(text.replace("```python", "```"), tmp_path)
+    assert [each.differences for each in runs] == [[], ["  document: 2 more\n  printed:  3 more"]]
+    assert rewritten(text.replace("```python", "```"), runs) == text.replace("```python", "```").replace("2 m", "3 m")
+    (failed,) = run("```console\n$ false\n$ echo never\n```\n", tmp_path)
+    assert failed.differences == ["exit code 1: "]
+
+
+def test_python_in_a_document_is_run(tmp_path: Path) -> None:
+    documents.prepare(tmp_path)
+    text = "```console\n$ source .venv/bin/activate\n```\n```python\nx = 1\nopen('made', 'w').write(str(x))\n```\n"
+    assert [each.exit_code for each in run(text, tmp_path)] == [0, 0]
+    assert (tmp_path / "made").read_text() == "1"
