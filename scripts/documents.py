@@ -1,4 +1,4 @@
-"""Runs what documents say to type, and compares what they say is printed: python scripts/documents.py [--write] FILE...
+"""Runs what documents say to type, compares what they say is printed: python scripts/documents.py [--write] [FILE...]
 
 All commands of a document (```console, after "$ ") and its Python (```python) run in the order in which they stand, one
 shell for all, in a copy of the sample data and scripts beside a .venv that leads to this interpreter. A command must
@@ -21,6 +21,7 @@ from itertools import zip_longest
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
+DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 COPIED = ("data", "examples", "scripts", "pyproject.toml")
 _BLOCK = re.compile(r"^```(console|python)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 _NUMBER = re.compile(r"(?<![\w.])[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?(?![\w])")
@@ -177,7 +178,7 @@ def differences(path: Path, *, write: bool = False) -> list[str]:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("files", nargs="*", type=Path, default=[ROOT / "README.md"], help="default: the README")
+    parser.add_argument("files", nargs="*", type=Path, default=DOCUMENTS, help="default: README and docs")
     parser.add_argument("--write", action="store_true", help="put what is printed now into the document")
     given = parser.parse_args(arguments)
     found = [line for path in given.files for line in differences(path, write=given.write)]

@@ -1,18 +1,50 @@
 """What the documents say to type works, in the order in which it stands, and prints what they say."""
 
+import re
+import shlex
 from pathlib import Path
 
 import documents
 import pytest
-from documents import Step, agree, differences, rewritten, run, steps_of
+from documents import DOCUMENTS, Step, agree, differences, rewritten, run, steps_of
 
-RUN = ("README.md", "docs/accuracy.md")
+from ceres_cal import InputError
+from ceres_cal.cli import chosen
+
+RUN = ("README.md", "docs/camera.md", "docs/cron.md")  # `python scripts/documents.py` runs the others, too
+CODE = re.compile(r"^```(?:console|text)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
+INLINE = re.compile(r"`(ceres-cal [^`]+)`")
+
+
+def typed(text: str) -> list[list[str]]:
+    """Every call of ceres-cal in a document that is written out in full, as the program gets its arguments."""
+    lines = [line for block in CODE.findall(text) for line in block.replace("\\\n", " ").splitlines()]
+    calls = [call for line in lines for call in re.split(r"\|\|?|&&|;", line) if "ceres-cal " in call]
+    calls = [call[call.index("ceres-cal ") :] for call in calls if re.match(r"\s*(\$ )?ceres-cal ", call)]
+    return [shlex.split(call, comments=True)[1:] for call in (*calls, *INLINE.findall(text))]
 
 
 @pytest.mark.parametrize("name", RUN)
 def test_every_command_works_and_prints_what_is_said(name: str) -> None:
     found = differences(documents.ROOT / name)
     assert not found, "\n".join([*found, f"if that is right: python scripts/documents.py --write {name}"])
+
+
+@pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: path.name)
+def test_every_command_that_is_named_is_one(path: Path) -> None:
+    for arguments in typed(path.read_text(encoding="utf-8")):
+        if not {"COMMAND", "...", "--help", "--version"} & set(arguments):
+            assert complaint(arguments) in ("", "required"), arguments
+
+
+def complaint(arguments: list[str]) -> str:
+    """Nothing of what can be run; "required" of what is only named, with an option or without."""
+    command, rest = chosen(arguments)
+    try:
+        command.parse(rest)
+    except InputError as error:
+        return "required" if "are required" in str(error) else str(error)
+    return ""
 
 
 @pytest.mark.parametrize(

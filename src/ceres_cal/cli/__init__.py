@@ -112,14 +112,15 @@ def _run(arguments: list[str]) -> int:
 
         print(", ".join(f"{name} {version}" for name, version in package_versions().items()))
         return 0
-    command, rest = _choose(arguments)
+    command, rest = chosen(arguments)
     options = command.parse(rest)
     answer = command.run(options)
     print_answer(answer, as_json=options.json)
     return answer.exit_code
 
 
-def _choose(arguments: list[str]) -> tuple[Command, list[str]]:
+def chosen(arguments: list[str]) -> tuple[Command, list[str]]:
+    """The command that is typed, and its arguments; InputError where there is none of its name."""
     for words in (2, 1):
         command = COMMANDS.get(" ".join(arguments[:words]))
         if command is not None:
