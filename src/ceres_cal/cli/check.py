@@ -68,7 +68,15 @@ def _photographed(args: Namespace, images: list[Path], level: float) -> tuple[Ch
         )
 
 
-COMMANDS = (Command("check", "does a calibration still hold? exit code 0 yes, 1 no", _add_arguments, _run),)
+COMMANDS = (
+    Command(
+        "check",
+        "does a calibration still hold? exit code 0 yes, 1 no",
+        _add_arguments,
+        _run,
+        ("calibration.json now.png", "calibration.json incoming/ --checks 720 --json"),
+    ),
+)
 
 
 def _share(text: str) -> float:

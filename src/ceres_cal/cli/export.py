@@ -7,7 +7,7 @@ from collections.abc import Collection, Sequence
 from typing import TYPE_CHECKING, Any
 
 from ceres_cal.base.errors import InputError
-from ceres_cal.cli.arguments import add_calibration, add_output
+from ceres_cal.cli.arguments import add_calibration, add_output, length, parse_length
 from ceres_cal.cli.command import Answer, Command
 from ceres_cal.cli.inputs import read_calibration
 from ceres_cal.cli.outputs import finishing, require_output, section
@@ -44,7 +44,7 @@ def _add_shared_arguments(parser: ArgumentParser, forms: Collection[ExportFormat
         action="append",
         help="which station; may be left out where there is only one, or the format holds all; repeatable",
     )
-    add("--max-loss-mm", type=float, metavar="MM", help="refuse what is wrong by more anywhere on the field")
+    add("--max-loss-mm", type=length("mm"), metavar="MM", help="refuse what is wrong by more anywhere on the field")
     add_format_options(parser, forms)
 
 
@@ -98,6 +98,8 @@ def format_options(args: Namespace, forms: Sequence[ExportFormat] | Sequence[Imp
         if name not in types:
             raise InputError(f"{_flag(name)} is no option of format {forms[0].name}")
         try:
+            if name.endswith("_mm"):
+                text = str(parse_length(text, _flag(name), "mm"))
             options[name] = msgspec.convert(text, types[name], strict=False)
         except msgspec.ValidationError:
             raise InputError(f"{_flag(name)}: {text!r} is not the number or word that it takes") from None
@@ -136,6 +138,22 @@ def losses_text(exported: Exported) -> list[str]:
 
 
 COMMANDS = (
-    Command("export", "a calibration in a format that others read, and what that loses", _add_arguments, _run),
-    Command("export-table", "a look-up table from pixels to the field (NPZ)", _add_table_arguments, _run),
+    Command(
+        "export",
+        "a calibration in a format that others read, and what that loses",
+        _add_arguments,
+        _run,
+        (
+            "calibration.json --to vision-processor -o geometry.yml --camera-id 0",
+            "calibration.json --to opencv -o camera.yml",
+            "calibration.json --to table -o table.npz --error-mm 0.05",
+        ),
+    ),
+    Command(
+        "export-table",
+        "a look-up table from pixels to the field (NPZ)",
+        _add_table_arguments,
+        _run,
+        ("calibration.json -o table.npz",),
+    ),
 )

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ceres_cal.base.errors import InputError
-from ceres_cal.cli.arguments import add_calibration, add_output
+from ceres_cal.cli.arguments import add_calibration, add_output, length
 from ceres_cal.cli.command import Answer, Command
 from ceres_cal.cli.export import add_format_options, format_options, losses_text
 from ceres_cal.cli.inputs import read_calibration
@@ -79,7 +79,12 @@ def _add_publish(parser: ArgumentParser) -> None:
     add("--camera-id", default="", metavar="ID,...", help="of the stations; default: the number that each name ends in")
     add("--geometry", metavar="FILE", type=Path, help="with the field, and other cameras: .pb or geometry.yml")
     add("--once", action="store_true", help="one packet, not one every 3 s until Ctrl-C")
-    add("--max-loss-mm", type=float, metavar="MM", help="refuse what the message would get wrong by more on the field")
+    add(
+        "--max-loss-mm",
+        type=length("mm"),
+        metavar="MM",
+        help="refuse what the message would get wrong by more on the field",
+    )
     _add_group(parser)
 
 
@@ -148,15 +153,32 @@ def _write_target(target: Target, path: Path) -> Answer:
 
 
 COMMANDS = (
-    Command("import", "a calibration, or observations, out of a file of another program", _add_import, _import),
     Command(
-        "publish", "send a calibration to those who see the field, by the league's multicast", _add_publish, _publish
+        "import",
+        "a calibration, or observations, out of a file of another program",
+        _add_import,
+        _import,
+        ("camera.yml -o calibration.json", "corners.csv --from csv -o observations.json"),
     ),
-    Command("listen", "the field, or all geometry, out of the league's multicast", _add_listen, _listen),
+    Command(
+        "publish",
+        "send a calibration to those who see the field, by the league's multicast",
+        _add_publish,
+        _publish,
+        ("calibration.json --camera-id 0", "calibration.json --geometry geometry.yml --once"),
+    ),
+    Command(
+        "listen",
+        "the field, or all geometry, out of the league's multicast",
+        _add_listen,
+        _listen,
+        ("-o field.json", "-o geometry.yml --seconds 30"),
+    ),
     Command(
         "targets import",
         "a field out of ssl-vision's or vision-processor's files",
         _add_targets_import,
         _targets_import,
+        ("geometry.yml -o field.json",),
     ),
 )
