@@ -11,16 +11,15 @@ shared/real beside the repository.
 
 from __future__ import annotations
 
-import os
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 
 import cv2
 import numpy as np
 from cases import Row, run
+from real_data import real_folder
 
 from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.errors import CalibrationError
@@ -35,7 +34,6 @@ from ceres_cal.observations.columns import taken
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.targets import checkerboard
 
-REAL = Path(os.environ.get("CERES_CAL_REAL") or Path(__file__).parents[2] / "shared" / "real")
 LEAST, MOST = 0.85, 1.25
 _CONTROL = 0.9, 1.1
 _NO_CURVES = Curves(np.empty(0, np.int32), np.empty(0, np.int32), np.empty((0, 2)), np.empty(0), np.empty(0, np.int8))
@@ -55,12 +53,12 @@ class RealSet:
 
 
 def _photographed(pattern: str, columns: int, rows: int, square_m: float) -> Observations:
-    return detect_boards(sorted(REAL.glob(pattern)), checkerboard(columns, rows, square_m)).observations
+    return detect_boards(sorted(real_folder().glob(pattern)), checkerboard(columns, rows, square_m)).observations
 
 
 def _ov_plane() -> Observations:
     """The corners of the training views, which come as numbers."""
-    with np.load(REAL / "babelcalib_ov_plane" / "train.npz") as data:
+    with np.load(real_folder() / "babelcalib_ov_plane" / "train.npz") as data:
         board, view, point, pixels, size = (data[n] for n in ("board_m", "view", "point", "pixels", "image_size"))
     pitch_m = float(board[0, 0])
     column, row = np.rint(board[:, :2] / pitch_m).astype(np.int32).T - 1

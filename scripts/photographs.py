@@ -15,6 +15,7 @@ from pathlib import Path
 from cases import Row, exit_code, json_text, printed
 from photograph_shots import floor_rows, line_figures, real_rows, rings_rows, speed_rows, start_rows
 from photographs_auto import auto_rows, real_auto_rows
+from real_data import real_folder
 from straightness import observed_boards, straight_rows
 
 CASES = ("lines", "floor", "starts", "auto", "speed", "rings", "real", "straight")
@@ -53,9 +54,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     real = None if options.real is None else Path(options.real)
     if real is not None and not real.is_dir():
-        parser.error(f"{real}: there is no such folder of real images")
+        raise SystemExit(f"{real}: there is no such folder of real images")
     if real is None and {"real", "straight"} & set(options.case or ()):
-        parser.error("real images are needed: name their folder with --real, or set CERES_CAL_REAL")
+        real = real_folder()
     rows = (row for case in options.case or CASES for row in rows_of(case, options.runs, real, options.picture))
     found = list(rows if options.json else printed(rows))
     if options.json:

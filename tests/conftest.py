@@ -1,12 +1,12 @@
 """What several test modules share."""
 
-import os
 import signal
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
 from moves import DAY, HOME, MOVED, calibrated, seen
+from real_data import real_place
 
 from ceres_cal.detect.boards import BoardDetections, detect_boards
 from ceres_cal.moves.labels import MIRRORED, relabelled
@@ -22,7 +22,7 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 @pytest.fixture(scope="session")
 def real_data() -> Path:
     """The folder of real images and calibrations: $CERES_CAL_REAL, or shared/real beside the repository."""
-    folder = Path(os.environ.get("CERES_CAL_REAL") or Path(__file__).parents[2] / "shared" / "real")
+    folder = real_place()
     if not folder.is_dir():
         pytest.skip(f"no real data: {folder} is not there (set CERES_CAL_REAL to its place)")
     return folder

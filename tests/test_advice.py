@@ -370,7 +370,7 @@ def test_the_command_for_scripts(file: str, capsys: pytest.CaptureFixture[str]) 
 @pytest.mark.parametrize(
     "more, message",
     [
-        (["--height-mm", "x"], "--height-mm: 'x' is not a number"),
+        (["--height-mm", "x"], "--height-mm: 'x' is no length: write a number of mm, or 5m, 150mm"),
         (["--station", "k"], "station 'k' is not there: there are 'overhead'"),
         (["--board", "9x6"], "--board '9x6': write COLUMNSxROWSxMM, such as 9x6x100"),
         (["--board", "1x6x100"], "columns and rows count inner corners"),

@@ -5,6 +5,8 @@ import io
 import json
 import os
 import pty
+import re
+import shlex
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
@@ -19,8 +21,11 @@ from accuracy_bound import make_trial
 from accuracy_scenes import CLEAN_NOISE, tilted
 
 import ceres_cal.calibrating
+from ceres_cal.base.errors import InputError
 from ceres_cal.calibration import Calibration
 from ceres_cal.cli import COMMANDS, main
+from ceres_cal.cli.arguments import length, parse_length
+from ceres_cal.cli.colour import coloured, in_colour
 from ceres_cal.cli.progress import ProgressBar
 from ceres_cal.detect.boards import CORNER_FITS
 from ceres_cal.model.parameters import LOSSES, Options
@@ -108,6 +113,7 @@ def test_help_lists_every_command(say: Say) -> None:
         "listen",
         "audit",
         "undistort",
+        "completion",
     }
     assert say("detect", "-h").out.count("board") > 0
 
@@ -119,9 +125,111 @@ def test_help_of_a_command(say: Say, name: str) -> None:
     assert said.out.startswith(f"usage: ceres-cal {name} ") and "--json" in said.out
 
 
-def test_version(say: Say) -> None:
-    said = say("--version")
+@pytest.mark.parametrize("name", ["", "detect", *COMMANDS])
+def test_version(say: Say, name: str) -> None:
+    said = say(*name.split(), "--version")
     assert said.code == 0 and said.out.startswith("ceres-cal ") and "pyceres" in said.out
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_examples_in_the_help(say: Say, name: str) -> None:
+    command, helped = COMMANDS[name], say(*name.split(), "--help").out
+    assert command.examples
+    for example in command.examples:
+        assert f"\n  ceres-cal {name} {example}\n".replace("  \n", " \n") in helped
+        command.parse(shlex.split(example.partition(" > ")[0]))
+
+
+# ---- lengths, spaces, colours, completion ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "text, unit, value",
+    [("0.15", "m", 0.15), ("150", "mm", 150.0), ("150mm", "m", 0.15), ("0.15 m", "mm", 150.0), ("2.5cm", "mm", 25.0)],
+)
+def test_lengths_say_their_unit_or_have_that_of_the_option(text: str, unit: str, value: float) -> None:
+    assert parse_length(text, "here", unit) == pytest.approx(value, rel=1e-15)
+    assert length(unit)(text) == pytest.approx(value, rel=1e-15)
+
+
+@pytest.mark.parametrize("text", ["", "m", "5km", "5 m m", "nanmm", "5,3m"])
+def test_what_is_no_length(text: str) -> None:
+    with pytest.raises(InputError, match="here"):
+        parse_length(text, "here")
+
+
+def test_lengths_are_taken_everywhere(say: Say, tmp_path: Path) -> None:
+    board = ["x.png", "--columns", "4", "--rows", "3", "-o", "y.json"]
+    assert COMMANDS["detect board"].parse([*board, "--square", "25mm"]).square == 0.025
+    assert COMMANDS["advise"].parse(["x", "--good-enough-mm", "0.2cm"]).good_enough_mm == 2.0
+    assert COMMANDS["undistort"].parse(["x", "y", "-o", "z", "--height-mm", "0.15m"]).height_mm == 150.0
+    out = tmp_path / "calibration.json"
+    said = say("calibrate", SAMPLE, "-o", out, "--prior", "height_m=4020mm:1cm", "--tolerance", "field.lines_m=10mm")
+    assert said.code == 0
+    options = json.loads(out.read_text())["options"]
+    assert options["priors"] == [{"station": "overhead", "height_m": 4.02, "sigma_m": 0.01}]
+    assert options["tolerances"]["field"]["lines_m"] == 0.01
+    assert "--square: 'wide' is no length" in refused(say("detect", "board", *board, "--square", "wide"))
+
+
+@pytest.mark.parametrize(
+    "typed", [["640,480"], ["640, 480"], ["640,", "480"], ["640", "480"], ["640 480"], ["640", ",480"]]
+)
+def test_a_place_has_spaces_where_somebody_puts_them(say: Say, calibrated: Path, typed: list[str]) -> None:
+    assert say("locate", calibrated, *typed).out == say("locate", calibrated, "640,480").out
+
+
+def test_places_with_spaces(say: Say, calibrated: Path) -> None:
+    both = say("project", calibrated, "-2.5,1.0", "-2.5,1.0,0.15").out
+    assert both.count("\n") == 2 and say("project", calibrated, "-2.5,", "1.0", "-2.5, 1.0", ",0.15").out == both
+    assert say("project", calibrated, "-2.5", "1.0", "0.15").out == both.splitlines()[1] + "\n"
+    assert "give 2 numbers" in refused(say("locate", calibrated, "640,480", "100"))
+    assert "give 2 or 3 numbers" in refused(say("project", calibrated, "1", "2", "3", "4"))
+
+
+def test_colours_say_what_is_good() -> None:
+    text = "verdict   Do not trust this.\n          more\nwarning   careful\nfit       points\nplain words here\n"
+    red, yellow, bold, plain = "\x1b[31m", "\x1b[33m", "\x1b[1m", "\x1b[0m"
+    shown = coloured(text)
+    assert shown.startswith(
+        f"{red}verdict   Do not trust this.{plain}\n          more\n{yellow}warning{plain}   careful\n"
+    )
+    assert shown.endswith(f"{bold}fit{plain}       points\nplain words here\n")
+    assert re.sub(r"\x1b\[\d+m", "", shown) == text
+    assert coloured("check     yes (1 %)").startswith("\x1b[32mcheck")
+
+
+@pytest.mark.parametrize(
+    "variables, expected", [({}, True), ({"NO_COLOR": "1"}, False), ({"TERM": "dumb"}, False), ({"NO_COLOR": ""}, True)]
+)
+def test_colours_are_for_terminals(monkeypatch: pytest.MonkeyPatch, variables: dict[str, str], expected: bool) -> None:
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    monkeypatch.setenv("TERM", "xterm")
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
+    assert in_colour(_Terminal()) is expected and not in_colour(io.StringIO())
+
+
+@pytest.mark.parametrize(
+    "words, completed",
+    [
+        (["cali"], {"calibrate"}),
+        (["detect", ""], {"board", "field", "rings"}),
+        (["calibrate", "--lo"], {"--loss", "--loss-scale"}),
+        (["refit", "--what", "zo"], {"zoom"}),
+    ],
+)
+def test_a_shell_completes(say: Say, tmp_path: Path, words: list[str], completed: set[str]) -> None:
+    pytest.importorskip("shtab", reason="pip install 'ceres-cal[completion]'")
+    (tmp_path / "script").write_text(say("completion", "bash").out)
+    line = " ".join(words)
+    ask = f"source {tmp_path}/script; COMP_WORDS=(ceres-cal {line}); COMP_CWORD={len(words)}; "
+    ask += "[ ${#COMP_WORDS[@]} -gt $COMP_CWORD ] || COMP_WORDS+=(''); $(complete -p ceres-cal | grep -oE '_shtab\\w+')"
+    done = subprocess.run(
+        ["bash", "-c", f'{ask} ceres-cal "{words[-1]}"; printf "%s\\n" "${{COMPREPLY[@]}}"'],
+        capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    assert set(done.stdout.split()) == completed, done.stderr
 
 
 def test_help_and_wrong_usage_bring_in_nothing_heavy() -> None:
@@ -205,8 +313,8 @@ def test_calibrate_tells_what_came_out(say: Say, tmp_path: Path) -> None:
     for words in (
         "20 views, 1 camera, 1 station, 12 placements",
         "680 point observations, 1591 curve observations",
-        f"phi             {camera.phi:.2f} ± 1.5 px (started from the views)",
-        f"a2              {camera.lens.values[0]!r} ± 2.2e-06",
+        f"phi             {camera.phi:.1f} ± 1.5 px (started from the views)",
+        f"a2              {camera.lens.values[0]:.2e} ± 2.2e-06",
         f"height {camera.position[2]:.3f} m ± 6.8 mm",
         "located   overhead: ± 0.21 mm on the floor (worst 0.44 at 0.8, 3.0 m), ± 0.26 mm at 150 mm",
         "deg from straight down",
@@ -598,7 +706,7 @@ def test_locate_and_project_are_inverse(say: Say, calibrated: Path) -> None:
 def test_locate_in_text(say: Say, calibrated: Path) -> None:
     x, y = Calibration.load(calibrated).station().locate(np.array([[640.0, 480.0]]))[0]
     assert say("locate", calibrated, "640,480") == Said(0, f"{x:.4f} {y:.4f}\n", "")
-    assert say("locate", "640,480", "--height-m", "0", calibrated).code == 2  # the calibration comes first
+    assert say("locate", "640,480", "--height-mm", "0", calibrated).code == 2  # the calibration comes first
 
 
 def test_negative_numbers_and_options_in_any_order(say: Say, calibrated: Path) -> None:
@@ -609,7 +717,7 @@ def test_negative_numbers_and_options_in_any_order(say: Say, calibrated: Path) -
 
 
 def test_no_answer_is_said_and_is_1(say: Say, calibrated: Path) -> None:
-    said = say("locate", calibrated, "640,480", "--height-m", "9")
+    said = say("locate", calibrated, "640,480", "--height-mm", "9m")
     assert (said.code, said.err) == (1, "")
     assert said.out == "no answer: its ray does not meet the plane z = 9 m in front of the camera\n"
     data = json.loads(say("project", calibrated, "0,0,9", "0,0", "--json").out)
@@ -648,8 +756,7 @@ def test_rows_from_a_file(say: Say, calibrated: Path, tmp_path: Path, monkeypatc
         (("1,2", "--file", "rows.csv"), "not both"),
         (("--file", "rows.csv"), "rows.csv, line 2: 'two' is not a number"),
         (("1,2", "--station", "attic"), "station 'attic' is not there: there are 'overhead'"),
-        (("1,2", "--height-m", "1", "--height-mm", "1"), "not allowed with"),
-        (("1,2", "--height-m", "nan"), "'nan' is not a finite number"),
+        (("1,2", "--height-mm", "nan"), "'nan' is no length: write a number of mm, or 5m, 150mm"),
     ],
 )
 def test_wrong_rows(
@@ -827,9 +934,17 @@ def test_bar_on_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
             now += 0.03
     lines = stream.getvalue().split("\r\x1b[K")
     assert lines[:2] == ["", "a line that stays\n"]
-    assert lines[2].startswith("[........................] xxx") and "[############............]" in stream.getvalue()
+    assert lines[2].startswith("[........................]   0 % xxx")
+    assert "[############............]  52 % x" in stream.getvalue()
     assert max(map(len, lines)) < 80 and 20 < len(lines) < 40  # a hundred updates in 3 seconds
     assert lines[-1] == ""  # the bar is gone
+
+
+def test_no_share_where_nobody_knows_it() -> None:
+    stream, now = _Terminal(), 0.0
+    with ProgressBar(silent=False, stream=stream, clock=lambda: now) as bar:
+        bar.update(3, 0, "solve 1, iteration 3")
+    assert stream.getvalue() == "\r\x1b[Ksolve 1, iteration 3\r\x1b[K"
 
 
 def test_few_lines_elsewhere() -> None:

@@ -76,7 +76,7 @@ def test_compare(say: Say, folder: Path) -> None:
 
 def test_export_table(say: Say, folder: Path) -> None:
     said = say("export-table", folder / "old.json", "-o", folder / "table.npz", "--error-mm", "1")
-    assert said.code == 0 and "mm at most, 150 mm above the floor" in said.out
+    assert said.code == 0 and "mm at most, at 150 mm" in said.out
     table = LookupTable.load(folder / "table.npz")
     assert table.station == "overhead" and table.error_mm[0.15][1] <= 1.0
     assert "above 0" in refused(say("export-table", folder / "old.json", "-o", folder / "t.npz", "--error-mm", "0"))

@@ -14,7 +14,7 @@ DOCUMENTS = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
 ROOMS = sorted(path.name for path in (ROOT / "src/ceres_cal").iterdir() if path.is_dir() and path.name[0] != "_")
 
 DESIGN = re.compile(r"[Dd]esign(?:,\s+|,?\s+sections?\s+)(\d+(?:(?:,|\s+and)\s+\d+)*)")
-FILE = re.compile(r"\b((?:scripts|tests|docs|data)/[\w.-]+(?:/[\w.-]+)*)")
+FILE = re.compile(r"\b((?:scripts|tests|docs|data|examples)/[\w.*-]+(?:/[\w.*-]+)*)")
 IN_ROOM = re.compile(rf"`((?:{'|'.join(ROOMS)})/[\w/.-]*)`")
 MODULE = re.compile(r"`(\w+\.py)`")
 LINK = re.compile(r"\]\(([^)\s]*)\)")
@@ -56,7 +56,7 @@ def test_sections_of_the_design() -> None:
 def test_files() -> None:
     """Scripts, tests, documents and sample data that are named with their folder."""
     missing = [
-        f"{where}: {name}" for where, name in cited(FILE, [*CODE, *DOCUMENTS]) if not (ROOT / name.rstrip(".")).exists()
+        f"{where}: {name}" for where, name in cited(FILE, [*CODE, *DOCUMENTS]) if not any(ROOT.glob(name.rstrip(".")))
     ]
     assert not missing, f"not in the repository: {missing}"
 
@@ -80,13 +80,6 @@ def test_links(path: Path) -> None:
         there = path.parent / name if name else path
         assert there.exists(), f"{where}: {target} is not there"
         assert not section or section in map(anchor, headings(there)), f"{where}: {target}: no such heading"
-
-
-def test_sections_of_the_readme() -> None:
-    """Cited as README "How good"."""
-    known = headings(ROOT / "README.md")
-    for where, name in cited(re.compile(r"README(?:\.md)?(?:'s)?,? \"([^\"]+)\""), [*CODE, *DOCUMENTS]):
-        assert any(heading.startswith(name) for heading in known), f"{where}: the README has no section {name!r}"
 
 
 def test_the_file_of_the_design_loads(tmp_path: Path) -> None:

@@ -79,9 +79,9 @@ def test_from_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str
     said = capsys.readouterr().out.splitlines()
     assert said[0] == f"toy       2 lines, written to {out}"
     assert said[1:] == [
-        "error     0.0100 px rms, 0.0200 px at most, over the image",
-        "error     0.1000 mm rms, 0.2000 mm at most, 0 mm above the floor",
-        "error     0.3000 mm rms, 0.4000 mm at most, 150 mm above the floor",
+        "error     overhead: 0.01 px rms, 0.02 px at most, over the image",
+        "error     overhead: 0.1 mm rms, 0.2 mm at most, on the floor",
+        "error     overhead: 0.3 mm rms, 0.4 mm at most, at 150 mm",
         "warning   toys break",
     ]
     assert out.read_text() == f"hello\noverhead {calibrated().station().phi:.2f}"
@@ -119,7 +119,7 @@ def test_the_look_up_table_is_a_format(tmp_path: Path, capsys: pytest.CaptureFix
         (("--to", "toy", "-o", "a.toy", "--digits", "x"), "--digits: 'x' is not the number or word that it takes"),
         (("--to", "toy", "-o", "a.toy", "--step-px", "4"), "--step-px is no option of format toy"),
         (("--to", "folder", "-o", "d", "--station", "overhead", "--station", "overhead"), "holds one station, not 2"),
-        (("--to", "table", "-o", "t.npz", "--error-mm", "nan"), "error_mm must be above 0"),
+        (("--to", "table", "-o", "t.npz", "--error-mm", "nan"), "--error-mm: 'nan' is not a finite number"),
         (("--to", "toy", "-o", "calibration.json"), "is an input, and the output would replace it"),
     ],
 )

@@ -303,7 +303,7 @@ def test_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([*ask, "--max-loss-mm", "1"]) == 2
     assert "the format would be wrong by" in capsys.readouterr().err and not path.exists()
     assert main([*ask, "--camera-id", "1"]) == 0
-    assert "mm at most, 150 mm above the floor" in capsys.readouterr().out
+    assert "mm at most, at 150 mm" in capsys.readouterr().out
     assert main(["import", str(path), "-o", str(tmp_path / "back.json")]) == 0
     assert "camera1: Camera(1280 x 960 px" in capsys.readouterr().out
     assert Calibration.load(tmp_path / "back.json").station().lens.names == ("a3",)

@@ -11,6 +11,7 @@ from ceres_cal.advice.candidates import BOARD, Search, still
 from ceres_cal.advice.measurements import Ground, Measurement
 from ceres_cal.advice.outlook import BENT, Errors, Outlook
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.progress import StepProgress
 from ceres_cal.calibration import Calibration, Fit
 from ceres_cal.model.information import Information
 from ceres_cal.model.parameters import Estimate
@@ -78,6 +79,7 @@ def advise(
     height_m: float = ROBOT_TOP_M,
     good_enough_mm: float | None = None,
     board: Target | None = None,
+    progress: StepProgress | None = None,
 ) -> Advice:
     """What to measure besides, ranked by the worst error that it leaves on a station's map.
 
@@ -87,7 +89,7 @@ def advise(
 
     Args:
         station: may be left out where there is only one. board: that could be shown; by default the calibration's own,
-            or one of 9 x 6 corners, 100 mm apart.
+            or one of 9 x 6 corners, 100 mm apart. progress: called after each measurement that was looked at.
 
     Raises:
         InputError: no such station, one that was held as the world, or a calibration that says nothing of how well it
@@ -99,7 +101,11 @@ def advise(
     search = Search(ground, outlook, _board(calibration.targets, board), calibration.fit.curves > 0)
     candidates = list(search.candidates())
     informations = [ground.information_of(measurement) for measurement in candidates]
-    promises = [_promise(*each, ground, outlook) for each in zip(candidates, informations, strict=True)]
+    promises = []
+    for number, each in enumerate(zip(candidates, informations, strict=True), start=1):
+        promises.append(_promise(*each, ground, outlook))
+        if progress is not None:
+            progress(number, len(candidates), each[0].words)
     enough = 0.0 if good_enough_mm is None else good_enough_mm
     best = _chosen(promises, outlook.before, enough)
     then = None if best is None else _next(best, candidates, informations, outlook, enough)

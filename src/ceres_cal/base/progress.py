@@ -1,8 +1,10 @@
-"""How long work on many images says how far it is."""
+"""How long work says how far it is."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
-ImageProgress = Callable[[int, int, str], None]
-"""Called after each image with (images done, images in all, file name)."""
+StepProgress = Callable[[int, int, str], None]
+"""Called after each step with (steps done, steps in all, what was done)."""
+ImageProgress = StepProgress
+"""Steps are images, named by their files."""

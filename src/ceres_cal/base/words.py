@@ -52,13 +52,19 @@ def chance(log10_p: float) -> str:
     return f"{100.0 * 10.0**log10_p:.2g} %" if log10_p >= -3.0 else f"1 in 10^{-log10_p:.0f}"
 
 
-def at_precision(value: float, sd: float, unit: str) -> str:
-    """A value with as many places as two digits of its sd; coefficients keep every digit."""
-    if unit.startswith("px^"):
-        return repr(value)
+_SMALL = 1e-3  # values below are written with a power of ten
+
+
+def at_precision(value: float, sd: float) -> str:
+    """A value that ends where two digits of its sd end: 868.9 beside 1.4, -5.0e-05 beside 2.2e-06."""
+    small = abs(value) < _SMALL
     if not (math.isfinite(sd) and sd > 0.0):
-        return f"{value:.4f}"
-    return f"{value:.{min(max(1 - math.floor(math.log10(sd)), 0), 9)}f}"
+        return f"{value:.3e}" if small else f"{value:.4f}"
+    places = 1 - math.floor(math.log10(sd))
+    if small and places > 4:
+        above = math.floor(math.log10(max(abs(value), sd)))
+        return f"{round(value, places):.{max(above + places, 0)}e}"
+    return f"{value:.{max(places, 0)}f}"
 
 
 def bounds_text(low: float, high: float, unit: str, digits: str = "") -> str:

@@ -14,12 +14,14 @@ from contextlib import suppress
 from ceres_cal.base.errors import CalibrationError, InputError, SolutionError
 from ceres_cal.base.words import first_of
 from ceres_cal.base.written import noting
+from ceres_cal.cli import colour
 from ceres_cal.cli.advise import COMMANDS as ADVISE
 from ceres_cal.cli.audit import COMMANDS as AUDIT
 from ceres_cal.cli.calibrate import COMMANDS as CALIBRATE
 from ceres_cal.cli.check import COMMANDS as CHECK
 from ceres_cal.cli.command import Command, print_answer
 from ceres_cal.cli.compare import COMMANDS as COMPARE
+from ceres_cal.cli.completion import completion
 from ceres_cal.cli.detect import COMMANDS as DETECT_BOARD
 from ceres_cal.cli.detect_field import COMMANDS as DETECT_FIELD
 from ceres_cal.cli.detect_rings import COMMANDS as DETECT_RINGS
@@ -36,9 +38,9 @@ from ceres_cal.cli.undistort import COMMANDS as UNDISTORT
 _GROUPS = (
     *(DETECT_BOARD, DETECT_RINGS, DETECT_FIELD),
     *(CALIBRATE, DIAGNOSE, ADVISE, REFIT, CHECK, COMPARE, AUDIT),
-    *(LOCATE, UNDISTORT, EXPORT, FOREIGN, SIMULATE, TARGETS),
+    *(LOCATE, UNDISTORT, EXPORT, FOREIGN, SIMULATE, TARGETS, (completion(lambda: COMMANDS),)),
 )
-COMMANDS = {command.name: command for group in _GROUPS for command in group}
+COMMANDS: dict[str, Command] = {command.name: command for group in _GROUPS for command in group}
 _BEGINNINGS = {"", *(name.partition(" ")[0] for name in COMMANDS if " " in name)}
 _MOST_LETTERS = 200  # of an error that nobody wrote for people
 _INTERRUPTED, _PIPE_CLOSED = 130, 141  # what a shell reports of a program that SIGINT or SIGPIPE ended
@@ -95,7 +97,8 @@ def _answer(arguments: list[str]) -> int:
 
 def _fail(message: str, exit_code: int, as_json: bool) -> int:
     line = " ".join(message.splitlines())
-    print(f"ceres-cal: {line}", file=sys.stderr)
+    said = f"ceres-cal: {line}"
+    print(colour.error(said) if colour.in_colour(sys.stderr) else said, file=sys.stderr)
     if as_json:
         with suppress(OSError):
             print(json.dumps({"error": line, "exit_code": exit_code}), flush=True)
@@ -107,19 +110,20 @@ def _run(arguments: list[str]) -> int:
     if arguments[-1:] in (["-h"], ["--help"]) and beginning in _BEGINNINGS and beginning not in COMMANDS:
         print(_overview(beginning))
         return 0
-    if arguments[:1] == ["--version"]:
+    if "--version" in arguments:
         from ceres_cal.calibration import package_versions
 
         print(", ".join(f"{name} {version}" for name, version in package_versions().items()))
         return 0
-    command, rest = _choose(arguments)
+    command, rest = chosen(arguments)
     options = command.parse(rest)
     answer = command.run(options)
     print_answer(answer, as_json=options.json)
     return answer.exit_code
 
 
-def _choose(arguments: list[str]) -> tuple[Command, list[str]]:
+def chosen(arguments: list[str]) -> tuple[Command, list[str]]:
+    """The command that is typed, and its arguments; InputError where there is none of its name."""
     for words in (2, 1):
         command = COMMANDS.get(" ".join(arguments[:words]))
         if command is not None:
@@ -136,7 +140,7 @@ def _overview(beginning: str) -> str:
     width = max(map(len, summaries))
     return "\n".join(
         [
-            "usage: ceres-cal COMMAND ... [--json]",
+            "usage: ceres-cal COMMAND ... [--json] [--version]",
             "",
             "Calibrate an overhead camera from corners, lines and arcs of a flat field.",
             "",

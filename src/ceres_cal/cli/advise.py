@@ -8,10 +8,19 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from ceres_cal.base.errors import InputError, naming
-from ceres_cal.cli.arguments import add_calibration, add_station, height_m, parse_number
+from ceres_cal.cli.arguments import (
+    add_calibration,
+    add_height,
+    add_quiet,
+    add_station,
+    height_m,
+    length,
+    parse_length,
+)
 from ceres_cal.cli.command import Answer, Command
 from ceres_cal.cli.inputs import read_calibration, station_of
 from ceres_cal.cli.outputs import section, wrapped
+from ceres_cal.cli.progress import progress_bar
 
 if TYPE_CHECKING:
     from ceres_cal.advice import Advice, Measurement, Promise
@@ -21,34 +30,48 @@ if TYPE_CHECKING:
 def _add_arguments(parser: ArgumentParser) -> None:
     add = parser.add_argument
     add_calibration(parser)
-    add("--height-mm", default="150", metavar="MM", help="height of what is to be located; default: 150, a robot's top")
+    add_height(parser, "height of what is to be located; default: 150, a robot's top", 150.0)
     add_station(parser, "whose map; may be left out where there is only one")
-    add("--good-enough-mm", metavar="MM", help="the worst error that will do; nothing is advised where it is reached")
+    add(
+        "--good-enough-mm",
+        type=length("mm"),
+        metavar="MM",
+        help="the worst error that will do; nothing is advised where it is reached",
+    )
     add(
         "--board",
         metavar="COLUMNSxROWSxMM",
         help="the board that could be shown: inner corners and size of a square, such as 9x6x100; default: the "
         "calibration's own, or that one",
     )
+    add_quiet(parser)
 
 
 def _run(args: Namespace) -> Answer:
     height = height_m(args)
-    enough = None if args.good_enough_mm is None else parse_number(args.good_enough_mm, "--good-enough-mm")
+    enough = args.good_enough_mm
     if enough is not None and not enough > 0.0:
-        raise InputError(f"--good-enough-mm {args.good_enough_mm}: give a number of millimetres above 0")
+        raise InputError(f"--good-enough-mm {enough:g}: give a number of millimetres above 0")
     board = None if args.board is None else _board(args.board)
     from ceres_cal.advice import advise
 
     calibration = read_calibration(args)
     station = station_of(args, calibration)
-    with naming(args.calibration):
-        advice = advise(calibration, station, height, enough, board)
+    with naming(args.calibration), progress_bar(args) as bar:
+        advice = advise(calibration, station, height, enough, board, bar.update)
     weak = [direction.words for direction in calibration.uncertainty.weak_directions]
     return Answer(_data(advice, weak), lambda: _text(advice, weak))
 
 
-COMMANDS = (Command("advise", "what to measure next, and what it would bring in mm", _add_arguments, _run),)
+COMMANDS = (
+    Command(
+        "advise",
+        "what to measure next, and what it would bring in mm",
+        _add_arguments,
+        _run,
+        ("calibration.json --good-enough-mm 2", "calibration.json --board 9x6x50mm --height-mm 150"),
+    ),
+)
 
 
 def _board(text: str) -> Target:
@@ -57,7 +80,7 @@ def _board(text: str) -> Target:
     parts = text.split("x")
     if len(parts) != 3 or not (parts[0].isdecimal() and parts[1].isdecimal()):
         raise InputError(f"--board {text!r}: write COLUMNSxROWSxMM, such as 9x6x100")
-    return checkerboard(int(parts[0]), int(parts[1]), parse_number(parts[2], f"--board {text!r}") / 1000.0)
+    return checkerboard(int(parts[0]), int(parts[1]), parse_length(parts[2], f"--board {text!r}", "mm") / 1000.0)
 
 
 # ---- for people -----------------------------------------------------------------------------------------------------

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from argparse import ArgumentParser, Namespace
-from collections.abc import Sequence
+import re
+from argparse import ArgumentParser, ArgumentTypeError, Namespace
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,6 +15,8 @@ if TYPE_CHECKING:
     from ceres_cal.observations import Observations, Prior
 
 PRIOR_EXAMPLE = "overhead.height_m=4.02:0.01"
+_IN_A_METRE = {"mm": 1000.0, "cm": 100.0, "m": 1.0}
+_LENGTH = re.compile(r"\s*(.*?)\s*(mm|cm|m)\s*")
 
 
 def add_calibration(parser: ArgumentParser, what: str = "file that `ceres-cal calibrate` or `refit` wrote") -> None:
@@ -86,14 +89,44 @@ def parse_numbers(text: str, where: str) -> tuple[float, ...]:
     return tuple(parse_number(part, where) for part in text.split(","))
 
 
+def parse_length(text: str, where: str, unit: str = "m") -> float:
+    """A length in `unit`, which is that of a plain number, too: "0.15", "150mm", "2.5 cm", "5m"."""
+    found = _LENGTH.fullmatch(text)
+    if found is None:
+        return parse_number(text, where)
+    return parse_number(found[1], where) * _IN_A_METRE[unit] / _IN_A_METRE[found[2]]
+
+
+def parse_lengths(text: str, where: str) -> tuple[float, ...]:
+    """Lengths between commas, in metres."""
+    return tuple(parse_length(part, where) for part in text.split(","))
+
+
+def length(unit: str) -> Callable[[str], float]:
+    """The type of an argument that is a length in `unit`; its name says which."""
+
+    def parse(text: str) -> float:
+        try:
+            return parse_length(text, "a length", unit)
+        except InputError:
+            raise ArgumentTypeError(f"{text!r} is no length: write a number of {unit}, or 5m, 150mm") from None
+
+    return parse
+
+
 def parse_names(text: str) -> list[str]:
     """Names between commas."""
     return [name.strip() for name in text.split(",") if name.strip()]
 
 
+def add_height(parser: ArgumentParser, what: str, default_mm: float | None = None) -> None:
+    """The option --height-mm."""
+    parser.add_argument("--height-mm", type=length("mm"), metavar="MM", default=default_mm, help=what)
+
+
 def height_m(args: Namespace) -> float:
     """--height-mm in metres; 0 where it was not given."""
-    return 0.0 if args.height_mm is None else parse_number(args.height_mm, "--height-mm") / 1000.0
+    return 0.0 if args.height_mm is None else float(args.height_mm) / 1000.0
 
 
 @dataclass(frozen=True)
@@ -126,13 +159,14 @@ def parse_prior(spec: str, observations: Observations, names: PriorNames) -> Pri
         name = next(iter(known))
     if name not in known:
         raise InputError(f"{where}: name one {owner} before the dot: {', '.join(known)}")
-    sigma = parse_numbers(sigmas, f"{where}: sigma")
+    parse = parse_lengths if quantity.endswith("_m") else parse_numbers
+    sigma = parse(sigmas, f"{where}: sigma")
     if min(sigma) <= 0.0:
         raise InputError(f"{where}: sigma must be above 0")
     return prior_from_json(
         {
             owner: name,
-            quantity: list(parse_numbers(values, where)),
+            quantity: list(parse(values, where)),
             "sigma_m" if owner == "station" else "sigma": sigma[0] if len(sigma) == 1 else list(sigma),
         },
         where,

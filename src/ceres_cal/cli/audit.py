@@ -79,5 +79,11 @@ def _text(stations: dict[str, StationAudit], warnings: tuple[str, ...]) -> str:
 
 
 COMMANDS = (
-    Command("audit", "may another program's calibration be trusted? exit code 0 yes, 1 no", _add_arguments, _run),
+    Command(
+        "audit",
+        "may another program's calibration be trusted? exit code 0 yes, 1 no",
+        _add_arguments,
+        _run,
+        ("opencv.yml --observations field.json", "geometry.yml --observations field.json --observations more.json"),
+    ),
 )

@@ -13,6 +13,7 @@ from ceres_cal.cli.arguments import (
     add_output,
     add_quiet,
     add_report,
+    parse_length,
     parse_names,
     parse_number,
     parse_prior,
@@ -79,7 +80,7 @@ def _add_camera(parser: ArgumentParser) -> None:
         action="append",
         default=[],
         help="solve for a target as built: field.lines_m=0.01, field.points_m=0.005 or board.warp_m=0.002 "
-        "(a sigma in metres; repeatable)",
+        "(a sigma in metres, or such as 10mm; repeatable)",
     )
     add(
         "--prior",
@@ -131,21 +132,31 @@ def _run(args: Namespace) -> Answer:
         from ceres_cal.calibrating import calibrate
         from ceres_cal.report.quality import quality_of
 
-        calibration = calibrate(observations, options, _solve_progress(bar, options.max_iterations))
-        if args.report is not None:
-            bar.update(0, 1, "drawing the report")
-        page = report_page(args, calibration, observations, photographs)
-        quality = quality_of(calibration, observations)
+        calibration = calibrate(observations, options, _solve_progress(bar))
+    page = report_page(args, calibration, observations, photographs)
+    quality = quality_of(calibration, observations)
     write_results(args, calibration.save, page)
     return Answer(
         calibration_data(quality, args.observations, args), lambda: calibration_text(quality, args.observations, args)
     )
 
 
-COMMANDS = (Command("calibrate", "calibrate cameras from observations of fields and boards", _add_arguments, _run),)
+COMMANDS = (
+    Command(
+        "calibrate",
+        "calibrate cameras from observations of fields and boards",
+        _add_arguments,
+        _run,
+        (
+            "field.json board.json -o calibration.json --report report.html",
+            "field.json --lens auto --prior height_m=4.02:10mm -o calibration.json",
+            "field.json --powers 3 --tolerance field.lines_m=10mm -o calibration.json",
+        ),
+    ),
+)
 
 
-def _solve_progress(bar: ProgressBar, most: int) -> Callable[[Progress], None]:
+def _solve_progress(bar: ProgressBar) -> Callable[[Progress], None]:
     """The solver's callback; a solve begins with its iteration 0."""
     solves = 0
 
@@ -153,7 +164,7 @@ def _solve_progress(bar: ProgressBar, most: int) -> Callable[[Progress], None]:
         nonlocal solves
         solves += progress.iteration == 0
         note = f"solve {solves}, iteration {progress.iteration}, cost {progress.cost:.6g}"
-        bar.update(progress.iteration, most, note)
+        bar.update(progress.iteration, 0, note)  # after how many it comes to rest nobody knows
 
     return show
 
@@ -226,5 +237,5 @@ def _tolerances(specs: list[str]) -> dict[str, Tolerance]:
         names = tuple(Tolerance.__dataclass_fields__)
         if not (equals and dot) or what not in names:
             raise InputError(f"--tolerance {spec!r}: write TARGET.{'|'.join(names)}=SIGMA, such as field.lines_m=0.01")
-        given.setdefault(target, {})[what] = parse_number(value, f"--tolerance {spec!r}")
+        given.setdefault(target, {})[what] = parse_length(value, f"--tolerance {spec!r}")
     return {target: Tolerance(**sigmas) for target, sigmas in given.items()}

@@ -14,6 +14,7 @@ from ceres_cal.cli.inputs import read_calibration, read_observations
 from ceres_cal.cli.outputs import section
 from ceres_cal.cli.photographs import add_inputs, photographs_data, photographs_in, photographs_text
 from ceres_cal.cli.progress import progress_bar
+from ceres_cal.scene.heights import at_height
 
 if TYPE_CHECKING:
     from ceres_cal.moves import Check, StationCheck
@@ -67,7 +68,15 @@ def _photographed(args: Namespace, images: list[Path], level: float) -> tuple[Ch
         )
 
 
-COMMANDS = (Command("check", "does a calibration still hold? exit code 0 yes, 1 no", _add_arguments, _run),)
+COMMANDS = (
+    Command(
+        "check",
+        "does a calibration still hold? exit code 0 yes, 1 no",
+        _add_arguments,
+        _run,
+        ("calibration.json now.png", "calibration.json incoming/ --checks 720 --json"),
+    ),
+)
 
 
 def _share(text: str) -> float:
@@ -100,13 +109,13 @@ def _station_lines(one: StationCheck) -> list[str]:
     first = f"{one.station} {one.words}"
     if not math.isfinite(one.statistic) and not one.degrees:
         return [first]
-    size = f"picture {one.shift_px:.3f} px rms, phi {100.0 * one.phi_change:+.3f} %"
+    size = f"picture {one.shift_px:.3g} px rms, phi {100.0 * one.phi_change:+.3f} %"
     return [
         first,
         f"{one.used} observations, {one.outliers} outliers, noise {one.noise:.2f} times as before",
-        f"moved {one.moved_mm:.1f} mm, turned {one.turned_deg:.4f} deg, {size}",
+        f"moved {one.moved_mm:.3g} mm, turned {one.turned_deg:.3g} deg, {size}",
         *(
-            f"map at {1e3 * height_m:.0f} mm: {mean:.2f} mm on average, {worst:.2f} mm at most"
+            f"map {at_height(height_m)}: {mean:.3g} mm on average, {worst:.3g} mm at most"
             for height_m, (mean, worst) in one.shift_mm.items()
         ),
     ]

@@ -11,6 +11,7 @@ from typing import Any, NoReturn
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.words import printable, sentence
+from ceres_cal.cli.colour import coloured, in_colour
 
 
 class Parser(argparse.ArgumentParser):
@@ -48,19 +49,36 @@ class Command:
         summary: one line for the help.
         add_arguments: adds the command's own; --json comes from here.
         run: does the work; raises CalibrationError.
+        examples: of its use, without "ceres-cal" and the name, for the help.
     """
 
     name: str
     summary: str
     add_arguments: Callable[[argparse.ArgumentParser], None]
     run: Callable[[argparse.Namespace], Answer]
+    examples: tuple[str, ...] = ()
 
     def parse(self, arguments: Sequence[str]) -> argparse.Namespace:
         """The command's options; InputError for wrong usage. Positional arguments may stand between options."""
-        parser = Parser(prog=f"ceres-cal {self.name}", description=f"{sentence(self.summary)}.")
+        parser = Parser(**self.about, prog=f"ceres-cal {self.name}")
+        self.fill(parser)
+        return parser.parse_intermixed_args(arguments)
+
+    @property
+    def about(self) -> dict[str, Any]:
+        """What a parser says of the command."""
+        calls = "\n".join(f"  ceres-cal {self.name} {example}" for example in self.examples)
+        return {
+            "description": f"{sentence(self.summary)}.",
+            "epilog": f"examples:\n{calls}",
+            "formatter_class": argparse.RawDescriptionHelpFormatter,
+        }
+
+    def fill(self, parser: argparse.ArgumentParser) -> None:
+        """Add all of its arguments to a parser."""
         self.add_arguments(parser)
         parser.add_argument("--json", action="store_true", help="print one JSON object")
-        return parser.parse_intermixed_args(arguments)
+        parser.add_argument("--version", action="store_true", help="print the version, and those of the libraries")
 
 
 def _all_printable(data: Any) -> Any:
@@ -84,5 +102,5 @@ def print_answer(answer: Answer, *, as_json: bool) -> None:
             encoded = msgspec.json.encode(_all_printable(plain))
         print(msgspec.json.format(encoded, indent=1).decode())
     else:
-        print(answer.text())
+        print(coloured(answer.text()) if in_colour(sys.stdout) else answer.text())
     sys.stdout.flush()

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ceres_cal.base.errors import InputError
-from ceres_cal.cli.arguments import add_station, height_m
+from ceres_cal.cli.arguments import add_height, add_station, height_m
 from ceres_cal.cli.command import Answer, Command
 from ceres_cal.cli.outputs import finishing, require_output, section
 
@@ -21,7 +21,7 @@ def _add_arguments(parser: ArgumentParser) -> None:
     add = parser.add_argument
     add("a", metavar="A", type=Path, help="one calibration")
     add("b", metavar="B", type=Path, help="the other")
-    add("--height-mm", default="0", metavar="MM", help="of the map above the floor; default: 0")
+    add_height(parser, "of the map above the floor; default: 0")
     add_station(parser, "only this one; default: all that both have")
     add("--picture", metavar="SVG", type=Path, help="draw the map there (of one station)")
 
@@ -48,7 +48,15 @@ def _run(args: Namespace) -> Answer:
     return Answer(data, lambda: "\n".join(map(_text, comparisons)))
 
 
-COMMANDS = (Command("compare", "where on the field two calibrations differ, in mm", _add_arguments, _run),)
+COMMANDS = (
+    Command(
+        "compare",
+        "where on the field two calibrations differ, in mm",
+        _add_arguments,
+        _run,
+        ("old.json new.json --height-mm 150", "old.json new.json --picture moved.svg"),
+    ),
+)
 
 
 def _data(one: StationComparison) -> dict[str, Any]:

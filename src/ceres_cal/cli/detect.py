@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ceres_cal.base.errors import InputError
-from ceres_cal.cli.arguments import add_detection, add_quiet
+from ceres_cal.cli.arguments import add_detection, add_quiet, length
 from ceres_cal.cli.command import Answer, Command
 from ceres_cal.cli.detection import detected
 from ceres_cal.cli.inputs import image_files
@@ -25,9 +25,9 @@ def _add_board(parser: ArgumentParser) -> None:
     add("images", nargs="+", metavar="IMAGE", help="images of one camera, or folders of them")
     add("--columns", type=int, required=True, metavar="N", help="inner corners along a row of the board")
     add("--rows", type=int, required=True, metavar="N", help="inner corners along a column of it")
-    add("--square", type=float, required=True, metavar="M", help="side of a square in metres")
+    add("--square", type=length("m"), required=True, metavar="M", help="side of a square in metres, or such as 25mm")
     add("--charuco", metavar="DICT", help="the board has markers of this OpenCV dictionary, such as DICT_4X4_50")
-    add("--marker", type=float, metavar="M", help="side of a marker in metres, with --charuco")
+    add("--marker", type=length("m"), metavar="M", help="side of a marker likewise, with --charuco")
     add(
         "--corner-fit",
         choices=("opencv", "saddle"),
@@ -56,7 +56,18 @@ def _run_board(args: Namespace) -> Answer:
     return Answer(_data(detections, args.output), lambda: _text(detections, args.output))
 
 
-COMMANDS = (Command("detect board", "corners of chessboards and ChArUco boards in images", _add_board, _run_board),)
+COMMANDS = (
+    Command(
+        "detect board",
+        "corners of chessboards and ChArUco boards in images",
+        _add_board,
+        _run_board,
+        (
+            "photographs/ --columns 9 --rows 6 --square 25mm -o board.json",
+            "photographs/ --columns 9 --rows 6 --square 40mm --charuco DICT_4X4_50 --marker 30mm -o board.json",
+        ),
+    ),
+)
 
 
 def _data(detections: BoardDetections, output: Path) -> dict[str, Any]:

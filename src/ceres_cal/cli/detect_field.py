@@ -100,7 +100,19 @@ def _run(args: Namespace) -> Answer:
     return Answer(data, lambda: _text(data))
 
 
-COMMANDS = (Command("detect field", "painted lines and crossings of a field in photographs", _add_arguments, _run),)
+COMMANDS = (
+    Command(
+        "detect field",
+        "painted lines and crossings of a field in photographs",
+        _add_arguments,
+        _run,
+        (
+            "photographs/ --target ssl-b --auto --facing LeftGoalLine=top -o field.json",
+            "0001.png --start calibration.json -o field.json",
+            "0001.png --target ssl-a --start corners.json -o field.json",
+        ),
+    ),
+)
 
 
 def _require_fitting(args: Namespace) -> None:

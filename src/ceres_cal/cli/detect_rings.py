@@ -7,7 +7,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from ceres_cal.base.errors import InputError
-from ceres_cal.cli.arguments import add_detection, parse_number, parse_numbers
+from ceres_cal.cli.arguments import add_detection, parse_length, parse_lengths
 from ceres_cal.cli.command import Answer, Command
 from ceres_cal.cli.detection import detected
 from ceres_cal.cli.outputs import finishing, require_observations_output
@@ -43,17 +43,25 @@ def _run(args: Namespace) -> Answer:
     return Answer(data, lambda: _text(data))
 
 
-COMMANDS = (Command("detect rings", "edges of concentric rings in a photograph", _add_arguments, _run),)
+COMMANDS = (
+    Command(
+        "detect rings",
+        "edges of concentric rings in a photograph",
+        _add_arguments,
+        _run,
+        ("rings.png --radii 10mm:360mm:10mm -o rings.json",),
+    ),
+)
 
 
 def _radii(text: str) -> tuple[float, ...]:
     where = f"--radii {text!r}"
     if ":" not in text:
-        return parse_numbers(text, where)
+        return parse_lengths(text, where)
     parts = text.split(":")
     if len(parts) != 3:
         raise InputError(f"{where}: write FROM:TO:STEP, such as 0.01:0.36:0.01, or the radii between commas")
-    first, last, step = (parse_number(part, where) for part in parts)
+    first, last, step = (parse_length(part, where) for part in parts)
     if not (0.0 < first <= last and step > 0.0 and (last - first) / step < _MOST_RINGS):
         raise InputError(f"{where}: FROM must be above 0, TO not below it, and STEP above 0")
     return tuple(first + i * step for i in range(round((last - first) / step) + 1))

@@ -6,10 +6,11 @@ from argparse import ArgumentParser, Namespace
 from typing import TYPE_CHECKING
 
 from ceres_cal.base.errors import InputError
-from ceres_cal.cli.arguments import add_calibration, add_output, add_report, parse_number
+from ceres_cal.cli.arguments import add_calibration, add_output, add_quiet, add_report, parse_number
 from ceres_cal.cli.command import Answer, Command
 from ceres_cal.cli.inputs import read_calibration, read_observations
 from ceres_cal.cli.outputs import report_page, report_photographs, require_ending, require_outputs, write_results
+from ceres_cal.cli.progress import progress_bar
 
 if TYPE_CHECKING:
     from ceres_cal.diagnostics import Diagnosis
@@ -28,6 +29,7 @@ def _add_arguments(parser: ArgumentParser) -> None:
         help="also calibrate with other powers or coefficients, on some frames to predict the others, and say which "
         "lens predicts best",
     )
+    add_quiet(parser)
     add("--strict", action="store_true", help="exit with 1 for any finding, also one that does no harm")
     add("--folds", type=int, default=5, metavar="K", help="parts into which frames go for --held-out; default: 5")
     add(
@@ -46,7 +48,9 @@ def _run(args: Namespace) -> Answer:
     calibration, observations = read_calibration(args), read_observations(args.observations)
     photographs = report_photographs(args, observations)
     diagnosis = diagnose(calibration, observations, new_data=args.new_data, false_alarm_rate=rate)
-    choice = choose(observations, calibration.options, args.folds) if args.held_out else None
+    with progress_bar(args) as bar:
+        options = calibration.options
+        choice = choose(observations, options, args.folds, progress=bar.update) if args.held_out else None
     page = report_page(args, calibration, observations, photographs, diagnosis, choice)
     write_results(args, diagnosis.table.save, page)
     return Answer(
@@ -56,7 +60,18 @@ def _run(args: Namespace) -> Answer:
     )
 
 
-COMMANDS = (Command("diagnose", "what the residuals say: faults by name, noise, outliers", _add_arguments, _run),)
+COMMANDS = (
+    Command(
+        "diagnose",
+        "what the residuals say: faults by name, noise, outliers",
+        _add_arguments,
+        _run,
+        (
+            "calibration.json field.json board.json",
+            "calibration.json field.json board.json --held-out --report report.html",
+        ),
+    ),
+)
 
 
 def _is_no(diagnosis: Diagnosis, *, strict: bool) -> bool:

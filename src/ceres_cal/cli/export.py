@@ -7,10 +7,10 @@ from collections.abc import Collection, Sequence
 from typing import TYPE_CHECKING, Any
 
 from ceres_cal.base.errors import InputError
-from ceres_cal.cli.arguments import add_calibration, add_output
+from ceres_cal.cli.arguments import add_calibration, add_output, length, parse_length
 from ceres_cal.cli.command import Answer, Command
 from ceres_cal.cli.inputs import read_calibration
-from ceres_cal.cli.outputs import finishing, require_output
+from ceres_cal.cli.outputs import finishing, require_output, section
 
 if TYPE_CHECKING:
     from ceres_cal.formats import Exported, ExportFormat, ImportFormat
@@ -44,7 +44,7 @@ def _add_shared_arguments(parser: ArgumentParser, forms: Collection[ExportFormat
         action="append",
         help="which station; may be left out where there is only one, or the format holds all; repeatable",
     )
-    add("--max-loss-mm", type=float, metavar="MM", help="refuse what is wrong by more anywhere on the field")
+    add("--max-loss-mm", type=length("mm"), metavar="MM", help="refuse what is wrong by more anywhere on the field")
     add_format_options(parser, forms)
 
 
@@ -98,6 +98,8 @@ def format_options(args: Namespace, forms: Sequence[ExportFormat] | Sequence[Imp
         if name not in types:
             raise InputError(f"{_flag(name)} is no option of format {forms[0].name}")
         try:
+            if name.endswith("_mm"):
+                text = str(parse_length(text, _flag(name), "mm"))
             options[name] = msgspec.convert(text, types[name], strict=False)
         except msgspec.ValidationError:
             raise InputError(f"{_flag(name)}: {text!r} is not the number or word that it takes") from None
@@ -124,19 +126,34 @@ def _data(exported: Exported, args: Namespace) -> dict[str, Any]:
 
 
 def _text(exported: Exported, args: Namespace) -> str:
-    lines = [f"{args.to:9} {exported.words}, written to {args.output}"]
-    for loss in exported.losses:
-        of = f"{loss.station}: " if len(exported.losses) > 1 else ""
-        if loss.image_px is not None:
-            rms, worst = loss.image_px
-            lines.append(f"{'error':10}{of}{rms:.4f} px rms, {worst:.4f} px at most, over the image")
-        for height_m, (rms, worst) in loss.field_mm.items():
-            where = f"{1e3 * height_m:.0f} mm above the floor"
-            lines.append(f"{'error':10}{of}{rms:.4f} mm rms, {worst:.4f} mm at most, {where}")
-    return "\n".join([*lines, *(f"{'warning':10}{warning}" for warning in exported.warnings)])
+    return "\n".join([f"{args.to:9} {exported.words}, written to {args.output}", *losses_text(exported)])
+
+
+def losses_text(exported: Exported) -> list[str]:
+    """What is lost, in px and mm, and what else to know."""
+    from ceres_cal.formats import loss_words
+
+    lines = [section("error", [text]) for loss in exported.losses for text in loss_words(loss)]
+    return lines + [section("warning", [text]) for text in exported.warnings]
 
 
 COMMANDS = (
-    Command("export", "a calibration in a format that others read, and what that loses", _add_arguments, _run),
-    Command("export-table", "a look-up table from pixels to the field (NPZ)", _add_table_arguments, _run),
+    Command(
+        "export",
+        "a calibration in a format that others read, and what that loses",
+        _add_arguments,
+        _run,
+        (
+            "calibration.json --to vision-processor -o geometry.yml --camera-id 0",
+            "calibration.json --to opencv -o camera.yml",
+            "calibration.json --to table -o table.npz --error-mm 0.05",
+        ),
+    ),
+    Command(
+        "export-table",
+        "a look-up table from pixels to the field (NPZ)",
+        _add_table_arguments,
+        _run,
+        ("calibration.json -o table.npz",),
+    ),
 )

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from ceres_cal.base.errors import InputError
-from ceres_cal.cli.arguments import add_calibration, add_output
+from ceres_cal.cli.arguments import add_calibration, add_output, length
 from ceres_cal.cli.command import Answer, Command
-from ceres_cal.cli.export import add_format_options, format_options
+from ceres_cal.cli.export import add_format_options, format_options, losses_text
 from ceres_cal.cli.inputs import read_calibration
 from ceres_cal.cli.outputs import finishing, require_output, section
 
@@ -79,7 +79,12 @@ def _add_publish(parser: ArgumentParser) -> None:
     add("--camera-id", default="", metavar="ID,...", help="of the stations; default: the number that each name ends in")
     add("--geometry", metavar="FILE", type=Path, help="with the field, and other cameras: .pb or geometry.yml")
     add("--once", action="store_true", help="one packet, not one every 3 s until Ctrl-C")
-    add("--max-loss-mm", type=float, metavar="MM", help="refuse what the message would get wrong by more on the field")
+    add(
+        "--max-loss-mm",
+        type=length("mm"),
+        metavar="MM",
+        help="refuse what the message would get wrong by more on the field",
+    )
     _add_group(parser)
 
 
@@ -96,14 +101,7 @@ def _publish(args: Namespace) -> Answer:
         {"station": loss.station, "field_mm": {str(h): e for h, e in loss.field_mm.items()}} for loss in exported.losses
     ]
     data = {"sent": sent, "bytes": len(packet), "losses": losses, "warnings": list(exported.warnings)}
-    return Answer(data, lambda: "\n".join([section("published", [words]), *_losses(exported)]))
-
-
-def _losses(exported: Any) -> list[str]:
-    from ceres_cal.formats import loss_words
-
-    lines = [section("error", [text]) for loss in exported.losses for text in loss_words(loss)]
-    return lines + [section("warning", [text]) for text in exported.warnings]
+    return Answer(data, lambda: "\n".join([section("published", [words]), *losses_text(exported)]))
 
 
 def _add_listen(parser: ArgumentParser) -> None:
@@ -155,15 +153,32 @@ def _write_target(target: Target, path: Path) -> Answer:
 
 
 COMMANDS = (
-    Command("import", "a calibration, or observations, out of a file of another program", _add_import, _import),
     Command(
-        "publish", "send a calibration to those who see the field, by the league's multicast", _add_publish, _publish
+        "import",
+        "a calibration, or observations, out of a file of another program",
+        _add_import,
+        _import,
+        ("camera.yml -o calibration.json", "corners.csv --from csv -o observations.json"),
     ),
-    Command("listen", "the field, or all geometry, out of the league's multicast", _add_listen, _listen),
+    Command(
+        "publish",
+        "send a calibration to those who see the field, by the league's multicast",
+        _add_publish,
+        _publish,
+        ("calibration.json --camera-id 0", "calibration.json --geometry geometry.yml --once"),
+    ),
+    Command(
+        "listen",
+        "the field, or all geometry, out of the league's multicast",
+        _add_listen,
+        _listen,
+        ("-o field.json", "-o geometry.yml --seconds 30"),
+    ),
     Command(
         "targets import",
         "a field out of ssl-vision's or vision-processor's files",
         _add_targets_import,
         _targets_import,
+        ("geometry.yml -o field.json",),
     ),
 )

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from argparse import ArgumentParser, Namespace
 from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING, Any
 
 from ceres_cal.base.errors import InputError
-from ceres_cal.cli.arguments import add_calibration, add_station, parse_number
+from ceres_cal.cli.arguments import add_calibration, add_height, add_station, height_m, parse_number
 from ceres_cal.cli.command import Answer, Command
 from ceres_cal.cli.inputs import read_calibration, station_of
 
@@ -28,9 +29,7 @@ def _add_common(parser: ArgumentParser, rows: str, example: str) -> None:
 
 def _add_locate(parser: ArgumentParser) -> None:
     _add_common(parser, "X,Y", "640.5,480.2 (px)")
-    height = parser.add_mutually_exclusive_group()
-    height.add_argument("--height-mm", type=float, metavar="MM", help="height of what is seen above the field")
-    height.add_argument("--height-m", type=float, metavar="M", help="the same in metres; default: 0, the floor")
+    add_height(parser, "height of what is seen above the field, 150 or 0.15m; default: 0, the floor")
 
 
 def _add_project(parser: ArgumentParser) -> None:
@@ -39,11 +38,11 @@ def _add_project(parser: ArgumentParser) -> None:
 
 def _locate(args: Namespace) -> Answer:
     pixels = _read_rows(args, (2,))
-    height_m = _height_m(args)
+    height = height_m(args)
     name, camera = _station(args)
-    points = camera.locate(pixels, height_m)
-    lost = {row: _why_not_located(camera, pixels[row], height_m) for row in _rows_without_answer(points)}
-    data = {"station": name, "height_m": height_m, "pixels": pixels.tolist()}
+    points = camera.locate(pixels, height)
+    lost = {row: _why_not_located(camera, pixels[row], height) for row in _rows_without_answer(points)}
+    data = {"station": name, "height_m": height, "pixels": pixels.tolist()}
     return _answer({**data, "points_m": _or_null(points)}, points, lost)
 
 
@@ -57,15 +56,21 @@ def _project(args: Namespace) -> Answer:
 
 
 COMMANDS = (
-    Command("locate", "where on the field, or at a height above it, pixels lie (m)", _add_locate, _locate),
-    Command("project", "where points of the world appear in the image (px)", _add_project, _project),
+    Command(
+        "locate",
+        "where on the field, or at a height above it, pixels lie (m)",
+        _add_locate,
+        _locate,
+        ("calibration.json 640,480 100,100 --height-mm 150", "calibration.json --file pixels.csv --json"),
+    ),
+    Command(
+        "project",
+        "where points of the world appear in the image (px)",
+        _add_project,
+        _project,
+        ("calibration.json -2.5,1.0 -2.5,1.0,0.15",),
+    ),
 )
-
-
-def _height_m(args: Namespace) -> float:
-    if args.height_mm is not None:
-        return parse_number(str(args.height_mm), "--height-mm") / 1000.0
-    return parse_number(str(args.height_m or 0.0), "--height-m")
 
 
 def _station(args: Namespace) -> tuple[str, Camera]:
@@ -98,7 +103,13 @@ def _texts(args: Namespace) -> Iterator[tuple[str, str]]:
 
         yield from _lines(read_bytes(args.file).decode("utf-8-sig", errors="replace").splitlines(), args.file)
     else:
-        yield from ((f"argument {text!r}", text) for text in args.rows)
+        yield from ((f"argument {text!r}", text) for text in _places(args.rows))
+
+
+def _places(arguments: Iterable[str]) -> list[str]:
+    """A text for each place, wherever spaces stand: 640,480 or 640, 480 or 640 480; several places need commas."""
+    typed = re.sub(r"\s*,\s*", ",", " ".join(arguments)).split()
+    return typed if any("," in text for text in typed) else [" ".join(typed)] if typed else []
 
 
 def _lines(lines: Iterable[str], where: str) -> Iterator[tuple[str, str]]:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.cli.inputs import image_files
+from ceres_cal.cli.progress import progress_bar
 
 if TYPE_CHECKING:
     from ceres_cal.calibration import Calibration
@@ -161,4 +162,5 @@ def report_page(
         return None
     from ceres_cal.report import make_report
 
-    return make_report(calibration, observations, diagnosis, choice, photographs)
+    with progress_bar(args) as bar:
+        return make_report(calibration, observations, diagnosis, choice, photographs, bar.update)

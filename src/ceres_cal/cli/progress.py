@@ -55,19 +55,23 @@ class ProgressBar:
             self._write(f"{_CLEAR if self._terminal else ''}{text}\n")
 
     def update(self, done: int, total: int, note: str) -> None:
-        """Show that `done` steps of at most `total` are done; `note` says what is going on."""
+        """Show that `done` of `total` steps are done, 0 where nobody knows; `note` says what is going on."""
         now = self._clock()
         if self._silent or now < self._due:
             return
         if self._terminal:
-            full = _BAR_COLUMNS * done // max(total, 1)
-            bar = f"[{'#' * full}{'.' * (_BAR_COLUMNS - full)}] {note}"
+            bar = f"{_bar(done, total)} {note}" if total else note
             self._write(_CLEAR + bar[: shutil.get_terminal_size().columns - 1])
         else:
-            self._write(f"{note} ({done} of {total})\n")
+            self._write(f"{note} ({done} of {total})\n" if total else f"{note}\n")
             self._wait *= 2.0
         self._due = now + self._wait
 
     def _write(self, text: str) -> None:
         self._stream.write(text)
         self._stream.flush()
+
+
+def _bar(done: int, total: int) -> str:
+    full = _BAR_COLUMNS * done // total
+    return f"[{'#' * full}{'.' * (_BAR_COLUMNS - full)}] {100 * done // total:3} %"

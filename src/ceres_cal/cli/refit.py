@@ -84,7 +84,18 @@ def _photographed(args: Namespace, calibration: Calibration, images: list[Path])
         return detect_known(calibration, images, args.station, not_painted=not_painted, progress=bar.update)
 
 
-COMMANDS = (Command("refit", "after a move: poses anew, everything else under what was known", _add_arguments, _run),)
+COMMANDS = (
+    Command(
+        "refit",
+        "after a move: poses anew, everything else under what was known",
+        _add_arguments,
+        _run,
+        (
+            "calibration.json now.png -o calibration.json",
+            "calibration.json new.json --what zoom -o calibration.json --report report.html",
+        ),
+    ),
+)
 
 
 def _data(quality: Quality, before: Calibration, args: Namespace) -> dict[str, Any]:

@@ -66,7 +66,13 @@ def _run(args: Namespace) -> Answer:
 
 
 COMMANDS = (
-    Command("simulate", "make observations of a scene, with noise and errors, and their truth", _add_arguments, _run),
+    Command(
+        "simulate",
+        "make observations of a scene, with noise and errors, and their truth",
+        _add_arguments,
+        _run,
+        ("ssl-field -o try/", "photographs -o try/ --images png --seed 3", "--list"),
+    ),
 )
 
 

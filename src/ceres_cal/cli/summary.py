@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ceres_cal.base.transforms import euler_from_rotation
-from ceres_cal.base.words import bounds_text, plural, two_digits
+from ceres_cal.base.words import at_precision, bounds_text, plural, two_digits
 from ceres_cal.calibration import Calibration
 from ceres_cal.cli.outputs import section, wrapped, written, written_data
 from ceres_cal.model.parameters import Options, anchored_stations
@@ -135,19 +135,22 @@ def _intrinsics(name: str, camera: Camera, options: Options, phi_from: str, qual
     centre = held("cx", "cy") if options.free_principal_point else " (held)"
     rows = [("phi", f"{known('phi', camera.phi)} ({_PHI_FROM.get(phi_from, phi_from)})")]
     if options.free_aspect or camera.aspect != 1.0:
-        rows.append(("aspect", f"{camera.aspect:.7f}{_plus_minus(quality, name, 'aspect')}{held('aspect')}"))
+        rows.append(("aspect", f"{_coefficient(quality, name, 'aspect', camera.aspect)}{held('aspect')}"))
     if options.free_skew or camera.skew != 0.0:
-        rows.append(("skew", f"{camera.skew:.7f}{_plus_minus(quality, name, 'skew')}{held('skew')}"))
+        rows.append(("skew", f"{_coefficient(quality, name, 'skew', camera.skew)}{held('skew')}"))
     rows.append(("principal point", f"{known('cx', cx)}, {known('cy', cy)}{centre}"))
     for coefficient, value in camera.lens.coefficients.items():
-        rows.append((coefficient, f"{value!r}{_plus_minus(quality, name, coefficient)}{held(coefficient)}"))
+        rows.append((coefficient, f"{_coefficient(quality, name, coefficient, value)}{held(coefficient)}"))
     lines = [f"{title:16}{value}" for title, value in rows]
     return [*lines, camera.lens.note] if camera.lens.note else lines
 
 
-def _plus_minus(quality: Quality, camera: str, quantity: str) -> str:
+def _coefficient(quality: Quality, camera: str, quantity: str, value: float) -> str:
     verdict = quality.verdicts.get(("camera", camera, quantity))
-    return "" if verdict is None else f" ± {verdict.sd:.2g}" if np.isfinite(verdict.sd) else ", unknown"
+    if verdict is None:
+        return repr(value)
+    shown = at_precision(value, verdict.sd)
+    return f"{shown} ± {verdict.sd:.2g}" if np.isfinite(verdict.sd) else f"{shown}, unknown"
 
 
 def _pose(name: str, camera: Camera, anchored: bool, quality: Quality) -> list[str]:
@@ -163,7 +166,7 @@ def _pose(name: str, camera: Camera, anchored: bool, quality: Quality) -> list[s
     sds = [f"{np.degrees(turn.sd):.2g}" if np.isfinite(turn.sd) else "unknown" for turn in turns if turn is not None]
     return [
         f"{'position':16}{', '.join(position)}",
-        f"{'angles':16}alpha {alpha:.4f}, beta {beta:.4f}, gamma {gamma:.4f} deg (the paper's)",
+        f"{'angles':16}alpha {alpha:.3f}, beta {beta:.3f}, gamma {gamma:.3f} deg (the paper's)",
         f"{'tilt':16}{camera.tilt_deg:.3f} deg from straight down",
         *([f"{'turns':16}± {', '.join(sds)} deg about the camera's x, y and z"] if sds else []),
     ]
@@ -223,7 +226,7 @@ def _warnings(calibration: Calibration, observations: Observations) -> Iterator[
 
 
 def with_sd(value: float, unit: str, verdict: Verdict | None) -> str:
-    """A number and how well it is known: "868.96 ± 1.4 px", "4.022 m ± 6.6 mm", "745 px, unknown: below 1209 px".
+    """A number and how well it is known: "869.0 ± 1.4 px", "4.022 m ± 6.6 mm", "745 px, unknown: below 1209 px".
 
     Without a verdict it was held, or nothing was minimised.
     """
@@ -237,8 +240,7 @@ def with_sd(value: float, unit: str, verdict: Verdict | None) -> str:
         return f"{value:.{3 if unit == 'm' else 0}f} {unit}{word}"
     if unit == "m":
         return f"{value:.3f} m ± {two_digits(1e3 * verdict.sd)} mm{word}"
-    places = int(np.clip(2 - np.floor(np.log10(verdict.sd)), 0, 9))
-    return f"{value:.{places}f} ± {two_digits(verdict.sd)} {unit}{word}"
+    return f"{at_precision(value, verdict.sd)} ± {two_digits(verdict.sd)} {unit}{word}"
 
 
 def _uncertainty_lines(quality: Quality) -> Iterator[tuple[str, list[str]]]:

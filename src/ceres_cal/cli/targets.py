@@ -37,7 +37,15 @@ def _run(args: Namespace) -> Answer:
     )
 
 
-COMMANDS = (Command("targets", "the kinds of targets and the names of their features", _add_arguments, _run),)
+COMMANDS = (
+    Command(
+        "targets",
+        "the kinds of targets and the names of their features",
+        _add_arguments,
+        _run,
+        ("", "ssl-b", "observations.json"),
+    ),
+)
 
 
 def _targets(wanted: str) -> dict[str, Target]:

@@ -10,7 +10,16 @@ from typing import TYPE_CHECKING, Any
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.words import frame_of
-from ceres_cal.cli.arguments import add_calibration, add_quiet, add_station, height_m, parse_number, parse_numbers
+from ceres_cal.cli.arguments import (
+    add_calibration,
+    add_height,
+    add_quiet,
+    add_station,
+    height_m,
+    length,
+    parse_lengths,
+    parse_number,
+)
 from ceres_cal.cli.command import Answer, Command
 from ceres_cal.cli.inputs import image_files, read_calibration
 from ceres_cal.cli.outputs import finishing
@@ -51,13 +60,13 @@ def _add_arguments(parser: ArgumentParser) -> None:
     )
     group = parser.add_argument_group("the field from above")
     group.add_argument("--top-view", action="store_true", help="the field from straight above, to scale")
-    group.add_argument("--mm-per-px", metavar="MM", help="scale of the top view; default: 5")
+    group.add_argument("--mm-per-px", type=length("mm"), metavar="MM", help="scale of the top view; default: 5")
     group.add_argument("--area", metavar="X0,Y0,X1,Y1", help="area in metres; default: the field and 0.3 m around it")
     group = parser.add_argument_group("the model in the photograph")
     group.add_argument("--overlay", action="store_true", help="draw the calibrated lines and boards into photographs")
     group.add_argument("--before", metavar="CALIBRATION", type=Path, help="draw an earlier calibration too")
     group.add_argument("--observations", metavar="OBS", type=Path, help="say what each frame shows, and draw them too")
-    parser.add_argument("--height-mm", metavar="MM", help="plane of the top view, or of a second drawing in an overlay")
+    add_height(parser, "plane of the top view, or of a second drawing in an overlay")
 
 
 def _run(args: Namespace) -> Answer:
@@ -89,7 +98,17 @@ def _run(args: Namespace) -> Answer:
 
 
 COMMANDS = (
-    Command("undistort", "straight images, top views to scale, the model in a photograph", _add_arguments, _run),
+    Command(
+        "undistort",
+        "straight images, top views to scale, the model in a photograph",
+        _add_arguments,
+        _run,
+        (
+            "calibration.json photographs/ -o straight/",
+            "calibration.json photographs/ -o top/ --top-view --mm-per-px 5 --height-mm 150",
+            "calibration.json photographs/ -o look/ --overlay --before old.json",
+        ),
+    ),
 )
 
 
@@ -107,7 +126,7 @@ def require_fitting(args: Namespace) -> None:
         (("height_mm",), args.top_view or args.overlay, "--top-view and --overlay"),
     )
     for names, chosen, what in groups:
-        given = [name for name in names if getattr(args, name)]
+        given = [name for name in names if getattr(args, name) not in (None, False)]
         if given and not chosen:
             raise InputError(f"--{given[0].replace('_', '-')} is for {what}: leave it out, or ask for that")
 
@@ -136,7 +155,7 @@ def _size(text: str) -> tuple[int, int]:
 
 
 def _area(text: str) -> tuple[float, float, float, float]:
-    numbers = parse_numbers(text, f"--area {text!r}")
+    numbers = parse_lengths(text, f"--area {text!r}")
     if len(numbers) != 4:
         raise InputError(f"--area {text!r}: write X0,Y0,X1,Y1 in metres, such as -4.5,-3,0,3")
     return numbers[0], numbers[1], numbers[2], numbers[3]
@@ -260,7 +279,7 @@ def _top_view(args: Namespace, calibration: Calibration) -> _PictureMaker:
     station = _station(args, calibration)
     camera, name = calibration.stations[station], calibration.estimate.stations[station].camera
     area = _field(calibration) if args.area is None else _area(args.area)
-    mm_per_px = 5.0 if args.mm_per_px is None else parse_number(args.mm_per_px, "--mm-per-px")
+    mm_per_px = 5.0 if args.mm_per_px is None else args.mm_per_px
     grid = make_grid(area, mm_per_px / 1000.0, height_m(args))
     warp = top_view(camera, grid)
     x0, y0, x1, y1 = grid.area_m

@@ -14,6 +14,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.errors import CalibrationError, DegenerateError, InputError
+from ceres_cal.base.progress import StepProgress
 from ceres_cal.base.transforms import Pose
 from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
@@ -135,13 +136,20 @@ def cross_validate(
     )  # fmt: skip
 
 
-def choose(observations: Observations, options: Options, k: int = FOLDS, *, most: int = MOST_OBSERVATIONS) -> Choice:
+def choose(
+    observations: Observations,
+    options: Options,
+    k: int = FOLDS,
+    *,
+    most: int = MOST_OBSERVATIONS,
+    progress: StepProgress | None = None,
+) -> Choice:
     """The lens that predicts best, among those of the same kind and the one that all kinds together would choose.
 
     All candidates are judged on the same observations: those that the calibration with any of them keeps.
 
     Args:
-        most: of more observations, evenly spread frames and rows take part.
+        most: of more observations, evenly spread frames and rows take part. progress: called before each lens.
 
     Raises:
         InputError: fewer than two frames. DegenerateError: no candidate can be calibrated.
@@ -159,7 +167,9 @@ def choose(observations: Observations, options: Options, k: int = FOLDS, *, most
         raise DegenerateError(f"no lens can be calibrated: {wholes[0]}")
     counted = np.any([_inliers(whole, few) for whole in good], axis=0)
     errors = []
-    for one, whole in zip(tried, wholes, strict=True):
+    for number, (one, whole) in enumerate(zip(tried, wholes, strict=True)):
+        if progress is not None:
+            progress(number, len(tried), f"held out: {label_of(one)}")
         if isinstance(whole, str):
             errors.append(HeldOut(label_of(one), coefficients_of(one), failed=whole))
             continue

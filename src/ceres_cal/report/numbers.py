@@ -80,7 +80,7 @@ def _row(name: str, value: float, unit: str, verdict: Verdict | None) -> _Row:
     if verdict is None:
         return name, f"{value:.10g}{space}", "", "", "", "not free"
     plain = verdict.key.kind == "camera" and not unit
-    shown = repr(value) if plain else f"{at_precision(value, verdict.sd, unit)}{space}"
+    shown = f"{at_precision(value, verdict.sd)}{space}"
     sds = (_width(sd, unit, plain) for sd in (verdict.sd, verdict.sd / verdict.factor))
     by = " (by its profile)" if verdict.by_profile and verdict.verdict != "known" else ""
     return name, shown, *sds, bounds(verdict, unit), verdict.verdict + by

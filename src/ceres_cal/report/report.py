@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from ceres_cal.base.files import write_bytes
+from ceres_cal.base.progress import StepProgress
 from ceres_cal.base.words import counted, first_of
 from ceres_cal.calibration import Calibration
 from ceres_cal.diagnostics import Choice, Diagnosis, diagnose
@@ -21,6 +22,7 @@ from ceres_cal.report.residual_pictures import against_radius, by_frame, vectors
 from ceres_cal.report.solve_pictures import against_closed_form, convergence, correlation
 from ceres_cal.report.verdict import verdict_chapter
 
+_CHAPTERS = 7  # at most
 MOST_CAMERAS = 8
 """Cameras, and stations, that have pictures of their own; the others are in the tables alone."""
 
@@ -36,13 +38,14 @@ def make_report(
     diagnosis: Diagnosis | None = None,
     choice: Choice | None = None,
     photographs: FramePhotographs | None = None,
+    progress: StepProgress | None = None,
 ) -> str:
     """One self-contained HTML page on a calibration: verdict, findings, numbers, pictures.
 
     Args:
         observations: those it was made from; or others, with a diagnosis of them (`new_data`).
         diagnosis: of these observations; made here where there is none. choice: of lens, by held-out error.
-        photographs: of the frames, for a chapter with the model drawn into them.
+        photographs: of the frames, for a chapter with the model drawn into them. progress: called after each chapter.
 
     Raises:
         InputError: the observations are not those of the calibration, and no diagnosis says so; or a photograph cannot
@@ -50,12 +53,11 @@ def make_report(
     """
     diagnosis = diagnose(calibration, observations) if diagnosis is None else diagnosis
     material = Material(calibration, observations, diagnosis, choice, photographs)
-    chapters = [verdict_chapter(material), findings(material), numbers(material)]
-    if photographs is not None:
-        from ceres_cal.report.in_photographs import in_photographs  # OpenCV, for photographs alone
-
-        chapters.append(in_photographs(material, photographs))
-    chapters += _pictures(material)
+    chapters = []
+    for number, chapter in enumerate(_chapters(material), start=1):
+        chapters.append(chapter)
+        if progress is not None:
+            progress(number, _CHAPTERS, f"report: {chapter.title}")
     return page(", ".join(list(observations.cameras)[:4]), _about(material), chapters, _foot(calibration))
 
 
@@ -73,6 +75,17 @@ def write_report(
         InputError: see `make_report`; or the file cannot be written.
     """
     write_bytes(path, make_report(calibration, observations, diagnosis, choice, photographs).encode())
+
+
+def _chapters(material: Material) -> Iterator[Chapter]:
+    yield verdict_chapter(material)
+    yield findings(material)
+    yield numbers(material)
+    if material.photographs is not None:
+        from ceres_cal.report.in_photographs import in_photographs  # OpenCV, for photographs alone
+
+        yield in_photographs(material, material.photographs)
+    yield from _pictures(material)
 
 
 def _pictures(material: Material) -> Iterator[Chapter]:

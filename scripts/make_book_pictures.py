@@ -1,0 +1,47 @@
+"""Draws the pictures of the book that commands make: python scripts/make_book_pictures.py [FOLDER]
+
+The model in a photograph, and where two calibrations differ; docs/pictures by default.
+"""
+
+from __future__ import annotations
+
+import shutil
+import sys
+import tempfile
+from pathlib import Path
+
+import cv2
+
+from ceres_cal.cli import main
+
+ROOT = Path(__file__).resolve().parents[1]
+HOME, MOVED = (ROOT / "data" / name / "photographs" for name in ("ssl_field", "ssl_field_moved"))
+SMALLER, QUALITY = 0.75, 85
+
+
+def run(*arguments: object) -> None:
+    code = main([str(argument) for argument in arguments])
+    if code:
+        raise SystemExit(code)
+
+
+def draw(to: Path, folder: Path) -> None:
+    """See above; `folder` is for what is made on the way."""
+    field, camera, new = folder / "field.json", folder / "camera.json", folder / "new.json"
+    images = sorted(HOME.glob("000*.jpg"))
+    found = ("--target", "ssl-b", "--auto", "--facing", "LeftGoalLine=top", "-o", field, "--quiet")
+    run("detect", "field", *images, *found)
+    run("calibrate", field, "--prior", "height_m=4.02:0.01", "-o", camera, "--quiet")
+    run("undistort", camera, images[0], "-o", folder, "--overlay", "--quiet")
+    drawn = cv2.imread(str(folder / "0001-overlay.png"))
+    assert drawn is not None
+    drawn = cv2.resize(drawn, None, fx=SMALLER, fy=SMALLER, interpolation=cv2.INTER_AREA)
+    cv2.imwrite(str(to / "overlay.jpg"), drawn, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+    run("refit", camera, MOVED / "0001.jpg", "-o", new, "--quiet")
+    run("compare", camera, new, "--picture", folder / "moved.svg")
+    shutil.copy(folder / "moved.svg", to / "moved.svg")
+
+
+if __name__ == "__main__":
+    with tempfile.TemporaryDirectory() as temporary:
+        draw(Path(sys.argv[1]) if len(sys.argv) > 1 else ROOT / "docs" / "pictures", Path(temporary))

@@ -1,0 +1,54 @@
+"""`ceres-cal completion`: what a shell needs to complete commands, options and files."""
+
+from __future__ import annotations
+
+import argparse
+from argparse import ArgumentParser, Namespace
+from collections.abc import Callable, Mapping
+
+from ceres_cal.base.errors import InputError
+from ceres_cal.cli.command import Answer, Command, Parser
+
+_SHELLS = ("bash", "zsh", "tcsh")
+_FILE = {"bash": "_shtab_compgen_files", "zsh": "_files", "tcsh": "f"}
+_EXAMPLES = (
+    "bash > ~/.local/share/bash-completion/completions/ceres-cal",
+    "zsh > ~/.zfunc/_ceres-cal",
+)
+
+
+def _add_arguments(parser: ArgumentParser) -> None:
+    parser.add_argument("shell", choices=_SHELLS, help="whose; what is printed goes into a file that it reads")
+
+
+def completion(every: Callable[[], Mapping[str, Command]]) -> Command:
+    """The command, of all commands there are."""
+
+    def run(args: Namespace) -> Answer:
+        try:
+            import shtab
+        except ImportError:
+            raise InputError("completion needs shtab: pip install 'ceres-cal[completion]'") from None
+        script = shtab.complete(whole_parser(every()), shell=args.shell)
+        return Answer({"shell": args.shell, "script": script}, lambda: script)
+
+    summary = "what a shell needs to complete commands, options and files"
+    return Command("completion", summary, _add_arguments, run, _EXAMPLES)
+
+
+def whole_parser(commands: Mapping[str, Command]) -> ArgumentParser:
+    """One parser of all commands; those of two words below their first. Files complete wherever a value is free."""
+    root = Parser(prog="ceres-cal", description="Calibrate an overhead camera.")
+    below = {"": root.add_subparsers()}
+    for name in sorted(commands):
+        first, _, second = name.partition(" ")
+        if second and first not in below:
+            above = below[""].choices.get(first) or below[""].add_parser(first, help=f"{first} ...")
+            below[first] = above.add_subparsers()
+        command = commands[name]
+        parser = below[first if second else ""].add_parser(second or first, help=command.summary, **command.about)
+        command.fill(parser)
+        for action in parser._actions:
+            if action.nargs != 0 and action.choices is None and not isinstance(action, argparse._SubParsersAction):
+                action.complete = _FILE  # type: ignore[attr-defined]
+    return root
