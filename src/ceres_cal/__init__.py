@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from ceres_cal.moves import check as check
     from ceres_cal.moves import compare as compare
     from ceres_cal.moves import refit as refit
+    from ceres_cal.moves import score as score
     from ceres_cal.observations import Curves as Curves
     from ceres_cal.observations import Observations as Observations
     from ceres_cal.observations import Points as Points
@@ -53,6 +54,7 @@ _HOME = {
     "check": "moves",
     "audit": "moves",
     "compare": "moves",
+    "score": "moves",
     "export": "formats",
     "import_calibration": "formats",
     "import_observations": "formats",

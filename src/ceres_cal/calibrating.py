@@ -121,12 +121,12 @@ class Again:
 
     Attributes:
         known: the layout of everything that is known by a posterior, also where the solve holds it.
-        scales: noise scales of points and curves that were seen before.
+        scales: noise scales of points and curves that were seen before; None for those of these observations alone.
         assessed: whether the posterior is wanted.
     """
 
     known: Layout
-    scales: tuple[float, float]
+    scales: tuple[float, float] | None
     assessed: bool = True
 
 

@@ -1,21 +1,27 @@
-"""After a move: refit, check and compare calibrations."""
+"""Calibrations and new observations: refit, check, score and compare."""
 
 from ceres_cal.moves.auditing import StationAudit, audit
 from ceres_cal.moves.carried import RefitOptions
 from ceres_cal.moves.checking import FALSE_ALARMS, Check, StationCheck, check
-from ceres_cal.moves.comparison import StationComparison, compare
+from ceres_cal.moves.comparison import CameraComparison, StationComparison, compare, compare_cameras
 from ceres_cal.moves.refitting import movements, refit
+from ceres_cal.moves.scoring import Part, Score, score
 
 __all__ = [
     "FALSE_ALARMS",
+    "CameraComparison",
     "Check",
+    "Part",
     "RefitOptions",
+    "Score",
     "StationAudit",
     "StationCheck",
     "StationComparison",
     "audit",
     "check",
     "compare",
+    "compare_cameras",
     "movements",
     "refit",
+    "score",
 ]

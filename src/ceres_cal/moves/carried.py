@@ -108,6 +108,7 @@ def make_plan(
     """
     if what not in WHAT:
         raise InputError(f"what={what!r} is unknown: choose one of {', '.join(WHAT)}")
+    require_posterior(calibration)
     require_same_things(calibration, observations)
     stations = observations.stations
     chosen = frozenset(stations if moved is None else moved)
@@ -155,12 +156,16 @@ def _turned(observations: Observations) -> Observations:
     return turned
 
 
-def require_same_things(calibration: Calibration, observations: Observations) -> None:
-    """Raise an error where cameras, image sizes or targets are not those that were calibrated, images too small for
-    the observations, or nothing is known of how well they were.
-    """
+def require_posterior(calibration: Calibration) -> None:
+    """Raise InputError where nothing is known of how well a calibration is known."""
     if calibration.posterior is None:
         raise InputError("the calibration does not say how well it is known: calibrate again")
+
+
+def require_same_things(calibration: Calibration, observations: Observations) -> None:
+    """Raise an error where cameras, image sizes or targets are not those that were calibrated, or images too small for
+    the observations.
+    """
     for name, size in observations.cameras.items():
         if name not in calibration.cameras:
             known = ", ".join(map(repr, calibration.cameras))

@@ -24,7 +24,7 @@ from ceres_cal.model.priors import GaussianPrior, tolerances
 from ceres_cal.model.quantities import layout_of
 from ceres_cal.model.residuals import residuals
 from ceres_cal.model.structure import make_structure
-from ceres_cal.moves.carried import require_same_things
+from ceres_cal.moves.carried import require_posterior, require_same_things
 from ceres_cal.moves.contrast import Contrast, Statement, contrast
 from ceres_cal.moves.poses import PoseCandidate, PoseSearch, movement, pose_candidates
 from ceres_cal.observations import Observations
@@ -129,6 +129,7 @@ def check(
         raise InputError(f"false_alarms must be a probability between 0 and 1, not {false_alarms}")
     if checks < 1:
         raise InputError(f"checks must be 1 or more, not {checks}")
+    require_posterior(calibration)
     require_same_things(calibration, observations)
     for name in observations.stations:
         if name not in calibration.estimate.stations:

@@ -1,5 +1,5 @@
-"""Where on the field two calibrations differ, how far the cameras stand apart, and whether their uncertainties explain
-it.
+"""Where two calibrations differ, on the field and over the image, how far the cameras stand apart, and whether their
+uncertainties explain it.
 """
 
 from __future__ import annotations
@@ -12,9 +12,12 @@ import numpy as np
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.tails import upper_tail
+from ceres_cal.base.transforms import nearest_rotation, rotation_log
 from ceres_cal.calibration import Calibration
+from ceres_cal.model.keys import Key
 from ceres_cal.model.parameters import Estimate
 from ceres_cal.model.quantities import difference
+from ceres_cal.model.structure import EXACT
 from ceres_cal.moves.poses import movement
 from ceres_cal.uncertainty.maps import ErrorMap, Grid, field_map, visible_pixels
 from ceres_cal.uncertainty.uncertainty import field_grid
@@ -22,6 +25,8 @@ from ceres_cal.uncertainty.uncertainty import field_grid
 # Probability below which uncertainty alone does not explain a difference; that often two sound calibrations differ.
 # At half of it nothing changes, at double one of six pairs does.
 _DOUBTFUL = 0.01
+_COLUMNS = 41  # of the grid over an image
+_ROUNDS = 20  # of reweighting
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,15 +114,21 @@ def _expected_mm(a: Calibration, b: Calibration, station: str, grid: Grid) -> Ar
 
 
 def _probability(a: Calibration, b: Calibration, station: str) -> float | None:
+    """See `StationComparison`."""
+    keys, others = (c.uncertainty.posterior.keys_of(c.estimate, station) for c in (a, b))
+    return (
+        _chance(a, b, keys, difference(_only(b, station), _only(a, station), keys))
+        if set(keys) == set(others)
+        else None
+    )
+
+
+def _chance(a: Calibration, b: Calibration, keys: Sequence[Key], off: Array) -> float | None:
     """Of a chi-squared as large: the difference d under (A^-1 + B^-1)^-1 = A (A + B)^+ B, which needs no inverse of
     either information where a direction is unknown.
     """
-    keys, others = (c.uncertainty.posterior.keys_of(c.estimate, station) for c in (a, b))
-    if set(keys) != set(others):
-        return None
     first, second = (c.uncertainty.posterior.information.marginal(keys) for c in (a, b))
     both = first.matrix @ (first + second).inverse @ second.matrix
-    off = difference(_only(b, station), _only(a, station), keys)
     degrees = min(first.known_rank, second.known_rank)
     return upper_tail(float(off @ both @ off), degrees) if degrees > 0 else None
 
@@ -127,3 +138,111 @@ def _only(calibration: Calibration, station: str) -> Estimate:
     old = calibration.estimate
     camera = old.stations[station].camera
     return Estimate({camera: old.cameras[camera]}, {station: old.stations[station]}, {}, old.structure)
+
+
+# ---- over the image -------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class CameraComparison:
+    """The intrinsics of one camera in two calibrations, a and b, over its image.
+
+    Attributes:
+        camera: its name in a. phi_px: of a and of b.
+        x_px (X,), y_px (Y,): a grid over the image.
+        difference_px: (Y, X, 2) where b sees the direction that a sees at a pixel, less the pixel; NaN where either has
+            no answer. angles_deg: (Y, X) between the directions that a and b see there.
+        turn_deg: of b's directions to those of a, which was taken out; 0 where that was not asked for.
+        probability: of intrinsics as far apart or farther, from their uncertainties alone; None where one of the two
+            does not say how well they are known, or has other free ones.
+    """
+
+    camera: str
+    phi_px: tuple[float, float]
+    x_px: Array
+    y_px: Array
+    difference_px: Array
+    angles_deg: Array
+    turn_deg: float
+    probability: float | None
+
+    @property
+    def errors_px(self) -> Array:
+        """(Y, X) length of the difference; NaN where either has no answer."""
+        return np.asarray(np.linalg.norm(self.difference_px, axis=2))
+
+    @property
+    def explained(self) -> bool | None:
+        """Whether the uncertainties explain the difference; None where they are not known."""
+        return None if self.probability is None else self.probability >= _DOUBTFUL
+
+
+def compare_cameras(
+    a: Calibration, b: Calibration, camera: str | None = None, *, without_turn: bool = False
+) -> list[CameraComparison]:
+    """Compare the intrinsics of two calibrations, camera by camera; neither needs a field.
+
+    Args:
+        camera: this one alone, by its name in both; else all that both have, or the only one of each.
+        without_turn: take out the rotation that most directions agree on: another principal point looks much like a
+            camera that is turned.
+
+    Raises:
+        InputError: no camera that both have, or not the one named; images of other sizes.
+    """
+    pairs = [(name, name) for name in a.cameras if name in b.cameras]
+    if not pairs and len(a.cameras) == len(b.cameras) == 1:
+        pairs = [(next(iter(a.cameras)), next(iter(b.cameras)))]
+    pairs = [pair for pair in pairs if camera in (None, pair[0])]
+    if not pairs:
+        asked = "no camera" if camera is None else f"camera {camera!r}"
+        raise InputError(f"{asked} is in both calibrations: {_listed([*a.cameras])}, and {_listed([*b.cameras])}")
+    return [_camera_compared(a, b, *pair, without_turn) for pair in pairs]
+
+
+def _camera_compared(a: Calibration, b: Calibration, name: str, other: str, without_turn: bool) -> CameraComparison:
+    first, second = a.cameras[name], b.cameras[other]
+    if first.image_size != second.image_size:
+        sizes = " and ".join(f"{w} x {h} px" for w, h in (first.image_size, second.image_size))
+        raise InputError(f"camera {name!r}: its images are of {sizes}: calibrations of one size can be compared")
+    width, height = first.image_size
+    x, y = (np.linspace(0.0, n - 1.0, max(2, round(_COLUMNS * n / width))) for n in (width, height))
+    pixels = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    seen, also = first.rays(pixels), second.rays(pixels)
+    both = np.isfinite(seen[:, 0]) & np.isfinite(also[:, 0])
+    turn = _common_turn(seen[both], also[both]) if without_turn else np.eye(3)
+    turned = seen @ turn.T
+    angles = 2.0 * np.arcsin(np.clip(0.5 * np.linalg.norm(turned - also, axis=1), 0.0, 1.0))
+    grid = len(y), len(x)
+    return CameraComparison(
+        name,
+        (first.phi, second.phi),
+        x,
+        y,
+        (second.project(turned) - pixels).reshape(*grid, 2),
+        np.degrees(angles).reshape(grid),
+        float(np.degrees(np.linalg.norm(rotation_log(turn)))),
+        _intrinsics_probability(a, b, name) if name == other else None,
+    )
+
+
+def _common_turn(seen: Array, also: Array) -> Array:
+    """(3, 3) the rotation that most of the directions (N, 3) agree on: Cauchy's weights at the median, since lenses
+    differ most in corners that nobody observed.
+    """
+    turn = np.eye(3)
+    for _ in range(_ROUNDS):
+        away = np.linalg.norm(seen @ turn.T - also, axis=1)
+        weights = 1.0 / (1.0 + (away / max(float(np.median(away)), 1e-15)) ** 2)
+        turn = nearest_rotation((also * weights[:, None]).T @ seen)
+    return turn
+
+
+def _intrinsics_probability(a: Calibration, b: Calibration, camera: str) -> float | None:
+    if a.posterior is None or b.posterior is None:
+        return None
+    keys, others = ([key for key in c.uncertainty.posterior.keys if key[:2] == ("camera", camera)] for c in (a, b))
+    if set(keys) != set(others) or not keys:
+        return None
+    first, second = (Estimate({camera: c.cameras[camera]}, {}, {}, EXACT) for c in (a, b))
+    return _chance(a, b, keys, difference(second, first, keys))

@@ -117,7 +117,8 @@ def _moved_sights(plan: RefitPlan) -> list[Sights]:
     moved = {name: sight for name, sight in plan.sights.of_world.items() if name in plan.moved}
     for name in sorted(plan.moved - moved.keys()):
         raise DegenerateError(
-            f"station {name!r} sees nothing that lies in the world: observe lines or points of the field with it"
+            f"station {name!r} sees nothing that lies in the world: observe lines or points of the field with it "
+            "(`ceres-cal score` says how well boards alone agree with held intrinsics)"
         )
     return list(moved.values())
 

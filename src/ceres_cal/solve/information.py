@@ -180,13 +180,14 @@ class _Sums:
         Args:
             covariance: (S, 6, 6) of each pose with everything shared held. follows: (S, 6, K) less what V has for it.
         """
-        flat = follows.reshape(-1, len(lead))
+        rows = 6 * len(follows)
+        flat = follows.reshape(rows, len(lead))
         for kind, normal in normals.items():
             coupling = normal[:, -6:, :-6]
-            reduced = np.sum(normal[:, :-6, :-6], axis=0) - coupling.reshape(-1, len(lead)).T @ flat
+            reduced = np.sum(normal[:, :-6, :-6], axis=0) - coupling.reshape(rows, len(lead)).T @ flat
             if len(normals) > 1:  # of all kinds together the placements are at their best, not of each
                 left = coupling - normal[:, -6:, -6:] @ follows
-                reduced -= flat.T @ left.reshape(-1, len(lead))
+                reduced -= flat.T @ left.reshape(rows, len(lead))
             self._matrices[kind][np.ix_(lead, lead)] += reduced
             self._leverages[kind] += float(np.sum(normal[:, -6:, -6:] * covariance))
 

@@ -59,7 +59,7 @@ def initialise(observations: Observations, sights: Sights, options: Options) -> 
         cameras[name], phi_from[name] = start.camera, start.phi_from
         numbers.append(own[start.sights])
         poses.append(start.poses)
-    stations, placements = _chain_poses(observations, sights, np.concatenate(numbers), np.concatenate(poses))
+    stations, placements = chained_poses(observations, sights, np.concatenate(numbers), np.concatenate(poses))
     structure = make_structure(observations.targets, options.tolerances)
     return Start(Estimate(cameras, stations, placements, structure), phi_from)
 
@@ -199,14 +199,26 @@ def _fit_lens(blank: Lens, profile: RadialProfile, phi: float, reach_px: float, 
 # ---- stations and placements ----------------------------------------------------------------------------------------
 
 
-def _chain_poses(
-    observations: Observations, sights: Sights, numbers: Indices, poses: Array
+def chained_poses(
+    observations: Observations,
+    sights: Sights,
+    numbers: Indices,
+    poses: Array,
+    standing: Mapping[str, Station] | None = None,
 ) -> tuple[dict[str, Station], Poses]:
-    """Stations and placements from the poses (K, 3, 4) of sights: best-seen first, each one extending what is known."""
+    """Stations and placements from the poses (K, 3, 4) of sights: best-seen first, each one extending what is known.
+
+    Args:
+        numbers: (K,) of these sights. standing: stations whose place is known.
+
+    Raises:
+        DegenerateError: naming a sight that nothing places.
+    """
     sizes = np.diff(sights.point_bounds) + np.diff(sights.curve_bounds)
     order = np.argsort(-sizes[numbers], kind="stable")
     keys, seen = [sights.keys[i] for i in numbers[order]], poses[order]
-    stations = {name: np.eye(3, 4) for name in anchored_stations(observations)}
+    stations = {name: station.cam_from_world.matrix for name, station in (standing or {}).items()}
+    stations = stations or {name: np.eye(3, 4) for name in anchored_stations(observations)}
     placements: dict[str | None, Array] = {None: np.eye(3, 4)}
     known = -1
     while len(stations) + len(placements) > known:

@@ -65,7 +65,7 @@ def weak_axes(information: Information, estimate: Estimate, keys: Sequence[Key])
     Structure is not looked at, nor what is not known at all.
     """
     sizes, at = natural_sizes(estimate, keys), information.columns(keys)
-    plain = np.array([key.kind != "structure" for key in keys])
+    plain = np.array([key.kind != "structure" for key in keys], dtype=bool)
     scaled = information.spread.covariance[np.ix_(at, at)] / sizes[:, None] / sizes
     values, vectors = np.linalg.eigh(np.where(plain[:, None] & plain, scaled, 0.0))
     weak = values > BENDING**2

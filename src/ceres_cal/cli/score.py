@@ -1,0 +1,101 @@
+"""`ceres-cal score`: how well a calibration predicts new boards or fields, poses alone at their best."""
+
+from __future__ import annotations
+
+from argparse import ArgumentParser, Namespace
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
+
+from ceres_cal.cli.arguments import add_calibration
+from ceres_cal.cli.command import Answer, Command
+from ceres_cal.cli.inputs import read_calibration, read_observations, require_different
+from ceres_cal.cli.outputs import section
+
+if TYPE_CHECKING:
+    from ceres_cal.moves import Part, Score
+
+_MOST_VIEWS = 3  # shown
+
+
+def _add_arguments(parser: ArgumentParser) -> None:
+    add_calibration(parser)
+    add = parser.add_argument
+    add("observations", nargs="+", metavar="OBS", help="files of new observations (.json or .npz), taken together")
+    add(
+        "--hold-stations",
+        action="store_true",
+        help="stations stand where the calibration has them, boards alone are posed: tests the poses of a rig, too",
+    )
+    add("--loss", choices=("trivial", "huber", "soft_l1", "cauchy", "tukey"), help="default: the calibration's")
+    add(
+        "--reject-sigma",
+        type=float,
+        metavar="SIGMA",
+        help="observations farther off do not take part; default: the calibration's. inf keeps all, and with --loss "
+        "trivial the rms is the one that other programs state",
+    )
+
+
+def _run(args: Namespace) -> Answer:
+    require_different(args.observations)
+    from dataclasses import replace
+
+    from ceres_cal.moves import score
+
+    calibration = read_calibration(args)
+    asked = {name: value for name in ("loss", "reject_sigma") if (value := getattr(args, name)) is not None}
+    options = replace(calibration.options, **asked)
+    observations = read_observations(args.observations)
+    answer = score(calibration, observations, options=options, hold_stations=args.hold_stations)
+    return Answer(_data(answer), lambda: _text(answer))
+
+
+COMMANDS = (
+    Command(
+        "score",
+        "how well a calibration predicts new boards or fields: intrinsics held",
+        _add_arguments,
+        _run,
+        ("calibration.json new.json", "rig.json boards.json --hold-stations --loss trivial --reject-sigma inf"),
+    ),
+)
+
+
+def _data(answer: Score) -> dict[str, Any]:
+    return {
+        "fit": asdict(answer.fit),
+        "rms_px": answer.fit.rms_px,
+        "calibration_rms_px": answer.before.rms_px,
+        "noise_ratios": dict(zip(("points", "curves"), answer.noise_ratios, strict=True)),
+        "cameras": [asdict(part) for part in answer.cameras],
+        "views": [asdict(part) for part in answer.views],
+    }
+
+
+def _text(answer: Score) -> str:
+    ratios = [
+        f"noise of {kind} {ratio:.2f} times the calibration's"
+        for kind, ratio in zip(("points", "curves"), answer.noise_ratios, strict=True)
+        if ratio == ratio
+    ]
+    shown = [f"{part.name}: {_left(part)}" for part in answer.views[:_MOST_VIEWS]]
+    return "\n".join(
+        [
+            section("score", ["intrinsics held, poses alone solved for", *ratios]),
+            *(section("camera", [f"{part.name}: {_left(part)}"]) for part in answer.cameras),
+            section("worst", shown),
+        ]
+    )
+
+
+def _left(part: Part) -> str:
+    kinds = [
+        f"rms {rms:.4f} px over {count} {kind}"
+        for kind, count, rms in (
+            ("points", part.points, part.points_rms_px),
+            ("curve observations", part.curves, part.curves_rms_px),
+        )
+        if count
+    ]
+    out = f"; {part.outliers} taken out, {part.all_rms_px:.4f} px with them" if part.outliers else ""
+    return ", ".join(kinds or ["nothing took part"]) + out
