@@ -3,8 +3,8 @@
 All commands of a document (```console, after "$ ") and its Python (```python) run in the order in which they stand, one
 shell for all, in a copy of the sample data and scripts beside a .venv that leads to this interpreter. A command must
 end with 0. What stands below it is compared, where anything does, with what it prints: text as it is, whole numbers
-exactly (but of iterations), others to one unit of their last digit, as two machines agree to nine digits or so and may still round
-differently. --write puts what was printed in its place.
+exactly (but of iterations), others to one unit of their last digit, as two machines agree to nine digits or so and may
+still round differently. --write puts what was printed in its place.
 """
 
 from __future__ import annotations
