@@ -101,6 +101,7 @@ def test_help_lists_every_command(say: Say) -> None:
         "refit",
         "check",
         "compare",
+        "score",
         "locate",
         "project",
         "export",

@@ -34,7 +34,7 @@ class CameraFile(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
     phi: float
     principal_point: tuple[float, float]
     aspect: float = 1.0
-    skew: float = 0.0
+    skew: float | msgspec.UnsetType = msgspec.UNSET
     lens: LensFile
     camera_matrix: Matrix | msgspec.UnsetType = msgspec.UNSET
     """K, for other programs: phi, aspect, skew and principal point once more."""
@@ -50,7 +50,7 @@ class CameraFile(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
             phi=camera.phi,
             principal_point=centre,
             aspect=camera.aspect,
-            skew=camera.skew,
+            skew=camera.skew or msgspec.UNSET,
             lens=lens,
             camera_matrix=k,
         )
@@ -58,7 +58,7 @@ class CameraFile(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
     def camera(self) -> Camera:
         """The camera, at no particular pose; InputError where it is none."""
         lens = make_lens(self.lens.kind, self.lens.powers or (2, 3), self.lens.coefficients)
-        camera = Camera(self.image_size, self.phi, self.principal_point, lens, self.aspect, skew=self.skew)
+        camera = Camera(self.image_size, self.phi, self.principal_point, lens, self.aspect, skew=self.skew or 0.0)
         if self.camera_matrix and not np.allclose(camera.matrix, self.camera_matrix, rtol=1e-9):
             raise InputError("camera_matrix is another than that of phi, aspect, skew and principal_point: correct one")
         return camera
