@@ -28,7 +28,8 @@ _AT_REST, _AT_REST_AGAIN = 1e-2, 1e-5
 # Of a camera: with them it is known well enough to place all others; fewer cost another round, more cost time.
 # Nothing changes from half to double.
 _ENOUGH_PLACEMENTS = 20
-_ENOUGH_WITHOUT_FORMULA = 100  # of a lens that says nothing of where it was not seen
+# Of a lens that says nothing of where it was not seen; they are solved to the end, and tell how smooth it is.
+_ENOUGH_WITHOUT_FORMULA = 100
 _STILL = 0.05  # variances by which a lens that is as smooth as the data say stands off: no number is off by 0.23 sd
 _ROUGH = 1e-3  # relative change of the cost at which the first solve ends
 _MOST_REFINED = 3
@@ -147,7 +148,12 @@ class _Rounds:
                 "the observations fix no pose that could show them: add points or lines of the targets"
             )
         few = problem.of_sights(_evenly(problem))
-        solution = solve(few, estimate, self._progress, precision=_ROUGH, is_near=False)
+        if problem.options.blank_lens.roughness and len(few.sights) < len(problem.sights):
+            end = solve_robustly(few, self._observations, estimate, self._usual, self._progress)
+            self._problem = replace(self._problem, smoothness=end.problem.smoothness)
+            solution = end.solution
+        else:
+            solution = solve(few, estimate, self._progress, precision=_ROUGH, is_near=False)
         if len(few.sights) < len(problem.sights):
             solution = replace(solution, estimate=with_placements_at_best(problem, solution.estimate))
         return self._judged(solution, there, rounds)

@@ -1,9 +1,9 @@
 """How smooth a lens without a formula is: the variance of its roughness, by the likelihood of the data (MacKay 1992).
 
-Of a quadratic form R with prior R / sigma^2, and A what the data say of its numbers c, sigma^2 = c^T R c / gamma with gamma =
-rank - tr((A + R / sigma^2)^-1 R) / sigma^2, the number of directions that the data determine: the fixed point is the
-restricted maximum of the likelihood. One more direction of the least size counts along (an inverse gamma distribution
-beforehand), so that few data do not make a lens perfect.
+Of a quadratic form R with prior R / sigma^2, and A what the data say of its numbers c, sigma^2 = c^T R c / gamma with
+gamma = rank - tr((A + R / sigma^2)^-1 R) / sigma^2, the number of directions that the data determine: the fixed point
+is the restricted maximum of the likelihood. One more direction of the least size counts along (an inverse gamma
+distribution beforehand), so that few data do not make a lens perfect.
 """
 
 from __future__ import annotations
@@ -89,4 +89,6 @@ def _sigmas(
 def _inverse(matrix: Array) -> Array:
     """Of a symmetric matrix at unit diagonal."""
     scale = 1.0 / np.sqrt(np.maximum(np.diagonal(matrix), 1e-300))
-    return np.asarray(np.linalg.pinv(matrix * scale[:, None] * scale, rcond=1e-13, hermitian=True) * scale[:, None] * scale)
+    return np.asarray(
+        np.linalg.pinv(matrix * scale[:, None] * scale, rcond=1e-13, hermitian=True) * scale[:, None] * scale
+    )
