@@ -25,7 +25,7 @@ LENSES = tuple(_LENSES)
 _RATIONAL = (0.31, -0.05, 4e-4, -3e-4, 0.01, 0.58, 0.02, 0.004, 9e-4, -4e-4, -7e-4, 3e-4)
 # rim, displacements along the radius from the axis outwards, and across it, px
 _SPLINE = (
-    560.0,
+    620.0,
     *(-1.2, -4.0, -9.0, -15.0, -21.0, -26.0, -29.0, -30.0, -29.5, -28.0, -27.0),
     *(0.9, -1.3, 0.4, 0.7) * 6,
 )
