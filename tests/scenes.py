@@ -8,7 +8,7 @@ from functools import partial
 
 from ceres_cal.base.transforms import Pose
 from ceres_cal.scene.camera import Camera
-from ceres_cal.scene.lens import Brown, KannalaBrandt, Lens, Radial
+from ceres_cal.scene.lens import Brown, KannalaBrandt, Lens, Radial, Spline
 from ceres_cal.scene.targets import Segment, Target, checkerboard, custom, rings, ssl_field
 from ceres_cal.simulate import Held, Scene, Station, board_scene, field_scene, join, overhead_pose, rings_scene
 
@@ -23,6 +23,12 @@ _LENSES: dict[str, tuple[float, Lens, float]] = {
 }
 LENSES = tuple(_LENSES)
 _RATIONAL = (0.31, -0.05, 4e-4, -3e-4, 0.01, 0.58, 0.02, 0.004, 9e-4, -4e-4, -7e-4, 3e-4)
+# rim, displacements along the radius from the axis outwards, and across it, px
+_SPLINE = (
+    620.0,
+    *(-1.2, -4.0, -9.0, -15.0, -21.0, -26.0, -29.0, -30.0, -29.5, -28.0, -27.0),
+    *(0.9, -1.3, 0.4, 0.7) * 6,
+)
 _MORE: dict[str, tuple[float, Lens, float]] = {
     "brown-all": (825.0, Brown(_RATIONAL, ("rational", "prism")), 5.2),
     "brown-rational": (825.0, Brown(_RATIONAL[:8], ("rational",)), 5.2),
@@ -31,6 +37,7 @@ _MORE: dict[str, tuple[float, Lens, float]] = {
         KannalaBrandt((-0.012, 0.004, -0.003, 0.0006, 8e-4, -5e-4), ("tangential",)),
         3.2,
     ),
+    "spline": (825.0, Spline(_SPLINE, (2, 3, 4)), 5.2),
 }
 EVERY_LENS = (*_LENSES, *_MORE)
 """Also with terms that a lens has only where they are asked for."""

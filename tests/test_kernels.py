@@ -22,7 +22,7 @@ from ceres_cal.kernels import CurveColumns, Loss, PointColumns, Unknowns
 from ceres_cal.kernels.lenses import prepared
 from ceres_cal.kernels.sight import normal_equations as sum_up
 from ceres_cal.kernels.sight import order_of_rows, working_space
-from ceres_cal.model.parameters import intrinsics_vector, with_intrinsics
+from ceres_cal.model.parameters import intrinsic_names, intrinsics_vector, with_intrinsics
 from ceres_cal.model.residuals import camera_optics
 from ceres_cal.model.structure import EXACT
 from ceres_cal.scene.camera import Camera
@@ -276,7 +276,9 @@ def test_every_residual_knows_its_derivatives(lens: str) -> None:
 
     steps = np.concatenate([intrinsics_steps(camera), POSE_STEPS])
     error = np.abs(found - np.vstack([derivative(project, steps), derivative(distance, steps)]))
-    error /= np.max(np.abs(found), axis=0)
+    error /= np.maximum(np.max(np.abs(found), axis=0), 1e-12)  # nothing is seen by some of a spline's numbers
+    moved_once = [intrinsic_names(camera.lens).index(name) for name in camera.lens.set_at_start]
+    error = np.delete(error, moved_once, axis=1)  # its knots: differences across them are not so smooth
     points = 2 * len(seen[0].places)
     assert np.max(error[:points]) < 5e-8  # 6e-9 measured
     assert np.max(error[points:]) < 1e-7  # 1e-8 measured
@@ -462,7 +464,7 @@ def assert_same_problem(block: Block, problem: tuple[float, Array, Array]) -> No
     assert np.max(np.abs(found_step - step) * size) < 1e-6 * np.max(np.abs(step) * size)  # 1e-7 measured
 
 
-@each_lens
+@pytest.mark.parametrize("lens", scenes.LENSES)
 @each_loss
 def test_block_is_the_uncompressed_problem(lens: str, loss: str) -> None:
     camera, seen = looked_at(lens)

@@ -58,8 +58,8 @@ def _add_arguments(parser: ArgumentParser) -> None:
 def _add_camera(parser: ArgumentParser) -> None:
     add = parser.add_argument_group("the camera").add_argument
     kinds = (
-        "radial (the paper's), brown (OpenCV's), kannala-brandt (its fisheye), ...: `--lens ?` names all; auto: the "
-        "simplest of all that predicts views as well as any other"
+        "radial (the paper's), brown (OpenCV's), kannala-brandt (its fisheye), spline (no formula), ...: `--lens ?` "
+        "names all; auto: the simplest of all that predicts views as well as any other"
     )
     add("--lens", type=_lens_kind, metavar="KIND", default=_DEFAULT_LENS, help=kinds)
     add("--powers", metavar="2,3", help="powers of a lens that leaves the choice; default: 2,3, the paper's")

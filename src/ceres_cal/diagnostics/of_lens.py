@@ -132,9 +132,10 @@ class Decentring(ScoreTest):
         )
 
 
-def _tangential(lens: type[Lens] | Lens) -> tuple[str, ...]:
+def _tangential(lens: Lens) -> tuple[str, ...]:
     """Names of Brown's decentring coefficients, which it has or may have."""
-    return lens.decentring or lens.more_terms.get("tangential", ())
+    own = tuple(name for name in ("p1", "p2") if name in lens.names)
+    return own or lens.more_terms.get("tangential", ())
 
 
 def _decentring_columns(case: Case, camera: str) -> Array:

@@ -227,7 +227,7 @@ class Layout:
 def make_layout(observations: Observations, options: Options) -> Layout:
     """The layout of a calibration: everything free but what the options fix and what nothing can tell."""
     names = intrinsic_names(options.blank_lens)
-    held = set(options.fixed)
+    held = {*options.fixed, *options.blank_lens.set_at_start}
     if not options.free_principal_point:
         held |= {"cx", "cy"}
     if not options.free_aspect:

@@ -20,7 +20,7 @@ Matrix = tuple[Vector, Vector, Vector]
 
 
 class LensFile(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True):
-    """A lens; only `radial` has powers. Which terms it has, its coefficients' names say."""
+    """A lens; only `radial` and `spline` have powers. Which terms it has, its coefficients' names say."""
 
     kind: str
     powers: tuple[int, ...] | None = None

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
+import numpy as np
+
 from ceres_cal.base.arrays import Array, Indices, Mask
+from ceres_cal.model.information import Information
+from ceres_cal.model.keys import Key
 from ceres_cal.model.parameters import Estimate, Layout, Options
 from ceres_cal.model.priors import GaussianPrior
-from ceres_cal.model.quantities import free_keys
+from ceres_cal.model.quantities import free_keys, intrinsic_keys
 from ceres_cal.observations.sights import Sights
 
 _CONVEX = ("trivial", "huber", "soft_l1")
@@ -46,6 +51,7 @@ class Problem:
     Attributes:
         sights: the observations that take part. layout: the numbers that are free.
         priors: all that is known beforehand; of numbers that are held they say nothing.
+        smoothness: camera -> standard deviations (px) of its lens's `roughness`; its loose ones where it is not named.
         weighting: of the observations. options: iterations and threads.
         feet: (M,) where on its track each curve observation's foot is sought first (see `residuals`), by row.
     """
@@ -56,6 +62,7 @@ class Problem:
     weighting: Weighting = field(default_factory=Weighting)
     options: Options = field(default_factory=Options)
     feet: Array | None = None
+    smoothness: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
 
     @cached_property
     def private(self) -> frozenset[str | None]:
@@ -63,12 +70,29 @@ class Problem:
         return self.layout.placements & self.sights.seen_once
 
     def priors_at(self, estimate: Estimate) -> list[GaussianPrior]:
+        """What the priors and the smoothness of lenses say of numbers that are free."""
+        return [*self.stated_at(estimate), *self._smooth_at(estimate)]
+
+    def stated_at(self, estimate: Estimate) -> list[GaussianPrior]:
         """What the priors say of numbers that are free, with those that are held at their mean."""
         if not self.priors:
             return []
         free = set(free_keys(estimate, self.layout, self.layout.placements))  # of placements nothing is known before
         restricted = [prior.given(free) for prior in self.priors]
         return [prior for prior in restricted if prior.keys]
+
+    def _smooth_at(self, estimate: Estimate) -> Iterator[GaussianPrior]:
+        """What its smoothness says of each lens, where no posterior says so already."""
+        for name, camera in estimate.cameras.items():
+            keys = {key.quantity: key for key in intrinsic_keys(name, camera.lens)}
+            free = {key for number, key in enumerate(keys.values()) if number in self.layout.free[name]}
+            forms = camera.lens.roughness
+            sigmas = self.smoothness.get(name, tuple(form.loose for form in forms))
+            for form, sigma in zip(forms, sigmas, strict=True):
+                own = tuple(keys[quantity] for quantity in form.names)
+                if free & set(own) and not any(_determines(prior, own) for prior in self.priors):
+                    whole = GaussianPrior(Information(own, form.matrix / sigma**2), np.zeros(len(own)))
+                    yield whole.given(free)
 
     def unknowns(self, estimate: Estimate) -> int:
         """Number of free numbers that use up observations: what is known beforehand does not."""
@@ -91,3 +115,8 @@ class Problem:
     def holding(self, camera: str, number: int) -> Problem:
         """The problem with one of a camera's intrinsics held, by its place in the solver's vector."""
         return replace(self, layout=self.layout.holding(camera, number))
+
+
+def _determines(prior: GaussianPrior, keys: Collection[Key]) -> bool:
+    """Whether it says something of every direction of some numbers, as a posterior does."""
+    return set(keys) <= set(prior.keys) and prior.information.given(tuple(keys)).known_rank == len(keys)

@@ -19,6 +19,7 @@ from ceres_cal.solve.lost import with_lost_boards_posed
 from ceres_cal.solve.mirrored import without_mirrored_poses
 from ceres_cal.solve.noise import Inliers, Redundancy, judge, visible_from
 from ceres_cal.solve.problem import Problem, Weighting
+from ceres_cal.solve.smoothness import with_smoothness
 
 _MOST_ROUNDS = 15
 # Relative change of a noise scale that is no change. From half to double the answer moves by under 1 % of its error;
@@ -27,6 +28,9 @@ _AT_REST, _AT_REST_AGAIN = 1e-2, 1e-5
 # Of a camera: with them it is known well enough to place all others; fewer cost another round, more cost time.
 # Nothing changes from half to double.
 _ENOUGH_PLACEMENTS = 20
+# Of a lens that says nothing of where it was not seen; they are solved to the end, and tell how smooth it is.
+_ENOUGH_WITHOUT_FORMULA = 100
+_STILL = 0.05  # variances by which a lens that is as smooth as the data say stands off: no number is off by 0.23 sd
 _ROUGH = 1e-3  # relative change of the cost at which the first solve ends
 _MOST_REFINED = 3
 # Share of the residuals' scale: a rough solve that leaves less is followed by another one at the new scale. A line that
@@ -110,6 +114,7 @@ class _Rounds:
     ) -> None:
         self._problem, self._observations, self._usual, self._progress = problem, observations, usual, progress
         self._redundancy: Redundancy | None = None
+        self._moving = 0.0
         self._visible: Inliers
         self.no_change = _AT_REST if usual is None else _AT_REST_AGAIN
 
@@ -126,7 +131,9 @@ class _Rounds:
                 break
             state = self._rough(state.solution.estimate, state.residuals, visible, state.rounds + 1)
         # Of one kind of observations without priors the leverages add up to the count.
-        mixed = bool(self._problem.priors) or all(kind.equations for kind in self._problem.sights.by_kind)
+        mixed = bool(self._problem.priors_at(state.solution.estimate)) or all(
+            kind.equations for kind in self._problem.sights.by_kind
+        )
         return self._by_leverages(state)[0] if mixed and len(state.problem.sights) else state
 
     def _rough(self, estimate: Estimate, there: Residuals, visible: Inliers, rounds: int) -> RobustSolution:
@@ -141,7 +148,12 @@ class _Rounds:
                 "the observations fix no pose that could show them: add points or lines of the targets"
             )
         few = problem.of_sights(_evenly(problem))
-        solution = solve(few, estimate, self._progress, precision=_ROUGH, is_near=False)
+        if problem.options.blank_lens.roughness and len(few.sights) < len(problem.sights):
+            end = solve_robustly(few, self._observations, estimate, self._usual, self._progress)
+            self._problem = replace(self._problem, smoothness=end.problem.smoothness)
+            solution = end.solution
+        else:
+            solution = solve(few, estimate, self._progress, precision=_ROUGH, is_near=False)
         if len(few.sights) < len(problem.sights):
             solution = replace(solution, estimate=with_placements_at_best(problem, solution.estimate))
         return self._judged(solution, there, rounds)
@@ -166,18 +178,20 @@ class _Rounds:
         return state, lost + turned, undecided
 
     def with_leverages(self, state: RobustSolution) -> RobustSolution:
-        """The state with what its problem says there, where the noise is judged no other by the leverages; else judged
-        by them, for another round.
+        """The state with what its problem says there, where the noise is judged no other by the leverages, and nothing
+        moves by how smooth lenses are; else judged by them, for another round.
         """
         anew, reduced = self._by_leverages(state)
-        if not anew.inliers.same_as(state.inliers, self.no_change):
+        if self._moving > _STILL or not anew.inliers.same_as(state.inliers, self.no_change):
             return anew
-        degrees = anew.inliers.degrees_of_freedom
-        return replace(state, inliers=replace(state.inliers, degrees_of_freedom=degrees), reduced=reduced)
+        problem = replace(state.problem, smoothness=self._problem.smoothness)
+        inliers = replace(state.inliers, degrees_of_freedom=anew.inliers.degrees_of_freedom)
+        return replace(state, problem=problem, inliers=inliers, reduced=reduced)
 
     def _by_leverages(self, state: RobustSolution) -> tuple[RobustSolution, ReducedInformation]:
         """The state judged by the leverages there, and what they were taken from."""
         reduced = information(state.problem, state.solution.estimate)
+        self._problem, reduced, self._moving = with_smoothness(self._problem, state.solution.estimate, reduced)
         self._redundancy = Redundancy.by_leverage(state.problem.sights, reduced.leverages)
         return self._weighted(state.solution, state.residuals, state.rounds), reduced
 
@@ -204,6 +218,7 @@ def _evenly(problem: Problem) -> Indices:
     chosen: list[int] = []
     for camera in problem.sights.cameras:
         boards = problem.sights.numbers(camera, placements=private).tolist()
-        chosen += boards[:: max(1, len(boards) // _ENOUGH_PLACEMENTS)]
+        enough = _ENOUGH_WITHOUT_FORMULA if problem.options.blank_lens.roughness else _ENOUGH_PLACEMENTS
+        chosen += boards[:: max(1, len(boards) // enough)]
         chosen += set(problem.sights.numbers(camera).tolist()) - set(boards)
     return np.array(sorted(chosen), dtype=np.int64)

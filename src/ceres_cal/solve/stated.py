@@ -104,7 +104,7 @@ def is_plain(prior: GaussianPrior) -> bool:
 
 def statements(problem: Problem, observations: Observations, estimate: Estimate) -> Iterator[Statement]:
     """Everything stated of a problem's numbers, and what is held by name."""
-    yield from grouped(problem.priors_at(estimate))
+    yield from grouped(problem.stated_at(estimate))
     yield from _held(problem.options, observations, estimate)
 
 

@@ -29,6 +29,7 @@ USUAL_PHI, USUAL_PHI_FACTOR = 1.1, 1.4
 """In half image diagonals: 85 degrees across the diagonal; 66 to 104 within the factor either way, a standard deviation
 of log phi. It decides where the image cannot, so it is that of usual cameras over a field or before a board."""
 _ENOUGH_VIEWS = 50  # for phi
+_MARGIN = 1.15  # of what a start takes for the edge of the picture: its profile is least sure there
 _GRID = np.geomspace(*PHI_RANGE, 120)
 _NEAR = np.geomspace(1.0 / 1.04, 1.04, 13)  # a grid step to either side
 
@@ -80,7 +81,10 @@ def _start_camera(blank: Camera, sights: Sights, options: Options, priors: Seque
     unit = unit_px(blank)
     profile, homographies = profile_and_homographies(sights, unit)
     phi, phi_from = _choose_phi(sights, homographies, unit, options, priors)
-    lens = _fit_lens(blank.lens, profile, phi, sights.reach_px, options.fixed)
+    edge = profile.lift(np.array([[sights.reach_px, 0.0]]))[0, 2]
+    beyond = _MARGIN * max(1.0, blank.corner_radius / sights.reach_px)
+    spanning = blank.lens.spanning(float(np.arctan2(sights.reach_px, phi * edge)), phi, beyond)
+    lens = _fit_lens(spanning, profile, phi, sights.reach_px, options.fixed)
     camera = replace(blank, phi=phi, lens=lens)
     return _CameraStart(camera, phi_from, homographies.sights, _poses_at(homographies, phi))
 

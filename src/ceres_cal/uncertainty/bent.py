@@ -62,10 +62,12 @@ def weak_axes(information: Information, estimate: Estimate, keys: Sequence[Key])
     """(K, A) directions of some of the keys whose sigma in natural sizes is above BENDING, one sigma long, in the units
     of the keys.
 
-    Structure is not looked at, nor what is not known at all.
+    Structure is not looked at, nor what is not known at all, nor a lens without a formula, which is a sum of what its
+    numbers do.
     """
     sizes, at = natural_sizes(estimate, keys), information.columns(keys)
-    plain = np.array([key.kind != "structure" for key in keys], dtype=bool)
+    sums = {(name, q) for name, one in estimate.cameras.items() for form in one.lens.roughness for q in form.names}
+    plain = np.array([key.kind != "structure" and key[1:3] not in sums for key in keys], dtype=bool)
     scaled = information.spread.covariance[np.ix_(at, at)] / sizes[:, None] / sizes
     values, vectors = np.linalg.eigh(np.where(plain[:, None] & plain, scaled, 0.0))
     weak = values > BENDING**2

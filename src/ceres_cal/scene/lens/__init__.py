@@ -4,9 +4,11 @@ from ceres_cal.scene.lens.base import LENSES, Lens, lens_class, make_lens, regis
 from ceres_cal.scene.lens.brown import Brown
 from ceres_cal.scene.lens.kannala_brandt import KannalaBrandt
 from ceres_cal.scene.lens.radial import Radial
+from ceres_cal.scene.lens.spline import Spline
 
-__all__ = ["LENSES", "Brown", "KannalaBrandt", "Lens", "Radial", "lens_class", "make_lens", "register"]
+__all__ = ["LENSES", "Brown", "KannalaBrandt", "Lens", "Radial", "Spline", "lens_class", "make_lens", "register"]
 
 register(Radial)
 register(Brown)
 register(KannalaBrandt)
+register(Spline)

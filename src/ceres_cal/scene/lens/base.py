@@ -49,6 +49,21 @@ def unit_rays(across: Array, depth: Array | float) -> Array:
     return np.asarray(rays / np.hypot(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2])[:, None])
 
 
+@dataclass(frozen=True, eq=False)
+class Roughness:
+    """A quadratic form of some coefficients that is small where the lens is smooth.
+
+    Attributes:
+        names: of the coefficients. matrix: (K, K); the form over a variance, which the data tell, is prior information.
+        loose, least: standard deviations, px: before the data have spoken, and what they cannot talk below.
+    """
+
+    names: tuple[str, ...]
+    matrix: Array
+    loose: float
+    least: float
+
+
 @dataclass(frozen=True)
 class Lens(ABC):
     """A lens model with its coefficients. A kind of its own is a subclass under `register`: nothing else is to be told.
@@ -62,6 +77,7 @@ class Lens(ABC):
         trial_powers: of the kinds that leave the choice of powers: those worth a trial, the plainest first.
         missing_powers: of the radius that a diagnosis tries, lowest first.
         more_terms: what it may have besides, by name, with the coefficients of each.
+        set_at_start: names of numbers that say where the model is defined: they are chosen, not solved for.
         work_rows: how many numbers per observation `distort_chunk` keeps for `differentiate_chunk`.
     """
 
@@ -74,6 +90,7 @@ class Lens(ABC):
     missing_powers: ClassVar[tuple[int, ...]] = (3, 5, 7, 9, 11)
     more_terms: ClassVar[Mapping[str, tuple[str, ...]]] = MappingProxyType({})
     work_rows: ClassVar[int] = 5
+    set_at_start: ClassVar[tuple[str, ...]] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "values", tuple(float(v) for v in self.values))
@@ -186,6 +203,15 @@ class Lens(ABC):
         """The size of each coefficient that moves a pixel `unit_px` from the middle by as much."""
         radius = unit_px if self.acts_on_pixels else unit_px / phi
         return [radius ** (1 - order) for order in self.orders]
+
+    def spanning(self, angle: float, phi: float, beyond: float) -> Lens:
+        """The model made for a picture that is seen up to an angle, and `beyond` times as far in pixels."""
+        return self
+
+    @property
+    def roughness(self) -> tuple[Roughness, ...]:
+        """What is small of a smooth lens; nothing where a formula is smooth by itself."""
+        return ()
 
     def start_equations(self, measured: Array, ideal: Array, angle: Array, phi: float) -> LinearEquations:
         """Columns by coefficient name and the right side of equations that are linear in the coefficients.

@@ -17,17 +17,21 @@ from ceres_cal.scene.lens.polynomials import STEPS, Profile, Ratio, invert_incre
 
 
 class Planar(Lens):
-    """A lens by its map of a plane, in units of phi."""
+    """A lens by its map of a plane, in units of its own."""
+
+    def _unit(self, phi: float) -> float:
+        """How many pixels a unit of the plane is."""
+        return phi
 
     @staticmethod
     @abstractmethod
     def _flat(rays: Array) -> Array:
-        """Rays (N, 3) -> points (N, 2) of the plane; NaN where a ray has none."""
+        """Rays (N, 3) -> points (N, 2) of the plane at focal length 1; NaN where a ray has none."""
 
     @staticmethod
     @abstractmethod
     def _lifted(flat: Array) -> Array:
-        """Points (N, 2) of the plane -> rays (N, 3) of unit length."""
+        """Points (N, 2) of the plane at focal length 1 -> rays (N, 3) of unit length."""
 
     @abstractmethod
     def _map(self, flat: Array) -> Array:
@@ -45,20 +49,18 @@ class Planar(Lens):
     @property
     @abstractmethod
     def _profile(self) -> Profile:
-        """The map along the radius, in the direction in which it grows least.
-
-        While it grows, the symmetric part of the map's derivative is positive definite in every direction: no two
-        points have one image.
-        """
+        """The map along the radius, from which its inverse starts."""
 
     @cached_property
     def _limit(self) -> float:
-        """Where that map stops growing; infinity where it never does."""
+        """The radius up to which the symmetric part of the map's derivative is positive definite in every direction, so
+        that no two points have one image: where the profile stops growing, if it is that of the worst direction.
+        """
         return self._profile.limit
 
     @cached_property
     def _rim(self) -> float:
-        """The map's value at its limit."""
+        """Where the map ends, in the direction in which that is nearest."""
         return float(self._profile.value(np.array(self._limit))) if np.isfinite(self._limit) else self._limit
 
     def _within(self, flat: Array) -> Array:
@@ -66,16 +68,21 @@ class Planar(Lens):
         return np.where(np.hypot(flat[:, :1], flat[:, 1:]) <= self._limit, flat, np.nan)
 
     def _distort(self, rays: Array, phi: float) -> Array:
-        return np.asarray(phi * self._map(self._within(self._flat(rays))))
+        unit = self._unit(phi)
+        return np.asarray(unit * self._map(self._within(self._flat(rays) * (phi / unit))))
 
     def _undistort(self, offsets: Array, phi: float) -> Array:
-        measured = offsets / phi
+        unit = self._unit(phi)
+        measured = offsets / unit
         radius = np.hypot(measured[:, 0], measured[:, 1])
-        # Other directions reach farther than the worst: from beyond its rim, start just inside.
-        target = radius if self._is_round else np.minimum(radius, self._rim * (1.0 - 1e-6))
-        start = invert_increasing(self._profile, target)
+        # Other directions may reach farther than that of the profile: from beyond its rim, start just inside.
+        end = self._profile.limit
+        rim = float(self._profile.value(np.array(end))) if np.isfinite(end) else end
+        start = invert_increasing(self._profile, radius if self._is_round else np.minimum(radius, rim * (1.0 - 1e-6)))
         flat = measured * np.where(radius > 0.0, start / radius, 1.0)[:, None]
-        return self._lifted(flat if self._is_round else self._within(self._newton(flat, measured)))
+        if not self._is_round:
+            flat = self._within(self._newton(flat, measured))
+        return self._lifted(flat * (unit / phi))
 
     def _newton(self, start: Array, measured: Array) -> Array:
         """Points (N, 2) whose image is `measured`; NaN where Newton's method does not get there."""
@@ -95,7 +102,7 @@ class Planar(Lens):
         return np.where(solved[:, None], flat, np.nan)
 
     def monotone_radius(self, phi: float) -> float:
-        return phi * self._rim
+        return self._unit(phi) * self._rim
 
 
 class Decentred(Planar):

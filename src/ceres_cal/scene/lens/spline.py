@@ -1,0 +1,247 @@
+"""A lens without a formula: a smooth profile along the radius and a little across it, as rough as the data say."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cache, cached_property
+from typing import ClassVar
+
+import numpy as np
+
+from ceres_cal.base.arrays import Array
+from ceres_cal.base.errors import InputError
+from ceres_cal.scene.lens import spline_kernel
+from ceres_cal.scene.lens.b_splines import COUNT, Growth, bending, first_fall, pieces, profile_columns
+from ceres_cal.scene.lens.base import LinearEquations, Roughness
+from ceres_cal.scene.lens.planar import Planar
+from ceres_cal.scene.lens.spline_kernel import DEGREE, INTERVALS, MOST, TINY, WORK_ROWS
+
+_CONRADY = 3  # terms of the decentring
+_TURNS = 48  # directions, between which nothing turns
+_START_WEIGHT = 1e-4  # of the roughness of a start beside its equations
+# Standard deviations before the data have spoken, in rims: loose, so that a first solve is not held by them. Least
+# ones: what usual lenses have, halved by each power, so that data that cannot tell do not take a lens for perfect.
+_LOOSE, _LOOSE_ACROSS, _LEAST, _LEAST_ACROSS = 1000.0, 1e-2, 0.1, 3e-3
+
+
+@dataclass(frozen=True)
+class _Monomial:
+    """weight c q^m conj(q)^n of the complex place q, or conj(c) for c; c has its real part at `name`."""
+
+    names: tuple[str, str]
+    turned: bool
+    m: int
+    n: int
+    weight: float
+
+
+@cache
+def _monomials(powers: tuple[int, ...]) -> tuple[_Monomial, ...]:
+    """What displaces by these powers of the radius, but for what the profile and the camera do.
+
+    Of power 2 there are 3 complex terms. Where nothing else bends, q^2 + q conj(q) is what a turn of the camera does
+    beside a shift of its principal point: it is left out, and Brown's decentring 2 q conj(q) c + q^2 conj(c) stays,
+    with Conrady's further terms, |q|^2 and |q|^4 times as large. Of odd powers q |q|^2k is along the radius, or a
+    twist, which no lens has.
+    """
+    every = []
+    for power in powers:
+        for k in range(_CONRADY if power == 2 else 0):
+            names = (f"p{2 * k + 2}", f"p{2 * k + 1}")
+            every.append(_Monomial(names, False, k + 1, k + 1, 2.0 / 3.0))
+            every.append(_Monomial(names, True, k + 2, k, 1.0 / 3.0))
+        for m in range(power, -1, -1):
+            n = power - m
+            if m - n != 1 and (power, n) not in ((2, 0), (2, 1)):
+                every.append(_Monomial((f"c{m}{n}", f"d{m}{n}"), False, m, n, 1.0))
+    return tuple(every)
+
+
+@dataclass(frozen=True)
+class Spline(Planar):
+    """A quintic spline along the radius and polynomials across it.
+
+    The ideal place q is phi 2 tan(angle / 2) over `rim`, the radius (px) that the knots go up to, set at the start; it
+    is measured at rim q + G(|q|) q / |q| + sum c q^m conj(q)^n, all coefficients in px. G has value and slope 0 at the
+    axis, so that phi is the focal length there. The powers are those of the displacements across.
+    """
+
+    values: tuple[float, ...] = ()
+    powers: tuple[int, ...] = (2, 3)
+    kind: ClassVar[str] = "spline"
+    acts_on_pixels: ClassVar[bool] = True
+    trial_powers: ClassVar[tuple[tuple[int, ...], ...]] = ((2, 3), (2, 3, 4, 5))
+    missing_powers: ClassVar[tuple[int, ...]] = ()
+    set_at_start: ClassVar[tuple[str, ...]] = ("rim",)
+    work_rows: ClassVar[int] = WORK_ROWS
+
+    def __post_init__(self) -> None:
+        powers = tuple(int(p) for p in self.powers)
+        if len(set(powers)) != len(powers) or powers != tuple(self.powers) or not all(2 <= p <= MOST for p in powers):
+            raise InputError(
+                f"powers of the spline lens must be different whole numbers from 2 to {MOST}, not {powers}"
+            )
+        object.__setattr__(self, "powers", powers)
+        object.__setattr__(self, "values", tuple(self.values) or (0.0,) * len(self.names))
+        super().__post_init__()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        across = dict.fromkeys(name for one in _monomials(self.powers) for name in one.names)
+        return ("rim", *(f"g{k}" for k in range(1, COUNT + 1)), *across)
+
+    @property
+    def orders(self) -> tuple[int, ...]:
+        return (0,) * len(self.names)
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        return ("px",) * len(self.names)
+
+    @classmethod
+    def blank(cls, powers: Sequence[int]) -> Spline:
+        return cls((), tuple(powers))
+
+    @property
+    def formula(self) -> str:
+        return "r = R + G(R) along the radius, R = 2 phi tan(angle / 2), and polynomials across it"
+
+    @property
+    def note(self) -> str:
+        return "g1, g2, ... are displacements (px) along the radius from the axis to rim, the others across it at rim"
+
+    def scales(self, unit_px: float) -> Array:
+        return np.full(len(self.names), 1.0 / unit_px)
+
+    def natural_sizes(self, phi: float, unit_px: float) -> list[float]:
+        return [unit_px] * len(self.names)
+
+    # ---- its start and its roughness ---------------------------------------------------------------------------------
+
+    def spanning(self, angle: float, phi: float, beyond: float) -> Spline:
+        rim = 2.0 * phi * np.tan(0.5 * angle) * beyond
+        return self if self.values[0] > 0.0 else replace(self, values=(float(rim), *self.values[1:]))
+
+    def start_equations(self, measured: Array, ideal: Array, angle: Array, phi: float) -> LinearEquations:
+        rim = self._rim_px
+        u = 2.0 * phi * np.tan(0.5 * angle) / rim
+        sizes, directions = np.linalg.eigh(bending())
+        rough = directions * np.sqrt(np.maximum(sizes, 0.0)) * _START_WEIGHT
+        rows = np.vstack([profile_columns(np.nan_to_num(u)), rough.T])
+        return {f"g{k + 1}": rows[:, k] for k in range(COUNT)}, np.append(measured - rim * u, np.zeros(COUNT))
+
+    @property
+    def roughness(self) -> tuple[Roughness, ...]:
+        rim, names = self._rim_px, self.names
+        along = Roughness(names[1 : 1 + COUNT], bending(), _LOOSE * rim, _LEAST * rim)
+        across = []
+        for power in self.powers:
+            own = tuple(dict.fromkeys(n for one in _monomials((power,)) for n in one.names))
+            least = _LEAST_ACROSS * rim / 2.0 ** (power - 2)
+            across.append(Roughness(own, np.eye(len(own)), _LOOSE_ACROSS * rim, least))
+        return (along, *across)
+
+    # ---- in arrays ---------------------------------------------------------------------------------------------------
+
+    @property
+    def _rim_px(self) -> float:
+        return self.values[0] if self.values[0] > 0.0 else 1.0
+
+    def _unit(self, phi: float) -> float:
+        return self._rim_px
+
+    @staticmethod
+    def _flat(rays: Array) -> Array:
+        length = np.sqrt(np.sum(rays * rays, axis=1))
+        depth = length + rays[:, 2]
+        return np.asarray(2.0 * rays[:, :2] / np.where(depth > 1e-12 * length, depth, np.nan)[:, None])
+
+    @staticmethod
+    def _lifted(flat: Array) -> Array:
+        quarter = 0.25 * np.sum(flat * flat, axis=1)
+        return np.asarray(np.column_stack([flat, 1.0 - quarter]) / (1.0 + quarter)[:, None])
+
+    @property
+    def _along(self) -> Array:
+        """The profile's coefficients in rims."""
+        return np.array(self.values[1 : 1 + COUNT]) / self._rim_px
+
+    @cached_property
+    def _across(self) -> list[tuple[_Monomial, complex]]:
+        named = self.coefficients
+        both = [(one, complex(named[one.names[0]], named[one.names[1]])) for one in _monomials(self.powers)]
+        rim = self._rim_px
+        return [(one, (c.conjugate() if one.turned else c) * one.weight / rim) for one, c in both if c != 0.0]
+
+    @property
+    def _is_round(self) -> bool:
+        return not self._across
+
+    @cached_property
+    def _profile(self) -> Growth:
+        return Growth(self._along)
+
+    @property
+    def _directions(self) -> Array:
+        turns = np.linspace(0.0, 2.0 * np.pi, 1 if self._is_round else _TURNS, endpoint=False)
+        return np.column_stack([np.cos(turns), np.sin(turns)])
+
+    @cached_property
+    def _limit(self) -> float:
+        return first_fall(self._least_growth)
+
+    @cached_property
+    def _rim(self) -> float:
+        return float(np.min(np.linalg.norm(self._map(self._limit * self._directions), axis=1)))
+
+    def _least_growth(self, u: Array) -> Array:
+        """(N,) least eigenvalue of the symmetric part of the map's derivative on each circle."""
+        xx, xy, yx, yy = self._jacobian((u[:, None, None] * self._directions).reshape(-1, 2))
+        least = 0.5 * (xx + yy) - np.hypot(0.5 * (xx - yy), 0.5 * (xy + yx))
+        return np.asarray(np.min(least.reshape(len(u), -1), axis=1))
+
+    def _map(self, flat: Array) -> Array:
+        u = np.maximum(np.hypot(flat[:, 0], flat[:, 1]), TINY)
+        outward = 1.0 + self._profile.bent(u)[0] / u
+        answer = flat * outward[:, None]
+        q = flat[:, 0] + 1j * flat[:, 1]
+        for one, c in self._across:
+            z = c * q**one.m * np.conj(q) ** one.n
+            answer += np.column_stack([z.real, z.imag])
+        return answer
+
+    def _jacobian(self, flat: Array) -> tuple[Array, Array, Array, Array]:
+        x, y = flat[:, 0], flat[:, 1]
+        u = np.maximum(np.hypot(x, y), TINY)
+        value, slope = self._profile.bent(u)
+        stretch = value / u
+        bend = (slope - stretch) / (u * u)
+        q = x + 1j * y
+        first, second = np.zeros_like(q), np.zeros_like(q)  # derivatives by q and by its conjugate
+        for one, c in self._across:
+            if one.m:
+                first += c * one.m * q ** (one.m - 1) * np.conj(q) ** one.n
+            if one.n:
+                second += c * one.n * q**one.m * np.conj(q) ** (one.n - 1)
+        both, other = first + second, first - second
+        xx, yy = 1.0 + stretch + bend * x * x + both.real, 1.0 + stretch + bend * y * y + other.real
+        return xx, bend * x * y - other.imag, bend * x * y + both.imag, yy
+
+    # ---- for the solve -----------------------------------------------------------------------------------------------
+
+    @property
+    def state(self) -> Array:
+        """See `spline_kernel`."""
+        names = self.names
+        rows = [
+            [4.0 + names.index(one.names[0]), float(one.turned), float(one.m), float(one.n), one.weight]
+            for one in _monomials(self.powers)
+        ]
+        head = [0.0, float(len(rows)), float(max((one.m for one in _monomials(self.powers)), default=0)), 0.0]
+        room = np.zeros(INTERVALS * (DEGREE + 1))
+        return np.concatenate([head, pieces().ravel(), room, np.array(rows).ravel()])
+
+    prepare = staticmethod(spline_kernel.prepare)
+    distort_chunk = staticmethod(spline_kernel.distort)
+    differentiate_chunk = staticmethod(spline_kernel.differentiate)

@@ -1,0 +1,169 @@
+"""The lens without a formula: there and back, other lenses in it, how smooth it is, and what is not known of it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scenes
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ceres_cal.base.arrays import Array
+from ceres_cal.base.errors import InputError
+from ceres_cal.base.transforms import Pose
+from ceres_cal.calibrating import calibrate
+from ceres_cal.calibration import Calibration
+from ceres_cal.formats import export
+from ceres_cal.model.parameters import Options
+from ceres_cal.observations import NO_CURVES, Observations, Points, View, taken
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.lens import Spline, make_lens
+from ceres_cal.scene.targets import checkerboard
+from ceres_cal.simulate import Disturbance, Simulation, simulate
+
+REAL = Path(__file__).parents[2] / "shared" / "real" / "babelcalib_ov_plane"
+
+
+@st.composite
+def splines(draw: st.DrawFn) -> Spline:
+    """As barrel-shaped and as crooked as lenses are, and more."""
+    rim = draw(st.floats(300.0, 2000.0))
+    blank = Spline.blank(draw(st.sampled_from([(), (2,), (2, 3), (2, 3, 4, 5)])))
+    u = np.linspace(0.1, 1.0, 11)
+    along = draw(st.floats(-0.25, 0.3)) * u**3 * rim + draw(st.floats(-0.003, 0.003)) * rim * np.sin(9.0 * u) * u**2
+    size, count = draw(st.floats(0.0, 3e-3)) * rim, len(blank.names) - 12
+    across = size * np.random.default_rng(draw(st.integers(0, 999))).normal(size=count)
+    return Spline((rim, *along, *across), blank.powers)
+
+
+def disc(radius: float) -> Array:
+    angles, radii = np.meshgrid(np.arange(24) * (np.pi / 12.0) + 0.1, np.linspace(0.0, radius, 40))
+    return np.column_stack([(radii * np.cos(angles)).ravel(), (radii * np.sin(angles)).ravel()])
+
+
+@settings(deadline=None, max_examples=40)
+@given(splines(), st.floats(200.0, 2000.0))
+def test_there_and_back(lens: Spline, phi: float) -> None:
+    offsets = disc(0.99 * min(lens.monotone_radius(phi), 1.3 * lens.values[0]))
+    rays = lens.undistort(offsets, phi)
+    assert np.abs(np.linalg.norm(rays, axis=1) - 1.0).max() < 1e-15
+    assert np.abs(lens.distort(3.0 * rays, phi) - offsets).max() < 1e-9  # px; measured 4e-12
+
+
+@settings(deadline=None, max_examples=40)
+@given(splines())
+def test_no_two_rays_have_one_pixel(lens: Spline) -> None:
+    """Up to where it says that it ends: where pixels are next to each other, so are rays, in the same sense."""
+    end = 0.99 * lens.monotone_radius(500.0)
+    offsets = disc(end)[24:]
+    step = 1e-4 * end
+    here, right, down = (lens.undistort(offsets + shift, 500.0) for shift in ((0.0, 0.0), (step, 0.0), (0.0, step)))
+    turned = np.einsum("ij,ij->i", np.cross(right - here, down - here), here)
+    assert np.all(turned > 0.0)
+
+
+def test_phi_is_the_focal_length_at_the_axis() -> None:
+    lens = scenes.camera("spline").lens
+    ray = np.array([[1e-7, 0.0, 1.0], [0.0, 1e-7, 1.0]])
+    assert lens.distort(ray, 700.0) == pytest.approx(700.0 * ray[:, :2], abs=1e-11)
+
+
+def test_powers_are_those_across() -> None:
+    assert Options(lens="spline").blank_lens.names[12:] == make_lens("spline", (2, 3)).names[12:]
+    assert len(make_lens("spline", (2,)).names) == 12 + 8 and len(make_lens("spline", ()).names) == 12
+    with pytest.raises(InputError, match="powers of the spline lens must be different whole numbers from 2 to 9"):
+        make_lens("spline", (1, 2))
+
+
+# ---- other lenses ---------------------------------------------------------------------------------------------------
+
+
+def seen(lens: str, sigma_px: float) -> Simulation:
+    scene = scenes.boards("kannala-brandt" if lens.startswith("kannala") else "brown")
+    scene = replace(scene, cameras=dict.fromkeys(scene.cameras, scenes.camera(lens)))
+    return simulate(scene, Disturbance(points_sigma_px=sigma_px), seed=3)
+
+
+@cache
+def solved(lens: str, sigma_px: float) -> Calibration:
+    return calibrate(seen(lens, sigma_px).observations, Options(lens="spline"))
+
+
+def off_px(calibration: Calibration, truth: Camera, pixels: Array) -> Array:
+    """(N,) px by which rays of the true camera are shown aside, the camera turned and moved as it may be."""
+    (camera,) = calibration.cameras.values()
+    rays = truth.rays(pixels)
+    pose, turn = np.zeros(3), np.zeros((len(rays) * 2, 3))
+    for _ in range(4):
+        here = camera.at(Pose.exp(np.append(pose, np.zeros(3))))
+        left = (here.project(rays) - pixels).ravel()
+        for k in range(3):
+            there = camera.at(Pose.exp(np.append(pose + 1e-6 * np.eye(3)[k], np.zeros(3))))
+            turn[:, k] = (there.project(rays) - here.project(rays)).ravel() / 1e-6
+        pose = pose - np.linalg.lstsq(turn, left, rcond=None)[0]
+    return np.asarray(np.linalg.norm(left.reshape(-1, 2), axis=1))
+
+
+@pytest.mark.parametrize("lens", [name for name in scenes.EVERY_LENS if name not in ("brown-all", "spline")])
+def test_every_other_lens_is_one(lens: str) -> None:
+    """Without noise, over the observed image: 0.0003 px measured at most."""
+    calibration = solved(lens, 0.0)
+    pixels = seen(lens, 0.0).observations.points.pixels
+    assert off_px(calibration, scenes.camera(lens), pixels).max() < 2e-3
+    assert calibration.fit.points_rms_px < 5e-4
+
+
+def test_it_is_as_smooth_as_the_data_say() -> None:
+    """A lens that is centred is not taken for one that is not: what displaces across is known to be little."""
+    truth = scenes.camera("kannala-brandt")
+    calibration = solved("kannala-brandt", 0.2)
+    plain = calibrate(seen("kannala-brandt", 0.2).observations, Options(lens="kannala-brandt"))
+    pixels = seen("kannala-brandt", 0.2).observations.points.pixels[::7]
+    spline, formula = (float(np.sqrt(np.mean(off_px(one, truth, pixels) ** 2))) for one in (calibration, plain))
+    assert spline < 4.0 * formula  # 0.020 against 0.007 px measured
+    (camera,) = calibration.cameras.values()
+    assert isinstance(camera.lens, Spline) and np.abs(camera.lens.values[12:]).max() < 1.0
+
+
+def test_where_nothing_was_seen_nothing_is_known() -> None:
+    """Boards in the middle third: the spread of the lens's numbers grows outwards by far."""
+    simulation = seen("kannala-brandt", 0.2)
+    points = simulation.observations.points
+    near = np.linalg.norm(points.pixels - (651.3, 468.9), axis=1) < 260.0
+    some = replace(simulation.observations, points=taken(points, np.flatnonzero(near)))
+    calibration = calibrate(some, Options(lens="spline"))
+    (name,) = calibration.cameras
+    sd = [calibration.uncertainty.verdict("camera", name, f"g{k}").sd for k in (2, 6, 11)]
+    whole = solved("kannala-brandt", 0.2).uncertainty.verdict("camera", name, "g11").sd
+    assert 10.0 * sd[0] < sd[1] < 0.2 * sd[2] and sd[2] > 3.0 * whole  # 0.06, 3.6, 28 and 8.5 px measured
+
+
+# ---- the rest of the house ------------------------------------------------------------------------------------------
+
+
+def test_it_is_saved_loaded_and_exported(tmp_path: Path) -> None:
+    calibration = solved("brown", 0.0)
+    calibration.save(tmp_path / "a.json")
+    loaded = Calibration.load(tmp_path / "a.json")
+    assert loaded.cameras == calibration.cameras and loaded.options == calibration.options
+    (loss,) = export(loaded, "opencv", tmp_path / "a.yml", [next(iter(loaded.stations))]).losses
+    assert loss.image_px is not None and loss.image_px[0] < 0.05
+
+
+@pytest.mark.skipif(not REAL.is_dir(), reason="the corners are not there")
+def test_a_real_fisheye_to_93_degrees() -> None:
+    """BabelCalib's OV-plane: kannala-brandt leaves 0.482 px of its training views, plain least squares."""
+    with np.load(REAL / "train.npz") as data:
+        places, view, point, pixels, size = (data[n] for n in ("board_m", "view", "point", "pixels", "image_size"))
+    pitch_m = float(places[0, 0])
+    column, row = np.rint(places[:, :2] / pitch_m).astype(np.int32).T - 1
+    views = tuple(View(f"{n:02d}", "camera", "camera", "board", f"{n:02d}") for n in range(int(view.max()) + 1))
+    points = Points(view.astype(np.int32), (22 * row + column)[point], pixels, np.ones(len(pixels)))
+    board, sizes = {"board": checkerboard(22, 22, pitch_m)}, {"camera": (int(size[0]), int(size[1]))}
+    observations = Observations(board, sizes, views, points, NO_CURVES)
+    plain = Options(lens="spline", free_aspect=True, loss="trivial", reject_sigma=1e9)
+    assert calibrate(observations, plain).fit.points_rms_px < 0.472  # measured 0.468
