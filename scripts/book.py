@@ -7,7 +7,7 @@ from contextlib import redirect_stdout
 from io import StringIO
 from typing import Any
 
-WIDTH = 100
+WIDTH = 96
 
 
 def help_of(name: str) -> str:

@@ -92,6 +92,7 @@ def test_help_lists_every_command(say: Say) -> None:
     assert said.code == 0 and said.err == ""
     assert all(f"  {name:14}  {command.summary}\n" in said.out for name, command in COMMANDS.items())
     assert set(COMMANDS) == {
+        "run",
         "detect board",
         "detect rings",
         "detect field",

@@ -31,12 +31,14 @@ from ceres_cal.cli.foreign import COMMANDS as FOREIGN
 from ceres_cal.cli.locate import COMMANDS as LOCATE
 from ceres_cal.cli.program import TERMINATED, Terminated, as_a_program, ended
 from ceres_cal.cli.refit import COMMANDS as REFIT
+from ceres_cal.cli.run import COMMANDS as RUN
 from ceres_cal.cli.score import COMMANDS as SCORE
 from ceres_cal.cli.simulate import COMMANDS as SIMULATE
 from ceres_cal.cli.targets import COMMANDS as TARGETS
 from ceres_cal.cli.undistort import COMMANDS as UNDISTORT
 
 _GROUPS = (
+    RUN,
     *(DETECT_BOARD, DETECT_RINGS, DETECT_FIELD),
     *(CALIBRATE, DIAGNOSE, ADVISE, REFIT, CHECK, SCORE, COMPARE, AUDIT),
     *(LOCATE, UNDISTORT, EXPORT, FOREIGN, SIMULATE, TARGETS, (completion(lambda: COMMANDS),)),

@@ -15,7 +15,7 @@ from ceres_cal.cli.arguments import (
     add_station,
     height_m,
     length,
-    parse_length,
+    parse_board,
 )
 from ceres_cal.cli.command import Answer, Command
 from ceres_cal.cli.inputs import read_calibration, station_of
@@ -24,7 +24,6 @@ from ceres_cal.cli.progress import progress_bar
 
 if TYPE_CHECKING:
     from ceres_cal.advice import Advice, Measurement, Promise
-    from ceres_cal.scene.targets import Target
 
 
 def _add_arguments(parser: ArgumentParser) -> None:
@@ -52,12 +51,14 @@ def _run(args: Namespace) -> Answer:
     enough = args.good_enough_mm
     if enough is not None and not enough > 0.0:
         raise InputError(f"--good-enough-mm {enough:g}: give a number of millimetres above 0")
-    board = None if args.board is None else _board(args.board)
+    shown = None if args.board is None else parse_board(args.board)
     from ceres_cal.advice import advise
+    from ceres_cal.scene.targets import checkerboard
 
     calibration = read_calibration(args)
     station = station_of(args, calibration)
     with naming(args.calibration), progress_bar(args) as bar:
+        board = None if shown is None else checkerboard(*shown)
         advice = advise(calibration, station, height, enough, board, bar.update)
     weak = [direction.words for direction in calibration.uncertainty.weak_directions]
     return Answer(_data(advice, weak), lambda: _text(advice, weak))
@@ -72,15 +73,6 @@ COMMANDS = (
         ("calibration.json --good-enough-mm 2", "calibration.json --board 9x6x50mm --height-mm 150"),
     ),
 )
-
-
-def _board(text: str) -> Target:
-    from ceres_cal.scene.targets import checkerboard
-
-    parts = text.split("x")
-    if len(parts) != 3 or not (parts[0].isdecimal() and parts[1].isdecimal()):
-        raise InputError(f"--board {text!r}: write COLUMNSxROWSxMM, such as 9x6x100")
-    return checkerboard(int(parts[0]), int(parts[1]), parse_length(parts[2], f"--board {text!r}", "mm") / 1000.0)
 
 
 # ---- for people -----------------------------------------------------------------------------------------------------

@@ -57,6 +57,19 @@ def add_report(parser: ArgumentParser) -> None:
     )
 
 
+def add_prior(parser: ArgumentParser) -> None:
+    """The option --prior of observations' cameras and stations."""
+    parser.add_argument(
+        "--prior",
+        action="append",
+        default=[],
+        metavar="OWNER.NAME=VALUE:SIGMA",
+        help="what is known beforehand: height_m or position_m of a station, phi, principal_point, aspect or a "
+        f"coefficient of a camera, such as {PRIOR_EXAMPLE} or phi=812:5 (the owner may be left out where there is "
+        "only one); repeatable",
+    )
+
+
 def add_timeout(parser: ArgumentParser) -> None:
     """The option --timeout S."""
     parser.add_argument("--timeout", type=float, metavar="S", help="give up after so many seconds; default: never")
@@ -112,6 +125,14 @@ def length(unit: str) -> Callable[[str], float]:
             raise ArgumentTypeError(f"{text!r} is no length: write a number of {unit}, or 5m, 150mm") from None
 
     return parse
+
+
+def parse_board(text: str) -> tuple[int, int, float]:
+    """COLUMNSxROWSxMM: inner corners, and the side of a square in metres."""
+    parts = text.split("x")
+    if len(parts) != 3 or not (parts[0].isdecimal() and parts[1].isdecimal()):
+        raise InputError(f"--board {text!r}: write COLUMNSxROWSxMM, such as 9x6x100")
+    return int(parts[0]), int(parts[1]), parse_length(parts[2], f"--board {text!r}", "mm") / 1000.0
 
 
 def parse_names(text: str) -> list[str]:

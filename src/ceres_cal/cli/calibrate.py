@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.cli.arguments import (
-    PRIOR_EXAMPLE,
     PriorNames,
     add_output,
+    add_prior,
     add_quiet,
     add_report,
     parse_length,
@@ -82,15 +82,7 @@ def _add_camera(parser: ArgumentParser) -> None:
         help="solve for a target as built: field.lines_m=0.01, field.points_m=0.005 or board.warp_m=0.002 "
         "(a sigma in metres, or such as 10mm; repeatable)",
     )
-    add(
-        "--prior",
-        action="append",
-        default=[],
-        metavar="OWNER.NAME=VALUE:SIGMA",
-        help="what is known beforehand: height_m or position_m of a station, phi, principal_point, aspect or a "
-        f"coefficient of a camera, such as {PRIOR_EXAMPLE} or phi=812:5 (the owner may be left out where there is "
-        "only one); repeatable",
-    )
+    add_prior(parser)
 
 
 def _add_solve(parser: ArgumentParser) -> None:

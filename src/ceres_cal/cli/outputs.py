@@ -6,7 +6,7 @@ import os
 import signal
 import threading
 from argparse import Namespace
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from textwrap import wrap
@@ -32,6 +32,16 @@ WIDTH = 100
 def section(title: str, lines: Iterable[str]) -> str:
     """A title beside its lines."""
     return "\n".join(f"{'' if number else title:10}{line}" for number, line in enumerate(lines))
+
+
+def sections_of(text: str, titles: Collection[str]) -> list[str]:
+    """The lines of those sections of a text that have one of these titles."""
+    kept, title = [], ""
+    for line in text.splitlines():
+        title = line[:10].strip() or title
+        if title in titles:
+            kept.append(line)
+    return kept
 
 
 def wrapped(*texts: str) -> list[str]:

@@ -1,0 +1,198 @@
+"""`ceres-cal run`: from photographs to a calibration, its report and its exports, by the other commands in turn."""
+
+from __future__ import annotations
+
+import shlex
+from argparse import ArgumentParser, Namespace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from ceres_cal.base.errors import InputError, NothingShownError
+from ceres_cal.base.words import plural
+from ceres_cal.cli.advise import COMMANDS as ADVISE
+from ceres_cal.cli.arguments import add_prior, add_quiet, parse_board
+from ceres_cal.cli.calibrate import COMMANDS as CALIBRATE
+from ceres_cal.cli.command import Answer, Command
+from ceres_cal.cli.detect import COMMANDS as DETECT_BOARD
+from ceres_cal.cli.detect_field import COMMANDS as DETECT_FIELD
+from ceres_cal.cli.export import COMMANDS as EXPORT
+from ceres_cal.cli.inputs import IMAGE_ENDINGS, image_files
+from ceres_cal.cli.outputs import section, sections_of
+from ceres_cal.cli.progress import progress_bar
+
+_SHOWN = ("fit", "lens", "located", "widened", "weak", "unknown", "warning", "verdict")
+_MOST_NAMES = 3
+
+
+def _add_arguments(parser: ArgumentParser) -> None:
+    add = parser.add_argument
+    add("images", nargs="+", metavar="IMAGE", help="photographs of one camera, a folder of them, or a video")
+    add("-o", "--output", metavar="FOLDER", type=Path, required=True, help="for everything that is made")
+    add("--target", metavar="TARGET", help="the field: ssl-a, ssl-b, or a file, as of `detect field`")
+    add("--facing", metavar="NAME=SIDE", action="append", default=[], help="which way round it is, likewise")
+    add("--not-painted", metavar="NAME,...", help="lines that this field does not have")
+    add(
+        "--board",
+        metavar="COLUMNSxROWSxMM",
+        help="a chessboard by its inner corners and the side of a square, such as 9x6x25mm",
+    )
+    add("--lens", metavar="KIND", default="auto", help="as of `calibrate`; default: auto")
+    add_prior(parser)
+    add("--camera", default="camera", metavar="NAME", help="name of the camera; default: camera")
+    add("--to", metavar="FORMAT", action="append", default=[], help="export it, too, as of `export`; repeatable")
+    add("--frames", type=int, default=30, metavar="N", help="how many photographs to take out of a video; default: 30")
+    add_quiet(parser)
+
+
+@dataclass(frozen=True)
+class _Step:
+    """A command that was run, as one would type it, and what is worth showing of its answer."""
+
+    command: str
+    lines: tuple[str, ...]
+    data: dict[str, Any]
+
+
+def _run(args: Namespace) -> Answer:
+    if args.target is None and args.board is None:
+        raise InputError("say what the photographs show: --target ssl-b, --board 9x6x25mm, or both")
+    if args.board is not None:
+        parse_board(args.board)
+    from ceres_cal.base.files import make_folder
+    from ceres_cal.formats import export_format
+
+    endings = {name: (export_format(name).endings or ("",))[0] for name in args.to}  # or says which there are
+    make_folder(args.output)
+    images = _photographs(args)
+    steps = [*_observed(args, images)]
+    calibrated = _calibrated(args, [step.data["output"] for step in steps if "output" in step.data])
+    level = calibrated.data["verdict"]["level"]
+    steps.append(calibrated)
+    if level != "good" and args.target is not None:
+        steps.append(_step(args, ADVISE[0], [str(args.output / "calibration.json")], most=2))
+    if level != "no":
+        steps += [_exported(args, name, f"{args.output / name}{ending}") for name, ending in endings.items()]
+    data = {"images": len(images), "verdict": calibrated.data["verdict"]}
+    data["steps"] = [{"command": step.command, "answer": step.data} for step in steps]
+    made = level != "no" and all(step.data for step in steps[-len(endings) :])
+    return Answer(data, lambda: _text(args, images, steps, level), 0 if made else 1)
+
+
+COMMANDS = (
+    Command(
+        "run",
+        "from photographs or a video to a calibration, its report and its exports",
+        _add_arguments,
+        _run,
+        (
+            "photographs/ --target ssl-b --facing LeftGoalLine=top --board 9x6x25mm -o camera/",
+            "photographs/ --target ssl-b --facing LeftGoalLine=top --prior height_m=4.02:20mm --to opencv -o camera/",
+            "boards.mp4 --board 9x6x25mm -o camera/",
+        ),
+    ),
+)
+
+
+# ---- the steps ------------------------------------------------------------------------------------------------------
+
+
+def _step(args: Namespace, command: Command, arguments: Sequence[str], most: int | None = None) -> _Step:
+    """Run a command and keep the first lines of what it says, and the images that showed nothing."""
+    quiet = ["--quiet"] if (args.quiet or args.json) and command is not EXPORT[0] else []
+    answer = command.run(command.parse([*arguments, *quiet]))
+    missed = [f"{one['image']}: {one['reason']}" for one in answer.data.get("missed", ())]
+    lines = [*answer.text().splitlines()[:most], *missed]
+    return _Step(_typed(command, arguments), tuple(lines), dict(answer.data))
+
+
+def _typed(command: Command, arguments: Sequence[str]) -> str:
+    return shlex.join(["ceres-cal", *command.name.split(), *arguments])
+
+
+def _photographs(args: Namespace) -> list[Path]:
+    """The photographs that were given, and those taken out of a video."""
+    files = [path for path in map(Path, args.images) if path.is_file()]
+    videos = [path for path in files if path.suffix.lower() not in IMAGE_ENDINGS]
+    images = image_files(name for name in args.images if Path(name) not in videos)
+    if videos:
+        from ceres_cal.detect.video import sharpest_frames
+
+        if args.frames < 1:
+            raise InputError(f"--frames must be at least 1, not {args.frames}")
+        with progress_bar(args) as bar:
+            for video in videos:
+                images += sharpest_frames(video, args.output / video.stem, args.frames, bar.update)
+    return images
+
+
+def _observed(args: Namespace, images: list[Path]) -> Iterator[_Step]:
+    """Boards first; what shows none may show the field."""
+    rest = [str(path) for path in images]
+    if args.board is not None:
+        columns, rows, square = args.board.split("x")
+        square += "" if square[-1].isalpha() else "mm"
+        board = ["--columns", columns, "--rows", rows, "--square", square]
+        goal = ["--camera", args.camera, "-o", str(args.output / "board.json")]
+        try:
+            found = _step(args, DETECT_BOARD[0], [*rest, *board, *goal], most=1)
+            rest = [path for path in rest if path not in found.data["found"]]
+            yield found if args.target is None else replace(found, lines=found.lines[:1])  # the rest may be the field
+        except NothingShownError as error:
+            if args.target is None:
+                raise
+            yield _Step(_typed(DETECT_BOARD[0], [*rest, *board, *goal]), (str(error),), {})
+    if args.target is not None:
+        if not rest:
+            raise InputError("every photograph shows the board, and none is left for the field: take one without it")
+        facing = [word for name in args.facing for word in ("--facing", name)]
+        missing = ["--not-painted", args.not_painted] if args.not_painted else []
+        goal = ["--camera", args.camera, "-o", str(args.output / "field.json")]
+        asked = [*rest, "--target", args.target, "--auto", *facing, *missing, *goal]
+        yield _step(args, DETECT_FIELD[0], asked, most=1)
+
+
+def _calibrated(args: Namespace, observations: list[str]) -> _Step:
+    priors = [word for prior in args.prior for word in ("--prior", prior)]
+    goal = ["-o", str(args.output / "calibration.json"), "--report", str(args.output / "report.html")]
+    step = _step(args, CALIBRATE[0], [*observations, "--lens", args.lens, *priors, *goal])
+    return replace(step, lines=tuple(sections_of("\n".join(step.lines), _SHOWN)))
+
+
+def _exported(args: Namespace, form: str, goal: str) -> _Step:
+    """The step of an export, without data where the format cannot hold the calibration."""
+    arguments = [str(args.output / "calibration.json"), "--to", form, "-o", goal]
+    try:
+        return _step(args, EXPORT[0], arguments)
+    except InputError as error:
+        return _Step(_typed(EXPORT[0], arguments), (section("error", [str(error)]),), {})
+
+
+# ---- for people -----------------------------------------------------------------------------------------------------
+
+
+def _text(args: Namespace, images: Sequence[Path], steps: Sequence[_Step], level: str) -> str:
+    parts = [section("read", [f"{plural(len(images), 'photograph')} in {', '.join(args.images[:_MOST_NAMES])}"])]
+    for number, step in enumerate(steps, start=1):
+        parts += ["", section(f"step {number}", [_short(step.command)]), *step.lines]
+    parts += ["", section("written", [f"{args.output}/: {', '.join(sorted(_made(args, steps)))}"])]
+    if args.to and level == "no":
+        parts.append(section("warning", ["a calibration that is not to be trusted was not exported"]))
+    return "\n".join(parts)
+
+
+def _made(args: Namespace, steps: Sequence[_Step]) -> set[str]:
+    files = {str(step.data[name]) for step in steps for name in ("output", "report") if step.data.get(name)}
+    return {str(Path(path).relative_to(args.output)) for path in files}
+
+
+def _short(command: str) -> str:
+    """A command with the first of its photographs only."""
+    words = shlex.split(command)
+    images = [word for word in words if Path(word).suffix.lower() in IMAGE_ENDINGS]
+    if len(images) <= _MOST_NAMES:
+        return command
+    kept = [word for word in words if word not in images[1:]]
+    place = kept.index(images[0])
+    return f"{shlex.join(kept[: place + 1])} ... {shlex.join(kept[place + 1 :])}"

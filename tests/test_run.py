@@ -1,0 +1,107 @@
+"""`ceres-cal run`: from photographs or a video to a calibration that may be trusted, or one that says why not."""
+
+import json
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from ceres_cal.base.errors import InputError
+from ceres_cal.calibration import Calibration
+from ceres_cal.cli import COMMANDS, main
+from ceres_cal.cli.run import _short
+from ceres_cal.detect.video import sharpest_frames
+
+SAMPLE = Path(__file__).resolve().parents[1] / "data" / "ssl_field"
+FIELD = ("--target", "ssl-b", "--facing", "LeftGoalLine=top")
+
+
+@pytest.fixture(scope="module")
+def photographs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two of the field and four of a board, in one folder."""
+    folder = tmp_path_factory.mktemp("photographs")
+    for name in ("0001", "0002", "board_01", "board_03", "board_05", "board_07"):
+        shutil.copy(SAMPLE / "photographs" / f"{name}.jpg", folder)
+    return folder
+
+
+def test_a_folder_to_a_camera_and_its_export(
+    photographs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "camera"
+    ask = ["run", str(photographs), *FIELD, "--board", "9x6x100mm", "--to", "opencv", "-o", str(out), "--quiet"]
+    assert main(ask) == 0
+    said = capsys.readouterr().out
+    for words in (
+        f"read      6 photographs in {photographs}\n",
+        "4 of 6 images show the board",
+        "2 of 2 images show the field",
+        "verdict   This calibration can be trusted: to 0.0",
+        f"written   {out}/: board.json, calibration.json, field.json, opencv.yml, report.html",
+    ):
+        assert words in said
+    assert {path.name for path in out.iterdir()} == set(said.rpartition("/: ")[2].strip().split(", "))
+    camera = Calibration.load(out / "calibration.json").station()
+    truth = json.loads((SAMPLE / "truth.json").read_text())
+    assert camera.phi == pytest.approx(truth["cameras"]["overhead"]["phi"], abs=0.5)  # 0.1 measured
+    # Each step is a command that can be typed.
+    commands = [line.partition("ceres-cal ")[2].split() for line in said.splitlines() if line.startswith("step ")]
+    assert [words[0] for words in commands] == ["detect", "detect", "calibrate", "export"]
+    COMMANDS["calibrate"].parse(commands[2][1:])
+
+
+def test_what_cannot_be_trusted_is_not_exported(photographs: Path, tmp_path: Path) -> None:
+    wrong = ("--prior", "height_m=3:5mm", "--to", "paper", "-o", str(tmp_path), "--json")
+    assert main(["run", str(photographs / "0001.jpg"), *FIELD, *wrong]) == 1
+    assert (tmp_path / "report.html").exists() and not list(tmp_path.glob("paper*"))
+
+
+def test_boards_alone_in_a_video(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    images = [np.asarray(cv2.imread(str(path))) for path in sorted((SAMPLE / "photographs").glob("board_0[1-6].jpg"))]
+    video = tmp_path / "boards.avi"
+    writer = cv2.VideoWriter(str(video), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, (1280, 960))
+    for image in images:
+        for sharp in (False, True, False):
+            writer.write(image if sharp else cv2.GaussianBlur(image, (0, 0), 4.0))
+    writer.release()
+    paths = sharpest_frames(video, tmp_path / "frames", 6)
+    assert [path.name for path in paths] == [f"{number:04d}.png" for number in range(1, 7)]
+    for path, image in zip(paths, images, strict=True):
+        assert np.mean(cv2.absdiff(np.asarray(cv2.imread(str(path))), image)) < 2.0  # 1.0 measured; blurred ones 5
+    ask = ("--board", "9x6x100", "--frames", "6", "--to", "vision-processor", "-o", str(tmp_path / "out"), "--json")
+    code = main(["run", str(video), *ask])
+    data = json.loads(capsys.readouterr().out)
+    assert code == 1 and data["steps"][2]["answer"] == {}  # that message needs a field; the rest is made
+    assert data["images"] == 6 and len(data["steps"]) == 3
+    assert data["steps"][1]["answer"]["calibration"]["cameras"]["camera"]["phi"] == pytest.approx(868.0, abs=6.0)
+
+
+@pytest.mark.parametrize(
+    "arguments, words",
+    [
+        (("x.jpg",), "say what the photographs show: --target ssl-b, --board 9x6x25mm, or both"),
+        (("x.jpg", "--board", "9x6"), "--board '9x6': write COLUMNSxROWSxMM"),
+        (("x.jpg", "--target", "ssl-b"), "x.jpg: no such file"),
+        (("x.jpg", "--target", "ssl-b", "--to", "atlantis"), "there is no export format 'atlantis'"),
+    ],
+)
+def test_wrong_usage(
+    arguments: tuple[str, ...], words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["run", *arguments, "-o", str(tmp_path / "out")]) == 2
+    assert words in capsys.readouterr().err
+
+
+def test_what_is_no_video(tmp_path: Path) -> None:
+    (tmp_path / "no.mp4").write_bytes(b"nothing")
+    for name in ("no.mp4", "missing.mp4"):
+        with pytest.raises(InputError, match="not a video that OpenCV can read"):
+            sharpest_frames(tmp_path / name, tmp_path / "frames", 3)
+
+
+def test_a_plan_names_the_first_of_many_photographs() -> None:
+    many = " ".join(f"{number}.jpg" for number in range(9))
+    assert _short(f"ceres-cal detect board {many} --rows 6") == "ceres-cal detect board 0.jpg ... --rows 6"
+    assert _short("ceres-cal detect field 0.jpg 1.jpg -o x") == "ceres-cal detect field 0.jpg 1.jpg -o x"
