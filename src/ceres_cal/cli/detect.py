@@ -30,9 +30,10 @@ def _add_board(parser: ArgumentParser) -> None:
     add("--marker", type=float, metavar="M", help="side of a marker in metres, with --charuco")
     add(
         "--corner-fit",
-        choices=("opencv", "saddle"),
-        default="opencv",
-        help="measure corners as OpenCV does (default), or by the saddle around each: finer where squares are large",
+        choices=("saddle", "opencv"),
+        default="saddle",
+        help="measure corners by the saddle around each (default), also of boards partly out of the picture, or as "
+        "OpenCV does, whole boards alone",
     )
     add_detection(parser)
     add_quiet(parser)

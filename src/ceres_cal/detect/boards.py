@@ -12,22 +12,24 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Image, Image8
+from ceres_cal.base.arrays import AnyArray, Array, Image, Image8
 from ceres_cal.base.errors import InputError, NothingShownError
 from ceres_cal.base.progress import ImageProgress
 from ceres_cal.base.words import frame_of, printable
 from ceres_cal.detect.images import read_grey
-from ceres_cal.detect.saddles import REACH, measure_saddles
+from ceres_cal.detect.partly import part_of_board
+from ceres_cal.detect.saddles import REACH, is_begun_dark, measure_saddles
 from ceres_cal.detect.scatter import scatter_px
 from ceres_cal.observations import NO_CURVES, Observations, Points, View
 from ceres_cal.scene.targets import Grid, Target
 
-CORNER_FITS = ("opencv", "saddle")
+CORNER_FITS = ("saddle", "opencv")
 MIN_CORNERS = 6
 TARGET_NAME = "board"
 _LARGE_PX = 2e6  # larger images are searched at this size first: faster, and with less of noise and blur
 _MOST_PX = 1.6e7  # and at this size at most: on noise OpenCV takes minutes, and 50 MB for every megapixel
 _SUBPIX_HALF_WINDOW_PX = 5  # at most; a third of the spacing keeps the neighbouring corners out of it
+_UNEVEN = 0.45  # natural logarithm: 1.57 times; a skipped square makes 2, perspective on three squares hardly 1.3
 _SMALL_PX = 2e6  # smaller ones also at twice their size, where the squares are few pixels wide
 
 
@@ -66,7 +68,7 @@ def detect_boards(
     board: Target,
     camera: str = "camera",
     station: str | None = None,
-    corners: CharucoSpec | str = "opencv",
+    corners: CharucoSpec | str = "saddle",
     progress: ImageProgress | None = None,
 ) -> BoardDetections:
     """Chessboard or ChArUco corners of one camera's images.
@@ -86,10 +88,11 @@ def detect_boards(
         board: a checkerboard target.
         camera: name of the camera.
         station: name of the station, that of the camera by default.
-        corners: the markers, when the board has any: boards may then be partly seen. Else one of CORNER_FITS: "opencv"
-            measures with cornerSubPix, as the peers do, so that results compare; "saddle" fits a blurred saddle to each
-            corner, as with markers always: about four times more precise on rendered boards (0.005 px against 0.02),
-            and without cornerSubPix's shift towards the middle of its window.
+        corners: the markers, when the board has any: boards may then be partly seen. Else one of CORNER_FITS: "saddle"
+            fits a blurred saddle to each corner, as with markers always: about four times more precise on rendered
+            boards (0.005 px against 0.02), and without cornerSubPix's shift towards the middle of its window; boards
+            may reach out of the picture, as long as it tells which corners are seen. "opencv" measures with
+            cornerSubPix, as the peers do, so that results compare; boards are seen whole.
         progress: called after each image.
 
     Raises:
@@ -160,17 +163,18 @@ def _finder(squares: Grid, corners: CharucoSpec | str) -> Finder:
 
 
 def _measured_chessboard(image: Image, columns: int, rows: int, corner_fit: str) -> Array | str:
-    seen = _find_chessboard(_as_8_bit(image), columns, rows)
+    levels = _as_8_bit(image)
+    seen = _find_chessboard(levels, columns, rows)
+    if seen is None and corner_fit == "saddle" and (seed := _find_squares(levels)) is not None:
+        part = part_of_board(image, seed, columns, rows)
+        return part if isinstance(part, str) else _enough(part)
     if seen is None:
         return f"no chessboard of {columns} x {rows} inner corners found"
     seen = right_handed(seen)
     saddles = measure_saddles(image, seen)
-    grid = saddles.grid if corner_fit == "saddle" else _subpixel(_as_8_bit(image), seen)
-    if (columns + rows) % 2 == 1:
-        parity = np.where(np.indices((rows, columns)).sum(axis=0) % 2 == 0, 1.0, -1.0)
-        if np.nansum(parity * saddles.contrast) < 0.0:
-            grid = grid[::-1, ::-1]
-    return _enough(grid)
+    grid = saddles.grid if corner_fit == "saddle" else _subpixel(levels, seen)
+    turned = (columns + rows) % 2 == 1 and not is_begun_dark(saddles.contrast)
+    return _enough(grid[::-1, ::-1] if turned else grid)
 
 
 def _subpixel(image: Image8, grid: Array) -> Array:
@@ -195,16 +199,42 @@ def _find_chessboard(image: Image8, columns: int, rows: int) -> Array | None:
     """Roughly where the corners are, (rows, columns, 2) px, by OpenCV's two detectors at several scales."""
     legacy = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
     for scale in _scales(image.size):
-        how = cv2.INTER_AREA if scale < 1.0 else cv2.INTER_CUBIC
-        scaled = image if scale == 1.0 else cv2.resize(image, None, fx=scale, fy=scale, interpolation=how)
+        scaled = _resized(image, scale)
         # The newer detector is the better one, but blind where it is dark.
         shown, corners = cv2.findChessboardCornersSB(scaled, (columns, rows))
         if not shown:
             shown, corners = cv2.findChessboardCorners(scaled, (columns, rows), flags=legacy)
         if shown:
-            ratio = np.array(image.shape[::-1]) / np.array(scaled.shape[::-1])
-            return np.asarray((corners.reshape(rows, columns, 2).astype(float) + 0.5) * ratio - 0.5)
+            return _places_in(image, scaled, corners).reshape(rows, columns, 2)
     return None
+
+
+def _find_squares(image: Image8) -> Array | None:
+    """Roughly where the corners of neighbouring squares are, (h, w, 2) px, right-handed: three each way or more."""
+    for scale in _scales(image.size):
+        scaled = _resized(image, scale)
+        shown, corners, meta = cv2.findChessboardCornersSBWithMeta(scaled, (3, 3), cv2.CALIB_CB_LARGER)
+        if shown and _is_even(grid := _places_in(image, scaled, corners).reshape(*meta.shape, 2)):
+            return right_handed(grid)
+    return None
+
+
+def _is_even(grid: Array) -> bool:
+    """Whether no square was skipped: then steps along a line change a little from one to the next."""
+    steps = [np.maximum(np.linalg.norm(np.diff(grid, axis=axis), axis=-1), 1e-9) for axis in (0, 1)]
+    ratios = [np.abs(np.diff(np.log(step), axis=axis)) for axis, step in enumerate(steps)]
+    return max(float(np.max(ratio, initial=0.0)) for ratio in ratios) < _UNEVEN
+
+
+def _resized(image: Image8, scale: float) -> Image8:
+    how = cv2.INTER_AREA if scale < 1.0 else cv2.INTER_CUBIC
+    return image if scale == 1.0 else cv2.resize(image, None, fx=scale, fy=scale, interpolation=how).astype(np.uint8)
+
+
+def _places_in(image: Image8, scaled: Image8, corners: AnyArray) -> Array:
+    """Corners of the image where OpenCV has them in a scaled one, (N, 2) px."""
+    ratio = np.array(image.shape[::-1]) / np.array(scaled.shape[::-1])
+    return np.asarray((corners.reshape(-1, 2).astype(float) + 0.5) * ratio - 0.5)
 
 
 def _scales(pixels: int) -> Iterator[float]:
