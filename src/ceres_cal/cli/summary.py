@@ -21,6 +21,7 @@ from ceres_cal.report.quality import Quality
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.heights import at_height
 from ceres_cal.uncertainty import FieldMap, Verdict
+from ceres_cal.uncertainty.rig import RigPair
 
 _MOST_FEATURES, _MOST_DIRECTIONS, _MOST_FINDINGS = 6, 4, 3
 _MANY_OUTLIERS, _LARGE_SCALE = 0.3, 4.0  # from where on a warning is due
@@ -235,13 +236,20 @@ def with_sd(value: float, unit: str, verdict: Verdict | None) -> str:
         return f"{value:.{3 if unit == 'm' else 0}f} {unit}{word}"
     if unit == "m":
         return f"{value:.3f} m ± {two_digits(1e3 * verdict.sd)} mm{word}"
-    places = int(np.clip(2 - np.floor(np.log10(verdict.sd)), 0, 9))
-    return f"{value:.{places}f} ± {two_digits(verdict.sd)} {unit}{word}"
+    return f"{_plus_sd(value, verdict.sd)} {unit}{word}"
+
+
+def _plus_sd(value: float, sd: float) -> str:
+    """A number to a hundredth of its standard deviation."""
+    places = int(np.clip(2 - np.floor(np.log10(sd)), 0, 9)) if np.isfinite(sd) else 4
+    return f"{value:.{places}f} ± {two_digits(sd) if np.isfinite(sd) else 'unknown'}"
 
 
 def _uncertainty_lines(quality: Quality) -> Iterator[tuple[str, list[str]]]:
     if quality.uncertainty is None:
         return
+    if quality.uncertainty.rig:
+        yield "rig", [_rig_line(pair) for pair in quality.uncertainty.rig]
     if quality.maps:
         yield "located", [f"{name}: {_sd_at_heights(maps)}" for name, maps in quality.maps.items()]
     seams = []
@@ -266,6 +274,15 @@ def _uncertainty_lines(quality: Quality) -> Iterator[tuple[str, list[str]]]:
         yield "unknown", [f"{', '.join(quantities)} of placement {name!r}{rest}"]
 
 
+def _rig_line(pair: RigPair) -> str:
+    """Baseline and angle of two stations, each with its standard deviation."""
+    baseline, turn = (
+        1e3 * np.array([pair.baseline_m, pair.baseline_sd_m]),
+        np.degrees([pair.angle_rad, pair.angle_sd_rad]),
+    )
+    return f"{' - '.join(pair.stations)}: baseline {_plus_sd(*baseline)} mm, angle {_plus_sd(*turn)} deg"
+
+
 def _sd_at_heights(maps: Sequence[FieldMap]) -> str:
     parts = []
     for m in maps:
@@ -283,6 +300,7 @@ def _uncertainty_data(quality: Quality) -> dict[str, Any] | None:
     return {
         "numbers": [{**asdict(v), "key": v.key._asdict()} for v in uncertainty.verdicts],
         "widening": uncertainty.widening,
+        "rig": [asdict(pair) for pair in uncertainty.rig],
         "dependence": uncertainty.posterior.dependence,
         "weak_directions": [
             {"words": d.words, "relative": d.relative, "shares": [[*key[:3], share] for key, share in d.shares]}
