@@ -105,6 +105,7 @@ def test_help_lists_every_command(say: Say) -> None:
         "simulate",
         "targets",
         "targets import",
+        "targets print",
         "import",
         "publish",
         "listen",

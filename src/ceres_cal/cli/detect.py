@@ -18,16 +18,21 @@ from ceres_cal.cli.progress import progress_bar
 
 if TYPE_CHECKING:
     from ceres_cal.detect.boards import BoardDetections
+    from ceres_cal.scene.targets import Target
 
 
 def _add_board(parser: ArgumentParser) -> None:
     add = parser.add_argument
     add("images", nargs="+", metavar="IMAGE", help="images of one camera, or folders of them")
-    add("--columns", type=int, required=True, metavar="N", help="inner corners along a row of the board")
-    add("--rows", type=int, required=True, metavar="N", help="inner corners along a column of it")
-    add("--square", type=float, required=True, metavar="M", help="side of a square in metres")
+    add("--columns", type=int, required=True, metavar="N", help="inner corners, or circles, along a row of the board")
+    add("--rows", type=int, required=True, metavar="N", help="inner corners, or circles, along a column of it")
+    add("--square", type=float, metavar="M", help="side of a square in metres")
+    add("--circles", type=float, metavar="M", help="a grid of circles, so far apart in metres, instead of squares")
+    add("--asymmetric", action="store_true", help="with --circles: every other row half a step aside, M as in OpenCV")
+    add("--diameter", type=float, metavar="M", help="with --circles: of a circle in metres")
     add("--charuco", metavar="DICT", help="the board has markers of this OpenCV dictionary, such as DICT_4X4_50")
     add("--marker", type=float, metavar="M", help="side of a marker in metres, with --charuco")
+    add("--legacy", action="store_true", help="with --charuco: made with OpenCV before 4.6")
     add(
         "--corner-fit",
         choices=("saddle", "opencv"),
@@ -45,10 +50,9 @@ def _run_board(args: Namespace) -> Answer:
     if (args.charuco is None) != (args.marker is None):
         raise InputError("--charuco DICT and --marker M go together: give both or neither")
     from ceres_cal.detect.boards import CharucoSpec, detect_boards
-    from ceres_cal.scene.targets import checkerboard
 
-    board = checkerboard(args.columns, args.rows, args.square)
-    corners = args.corner_fit if args.charuco is None else CharucoSpec(args.charuco, args.marker)
+    board = _board(args)
+    corners = args.corner_fit if args.charuco is None else CharucoSpec(args.charuco, args.marker, args.legacy)
     with progress_bar(args) as bar:
         found = partial(detect_boards, images, board, args.camera, args.station, corners, bar.update)
         detections = detected(args, found)
@@ -57,7 +61,21 @@ def _run_board(args: Namespace) -> Answer:
     return Answer(_data(detections, args.output), lambda: _text(detections, args.output))
 
 
-COMMANDS = (Command("detect board", "corners of chessboards and ChArUco boards in images", _add_board, _run_board),)
+def _board(args: Namespace) -> Target:
+    from ceres_cal.scene.targets import checkerboard, circle_grid
+
+    if (args.square is None) == (args.circles is None):
+        raise InputError("--square M, of a chessboard, or --circles M, of a grid of circles: give one of them")
+    if args.square is not None:
+        return checkerboard(args.columns, args.rows, args.square)
+    if args.diameter is None or args.charuco is not None:
+        raise InputError("--circles M needs --diameter M, and goes without --charuco")
+    return circle_grid(args.columns, args.rows, args.circles, args.diameter, asymmetric=args.asymmetric)
+
+
+COMMANDS = (
+    Command("detect board", "chessboards, ChArUco boards and grids of circles in images", _add_board, _run_board),
+)
 
 
 def _data(detections: BoardDetections, output: Path) -> dict[str, Any]:

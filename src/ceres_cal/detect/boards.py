@@ -1,4 +1,4 @@
-"""Chessboard and ChArUco corners from image files, as observations.
+"""Boards in image files, as observations: corners of chessboards and ChArUco boards, centres of circles.
 
 OpenCV finds the board; its sub-pixel search or `saddles` then measures every corner.
 """
@@ -16,6 +16,7 @@ from ceres_cal.base.arrays import AnyArray, Array, Image, Image8
 from ceres_cal.base.errors import InputError, NothingShownError
 from ceres_cal.base.progress import ImageProgress
 from ceres_cal.base.words import frame_of, printable
+from ceres_cal.detect.circles import measured_circles
 from ceres_cal.detect.images import read_grey
 from ceres_cal.detect.partly import part_of_board
 from ceres_cal.detect.saddles import REACH, is_begun_dark, measure_saddles
@@ -26,6 +27,8 @@ from ceres_cal.scene.targets import Grid, Target
 CORNER_FITS = ("saddle", "opencv")
 MIN_CORNERS = 6
 TARGET_NAME = "board"
+_COUNTED = {"checkerboard": "inner corners", "circle-grid": "circles"}
+_HINTS = {"checkerboard": " (count the corners between squares, not the squares)", "circle-grid": ""}
 _LARGE_PX = 2e6  # larger images are searched at this size first: faster, and with less of noise and blur
 _MOST_PX = 1.6e7  # and at this size at most: on noise OpenCV takes minutes, and 50 MB for every megapixel
 _SUBPIX_HALF_WINDOW_PX = 5  # at most; a third of the spacing keeps the neighbouring corners out of it
@@ -85,7 +88,7 @@ def detect_boards(
     Args:
         images: files of any kind OpenCV reads, colour or grey, 8 or 16 bit, all of one size. A rotation noted in the
             file is ignored: intrinsics belong to the pixels as the sensor has them, not to how a viewer turns them.
-        board: a checkerboard target.
+        board: a target of kind checkerboard or circle-grid.
         camera: name of the camera.
         station: name of the station, that of the camera by default.
         corners: the markers, when the board has any: boards may then be partly seen. Else one of CORNER_FITS: "saddle"
@@ -101,16 +104,12 @@ def detect_boards(
         NothingShownError: no image shows the board.
     """
     paths = [Path(path) for path in images]
-    placements, squares = _placement_names(paths), board.grid
-    if squares is None or not squares.checkered:
-        raise InputError(f"target of kind {board.kind!r}: boards are detected with a target of kind 'checkerboard'")
-    size, grids, missed = _find_all(paths, _finder(squares, corners), progress)
+    placements, find = _placement_names(paths), _finder(board, corners)
+    size, grids, missed = _find_all(paths, find, progress)
     if not grids:
-        raise NothingShownError(
-            f"no board of {squares.columns} x {squares.rows} inner corners in any of {len(paths)} images "
-            f"(count the corners between squares, not the squares); {missed[0][0]}: {missed[0][1]}",
-            tuple(missed),
-        )
+        what = f"{board.spec['columns']} x {board.spec['rows']} {_COUNTED[board.kind]}"
+        reason = f"in any of {len(paths)} images{_HINTS[board.kind]}; {missed[0][0]}: {missed[0][1]}"
+        raise NothingShownError(f"no board of {what} {reason}", tuple(missed))
     views = tuple(View(frame_of(path), camera, station or camera, TARGET_NAME, placements[path]) for path in grids)
     points = _points(list(grids.values()), board)
     observations = Observations({TARGET_NAME: board}, {camera: size}, views, points, NO_CURVES)
@@ -149,7 +148,16 @@ def _find_all(
     return size, grids, missed
 
 
-def _finder(squares: Grid, corners: CharucoSpec | str) -> Finder:
+def _finder(board: Target, corners: CharucoSpec | str) -> Finder:
+    if board.kind == "circle-grid":
+        return lambda image: measured_circles(_as_8_bit(image), board)
+    if board.grid is None or not board.grid.checkered:
+        known = " or ".join(map(repr, _COUNTED))
+        raise InputError(f"target of kind {board.kind!r}: boards are detected with a target of kind {known}")
+    return _corner_finder(board.grid, corners)
+
+
+def _corner_finder(squares: Grid, corners: CharucoSpec | str) -> Finder:
     if isinstance(corners, str) and corners not in CORNER_FITS:
         raise InputError(f"unknown corner fit {corners!r}: choose one of {', '.join(CORNER_FITS)}")
     columns, rows, square_m = squares.columns, squares.rows, squares.spacing_m
@@ -328,5 +336,5 @@ def _points(grids: Sequence[Array], board: Target) -> Points:
         view=np.repeat(np.arange(len(grids), dtype=np.int32), count),
         feature=np.concatenate([features[s] for s in seen]),
         pixels=np.concatenate([grid[s] for grid, s in zip(grids, seen, strict=True)]),
-        sigma_px=np.full(sum(count), scatter_px(grids)),
+        sigma_px=np.full(sum(count), scatter_px(grids, board.point_array[features, :2])),
     )
