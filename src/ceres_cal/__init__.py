@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from ceres_cal.scene.targets import Arc as Arc
     from ceres_cal.scene.targets import Segment as Segment
     from ceres_cal.scene.targets import Target as Target
+    from ceres_cal.scene.targets import april_grid as april_grid
     from ceres_cal.scene.targets import checkerboard as checkerboard
     from ceres_cal.scene.targets import circle_grid as circle_grid
     from ceres_cal.scene.targets import custom as custom
@@ -65,7 +66,8 @@ _HOME = {
     "Curves": "observations",
     "Prior": "observations",
     **dict.fromkeys(
-        ("Target", "Segment", "Arc", "checkerboard", "circle_grid", "custom", "rings", "ssl_field"), "scene.targets"
+        ("Target", "Segment", "Arc", "april_grid", "checkerboard", "circle_grid", "custom", "rings", "ssl_field"),
+        "scene.targets",
     ),
     "Options": "model.parameters",
     "Pose": "base.transforms",

@@ -27,6 +27,10 @@ def _add_board(parser: ArgumentParser) -> None:
     add("--columns", type=int, required=True, metavar="N", help="inner corners, or circles, along a row of the board")
     add("--rows", type=int, required=True, metavar="N", help="inner corners, or circles, along a column of it")
     add("--square", type=float, metavar="M", help="side of a square in metres")
+    add(
+        "--april-grid", type=float, metavar="M", help="Kalibr's AprilGrid: side of a tag in metres; columns, rows: tags"
+    )
+    add("--gap", type=float, metavar="SHARE", help="with --april-grid: between tags, over their side (tagSpacing)")
     add("--circles", type=float, metavar="M", help="a grid of circles, so far apart in metres, instead of squares")
     add("--asymmetric", action="store_true", help="with --circles: every other row half a step aside, M as in OpenCV")
     add("--diameter", type=float, metavar="M", help="with --circles: of a circle in metres")
@@ -62,19 +66,25 @@ def _run_board(args: Namespace) -> Answer:
 
 
 def _board(args: Namespace) -> Target:
-    from ceres_cal.scene.targets import checkerboard, circle_grid
+    from ceres_cal.scene.targets import april_grid, checkerboard, circle_grid
 
-    if (args.square is None) == (args.circles is None):
-        raise InputError("--square M, of a chessboard, or --circles M, of a grid of circles: give one of them")
+    if sum(size is not None for size in (args.square, args.circles, args.april_grid)) != 1:
+        raise InputError("--square M, --circles M or --april-grid M, by the kind of board: give one of them")
     if args.square is not None:
         return checkerboard(args.columns, args.rows, args.square)
-    if args.diameter is None or args.charuco is not None:
-        raise InputError("--circles M needs --diameter M, and goes without --charuco")
+    if args.charuco is not None:
+        raise InputError("--charuco is for a board of squares: give --square M")
+    if args.april_grid is not None:
+        if args.gap is None:
+            raise InputError("--april-grid M needs --gap SHARE")
+        return april_grid(args.columns, args.rows, args.april_grid, args.gap)
+    if args.diameter is None:
+        raise InputError("--circles M needs --diameter M")
     return circle_grid(args.columns, args.rows, args.circles, args.diameter, asymmetric=args.asymmetric)
 
 
 COMMANDS = (
-    Command("detect board", "chessboards, ChArUco boards and grids of circles in images", _add_board, _run_board),
+    Command("detect board", "chessboards, ChArUco, AprilGrid and circle boards in images", _add_board, _run_board),
 )
 
 

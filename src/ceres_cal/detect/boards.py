@@ -16,6 +16,7 @@ from ceres_cal.base.arrays import AnyArray, Array, Image, Image8
 from ceres_cal.base.errors import InputError, NothingShownError
 from ceres_cal.base.progress import ImageProgress
 from ceres_cal.base.words import frame_of, printable
+from ceres_cal.detect.april_grids import measured_april_grid
 from ceres_cal.detect.circles import measured_circles
 from ceres_cal.detect.images import read_grey
 from ceres_cal.detect.partly import part_of_board
@@ -27,8 +28,8 @@ from ceres_cal.scene.targets import Grid, Target
 CORNER_FITS = ("saddle", "opencv")
 MIN_CORNERS = 6
 TARGET_NAME = "board"
-_COUNTED = {"checkerboard": "inner corners", "circle-grid": "circles"}
-_HINTS = {"checkerboard": " (count the corners between squares, not the squares)", "circle-grid": ""}
+_COUNTED = {"checkerboard": "inner corners", "circle-grid": "circles", "april-grid": "tags"}
+_HINTS = {"checkerboard": " (count the corners between squares, not the squares)", "circle-grid": "", "april-grid": ""}
 _LARGE_PX = 2e6  # larger images are searched at this size first: faster, and with less of noise and blur
 _MOST_PX = 1.6e7  # and at this size at most: on noise OpenCV takes minutes, and 50 MB for every megapixel
 _SUBPIX_HALF_WINDOW_PX = 5  # at most; a third of the spacing keeps the neighbouring corners out of it
@@ -88,7 +89,7 @@ def detect_boards(
     Args:
         images: files of any kind OpenCV reads, colour or grey, 8 or 16 bit, all of one size. A rotation noted in the
             file is ignored: intrinsics belong to the pixels as the sensor has them, not to how a viewer turns them.
-        board: a target of kind checkerboard or circle-grid.
+        board: a target of kind checkerboard, circle-grid or april-grid.
         camera: name of the camera.
         station: name of the station, that of the camera by default.
         corners: the markers, when the board has any: boards may then be partly seen. Else one of CORNER_FITS: "saddle"
@@ -151,6 +152,8 @@ def _find_all(
 def _finder(board: Target, corners: CharucoSpec | str) -> Finder:
     if board.kind == "circle-grid":
         return lambda image: measured_circles(_as_8_bit(image), board)
+    if board.kind == "april-grid":
+        return lambda image: _placing(measured_april_grid(image, _as_8_bit(image), board))
     if board.grid is None or not board.grid.checkered:
         known = " or ".join(map(repr, _COUNTED))
         raise InputError(f"target of kind {board.kind!r}: boards are detected with a target of kind {known}")
@@ -175,7 +178,7 @@ def _measured_chessboard(image: Image, columns: int, rows: int, corner_fit: str)
     seen = _find_chessboard(levels, columns, rows)
     if seen is None and corner_fit == "saddle" and (seed := _find_squares(levels)) is not None:
         part = part_of_board(image, seed, columns, rows)
-        return part if isinstance(part, str) else _enough(part)
+        return _placing(part)
     if seen is None:
         return f"no chessboard of {columns} x {rows} inner corners found"
     seen = right_handed(seen)
@@ -285,6 +288,11 @@ def _measured_charuco(
     # The disc around a corner must end before the markers on both sides of it begin.
     reach = min(REACH, float(np.sqrt(2.0)) * margin)
     return _enough(measure_saddles(image, seen, reach).grid)
+
+
+def _placing(found: Array | str) -> Array | str:
+    """What was found, or why it cannot place a board."""
+    return found if isinstance(found, str) else _enough(found)
 
 
 def _enough(grid: Array) -> Array | str:
