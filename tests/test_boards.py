@@ -1,6 +1,7 @@
 """Boards in images: how many, how well, under which names, and what is said where there are none."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -141,6 +142,17 @@ def test_corners_stay_good_whatever_the_camera_does(change: str, limit: float, p
     assert rms(error) < limit
 
 
+def test_large_squares_out_of_focus() -> None:
+    """Squares of 120 px, blurred by 8 px: in discs of 20 px there is little but blur."""
+    camera = Camera((1440, 1080), 1350.0, (730.0, 534.0), Radial((0.0,), (3,)))
+    truth = camera.at(POSE).project(BOARD.point_array).reshape(6, 7, 2)
+    image = photograph(ideal_picture(camera.at(POSE), 0.03, squares(7, 6)), blur_px=8.0)
+    error = error_px(measure_saddles(image, truth + 1.0).grid, truth)
+    assert len(error) == 42 and rms(error) < 0.02  # 0.011; 0.05 at the scale of the picture
+    peer = cv2.cornerSubPix(image, truth.reshape(-1, 1, 2).astype(np.float32), (15, 15), (-1, -1), (3, 100, 1e-4))
+    assert rms(error) < 0.2 * rms(peer.reshape(6, 7, 2) - truth)  # 0.2
+
+
 @settings(max_examples=25, deadline=None)
 @given(
     turn=st.floats(-np.pi, np.pi),
@@ -255,6 +267,41 @@ def test_labelling_is_never_mirrored_and_stays_on_the_board(
     for _ in range(quarter_turns):
         origin, width, height = np.array([origin[1], width - 1 - origin[0]]), height, width
     assert np.linalg.norm(grid[0, 0] - origin) < 0.1  # 0.003; the other end is 230 px away
+
+
+# ---- partly out of the picture --------------------------------------------------------------------------------------
+
+
+def _moved_aside(x_px: float, y_px: float, turn: float = 0.0, board: Target = BOARD) -> tuple[Image8, Array]:
+    """A picture of a board whose middle is so far from the picture's, and where its corners are."""
+    squares_of = board.grid
+    assert squares_of is not None
+    columns, rows = squares_of.columns, squares_of.rows
+    middle = Pose.exp((0.0, 0.0, 0.0, -0.015 * (columns - 1), -0.015 * (rows - 1), 0.0))
+    pose = Pose.exp((0.3, -0.35, 0.0, 0.0, 0.0, 0.3)) @ Pose.exp((0.0, 0.0, turn, 0.0, 0.0, 0.0)) @ middle
+    camera = replace(CAMERA, principal_point=(243.3 + x_px, 177.8 + y_px)).at(pose)
+    truth = camera.project(board.point_array).reshape(rows, columns, 2)
+    return photograph(ideal_picture(camera, 0.03, squares(columns, rows))), truth
+
+
+@pytest.mark.parametrize("x_px, y_px, turn", [(-220, 0, 0.0), (220, 0, np.pi), (0, -140, np.pi), (0, 140, 0.0)])
+def test_a_board_partly_out_of_the_picture(x_px: float, y_px: float, turn: float, tmp_path: Path) -> None:
+    image, truth = _moved_aside(x_px, y_px, turn)
+    points = detect_boards([write(tmp_path / "a.png", image)], BOARD).observations.points
+    inside = np.all((truth > 3.0) & (truth < np.array([476.0, 356.0])), axis=-1)
+    assert np.count_nonzero(inside) - 3 <= len(points) <= np.count_nonzero(inside) < 42
+    error = points.pixels - truth.reshape(-1, 2)[points.feature]  # 7 + 6 is odd: every name is known
+    assert np.max(np.abs(error)) < 0.1  # 0.04, next to the border
+
+
+def test_a_part_that_has_several_places_on_the_board_is_refused(tmp_path: Path) -> None:
+    both_ends = Camera((160, 360), 450.0, (80.0, 177.8), CAMERA.lens)
+    whole, _ = _moved_aside(0.0, 0.0)
+    cut = write(tmp_path / "cut.png", whole[:, 163 : 163 + both_ends.image_size[0]])
+    with pytest.raises(InputError, match=r"more than one place on it|no place on it|corners found"):
+        detect_boards([cut], BOARD)
+    with pytest.raises(InputError, match="no chessboard of 7 x 6"):  # OpenCV sees whole boards alone
+        detect_boards([write(tmp_path / "a.png", _moved_aside(220, 0)[0])], BOARD, corners="opencv")
 
 
 def test_a_mirrored_grid_is_turned_over(truth: Array) -> None:

@@ -359,7 +359,7 @@ def test_the_order_of_features_counts() -> None:
 
 WIDE_ARC = {"centre": [0, 0, 0], "radius_m": 0.1, "width_m": 0.2}
 BAD_SPECS: list[tuple[Any, str]] = [
-    (None, "unknown kind None: choose one of ssl-field, checkerboard, rings, custom"),
+    (None, "unknown kind None: choose one of ssl-field, checkerboard, circle-grid, april-grid, rings, custom"),
     ([1, 2], "unknown kind None"),
     ({"kind": "ssl"}, "unknown kind 'ssl'"),
     ({"kind": ["ssl-field"]}, r"unknown kind \['ssl-field'\]"),

@@ -35,7 +35,9 @@ if TYPE_CHECKING:
     from ceres_cal.scene.targets import Arc as Arc
     from ceres_cal.scene.targets import Segment as Segment
     from ceres_cal.scene.targets import Target as Target
+    from ceres_cal.scene.targets import april_grid as april_grid
     from ceres_cal.scene.targets import checkerboard as checkerboard
+    from ceres_cal.scene.targets import circle_grid as circle_grid
     from ceres_cal.scene.targets import custom as custom
     from ceres_cal.scene.targets import rings as rings
     from ceres_cal.scene.targets import ssl_field as ssl_field
@@ -63,7 +65,10 @@ _HOME = {
     "Points": "observations",
     "Curves": "observations",
     "Prior": "observations",
-    **dict.fromkeys(("Target", "Segment", "Arc", "checkerboard", "custom", "rings", "ssl_field"), "scene.targets"),
+    **dict.fromkeys(
+        ("Target", "Segment", "Arc", "april_grid", "checkerboard", "circle_grid", "custom", "rings", "ssl_field"),
+        "scene.targets",
+    ),
     "Options": "model.parameters",
     "Pose": "base.transforms",
     "write_report": "report",

@@ -28,6 +28,7 @@ from ceres_cal.cli.detect_rings import COMMANDS as DETECT_RINGS
 from ceres_cal.cli.diagnose import COMMANDS as DIAGNOSE
 from ceres_cal.cli.export import COMMANDS as EXPORT
 from ceres_cal.cli.foreign import COMMANDS as FOREIGN
+from ceres_cal.cli.join import COMMANDS as JOIN
 from ceres_cal.cli.locate import COMMANDS as LOCATE
 from ceres_cal.cli.program import TERMINATED, Terminated, as_a_program, ended
 from ceres_cal.cli.refit import COMMANDS as REFIT
@@ -40,7 +41,7 @@ from ceres_cal.cli.undistort import COMMANDS as UNDISTORT
 _GROUPS = (
     RUN,
     *(DETECT_BOARD, DETECT_RINGS, DETECT_FIELD),
-    *(CALIBRATE, DIAGNOSE, ADVISE, REFIT, CHECK, SCORE, COMPARE, AUDIT),
+    *(JOIN, CALIBRATE, DIAGNOSE, ADVISE, REFIT, CHECK, SCORE, COMPARE, AUDIT),
     *(LOCATE, UNDISTORT, EXPORT, FOREIGN, SIMULATE, TARGETS, (completion(lambda: COMMANDS),)),
 )
 COMMANDS: dict[str, Command] = {command.name: command for group in _GROUPS for command in group}

@@ -18,21 +18,34 @@ from ceres_cal.cli.progress import progress_bar
 
 if TYPE_CHECKING:
     from ceres_cal.detect.boards import BoardDetections
+    from ceres_cal.scene.targets import Target
 
 
 def _add_board(parser: ArgumentParser) -> None:
     add = parser.add_argument
     add("images", nargs="+", metavar="IMAGE", help="images of one camera, or folders of them")
-    add("--columns", type=int, required=True, metavar="N", help="inner corners along a row of the board")
-    add("--rows", type=int, required=True, metavar="N", help="inner corners along a column of it")
-    add("--square", type=length("m"), required=True, metavar="M", help="side of a square in metres, or such as 25mm")
+    add("--columns", type=int, required=True, metavar="N", help="inner corners, or circles, along a row of the board")
+    add("--rows", type=int, required=True, metavar="N", help="inner corners, or circles, along a column of it")
+    add("--square", type=length("m"), metavar="M", help="side of a square in metres, or such as 25mm")
+    add(
+        "--april-grid",
+        type=length("m"),
+        metavar="M",
+        help="Kalibr's AprilGrid: side of a tag likewise; columns and rows are of tags",
+    )
+    add("--gap", type=float, metavar="SHARE", help="with --april-grid: between tags, over their side (tagSpacing)")
+    add("--circles", type=length("m"), metavar="M", help="a grid of circles, so far apart, instead of squares")
+    add("--asymmetric", action="store_true", help="with --circles: every other row half a step aside, M as in OpenCV")
+    add("--diameter", type=length("m"), metavar="M", help="with --circles: of a circle")
     add("--charuco", metavar="DICT", help="the board has markers of this OpenCV dictionary, such as DICT_4X4_50")
     add("--marker", type=length("m"), metavar="M", help="side of a marker likewise, with --charuco")
+    add("--legacy", action="store_true", help="with --charuco: made with OpenCV before 4.6")
     add(
         "--corner-fit",
-        choices=("opencv", "saddle"),
-        default="opencv",
-        help="measure corners as OpenCV does (default), or by the saddle around each: finer where squares are large",
+        choices=("saddle", "opencv"),
+        default="saddle",
+        help="measure corners by the saddle around each (default), also of boards partly out of the picture, or as "
+        "OpenCV does, whole boards alone",
     )
     add_detection(parser)
     add_quiet(parser)
@@ -44,10 +57,9 @@ def _run_board(args: Namespace) -> Answer:
     if (args.charuco is None) != (args.marker is None):
         raise InputError("--charuco DICT and --marker M go together: give both or neither")
     from ceres_cal.detect.boards import CharucoSpec, detect_boards
-    from ceres_cal.scene.targets import checkerboard
 
-    board = checkerboard(args.columns, args.rows, args.square)
-    corners = args.corner_fit if args.charuco is None else CharucoSpec(args.charuco, args.marker)
+    board = _board(args)
+    corners = args.corner_fit if args.charuco is None else CharucoSpec(args.charuco, args.marker, args.legacy)
     with progress_bar(args) as bar:
         found = partial(detect_boards, images, board, args.camera, args.station, corners, bar.update)
         detections = detected(args, found)
@@ -56,15 +68,35 @@ def _run_board(args: Namespace) -> Answer:
     return Answer(_data(detections, args.output), lambda: _text(detections, args.output))
 
 
+def _board(args: Namespace) -> Target:
+    from ceres_cal.scene.targets import april_grid, checkerboard, circle_grid
+
+    if sum(size is not None for size in (args.square, args.circles, args.april_grid)) != 1:
+        raise InputError("--square M, --circles M or --april-grid M, by the kind of board: give one of them")
+    if args.square is not None:
+        return checkerboard(args.columns, args.rows, args.square)
+    if args.charuco is not None:
+        raise InputError("--charuco is for a board of squares: give --square M")
+    if args.april_grid is not None:
+        if args.gap is None:
+            raise InputError("--april-grid M needs --gap SHARE")
+        return april_grid(args.columns, args.rows, args.april_grid, args.gap)
+    if args.diameter is None:
+        raise InputError("--circles M needs --diameter M")
+    return circle_grid(args.columns, args.rows, args.circles, args.diameter, asymmetric=args.asymmetric)
+
+
 COMMANDS = (
     Command(
         "detect board",
-        "corners of chessboards and ChArUco boards in images",
+        "chessboards, ChArUco, AprilGrid and circle boards in images",
         _add_board,
         _run_board,
         (
             "photographs/ --columns 9 --rows 6 --square 25mm -o board.json",
             "photographs/ --columns 9 --rows 6 --square 40mm --charuco DICT_4X4_50 --marker 30mm -o board.json",
+            "photographs/ --columns 6 --rows 6 --april-grid 88mm --gap 0.3 -o april.json",
+            "photographs/ --columns 7 --rows 5 --circles 30mm --diameter 20mm -o circles.json",
         ),
     ),
 )

@@ -21,6 +21,7 @@ from ceres_cal.report.quality import Quality
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.heights import at_height
 from ceres_cal.uncertainty import FieldMap, Verdict
+from ceres_cal.uncertainty.rig import RigPair
 
 _MOST_FEATURES, _MOST_DIRECTIONS, _MOST_FINDINGS = 6, 4, 3
 _MANY_OUTLIERS, _LARGE_SCALE = 0.3, 4.0  # from where on a warning is due
@@ -246,6 +247,8 @@ def with_sd(value: float, unit: str, verdict: Verdict | None) -> str:
 def _uncertainty_lines(quality: Quality) -> Iterator[tuple[str, list[str]]]:
     if quality.uncertainty is None:
         return
+    if quality.uncertainty.rig:
+        yield "rig", [_rig_line(pair) for pair in quality.uncertainty.rig]
     if quality.maps:
         yield "located", [f"{name}: {_sd_at_heights(maps)}" for name, maps in quality.maps.items()]
     seams = []
@@ -270,6 +273,19 @@ def _uncertainty_lines(quality: Quality) -> Iterator[tuple[str, list[str]]]:
         yield "unknown", [f"{', '.join(quantities)} of placement {name!r}{rest}"]
 
 
+def _rig_line(pair: RigPair) -> str:
+    """Baseline and angle of two stations, each with its standard deviation."""
+    baseline, turn = (
+        1e3 * np.array([pair.baseline_m, pair.baseline_sd_m]),
+        np.degrees([pair.angle_rad, pair.angle_sd_rad]),
+    )
+    apart, turned = (
+        f"{at_precision(value, sd)} ± {two_digits(sd) if np.isfinite(sd) else 'unknown'}"
+        for value, sd in (baseline, turn)
+    )
+    return f"{' - '.join(pair.stations)}: baseline {apart} mm, angle {turned} deg"
+
+
 def _sd_at_heights(maps: Sequence[FieldMap]) -> str:
     parts = []
     for m in maps:
@@ -287,6 +303,7 @@ def _uncertainty_data(quality: Quality) -> dict[str, Any] | None:
     return {
         "numbers": [{**asdict(v), "key": v.key._asdict()} for v in uncertainty.verdicts],
         "widening": uncertainty.widening,
+        "rig": [asdict(pair) for pair in uncertainty.rig],
         "dependence": uncertainty.posterior.dependence,
         "weak_directions": [
             {"words": d.words, "relative": d.relative, "shares": [[*key[:3], share] for key, share in d.shares]}

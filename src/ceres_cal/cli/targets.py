@@ -7,7 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ceres_cal.base.errors import InputError
+from ceres_cal.cli.arguments import add_output
 from ceres_cal.cli.command import Answer, Command
+from ceres_cal.cli.outputs import finishing, require_ending, require_output, section
 
 if TYPE_CHECKING:
     from ceres_cal.scene.targets import Curve, Target, TargetKind
@@ -37,6 +39,42 @@ def _run(args: Namespace) -> Answer:
     )
 
 
+def _add_print(parser: ArgumentParser) -> None:
+    parser.add_argument("target", metavar="BOARD", help='as `ceres-cal targets` has it, or {"kind": ...} as in files')
+    add_output(parser, "the sheet (.pdf)", required=True)
+
+
+def _print(args: Namespace) -> Answer:
+    require_output(args.output, [])
+    require_ending(args.output, "sheets are", ".pdf")
+    import json
+
+    from ceres_cal.base.files import write_bytes
+    from ceres_cal.report.sheet import sheet_pdf
+
+    targets = _given(args.target)
+    if len(targets) > 1:
+        raise InputError(f"{args.target}: it has several targets: {', '.join(targets)}: give the description of one")
+    (target,) = targets.values()
+    content = sheet_pdf(target, json.dumps(target.spec))
+    with finishing():
+        write_bytes(args.output, content)
+    return Answer({"output": str(args.output), "spec": target.spec}, lambda: section("written", [str(args.output)]))
+
+
+def _given(wanted: str) -> dict[str, Target]:
+    if not wanted.lstrip().startswith("{"):
+        return _targets(wanted)
+    from json import JSONDecodeError, loads
+
+    from ceres_cal.scene.targets import target_from_spec
+
+    try:
+        return {"board": target_from_spec(loads(wanted), "BOARD")}
+    except JSONDecodeError as error:
+        raise InputError(f"BOARD: no JSON: {error}") from None
+
+
 COMMANDS = (
     Command(
         "targets",
@@ -44,6 +82,13 @@ COMMANDS = (
         _add_arguments,
         _run,
         ("", "ssl-b", "observations.json"),
+    ),
+    Command(
+        "targets print",
+        "a board as a PDF to print to scale, with a ruler on it",
+        _add_print,
+        _print,
+        ('\'{"kind": "checkerboard", "columns": 9, "rows": 6, "square_m": 0.025}\' -o board.pdf',),
     ),
 )
 

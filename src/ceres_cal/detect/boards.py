@@ -1,4 +1,4 @@
-"""Chessboard and ChArUco corners from image files, as observations.
+"""Boards in image files, as observations: corners of chessboards and ChArUco boards, centres of circles.
 
 OpenCV finds the board; its sub-pixel search or `saddles` then measures every corner.
 """
@@ -12,22 +12,28 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Image, Image8
+from ceres_cal.base.arrays import AnyArray, Array, Image, Image8
 from ceres_cal.base.errors import InputError, NothingShownError
 from ceres_cal.base.progress import ImageProgress
 from ceres_cal.base.words import frame_of, printable
+from ceres_cal.detect.april_grids import measured_april_grid
+from ceres_cal.detect.circles import measured_circles
 from ceres_cal.detect.images import read_grey
-from ceres_cal.detect.saddles import REACH, measure_saddles
+from ceres_cal.detect.partly import part_of_board
+from ceres_cal.detect.saddles import REACH, is_begun_dark, measure_saddles
 from ceres_cal.detect.scatter import scatter_px
 from ceres_cal.observations import NO_CURVES, Observations, Points, View
 from ceres_cal.scene.targets import Grid, Target
 
-CORNER_FITS = ("opencv", "saddle")
+CORNER_FITS = ("saddle", "opencv")
 MIN_CORNERS = 6
 TARGET_NAME = "board"
+_COUNTED = {"checkerboard": "inner corners", "circle-grid": "circles", "april-grid": "tags"}
+_HINTS = {"checkerboard": " (count the corners between squares, not the squares)", "circle-grid": "", "april-grid": ""}
 _LARGE_PX = 2e6  # larger images are searched at this size first: faster, and with less of noise and blur
 _MOST_PX = 1.6e7  # and at this size at most: on noise OpenCV takes minutes, and 50 MB for every megapixel
 _SUBPIX_HALF_WINDOW_PX = 5  # at most; a third of the spacing keeps the neighbouring corners out of it
+_UNEVEN = 0.45  # natural logarithm: 1.57 times; a skipped square makes 2, perspective on three squares hardly 1.3
 _SMALL_PX = 2e6  # smaller ones also at twice their size, where the squares are few pixels wide
 
 
@@ -66,7 +72,7 @@ def detect_boards(
     board: Target,
     camera: str = "camera",
     station: str | None = None,
-    corners: CharucoSpec | str = "opencv",
+    corners: CharucoSpec | str = "saddle",
     progress: ImageProgress | None = None,
 ) -> BoardDetections:
     """Chessboard or ChArUco corners of one camera's images.
@@ -83,13 +89,14 @@ def detect_boards(
     Args:
         images: files of any kind OpenCV reads, colour or grey, 8 or 16 bit, all of one size. A rotation noted in the
             file is ignored: intrinsics belong to the pixels as the sensor has them, not to how a viewer turns them.
-        board: a checkerboard target.
+        board: a target of kind checkerboard, circle-grid or april-grid.
         camera: name of the camera.
         station: name of the station, that of the camera by default.
-        corners: the markers, when the board has any: boards may then be partly seen. Else one of CORNER_FITS: "opencv"
-            measures with cornerSubPix, as the peers do, so that results compare; "saddle" fits a blurred saddle to each
-            corner, as with markers always: about four times more precise on rendered boards (0.005 px against 0.02),
-            and without cornerSubPix's shift towards the middle of its window.
+        corners: the markers, when the board has any: boards may then be partly seen. Else one of CORNER_FITS: "saddle"
+            fits a blurred saddle to each corner, as with markers always: about four times more precise on rendered
+            boards (0.005 px against 0.02), and without cornerSubPix's shift towards the middle of its window; boards
+            may reach out of the picture, as long as it tells which corners are seen. "opencv" measures with
+            cornerSubPix, as the peers do, so that results compare; boards are seen whole.
         progress: called after each image.
 
     Raises:
@@ -98,16 +105,12 @@ def detect_boards(
         NothingShownError: no image shows the board.
     """
     paths = [Path(path) for path in images]
-    placements, squares = _placement_names(paths), board.grid
-    if squares is None or not squares.checkered:
-        raise InputError(f"target of kind {board.kind!r}: boards are detected with a target of kind 'checkerboard'")
-    size, grids, missed = _find_all(paths, _finder(squares, corners), progress)
+    placements, find = _placement_names(paths), _finder(board, corners)
+    size, grids, missed = _find_all(paths, find, progress)
     if not grids:
-        raise NothingShownError(
-            f"no board of {squares.columns} x {squares.rows} inner corners in any of {len(paths)} images "
-            f"(count the corners between squares, not the squares); {missed[0][0]}: {missed[0][1]}",
-            tuple(missed),
-        )
+        what = f"{board.spec['columns']} x {board.spec['rows']} {_COUNTED[board.kind]}"
+        reason = f"in any of {len(paths)} images{_HINTS[board.kind]}; {missed[0][0]}: {missed[0][1]}"
+        raise NothingShownError(f"no board of {what} {reason}", tuple(missed))
     views = tuple(View(frame_of(path), camera, station or camera, TARGET_NAME, placements[path]) for path in grids)
     points = _points(list(grids.values()), board)
     observations = Observations({TARGET_NAME: board}, {camera: size}, views, points, NO_CURVES)
@@ -146,7 +149,18 @@ def _find_all(
     return size, grids, missed
 
 
-def _finder(squares: Grid, corners: CharucoSpec | str) -> Finder:
+def _finder(board: Target, corners: CharucoSpec | str) -> Finder:
+    if board.kind == "circle-grid":
+        return lambda image: measured_circles(_as_8_bit(image), board)
+    if board.kind == "april-grid":
+        return lambda image: _placing(measured_april_grid(image, _as_8_bit(image), board))
+    if board.grid is None or not board.grid.checkered:
+        known = " or ".join(map(repr, _COUNTED))
+        raise InputError(f"target of kind {board.kind!r}: boards are detected with a target of kind {known}")
+    return _corner_finder(board.grid, corners)
+
+
+def _corner_finder(squares: Grid, corners: CharucoSpec | str) -> Finder:
     if isinstance(corners, str) and corners not in CORNER_FITS:
         raise InputError(f"unknown corner fit {corners!r}: choose one of {', '.join(CORNER_FITS)}")
     columns, rows, square_m = squares.columns, squares.rows, squares.spacing_m
@@ -160,17 +174,18 @@ def _finder(squares: Grid, corners: CharucoSpec | str) -> Finder:
 
 
 def _measured_chessboard(image: Image, columns: int, rows: int, corner_fit: str) -> Array | str:
-    seen = _find_chessboard(_as_8_bit(image), columns, rows)
+    levels = _as_8_bit(image)
+    seen = _find_chessboard(levels, columns, rows)
+    if seen is None and corner_fit == "saddle" and (seed := _find_squares(levels)) is not None:
+        part = part_of_board(image, seed, columns, rows)
+        return _placing(part)
     if seen is None:
         return f"no chessboard of {columns} x {rows} inner corners found"
     seen = right_handed(seen)
     saddles = measure_saddles(image, seen)
-    grid = saddles.grid if corner_fit == "saddle" else _subpixel(_as_8_bit(image), seen)
-    if (columns + rows) % 2 == 1:
-        parity = np.where(np.indices((rows, columns)).sum(axis=0) % 2 == 0, 1.0, -1.0)
-        if np.nansum(parity * saddles.contrast) < 0.0:
-            grid = grid[::-1, ::-1]
-    return _enough(grid)
+    grid = saddles.grid if corner_fit == "saddle" else _subpixel(levels, seen)
+    turned = (columns + rows) % 2 == 1 and not is_begun_dark(saddles.contrast)
+    return _enough(grid[::-1, ::-1] if turned else grid)
 
 
 def _subpixel(image: Image8, grid: Array) -> Array:
@@ -195,16 +210,42 @@ def _find_chessboard(image: Image8, columns: int, rows: int) -> Array | None:
     """Roughly where the corners are, (rows, columns, 2) px, by OpenCV's two detectors at several scales."""
     legacy = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
     for scale in _scales(image.size):
-        how = cv2.INTER_AREA if scale < 1.0 else cv2.INTER_CUBIC
-        scaled = image if scale == 1.0 else cv2.resize(image, None, fx=scale, fy=scale, interpolation=how)
+        scaled = _resized(image, scale)
         # The newer detector is the better one, but blind where it is dark.
         shown, corners = cv2.findChessboardCornersSB(scaled, (columns, rows))
         if not shown:
             shown, corners = cv2.findChessboardCorners(scaled, (columns, rows), flags=legacy)
         if shown:
-            ratio = np.array(image.shape[::-1]) / np.array(scaled.shape[::-1])
-            return np.asarray((corners.reshape(rows, columns, 2).astype(float) + 0.5) * ratio - 0.5)
+            return _places_in(image, scaled, corners).reshape(rows, columns, 2)
     return None
+
+
+def _find_squares(image: Image8) -> Array | None:
+    """Roughly where the corners of neighbouring squares are, (h, w, 2) px, right-handed: three each way or more."""
+    for scale in _scales(image.size):
+        scaled = _resized(image, scale)
+        shown, corners, meta = cv2.findChessboardCornersSBWithMeta(scaled, (3, 3), cv2.CALIB_CB_LARGER)
+        if shown and _is_even(grid := _places_in(image, scaled, corners).reshape(*meta.shape, 2)):
+            return right_handed(grid)
+    return None
+
+
+def _is_even(grid: Array) -> bool:
+    """Whether no square was skipped: then steps along a line change a little from one to the next."""
+    steps = [np.maximum(np.linalg.norm(np.diff(grid, axis=axis), axis=-1), 1e-9) for axis in (0, 1)]
+    ratios = [np.abs(np.diff(np.log(step), axis=axis)) for axis, step in enumerate(steps)]
+    return max(float(np.max(ratio, initial=0.0)) for ratio in ratios) < _UNEVEN
+
+
+def _resized(image: Image8, scale: float) -> Image8:
+    how = cv2.INTER_AREA if scale < 1.0 else cv2.INTER_CUBIC
+    return image if scale == 1.0 else cv2.resize(image, None, fx=scale, fy=scale, interpolation=how).astype(np.uint8)
+
+
+def _places_in(image: Image8, scaled: Image8, corners: AnyArray) -> Array:
+    """Corners of the image where OpenCV has them in a scaled one, (N, 2) px."""
+    ratio = np.array(image.shape[::-1]) / np.array(scaled.shape[::-1])
+    return np.asarray((corners.reshape(-1, 2).astype(float) + 0.5) * ratio - 0.5)
 
 
 def _scales(pixels: int) -> Iterator[float]:
@@ -247,6 +288,11 @@ def _measured_charuco(
     # The disc around a corner must end before the markers on both sides of it begin.
     reach = min(REACH, float(np.sqrt(2.0)) * margin)
     return _enough(measure_saddles(image, seen, reach).grid)
+
+
+def _placing(found: Array | str) -> Array | str:
+    """What was found, or why it cannot place a board."""
+    return found if isinstance(found, str) else _enough(found)
 
 
 def _enough(grid: Array) -> Array | str:
@@ -298,5 +344,5 @@ def _points(grids: Sequence[Array], board: Target) -> Points:
         view=np.repeat(np.arange(len(grids), dtype=np.int32), count),
         feature=np.concatenate([features[s] for s in seen]),
         pixels=np.concatenate([grid[s] for grid, s in zip(grids, seen, strict=True)]),
-        sigma_px=np.full(sum(count), scatter_px(grids)),
+        sigma_px=np.full(sum(count), scatter_px(grids, board.point_array[features, :2])),
     )

@@ -16,7 +16,7 @@ _FEWEST_SPARE = 8  # equations below which a board says nothing
 _LEAST_PX = 1e-3
 
 
-def scatter_px(grids: Iterable[Array]) -> float:
+def scatter_px(grids: Iterable[Array], places: Array) -> float:
     """Standard deviation (px) of each coordinate of boards' corners about a smooth picture of their board.
 
     A lens and a bent board move neighbouring corners alike: a homography and a polynomial take that up, of as many
@@ -25,22 +25,23 @@ def scatter_px(grids: Iterable[Array]) -> float:
 
     Args:
         grids: each (rows, columns, 2) px, NaN where a corner was not seen.
+        places: (rows, columns, 2) where the corners are on the board, in any unit.
 
     Returns:
         The median over the boards; USUAL_PX where none has corners enough to tell.
     """
-    scatters = [one for grid in grids if (one := _of_board(grid)) is not None]
+    scatters = [one for grid in grids if (one := _of_board(grid, places)) is not None]
     return max(float(np.median(scatters)), _LEAST_PX) if scatters else USUAL_PX
 
 
-def _of_board(grid: Array) -> float | None:
-    row, column = np.nonzero(~np.isnan(grid[..., 0]))
-    pixels, places = grid[row, column], np.column_stack([column, row]).astype(float)
+def _of_board(grid: Array, board: Array) -> float | None:
+    seen = ~np.isnan(grid[..., 0])
+    pixels, places = grid[seen], board[seen]
     homography, _ = cv2.findHomography(places, pixels)
     if homography is None:
         return None
     flat = cv2.perspectiveTransform(places[None], homography)[0]
-    x, y = (places - places.mean(axis=0)).T / max(grid.shape[:2])
+    x, y = (places - places.mean(axis=0)).T / np.ptp(board, axis=(0, 1)).max()
     degrees = next(d for d in range(_MOST_DEGREES, -1, -1) if (d + 1) * (d + 2) <= 2.0 * _SHARE * len(places))
     terms = np.column_stack([x**i * y**j for i in range(degrees + 1) for j in range(degrees + 1 - i)])
     solved, _, rank, _ = np.linalg.lstsq(terms, pixels - flat, rcond=None)

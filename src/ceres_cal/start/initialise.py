@@ -48,6 +48,16 @@ def initialise(observations: Observations, sights: Sights, options: Options) -> 
     Raises:
         DegenerateError: naming the sight whose pose the observations do not determine.
     """
+    cameras, phi_from, numbers, poses = posed_sights(observations, sights, options)
+    stations, placements = chained_poses(observations, sights, numbers, poses)
+    structure = make_structure(observations.targets, options.tolerances)
+    return Start(Estimate(cameras, stations, placements, structure), phi_from)
+
+
+def posed_sights(
+    observations: Observations, sights: Sights, options: Options
+) -> tuple[dict[str, Camera], dict[str, str], Indices, Array]:
+    """Cameras and where their phi is from, by name; numbers (K,) and poses (K, 3, 4) of the sights that they pose."""
     cameras: dict[str, Camera] = {}
     phi_from: dict[str, str] = {}
     numbers, poses = [], []
@@ -60,9 +70,7 @@ def initialise(observations: Observations, sights: Sights, options: Options) -> 
         cameras[name], phi_from[name] = start.camera, start.phi_from
         numbers.append(own[start.sights])
         poses.append(start.poses)
-    stations, placements = chained_poses(observations, sights, np.concatenate(numbers), np.concatenate(poses))
-    structure = make_structure(observations.targets, options.tolerances)
-    return Start(Estimate(cameras, stations, placements, structure), phi_from)
+    return cameras, phi_from, np.concatenate(numbers), np.concatenate(poses)
 
 
 # ---- one camera -----------------------------------------------------------------------------------------------------

@@ -17,6 +17,7 @@ from ceres_cal.model.parameters import Estimate
 from ceres_cal.scene.targets import Target
 from ceres_cal.uncertainty.maps import FieldMap, Grid, PointSpread, field_map, spread_of_points
 from ceres_cal.uncertainty.posterior import Posterior
+from ceres_cal.uncertainty.rig import RigPair, rig_pairs
 from ceres_cal.uncertainty.seam import seam_map
 from ceres_cal.uncertainty.weak import (
     Verdict,
@@ -78,6 +79,11 @@ class Uncertainty:
     def unknown_placements(self) -> dict[str, tuple[str, ...]]:
         """Placements of which some number is not known at all, and which."""
         return unknown_placements(self.posterior)
+
+    @cached_property
+    def rig(self) -> tuple[RigPair, ...]:
+        """Baseline and angle between the first station and those of other cameras."""
+        return rig_pairs(self.estimate, self.posterior)
 
     @property
     def widening(self) -> str:

@@ -4,7 +4,9 @@ from ceres_cal.scene.curves import SIDES as SIDES
 from ceres_cal.scene.curves import Arc as Arc
 from ceres_cal.scene.curves import Curve as Curve
 from ceres_cal.scene.curves import Segment as Segment
+from ceres_cal.scene.targets.april_grids import april_grid as april_grid
 from ceres_cal.scene.targets.checkerboards import checkerboard as checkerboard
+from ceres_cal.scene.targets.circle_grids import circle_grid as circle_grid
 from ceres_cal.scene.targets.custom_targets import custom as custom
 from ceres_cal.scene.targets.registry import TARGET_KINDS as TARGET_KINDS
 from ceres_cal.scene.targets.registry import target_from_spec as target_from_spec

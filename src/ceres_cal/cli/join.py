@@ -1,0 +1,91 @@
+"""`ceres-cal join`: the observations of a rig's cameras as one file, with frames and labels that go together."""
+
+from __future__ import annotations
+
+from argparse import ArgumentParser, Namespace
+from collections import Counter
+from typing import TYPE_CHECKING, Any
+
+from ceres_cal.cli.arguments import add_output
+from ceres_cal.cli.command import Answer, Command
+from ceres_cal.cli.inputs import read_observations, require_different
+from ceres_cal.cli.outputs import finishing, require_observations_output, section, wrapped
+
+if TYPE_CHECKING:
+    from ceres_cal.observations import Observations
+    from ceres_cal.start.same_labels import Labels
+
+
+def _add_arguments(parser: ArgumentParser) -> None:
+    parser.add_argument("observations", nargs="+", metavar="OBS", help="files of observations, of all cameras")
+    parser.add_argument(
+        "--same-frame",
+        metavar="RULE",
+        help="which frames are one moment: 'left*,right*' (what * stands for names it), index (the n-th of each "
+        "camera), or within:0.01 (frames are named by time stamps); default: those of one name",
+    )
+    add_output(parser, "the joined observations (.json or .npz)", required=True)
+
+
+def _run(args: Namespace) -> Answer:
+    require_different(args.observations)
+    require_observations_output(args.output, args.observations)
+    observations = read_observations(args.observations)
+    from ceres_cal.observations.same_frame import with_same_frames
+    from ceres_cal.start.same_labels import with_same_labels
+
+    if args.same_frame is not None:
+        observations = with_same_frames(observations, args.same_frame)
+    labels = with_same_labels(observations)
+    with finishing():
+        labels.observations.save(args.output)
+    return Answer(_data(labels, args), lambda: _text(labels, args))
+
+
+COMMANDS = (
+    Command(
+        "join",
+        "a rig's observations as one: same frames, same labels",
+        _add_arguments,
+        _run,
+        ("left.json right.json --same-frame 'left*,right*' -o rig.json",),
+    ),
+)
+
+
+def _moments(observations: Observations) -> Counter[int]:
+    """How many moments so many cameras saw."""
+    cameras: dict[str, set[str]] = {}
+    for view in observations.views:
+        cameras.setdefault(view.frame, set()).add(view.camera)
+    return Counter(len(seen) for seen in cameras.values())
+
+
+def _data(labels: Labels, args: Namespace) -> dict[str, Any]:
+    return {
+        "output": str(args.output),
+        "moments_by_cameras": {str(count): number for count, number in sorted(_moments(labels.observations).items())},
+        "turned": labels.turned,
+        "open": labels.open,
+    }
+
+
+def _text(labels: Labels, args: Namespace) -> str:
+    by_count = sorted(_moments(labels.observations).items(), reverse=True)
+    rule = "of one name" if args.same_frame is None else f"by {args.same_frame!r}"
+    moments = ", ".join(f"{number} seen by {count} camera{'s' * (count > 1)}" for count, number in by_count)
+    lines = [section("moments", wrapped(f"{moments} (frames {rule})"))]
+    if labels.turned:
+        which = ", ".join(f"{placement!r} of {station!r}" for station, placement in labels.turned)
+        lines.append(section("labels", wrapped(f"turned, to be those of the first camera: {which}")))
+    for station in labels.open:
+        lines.append(
+            section(
+                "warning",
+                wrapped(
+                    f"station {station!r}: nothing tells which way round its boards are labelled: show the board to it "
+                    "and to the first camera at once in more poses, or take a board of odd columns + rows"
+                ),
+            )
+        )
+    return "\n".join([*lines, section("written", [str(args.output)])])

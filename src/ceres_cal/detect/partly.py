@@ -1,0 +1,152 @@
+"""Chessboards that are partly out of the picture: the squares that are seen, and which of the board's they are.
+
+A few squares anywhere are found by OpenCV, and corners are added around them where the picture has a saddle as strong
+as the next one. On each side of what was found the board then either ends in the picture, or is cut off by its border;
+where that leaves one place on the board for the corners, they are named.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import product
+
+import numpy as np
+
+from ceres_cal.base.arrays import Array, Image, Mask
+from ceres_cal.detect.saddles import Saddles, fit_saddles, is_begun_dark, measure_saddles
+
+# Of the contrast, root mean square: where the board ends dark squares meet the margin, which no saddle describes.
+_MISFIT = 0.25
+# Of the contrast of the corner next to it.
+_AS_STRONG = 0.75
+_BORDER_PX = 3.0  # nearer to it a corner has too few pixels on one side
+_CLEAR = 0.2  # of the corners' distance, from the border: less may be the error of where a corner is foreseen
+_SIDES = ((1, 0), (1, -1), (0, 0), (0, -1))  # left, right, top, bottom: axis of the picture's grid, and which end
+
+
+def part_of_board(image: Image, seed: Array, columns: int, rows: int) -> Array | str:
+    """Corners (rows, columns, 2) px, NaN where one is not seen, or why there are none.
+
+    Args:
+        seed: (h, w, 2) px, right-handed: some neighbouring corners of the board, about where they are.
+    """
+    grown = _grown(image, seed, max(columns, rows))
+    places = list(_places(grown, image.shape, columns, rows))
+    if len({missing for missing, _ in places}) != 1:
+        height, width = grown.contrast.shape
+        why = "more than one" if places else "no"
+        found = f"but {width} x {height} corners, which have {why} place on it"
+        return f"no chessboard of {columns} x {rows} inner corners found, {found}"
+    return places[0][1]
+
+
+# ---- growing --------------------------------------------------------------------------------------------------------
+
+
+def _grown(image: Image, seed: Array, most: int) -> Saddles:
+    """All corners that the seed leads to, at most so many each way; measured once more when all are there."""
+    known = _trimmed(_clean(measure_saddles(image, seed), image.shape))
+    for _ in range(2 * most):
+        wider = _with_border(known)
+        unknown = np.isnan(wider.contrast)
+        foreseen = np.where(unknown[..., None], _foreseen(wider.grid), wider.grid)
+        measured = _clean(fit_saddles(image, foreseen, unknown), image.shape)
+        fresh = unknown & _strong(measured.contrast, wider.contrast)
+        if not np.any(fresh):
+            break
+        pairs = ((getattr(measured, name), getattr(wider, name)) for name in ("contrast", "misfit"))
+        grid = np.where(fresh[..., None], measured.grid, wider.grid)
+        known = _trimmed(Saddles(grid, *(np.where(fresh, new, old) for new, old in pairs)))
+    return _trimmed(_clean(measure_saddles(image, known.grid), image.shape))
+
+
+def _clean(saddles: Saddles, shape: tuple[int, ...]) -> Saddles:
+    """Without what is no saddle, or too near to the border to be measured."""
+    with np.errstate(invalid="ignore"):
+        bad = ~(_inside(saddles.grid, shape, _BORDER_PX) & (saddles.misfit < _MISFIT))
+    grid = np.where(bad[..., None], np.nan, saddles.grid)
+    return Saddles(grid, *(np.where(bad, np.nan, values) for values in (saddles.contrast, saddles.misfit)))
+
+
+def _with_border(saddles: Saddles) -> Saddles:
+    """With one more line of corners on every side, none of them known."""
+    around = ((1, 1), (1, 1))
+    grid = np.pad(saddles.grid, (*around, (0, 0)), constant_values=np.nan)
+    return Saddles(grid, *(np.pad(v, around, constant_values=np.nan) for v in (saddles.contrast, saddles.misfit)))
+
+
+def _trimmed(saddles: Saddles) -> Saddles:
+    seen = ~np.isnan(saddles.contrast)
+    if not np.any(seen):
+        return saddles
+    rows, columns = (np.flatnonzero(np.any(seen, axis=axis)) for axis in (1, 0))
+    part = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+    return Saddles(saddles.grid[part], saddles.contrast[part], saddles.misfit[part])
+
+
+def _foreseen(grid: Array) -> Array:
+    """Where unknown corners should be: the mean of what the three, or two, before them on any line lead to."""
+    lines = [[_shifted(grid, axis, step * k) for k in (1, 2, 3)] for axis in (0, 1) for step in (1, -1)]
+    bent = np.array([3.0 * first - 3.0 * second + third for first, second, third in lines])
+    straight = np.array([2.0 * first - second for first, second, _ in lines])
+    return np.where(np.all(np.isnan(bent), axis=0), _mean(straight), _mean(bent))
+
+
+def _mean(guesses: Array) -> Array:
+    """Over the first axis, of what is known; NaN where nothing is."""
+    known = ~np.isnan(guesses)
+    count = np.sum(known, axis=0)
+    return np.asarray(np.where(count > 0, np.nansum(guesses, axis=0) / np.maximum(count, 1), np.nan))
+
+
+def _shifted(values: Array, axis: int, by: int) -> Array:
+    """The values of the neighbours `by` places before; NaN beyond the ends."""
+    moved = np.full(values.shape, np.nan)
+    here, there = [slice(None)] * values.ndim, [slice(None)] * values.ndim
+    here[axis], there[axis] = (slice(by, None), slice(None, -by)) if by > 0 else (slice(None, by), slice(-by, None))
+    moved[tuple(here)] = values[tuple(there)]
+    return moved
+
+
+def _strong(contrast: Array, known: Array) -> Mask:
+    """Whether a corner's contrast is about that of a known one beside it, of the other sign."""
+    beside = np.array([-_shifted(known, axis, step) for axis in (0, 1) for step in (1, -1)])
+    with np.errstate(invalid="ignore"):
+        share = contrast / beside
+        return np.asarray(np.any((share > _AS_STRONG) & (share < 1.0 / _AS_STRONG), axis=0))
+
+
+def _inside(grid: Array, shape: tuple[int, ...], border_px: float) -> Mask:
+    with np.errstate(invalid="ignore"):
+        last = np.array([shape[1], shape[0]]) - 1.0 - border_px
+        return np.asarray(np.all((grid >= border_px) & (grid <= last), axis=-1))
+
+
+# ---- naming ---------------------------------------------------------------------------------------------------------
+
+
+def _places(seen: Saddles, shape: tuple[int, ...], columns: int, rows: int) -> Iterator[tuple[tuple[int, ...], Array]]:
+    """Every place on the board that the corners can have: lines missing to the left, right, top and bottom of the
+    picture's grid, and the board's grid.
+    """
+    ends = [_ends(seen.grid, shape, axis, end) for axis, end in _SIDES]
+    height, width = seen.contrast.shape
+    for turns in range(4):
+        wide, high = (rows, columns) if turns % 2 else (columns, rows)
+        for left, top in product(range(wide - width + 1), range(high - height + 1)):
+            missing = (left, wide - width - left, top, high - height - top)
+            if any(ended and lines for ended, lines in zip(ends, missing, strict=True)):
+                continue
+            around = ((top, missing[3]), (left, missing[1]))
+            grid = np.rot90(np.pad(seen.grid, (*around, (0, 0)), constant_values=np.nan), turns)
+            contrast = np.rot90(np.pad(seen.contrast, around, constant_values=np.nan), turns)
+            # A quarter turn puts a bright square where a dark one was.
+            if (columns + rows) % 2 == 0 or is_begun_dark(contrast if turns % 2 == 0 else -contrast):
+                yield missing, grid
+
+
+def _ends(grid: Array, shape: tuple[int, ...], axis: int, end: int) -> bool:
+    """Whether the next line of corners on a side would be well in the picture: there is none, so the board ends."""
+    wider = np.pad(grid, ((1, 1), (1, 1), (0, 0)), constant_values=np.nan)
+    steps = np.linalg.norm(np.concatenate([np.diff(grid, axis=n).reshape(-1, 2) for n in (0, 1)]), axis=1)
+    return bool(np.any(_inside(np.take(_foreseen(wider), end, axis=axis), shape, _CLEAR * float(np.nanmedian(steps)))))

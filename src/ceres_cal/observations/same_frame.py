@@ -1,0 +1,105 @@
+"""Which frames of several cameras are one moment: said by a rule, never guessed."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from itertools import pairwise
+
+from ceres_cal.base.errors import InputError
+from ceres_cal.observations.columns import View
+from ceres_cal.observations.observations import Observations
+
+RULES = "'left*,right*' (what * stands for names the moment), index (in their order), or within:0.01 (numbers as names)"
+
+_Frames = Mapping[str, tuple[str, ...]]  # of each camera, in the order of its views
+_Moments = Mapping[tuple[str, str], str]  # by camera and frame
+
+
+def with_same_frames(observations: Observations, rule: str) -> Observations:
+    """The observations with the frames of its cameras renamed, so that those of one moment have one name.
+
+    A placement that is named like its frame, as detected boards are, is renamed with it: then the cameras see one
+    board at one place.
+
+    Args:
+        rule: patterns between commas, of which one fits each frame, as "left*,right*": what * stands for is the moment.
+            "index": the n-th frames of all cameras belong together. "within:T": frames are numbers, such as time
+            stamps; the nearest of two cameras belong together where they are T or less apart.
+
+    Raises:
+        InputError: a frame that no pattern or more than one fits, other numbers of frames for "index", names that are
+            no numbers, T that is as long as the frames of one camera are apart; or nothing comes together.
+    """
+    frames: dict[str, tuple[str, ...]] = {}
+    for camera in observations.cameras:
+        frames[camera] = tuple(dict.fromkeys(view.frame for view in observations.views if view.camera == camera))
+    if rule == "index":
+        moments = _by_index(frames)
+    elif rule.startswith("within:"):
+        moments = _within(frames, rule)
+    else:
+        moments = _by_pattern(frames, rule.split(","))
+    if len(set(moments.values())) == len(moments):
+        raise InputError(f"same frames by {rule!r}: no two cameras have one in common: say them by {RULES}")
+    return replace(observations, views=tuple(_renamed(view, moments) for view in observations.views))
+
+
+def _renamed(view: View, moments: _Moments) -> View:
+    moment = moments[view.camera, view.frame]
+    return replace(view, frame=moment, placement=moment if view.placement == view.frame else view.placement)
+
+
+def _by_index(frames: _Frames) -> _Moments:
+    if len({len(names) for names in frames.values()}) > 1:
+        counts = ", ".join(f"{camera!r} has {len(names)}" for camera, names in frames.items())
+        raise InputError(f"same frames by index: {counts} frames (one was not found?): say them by {RULES}")
+    return {(camera, name): f"{n:04d}" for camera, names in frames.items() for n, name in enumerate(names, start=1)}
+
+
+def _by_pattern(frames: _Frames, patterns: Iterable[str]) -> _Moments:
+    shapes = []
+    for pattern in patterns:
+        before, star, after = pattern.strip().partition("*")
+        if not star or "*" in after:
+            raise InputError(f"same frames by {pattern!r}: write one * in each pattern, such as 'left*,right*'")
+        shapes.append(re.compile(f"{re.escape(before)}(.+){re.escape(after)}"))
+    moments = {}
+    for camera, names in frames.items():
+        for name in names:
+            fits = {found[1] for shape in shapes if (found := shape.fullmatch(name))}
+            if len(fits) != 1:
+                how = "several patterns fit" if fits else "no pattern fits"
+                raise InputError(f"same frames: {how} frame {name!r} of camera {camera!r}: say them by {RULES}")
+            moments[camera, name] = fits.pop()
+    return moments
+
+
+def _within(frames: _Frames, rule: str) -> _Moments:
+    times = {camera: [(_number(name, "a frame's name"), name) for name in names] for camera, names in frames.items()}
+    most = _number(rule.removeprefix("within:"), rule)
+    for camera, stamps in times.items():
+        ordered = sorted(time for time, _ in stamps)
+        apart = min((b - a for a, b in pairwise(ordered)), default=float("inf"))
+        if not 0.0 <= most < 0.5 * apart:
+            raise InputError(
+                f"same frames by {rule!r}: it must be below half of the {apart:g} between frames of camera {camera!r}"
+            )
+    moments: dict[tuple[str, str], str] = {}
+    first_seen: list[tuple[float, str]] = []
+    for camera, stamps in times.items():
+        for time, name in stamps:
+            near = [moment for at, moment in first_seen if abs(at - time) <= most]
+            if len(near) > 1:
+                raise InputError(f"same frames by {rule!r}: frame {name!r} of camera {camera!r} is near two moments")
+            moments[camera, name] = near[0] if near else name
+        first_seen += [(time, name) for time, name in stamps if moments[camera, name] == name]
+    return moments
+
+
+def _number(text: str, where: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise InputError(f"same frames within a time: {text!r} is no number ({where})") from None

@@ -1,0 +1,89 @@
+"""Grids of dark circles, as OpenCV has them: in columns and rows, or every other row half a step aside."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from ceres_cal.base.arrays import Array
+from ceres_cal.base.errors import InputError
+from ceres_cal.base.files import convert
+from ceres_cal.scene.targets.paper import Footprints, Paper, share_inside
+from ceres_cal.scene.targets.target import Grid, Target, TargetKind, require_size
+
+
+def circle_grid(columns: int, rows: int, spacing_m: float, diameter_m: float, *, asymmetric: bool = False) -> Target:
+    """The centres of a grid of circles, features "c,r", c < columns, r < rows.
+
+    Centre "c,r" lies at (c, r, 0) spacings; of an asymmetric grid at (2 c + r mod 2, r, 0), as OpenCV counts them: the
+    spacing is half the distance between circles of one row.
+
+    Raises:
+        InputError: fewer than 2 circles a side, more than MOST_FEATURES, a spacing that is no positive number, or
+            circles that meet.
+    """
+    if columns < 2 or rows < 2:
+        raise InputError(f"circle-grid: columns and rows count circles, at least 2, not {columns} and {rows}")
+    require_size(columns * rows, "circle-grid")
+    if not (np.isfinite(spacing_m) and spacing_m > 0.0):
+        raise InputError(f"circle-grid: spacing_m must be a positive number of metres, not {spacing_m}")
+    apart_m = float(spacing_m) * (np.sqrt(2.0) if asymmetric else 1.0)
+    if not 0.0 < diameter_m < apart_m:
+        raise InputError(f"circle-grid: diameter_m must be above 0 and below the {apart_m:.4g} m between circles")
+    given = _Spec("circle-grid", int(columns), int(rows), float(spacing_m), float(diameter_m), bool(asymmetric))
+    step = 2 if asymmetric else 1
+    places = {
+        f"{c},{r}": ((step * c + (r % 2 if asymmetric else 0)) * spacing_m, r * spacing_m, 0.0)
+        for r in range(rows)
+        for c in range(columns)
+    }
+    flat, border = np.array(list(places.values()))[:, :2], apart_m
+    paper = Paper(
+        (-border, -border),
+        (float(flat[:, 0].max() + border), float(flat[:, 1].max() + border)),
+        partial(_dark_circles, given),
+    )
+    grid = None if asymmetric else Grid(int(columns), int(rows), float(spacing_m))
+    return Target(msgspec.to_builtins(given), places, {}, movable=True, bows=True, grid=grid, paper=paper)
+
+
+def _dark_circles(grid: _Spec, footprints: Footprints) -> Array:
+    """Of the two rows around a place the nearer circle decides: circles do not meet."""
+    step, x, y = (2.0 if grid.asymmetric else 1.0), *(footprints.plane.T / grid.spacing_m)
+    offs = []
+    for below in (0.0, 1.0):
+        row = np.clip(np.floor(y) + below, 0, grid.rows - 1)
+        aside = row % 2 if grid.asymmetric else 0.0
+        column = np.clip(np.round((x - aside) / step), 0, grid.columns - 1)
+        offs.append(np.column_stack([x - step * column - aside, y - row]) * grid.spacing_m)
+    away = np.array([np.hypot(off[:, 0], off[:, 1]) for off in offs])
+    off, nearest = np.where((away[0] <= away[1])[:, None], *offs), away.min(axis=0)
+    direction = off / np.maximum(nearest, 1e-12)[:, None]
+    return share_inside(0.5 * grid.diameter_m - nearest, footprints.step_m(direction))
+
+
+class _Spec(msgspec.Struct, forbid_unknown_fields=True):
+    kind: str
+    columns: int
+    rows: int
+    spacing_m: float
+    diameter_m: float
+    asymmetric: bool = False
+
+
+def _from_spec(spec: dict[str, Any], where: str) -> Target:
+    given = convert(spec, _Spec, where)
+    return circle_grid(given.columns, given.rows, given.spacing_m, given.diameter_m, asymmetric=given.asymmetric)
+
+
+KIND = TargetKind(
+    "circle-grid",
+    "the centres of a grid of circles",
+    "columns and rows (circles), spacing_m, diameter_m, asymmetric (every other row half a step aside, OpenCV's)",
+    'points "c,r" at (c, r, 0) spacings, or (2 c + r mod 2, r, 0) of an asymmetric grid',
+    lambda: {"circle-grid": circle_grid(4, 11, 0.02, 0.016, asymmetric=True)},
+    _from_spec,
+)

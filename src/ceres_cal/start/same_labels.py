@@ -1,0 +1,148 @@
+"""A board of even symmetry that several cameras see at once: labelled the same way in all of them.
+
+A detector cannot tell a board of 4 x 6 corners from the same board turned by half a turn. Before one camera the
+placement takes that up; two cameras then see the board at two places. But they stand as they stand, so the pose of one
+in the other's frame, by way of the board, is the same at every moment once the labels are: the labelling that most
+moments agree on is taken.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ceres_cal.base.arrays import Array, Indices
+from ceres_cal.base.transforms import Pose, rotation_exp
+from ceres_cal.model.parameters import Options
+from ceres_cal.observations import Observations, View
+from ceres_cal.observations.sights import SightKey, gather_sights
+from ceres_cal.scene.targets import Target
+from ceres_cal.start.initialise import posed_sights
+
+_START = Options(lens="radial")
+# Of a turn (rad) and of a shift as a part of the distance: what a start leaves of two labels alike.
+_ALIKE = 0.15
+# By how much another labelling must be worse, as a factor, to be out of the question.
+_CLEARLY = 3.0
+
+
+@dataclass(frozen=True)
+class Labels:
+    """What was said of the labels.
+
+    Attributes:
+        observations: with the labels that agree. turned: (station, placement) of each board that was labelled anew.
+        open: stations whose labels nothing tells: they share one placement, or poses that either labelling suits.
+    """
+
+    observations: Observations
+    turned: tuple[tuple[str, str], ...]
+    open: tuple[str, ...]
+
+
+def with_same_labels(observations: Observations) -> Labels:
+    """The observations with every symmetric board labelled alike by all stations that see it at a placement.
+
+    Raises:
+        DegenerateError: a sight whose pose cannot be told.
+    """
+    poses = _board_poses(observations)
+    stations = list(dict.fromkeys(key.station for key in poses))
+    alike, turned, unsaid = stations[:1], [], []
+    for station in stations[1:]:
+        shared = [(a, b) for a in poses for b in poses if _is_pair(a, b, alike, station)]
+        if not shared:
+            continue
+        turns = _turns(observations, shared, poses)
+        if turns is None:
+            unsaid.append(station)
+            continue
+        alike.append(station)
+        for (_, key), turn in zip(shared, turns, strict=True):
+            if turn is not None:
+                turned.append((station, str(key.placement)))
+                poses[key] = poses[key] @ turn
+                observations = _relabelled(observations, key, turn)
+    return Labels(observations, tuple(dict.fromkeys(turned)), tuple(unsaid))
+
+
+def _is_pair(a: SightKey, b: SightKey, alike: Sequence[str], station: str) -> bool:
+    return a.placement == b.placement and a.station == alike[0] and b.station == station
+
+
+def _board_poses(observations: Observations) -> dict[SightKey, Pose]:
+    """cam_from_target of every sight of a symmetric board at a placement that several stations show."""
+    sights = gather_sights(observations)
+    target_of = {SightKey(view.camera, view.station, view.placement): view.target for view in observations.views}
+    symmetric = [
+        number
+        for number, key in enumerate(sights.keys)
+        if key.placement not in (None, *sights.seen_once) and len(symmetries(observations.targets[target_of[key]])) > 1
+    ]
+    if not symmetric:
+        return {}
+    _, _, numbers, poses = posed_sights(observations, sights, _START)
+    wanted = set(symmetric)
+    return {
+        sights.keys[number]: Pose(pose[:, :3], pose[:, 3])
+        for number, pose in zip(numbers.tolist(), poses, strict=True)
+        if number in wanted
+    }
+
+
+def symmetries(target: Target) -> list[Pose]:
+    """Turns about a board's middle after which it looks the same, as far as its corners tell; the first is none."""
+    grid = target.grid
+    if grid is None or (grid.checkered and (grid.columns + grid.rows) % 2 == 1):
+        return [Pose.identity()]
+    middle = np.append(0.5 * grid.spacing_m * (np.array([grid.columns, grid.rows]) - 1.0), 0.0)
+    count = 4 if grid.columns == grid.rows else 2
+    rotations = [rotation_exp([0.0, 0.0, 2.0 * np.pi * n / count]) for n in range(count)]
+    return [Pose(rotation, middle - rotation @ middle) for rotation in rotations]
+
+
+def _turns(
+    observations: Observations, shared: Sequence[tuple[SightKey, SightKey]], poses: dict[SightKey, Pose]
+) -> list[Pose | None] | None:
+    """How each second sight of the pairs must be turned, None where it is right; None where nothing tells."""
+    target_of = {view.placement: observations.targets[view.target] for view in observations.views}
+    turns = [symmetries(target_of[b.placement]) for _, b in shared]
+    between = [[poses[b] @ turn @ poses[a].inverse for turn in own] for (a, b), own in zip(shared, turns, strict=True)]
+    depth = float(np.median([poses[b].position @ poses[b].position for _, b in shared]) ** 0.5)
+    answers = []
+    for pose in (one for own in between for one in own):
+        off = [[_apart(pose, other, depth) for other in own] for own in between]
+        answers.append((float(np.mean(np.min([row + [np.inf] * (4 - len(row)) for row in off], axis=1))), off, pose))
+    cost, off, best = min(answers, key=lambda answer: answer[0])
+    others = [answer[0] for answer in answers if _apart(answer[2], best, depth) > _ALIKE]
+    if len(shared) < 2 or (others and min(others) < _CLEARLY * max(cost, 0.01)):
+        return None
+    numbers = [int(np.argmin(row)) for row in off]
+    return [own[number] if number else None for own, number in zip(turns, numbers, strict=True)]
+
+
+def _apart(a: Pose, b: Pose, depth: float) -> float:
+    """Between two poses of a camera: the angle's sine and the shift over a depth."""
+    turn = np.linalg.norm(a.rotation - b.rotation) / np.sqrt(8.0)
+    return float(turn + np.linalg.norm(a.position - b.position) / depth)
+
+
+def _relabelled(observations: Observations, key: SightKey, turn: Pose) -> Observations:
+    points, feature = observations.points, observations.points.feature.copy()
+    for number, view in _views_of(observations, key):
+        places = observations.targets[view.target].point_array
+        rows = np.flatnonzero(points.view == number)
+        feature[rows] = _nearest(turn.inverse.transform(places[points.feature[rows]]), places)
+    return replace(observations, points=replace(points, feature=feature))
+
+
+def _views_of(observations: Observations, key: SightKey) -> Iterator[tuple[int, View]]:
+    for number, view in enumerate(observations.views):
+        if SightKey(view.camera, view.station, view.placement) == key:
+            yield number, view
+
+
+def _nearest(sought: Array, places: Array) -> Indices:
+    return np.asarray(np.argmin(np.linalg.norm(sought[:, None] - places, axis=2), axis=1))

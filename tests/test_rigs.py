@@ -1,0 +1,194 @@
+"""Rigs from `detect board` on: which frames are one moment, labels that agree, baseline and angle."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import scenes
+from test_cli import Say, refused, say
+
+from ceres_cal.base.errors import InputError
+from ceres_cal.base.transforms import Pose, rotation_exp
+from ceres_cal.calibrating import calibrate
+from ceres_cal.detect.images import read_grey
+from ceres_cal.model.parameters import Options, Station
+from ceres_cal.observations import Observations, combine
+from ceres_cal.observations.same_frame import with_same_frames
+from ceres_cal.scene.targets import Target, checkerboard
+from ceres_cal.simulate import Disturbance, Held, board_scene, simulate
+from ceres_cal.start.same_labels import with_same_labels
+
+__all__ = ["say"]
+_BROWN = Options(lens="brown")
+_LEFT = scenes.camera("brown")
+_BASELINE_M, _ANGLE_RAD = 0.3, 0.12
+_STATIONS = {
+    "left": Station("left", Pose.identity()),
+    "right": Station("right", Pose.looking([_BASELINE_M, 0.0, 0.0], rotation_exp([0.0, _ANGLE_RAD, 0.0]))),
+}
+
+
+def _rig(board: Target, count: int = 11, seed: int = 3) -> Observations:
+    cameras = {"left": _LEFT, "right": replace(_LEFT, phi=873.4)}
+    scene = board_scene(board, cameras, _STATIONS, count, seed, Held((1.2, 2.2)))
+    return simulate(scene, Disturbance(points_sigma_px=0.1), seed=seed).observations
+
+
+def _turned(observations: Observations, station: str, frames: tuple[str, ...]) -> Observations:
+    """The points of a board in the frames of one station as if it had been turned: the last first."""
+    points = observations.points
+    last = len(observations.targets["board"].points) - 1
+    own = np.array([view.station == station and view.frame in frames for view in observations.views])
+    feature = np.where(own[points.view], last - points.feature, points.feature).astype(np.int32)
+    return replace(observations, points=replace(points, feature=feature))
+
+
+# ---- labels ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("turned", [("board_05",), ("board_01", "board_02", "board_07", "board_09")])
+def test_a_turned_label_is_found_and_mended(turned: tuple[str, ...]) -> None:
+    seen = _rig(checkerboard(4, 6, 0.1))
+    labels = with_same_labels(_turned(seen, "right", turned))
+    assert labels.turned == tuple(("right", name) for name in turned) and not labels.open
+    assert np.array_equal(labels.observations.points.feature, seen.points.feature)
+    assert with_same_labels(seen).turned == ()
+
+
+def test_square_boards_have_four_ways_round() -> None:
+    seen = _rig(checkerboard(5, 5, 0.1))
+    points = seen.points
+    column, row = points.feature % 5, points.feature // 5
+    own = np.array([view.station == "right" and view.frame == "board_04" for view in seen.views])[points.view]
+    quarter = np.where(own, 5 * column + 4 - row, points.feature).astype(np.int32)
+    labels = with_same_labels(replace(seen, points=replace(points, feature=quarter)))
+    assert labels.turned == (("right", "board_04"),)
+    assert np.array_equal(labels.observations.points.feature, points.feature)
+
+
+def test_a_board_that_tells_its_end_is_left_alone() -> None:
+    seen = _turned(_rig(checkerboard(5, 6, 0.1)), "right", ("board_02",))
+    assert with_same_labels(seen).observations is seen
+
+
+def test_one_moment_tells_nothing_of_labels() -> None:
+    labels = with_same_labels(_rig(checkerboard(4, 6, 0.1), count=1))
+    assert labels.open == ("right",) and not labels.turned
+
+
+# ---- frames ---------------------------------------------------------------------------------------------------------
+
+
+def _named(names: dict[str, list[str]]) -> Observations:
+    seen = _rig(checkerboard(5, 6, 0.1), count=3)
+    order = [view.frame for view in seen.views if view.camera == "left"]
+    views = tuple(
+        replace(view, frame=(name := names[view.camera][order.index(view.frame)]), placement=name)
+        for view in seen.views
+    )
+    return replace(seen, views=views)
+
+
+@pytest.mark.parametrize(
+    "left, right, rule, moments",
+    [
+        (["left1", "left2", "left3"], ["right1", "right2", "right3"], "left*,right*", ["1", "2", "3"]),
+        (["a", "b", "c"], ["x", "y", "z"], "index", ["0001", "0002", "0003"]),
+        (["1.00", "2.00", "3.00"], ["1.004", "1.996", "3.0"], "within:0.01", ["1.00", "2.00", "3.00"]),
+    ],
+)
+def test_frames_of_one_moment(left: list[str], right: list[str], rule: str, moments: list[str]) -> None:
+    seen = with_same_frames(_named({"left": left, "right": right}), rule)
+    for camera in ("left", "right"):
+        assert [view.frame for view in seen.views if view.camera == camera] == moments
+    assert all(view.placement == view.frame for view in seen.views)
+
+
+@pytest.mark.parametrize(
+    "left, rule, why",
+    [
+        (["left1", "left2", "left3"], "up*,right*", "no pattern fits frame 'left1' of camera 'left'"),
+        (["left1", "left2", "left3"], "left*,*", "several patterns fit"),
+        (["left1", "left2", "left3"], "left,right", r"one \* in each"),
+        (["left7", "left8", "left9"], "left*,right*", "no two cameras have one in common"),
+        (["left1", "left2", "left3"], "within:0.4", "'left1' is no number"),
+    ],
+)
+def test_frames_are_never_guessed(left: list[str], rule: str, why: str) -> None:
+    with pytest.raises(InputError, match=why):
+        with_same_frames(_named({"left": left, "right": ["right1", "right2", "right3"]}), rule)
+
+
+def test_moments_must_be_apart() -> None:
+    seen = _named({"left": ["1.0", "1.5", "2.0"], "right": ["1.1", "1.6", "2.1"]})
+    with pytest.raises(InputError, match=r"below half of the 0\.5 between frames of camera 'left'"):
+        with_same_frames(seen, "within:0.4")
+
+
+def test_index_needs_as_many_frames() -> None:
+    left, right = (_rig(checkerboard(5, 6, 0.1), count) for count in (3, 2))
+    both = combine([left.of_station("left"), right.of_station("right")])
+    with pytest.raises(InputError, match="'left' has 3, 'right' has 2 frames"):
+        with_same_frames(both, "index")
+
+
+# ---- baseline and angle ---------------------------------------------------------------------------------------------
+
+
+def test_baseline_and_angle_with_their_sd() -> None:
+    off = []
+    for seed in range(1, 13):
+        (pair,) = calibrate(_rig(checkerboard(9, 6, 0.1), 8, seed), _BROWN).uncertainty.rig
+        assert pair.stations == ("left", "right")
+        off.append((pair.baseline_m - _BASELINE_M) / pair.baseline_sd_m)
+        off.append((pair.angle_rad - _ANGLE_RAD) / pair.angle_sd_rad)
+        assert pair.baseline_sd_m < 1e-3 and pair.angle_sd_rad < 1e-3
+    assert 0.5 < np.sqrt(np.mean(np.square(off))) < 1.5  # 0.9
+
+
+def test_opencv_left_right(real_data: Path) -> None:
+    """On its own corners cv2.stereoCalibrate, everything free at once, ends at 83.1815 mm and 0.2150 px."""
+    board, sides = checkerboard(9, 6, 0.025), []
+    for side in ("left", "right"):
+        corners = {p.stem: _opencv_corners(p) for p in sorted((real_data / "opencv_left_right").glob(f"{side}*.jpg"))}
+        sides.append(Observations.from_points(corners, board, (640, 480), camera=side))
+    seen = with_same_frames(combine(sides), "left*,right*")
+    plain = replace(_BROWN, free_aspect=True, loss="trivial", reject_sigma=np.inf)
+    calibration = calibrate(seen, plain)
+    (pair,) = calibration.uncertainty.rig
+    assert calibration.fit.points_rms_px == pytest.approx(0.2150, abs=1e-4)
+    assert 1e3 * pair.baseline_m == pytest.approx(83.1815, abs=2e-3)
+    assert 1e3 * pair.baseline_sd_m < 0.5
+
+
+def _opencv_corners(path: Path) -> np.ndarray:
+    image = read_grey(path)
+    shown, corners = cv2.findChessboardCorners(image, (9, 6))
+    assert shown
+    return np.asarray(cv2.cornerSubPix(image, corners, (5, 5), (-1, -1), (3, 100, 1e-6)), dtype=float)
+
+
+# ---- as typed -------------------------------------------------------------------------------------------------------
+
+
+def test_join_as_typed(say: Say, tmp_path: Path) -> None:
+    seen = _turned(_rig(checkerboard(4, 6, 0.1)), "right", ("board_05",))
+    paths = []
+    for camera in ("left", "right"):
+        own = seen.of_station(camera)
+        views = tuple(
+            replace(view, frame=f"{camera}_{view.frame}", placement=f"{camera}_{view.frame}") for view in own.views
+        )
+        paths.append(tmp_path / f"{camera}.json")
+        replace(own, views=views).save(paths[-1])
+    joined = tmp_path / "rig.json"
+    said = say("join", *paths, "--same-frame", "left_*,right_*", "-o", joined)
+    assert said.code == 0 and "11 seen by 2 cameras" in said.out and "'board_05' of 'right'" in said.out
+    said = say("calibrate", joined, "--lens", "brown", "--quiet", "-o", tmp_path / "c.json")
+    assert said.code == 0 and "left - right: baseline " in said.out
+    data = json.loads(say("join", *paths, "--same-frame", "index", "-o", tmp_path / "i.json", "--json").out)
+    assert data["moments_by_cameras"] == {"2": 11} and data["turned"] == [["right", "0005"]]
+    assert "no pattern fits" in refused(say("join", *paths, "--same-frame", "up*", "-o", joined))
