@@ -104,7 +104,6 @@ def test_help_lists_every_command(say: Say) -> None:
         "check",
         "score",
         "compare",
-        "score",
         "locate",
         "project",
         "export",
