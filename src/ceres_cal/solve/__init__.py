@@ -10,6 +10,7 @@ from ceres_cal.base.native import kept_signals
 with kept_signals():
     import pyceres  # noqa: F401
 
+from ceres_cal.solve.as_built import AsBuilt
 from ceres_cal.solve.bundle import Progress, Solution, placement_costs, solve, with_placements_at_best
 from ceres_cal.solve.conflicts import Conflicts, find_conflicts
 from ceres_cal.solve.information import Eliminated, ReducedInformation, information
@@ -18,6 +19,7 @@ from ceres_cal.solve.robust import RobustSolution, solve_robustly
 from ceres_cal.solve.stated import Conflict
 
 __all__ = [
+    "AsBuilt",
     "Conflict",
     "Conflicts",
     "Eliminated",

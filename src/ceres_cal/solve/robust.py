@@ -64,6 +64,7 @@ def solve_robustly(
     usual: tuple[float, float] | None = None,
     progress: Callable[[Progress], None] | None = None,
     most_rounds: int = _MOST_ROUNDS,
+    is_near: bool = False,
 ) -> RobustSolution:
     """The minimum over the inliers, at the noise that they show.
 
@@ -74,12 +75,13 @@ def solve_robustly(
         problem: of all the observations; its weighting is not looked at.
         usual: noise scales of points and curves that were seen before, where there are any.
         most_rounds: solves, the rough one counted; 2 end near the minimum.
+        is_near: whether the estimate tells outliers as it is: no rough solve is needed.
 
     Raises:
         CalibrationError: see `solve`.
     """
     rounds = _Rounds(problem, observations, usual, progress)
-    state = rounds.first(estimate)
+    state = rounds.at(estimate) if is_near else rounds.first(estimate)
     undecided = frozenset(state.problem.sights.keys)
     before: Inliers | None = None
     while state.rounds < most_rounds:
@@ -88,7 +90,7 @@ def solve_robustly(
             undecided = frozenset(state.problem.sights.keys)  # another lens had decided about mirrored poses
         if at_rest or before is None:
             state, changed, undecided = rounds.mended(state, undecided)
-            if before is None:
+            if before is None and not is_near:
                 state = rounds.refined(state)
             if at_rest and not changed:
                 state = rounds.with_leverages(state)
@@ -117,6 +119,11 @@ class _Rounds:
         """The rough solve from a start."""
         there = residuals(self._observations, self._problem.sights, estimate)
         return self._rough(estimate, there, visible_from(self._observations, there), 1)
+
+    def at(self, estimate: Estimate) -> RobustSolution:
+        """A start as it is, judged."""
+        there = residuals(self._observations, self._problem.sights, estimate)
+        return self._weighted(Solution(estimate, np.nan, False, "", ()), there, 0)
 
     def refined(self, state: RobustSolution) -> RobustSolution:
         """Further rough solves, each at the scale of the residuals that the one before left, while that falls."""
