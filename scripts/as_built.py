@@ -99,7 +99,9 @@ def board_rows(case: str, board: Board, runs: int) -> Iterator[Row]:
     yield Row(case, "share found not as drawn", share, error, *((0.0, 0.1) if flat else (0.0, 1.0)), note=note)
     inside = np.mean(np.abs(offs) < 1.96, axis=1)
     yield Row(case, "95 % intervals that hold", *_mean_and_error(inside), 0.9, 0.98, note)
-    yield Row(case, "standard deviations over as drawn", *_mean_and_error(np.array(spreads)), most=1.03 if flat else np.inf)
+    yield Row(
+        case, "standard deviations over as drawn", *_mean_and_error(np.array(spreads)), most=1.03 if flat else np.inf
+    )
     ratio = np.sum(squares, axis=0)
     yield Row(case, "squared error over as drawn", ratio[0] / ratio[1], most=1.03 if flat else 1.0, note=note)
     for kind, truth in (("points", board.points_m), ("warp", board.bow_m)):

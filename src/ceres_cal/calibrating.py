@@ -20,6 +20,7 @@ from ceres_cal.model.residuals import residuals
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import gather_sights
 from ceres_cal.solve import (
+    AsBuilt,
     Conflicts,
     Problem,
     Progress,
@@ -30,7 +31,7 @@ from ceres_cal.solve import (
     information,
     solve_robustly,
 )
-from ceres_cal.solve.as_built import AsBuilt, compete_as_built, solve_as_built, tolerances_of
+from ceres_cal.solve.as_built import solve_as_built, tolerances_of
 from ceres_cal.solve.competing import compete
 from ceres_cal.solve.conflicts import contradicted_by
 from ceres_cal.solve.explanation import Explanation
@@ -153,9 +154,7 @@ def solved_from(
     end, explanations = compete(problem, observations, end, solved)
     as_built: tuple[AsBuilt, ...] = ()
     if again is None and problem.options.as_built == "estimate":
-        end, problem, as_built = solve_as_built(problem, observations, end, explanations)
-    if as_built:
-        end, explanations = compete_as_built(problem, observations, end, as_built, solved)
+        end, problem, explanations, as_built = solve_as_built(problem, observations, end, explanations, solved)
     _require_fits(end, problem)
     require_possible(observations, problem.sights, end.solution.estimate, end.residuals)
     warnings = tuple(one.warning for one in explanations)
