@@ -78,6 +78,12 @@ def _add_camera(parser: ArgumentParser) -> None:
         "(a sigma in metres; repeatable)",
     )
     add(
+        "--as-drawn",
+        action="store_true",
+        help="take targets without a tolerance as drawn; else corners, bows and lines whose residuals repeat over the "
+        "views are solved for, with a sigma from the data",
+    )
+    add(
         "--prior",
         action="append",
         default=[],
@@ -202,6 +208,7 @@ def _options(
         fixed=fixed,
         priors=tuple(parse_prior(spec, observations, names) for spec in args.prior),
         tolerances=_tolerances(args.tolerance),
+        as_built="as drawn" if args.as_drawn else "estimate",
         loss=args.loss,
         loss_scale=args.loss_scale,
         reject_sigma=args.reject_sigma,

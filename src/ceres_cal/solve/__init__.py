@@ -10,6 +10,7 @@ from ceres_cal.base.native import kept_signals
 with kept_signals():
     import pyceres  # noqa: F401
 
+from ceres_cal.solve.as_built import words_of
 from ceres_cal.solve.bundle import Progress, Solution, placement_costs, solve, with_placements_at_best
 from ceres_cal.solve.conflicts import Conflicts, find_conflicts
 from ceres_cal.solve.information import Eliminated, ReducedInformation, information
@@ -35,4 +36,5 @@ __all__ = [
     "solve",
     "solve_robustly",
     "with_placements_at_best",
+    "words_of",
 ]

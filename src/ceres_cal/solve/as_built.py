@@ -67,6 +67,13 @@ def tolerances_of(every: Sequence[AsBuilt]) -> dict[str, Tolerance]:
     return {target: Tolerance(**of) for target, of in sigmas.items()}
 
 
+def words_of(every: Sequence[AsBuilt]) -> tuple[str, ...]:
+    """One line for each target that is not as drawn."""
+    targets = dict.fromkeys(one.target for one in every)
+    said = {target: " and ".join(one.words for one in every if one.target == target) for target in targets}
+    return tuple(f"{target!r} is not as drawn: {words}; solved for" for target, words in said.items())
+
+
 def _held(problem: Problem, built: Structure) -> Problem:
     """The problem of targets that are drawn as they are built."""
     return replace(problem, sights=built.built_into(problem.sights))

@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices
+from ceres_cal.base.words import two_digits
 from ceres_cal.model.equations import Equations, equations_of, whole_structure
 from ceres_cal.model.parameters import Estimate, unit_px
 from ceres_cal.model.structure import Kind, Structure, make_structure, numbers_by_kind
@@ -56,6 +57,12 @@ class AsBuilt:
     sigma_m: float
     probability: float
     rms_m: float = 0.0
+
+    @property
+    def words(self) -> str:
+        """What it says, without the target."""
+        amount = f"{two_digits(1e3 * self.rms_m)} mm rms"
+        return f"it is bowed by {amount}" if self.kind == "warp" else f"its {self.kind} lie {amount} aside"
 
 
 def estimate_as_built(
