@@ -87,7 +87,7 @@ class Case:
 
 @dataclass(frozen=True, eq=False)
 class Tested:
-    """A case, the alternatives that its residuals speak for at a rate of false alarms, and the noise that these leave."""
+    """A case, the alternatives that its residuals speak for, the noise that these leave, the rate of false alarms."""
 
     case: Case
     selection: Selection

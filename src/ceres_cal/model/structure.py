@@ -90,6 +90,8 @@ class Structure:
 
     def built_into(self, sights: Sights) -> Sights:
         """The sights of targets that were drawn as they are built."""
+        if not len(self.values):
+            return sights
         return replace(sights, points=self.points(sights), tracks=self.tracks(sights))
 
     def built(self, targets: Mapping[str, Target]) -> dict[str, Built]:

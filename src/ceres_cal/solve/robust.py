@@ -100,6 +100,12 @@ def solve_robustly(
     return state
 
 
+def judge_at(problem: Problem, observations: Observations, estimate: Estimate) -> RobustSolution:
+    """Noise and outliers by the leverages at an estimate, where nothing is solved."""
+    rounds = _Rounds(problem, observations, None, None)
+    return rounds.by_leverages(rounds.at(estimate))[0]
+
+
 class _Rounds:
     """What the rounds of one robust solve have in common."""
 
@@ -134,7 +140,7 @@ class _Rounds:
             state = self._rough(state.solution.estimate, state.residuals, visible, state.rounds + 1)
         # Of one kind of observations without priors the leverages add up to the count.
         mixed = bool(self._problem.priors) or all(kind.equations for kind in self._problem.sights.by_kind)
-        return self._by_leverages(state)[0] if mixed and len(state.problem.sights) else state
+        return self.by_leverages(state)[0] if mixed and len(state.problem.sights) else state
 
     def _rough(self, estimate: Estimate, there: Residuals, visible: Inliers, rounds: int) -> RobustSolution:
         """A solve of few placements, which the others follow, that gross errors do not decide."""
@@ -176,13 +182,13 @@ class _Rounds:
         """The state with what its problem says there, where the noise is judged no other by the leverages; else judged
         by them, for another round.
         """
-        anew, reduced = self._by_leverages(state)
+        anew, reduced = self.by_leverages(state)
         if not anew.inliers.same_as(state.inliers, self.no_change):
             return anew
         degrees = anew.inliers.degrees_of_freedom
         return replace(state, inliers=replace(state.inliers, degrees_of_freedom=degrees), reduced=reduced)
 
-    def _by_leverages(self, state: RobustSolution) -> tuple[RobustSolution, ReducedInformation]:
+    def by_leverages(self, state: RobustSolution) -> tuple[RobustSolution, ReducedInformation]:
         """The state judged by the leverages there, and what they were taken from."""
         reduced = information(state.problem, state.solution.estimate)
         self._redundancy = Redundancy.by_leverage(state.problem.sights, reduced.leverages)
