@@ -4,9 +4,10 @@ How large the noise is, what is an outlier and what explanations say of whole li
 and these with all that. So in turns the offsets are read off the residuals (`repeats`) and everything else is solved
 for with the targets drawn as they were found to be, which costs no more than a calibration, until the sigmas stay.
 
-The offsets are not solved for with all the rest: a lens that is too simple would bend the board instead. What smooth
+A board's offsets are not solved for with all the rest: a lens that is too simple would bend it instead. What smooth
 displacements of the image explain has no say in them (a module that is cut off; Liu, Bayarri and Berger, Bayesian
-Analysis 4, 2009). The posterior has them under their sigmas like any tolerance.
+Analysis 4, 2009). The few of a field, which nothing but its cameras together tell, are. The posterior has them under
+their sigmas like any tolerance.
 """
 
 from __future__ import annotations
@@ -58,9 +59,13 @@ def solve_as_built(
     explanations = tuple(replace(one, other=replace(one.other, structure=structure)) for one in explanations)
     problem = replace(problem, priors=gather_priors(observations, options, structure))
     estimate = replace(end.solution.estimate, structure=structure)
-    judged = judge_at(_taking_part(problem, observations, explanations), observations, estimate)
-    solution = replace(end.solution, estimate=estimate)
-    end = replace(judged, solution=solution, rounds=end.rounds).moved_to(estimate, observations, problem)
+    part = _taking_part(problem, observations, explanations)
+    if {view.target for view in observations.views if view.placement is None} & {one.target for one in every}:
+        end = solve_robustly(part, observations, estimate, is_near=True)
+    else:
+        settled = replace(end.solution, estimate=estimate)
+        end = replace(judge_at(part, observations, estimate), solution=settled, rounds=end.rounds)
+    end, structure = end.moved_to(end.solution.estimate, observations, problem), end.solution.estimate.structure
     return end, problem, explanations, tuple(_measured(every, structure, observations))
 
 
