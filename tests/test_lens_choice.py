@@ -21,8 +21,7 @@ from ceres_cal.model.parameters import AUTO, Options
 from ceres_cal.model.residuals import residuals
 from ceres_cal.observations import Observations
 from ceres_cal.simulate import Disturbance, simulate
-from ceres_cal.solve.linear_model import make_linear_model
-from ceres_cal.uncertainty.sample import robust_weights
+from ceres_cal.solve.linear_model import equation_weights, make_linear_model
 
 _NOISE = Disturbance(points_sigma_px=0.3, curves_sigma_px=0.3)
 
@@ -78,7 +77,7 @@ def test_errors_without_a_placement_are_those_of_a_solve_without_it() -> None:
     problem, estimate = calibration.problem(observations), calibration.estimate
     there = residuals(observations, problem.sights, estimate)
     equations = write_equations(observations, problem.sights, estimate, there)
-    weights = robust_weights(observations, problem, equations, there)
+    weights = equation_weights(observations, problem.weighting, equations, there).within_sigma
     model = make_linear_model(problem, estimate, equations, weights)
     predicted = held_out_errors(model, equations.sight)
     rows = np.array([observations.views[v].placement == out for v in equations.view])

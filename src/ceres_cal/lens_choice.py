@@ -26,10 +26,9 @@ from ceres_cal.observations.sights import Sights, gather_sights
 from ceres_cal.observations.thinning import thinned
 from ceres_cal.scene.lens import LENSES
 from ceres_cal.solve import Problem, RobustSolution, solve, solve_robustly
-from ceres_cal.solve.linear_model import LinearModel, make_linear_model
+from ceres_cal.solve.linear_model import LinearModel, equation_weights, make_linear_model
 from ceres_cal.solve.noise import Inliers
 from ceres_cal.start.initialise import initialise
-from ceres_cal.uncertainty.sample import robust_weights
 
 PAPER = "radial 2,3"
 """The lens that wins ties."""
@@ -198,7 +197,7 @@ def _model(observations: Observations, end: RobustSolution, reference: RobustSol
     if not (np.isfinite(points[sights.point_rows]).all() and np.isfinite(curves[sights.curve_rows]).all()):
         raise DegenerateError("cannot show all that another lens shows")
     equations = write_equations(observations, sights, solution.estimate, there)
-    weights = robust_weights(observations, problem, equations, there)
+    weights = equation_weights(observations, problem.weighting, equations, there).within_sigma
     return make_linear_model(problem, solution.estimate, equations, weights)
 
 

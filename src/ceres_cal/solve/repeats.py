@@ -25,7 +25,7 @@ from ceres_cal.model.parameters import Estimate, unit_px
 from ceres_cal.model.structure import Kind, Structure, make_structure, numbers_by_kind
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights
-from ceres_cal.solve.linear_model import LinearModel, equation_weights, make_linear_model
+from ceres_cal.solve.linear_model import LinearModel, Weights, equation_weights, make_linear_model
 from ceres_cal.solve.problem import Problem
 from ceres_cal.solve.robust import RobustSolution
 
@@ -128,7 +128,7 @@ class _Columns:
         """Of some sights; the residuals are those to the drawing, offsets that were found before taken off."""
         estimate = end.solution.estimate
         equations = equations_of(observations, sights, estimate, end.residuals)
-        weights = equation_weights(observations, end.problem.options, end.inliers, equations)
+        weights = _weights(observations, end, equations)
         before = estimate.structure.values * [name not in stated.names for name in estimate.structure.names]
         solved = np.append(before, 0.0)[equations.slots(estimate.structure)]
         equations = replace(equations, residual=equations.residual - np.sum(equations.built * solved, axis=1))
@@ -154,6 +154,12 @@ class _Columns:
         """(Q, Q) X^T X."""
         every = [self.gathered(self.values[:, k], self.slots[:, k], self.size + 1) for k in range(self.slots.shape[1])]
         return np.asarray(np.sum(every, axis=0)[:-1])
+
+
+def _weights(observations: Observations, end: RobustSolution, equations: Equations) -> Weights:
+    """How the equations counted at the end."""
+    taking_part = end.inliers.points, end.inliers.curves
+    return equation_weights(observations, end.problem.weighting, equations, end.residuals, taking_part)
 
 
 def _repeating(scores: Array) -> float:
@@ -250,7 +256,7 @@ def _drawn(columns: _Columns, stated: Structure, observations: Observations, end
     """The linear model of the targets as drawn, smooth displacements of the image free besides."""
     equations, estimate = columns.equations, replace(end.solution.estimate, structure=stated)
     problem = end.problem.of_sights(np.flatnonzero([key in equations.sights.keys for key in end.problem.sights.keys]))
-    weights = equation_weights(observations, end.problem.options, end.inliers, equations)
+    weights = _weights(observations, end, equations)
     model = make_linear_model(problem, estimate, equations, weights)
     return model.with_columns(np.column_stack(list(_of_image(equations, estimate))))
 
