@@ -29,9 +29,9 @@ from ceres_cal.solve.linear_model import LinearModel, Weights, equation_weights,
 from ceres_cal.solve.problem import Problem
 from ceres_cal.solve.robust import RobustSolution
 
-_MOST_SCREENED, _MOST_SIGHTS = 24, 200  # of a camera: that are asked first, and that tell the sigma
-# Standard deviations of products of different views from which on the likelihood is asked: one in fifteen flat boards.
-_REPEATS = 1.5
+_MOST_SCREENED, _MOST_SIGHTS = 12, 200  # of a camera: that are asked first, and that tell the sigma
+# Standard deviations of products of different views from which on the likelihood is asked, which costs as much again.
+_REPEATS = 2.5
 # Degrees of freedom of the views about their mean below which they cannot be told from one another.
 _FEWEST = 4
 # Probability, before anything was seen, that a target is as drawn, and from which on what it is not is solved for.
