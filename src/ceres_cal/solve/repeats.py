@@ -31,7 +31,7 @@ from ceres_cal.solve.robust import RobustSolution
 
 _MOST_SCREENED, _MOST_SIGHTS = 12, 200  # of a camera: that are asked first, and that tell the sigma
 # Standard deviations of products of different views from which on the likelihood is asked, which costs as much again.
-_REPEATS = 2.5
+_REPEATS = 2.0
 # Degrees of freedom of the views about their mean below which they cannot be told from one another.
 _FEWEST = 4
 # Probability, before anything was seen, that a target is as drawn, and from which on what it is not is solved for.
@@ -96,8 +96,11 @@ def estimate_as_built(
 
 
 def _some(sights: Sights, most: int) -> Sights:
-    """At most so many of each camera, evenly."""
-    chosen = [numbers[:: -(-len(numbers) // most)] for numbers in map(sights.numbers, sights.cameras)]
+    """All of the world, and of each camera's others at most so many, evenly."""
+    chosen = [sights.numbers(placements=(None,))]
+    for camera in sights.cameras:
+        others = np.setdiff1d(sights.numbers(camera), chosen[0])
+        chosen.append(others[:: max(1, -(-len(others) // most))])
     return sights.take(np.sort(np.concatenate(chosen)))
 
 
