@@ -86,6 +86,7 @@ DECIDING: tuple[Constant, ...] = (
     *_of("solve.competing", "_LEFT _STANDS_OUT", "calibrate"),
     *_of("solve.explanation", "DOUBTFUL", "calibrate"),
     *_of("solve.offsets", "_FAULTY _INDEPENDENT", "calibrate"),
+    *_of("solve.repeats", "_REPEATS _AS_DRAWN _LIKELY", "calibrate", "diagnose"),
     *_of("solve.wholes", "FEWEST", "calibrate"),
     *_of("solve.bundle", "_POSED", "calibrate"),
     *_of("solve.costs", "_LEFT_TO_THE_COMPLEMENT", "calibrate"),

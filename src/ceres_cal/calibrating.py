@@ -1,4 +1,4 @@
-"""The steps, in order: choose a lens (where that is asked for), initialise, solve, reject, solve, compete, assess."""
+"""The steps: choose a lens (where that is asked for), initialise, solve, reject, solve, compete, as built, assess."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from ceres_cal.model.residuals import residuals
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import gather_sights
 from ceres_cal.solve import (
+    AsBuilt,
     Conflicts,
     Problem,
     Progress,
@@ -30,6 +31,7 @@ from ceres_cal.solve import (
     information,
     solve_robustly,
 )
+from ceres_cal.solve.as_built import solve_as_built, tolerances_of
 from ceres_cal.solve.competing import compete
 from ceres_cal.solve.conflicts import contradicted_by
 from ceres_cal.solve.explanation import Explanation
@@ -137,7 +139,7 @@ def solved_from(
     again: Again | None = None,
     progress: Callable[[Progress], None] | None = None,
 ) -> Calibration:
-    """Solve, reject, solve, let explanations compete, assess, from a start.
+    """Solve, reject, solve, let explanations compete, solve for targets as built, assess, from a start.
 
     Raises:
         CalibrationError: see `calibrate`.
@@ -150,6 +152,9 @@ def solved_from(
         return solve_robustly(others, observations, _start_of(others, problem, observations, start, again), usual)
 
     end, explanations = compete(problem, observations, end, solved)
+    as_built: tuple[AsBuilt, ...] = ()
+    if again is None and problem.options.as_built == "estimate":
+        end, problem, explanations, as_built = solve_as_built(problem, observations, end, explanations, solved)
     _require_fits(end, problem)
     require_possible(observations, problem.sights, end.solution.estimate, end.residuals)
     warnings = tuple(one.warning for one in explanations)
@@ -162,7 +167,9 @@ def solved_from(
     digest.result()  # which the observations remember
     calibration = _calibration(start, observations, problem, end, explanations)
     warnings = (*calibration.warnings, *_require_usable(end, problem, explanations), *warnings)
-    return replace(calibration, warnings=warnings, posterior=posterior, conflicts=conflicts.every)
+    calibration = replace(calibration, warnings=warnings, posterior=posterior, conflicts=conflicts.every)
+    tolerances = {**problem.options.tolerances, **tolerances_of(as_built)}
+    return replace(calibration, options=replace(problem.options, tolerances=tolerances), as_built=as_built)
 
 
 def _closed_form(start: Start, observations: Observations, problem: Problem) -> Calibration:

@@ -33,12 +33,12 @@ from ceres_cal.observations.sights import gather_sights
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.files import CameraFile, PoseFile
 from ceres_cal.scene.targets import Target, targets_from_specs
-from ceres_cal.solve import Conflict, Problem, Weighting
+from ceres_cal.solve import AsBuilt, Conflict, Problem, Weighting
 from ceres_cal.uncertainty import Disagreement, Posterior, PosteriorFile, Uncertainty, disagreement
 
 _ALIKE = (
     *("fit", "rejected", "termination", "converged", "rounds", "history"),
-    *("phi_from", "warnings", "digest", "versions", "conflicts", "lens_choice"),
+    *("phi_from", "warnings", "digest", "versions", "conflicts", "lens_choice", "as_built"),
 )
 """What the file has as it is."""
 
@@ -60,6 +60,8 @@ class Calibration:
         refitted: how it came from an earlier calibration; None for one from scratch.
         conflicts: what was known beforehand and everything else contradicts; what is in dispute is in the posterior.
         lens_choice: how the lens was chosen; None where it was given.
+        as_built: what of the targets is not where it is drawn, and was solved for under the sigmas that the data show;
+            these are in the options' tolerances.
         notes: whatever somebody wants to keep with it, plain data.
     """
 
@@ -80,6 +82,7 @@ class Calibration:
     refitted: Refitted | None = None
     conflicts: tuple[Conflict, ...] = ()
     lens_choice: LensChoice | None = None
+    as_built: tuple[AsBuilt, ...] = ()
     notes: Mapping[str, Any] = field(default_factory=dict)
 
     def __repr__(self) -> str:

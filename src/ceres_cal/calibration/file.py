@@ -20,7 +20,7 @@ from ceres_cal.model.structure import EXACT, make_structure
 from ceres_cal.observations import prior_from_json, prior_to_json
 from ceres_cal.scene.files import CameraFile, Matrix, PoseFile, Vector, rotation_of
 from ceres_cal.scene.targets import Target
-from ceres_cal.solve import Conflict
+from ceres_cal.solve import AsBuilt, Conflict
 from ceres_cal.uncertainty import PosteriorFile, information_from, lower_triangle
 
 FORMAT, VERSION = "ceres-cal/calibration", 1
@@ -132,6 +132,7 @@ class CalibrationFile(msgspec.Struct, forbid_unknown_fields=True):
     refitted: RefittedFile | None = None
     conflicts: tuple[Conflict, ...] = ()
     lens_choice: LensChoice | None = None
+    as_built: tuple[AsBuilt, ...] = ()
     notes: dict[str, Any] | msgspec.UnsetType = msgspec.UNSET
 
     def estimate(self, targets: Mapping[str, Target], options: Options) -> Estimate:

@@ -82,6 +82,12 @@ def _add_camera(parser: ArgumentParser) -> None:
         help="solve for a target as built: field.lines_m=0.01, field.points_m=0.005 or board.warp_m=0.002 "
         "(a sigma in metres, or such as 10mm; repeatable)",
     )
+    add(
+        "--as-drawn",
+        action="store_true",
+        help="take targets without a tolerance as drawn; else corners, bows and lines whose residuals repeat over the "
+        "views are solved for, with a sigma from the data",
+    )
     add_prior(parser)
 
 
@@ -208,6 +214,7 @@ def _options(
         fixed=fixed,
         priors=tuple(parse_prior(spec, observations, names) for spec in args.prior),
         tolerances=_tolerances(args.tolerance),
+        as_built="as drawn" if args.as_drawn else "estimate",
         loss=args.loss,
         loss_scale=args.loss_scale,
         reject_sigma=args.reject_sigma,

@@ -20,6 +20,7 @@ from ceres_cal.report.grounds import disputed, is_against, judge_quality
 from ceres_cal.report.quality import Quality
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.heights import at_height
+from ceres_cal.solve import words_of
 from ceres_cal.uncertainty import FieldMap, Verdict
 from ceres_cal.uncertainty.rig import RigPair
 
@@ -118,10 +119,12 @@ def _fit(calibration: Calibration) -> list[str]:
 
 
 def _structure(calibration: Calibration) -> list[str]:
-    structure = calibration.estimate.structure
-    order = np.argsort(-np.abs(structure.values))[:_MOST_FEATURES]
-    lines = [f"{1e3 * structure.values[i]:8.2f} mm  {structure.names[i]}" for i in order]
-    rest = len(structure.names) - len(lines)
+    structure, estimated = calibration.estimate.structure, {one.target for one in calibration.as_built}
+    stated = [i for i, name in enumerate(structure.names) if name.partition("/")[0] not in estimated]
+    order = sorted(stated, key=lambda i: -abs(structure.values[i]))[:_MOST_FEATURES]
+    lines = [line for words in words_of(calibration.as_built) for line in wrapped(words)]
+    lines += [f"{1e3 * structure.values[i]:8.2f} mm  {structure.names[i]}" for i in order]
+    rest = len(stated) - len(order)
     return [*lines, f"and {plural(rest, 'smaller correction')}"] if rest else lines
 
 

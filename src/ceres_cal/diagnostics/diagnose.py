@@ -131,7 +131,8 @@ def _case(calibration: Calibration, observations: Observations, new_data: bool) 
         model = replace(model, known_noise=USUAL_EQUATIONS)
     table = make_table(observations, inliers, model, weights.robust, estimate.cameras)
     labels = find_mislabelled(observations, estimate, inliers, problem.options.reject_sigma)
-    case = Case(observations, problem, estimate, inliers, model, table, labels, calibration if new_data else None)
+    other, as_built = (calibration, ()) if new_data else (None, calibration.as_built)
+    case = Case(observations, problem, estimate, inliers, model, table, labels, other, as_built)
     used = recalled(case)
     if np.array_equal(used, model.used):
         return case
@@ -164,4 +165,4 @@ def _tested(case: Case, rate: float) -> Tested:
     if inflation > 1.0 and selection.chosen:  # correlated noise makes every other test too eager
         selection = select(case.model, families, rate, extra, inflation)
         noise = measure_noise(case.observations, selection.model, case.model, case.inliers)
-    return Tested(case, selection, noise)
+    return Tested(case, selection, noise, rate)

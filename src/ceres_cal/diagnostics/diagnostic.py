@@ -21,7 +21,7 @@ from ceres_cal.diagnostics.table import ResidualTable, plane_shift
 from ceres_cal.model.equations import Equations
 from ceres_cal.model.parameters import Estimate
 from ceres_cal.observations import Observations
-from ceres_cal.solve import Problem
+from ceres_cal.solve import AsBuilt, Problem
 from ceres_cal.solve.linear_model import LinearModel
 from ceres_cal.solve.noise import Inliers
 
@@ -43,6 +43,7 @@ class Case:
     Attributes:
         problem: of all the observations. model: before any alternative is put in.
         calibration: of other observations, which may not hold on these; None where these are its own.
+        as_built: what the calibration found not to be as drawn, and solved for.
     """
 
     observations: Observations
@@ -53,6 +54,7 @@ class Case:
     table: ResidualTable
     labels: Mislabelling
     calibration: Calibration | None
+    as_built: tuple[AsBuilt, ...] = ()
 
     @property
     def equations(self) -> Equations:
@@ -85,11 +87,12 @@ class Case:
 
 @dataclass(frozen=True, eq=False)
 class Tested:
-    """A case, the alternatives that its residuals speak for, and the noise that these leave."""
+    """A case, the alternatives that its residuals speak for, the noise that these leave, the rate of false alarms."""
 
     case: Case
     selection: Selection
     noise: tuple[Noise, ...]
+    rate: float
 
     def log10_p(self, log_p: float) -> float:
         """Decimal logarithm after Bonferroni."""

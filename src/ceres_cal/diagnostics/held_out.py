@@ -226,7 +226,7 @@ def _predicted(observations: Observations, held: Mask, trained: Calibration, who
 
 def _posed(sights: Sights, estimate: Estimate, trained: Calibration, observations: Observations) -> Mapping[str, Pose]:
     """All placements, those of the sights in their best pose, everything else held; targets as the fold built them."""
-    built = replace(sights, points=estimate.structure.points(sights), tracks=estimate.structure.tracks(sights))
+    built = estimate.structure.built_into(sights)
     start = replace(estimate, structure=make_structure(observations.targets, {}))
     none = {name: np.empty(0, dtype=np.int64) for name in estimate.cameras}
     layout = Layout(none, frozenset(), frozenset(str(key.placement) for key in sights.keys))

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask
-from ceres_cal.diagnostics.diagnostic import Case, Evidence, ScoreTest, Words
-from ceres_cal.diagnostics.findings import amounts
+from ceres_cal.base.words import first_of
+from ceres_cal.diagnostics.diagnostic import Case, Evidence, ScoreTest, Tested, Words
+from ceres_cal.diagnostics.findings import Amount, Finding, amounts
 from ceres_cal.diagnostics.scores import Family, grouped
 from ceres_cal.model.equations import whole_structure
+from ceres_cal.model.structure import Kind, numbers_by_kind
 from ceres_cal.scene.targets import Arc, Segment
+from ceres_cal.solve import AsBuilt
 
 # Observations that say whether a curve lies aside: three numbers of an arc, and as many left to contradict them.
 # Nothing changes from half to double.
@@ -24,6 +27,8 @@ _FEWEST_OF_POINT = 2
 # Rejected observations of one line that must agree on its place: two determine it, three more do not by chance.
 # Nothing changes from half to double.
 _FEWEST_AGREE = 5
+# Features aside of one target from which on it is the target. Two may be lines that somebody painted anew.
+_SEVERAL = 3
 # What lies farther aside is no painting error: its label is wrong. Nothing changes from half to double.
 _FAR_M = 0.1
 
@@ -32,11 +37,13 @@ class _AsBuilt(ScoreTest):
     """What moves some numbers of the structure that no tolerance solves for, where enough equations of it are used.
 
     Attributes:
-        curves: whether of curves, or of points. places: of the numbers, as in `Equations.built`.
+        curves: whether of curves, or of points. places: of the numbers, as in `Equations.built`. built: the kind of
+            what `calibrate` solves for by itself.
     """
 
     curves: ClassVar[bool] = False
     places: ClassVar[slice]
+    built: ClassVar[Kind]
 
     @property
     def _fewest(self) -> int:
@@ -53,6 +60,54 @@ class _AsBuilt(ScoreTest):
         names = tuple(_feature_of(structure.names[number]) for number in numbers)
         yield Family(self.kind, equations.built[:, self.places], group, names)
 
+    def findings(self, tested: Tested) -> Iterator[Finding]:
+        yield from _of_each_target(list(super().findings(tested)))
+        for one in tested.case.as_built:
+            if one.kind == self.built and one.probability >= 1.0 - tested.rate:
+                yield _solved_for(self.kind, one, tested)
+
+
+def _of_each_target(findings: Sequence[Finding]) -> Iterator[Finding]:
+    """One finding for a target of which several features lie aside."""
+    for target in dict.fromkeys(one.subject.partition("/")[0] for one in findings):
+        own = [one for one in findings if one.subject.partition("/")[0] == target]
+        if len(own) < _SEVERAL:
+            yield from own
+            continue
+        counts = np.array([one.observations for one in own], dtype=float)
+        px, mm, ratio = (
+            float(np.sqrt(np.average([value**2 for value in values], weights=counts)))
+            for values in zip(*((one.effect_px, one.effect_mm, one.noise_ratio) for one in own), strict=True)
+        )
+        names = first_of([one.subject for one in own], 3)
+        yield replace(
+            own[0], subject=target, sentence=f"{target} is not as drawn: {names} ({px:.2f} px, {mm:.1f} mm rms)",
+            advice=f"measure it, or let `calibrate` solve for it: without --as-drawn, or with --tolerance {target}",
+            effect_px=px, effect_mm=mm, noise_ratio=ratio, amounts=(), observations=int(counts.sum()),
+            log10_p=min(one.log10_p for one in own),
+        )  # fmt: skip
+
+
+def _solved_for(kind: str, one: AsBuilt, tested: Tested) -> Finding:
+    """What the calibration found by itself, and has in it."""
+    case, structure = tested.case, tested.case.estimate.structure
+    numbers = numbers_by_kind(structure, case.observations.targets)[one.target, one.kind]
+    offsets = np.zeros(len(structure.values) + 1)
+    offsets[numbers] = structure.values[numbers]
+    shift = np.sum(case.equations.built * offsets[case.equations.slots(structure)], axis=1)
+    rows = (shift != 0.0) & case.model.used
+    effect = case.effect(shift, rows)
+    most = int(numbers[np.argmax(np.abs(offsets[numbers]))])
+    alone = offsets[most] ** 2 > 0.5 * float(offsets @ offsets) and len(numbers) > 2
+    return Finding(
+        kind, "observations", _feature_of(structure.names[most]) if alone else one.target, None,
+        f"{one.target} is not as drawn: {one.words}, most of all {structure.names[most]} by "
+        f"{1e3 * offsets[most]:+.2f} mm; it was solved for", "none is needed; a flat, exact target needs fewer views",
+        effect.px, effect.mm, effect.px / case.noise_px(tested.selection.model.left_over, rows),
+        (Amount("sigma", 1e3 * one.sigma_m, 0.0, "mm"),), float(np.log10(max(1.0 - one.probability, 1e-300))),
+        effect.observations,
+    )  # fmt: skip
+
 
 def _feature_of(name: str) -> str:
     """field/CenterCircle.x -> field/CenterCircle"""
@@ -65,6 +120,7 @@ class CurveAside(_AsBuilt):
     """A line or an arc is not painted as drawn."""
 
     kind = "curve aside"
+    built: ClassVar = "lines"
     curves = True
     places: ClassVar = slice(0, 3)
 
@@ -92,6 +148,7 @@ class PointAside(_AsBuilt):
     """A point does not lie where it is drawn."""
 
     kind = "point aside"
+    built: ClassVar = "points"
     places: ClassVar = slice(0, 2)
 
     def words(self, evidence: Evidence) -> Words:
@@ -109,6 +166,7 @@ class BoardBent(_AsBuilt):
     """A board is bowed along its sides."""
 
     kind = "board bent"
+    built: ClassVar = "warp"
     places: ClassVar = slice(2, 4)
 
     def words(self, evidence: Evidence) -> Words:

@@ -44,7 +44,9 @@ class Options:
             files.
             They hold for every camera.
         priors: what is known beforehand, besides the observations' own.
-        tolerances: target -> how far it may have been built from its drawing; none of it where a target is not named.
+        tolerances: target -> how far it may have been built from its drawing.
+        as_built: of a target without a tolerance "estimate" how far it was, from what repeats over the views (what it
+            is, a calibration says in its tolerances), or take it "as drawn".
         loss: robust loss of each observation: one of LOSSES. loss_scale: where it starts to bend, in standard
             deviations; from half to double of 2.5 the squared error changes by under a tenth.
         reject_sigma: observations farther off than this many standard deviations are taken out and listed. At half of 5
@@ -69,6 +71,7 @@ class Options:
     loss_scale: float = 2.5
     reject_sigma: float = 5.0
     noise_scale: str = "estimate"
+    as_built: str = "estimate"
     closed_form_only: bool = False
     max_iterations: int = 100
     threads: int = 0
@@ -82,6 +85,8 @@ class Options:
             raise InputError(f"unknown loss {self.loss!r}: choose one of {', '.join(LOSSES)}")
         if self.noise_scale not in ("estimate", "stated"):
             raise InputError(f"noise_scale must be 'estimate' or 'stated', not {self.noise_scale!r}")
+        if self.as_built not in ("estimate", "as drawn"):
+            raise InputError(f"as_built must be 'estimate' or 'as drawn', not {self.as_built!r}")
         names = self.intrinsic_names  # which refuses unknown terms, too
         for name, value in self.fixed.items():
             if name not in names:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
@@ -17,6 +18,8 @@ from ceres_cal.base.errors import InputError
 from ceres_cal.observations.sights import Sights
 from ceres_cal.scene.targets import Arc, Target
 
+Kind = Literal["lines", "points", "warp"]
+"""What a tolerance speaks of."""
 _NONE = -1
 
 
@@ -84,6 +87,12 @@ class Structure:
     def tracks(self, sights: Sights) -> Array:
         """(T, 3, 3) the tracks of all targets as built."""
         return self._tracks(sights.tracks, sights.is_arc)
+
+    def built_into(self, sights: Sights) -> Sights:
+        """The sights of targets that were drawn as they are built."""
+        if not len(self.values):
+            return sights
+        return replace(sights, points=self.points(sights), tracks=self.tracks(sights))
 
     def built(self, targets: Mapping[str, Target]) -> dict[str, Built]:
         """Every target as built; `targets` are those that the corrections were made for, in that order."""
@@ -179,6 +188,22 @@ def make_structure(targets: Mapping[str, Target], tolerances: Mapping[str, Toler
         np.concatenate(bends),
         np.array(track_slots, dtype=np.int32).reshape(-1, 3),
     )
+
+
+def numbers_by_kind(structure: Structure, targets: Mapping[str, Target]) -> dict[tuple[str, Kind], Indices]:
+    """(target, kind) -> which of the structure's numbers are of it, where there are any."""
+    numbers: dict[tuple[str, Kind], Indices] = {}
+    if not structure.names:
+        return numbers
+    points = np.cumsum([0, *(len(target.points) for target in targets.values())])
+    curves = 3 * np.cumsum([0, *(len(target.curves) for target in targets.values())])
+    for place, name in enumerate(targets):
+        own = structure.point_slots[points[place] : points[place + 1]]
+        tracks = structure.track_slots[curves[place] : curves[place + 1]]
+        kinds: tuple[tuple[Kind, Indices32], ...] = (("lines", tracks), ("points", own[:, :2]), ("warp", own[:, 2:]))
+        every = {(name, kind): np.unique(slots[slots >= 0]).astype(np.int64) for kind, slots in kinds}
+        numbers |= {of: slots for of, slots in every.items() if len(slots)}
+    return numbers
 
 
 def bends_of(target: Target) -> Array:

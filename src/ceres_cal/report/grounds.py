@@ -15,6 +15,7 @@ from ceres_cal.diagnostics import Finding
 from ceres_cal.observations.copies import COUNTED_ONCE
 from ceres_cal.report.quality import Quality
 from ceres_cal.scene.heights import HEIGHTS_M
+from ceres_cal.solve import words_of
 from ceres_cal.uncertainty import FieldMap, Verdict
 
 GOOD_MM, CARE_MM = 10.0, 50.0
@@ -101,6 +102,7 @@ def grounds(quality: Quality) -> Iterator[tuple[str, str]]:
     elif calibration.rounds:
         yield "no", "The solve did not come to rest: raise --max-iterations."
     yield from _of_findings(quality)
+    yield from (("", f"{sentence(words)}.") for words in words_of(calibration.as_built))
     for conflict in calibration.conflicts:
         yield "care" if conflict.kind == "tolerance" else "no", f"{sentence(conflict.words)}."
     if noise_ratio(quality) >= LARGE_NOISE:

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from ceres_cal.base.transforms import euler_from_rotation
-from ceres_cal.base.words import DASH, at_precision, bounds_text, fixed, grouped, mm, powered, short
+from ceres_cal.base.words import DASH, at_precision, bounds_text, fixed, grouped, mm, powered, sentence, short
 from ceres_cal.calibration import LensChoice
 from ceres_cal.model.parameters import anchored_stations
 from ceres_cal.report.material import Material
@@ -15,6 +15,7 @@ from ceres_cal.report.page import BulletList, Chapter, Piece, Table, Text
 from ceres_cal.report.quality import Seam
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.heights import HEIGHTS_M, at_height
+from ceres_cal.solve import words_of
 from ceres_cal.uncertainty import Verdict
 
 _HEAD = ("", "value", "± sd", "by the model alone", "95 % bounds", "verdict")
@@ -143,6 +144,7 @@ def _as_built(material: Material) -> Iterator[Piece]:
         rows.append((structure.names[i], f"{1e3 * structure.values[i]:+.2f} mm", f"{short(sd)} mm",
                      f"{short(1e3 * float(structure.sigma_m[i]))} mm"))  # fmt: skip
     rest = len(structure.names) - len(order)
+    yield from (Text(f"{sentence(words)}.") for words in words_of(material.calibration.as_built))
     yield Table(("", "off its drawing", "± sd", "tolerance"), tuple(rows), "Targets as built", stacked=True)
     if rest:
         yield Text(f"And {grouped(rest)} smaller ones.", "note")

@@ -10,14 +10,17 @@ from ceres_cal.base.native import kept_signals
 with kept_signals():
     import pyceres  # noqa: F401
 
+from ceres_cal.solve.as_built import words_of
 from ceres_cal.solve.bundle import Progress, Solution, placement_costs, solve, with_placements_at_best
 from ceres_cal.solve.conflicts import Conflicts, find_conflicts
 from ceres_cal.solve.information import Eliminated, ReducedInformation, information
 from ceres_cal.solve.problem import Problem, Weighting
+from ceres_cal.solve.repeats import AsBuilt
 from ceres_cal.solve.robust import RobustSolution, solve_robustly
 from ceres_cal.solve.stated import Conflict
 
 __all__ = [
+    "AsBuilt",
     "Conflict",
     "Conflicts",
     "Eliminated",
@@ -33,4 +36,5 @@ __all__ = [
     "solve",
     "solve_robustly",
     "with_placements_at_best",
+    "words_of",
 ]

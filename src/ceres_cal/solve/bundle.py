@@ -288,6 +288,8 @@ def _solver_options(problem: Problem, assembly: _Assembly, precision: float) -> 
     kept += 6 * len(problem.layout.stations) if assembly.blocks.placements else 0
     few = kept < _DENSE_LIMIT
     solver.linear_solver_type = pyceres.LinearSolverType.DENSE_SCHUR if few else pyceres.LinearSolverType.SPARSE_SCHUR
+    if len(assembly.blocks.structure) and not assembly.blocks.placements:  # nothing is left to be eliminated
+        solver.linear_solver_type = pyceres.LinearSolverType.DENSE_NORMAL_CHOLESKY
     solver.max_num_iterations = problem.options.max_iterations
     solver.function_tolerance = precision
     solver.parameter_tolerance = 1e-12

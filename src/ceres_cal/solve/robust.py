@@ -68,6 +68,7 @@ def solve_robustly(
     usual: tuple[float, float] | None = None,
     progress: Callable[[Progress], None] | None = None,
     most_rounds: int = _MOST_ROUNDS,
+    is_near: bool = False,
 ) -> RobustSolution:
     """The minimum over the inliers, at the noise that they show.
 
@@ -78,12 +79,13 @@ def solve_robustly(
         problem: of all the observations; its weighting is not looked at.
         usual: noise scales of points and curves that were seen before, where there are any.
         most_rounds: solves, the rough one counted; 2 end near the minimum.
+        is_near: whether the estimate tells outliers as it is: no rough solve is needed.
 
     Raises:
         CalibrationError: see `solve`.
     """
     rounds = _Rounds(problem, observations, usual, progress)
-    state = rounds.first(estimate)
+    state = rounds.at(estimate) if is_near else rounds.first(estimate)
     undecided = frozenset(state.problem.sights.keys)
     before: Inliers | None = None
     while state.rounds < most_rounds:
@@ -92,7 +94,7 @@ def solve_robustly(
             undecided = frozenset(state.problem.sights.keys)  # another lens had decided about mirrored poses
         if at_rest or before is None:
             state, changed, undecided = rounds.mended(state, undecided)
-            if before is None:
+            if before is None and not is_near:
                 state = rounds.refined(state)
             if at_rest and not changed:
                 state = rounds.with_leverages(state)
@@ -100,6 +102,12 @@ def solve_robustly(
                     break
         before, state = state.inliers, rounds.next(state)
     return state
+
+
+def judge_at(problem: Problem, observations: Observations, estimate: Estimate) -> RobustSolution:
+    """Noise and outliers by the leverages at an estimate, where nothing is solved."""
+    rounds = _Rounds(problem, observations, None, None)
+    return rounds.by_leverages(rounds.at(estimate))[0]
 
 
 class _Rounds:
@@ -123,6 +131,11 @@ class _Rounds:
         there = residuals(self._observations, self._problem.sights, estimate)
         return self._rough(estimate, there, visible_from(self._observations, there), 1)
 
+    def at(self, estimate: Estimate) -> RobustSolution:
+        """A start as it is, judged."""
+        there = residuals(self._observations, self._problem.sights, estimate)
+        return self._weighted(Solution(estimate, np.nan, False, "", ()), there, 0)
+
     def refined(self, state: RobustSolution) -> RobustSolution:
         """Further rough solves, each at the scale of the residuals that the one before left, while that falls."""
         for _ in range(_MOST_REFINED):
@@ -134,7 +147,7 @@ class _Rounds:
         mixed = bool(self._problem.priors_at(state.solution.estimate)) or all(
             kind.equations for kind in self._problem.sights.by_kind
         )
-        return self._by_leverages(state)[0] if mixed and len(state.problem.sights) else state
+        return self.by_leverages(state)[0] if mixed and len(state.problem.sights) else state
 
     def _rough(self, estimate: Estimate, there: Residuals, visible: Inliers, rounds: int) -> RobustSolution:
         """A solve of few placements, which the others follow, that gross errors do not decide."""
@@ -181,14 +194,14 @@ class _Rounds:
         """The state with what its problem says there, where the noise is judged no other by the leverages, and nothing
         moves by how smooth lenses are; else judged by them, for another round.
         """
-        anew, reduced = self._by_leverages(state)
+        anew, reduced = self.by_leverages(state)
         if self._moving > _STILL or not anew.inliers.same_as(state.inliers, self.no_change):
             return anew
         problem = replace(state.problem, smoothness=self._problem.smoothness)
         inliers = replace(state.inliers, degrees_of_freedom=anew.inliers.degrees_of_freedom)
         return replace(state, problem=problem, inliers=inliers, reduced=reduced)
 
-    def _by_leverages(self, state: RobustSolution) -> tuple[RobustSolution, ReducedInformation]:
+    def by_leverages(self, state: RobustSolution) -> tuple[RobustSolution, ReducedInformation]:
         """The state judged by the leverages there, and what they were taken from."""
         reduced = information(state.problem, state.solution.estimate)
         self._problem, reduced, self._moving = with_smoothness(self._problem, state.solution.estimate, reduced)

@@ -103,8 +103,11 @@ def is_plain(prior: GaussianPrior) -> bool:
 
 
 def statements(problem: Problem, observations: Observations, estimate: Estimate) -> Iterator[Statement]:
-    """Everything stated of a problem's numbers, and what is held by name."""
-    yield from grouped(problem.stated_at(estimate))
+    """Everything stated of a problem's numbers, and what is held by name; a tolerance that was estimated is none."""
+    tolerances = problem.options.tolerances
+    for one in grouped(problem.stated_at(estimate)):
+        if one.kind != "tolerance" or one.keys[0].owner in tolerances:
+            yield one
     yield from _held(problem.options, observations, estimate)
 
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import AnyArray, Array, Indices, Mask
 from ceres_cal.model.equations import Equations, equations_of
+from ceres_cal.model.information import Information
 from ceres_cal.model.parameters import Estimate
 from ceres_cal.model.residuals import Residuals
 from ceres_cal.observations import Observations
@@ -107,7 +108,7 @@ def take_sample(
     weights = equation_weights(observations, problem.weighting, equations, there).within_sigma
     blank, columns = without_shared(problem, estimate, equations, weights)
     placed = blank.beyond_private(np.column_stack([columns, blank.score]))
-    root = inverse_root(information, np.diagonal(information), _DETERMINED)
+    root = _root(reduced.shared)
     curves, grouped = equations.is_curve, _groups(equations)
     return Sample(
         placed[:, :-1] @ root,
@@ -120,6 +121,22 @@ def take_sample(
         tuple(strands_of(equations, equations.view)),
         tuple(strands_of(equations, equations.sight)) if _lasting(equations) else (),
     )
+
+
+def _root(shared: Information) -> Array:
+    """(K, P) from directions in which all but the structure is known to one, which follows, to the shared numbers.
+
+    How far the targets were built from their drawings has a scatter of its own (see `solve.as_built`).
+    """
+    size, matrix = len(shared.keys), shared.matrix
+    rest = np.array([key.kind != "structure" for key in shared.keys])
+    if rest.all():
+        return inverse_root(matrix, np.diagonal(matrix), _DETERMINED)
+    follows = np.zeros((size, int(np.count_nonzero(rest))))
+    follows[rest] = np.eye(follows.shape[1])
+    follows[~rest] = -np.linalg.solve(matrix[np.ix_(~rest, ~rest)], matrix[np.ix_(~rest, rest)])
+    left = matrix[rest] @ follows
+    return np.asarray(follows @ inverse_root(0.5 * (left + left.T), np.diagonal(left), _DETERMINED))
 
 
 def _some(observations: Observations, sights: Sights) -> Sights:

@@ -153,7 +153,7 @@ def field_grid(targets: Mapping[str, Target]) -> tuple[Array, Array]:
     Raises:
         InputError: there is nothing that does not move.
     """
-    box = [_corners(target) for target in targets.values() if not target.movable]
+    box = [target.box for target in targets.values() if not target.movable]
     if not box:
         raise InputError("no field to draw a map of: give x_m and y_m")
     low, high = np.min([b[0] for b in box], axis=0), np.max([b[1] for b in box], axis=0)
@@ -161,14 +161,3 @@ def field_grid(targets: Mapping[str, Target]) -> tuple[Array, Array]:
     counts = np.maximum(np.round((high - low) / spacing).astype(int) + 1, 2)
     x, y = (np.linspace(a, b, n) for a, b, n in zip(low, high, counts, strict=True))
     return x, y
-
-
-def _corners(target: Target) -> tuple[Array, Array]:
-    """(2,) lowest and highest x and y of a target's points and curves."""
-    reach = [target.point_array[:, :2]]
-    for track, is_arc in zip(target.tracks[0], target.is_arc, strict=True):
-        middle, along = track[0, :2], track[1, :2]
-        size = np.linalg.norm(along)
-        reach.append(np.array([middle - size, middle + size] if is_arc else [middle, middle + along]))
-    every = np.concatenate(reach)
-    return every.min(axis=0), every.max(axis=0)

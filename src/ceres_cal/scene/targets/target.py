@@ -105,6 +105,17 @@ class Target:
         """(C,) whether each curve is an arc."""
         return np.array([isinstance(curve, Arc) for curve in self.curves.values()], dtype=bool)
 
+    @cached_property
+    def box(self) -> Array:
+        """(2, 2) m, the lowest and the highest x and y of its points and curves."""
+        reach = [self.point_array[:, :2]]
+        for track, is_arc in zip(self.tracks[0], self.is_arc, strict=True):
+            middle, along = track[0, :2], track[1, :2]
+            size = np.linalg.norm(along)
+            reach.append(np.array([middle - size, middle + size] if is_arc else [middle, middle + along]))
+        every = np.concatenate(reach)
+        return np.array([every.min(axis=0), every.max(axis=0)])
+
 
 @dataclass(frozen=True)
 class TargetKind:
