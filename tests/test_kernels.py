@@ -281,7 +281,8 @@ def test_every_residual_knows_its_derivatives(lens: str) -> None:
     error = np.delete(error, moved_once, axis=1)  # its knots: differences across them are not so smooth
     points = 2 * len(seen[0].places)
     assert np.max(error[:points]) < 5e-8  # 6e-9 measured
-    assert np.max(error[points:]) < 1e-7  # 1e-8 measured
+    curved = 2e-6 if lens == "spline" else 1e-7  # of the first B-spline the foot is no straight function
+    assert np.max(error[points:]) < curved  # 1e-8 measured, 9e-7 of the spline
 
 
 @each_lens

@@ -27,7 +27,7 @@ def robust_loss(loss: Loss, squared: float) -> tuple[float, float]:
         return 2.0 * scale * root - b, scale / root
     if code == _SOFT_L1:
         root = np.sqrt(1.0 + squared / b)
-        return 2.0 * b * (root - 1.0), 1.0 / root
+        return 2.0 * squared / (1.0 + root), 1.0 / root  # 2 b (root - 1) without its rounding
     if code == _CAUCHY:
         return b * np.log(1.0 + squared / b), 1.0 / (1.0 + squared / b)
     if squared >= b:
