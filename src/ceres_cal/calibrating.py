@@ -12,13 +12,13 @@ from ceres_cal.base.errors import CalibrationError, DegenerateError, SolutionErr
 from ceres_cal.base.threads import at_most, meanwhile, single_threaded_blas
 from ceres_cal.base.words import bounds_text
 from ceres_cal.calibration import COPY, Calibration, Fit, Rejected
-from ceres_cal.lens_choice import choose_lens
+from ceres_cal.lens_choice import choose_lens, papers
 from ceres_cal.model.parameters import AUTO, Estimate, Layout, Options, make_layout
 from ceres_cal.model.priors import gather_priors
 from ceres_cal.model.quantities import difference
 from ceres_cal.model.residuals import residuals
 from ceres_cal.observations import Observations
-from ceres_cal.observations.sights import gather_sights
+from ceres_cal.observations.sights import Sights, gather_sights
 from ceres_cal.solve import (
     Conflicts,
     Problem,
@@ -86,13 +86,27 @@ def _calibrated(
 ) -> Calibration:
     """See `calibrate`."""
     observations.require_inside()
-    if options.lens == AUTO:
-        chosen, lens_choice = choose_lens(observations, options)
-        return replace(_calibrated(observations, chosen, progress), lens_choice=lens_choice)
-    sights, layout = gather_sights(observations), make_layout(observations, options)
-    start = initialise(observations, sights, options)
+    sights = gather_sights(observations)
+    start = initialise(observations, sights, options if options.lens != AUTO else papers(options))
+    if options.lens != AUTO:
+        return _of_lens(start, observations, sights, options, progress)
+    if options.closed_form_only:
+        return _of_lens(start, observations, sights, papers(options), progress)
+    chosen = choose_lens(observations, options, start)
+    calibration = _of_lens(chosen.start, observations, sights, chosen.options, progress)
+    return replace(calibration, lens_choice=chosen.choice)
+
+
+def _of_lens(
+    start: Start,
+    observations: Observations,
+    sights: Sights,
+    options: Options,
+    progress: Callable[[Progress], None] | None,
+) -> Calibration:
+    """With a lens that is named."""
     priors = gather_priors(observations, options, start.estimate.structure)
-    problem = Problem(sights, layout, priors, options=options)
+    problem = Problem(sights, make_layout(observations, options), priors, options=options)
     if options.closed_form_only:
         return _closed_form(start, observations, problem)
     return solved_from(start, observations, problem, progress=progress)
@@ -144,7 +158,7 @@ def solved_from(
     """
     digest = meanwhile(lambda: observations.digest)
     usual = again.scales if again else None
-    end = solve_robustly(problem, observations, start.estimate, usual, progress)
+    end = solve_robustly(problem, observations, start.estimate, usual, progress, is_near=start.is_near)
 
     def solved(others: Problem) -> RobustSolution:
         return solve_robustly(others, observations, _start_of(others, problem, observations, start, again), usual)

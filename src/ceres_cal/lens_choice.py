@@ -1,79 +1,99 @@
 """Which lens the data ask for: the simplest of those that predict placements, or lines, as well as any other does.
 
-Some of the observations are solved with each lens, and one linear model is made at the end of each. Leaving out a group
-of equations moves the free numbers by (1 - A)^-1 S^T r, with S the group's equations in directions in which everything
-is known to one, A = S^T S and r its residuals. What a solve without them would leave of them, r + S (1 - A)^-1 S^T r,
-thus follows from the fit of all. Errors that go together within a group make a longer lens predict the others no
-better: a criterion that counts observations would take them for a lens.
+Some of the observations are solved once, robustly, and from there with the longest lens of each kind. Shorter ones are
+these with coefficients held at 0: what a solve without a group of equations would leave of it follows for every lens
+from the normal equations of each group (`solve/left_out.py`). Errors that go together within a group make a longer lens
+predict the others no better: a criterion that counts observations would take them for a lens.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cache, cached_property
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices
+from ceres_cal.base.arrays import Array, Indices, Mask
 from ceres_cal.base.errors import CalibrationError, DegenerateError
+from ceres_cal.base.transforms import Poses
 from ceres_cal.calibration import LensChoice, TriedLens
 from ceres_cal.model.equations import Equations, write_equations
-from ceres_cal.model.parameters import OF_PIXELS, Estimate, Options, make_layout
+from ceres_cal.model.parameters import PAPERS_POWERS, Estimate, Options, make_layout
 from ceres_cal.model.priors import gather_priors
+from ceres_cal.model.quantities import moved, values_of
 from ceres_cal.model.residuals import residuals
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights, gather_sights
 from ceres_cal.observations.thinning import thinned
 from ceres_cal.scene.lens import LENSES
 from ceres_cal.solve import Problem, RobustSolution, solve, solve_robustly
-from ceres_cal.solve.linear_model import LinearModel, make_linear_model
-from ceres_cal.solve.noise import Inliers
-from ceres_cal.start.initialise import initialise
+from ceres_cal.solve.left_out import GroupNormals, group_normals
+from ceres_cal.start.initialise import LensProfile, Start
 from ceres_cal.uncertainty.sample import robust_weights
 
 PAPER = "radial 2,3"
 """The lens that wins ties."""
 _LEAST_ROWS, _SHARE = 1_250, 0.025  # of the observations, how many take part
-_NOISY = 1.5  # times the least noise: a lens that leaves as much predicts worse, whatever is held out
-_PRECISION = 1e-6  # relative change of the cost at which a lens is at its best
+_FEWEST_GROUPS = 8  # with fewer nothing tells lenses apart
+# What shows any direction and comes near to any lens but for its decentring: the first solve is with it.
+_WIDEST = "kannala-brandt"
+# Share of its squares: a kind that leaves less is solved instead, for it may have other inliers.
+_QUIETER = 0.7
+_PRECISION = 1e-3  # relative change of the cost from which on normal equations say where the least is
 _FEWEST_PLACEMENTS = 5  # with fewer the features of each are held out one by one
-_RIDGE = 1e-3  # of everything's information: a group that tells a direction alone cannot be left out
 # How much worse than the best, in standard errors of the difference, is as good. Of 180 scenes with the paper's lens it
 # was recognised in 92 % at 1, in 97 % at 1.5; at 2 the decentring of real sets is missed.
 _AS_GOOD = 1.5
 
 
-def choose_lens(observations: Observations, options: Options) -> tuple[Options, LensChoice]:
-    """The options with the lens that the data ask for, one for all cameras, and how it was chosen.
+@dataclass(frozen=True, eq=False)
+class Chosen:
+    """The lens that was chosen: options with it, where to start from, and what it was compared with."""
+
+    options: Options
+    start: Start
+    choice: LensChoice
+
+
+def papers(options: Options) -> Options:
+    """The options with the paper's lens."""
+    return replace(options, lens="radial", powers=PAPERS_POWERS, coefficients=None)
+
+
+def choose_lens(observations: Observations, options: Options, start: Start) -> Chosen:
+    """The lens that the data ask for, one for all cameras; the paper's where there is too little to tell by.
 
     The paper's lens and the longest of each kind come first: only where the paper's is not as good as the best of them
-    are the shorter ones tried.
+    are the shorter ones looked at.
 
     Args:
-        options: their lens, powers and fixed coefficients are not looked at.
-
-    Raises:
-        CalibrationError: no lens makes a calibration.
+        options: their lens is not looked at. start: of everything, with whatever lens.
     """
-    total = len(observations.points) + len(observations.curves)
-    few = thinned(observations, max(_LEAST_ROWS, int(_SHARE * total)))
-    every = list(_every_lens(options))
-    longest = {one.lens: one for one in sorted(every, key=coefficients_of)}
-    first = [next(one for one in every if label_of(one) == PAPER), *longest.values()]
-    sights = gather_sights(few)
-    solved = [_solve_roughly(few, sights, one) for one in first]
-    reference = _reference(few, sights, solved)
-    tried = [_judge(few, one, reference) for one in solved]
-    best, chosen = _decide(tried)
-    if chosen != 0:
-        kinds = [
-            one.options.lens for one in tried[1:] if _worse(one, tried[best]) <= _AS_GOOD or (one.failed and one.end)
-        ]
-        shorter = [one for one in every if one.lens in kinds and one not in first]
-        tried += [_judge(few, _solve_roughly(few, sights, one), reference) for one in shorter]
-        _, chosen = _decide(tried)
-    share = (len(few.points) + len(few.curves)) / total
-    return tried[chosen].options, _choice(tried, tried[chosen], share)
+    try:
+        kinds, share = _compared(observations, options, start.estimate)
+        tried, best, chosen = _compare([one for kind in kinds for one in kind.candidates(first=True)])
+        if chosen.form.label != PAPER:
+            others = [one for longest in tried if longest.may_win(best) for one in longest.of.candidates(first=False)]
+            tried, _, chosen = _compare([*tried, *others])
+    except CalibrationError:
+        return Chosen(papers(options), start, LensChoice(PAPER, (TriedLens(PAPER, 2),), 0, 0.0))
+    best = chosen.estimate
+    placements = Poses.of(start.estimate.placements).updated(list(best.placements), Poses.of(best.placements).stack)
+    stations = {**start.estimate.stations, **best.stations}
+    near = replace(start, estimate=replace(best, stations=stations, placements=placements), is_near=True)
+    return Chosen(chosen.form.of(options), near, _choice(tried, chosen, share))
+
+
+def _compare(tried: list[_Candidate]) -> tuple[list[_Candidate], _Candidate, _Candidate]:
+    """The lenses, the best and the one that is chosen: one that folds where it must not gives no answer."""
+    labels, counts = [one.form.label for one in tried], [len(one.form.names) for one in tried]
+    while True:
+        best, chosen = decide(labels, counts, [one.squares for one in tried])
+        faults = {number: fault for number in (best, chosen) if (fault := tried[number].fault)}
+        if not faults:
+            return tried, tried[best], tried[chosen]
+        tried = [replace(one, squares=None, failed=faults[n]) if n in faults else one for n, one in enumerate(tried)]
 
 
 # ---- candidates -----------------------------------------------------------------------------------------------------
@@ -87,160 +107,293 @@ def candidates(options: Options) -> list[Options]:
         if set(lens.names) & set(options.fixed):  # a held coefficient belongs to its own powers alone
             powers = [options.powers]
         return [replace(options, powers=one) for one in powers]
-    by_order = sorted(zip(lens.orders, lens.names, strict=True))
-    names = [name for _, name in by_order if name not in lens.decentring]
-    held = {name: value for name, value in options.fixed.items() if name not in names}
-    shorter = []
-    for count in range(1, len(names) + 1):
-        shorter.append(replace(options, fixed={**held, **dict.fromkeys(names[count:], 0.0)}))
+    by_order = [name for _, name in sorted(zip(lens.orders, lens.names, strict=True)) if name not in options.fixed]
+    names = [name for name in by_order if name not in lens.decentring]
+    also = tuple(name for name in by_order if name in lens.decentring and name not in options.held)
+    shorter = [replace(options, coefficients=(*names[: count + 1], *also)) for count in range(len(names))]
     if all(label_of(one) != label_of(options) for one in shorter):
         shorter.append(options)
     return shorter
-
-
-def _every_lens(options: Options) -> Iterator[Options]:
-    """Every sensible lens of every kind, with decentring terms and without."""
-    of_pixels = {name: value for name, value in options.fixed.items() if name in OF_PIXELS}
-    for kind, lens in LENSES.items():
-        for held in dict.fromkeys(((), lens.decentring)):
-            fixed = {**of_pixels, **dict.fromkeys(held, 0.0)}
-            yield from candidates(replace(options, lens=kind, powers=(2, 3), fixed=fixed))
 
 
 def label_of(options: Options) -> str:
     """How a lens is called: "radial 2,3" or "brown k1 k2 p1 p2"."""
     if options.blank_lens.powers:
         return f"{options.lens} {','.join(map(str, options.powers))}"
-    return " ".join([options.lens, *(name for name in options.blank_lens.names if name not in options.fixed)])
+    return " ".join([options.lens, *(name for name in options.blank_lens.names if name not in options.held)])
 
 
 def coefficients_of(options: Options) -> int:
     """How many coefficients of the lens are free."""
-    return len(set(options.blank_lens.names) - set(options.fixed))
+    return len(set(options.blank_lens.names) - set(options.held))
 
 
-# ---- one lens -------------------------------------------------------------------------------------------------------
+@dataclass(frozen=True)
+class _Form:
+    """A lens to be tried: see `Options`.
+
+    Attributes:
+        names: of the coefficients that are free. label: how it is called.
+    """
+
+    lens: str
+    powers: tuple[int, ...]
+    coefficients: tuple[str, ...] | None
+    names: tuple[str, ...]
+    label: str
+
+    @classmethod
+    def among(cls, options: Options) -> _Form:
+        """The lens of some options."""
+        names = tuple(name for name in options.blank_lens.names if name not in options.held)
+        return cls(options.lens, options.powers, options.coefficients, names, label_of(options))
+
+    def of(self, options: Options) -> Options:
+        """The options with this lens."""
+        return replace(options, lens=self.lens, powers=self.powers, coefficients=self.coefficients)
+
+
+@cache
+def _forms(kind: str) -> tuple[_Form, ...]:
+    """Every sensible lens of a kind, with decentring terms and without, the longest first: all others are this one with
+    coefficients at 0.
+    """
+    lens = LENSES[kind]
+    powers = tuple(sorted({power for trial in lens.trial_powers for power in trial}))
+    longest = Options(lens=kind, powers=powers)
+    bare = tuple(name for name in longest.blank_lens.names if name not in lens.decentring)
+    starts = [longest, *([replace(longest, coefficients=bare)] if lens.decentring else [])]
+    every = [_Form.among(one) for start in starts for one in candidates(start)]
+    return tuple(sorted(every, key=lambda one: -len(one.names)))
+
+
+# ---- one kind -------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
-class _Tried:
-    """A lens and, once it was judged, its errors of prediction.
+class _Kind:
+    """A kind of lens near its best, and what follows for each of its lenses.
 
     Attributes:
-        end: where its rough solve ended; None where it failed. squares: (G,) of each group, in standard deviations.
-        rms_px: of all. failed: why there is no answer, "" where there is.
+        forms: the longest first. normals: None where it gives no answer, and `failed` says why. sigma_px: of a typical
+            observation. reach_px: how far from its principal point each camera's observations reach.
     """
 
-    options: Options
-    end: RobustSolution | None = None
-    squares: Array | None = None
-    rms_px: float = np.nan
+    forms: tuple[_Form, ...]
+    estimate: Estimate
+    normals: GroupNormals | None = None
+    sigma_px: float = np.nan
+    reach_px: Mapping[str, float] = field(default_factory=dict)
     failed: str = ""
 
+    @property
+    def least(self) -> float:
+        """The least squares of its longest lens."""
+        return np.inf if self.normals is None else self.normals.least
 
-def _solve_roughly(observations: Observations, sights: Sights, options: Options) -> _Tried:
-    """The solve of a lens from nothing, up to where the noise is known well enough."""
-    try:
-        start = initialise(observations, sights, options).estimate
-        priors = gather_priors(observations, options, start.structure)
-        problem = Problem(sights, make_layout(observations, options), priors, options=options)
-        return _Tried(options, solve_robustly(problem, observations, start, most_rounds=1))
-    except CalibrationError as error:
-        return _Tried(options, failed=str(error))
+    def candidates(self, *, first: bool) -> Iterator[_Candidate]:
+        """The longest lens of the kind and the paper's, or all others."""
+        for form in self.forms:
+            if first == (form is self.forms[0] or form.label == PAPER):
+                yield self._judged(form)
 
-
-def _reference(observations: Observations, sights: Sights, tried: Sequence[_Tried]) -> RobustSolution:
-    """The lens that explains the observations best: all are compared over its inliers, at its noise, from its poses."""
-    ends = [one.end for one in tried if one.end is not None]
-    if not ends:
-        raise DegenerateError(tried[0].failed)
-    end = min(ends, key=lambda end: _log_noise(end.inliers))
-    return solve_robustly(replace(end.problem, sights=sights), observations, end.solution.estimate, most_rounds=2)
-
-
-def _log_noise(inliers: Inliers) -> float:
-    """Of a typical observation, over the stated."""
-    counts = 2 * len(inliers.points), len(inliers.curves)
-    return float(np.log([inliers.point_scale, inliers.curve_scale]) @ counts) / sum(counts)
+    def _judged(self, form: _Form) -> _Candidate:
+        """A lens with its errors of prediction."""
+        if self.normals is None:
+            return _Candidate(form, self, failed=self.failed)
+        lens = set(self.forms[0].names) - set(form.names)
+        held = [key for key in self.normals.keys if key.kind == "camera" and key.quantity in lens]
+        squares, step = self.normals.held_out(dict(zip(held, -values_of(self.estimate, held), strict=True)))
+        rms_px = self.sigma_px * float(np.sqrt(squares.sum() / self.normals.counts.sum()))
+        return _Candidate(form, self, squares, rms_px, step)
 
 
-def _judge(observations: Observations, one: _Tried, reference: RobustSolution) -> _Tried:
-    """A lens with its errors of prediction, of the reference's inliers and at its noise."""
-    if one.end is None:
-        return one
-    noise = float(np.exp(_log_noise(one.end.inliers) - _log_noise(reference.inliers)))
-    if noise > _NOISY:
-        return replace(one, end=None, failed=f"leaves {noise:.1f} times the noise of the best")
-    try:
-        model = _model(observations, one.end, reference)
-    except CalibrationError as error:
-        return replace(one, failed=str(error))
-    group = _groups(model.equations)
-    errors = held_out_errors(model, group)
-    count = len(np.unique(model.equations.observation))
-    rms_px = float(np.linalg.norm(errors / model.weight)) / count**0.5
-    return replace(one, squares=np.asarray(np.bincount(group, errors**2), dtype=float), rms_px=rms_px)
+@dataclass(frozen=True, eq=False)
+class _Candidate:
+    """A lens and its errors of prediction.
+
+    Attributes:
+        squares: (G,) of each group, in standard deviations; None where it gives no answer, and `failed` says why.
+        rms_px: of all. step: from the kind's estimate to where this lens is at its best.
+    """
+
+    form: _Form
+    of: _Kind
+    squares: Array | None = None
+    rms_px: float = np.nan
+    step: Array = field(default_factory=lambda: np.empty(0))
+    failed: str = ""
+
+    def may_win(self, best: _Candidate) -> bool:
+        """Whether it is the longest of a kind whose shorter ones may be as good as the best."""
+        if self.form is not self.of.forms[0] or self.of.normals is None:
+            return False
+        return self.squares is None or best.squares is None or standard_errors(self.squares, best.squares) <= _AS_GOOD
+
+    @cached_property
+    def estimate(self) -> Estimate:
+        """Near its best.
+
+        Raises:
+            InputError: there is no camera there.
+        """
+        there = moved(self.of.estimate, self.of.normals.keys if self.of.normals else (), self.step)
+        blank = self.form.of(Options()).blank_lens
+        cameras = {}
+        for name, camera in there.cameras.items():
+            values = camera.lens.coefficients
+            lens = blank.with_values([values[n] if n in self.form.names else 0.0 for n in blank.names])
+            cameras[name] = replace(camera, lens=lens)
+        return replace(there, cameras=cameras)
+
+    @cached_property
+    def fault(self) -> str:
+        """Why it cannot be used, "" where it can."""
+        try:
+            cameras = self.estimate.cameras
+        except CalibrationError as error:
+            return str(error)
+        for name, reach_px in self.of.reach_px.items():
+            camera = cameras[name]
+            if camera.folds and (not camera.lens.may_fold or camera.lens.monotone_radius(camera.phi) <= reach_px):
+                return "folds inside the image"
+        return ""
 
 
-def _model(observations: Observations, end: RobustSolution, reference: RobustSolution) -> LinearModel:
-    """The linear model of a lens at its best.
+def _compared(observations: Observations, options: Options, start: Estimate) -> tuple[list[_Kind], float]:
+    """Each kind near its best, over the same observations and at the noise of the one that explains the most; and their
+    share of all.
 
     Raises:
-        CalibrationError: the lens folds where it must not, or cannot show all of the observations.
+        CalibrationError: too little to tell lenses apart, or no calibration.
     """
-    sights = reference.problem.sights
-    problem = replace(end.problem, sights=sights, weighting=reference.problem.weighting)
-    estimate = replace(end.solution.estimate, placements=reference.solution.estimate.placements)
-    solution = solve(problem, estimate, precision=_PRECISION)
-    _require_unfolded(problem, solution.estimate)
-    there = residuals(observations, sights, solution.estimate, end.residuals.feet)
-    points, curves = there.lengths
-    if not (np.isfinite(points[sights.point_rows]).all() and np.isfinite(curves[sights.curve_rows]).all()):
-        raise DegenerateError("cannot show all that another lens shows")
-    equations = write_equations(observations, sights, solution.estimate, there)
-    weights = robust_weights(observations, problem, equations, there)
-    return make_linear_model(problem, solution.estimate, equations, weights)
+    kinds = sorted(map(_forms, LENSES), key=lambda forms: forms[0].lens != _WIDEST)
+    total = len(observations.points) + len(observations.curves)
+    few = thinned(observations, max(_LEAST_ROWS, int(_SHARE * total)))
+    sights = gather_sights(few)
+    _require_groups(sights)
+    names = list(dict.fromkeys(key.placement for key in sights.keys if key.placement is not None))
+    start = replace(start, placements=Poses.stacked(names, Poses.of(start.placements).of_names(names)))
+    tried = kinds
+    while True:
+        end, used = _first_solved(few, options, sights, start, tried)
+        seen = _Seen(few, end, options)
+        compared = [seen.kind(forms, is_solved=forms is used) for forms in kinds]
+        best = min(compared, key=lambda one: one.least)
+        least = next(one.least for one in compared if one.forms is used)
+        if tried is not kinds or best.least > _QUIETER * least:
+            return compared, (len(few.points) + len(few.curves)) / total
+        tried = [best.forms]
 
 
-def _require_unfolded(problem: Problem, estimate: Estimate) -> None:
-    for name, camera in estimate.cameras.items():
-        fold = camera.lens.monotone_radius(camera.phi)
-        if camera.folds and (not camera.lens.may_fold or fold <= problem.sights.of_camera(name).about(camera).reach_px):
-            raise DegenerateError("folds inside the image")
+def _first_solved(
+    observations: Observations, options: Options, sights: Sights, start: Estimate, kinds: Sequence[tuple[_Form, ...]]
+) -> tuple[RobustSolution, tuple[_Form, ...]]:
+    """The robust solve with the first of these kinds that has one, up to where the noise is known well enough."""
+    failure: CalibrationError | None = None
+    for forms in kinds:
+        own = forms[0].of(options)
+        try:
+            near = _seen_through(start, own, _profiles(start, sights))
+            problem = _problem(observations, sights, own, near)
+            return solve_robustly(problem, observations, near, most_rounds=1), forms
+        except CalibrationError as error:
+            failure = error
+    raise failure or DegenerateError("there is no lens")
 
 
-def _groups(equations: Equations) -> Indices:
-    """(E,) number of the placement of each equation, or, of what stays where it is, of the feature."""
-    placed = np.array([key.placement is not None for key in equations.sights.keys])
-    if np.count_nonzero(placed) < _FEWEST_PLACEMENTS:
-        placed[:] = False
+def _problem(observations: Observations, sights: Sights, options: Options, estimate: Estimate) -> Problem:
+    priors = gather_priors(observations, options, estimate.structure)
+    return Problem(sights, make_layout(observations, options), priors, options=options)
+
+
+def _profiles(estimate: Estimate, sights: Sights) -> dict[str, LensProfile]:
+    """What each camera's lens does, as far as it was observed."""
+    return {
+        name: LensProfile.of(camera := estimate.cameras[name], sights.of_camera(name).about(camera).reach_px)
+        for name in sights.cameras
+    }
+
+
+def _seen_through(estimate: Estimate, options: Options, profiles: Mapping[str, LensProfile]) -> Estimate:
+    """The estimate with the lens of the options, as near to its own as it comes."""
+    cameras = dict(estimate.cameras)
+    for name, profile in profiles.items():
+        lens = profile.nearest(options.blank_lens, cameras[name].phi, options.held)
+        cameras[name] = replace(cameras[name], lens=lens)
+    return replace(estimate, cameras=cameras)
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """The inliers of a solve."""
+
+    observations: Observations
+    end: RobustSolution
+    options: Options
+
+    @property
+    def sights(self) -> Sights:
+        return self.end.problem.sights
+
+    @cached_property
+    def _profiles(self) -> dict[str, LensProfile]:
+        return _profiles(self.end.solution.estimate, self.sights)
+
+    def kind(self, forms: tuple[_Form, ...], *, is_solved: bool) -> _Kind:
+        """A kind near its best, and the normal equations of each group there; `is_solved`: the one that was solved."""
+        options = forms[0].of(self.options)
+        estimate = _seen_through(self.end.solution.estimate, options, self._profiles)
+        try:
+            problem = _problem(self.observations, self.sights, options, estimate)
+            problem = problem.weighted(self.end.problem.weighting)
+            if not is_solved:
+                estimate = solve(problem, estimate, precision=_PRECISION).estimate
+            normals, sigma_px = self._normals(problem, estimate)
+        except CalibrationError as error:
+            return _Kind(forms, estimate, failed=str(error))
+        reach_px = {name: profile.reach_px for name, profile in self._profiles.items()}
+        return _Kind(forms, estimate, normals, sigma_px, reach_px)
+
+    def _normals(self, problem: Problem, estimate: Estimate) -> tuple[GroupNormals, float]:
+        """The normal equations of each group, and the sigma of a typical observation, px."""
+        there = residuals(self.observations, self.sights, estimate)
+        points, curves = there.lengths
+        if not np.isfinite([*points[self.sights.point_rows], *curves[self.sights.curve_rows]]).all():
+            raise DegenerateError("cannot show all that another lens shows")
+        equations = write_equations(self.observations, self.sights, estimate, there)
+        weights = robust_weights(self.observations, problem, equations, there)
+        normals = group_normals(problem, estimate, equations, weights, _groups(equations, problem))
+        return normals, 1.0 / float(np.mean(weights.inverse_sigma))
+
+
+def _placed(sights: Sights) -> Mask:
+    """(S,) which sights are held out whole: those of placements, where there are enough of them."""
+    placed = np.array([key.placement is not None for key in sights.keys])
+    return placed & (np.count_nonzero(placed) >= _FEWEST_PLACEMENTS)
+
+
+def _require_groups(sights: Sights) -> None:
+    """Raise DegenerateError where there is too little to hold out."""
+    placed = _placed(sights)
+    count = int(np.count_nonzero(placed))
+    for own in (sights[int(number)] for number in np.flatnonzero(~placed)):
+        count += len(np.unique(own.point_index)) + len(np.unique(own.track_index))
+    if count < _FEWEST_GROUPS:
+        raise DegenerateError("too few views or features to tell lenses apart")
+
+
+def _groups(equations: Equations, problem: Problem) -> tuple[Indices, frozenset[str]]:
+    """(E,) number of the placement of each equation, or, of what stays where it is, of the feature; and the private
+    placements that are held out whole.
+    """
+    placed = _placed(equations.sights)
     feature = 2 * equations.feature + equations.is_curve + 1
     name = equations.sight * (feature.max() + 1) + np.where(placed[equations.sight], 0, feature)
-    return np.unique(name, return_inverse=True)[1]
-
-
-def held_out_errors(model: LinearModel, group: Indices) -> Array:
-    """(E,) errors, in standard deviations, of each group (E,) predicted from all others.
-
-    A placement that one group alone shows is posed from it, everything else held.
-    """
-    errors, bounds, sight = np.zeros(len(group)), model.equations.bounds, model.equations.sight
-    order = np.argsort(group, kind="stable")
-    for rows in np.split(order, np.flatnonzero(np.diff(group[order])) + 1):
-        basis, left = model.shared[rows], model.left_over[rows]
-        if len(rows) < bounds[sight[rows[0]] + 1] - bounds[sight[rows[0]]]:
-            basis = np.hstack([basis, model.private[rows]])
-        rest = (1.0 + _RIDGE) * np.eye(basis.shape[1]) - basis.T @ basis
-        errors[rows] = left + basis @ np.linalg.solve(rest, basis.T @ left)
-    return errors
+    return np.unique(name, return_inverse=True)[1], problem.private if placed.any() else frozenset()
 
 
 # ---- the choice -----------------------------------------------------------------------------------------------------
-
-
-def _decide(tried: Sequence[_Tried]) -> tuple[int, int]:
-    options = [one.options for one in tried]
-    return decide(list(map(label_of, options)), list(map(coefficients_of, options)), [one.squares for one in tried])
 
 
 def decide(labels: Sequence[str], coefficients: Sequence[int], squares: Sequence[Array | None]) -> tuple[int, int]:
@@ -271,20 +424,13 @@ def standard_errors(squares: Array, others: Array) -> float:
     return float(more.sum()) / error if error > 0.0 else 0.0
 
 
-def _worse(one: _Tried, other: _Tried) -> float:
-    """By how many standard errors it predicts worse; infinite where it does not at all."""
-    if one.squares is None or other.squares is None:
-        return np.inf
-    return standard_errors(one.squares, other.squares)
-
-
-def _choice(tried: Sequence[_Tried], chosen: _Tried, share: float) -> LensChoice:
-    def as_told(one: _Tried) -> TriedLens:
-        label, count = label_of(one.options), coefficients_of(one.options)
-        if one.squares is None:
+def _choice(tried: Sequence[_Candidate], chosen: _Candidate, share: float) -> LensChoice:
+    def as_told(one: _Candidate) -> TriedLens:
+        label, count = one.form.label, len(one.form.names)
+        if one.squares is None or chosen.squares is None:
             return TriedLens(label, count, failed=one.failed)
-        return TriedLens(label, count, one.rms_px, _worse(one, chosen))
+        return TriedLens(label, count, one.rms_px, standard_errors(one.squares, chosen.squares))
 
     order = sorted(tried, key=lambda one: (one is not chosen, one.rms_px if one.squares is not None else np.inf))
     groups = 0 if chosen.squares is None else len(chosen.squares)
-    return LensChoice(label_of(chosen.options), tuple(as_told(one) for one in order), groups, share)
+    return LensChoice(chosen.form.label, tuple(map(as_told, order)), groups, share)

@@ -17,7 +17,7 @@ from ceres_cal.base.arrays import AnyArray, Array, Indices, Mask
 from ceres_cal.base.errors import SolutionError
 from ceres_cal.model.parameters import Estimate
 from ceres_cal.model.residuals import Residuals, camera_optics, curve_columns, point_columns
-from ceres_cal.model.structure import Structure, Tolerance, make_structure
+from ceres_cal.model.structure import Structure, Tolerance, all_bends, make_structure
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights
 from ceres_cal.scene.curves import along_track
@@ -136,7 +136,7 @@ def _of_camera(
     size = len(optics.intrinsics)
     rows = np.empty((len(own.point_rows), 2, size + 10))
     points = point_columns(own, estimate.structure)
-    points = points._replace(bends=whole_structure(observations.targets).bends[own.point_index])
+    points = points._replace(bends=all_bends(observations.targets)[own.point_index])
     kernels.point_rows(optics, poses[numbers], points, rows)
     yield {
         "sight": np.repeat(numbers[_sight_of(own.point_bounds)], 2),

@@ -24,6 +24,8 @@ from ceres_cal.scene.lens import Lens, lens_class, make_lens
 
 AUTO = "auto"
 """The lens that the data ask for: which it is, a calibration says in its options (`ceres_cal.lens_choice`)."""
+PAPERS_POWERS = (2, 3)
+_OF_POWERS = "radial"  # the lens that powers stand for where none is named
 OF_PIXELS = ("phi", "aspect", "cx", "cy")
 """The intrinsics that every camera has, in the order of the solver's vector."""
 LOSSES = ("trivial", "huber", "soft_l1", "cauchy", "tukey")
@@ -35,7 +37,8 @@ class Options:
 
     Attributes:
         lens: one of `scene.lens.LENSES`, or "auto": the one that the data ask for. powers: of a lens that leaves the
-            choice, as "radial" does.
+            choice, as "radial" does, which powers alone stand for; () for (2, 3).
+        coefficients: names of those of the lens that are solved for, the others are 0; None: all.
         free_principal_point: else it is held at the image centre, or where `fixed` says.
         free_aspect: whether fy / fx is free; else 1, or what `fixed` says.
         fixed: numbers held, by name: phi, aspect, cx, cy (px) and the lens's coefficients in the units of the files.
@@ -53,8 +56,9 @@ class Options:
         max_iterations: of each solve. threads: of the solver; 0 chooses.
     """
 
-    lens: str = "radial"
-    powers: tuple[int, ...] = (2, 3)
+    lens: str = AUTO
+    powers: tuple[int, ...] = ()
+    coefficients: tuple[str, ...] | None = None
     free_principal_point: bool = True
     free_aspect: bool = False
     fixed: Mapping[str, float] = field(default_factory=dict)
@@ -69,17 +73,21 @@ class Options:
     threads: int = 0
 
     def __post_init__(self) -> None:
+        if self.lens == AUTO and self.powers:
+            object.__setattr__(self, "lens", _OF_POWERS)
         if self.lens != AUTO:
             lens_class(self.lens)
+            object.__setattr__(self, "powers", tuple(self.powers) or PAPERS_POWERS)
         if self.loss not in LOSSES:
             raise InputError(f"unknown loss {self.loss!r}: choose one of {', '.join(LOSSES)}")
         if self.noise_scale not in ("estimate", "stated"):
             raise InputError(f"noise_scale must be 'estimate' or 'stated', not {self.noise_scale!r}")
         names = self.intrinsic_names
+        if unknown := [name for name in self.coefficients or () if name not in names[len(OF_PIXELS) :]]:
+            raise InputError(f"cannot solve for {unknown[0]!r}: {self._which} has {', '.join(names)}")
         for name, value in self.fixed.items():
             if name not in names:
-                which = "a lens that is still to be chosen" if self.lens == AUTO else f"the {self.lens} lens"
-                raise InputError(f"cannot fix {name!r}: {which} has {', '.join(names)}")
+                raise InputError(f"cannot fix {name!r}: {self._which} has {', '.join(names)}")
             if not np.isfinite(value):
                 raise InputError(f"cannot fix {name} at {value}: give a finite number")
         for name in ("loss_scale", "reject_sigma", "max_iterations"):
@@ -87,6 +95,18 @@ class Options:
                 raise InputError(f"{name} must be above 0, not {getattr(self, name)}")
         if self.threads < 0:
             raise InputError(f"threads must be 0 (to choose) or above, not {self.threads}")
+
+    @property
+    def _which(self) -> str:
+        return "a lens that is still to be chosen" if self.lens == AUTO else f"the {self.lens} lens"
+
+    @cached_property
+    def held(self) -> Mapping[str, float]:
+        """What `fixed` holds, and at 0 the coefficients that are not solved for."""
+        if self.coefficients is None:
+            return self.fixed
+        names = make_lens(self.lens, self.powers).names
+        return {**{name: 0.0 for name in names if name not in self.coefficients}, **self.fixed}
 
     @cached_property
     def intrinsic_names(self) -> tuple[str, ...]:
@@ -220,7 +240,7 @@ class Layout:
 def make_layout(observations: Observations, options: Options) -> Layout:
     """The layout of a calibration: everything free but what the options fix and what nothing can tell."""
     names = intrinsic_names(options.blank_lens)
-    held = set(options.fixed)
+    held = set(options.held)
     if not options.free_principal_point:
         held |= {"cx", "cy"}
     if not options.free_aspect:

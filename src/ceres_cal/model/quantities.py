@@ -142,7 +142,8 @@ def moved(estimate: Estimate, keys: Sequence[Key], step: Array) -> Estimate:
     Raises:
         InputError: the step leads to no camera (phi or aspect below 0).
     """
-    cameras, stations, placements = dict(estimate.cameras), dict(estimate.stations), dict(estimate.placements)
+    cameras, stations = dict(estimate.cameras), dict(estimate.stations)
+    placements = dict(estimate.placements) if any(key.kind == "placement" for key in keys) else estimate.placements
     values = estimate.structure.values.copy()
     for (kind, owner), columns in columns_by_owner(keys).items():
         names = [keys[column].quantity for column in columns]

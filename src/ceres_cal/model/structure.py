@@ -176,6 +176,11 @@ def make_structure(targets: Mapping[str, Target], tolerances: Mapping[str, Toler
     )
 
 
+def all_bends(targets: Mapping[str, Target]) -> Array:
+    """(P, 2) `Structure.bends` of every target that can bow."""
+    return np.concatenate([_bends(target, name, Tolerance()) for name, target in targets.items()])
+
+
 def _bends(target: Target, name: str, tolerance: Tolerance) -> Array:
     """1 - x^2 and 1 - y^2 over the board, x and y from -1 to 1 between its edges."""
     if tolerance.warp_m > 0.0 and not target.bows:
