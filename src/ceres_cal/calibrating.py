@@ -93,7 +93,11 @@ def _calibrated(
     if options.closed_form_only:
         return _of_lens(start, observations, sights, papers(options), progress)
     chosen = choose_lens(observations, options, start)
-    calibration = _of_lens(chosen.start, observations, sights, chosen.options, progress)
+    try:
+        calibration = _of_lens(chosen.start, observations, sights, chosen.options, progress)
+    except CalibrationError as error:  # of all observations, not of those that took part in the choice
+        chosen = chosen.without(str(error), papers(options), start)
+        calibration = _of_lens(start, observations, sights, chosen.options, progress)
     return replace(calibration, lens_choice=chosen.choice)
 
 

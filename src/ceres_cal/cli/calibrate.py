@@ -28,12 +28,12 @@ if TYPE_CHECKING:
     from ceres_cal.solve import Progress
 
 
-_DEFAULT_LENS, _AUTO = "radial", "auto"
+_AUTO = "auto"
 
 
 def _lens_kind(name: str) -> str:
-    """A kind of lens that is in the table; the default is, and help and wrong usage need no table."""
-    if name not in (_DEFAULT_LENS, _AUTO):
+    """A kind of lens that is in the table; the default needs none, nor do help and wrong usage."""
+    if name != _AUTO:
         from ceres_cal.scene.lens import LENSES
 
         if name not in LENSES:
@@ -55,11 +55,11 @@ def _add_arguments(parser: ArgumentParser) -> None:
 def _add_camera(parser: ArgumentParser) -> None:
     add = parser.add_argument_group("the camera").add_argument
     kinds = (
-        "radial (the paper's), brown (OpenCV's), kannala-brandt (its fisheye), ...: `--lens ?` names all; auto: the "
-        "simplest of all that predicts views as well as any other"
+        "radial (the paper's), brown (OpenCV's), kannala-brandt (its fisheye), ...: `--lens ?` names all; default: "
+        "auto, the simplest of all that predicts views as well as any other"
     )
-    add("--lens", type=_lens_kind, metavar="KIND", default=_DEFAULT_LENS, help=kinds)
-    add("--powers", metavar="2,3", help="powers of a lens that leaves the choice; default: 2,3, the paper's")
+    add("--lens", type=_lens_kind, metavar="KIND", help=kinds)
+    add("--powers", metavar="2,3", help="powers of the radial lens; of one that is named default: 2,3, the paper's")
     add(
         "--fix",
         action="append",
@@ -163,11 +163,11 @@ def _solve_progress(bar: ProgressBar, most: int) -> Callable[[Progress], None]:
 
 def _powers(args: Namespace) -> tuple[int, ...]:
     if args.powers is None:
-        return (2, 3)
+        return ()
     from ceres_cal.scene.lens import LENSES
 
     choosing = [kind for kind, lens in LENSES.items() if lens.trial_powers]
-    if args.lens not in choosing:
+    if args.lens not in (None, *choosing):
         raise InputError(f"--powers is for the {' or '.join(choosing)} lens, not for {args.lens}: leave it out")
     try:
         return tuple(int(power) for power in args.powers.split(","))
@@ -192,10 +192,11 @@ def _options(
 ) -> Options:
     from ceres_cal.model.parameters import Options
 
-    options = Options(lens=args.lens, powers=powers, fixed=fixed)
+    lens = args.lens or _AUTO  # which powers make radial
+    options = Options(lens=lens, powers=powers, fixed=fixed)
     names = PriorNames(("height_m", "position_m"), (*options.intrinsic_names, "principal_point"))
     return Options(
-        lens=args.lens,
+        lens=lens,
         powers=powers,
         free_principal_point=not args.hold_principal_point,
         free_aspect=args.free_aspect,

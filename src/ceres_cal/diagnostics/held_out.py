@@ -18,7 +18,7 @@ from ceres_cal.base.transforms import Pose
 from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
 from ceres_cal.diagnostics.table import error_mm
-from ceres_cal.lens_choice import candidates, choose_lens, coefficients_of, decide, label_of
+from ceres_cal.lens_choice import any_lens, candidates, coefficients_of, decide, label_of
 from ceres_cal.model.equations import write_equations
 from ceres_cal.model.parameters import Estimate, Layout, Options
 from ceres_cal.model.residuals import residuals
@@ -150,9 +150,9 @@ def choose(observations: Observations, options: Options, k: int = FOLDS, *, most
     if len(frames_of(few)[0]) < 2:
         raise InputError("cross-validation by frame needs at least two frames: a single one cannot be held out")
     tried = candidates(options)
-    other, _ = choose_lens(few, options)
-    if label_of(other) not in map(label_of, tried):
-        tried = sorted([*tried, other], key=coefficients_of)
+    other = _attempt(few, any_lens(options))
+    if isinstance(other, Calibration) and label_of(other.options) not in map(label_of, tried):
+        tried = sorted([*tried, other.options], key=coefficients_of)
     wholes: list[Calibration | str] = [_attempt(few, one) for one in tried]
     good = [whole for whole in wholes if isinstance(whole, Calibration)]
     if not good:

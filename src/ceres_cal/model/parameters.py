@@ -98,7 +98,7 @@ class Options:
 
     @property
     def _which(self) -> str:
-        return "a lens that is still to be chosen" if self.lens == AUTO else f"the {self.lens} lens"
+        return "a lens that is still to be chosen (name it)" if self.lens == AUTO else f"the {self.lens} lens"
 
     @cached_property
     def held(self) -> Mapping[str, float]:

@@ -75,7 +75,7 @@ def group_normals(
     estimate: Estimate,
     equations: Equations,
     weights: Weights,
-    groups: tuple[Indices, Collection[str]],
+    groups: tuple[Indices, Collection[str | None]],
 ) -> GroupNormals:
     """The normal equations of each group.
 

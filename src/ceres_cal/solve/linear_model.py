@@ -284,8 +284,9 @@ def shared_columns(equations: Equations, estimate: Estimate, keys: Sequence[Key]
     for name in equations.sights.cameras:
         own = owned.get(("camera", name), [])
         at = [names[name].index(keys[column].quantity) for column in own]
-        rows = np.array([key.camera == name for key in equations.sights.keys])[equations.sight]
-        columns[np.ix_(rows, own)] = equations.intrinsics[np.ix_(rows, at)] * scales[name][at]
+        shown = np.array([key.camera == name for key in equations.sights.keys])
+        rows = np.flatnonzero(shown[equations.sight])[:, None]
+        columns[rows, own] = equations.intrinsics[rows, at] * scales[name][at]
     for number, key in enumerate(equations.sights.keys):
         if ("station", key.station) not in owned and ("placement", str(key.placement)) not in owned:
             continue

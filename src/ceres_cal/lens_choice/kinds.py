@@ -1,25 +1,20 @@
-"""Which lens the data ask for: the simplest of those that predict placements, or lines, as well as any other does.
-
-Some of the observations are solved once, robustly, and from there with the longest lens of each kind. Shorter ones are
-these with coefficients held at 0: what a solve without a group of equations would leave of it follows for every lens
-from the normal equations of each group (`solve/left_out.py`). Errors that go together within a group make a longer lens
-predict the others no better: a criterion that counts observations would take them for a lens.
-"""
+"""Each kind of lens near its best, and what follows for each of its lenses."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache, cached_property
+from functools import cached_property
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask
 from ceres_cal.base.errors import CalibrationError, DegenerateError
 from ceres_cal.base.transforms import Poses
-from ceres_cal.calibration import LensChoice, TriedLens
+from ceres_cal.lens_choice.forms import PAPER, Form, forms_of
+from ceres_cal.lens_choice.rule import AS_GOOD, standard_errors
 from ceres_cal.model.equations import Equations, write_equations
-from ceres_cal.model.parameters import PAPERS_POWERS, Estimate, Options, make_layout
+from ceres_cal.model.parameters import Estimate, Options, make_layout
 from ceres_cal.model.priors import gather_priors
 from ceres_cal.model.quantities import moved, values_of
 from ceres_cal.model.residuals import residuals
@@ -29,11 +24,9 @@ from ceres_cal.observations.thinning import thinned
 from ceres_cal.scene.lens import LENSES
 from ceres_cal.solve import Problem, RobustSolution, solve, solve_robustly
 from ceres_cal.solve.left_out import GroupNormals, group_normals
-from ceres_cal.start.initialise import LensProfile, Start
+from ceres_cal.start.initialise import LensProfile
 from ceres_cal.uncertainty.sample import robust_weights
 
-PAPER = "radial 2,3"
-"""The lens that wins ties."""
 _LEAST_ROWS, _SHARE = 1_250, 0.025  # of the observations, how many take part
 _FEWEST_GROUPS = 8  # with fewer nothing tells lenses apart
 # What shows any direction and comes near to any lens but for its decentring: the first solve is with it.
@@ -42,136 +35,10 @@ _WIDEST = "kannala-brandt"
 _QUIETER = 0.7
 _PRECISION = 1e-3  # relative change of the cost from which on normal equations say where the least is
 _FEWEST_PLACEMENTS = 5  # with fewer the features of each are held out one by one
-# How much worse than the best, in standard errors of the difference, is as good. Of 180 scenes with the paper's lens it
-# was recognised in 92 % at 1, in 97 % at 1.5; at 2 the decentring of real sets is missed.
-_AS_GOOD = 1.5
 
 
 @dataclass(frozen=True, eq=False)
-class Chosen:
-    """The lens that was chosen: options with it, where to start from, and what it was compared with."""
-
-    options: Options
-    start: Start
-    choice: LensChoice
-
-
-def papers(options: Options) -> Options:
-    """The options with the paper's lens."""
-    return replace(options, lens="radial", powers=PAPERS_POWERS, coefficients=None)
-
-
-def choose_lens(observations: Observations, options: Options, start: Start) -> Chosen:
-    """The lens that the data ask for, one for all cameras; the paper's where there is too little to tell by.
-
-    The paper's lens and the longest of each kind come first: only where the paper's is not as good as the best of them
-    are the shorter ones looked at.
-
-    Args:
-        options: their lens is not looked at. start: of everything, with whatever lens.
-    """
-    try:
-        kinds, share = _compared(observations, options, start.estimate)
-        tried, best, chosen = _compare([one for kind in kinds for one in kind.candidates(first=True)])
-        if chosen.form.label != PAPER:
-            others = [one for longest in tried if longest.may_win(best) for one in longest.of.candidates(first=False)]
-            tried, _, chosen = _compare([*tried, *others])
-    except CalibrationError:
-        return Chosen(papers(options), start, LensChoice(PAPER, (TriedLens(PAPER, 2),), 0, 0.0))
-    best = chosen.estimate
-    placements = Poses.of(start.estimate.placements).updated(list(best.placements), Poses.of(best.placements).stack)
-    stations = {**start.estimate.stations, **best.stations}
-    near = replace(start, estimate=replace(best, stations=stations, placements=placements), is_near=True)
-    return Chosen(chosen.form.of(options), near, _choice(tried, chosen, share))
-
-
-def _compare(tried: list[_Candidate]) -> tuple[list[_Candidate], _Candidate, _Candidate]:
-    """The lenses, the best and the one that is chosen: one that folds where it must not gives no answer."""
-    labels, counts = [one.form.label for one in tried], [len(one.form.names) for one in tried]
-    while True:
-        best, chosen = decide(labels, counts, [one.squares for one in tried])
-        faults = {number: fault for number in (best, chosen) if (fault := tried[number].fault)}
-        if not faults:
-            return tried, tried[best], tried[chosen]
-        tried = [replace(one, squares=None, failed=faults[n]) if n in faults else one for n, one in enumerate(tried)]
-
-
-# ---- candidates -----------------------------------------------------------------------------------------------------
-
-
-def candidates(options: Options) -> list[Options]:
-    """Options with every sensible lens of the same kind, fewest coefficients first; the given one is among them."""
-    lens = options.blank_lens
-    if lens.powers:
-        powers = sorted({*lens.trial_powers, options.powers}, key=lambda p: (len(p), p))
-        if set(lens.names) & set(options.fixed):  # a held coefficient belongs to its own powers alone
-            powers = [options.powers]
-        return [replace(options, powers=one) for one in powers]
-    by_order = [name for _, name in sorted(zip(lens.orders, lens.names, strict=True)) if name not in options.fixed]
-    names = [name for name in by_order if name not in lens.decentring]
-    also = tuple(name for name in by_order if name in lens.decentring and name not in options.held)
-    shorter = [replace(options, coefficients=(*names[: count + 1], *also)) for count in range(len(names))]
-    if all(label_of(one) != label_of(options) for one in shorter):
-        shorter.append(options)
-    return shorter
-
-
-def label_of(options: Options) -> str:
-    """How a lens is called: "radial 2,3" or "brown k1 k2 p1 p2"."""
-    if options.blank_lens.powers:
-        return f"{options.lens} {','.join(map(str, options.powers))}"
-    return " ".join([options.lens, *(name for name in options.blank_lens.names if name not in options.held)])
-
-
-def coefficients_of(options: Options) -> int:
-    """How many coefficients of the lens are free."""
-    return len(set(options.blank_lens.names) - set(options.held))
-
-
-@dataclass(frozen=True)
-class _Form:
-    """A lens to be tried: see `Options`.
-
-    Attributes:
-        names: of the coefficients that are free. label: how it is called.
-    """
-
-    lens: str
-    powers: tuple[int, ...]
-    coefficients: tuple[str, ...] | None
-    names: tuple[str, ...]
-    label: str
-
-    @classmethod
-    def among(cls, options: Options) -> _Form:
-        """The lens of some options."""
-        names = tuple(name for name in options.blank_lens.names if name not in options.held)
-        return cls(options.lens, options.powers, options.coefficients, names, label_of(options))
-
-    def of(self, options: Options) -> Options:
-        """The options with this lens."""
-        return replace(options, lens=self.lens, powers=self.powers, coefficients=self.coefficients)
-
-
-@cache
-def _forms(kind: str) -> tuple[_Form, ...]:
-    """Every sensible lens of a kind, with decentring terms and without, the longest first: all others are this one with
-    coefficients at 0.
-    """
-    lens = LENSES[kind]
-    powers = tuple(sorted({power for trial in lens.trial_powers for power in trial}))
-    longest = Options(lens=kind, powers=powers)
-    bare = tuple(name for name in longest.blank_lens.names if name not in lens.decentring)
-    starts = [longest, *([replace(longest, coefficients=bare)] if lens.decentring else [])]
-    every = [_Form.among(one) for start in starts for one in candidates(start)]
-    return tuple(sorted(every, key=lambda one: -len(one.names)))
-
-
-# ---- one kind -------------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, eq=False)
-class _Kind:
+class Kind:
     """A kind of lens near its best, and what follows for each of its lenses.
 
     Attributes:
@@ -179,7 +46,7 @@ class _Kind:
             observation. reach_px: how far from its principal point each camera's observations reach.
     """
 
-    forms: tuple[_Form, ...]
+    forms: tuple[Form, ...]
     estimate: Estimate
     normals: GroupNormals | None = None
     sigma_px: float = np.nan
@@ -191,25 +58,25 @@ class _Kind:
         """The least squares of its longest lens."""
         return np.inf if self.normals is None else self.normals.least
 
-    def candidates(self, *, first: bool) -> Iterator[_Candidate]:
+    def candidates(self, *, first: bool) -> Iterator[Candidate]:
         """The longest lens of the kind and the paper's, or all others."""
         for form in self.forms:
             if first == (form is self.forms[0] or form.label == PAPER):
                 yield self._judged(form)
 
-    def _judged(self, form: _Form) -> _Candidate:
+    def _judged(self, form: Form) -> Candidate:
         """A lens with its errors of prediction."""
         if self.normals is None:
-            return _Candidate(form, self, failed=self.failed)
+            return Candidate(form, self, failed=self.failed)
         lens = set(self.forms[0].names) - set(form.names)
         held = [key for key in self.normals.keys if key.kind == "camera" and key.quantity in lens]
         squares, step = self.normals.held_out(dict(zip(held, -values_of(self.estimate, held), strict=True)))
         rms_px = self.sigma_px * float(np.sqrt(squares.sum() / self.normals.counts.sum()))
-        return _Candidate(form, self, squares, rms_px, step)
+        return Candidate(form, self, squares, rms_px, step)
 
 
 @dataclass(frozen=True, eq=False)
-class _Candidate:
+class Candidate:
     """A lens and its errors of prediction.
 
     Attributes:
@@ -217,18 +84,18 @@ class _Candidate:
         rms_px: of all. step: from the kind's estimate to where this lens is at its best.
     """
 
-    form: _Form
-    of: _Kind
+    form: Form
+    of: Kind
     squares: Array | None = None
     rms_px: float = np.nan
     step: Array = field(default_factory=lambda: np.empty(0))
     failed: str = ""
 
-    def may_win(self, best: _Candidate) -> bool:
+    def may_win(self, best: Candidate) -> bool:
         """Whether it is the longest of a kind whose shorter ones may be as good as the best."""
         if self.form is not self.of.forms[0] or self.of.normals is None:
             return False
-        return self.squares is None or best.squares is None or standard_errors(self.squares, best.squares) <= _AS_GOOD
+        return self.squares is None or best.squares is None or standard_errors(self.squares, best.squares) <= AS_GOOD
 
     @cached_property
     def estimate(self) -> Estimate:
@@ -260,14 +127,14 @@ class _Candidate:
         return ""
 
 
-def _compared(observations: Observations, options: Options, start: Estimate) -> tuple[list[_Kind], float]:
+def compared_kinds(observations: Observations, options: Options, start: Estimate) -> tuple[list[Kind], float]:
     """Each kind near its best, over the same observations and at the noise of the one that explains the most; and their
     share of all.
 
     Raises:
         CalibrationError: too little to tell lenses apart, or no calibration.
     """
-    kinds = sorted(map(_forms, LENSES), key=lambda forms: forms[0].lens != _WIDEST)
+    kinds = sorted(map(forms_of, LENSES), key=lambda forms: forms[0].lens != _WIDEST)
     total = len(observations.points) + len(observations.curves)
     few = thinned(observations, max(_LEAST_ROWS, int(_SHARE * total)))
     sights = gather_sights(few)
@@ -287,8 +154,8 @@ def _compared(observations: Observations, options: Options, start: Estimate) -> 
 
 
 def _first_solved(
-    observations: Observations, options: Options, sights: Sights, start: Estimate, kinds: Sequence[tuple[_Form, ...]]
-) -> tuple[RobustSolution, tuple[_Form, ...]]:
+    observations: Observations, options: Options, sights: Sights, start: Estimate, kinds: Sequence[tuple[Form, ...]]
+) -> tuple[RobustSolution, tuple[Form, ...]]:
     """The robust solve with the first of these kinds that has one, up to where the noise is known well enough."""
     failure: CalibrationError | None = None
     for forms in kinds:
@@ -340,7 +207,7 @@ class _Seen:
     def _profiles(self) -> dict[str, LensProfile]:
         return _profiles(self.end.solution.estimate, self.sights)
 
-    def kind(self, forms: tuple[_Form, ...], *, is_solved: bool) -> _Kind:
+    def kind(self, forms: tuple[Form, ...], *, is_solved: bool) -> Kind:
         """A kind near its best, and the normal equations of each group there; `is_solved`: the one that was solved."""
         options = forms[0].of(self.options)
         estimate = _seen_through(self.end.solution.estimate, options, self._profiles)
@@ -351,9 +218,9 @@ class _Seen:
                 estimate = solve(problem, estimate, precision=_PRECISION).estimate
             normals, sigma_px = self._normals(problem, estimate)
         except CalibrationError as error:
-            return _Kind(forms, estimate, failed=str(error))
+            return Kind(forms, estimate, failed=str(error))
         reach_px = {name: profile.reach_px for name, profile in self._profiles.items()}
-        return _Kind(forms, estimate, normals, sigma_px, reach_px)
+        return Kind(forms, estimate, normals, sigma_px, reach_px)
 
     def _normals(self, problem: Problem, estimate: Estimate) -> tuple[GroupNormals, float]:
         """The normal equations of each group, and the sigma of a typical observation, px."""
@@ -383,7 +250,7 @@ def _require_groups(sights: Sights) -> None:
         raise DegenerateError("too few views or features to tell lenses apart")
 
 
-def _groups(equations: Equations, problem: Problem) -> tuple[Indices, frozenset[str]]:
+def _groups(equations: Equations, problem: Problem) -> tuple[Indices, frozenset[str | None]]:
     """(E,) number of the placement of each equation, or, of what stays where it is, of the feature; and the private
     placements that are held out whole.
     """
@@ -391,46 +258,3 @@ def _groups(equations: Equations, problem: Problem) -> tuple[Indices, frozenset[
     feature = 2 * equations.feature + equations.is_curve + 1
     name = equations.sight * (feature.max() + 1) + np.where(placed[equations.sight], 0, feature)
     return np.unique(name, return_inverse=True)[1], problem.private if placed.any() else frozenset()
-
-
-# ---- the choice -----------------------------------------------------------------------------------------------------
-
-
-def decide(labels: Sequence[str], coefficients: Sequence[int], squares: Sequence[Array | None]) -> tuple[int, int]:
-    """Indices of the best lens and of the simplest that is as good; the paper's comes before all others.
-
-    As good is what exceeds the least error by no more than 1.5 standard errors of their difference, group by group (the
-    one-standard-error rule of Breiman et al. 1984, paired, and wider because the best of many is the luckiest).
-
-    Args:
-        squares: (G,) squared errors by group of each lens; None where there is no answer.
-
-    Raises:
-        DegenerateError: no lens has one.
-    """
-    known = {i: one for i, one in enumerate(squares) if one is not None}
-    if not known:
-        raise DegenerateError("no lens can be calibrated: check labels and target dimensions")
-    totals = {i: float(one.sum()) for i, one in known.items()}
-    best = min(totals, key=totals.__getitem__)
-    order = sorted(totals, key=lambda i: (labels[i] != PAPER, coefficients[i], totals[i]))
-    return best, next(i for i in order if standard_errors(known[i], known[best]) <= _AS_GOOD)
-
-
-def standard_errors(squares: Array, others: Array) -> float:
-    """By how many standard errors of the difference squared errors by group exceed others; 0 of the same."""
-    more = squares - others
-    error = float(np.sqrt(len(more)) * np.std(more, ddof=1)) if len(more) > 1 else np.inf
-    return float(more.sum()) / error if error > 0.0 else 0.0
-
-
-def _choice(tried: Sequence[_Candidate], chosen: _Candidate, share: float) -> LensChoice:
-    def as_told(one: _Candidate) -> TriedLens:
-        label, count = one.form.label, len(one.form.names)
-        if one.squares is None or chosen.squares is None:
-            return TriedLens(label, count, failed=one.failed)
-        return TriedLens(label, count, one.rms_px, standard_errors(one.squares, chosen.squares))
-
-    order = sorted(tried, key=lambda one: (one is not chosen, one.rms_px if one.squares is not None else np.inf))
-    groups = 0 if chosen.squares is None else len(chosen.squares)
-    return LensChoice(chosen.form.label, tuple(map(as_told, order)), groups, share)
