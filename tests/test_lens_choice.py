@@ -158,7 +158,7 @@ def test_options_name_the_lens_by_its_powers_alone() -> None:
 def test_few_observations_keep_to_the_papers_lens() -> None:
     """One frame of four corners tells lenses nothing, and says so."""
     observations = _seen("radial-2-3", "boards")
-    calibration = calibrate(observations.part(observations.points.view < 3, np.ones(0, bool)))
+    calibration = calibrate(observations.part(observations.points.view < 4, np.ones(0, bool)))
     choice = calibration.lens_choice
     assert choice is not None and choice.chosen == PAPER and "too few to compare" in choice.words
 

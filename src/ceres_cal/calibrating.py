@@ -128,7 +128,7 @@ def _without_priors(observations: Observations, options: Options) -> Calibration
 
 def _contradicted(observations: Observations, options: Options, free: Calibration) -> str | None:
     """What the priors that no calibration came out of contradict, when one comes out without them."""
-    stated = gather_priors(observations, options, free.estimate.structure)
+    stated = gather_priors(observations, replace(free.options, priors=options.priors), free.estimate.structure)
     posterior = free.uncertainty.posterior
     return contradicted_by(stated, free.estimate, posterior.information, posterior.degrees_of_freedom)
 

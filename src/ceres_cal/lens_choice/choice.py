@@ -64,9 +64,9 @@ def choose_lens(observations: Observations, options: Options, start: Start) -> C
 
 def _compare(tried: list[Candidate]) -> tuple[list[Candidate], Candidate, Candidate]:
     """The lenses, the best and the one that is chosen: one that folds where it must not gives no answer."""
-    labels, counts = [one.form.label for one in tried], [len(one.form.names) for one in tried]
+    labels, sizes = [one.form.label for one in tried], [one.form.size for one in tried]
     while True:
-        best, chosen = decide(labels, counts, [one.squares for one in tried])
+        best, chosen = decide(labels, sizes, [one.squares for one in tried])
         faults = {number: fault for number in (best, chosen) if (fault := tried[number].fault)}
         if not faults:
             return tried, tried[best], tried[chosen]

@@ -5,11 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import cache
 
+import numpy as np
+
 from ceres_cal.model.parameters import AUTO, OF_PIXELS, PAPERS_POWERS, Options
-from ceres_cal.scene.lens import LENSES
+from ceres_cal.scene.lens import LENSES, make_lens
 
 PAPER = "radial 2,3"
 """The lens that wins ties."""
+_ANY_PHI = 100.0
+_PROJECTION = 2  # coefficients that a projection of its own is worth
 
 
 def papers(options: Options) -> Options:
@@ -52,12 +56,21 @@ def coefficients_of(options: Options) -> int:
     return len(set(options.blank_lens.names) - set(options.held))
 
 
+def size_of(options: Options) -> int:
+    """How much a lens may follow: its free coefficients, and two more where it is no pinhole without any: its series in
+    the tangent has its first two coefficients chosen.
+    """
+    blank = make_lens(options.lens, options.powers)
+    is_pinhole = np.isclose(blank.distort([[1.0, 0.0, 1.0]], _ANY_PHI)[0, 0], _ANY_PHI)
+    return coefficients_of(options) + (0 if is_pinhole else _PROJECTION)
+
+
 @dataclass(frozen=True)
 class Form:
     """A lens to be tried: see `Options`.
 
     Attributes:
-        names: of the coefficients that are free. label: how it is called.
+        names: of the coefficients that are free. label: how it is called. size: see `size_of`.
     """
 
     lens: str
@@ -65,12 +78,13 @@ class Form:
     coefficients: tuple[str, ...] | None
     names: tuple[str, ...]
     label: str
+    size: int
 
     @classmethod
     def among(cls, options: Options) -> Form:
         """The lens of some options."""
         names = tuple(name for name in options.blank_lens.names if name not in options.held)
-        return cls(options.lens, options.powers, options.coefficients, names, label_of(options))
+        return cls(options.lens, options.powers, options.coefficients, names, label_of(options), size_of(options))
 
     def of(self, options: Options) -> Options:
         """The options with this lens."""

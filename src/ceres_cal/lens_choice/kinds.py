@@ -33,6 +33,8 @@ _FEWEST_GROUPS = 8  # with fewer nothing tells lenses apart
 _WIDEST = "kannala-brandt"
 # Share of its squares: a kind that leaves less is solved instead, for it may have other inliers.
 _QUIETER = 0.7
+_MOST_ROUNDS = 8
+_SOUND_PX = 1.0  # noise beyond which a first solve may have ended in a wrong valley: others are tried from nothing
 _PRECISION = 1e-3  # relative change of the cost from which on normal equations say where the least is
 _FEWEST_PLACEMENTS = 5  # with fewer the features of each are held out one by one
 
@@ -143,30 +145,49 @@ def compared_kinds(observations: Observations, options: Options, start: Estimate
     start = replace(start, placements=Poses.stacked(names, Poses.of(start.placements).of_names(names)))
     tried = kinds
     while True:
-        end, used = _first_solved(few, options, sights, start, tried)
+        end, used = _solved(few, options, sights, start, tried)
         seen = _Seen(few, end, options)
         compared = [seen.kind(forms, is_solved=forms is used) for forms in kinds]
         best = min(compared, key=lambda one: one.least)
         least = next(one.least for one in compared if one.forms is used)
-        if tried is not kinds or best.least > _QUIETER * least:
+        if len(tried) == 1 or best.least > _QUIETER * least:
             return compared, (len(few.points) + len(few.curves)) / total
         tried = [best.forms]
 
 
-def _first_solved(
+_Found = tuple[RobustSolution, tuple[Form, ...]]
+
+
+def _solved(
     observations: Observations, options: Options, sights: Sights, start: Estimate, kinds: Sequence[tuple[Form, ...]]
-) -> tuple[RobustSolution, tuple[Form, ...]]:
-    """The robust solve with the first of these kinds that has one, up to where the noise is known well enough."""
+) -> _Found:
+    """The robust solve with the first of these kinds that explains the observations, or with the one that does it best,
+    up to where the noise is known well enough.
+    """
     failure: CalibrationError | None = None
-    for forms in kinds:
+    found: list[_Found] = []
+    for forms, most_rounds in [(kinds[0], 1), *((forms, _MOST_ROUNDS) for forms in kinds)]:
         own = forms[0].of(options)
         try:
             near = _seen_through(start, own, _profiles(start, sights))
             problem = _problem(observations, sights, own, near)
-            return solve_robustly(problem, observations, near, most_rounds=1), forms
+            end = solve_robustly(problem, observations, near, most_rounds=most_rounds)
         except CalibrationError as error:
             failure = error
-    raise failure or DegenerateError("there is no lens")
+            continue
+        if _noise_px(end) < _SOUND_PX:
+            return end, forms
+        found.append((end, forms))
+    if not found:
+        raise failure or DegenerateError("there is no lens")
+    return min(found, key=lambda one: _noise_px(one[0]))
+
+
+def _noise_px(end: RobustSolution) -> float:
+    """Of a typical observation."""
+    sights, inliers = end.problem.sights, end.inliers
+    sigmas = inliers.point_scale * sights.sigma_px, inliers.curve_scale * sights.curve_sigma_px
+    return float(np.exp(np.mean(np.log(np.concatenate(sigmas)))))
 
 
 def _problem(observations: Observations, sights: Sights, options: Options, estimate: Estimate) -> Problem:

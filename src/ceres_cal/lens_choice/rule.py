@@ -15,14 +15,14 @@ from ceres_cal.lens_choice.forms import PAPER
 AS_GOOD = 1.5
 
 
-def decide(labels: Sequence[str], coefficients: Sequence[int], squares: Sequence[Array | None]) -> tuple[int, int]:
+def decide(labels: Sequence[str], sizes: Sequence[int], squares: Sequence[Array | None]) -> tuple[int, int]:
     """Indices of the best lens and of the simplest that is as good; the paper's comes before all others.
 
     As good is what exceeds the least error by no more than 1.5 standard errors of their difference, group by group (the
     one-standard-error rule of Breiman et al. 1984, paired, and wider because the best of many is the luckiest).
 
     Args:
-        squares: (G,) squared errors by group of each lens; None where there is no answer.
+        sizes: see `forms.size_of`. squares: (G,) squared errors by group of each lens; None where there is no answer.
 
     Raises:
         DegenerateError: no lens has one.
@@ -32,7 +32,7 @@ def decide(labels: Sequence[str], coefficients: Sequence[int], squares: Sequence
         raise DegenerateError("no lens can be calibrated: check labels and target dimensions")
     totals = {i: float(one.sum()) for i, one in known.items()}
     best = min(totals, key=totals.__getitem__)
-    order = sorted(totals, key=lambda i: (labels[i] != PAPER, coefficients[i], totals[i]))
+    order = sorted(totals, key=lambda i: (labels[i] != PAPER, sizes[i], totals[i]))
     return best, next(i for i in order if standard_errors(known[i], known[best]) <= AS_GOOD)
 
 
