@@ -74,7 +74,7 @@ class Kind:
         held = [key for key in self.normals.keys if key.kind == "camera" and key.quantity in lens]
         squares, step = self.normals.held_out(dict(zip(held, -values_of(self.estimate, held), strict=True)))
         rms_px = self.sigma_px * float(np.sqrt(squares.sum() / self.normals.counts.sum()))
-        return Candidate(form, self, squares, rms_px, step)
+        return Candidate(form, self, _surprise(squares, self.normals.counts), rms_px, step)
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,6 +127,13 @@ class Candidate:
             if camera.folds and (not camera.lens.may_fold or camera.lens.monotone_radius(camera.phi) <= reach_px):
                 return "folds inside the image"
         return ""
+
+
+def _surprise(squares: Array, counts: Array) -> Array:
+    """(G,) squares that grow by their logarithm where a group is off by more than the noise: a line that lies aside, or
+    a feature whose label is wrong, must not decide.
+    """
+    return np.asarray(counts * np.log1p(squares / counts))
 
 
 def compared_kinds(observations: Observations, options: Options, start: Estimate) -> tuple[list[Kind], float]:
