@@ -7,6 +7,7 @@ from dataclasses import replace
 from functools import partial
 
 from ceres_cal.base.transforms import Pose
+from ceres_cal.model.parameters import Options
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Brown, KannalaBrandt, Lens, Radial
 from ceres_cal.scene.targets import Segment, Target, checkerboard, custom, rings, ssl_field
@@ -22,6 +23,9 @@ _LENSES: dict[str, tuple[float, Lens, float]] = {
     "kannala-brandt": (548.0, KannalaBrandt((-0.012, 0.004, -0.003, 0.0006)), 3.2),
 }
 LENSES = tuple(_LENSES)
+
+RADIAL = Options(lens="radial")
+"""The paper's lens, of tests that do not ask which lens it is."""
 
 _SPACING_M = 0.2
 _LINES = tuple(name for name in ssl_field("B").curve_names if name != "CenterCircle")

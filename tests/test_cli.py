@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from accuracy_bound import make_trial
 from accuracy_scenes import CLEAN_NOISE, tilted
+from scenes import RADIAL
 
 import ceres_cal.calibrating
 from ceres_cal.calibration import Calibration
@@ -261,7 +262,7 @@ def test_calibrate_as_json_is_the_file_and_more(say: Say, tmp_path: Path) -> Non
     assert 0.1 < floor["mean_sd_mm"] < robots["mean_sd_mm"] < robots["worst_sd_mm"] < 1.0
     assert known["weak_directions"] == [] and known["unknown_placements"] == {} and known["seams"] == []
     # Nothing given on the command line is what nothing given in Python is.
-    assert data["calibration"]["options"] == _plain(Options())
+    assert data["calibration"]["options"] == _plain(RADIAL)
 
 
 def test_options_arrive(say: Say) -> None:

@@ -9,6 +9,7 @@ import pytest
 import scenes
 from hypothesis import given
 from hypothesis import strategies as st
+from scenes import RADIAL
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.transforms import Pose, rotation_exp
@@ -73,7 +74,7 @@ def test_priors_of_file_and_options_come_together() -> None:
     one = Prior("camera", "overhead", "phi", (800.0,), (5.0,))
     two = Prior("station", "overhead", "height_m", (4.0,), (0.01,))
     seen = replace(observed(), priors=(one,))
-    first, second = gather_priors(seen, Options(priors=(two,)), estimated().structure)
+    first, second = gather_priors(seen, Options(lens="radial", priors=(two,)), estimated().structure)
     assert (first.keys, first.mean.tolist()) == ((PHI,), [800.0])
     assert (second.keys, second.mean.tolist()) == ((HEIGHT,), [4.0])
 
@@ -88,12 +89,12 @@ def test_priors_of_file_and_options_come_together() -> None:
 )
 def test_priors_on_what_is_not_there(prior: Prior, message: str) -> None:
     with pytest.raises(InputError, match=message):
-        gather_priors(observed(), Options(priors=(prior,)), estimated().structure)
+        gather_priors(observed(), Options(lens="radial", priors=(prior,)), estimated().structure)
 
 
 def test_tolerances_are_priors_of_mean_nought() -> None:
     structure = make_structure({"field": FIELD}, {"field": Tolerance(lines_m=0.01)})
-    (prior,) = gather_priors(replace(observed(), targets={"field": FIELD}), Options(), structure)
+    (prior,) = gather_priors(replace(observed(), targets={"field": FIELD}), RADIAL, structure)
     assert [key.structure_name for key in prior.keys] == list(structure.names)
     assert not np.any(prior.mean)
     assert prior.information.spread.sd == pytest.approx(structure.sigma_m, rel=1e-12)
@@ -171,7 +172,7 @@ def test_given_and_without() -> None:
 def test_of_numbers_that_are_held_a_problem_hears_nothing() -> None:
     """The other numbers of the prior still count, with those held at their mean; what is known uses up no equation."""
     estimate, seen = estimated(), observed()
-    options = Options(fixed={"cx": 651.3})
+    options = Options(lens="radial", fixed={"cx": 651.3})
     prior = known_prior(estimate)
     problem = Problem(gather_sights(seen), make_layout(seen, options), (prior,), options=options)
     (heard,) = problem.priors_at(estimate)
