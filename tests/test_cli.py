@@ -399,13 +399,13 @@ def test_a_baseline_says_nothing_of_its_uncertainty(say: Say) -> None:
 
 def test_warns_of_a_lens_that_does_not_suit(say: Say, tmp_path: Path) -> None:
     say("simulate", "fisheye", "-o", tmp_path)
-    said = say("calibrate", tmp_path / "observations.json", "--json")
+    said = say("calibrate", tmp_path / "observations.json", "--lens", "radial", "--json")
     assert any("times the stated sigmas" in warning for warning in json.loads(said.out)["warnings"])
 
 
 def test_says_what_boards_alone_cannot_tell(say: Say, tmp_path: Path) -> None:
     say("simulate", "boards", "-o", tmp_path)
-    said = say("calibrate", tmp_path / "observations.json", "--fix", "a3=6.1e-7", "--free-aspect")
+    said = say("calibrate", tmp_path / "observations.json", "--lens", "radial", "--fix", "a3=6.1e-7", "--free-aspect")
     assert "held as the world" in said.out and "height" not in said.out
     assert "a3              6.1e-07 (held)" in said.out and "aspect          1.000" in said.out
 

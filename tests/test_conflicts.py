@@ -268,3 +268,34 @@ def test_what_is_in_dispute_is_in_the_covariance(seed: int) -> None:
     after = before.in_doubt(keys[::-1], [shift[::-1] for shift in shifts])
     expected = before.covariance + sum(np.outer(shift, shift) for shift in shifts)
     assert after.covariance == pytest.approx(expected, rel=1e-6, abs=1e-6)
+
+
+# ---- what is usual --------------------------------------------------------------------------------------------------
+
+
+def cropped(left_px: int) -> Observations:
+    """The picture without its left part: the principal point is no longer near the middle."""
+    whole = seen(15.0)
+    kept_points, kept_curves = (column.pixels[:, 0] >= left_px for column in (whole.points, whole.curves))
+    part = whole.part(kept_points, kept_curves)
+    (name, (width, height_px)) = next(iter(whole.cameras.items()))
+    return replace(
+        part,
+        cameras={name: (width - left_px, height_px)},
+        points=replace(part.points, pixels=part.points.pixels - (left_px, 0.0)),
+        curves=replace(part.curves, pixels=part.curves.pixels - (left_px, 0.0)),
+    )
+
+
+def test_a_cropped_picture_has_no_usual_principal_point() -> None:
+    """The data say where it is: what is usual is left out, and a warning says so."""
+    calibration = calibrate(cropped(400), RADIAL)
+    assert any("the usual cx of camera 'overhead'" in line for line in calibration.warnings)
+    assert not calibration.conflicts and not calibration.options.usual_camera
+    assert calibration.station().phi == pytest.approx(868.0, rel=0.02)
+
+
+def test_what_is_usual_moves_nothing_that_the_data_determine() -> None:
+    with_it, without = (calibrate(seen(15.0), replace(RADIAL, usual_camera=on)) for on in (True, False))
+    sd = without.uncertainty.posterior.sd_of("camera", "overhead", "phi")
+    assert with_it.station().phi == pytest.approx(without.station().phi, abs=0.1 * sd)

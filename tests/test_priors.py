@@ -74,7 +74,9 @@ def test_priors_of_file_and_options_come_together() -> None:
     one = Prior("camera", "overhead", "phi", (800.0,), (5.0,))
     two = Prior("station", "overhead", "height_m", (4.0,), (0.01,))
     seen = replace(observed(), priors=(one,))
-    first, second = gather_priors(seen, Options(lens="radial", priors=(two,)), estimated().structure)
+    first, second = gather_priors(
+        seen, Options(lens="radial", usual_camera=False, priors=(two,)), estimated().structure
+    )
     assert (first.keys, first.mean.tolist()) == ((PHI,), [800.0])
     assert (second.keys, second.mean.tolist()) == ((HEIGHT,), [4.0])
 
@@ -94,7 +96,9 @@ def test_priors_on_what_is_not_there(prior: Prior, message: str) -> None:
 
 def test_tolerances_are_priors_of_mean_nought() -> None:
     structure = make_structure({"field": FIELD}, {"field": Tolerance(lines_m=0.01)})
-    (prior,) = gather_priors(replace(observed(), targets={"field": FIELD}), RADIAL, structure)
+    (prior,) = gather_priors(
+        replace(observed(), targets={"field": FIELD}), replace(RADIAL, usual_camera=False), structure
+    )
     assert [key.structure_name for key in prior.keys] == list(structure.names)
     assert not np.any(prior.mean)
     assert prior.information.spread.sd == pytest.approx(structure.sigma_m, rel=1e-12)
@@ -181,3 +185,20 @@ def test_of_numbers_that_are_held_a_problem_hears_nothing() -> None:
     assert problem.unknowns(estimate) == problem.layout.size - len(heard.keys) == 0
     nobody = GaussianPrior(Information.of_sigmas({Key("camera", "overhead", "cx", "px"): 1.0}), np.array([651.3]))
     assert replace(problem, priors=(nobody,)).priors_at(estimate) == []
+
+
+# ---- what is usual --------------------------------------------------------------------------------------------------
+
+
+def test_a_principal_point_that_nobody_states_lies_near_the_middle() -> None:
+    """Not where it is stated, held back by the options, or known by an earlier calibration."""
+    seen, structure = observed(), estimated().structure
+    (usual,) = [one for one in gather_priors(seen, RADIAL, structure) if one.is_usual]
+    assert usual.mean == pytest.approx(0.5 * (np.array(next(iter(seen.cameras.values()))) - 1.0))
+    assert {key.quantity for key in usual.keys} == {"cx", "cy"}
+    name = next(iter(seen.cameras))
+    stated = replace(RADIAL, priors=(Prior("camera", name, "cx", (640.0,), (1.0,)),))
+    carried = gather_priors(seen, RADIAL, structure, GaussianPrior(usual.information, usual.mean))
+    for priors in (gather_priors(seen, replace(RADIAL, usual_camera=False), structure), carried):
+        assert not any(one.is_usual for one in priors)
+    assert not any(one.is_usual for one in gather_priors(seen, stated, structure))

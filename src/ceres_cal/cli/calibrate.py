@@ -68,6 +68,7 @@ def _add_camera(parser: ArgumentParser) -> None:
         help="hold phi, aspect, cx, cy or a coefficient, such as k3=0; repeatable",
     )
     add("--free-aspect", action="store_true", help="let fy / fx differ from 1")
+    add("--no-usual-camera", action="store_true", help="nothing is taken for usual of the principal point")
     add("--hold-principal-point", action="store_true", help="hold it at the image's centre")
     add(
         "--tolerance",
@@ -200,6 +201,7 @@ def _options(
         powers=powers,
         free_principal_point=not args.hold_principal_point,
         free_aspect=args.free_aspect,
+        usual_camera=not args.no_usual_camera,
         fixed=fixed,
         priors=tuple(parse_prior(spec, observations, names) for spec in args.prior),
         tolerances=_tolerances(args.tolerance),

@@ -41,6 +41,8 @@ class Options:
         coefficients: names of those of the lens that are solved for, the others are 0; None: all.
         free_principal_point: else it is held at the image centre, or where `fixed` says.
         free_aspect: whether fy / fx is free; else 1, or what `fixed` says.
+        usual_camera: whether a principal point that nobody states is taken to lie near the middle of its image, as is
+            usual (`priors.USUAL_CENTRE`); where the data say otherwise it is left out.
         fixed: numbers held, by name: phi, aspect, cx, cy (px) and the lens's coefficients in the units of the files.
             They hold for every camera.
         priors: what is known beforehand, besides the observations' own.
@@ -61,6 +63,7 @@ class Options:
     coefficients: tuple[str, ...] | None = None
     free_principal_point: bool = True
     free_aspect: bool = False
+    usual_camera: bool = True
     fixed: Mapping[str, float] = field(default_factory=dict)
     priors: tuple[Prior, ...] = ()
     tolerances: Mapping[str, Tolerance] = field(default_factory=dict)

@@ -140,7 +140,8 @@ class _Rounds:
                 break
             state = self._rough(state.solution.estimate, state.residuals, visible, state.rounds + 1)
         # Of one kind of observations without priors the leverages add up to the count.
-        mixed = bool(self._problem.priors) or all(kind.equations for kind in self._problem.sights.by_kind)
+        stated = any(not prior.is_usual for prior in self._problem.priors)
+        mixed = stated or all(kind.equations for kind in self._problem.sights.by_kind)
         return self._by_leverages(state)[0] if mixed and len(state.problem.sights) else state
 
     def _rough(self, estimate: Estimate, there: Residuals, visible: Inliers, rounds: int) -> RobustSolution:
