@@ -18,8 +18,10 @@ from ceres_cal.calibration import Calibration
 from ceres_cal.moves import refit
 from ceres_cal.observations import Observations
 from ceres_cal.simulate import Disturbance, simulate
-from ceres_cal.uncertainty.between import _averaged
+from ceres_cal.uncertainty.between import _averaged, _expected
 from ceres_cal.uncertainty.correlation import _freedom_of_mixture
+from ceres_cal.uncertainty.likelihood import likelihoods
+from ceres_cal.uncertainty.strands import Family, Strand, decay
 
 HALF = SSL_PROBLEMS["half, paper's lens"]()
 TEN = boards(868.0, RADIAL, 10)
@@ -193,6 +195,97 @@ def test_a_mixture_has_the_tails_of_its_widest_part() -> None:
     half = student_95(degrees) * np.sqrt(weights @ variances)
     assert np.mean(np.abs(draws) <= half) == pytest.approx(0.95, abs=0.003)
     assert student_95(degrees) > NORMAL_95
+
+
+# ---- what is summed first -------------------------------------------------------------------------------------------
+
+
+def _family(rng: np.random.Generator) -> tuple[Family, Array]:
+    """Nine strands of three shapes over three views, and the columns of all their rows: private, two shared, left."""
+    places = [np.column_stack([rng.uniform(0.0, 1.0, (count, 2)), np.zeros(count)]) for count in (20, 28, 20)]
+    strands, first = [], 0
+    for number in (0, 1, 0, 2, 0, 1, 1, 0, 2):
+        strands.append(Strand(np.arange(first, first + len(places[number])), places[number]))
+        first += len(places[number])
+    group = np.repeat([0, 0, 0, 1, 1, 1, 2, 2, 2], [len(strand.rows) for strand in strands])
+    columns = np.zeros((first, 9))
+    for view in range(3):
+        own = group == view
+        columns[own, :6] = np.linalg.qr(rng.standard_normal((np.count_nonzero(own), 6)))[0]
+    columns[:, 6:8] = 0.02 * rng.standard_normal((first, 2))
+    columns[:, 8] = rng.standard_normal(first)
+    return Family.of(strands, False, columns, group), columns
+
+
+def test_strands_of_one_shape_are_multiplied_as_one_matrix() -> None:
+    family, columns = _family(np.random.default_rng(0))
+    matrices = np.where(np.isfinite(family.distance), decay(family.distance, 0.3, False), 0.0)
+    product, squared = family.applied(matrices), np.zeros((3, 28, 28))
+    for number, strand in enumerate(family.strands):
+        shape, size = int(np.searchsorted(family.bounds, number, side="right")) - 1, len(strand.rows)
+        own = columns[strand.rows]
+        np.testing.assert_allclose(product[number, :size], matrices[shape, :size, :size] @ own, atol=1e-12)
+        squared[shape, :size, :size] += own[:, 6:8] @ own[:, 6:8].T
+    np.testing.assert_allclose(family.squared(slice(6, 8)), squared, atol=1e-12)
+    np.testing.assert_allclose(family.products, columns.T @ columns, atol=1e-10)
+
+
+def test_the_likelihood_is_that_of_the_whole_covariance() -> None:
+    """Of all rows at once, private placements and what is shared as columns, the shared ones known to one."""
+    family, columns = _family(np.random.default_rng(1))
+    at = likelihoods([family], False, float(np.sum(columns[:, 6:8] ** 2)))
+    group = np.concatenate([np.full(len(s.rows), g) for s, g in zip(family.strands, family.group, strict=True)])
+    rows = np.concatenate([strand.rows for strand in family.strands])
+    private = np.hstack([columns[rows, :6] * (group == view)[:, None] for view in range(3)])
+    shared, left = columns[rows, 6:8], columns[rows, 8]
+    known, slope = np.eye(2) - shared.T @ shared, -shared.T @ left  # of what was not looked at, as it is at the optimum
+
+    def log(length: float, share: float) -> float:
+        inverses, log_of = [], 0.0
+        for strand in family.strands:
+            distance = np.linalg.norm(strand.places[:, None] - strand.places, axis=2)
+            covariance = (1.0 - share) * np.eye(len(distance)) + share * decay(distance, length, False)
+            inverses.append(np.linalg.inv(covariance))
+            log_of -= 0.5 * np.linalg.slogdet(covariance)[1]
+        weighted = [i @ part for i, part in zip(inverses, _split(family, np.hstack([private, shared])), strict=True)]
+        both, weighted_all = np.hstack([private, shared]), np.concatenate(weighted)
+        normal, gradient = both.T @ weighted_all, weighted_all.T @ left
+        normal[-2:, -2:] += known
+        gradient[-2:] += slope
+        weighted_left = np.concatenate([i @ part for i, part in zip(inverses, _split(family, left), strict=True)])
+        squares = left @ weighted_left - gradient @ np.linalg.solve(normal, gradient)
+        freedom = len(left) - 18 - np.sum(shared**2)
+        return float(log_of - 0.5 * (np.linalg.slogdet(normal)[1] + freedom * np.log(squares / freedom)))
+
+    seen = np.isfinite(at.log)
+    assert np.count_nonzero(seen) > 20
+    expected = [log(max(length, 1e-9), share) for length, share in zip(at.length_m[seen], at.share[seen], strict=True)]
+    np.testing.assert_allclose(at.log[seen] - at.log[0], np.array(expected) - expected[0], atol=1e-7)
+    skipped = [log(length, share) for length, share in zip(at.length_m[~seen], at.share[~seen], strict=True)]
+    assert max(skipped, default=-np.inf) < expected[0] - 6.0
+
+
+def _split(family: Family, values: Array) -> list[Array]:
+    """Values of the rows, strand by strand."""
+    return np.split(values, np.cumsum([len(strand.rows) for strand in family.strands])[:-1])
+
+
+def test_the_spread_of_scores_is_that_over_all_pairs_of_views() -> None:
+    rng = np.random.default_rng(0)
+    roots = rng.standard_normal((2, 5, 4, 3))
+    informations, scatter = roots @ np.swapaxes(roots, 2, 3) / 40.0
+    whole = scatter.sum(axis=0) + np.eye(4)
+    values, vectors = np.linalg.eigh(whole)
+    white = (vectors * values**-0.5) @ vectors.T
+    own, spread = _expected(informations, scatter, whole, white)
+    total = 0.0
+    for i, (a, m) in enumerate(zip(informations, scatter, strict=True)):
+        for j, (b, n) in enumerate(zip(informations, scatter, strict=True)):
+            covariance = white @ ((i == j) * m - a @ n - m @ b + a @ whole @ b) @ white
+            total += 2.0 * np.sum(covariance**2)
+            if i == j:
+                np.testing.assert_allclose(own[i], covariance, atol=1e-12)
+    assert spread == pytest.approx(total, rel=1e-10)
 
 
 # ---- coverage, by small samples -------------------------------------------------------------------------------------

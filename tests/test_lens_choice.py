@@ -22,8 +22,7 @@ from ceres_cal.model.residuals import residuals
 from ceres_cal.observations import Observations
 from ceres_cal.simulate import Disturbance, simulate
 from ceres_cal.solve.left_out import GroupNormals, group_normals
-from ceres_cal.solve.linear_model import LinearModel, make_linear_model
-from ceres_cal.uncertainty.sample import robust_weights
+from ceres_cal.solve.linear_model import LinearModel, equation_weights, make_linear_model
 
 _PLAIN = Options(loss="trivial", reject_sigma=50.0)
 _NOISE = Disturbance(points_sigma_px=0.3, curves_sigma_px=0.3)
@@ -77,7 +76,7 @@ def _normals(observations: Observations, calibration: Calibration) -> tuple[Grou
     problem, estimate = calibration.problem(observations), calibration.estimate
     there = residuals(observations, problem.sights, estimate)
     equations = write_equations(observations, problem.sights, estimate, there)
-    weights = robust_weights(observations, problem, equations, there)
+    weights = equation_weights(observations, problem.weighting, equations, there).within_sigma
     normals = group_normals(problem, estimate, equations, weights, (equations.sight, problem.private))
     return normals, make_linear_model(problem, estimate, equations, weights)
 

@@ -24,8 +24,8 @@ from ceres_cal.observations.thinning import thinned
 from ceres_cal.scene.lens import LENSES
 from ceres_cal.solve import Problem, RobustSolution, solve, solve_robustly
 from ceres_cal.solve.left_out import GroupNormals, group_normals
+from ceres_cal.solve.linear_model import equation_weights
 from ceres_cal.start.initialise import LensProfile
-from ceres_cal.uncertainty.sample import robust_weights
 
 _LEAST_ROWS, _SHARE = 1_250, 0.025  # of the observations, how many take part
 _FEWEST_GROUPS = 8  # with fewer nothing tells lenses apart
@@ -257,7 +257,7 @@ class _Seen:
         if not np.isfinite([*points[self.sights.point_rows], *curves[self.sights.curve_rows]]).all():
             raise DegenerateError("cannot show all that another lens shows")
         equations = write_equations(self.observations, self.sights, estimate, there)
-        weights = robust_weights(self.observations, problem, equations, there)
+        weights = equation_weights(self.observations, problem.weighting, equations, there).within_sigma
         normals = group_normals(problem, estimate, equations, weights, _groups(equations, problem))
         return normals, 1.0 / float(np.mean(weights.inverse_sigma))
 

@@ -7,7 +7,7 @@ moves on a target by `built`, the camera by `pose`.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,7 +17,7 @@ from ceres_cal.base.arrays import AnyArray, Array, Indices, Mask
 from ceres_cal.base.errors import SolutionError
 from ceres_cal.model.parameters import Estimate
 from ceres_cal.model.residuals import Residuals, camera_optics, curve_columns, point_columns
-from ceres_cal.model.structure import Structure, Tolerance, all_bends, make_structure
+from ceres_cal.model.structure import Structure, Tolerance, bends_of, make_structure
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights
 from ceres_cal.scene.curves import along_track
@@ -99,16 +99,17 @@ def write_equations(observations: Observations, sights: Sights, estimate: Estima
 def equations_of(observations: Observations, sights: Sights, estimate: Estimate, there: Residuals) -> Equations:
     """The equations of some sights, all of whose residuals are finite."""
     poses = estimate.pose_stack(sights.keys)
-    parts = [
-        part
-        for name in sights.cameras
-        for part in _of_camera(observations, sights, sights.numbers(name), poses, estimate, there)
-        if len(part["sight"])
-    ]
+    parts = []
+    for numbers in map(sights.numbers, sights.cameras):
+        own = sights.take(numbers)
+        if len(own.point_rows):
+            parts.append(_of_points(observations, own, numbers, poses[numbers], estimate, there))
+        if len(own.curve_rows):
+            parts.append(_of_curves(observations, own, numbers, poses[numbers], estimate, there))
     size = max(part["intrinsics"].shape[1] for part in parts)
     for part in parts:
-        missing = size - part["intrinsics"].shape[1]
-        part["intrinsics"] = np.pad(part["intrinsics"], ((0, 0), (0, missing)))
+        if missing := size - part["intrinsics"].shape[1]:
+            part["intrinsics"] = np.pad(part["intrinsics"], ((0, 0), (0, missing)))
     columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]} if parts[1:] else parts[0]
     if np.any(np.diff(columns["sight"]) < 0):
         order = np.argsort(columns["sight"], kind="stable")
@@ -122,23 +123,25 @@ def equations_of(observations: Observations, sights: Sights, estimate: Estimate,
 def of_observations(numbers: Indices, points: AnyArray, curves: AnyArray) -> AnyArray:
     """(E,) values of points (N,) and of curve observations (M,) by the number of the observation."""
     is_curve = numbers >= len(points)
+    if not is_curve.any():
+        return points[numbers]
     values = np.empty(len(numbers), dtype=points.dtype)
     values[~is_curve], values[is_curve] = points[numbers[~is_curve]], curves[numbers[is_curve] - len(points)]
     return values
 
 
-def _of_camera(
-    observations: Observations, sights: Sights, numbers: Indices, poses: Array, estimate: Estimate, there: Residuals
-) -> Iterator[dict[str, AnyArray]]:
-    """The columns of one camera's points, then of its curve observations."""
-    own = sights.take(numbers)
+def _of_points(
+    observations: Observations, own: Sights, numbers: Indices, poses: Array, estimate: Estimate, there: Residuals
+) -> dict[str, AnyArray]:
+    """The columns of the points of one camera's sights, of these numbers and poses."""
     optics = camera_optics(estimate.cameras[own.keys[0].camera])
     size = len(optics.intrinsics)
     rows = np.empty((len(own.point_rows), 2, size + 10))
     points = point_columns(own, estimate.structure)
-    points = points._replace(bends=all_bends(observations.targets)[own.point_index])
-    kernels.point_rows(optics, poses[numbers], points, rows)
-    yield {
+    bends = np.concatenate([bends_of(target) for target in observations.targets.values()])
+    points = points._replace(bends=bends[own.point_index])
+    kernels.point_rows(optics, poses, points, rows)
+    return {
         "sight": np.repeat(numbers[_sight_of(own.point_bounds)], 2),
         "observation": np.repeat(own.point_rows, 2),
         "feature": np.repeat(own.point_index, 2),
@@ -150,11 +153,19 @@ def _of_camera(
         "place": np.repeat(points.places, 2, axis=0),
         "built": rows[:, :, -4:].reshape(-1, 4),
     }
+
+
+def _of_curves(
+    observations: Observations, own: Sights, numbers: Indices, poses: Array, estimate: Estimate, there: Residuals
+) -> dict[str, AnyArray]:
+    """The columns of their curve observations."""
+    optics = camera_optics(estimate.cameras[own.keys[0].camera])
+    size = len(optics.intrinsics)
     curves = curve_columns(own, estimate.structure, there.feet[own.curve_rows])
     rows, normals = np.empty((len(own.curve_rows), size + 10)), np.empty((len(own.curve_rows), 2))
-    kernels.curve_rows(optics, poses[numbers], curves, rows, normals)
+    kernels.curve_rows(optics, poses, curves, rows, normals)
     distance = there.curves[own.curve_rows]
-    yield {
+    return {
         "sight": numbers[_sight_of(own.curve_bounds)],
         "observation": len(observations.points) + own.curve_rows,
         "feature": own.track_index.astype(np.int64),

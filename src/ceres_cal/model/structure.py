@@ -165,7 +165,12 @@ def make_structure(targets: Mapping[str, Target], tolerances: Mapping[str, Toler
         for point_name in target.points:
             own = [free(f"{name}/{point_name}.{axis}", tolerance.points_m) for axis in "xy"]
             point_slots.append(own + bows)
-        bends.append(_bends(target, name, tolerance))
+        if tolerance.warp_m > 0.0 and not target.bows:
+            raise InputError(
+                f"a warp is for checkerboards and boards like them: target {name!r}, of kind {target.kind!r}, does not "
+                "bow"
+            )
+        bends.append(bends_of(target))
     return Structure(
         tuple(names),
         np.zeros(len(names)),
@@ -176,17 +181,8 @@ def make_structure(targets: Mapping[str, Target], tolerances: Mapping[str, Toler
     )
 
 
-def all_bends(targets: Mapping[str, Target]) -> Array:
-    """(P, 2) `Structure.bends` of every target that can bow."""
-    return np.concatenate([_bends(target, name, Tolerance()) for name, target in targets.items()])
-
-
-def _bends(target: Target, name: str, tolerance: Tolerance) -> Array:
-    """1 - x^2 and 1 - y^2 over the board, x and y from -1 to 1 between its edges."""
-    if tolerance.warp_m > 0.0 and not target.bows:
-        raise InputError(
-            f"a warp is for checkerboards and boards like them: target {name!r}, of kind {target.kind!r}, does not bow"
-        )
+def bends_of(target: Target) -> Array:
+    """(N, 2) 1 - x^2 and 1 - y^2 over a board, x and y from -1 to 1 between its edges; 0 where it does not bow."""
     if not target.bows or not target.points:
         return np.zeros((len(target.points), 2))
     flat = target.point_array[:, :2]

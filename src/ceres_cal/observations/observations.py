@@ -107,7 +107,8 @@ class Observations(Content):
     @cached_property
     def digest(self) -> str:
         """SHA-256 of the content, the same for the JSON and the NPZ file: where a calibration came from."""
-        content = hashlib.sha256(msgspec.json.encode(header_of(replace(self, notes={}))))
+        header = msgspec.structs.replace(header_of(self), notes=msgspec.UNSET)
+        content = hashlib.sha256(msgspec.json.encode(header))
         for column in (self.points, self.curves):
             for array in vars(column).values():
                 content.update(np.ascontiguousarray(array).data)

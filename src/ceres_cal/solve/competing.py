@@ -217,7 +217,9 @@ class _Competition:
         if not len(sights):
             return np.empty(0, dtype=np.int64), None
         equations = write_equations(self._observations, sights, end.solution.estimate, end.residuals)
-        weights = equation_weights(self._observations, self._problem.options, end.inliers, equations)
+        inliers, weighting = end.inliers, end.inliers.weighting(self._problem.options)
+        taking_part = inliers.points, inliers.curves
+        weights = equation_weights(self._observations, weighting, equations, end.residuals, taking_part)
         here = recalled[equations.observation]
         weights = replace(weights, used=weights.used | here, robust=np.where(here, 1.0, weights.robust))
         model = make_linear_model(self._problem, end.solution.estimate, equations, weights)
@@ -256,11 +258,13 @@ class _Competition:
         median one.
         """
         lengths = np.concatenate([end.inliers.point_sigmas, end.inliers.curve_sigmas])
-        own = _inliers(end) & (wholes.of >= 0) & self.taking_part
-        equations = np.where(np.arange(len(lengths)) < len(end.inliers.points), 2.0, 1.0)
-        spare = np.bincount(wholes.of[own], equations[own], minlength=wholes.size + 1)
-        square = np.bincount(wholes.of[own], lengths[own] ** 2, minlength=wholes.size + 1) / np.maximum(spare, 1.0)
-        there = spare > 0.0
+        points, size = len(end.inliers.points), wholes.size + 1
+        of = np.where(_inliers(end) & self.taking_part, wholes.of, -1)
+        of[of < 0] = wholes.size
+        spare = 2.0 * np.bincount(of[:points], minlength=size) + np.bincount(of[points:], minlength=size)
+        square = np.bincount(of, lengths**2, minlength=size)
+        spare[-1] = square[-1] = 0.0  # of what is in none
+        square, there = square / np.maximum(spare, 1.0), spare > 0.0
         middle = float(np.median(square[there])) if np.any(there) else 1.0
         return np.asarray((square / max(middle, 1e-12) - 1.0) / np.sqrt(2.0 / np.maximum(spare, 1.0)) * there)
 

@@ -16,13 +16,14 @@ import numpy as np
 
 from ceres_cal import kernels
 from ceres_cal.base.arrays import Array, Indices, Mask
-from ceres_cal.model.equations import Equations
+from ceres_cal.model.equations import Equations, of_observations
 from ceres_cal.model.keys import Key, columns_by_owner
-from ceres_cal.model.parameters import Estimate, Options, intrinsic_names, intrinsics_scales
+from ceres_cal.model.parameters import Estimate, intrinsic_names, intrinsics_scales
 from ceres_cal.model.quantities import free_keys, from_placement, from_station
+from ceres_cal.model.residuals import Residuals
 from ceres_cal.observations import Observations
-from ceres_cal.solve.noise import Inliers
-from ceres_cal.solve.problem import Problem
+from ceres_cal.observations.sights import ranges
+from ceres_cal.solve.problem import Problem, Weighting
 
 LEAST_LEFT = 1e-7
 """Share of an alternative's squared length that the free numbers must leave for it to be testable."""
@@ -42,6 +43,11 @@ class Weights:
     inverse_sigma: Array
     used: Mask
     robust: Array
+
+    @property
+    def within_sigma(self) -> Weights:
+        """The same with the robust weights in the standard deviations, as the solver sees them."""
+        return Weights(self.inverse_sigma * np.sqrt(self.robust), self.used, np.ones_like(self.robust))
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,16 +217,25 @@ def inverse_root(normal: Array, sizes: Array, least: float) -> Array:
     return np.asarray(scale[:, None] * vectors[:, kept] / np.sqrt(values[kept]))
 
 
-def equation_weights(observations: Observations, options: Options, inliers: Inliers, equations: Equations) -> Weights:
-    """How each equation counts at the noise that was found, with the loss of the options."""
-    sigma = np.concatenate(
-        [inliers.point_scale * observations.points.sigma_px, inliers.curve_scale * observations.curves.sigma_px]
-    )
-    lengths = np.concatenate([inliers.point_sigmas, inliers.curve_sigmas])
-    squared = np.where(np.isfinite(lengths), lengths, 0.0) ** 2
-    robust = kernels.loss_weights(kernels.Loss(kernels.LOSS_CODES[options.loss], options.loss_scale), squared)
-    inlier, at = np.concatenate([inliers.points, inliers.curves]), equations.observation
-    return Weights(1.0 / sigma[at], inlier[at], robust[at])
+def equation_weights(
+    observations: Observations,
+    weighting: Weighting,
+    equations: Equations,
+    there: Residuals,
+    taking_part: tuple[Mask, Mask] | None = None,
+) -> Weights:
+    """How each equation counts at a noise and a loss.
+
+    Args:
+        there: residuals where the equations stand. taking_part: of points (N,) and of curve observations (M,); by
+            default all do.
+    """
+    at, scale = equations.observation, np.where(equations.is_curve, weighting.curve_scale, weighting.point_scale)
+    sigma = scale * of_observations(at, observations.points.sigma_px, observations.curves.sigma_px)
+    squared = (of_observations(at, *there.lengths) / sigma) ** 2
+    loss = kernels.Loss(kernels.LOSS_CODES[weighting.loss], weighting.loss_scale)
+    used = np.ones(len(at), dtype=bool) if taking_part is None else of_observations(at, *taking_part)
+    return Weights(1.0 / sigma, used, kernels.loss_weights(loss, squared))
 
 
 def make_linear_model(problem: Problem, estimate: Estimate, equations: Equations, weights: Weights) -> LinearModel:
@@ -279,17 +294,18 @@ def _private_basis(equations: Equations, problem: Problem, weight: Array, used: 
 def shared_columns(equations: Equations, estimate: Estimate, keys: Sequence[Key]) -> Array:
     """(E, P) px per unit of each key: what a step of the shared numbers does to every equation."""
     columns, owned = np.zeros((len(equations), len(keys))), columns_by_owner(keys)
-    scales = {name: intrinsics_scales(camera) for name, camera in estimate.cameras.items()}
-    names = {name: intrinsic_names(camera.lens) for name, camera in estimate.cameras.items()}
-    for name in equations.sights.cameras:
-        own = owned.get(("camera", name), [])
-        at = [names[name].index(keys[column].quantity) for column in own]
-        shown = np.array([key.camera == name for key in equations.sights.keys])
-        rows = np.flatnonzero(shown[equations.sight])[:, None]
-        columns[rows, own] = equations.intrinsics[rows, at] * scales[name][at]
-    for number, key in enumerate(equations.sights.keys):
-        if ("station", key.station) not in owned and ("placement", str(key.placement)) not in owned:
+    cameras = equations.sights.cameras
+    for name in cameras:
+        camera, own = estimate.cameras[name], owned.get(("camera", name), [])
+        if not own:
             continue
+        at = [intrinsic_names(camera.lens).index(keys[column].quantity) for column in own]
+        here: slice | Indices = slice(None)
+        if len(cameras) > 1:
+            here = ranges(equations.bounds, equations.sights.numbers(name))
+        columns[here, own[0] : own[-1] + 1] = equations.intrinsics[here][:, at] * intrinsics_scales(camera)[at]
+    posed = any(kind in ("station", "placement") for kind, _ in owned)
+    for number, key in enumerate(equations.sights.keys if posed else ()):
         here = slice(equations.bounds[number], equations.bounds[number + 1])
         pose = equations.poses[number : number + 1]
         world = estimate.stations[key.station].cam_from_world

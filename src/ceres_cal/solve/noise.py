@@ -15,6 +15,7 @@ from ceres_cal.model.parameters import Options
 from ceres_cal.model.residuals import Residuals
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights
+from ceres_cal.solve.problem import Weighting
 
 _BEYOND = 100.0  # an exponent: no observation is so rare
 # Spare equations below which a spread says nothing: its own error is 25 % at 8. At 4 the errors of fits to ten points
@@ -88,6 +89,10 @@ class Inliers:
             and abs(self.point_scale - other.point_scale) <= relative * other.point_scale
             and abs(self.curve_scale - other.curve_scale) <= relative * other.curve_scale
         )
+
+    def weighting(self, options: Options) -> Weighting:
+        """Of the observations at these noise scales."""
+        return Weighting(self.point_scale, self.curve_scale, options.loss, options.loss_scale)
 
     def much_below(self, other: Inliers, share: float) -> bool:
         """Whether a scale fell to less than a share of what it was."""
@@ -207,5 +212,5 @@ def _spread(lengths: Array, median_of_one: float, reject_sigma: float, least: fl
 
 
 def _within(lengths: Array, bound: float) -> _Spread:
-    inside = lengths <= bound
-    return _Spread(int(np.count_nonzero(inside)), float(np.sum(lengths**2, where=inside)))
+    inside = lengths[lengths <= bound]
+    return _Spread(len(inside), float(inside @ inside))

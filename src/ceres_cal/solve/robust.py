@@ -208,8 +208,8 @@ class _Rounds:
             self._problem.sights.equations, self._problem.unknowns(solution.estimate)
         )
         inliers = judge(self._observations, there, redundancy, options, self._usual)
-        weighting = Weighting(inliers.point_scale, inliers.curve_scale, options.loss, options.loss_scale)
-        problem = replace(self._problem.used(inliers.points, inliers.curves), weighting=weighting, feet=there.feet)
+        used = self._problem.used(inliers.points, inliers.curves)
+        problem = replace(used, weighting=inliers.weighting(options), feet=there.feet)
         return RobustSolution(problem, solution, inliers, there, rounds)
 
 

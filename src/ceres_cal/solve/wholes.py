@@ -38,7 +38,7 @@ class Wholes:
 
     def count(self, rows: Mask) -> Indices:
         """(size,) how many of these observations (N + M,) each has."""
-        return np.bincount(self.of[rows & (self.of >= 0)], minlength=self.size)
+        return np.bincount(np.where(rows, self.of, -1) + 1, minlength=self.size + 1)[1:]
 
     def among(self, numbers: Indices) -> Mask:
         """(N + M,) the observations of some of them."""
@@ -128,9 +128,11 @@ def wholes_of(observations: Observations, sights: Sights) -> Iterator[Wholes]:
         yield _wholes(observations, views, np.ones_like(views))
         if np.any(frames):
             yield _wholes(observations, together, frames)
-    placed = {name: len(views) + number for number, name in enumerate(observations.placements)}
-    names = [view.placement for view in observations.views]
-    owner = np.array([number if name is None else placed[name] for number, name in enumerate(names)], dtype=np.int64)
+    placed: dict[str, int] = {}
+    owner = views.copy()
+    for number, view in enumerate(observations.views):
+        if view.placement is not None:
+            owner[number] = len(views) + placed.setdefault(view.placement, len(placed))
     owner[(owner < len(views)) & (frames == 0)] = -1
     if len(np.unique(owner[owner >= 0])) >= FEWEST_VIEWS:
         of = owner[np.concatenate([observations.points.view, observations.curves.view])]

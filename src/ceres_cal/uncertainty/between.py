@@ -71,14 +71,14 @@ def compare_groups(sample: Sample, scatter: Array, whole: Array) -> tuple[Betwee
 
 def _expected(informations: Array, scatter: Array, whole: Array, white: Array) -> tuple[Array, float]:
     """(G, P, P) covariance of each group's score, whitened, and the variance of the sum of their squared lengths."""
-    a, m, w = informations @ white, scatter @ white, white
-    own, spread = [], 0.0
-    for i in range(len(scatter)):
-        row = np.swapaxes(a[i : i + 1], 1, 2) @ (whole @ a - m) - np.swapaxes(m[i : i + 1], 1, 2) @ a
-        row[i] += w @ m[i]
-        own.append(row[i])
-        spread += 2.0 * float(np.sum(row**2))
-    return np.array(own), spread
+    a, m, size = informations @ white, scatter @ white, len(white)
+    left = np.concatenate([a, -m], axis=1)  # Cov(g_i, g_j) is left_i^T right_j for others, and more for i = j
+    right = np.concatenate([whole @ a - m, a], axis=1)
+    cross = np.swapaxes(left, 1, 2) @ right
+    own = cross + white @ m
+    lefts, rights = (np.swapaxes(part, 0, 1).reshape(2 * size, -1) for part in (left, right))
+    pairs = float(np.sum((lefts @ lefts.T) * (rights @ rights.T)))
+    return own, 2.0 * (pairs - float(np.sum(cross**2)) + float(np.sum(own**2)))
 
 
 def _averaged(ratio: float, degrees: float, widened: float) -> tuple[float, float]:

@@ -6,37 +6,24 @@ length, a share, a variance) that hold for all of them.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
-from ceres_cal import kernels
 from ceres_cal.base.arrays import AnyArray, Array, Indices, Mask
-from ceres_cal.model.equations import Equations, equations_of, of_observations
+from ceres_cal.model.equations import Equations, equations_of
 from ceres_cal.model.parameters import Estimate
 from ceres_cal.model.residuals import Residuals
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights
 from ceres_cal.solve import Problem, ReducedInformation
-from ceres_cal.solve.linear_model import Weights, inverse_root, without_shared
+from ceres_cal.solve.linear_model import equation_weights, inverse_root, without_shared
+from ceres_cal.uncertainty.strands import Family, Strand, evenly, strands_of
 
 _MOST_VIEWS = 16  # of a camera
 _MOST_ROWS = 1_500  # of a kind in a view
 _DETERMINED = 1e-11  # eigenvalue, at unit diagonal, from which on a direction counts as determined
-
-
-@dataclass(frozen=True, eq=False)
-class Strand:
-    """Equations whose errors may go together: of one curve, or of one image axis at one target's points.
-
-    Attributes:
-        rows: (N,) of the sample. places: (N, 3) m, where they lie on the target.
-    """
-
-    rows: Indices
-    places: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,29 +55,40 @@ class Sample:
         return int(self.group.max()) + 1
 
     @cached_property
+    def _products(self) -> Array:
+        """(G, P + 1, P + 1) of `shared` and `left` within each group."""
+        order = np.argsort(self.group, kind="stable")
+        columns = self.columns[order, 6:]
+        ends = np.cumsum(np.bincount(self.group))[:-1]
+        return np.array([part.T @ part for part in np.split(columns, ends)])
+
+    @property
     def informations(self) -> Array:
         """(G, P, P) of each group, were errors independent."""
-        parts = (self.shared[self.group == g] for g in range(self.groups))
-        return np.array([part.T @ part for part in parts])
+        return self._products[:, :-1, :-1]
 
-    @cached_property
+    @property
     def scores(self) -> Array:
         """(G, P) derivative of half the squared residuals of each group."""
-        scores = np.zeros((self.groups, self.shared.shape[1]))
-        np.add.at(scores, self.group, self.shared * self.left[:, None])
-        return scores
+        return self._products[:, :-1, -1]
 
     @cached_property
     def is_shared(self) -> bool:
         """Whether some strand goes over several groups."""
         return any(np.any(self.group[strand.rows] != self.group[strand.rows[0]]) for strand in self.lasting)
 
-    def families(self, curves: bool) -> list[list[Strand]]:
+    @cached_property
+    def columns(self) -> Array:
+        """(E, 6 + P + 1) private, shared and left."""
+        return np.column_stack([self.private, self.shared, self.left])
+
+    def families(self, curves: bool) -> list[Family]:
         """The strands of curves or of points, within views and then, where there are others, over all views."""
-        families = (
-            [s for s in strands if self.is_curve[s.rows[0]] == curves] for strands in (self.within, self.lasting)
-        )
-        return [family for family in families if family]
+        families = []
+        for strands, lasting in ((self.within, False), (self.lasting, True)):
+            if own := [strand for strand in strands if self.is_curve[strand.rows[0]] == curves]:
+                families.append(Family.of(own, lasting, self.columns, self.group))
+        return families
 
 
 def take_sample(
@@ -106,7 +104,7 @@ def take_sample(
     if not len(information):
         return None
     equations = equations_of(observations, _some(observations, problem.sights), estimate, there)
-    weights = robust_weights(observations, problem, equations, there)
+    weights = equation_weights(observations, problem.weighting, equations, there).within_sigma
     blank, columns = without_shared(problem, estimate, equations, weights)
     placed = blank.beyond_private(np.column_stack([columns, blank.score]))
     root = inverse_root(information, np.diagonal(information), _DETERMINED)
@@ -119,8 +117,8 @@ def take_sample(
         root.T @ reduced.priors.over(reduced.shared.keys).matrix @ root,
         grouped,
         curves,
-        tuple(_strands(equations, equations.view)),
-        tuple(_strands(equations, equations.sight)) if _lasting(equations) else (),
+        tuple(strands_of(equations, equations.view)),
+        tuple(strands_of(equations, equations.sight)) if _lasting(equations) else (),
     )
 
 
@@ -131,20 +129,16 @@ def _some(observations: Observations, sights: Sights) -> Sights:
     shown[observations.curves.view[sights.curve_rows]] = True
     for camera in sights.cameras:
         own = (views for key, views in zip(sights.keys, sights.views, strict=True) if key.camera == camera)
-        views = [view for views in own for view in views if shown[view]]
-        chosen[np.array(views)[evenly(len(views), _MOST_VIEWS)]] = True
-    sights = sights.take(np.flatnonzero([chosen[list(views)].any() for views in sights.views]))
+        views = np.array([view for views in own for view in views])
+        views = views[shown[views]]
+        chosen[views[evenly(len(views), _MOST_VIEWS)]] = True
+    wanted = set(np.flatnonzero(chosen).tolist())
+    sights = sights.take(np.flatnonzero([not wanted.isdisjoint(views) for views in sights.views]))
     rows = max(np.diff(sights.point_bounds).max(), np.diff(sights.curve_bounds).max())
-    if rows <= _MOST_ROWS and all(chosen[list(views)].all() for views in sights.views):
+    if rows <= _MOST_ROWS and all(wanted.issuperset(views) for views in sights.views):
         return sights
     points, curves = (_some_rows(column.view, chosen) for column in (observations.points, observations.curves))
     return sights.used(points, curves)
-
-
-def evenly(count: int, most: int) -> Indices:
-    """At most so many of `count` numbers, evenly."""
-    taken = min(count, most)
-    return np.asarray((np.arange(taken) * (count - 1)) // max(taken - 1, 1))
 
 
 def _some_rows(view: AnyArray, chosen: Mask) -> Mask:
@@ -155,17 +149,6 @@ def _some_rows(view: AnyArray, chosen: Mask) -> Mask:
         rows[own] = False
         rows[own[evenly(len(own), _MOST_ROWS)]] = True
     return rows
-
-
-def robust_weights(observations: Observations, problem: Problem, equations: Equations, there: Residuals) -> Weights:
-    """Of each equation, the root of its robust weight in its standard deviation."""
-    weighting, at = problem.weighting, equations.observation
-    scale = np.where(equations.is_curve, weighting.curve_scale, weighting.point_scale)
-    sigma = scale * of_observations(at, observations.points.sigma_px, observations.curves.sigma_px)
-    squared = (of_observations(at, *there.lengths) / sigma) ** 2
-    robust = kernels.loss_weights(kernels.Loss(kernels.LOSS_CODES[weighting.loss], weighting.loss_scale), squared)
-    everything = np.ones(len(equations))
-    return Weights(np.sqrt(robust) / sigma, everything > 0.0, everything)
 
 
 def _groups(equations: Equations) -> Indices:
@@ -180,21 +163,3 @@ def _lasting(equations: Equations) -> bool:
     sight_of_view = np.full(int(equations.view.max()) + 1, -1)
     sight_of_view[equations.view] = equations.sight
     return bool(np.max(np.bincount(sight_of_view[sight_of_view >= 0])) > 1)
-
-
-def _strands(equations: Equations, owner: Indices) -> Iterator[Strand]:
-    """The curves, and the image axes of points, of each owner (E,): a view or a sight."""
-    axis = (equations.direction[:, 1] > 0.5).astype(np.int64)
-    what = np.where(equations.is_curve, equations.feature + 2, axis)
-    name = owner * (what.max() + 1) + what
-    order = np.argsort(name, kind="stable")
-    for rows in np.split(order, np.flatnonzero(np.diff(name[order])) + 1):
-        places = equations.place[rows]
-        along = np.argsort(places @ _along(places), kind="stable") if equations.is_curve[rows[0]] else slice(None)
-        yield Strand(rows[along], places[along])
-
-
-def _along(places: Array) -> Array:
-    """(3,) from the first place towards the farthest."""
-    away = places - places[0]
-    return np.asarray(away[np.argmax(np.sum(away**2, axis=1))])
