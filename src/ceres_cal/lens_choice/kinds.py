@@ -27,7 +27,7 @@ from ceres_cal.solve.left_out import GroupNormals, group_normals
 from ceres_cal.solve.linear_model import equation_weights
 from ceres_cal.start.initialise import LensProfile
 
-_LEAST_ROWS, _SHARE = 1_250, 0.025  # of the observations, how many take part
+_LEAST_ROWS, _SHARE, _FEWEST_FRAMES = 1_000, 0.025, 24  # of the observations, how many take part
 _FEWEST_GROUPS = 8  # with fewer nothing tells lenses apart
 # What shows any direction and comes near to any lens but for its decentring: the first solve is with it.
 _WIDEST = "kannala-brandt"
@@ -145,7 +145,7 @@ def compared_kinds(observations: Observations, options: Options, start: Estimate
     """
     kinds = sorted(map(forms_of, LENSES), key=lambda forms: forms[0].lens != _WIDEST)
     total = len(observations.points) + len(observations.curves)
-    few = thinned(observations, max(_LEAST_ROWS, int(_SHARE * total)))
+    few = thinned(observations, max(_LEAST_ROWS, int(_SHARE * total)), _FEWEST_FRAMES)
     sights = gather_sights(few)
     _require_groups(sights)
     names = list(dict.fromkeys(key.placement for key in sights.keys if key.placement is not None))
