@@ -35,7 +35,7 @@ _WIDEST = "kannala-brandt"
 _QUIETER = 0.7
 _MOST_ROUNDS = 8
 _SOUND_PX = 1.0  # noise beyond which a first solve may have ended in a wrong valley: others are tried from nothing
-_PRECISION = 1e-3  # relative change of the cost from which on normal equations say where the least is
+_PRECISION = 1e-2  # relative change of the cost from which on normal equations say where the least is
 _FEWEST_PLACEMENTS = 5  # with fewer the features of each are held out one by one
 
 
