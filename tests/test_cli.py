@@ -403,6 +403,11 @@ def test_warns_of_a_lens_that_does_not_suit(say: Say, tmp_path: Path) -> None:
     assert any("times the stated sigmas" in warning for warning in json.loads(said.out)["warnings"])
 
 
+def test_nothing_is_taken_for_usual_where_that_is_asked_for(say: Say) -> None:
+    given = [json.loads(say("calibrate", SAMPLE, *more, "--json").out) for more in ((), ("--no-usual-camera",))]
+    assert [one["calibration"]["options"]["usual_camera"] for one in given] == [True, False]
+
+
 def test_says_what_boards_alone_cannot_tell(say: Say, tmp_path: Path) -> None:
     say("simulate", "boards", "-o", tmp_path)
     said = say("calibrate", tmp_path / "observations.json", "--lens", "radial", "--fix", "a3=6.1e-7", "--free-aspect")
