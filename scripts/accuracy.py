@@ -226,14 +226,14 @@ def as_built_case(runs: int) -> Iterator[Row]:
 
 def _offsets_from_six_stations(seed: int) -> Array:
     painted = painted_by_six_stations(seed)
-    calibration = calibrate(painted.observations, Options(tolerances=TOLERANCES))
+    calibration = calibrate(painted.observations, Options(lens="radial", tolerances=TOLERANCES))
     return offset_errors_mm(calibration, painted.offsets_m, painted.observations.targets["field"])
 
 
 def floor_errors_of_two_cameras(seed: int, heights_known: bool) -> list[float]:
     """Mean field error (mm) with the nominal field and with tolerances, over what each camera sees of the floor."""
     painted, means = painted_by_two_cameras(seed, heights_known), []
-    for options in (Options(), Options(tolerances=TOLERANCES)):
+    for options in (Options(lens="radial"), Options(lens="radial", tolerances=TOLERANCES)):
         stations = calibrate(painted.observations, options).stations
         errors = [
             map_errors_mm(painted.scene.camera_at(name), camera, field_places(), 0.0)

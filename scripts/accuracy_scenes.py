@@ -71,7 +71,7 @@ def over_the_field() -> Problem:
     """One camera over a division B field: its points, lines and circle; the height is known to 10 mm."""
     pose = overhead_pose(-0.3, 0.2, 5.2, tilt_x_deg=1.8, tilt_y_deg=-2.4, yaw_deg=1.6)
     scene = field_scene(FIELD, {"overhead": _camera()}, {"overhead": Station("overhead", pose)}, spacing_m=_SPACING_M)
-    return Problem(scene, Options(), (_height(scene, "overhead", 0.010),))
+    return Problem(scene, Options(lens="radial"), (_height(scene, "overhead", 0.010),))
 
 
 def two_cameras() -> Problem:
@@ -85,7 +85,7 @@ def two_cameras() -> Problem:
     field = field_scene(FIELD, cameras, stations, spacing_m=_SPACING_M)
     board = checkerboard(9, 6, 0.1)
     both = board_scene(board, cameras, stations, count=6, seed=2, held=Held((3.0, 5.0), (20.0, 50.0)))
-    return Problem(join(field, both), Options())
+    return Problem(join(field, both), Options(lens="radial"))
 
 
 PROBLEMS: dict[str, Callable[[], Problem]] = {
@@ -109,7 +109,7 @@ def tilted(tilt_deg: float, height_sigma_m: float | None = None, boards: int = 0
         shown = board_scene(checkerboard(9, 6, 0.1), cameras, stations, boards, seed=5, held=Held((1.0, 2.0)))
         scene = join(scene, shown)
     priors = () if height_sigma_m is None else (_height(scene, "overhead", height_sigma_m),)
-    return Problem(scene, Options(), priors)
+    return Problem(scene, Options(lens="radial"), priors)
 
 
 # ---- mirrored poses -------------------------------------------------------------------------------------------------

@@ -42,7 +42,7 @@ def half_field(tilt_deg: float) -> Problem:
     pose = overhead_pose(-2.3, 0.1, 4.0, tilt_x_deg=0.6 * tilt_deg, tilt_y_deg=-0.8 * tilt_deg, yaw_deg=91.0)
     narrow = {"overhead": replace(cameras["overhead"], phi=868.0)}
     stations = {"overhead": Station("overhead", pose)}
-    return Problem(field_scene(FIELD, narrow, stations, frames=2, points=(), spacing_m=0.2), Options())
+    return Problem(field_scene(FIELD, narrow, stations, frames=2, points=(), spacing_m=0.2), Options(lens="radial"))
 
 
 CASES: Mapping[str, Callable[[], Problem]] = {

@@ -201,15 +201,16 @@ def corners_memory(frames: int, repeat: int) -> float:
 def field_growth(line_points: int, repeat: int) -> dict[str, Any]:
     """Seconds of calibrate (median) and the memory that the process holds at most meanwhile, observations included."""
     from ceres_cal.calibrating import calibrate
+    from ceres_cal.model.parameters import Options
 
-    calibrate(field_observations(WARM_UP_LINE_POINTS))
+    calibrate(field_observations(WARM_UP_LINE_POINTS), Options(lens="radial"))
     observations = field_observations(line_points)
     reset_peak()
     seconds = []
     for _ in range(repeat):
         fresh = replace(observations)  # forgets what was derived from it
         start = time.perf_counter()
-        calibration = calibrate(fresh)
+        calibration = calibrate(fresh, Options(lens="radial"))
         seconds.append(time.perf_counter() - start)
     return {
         "size": line_points,

@@ -28,6 +28,7 @@ from ceres_cal.simulate import (
     simulate,
 )
 
+RADIAL = Options(lens="radial")
 NOISE = Disturbance(points_sigma_px=0.3, curves_sigma_px=0.3)
 OUTLIERS = replace(NOISE, outliers=0.1, hidden_stretches=4, hidden_points=0.1)
 USUAL: Lens = Radial((-5.2e-5, 6.1e-7), (2, 3))
@@ -65,7 +66,7 @@ def _plain(scene: Callable[[], Scene], disturbance: Disturbance = NOISE, **optio
     def observe(seed: int) -> Observations:
         return simulate(scene(), disturbance, seed).observations
 
-    return Problem(observe, Options(**options))  # type: ignore[arg-type]
+    return Problem(observe, Options(**{"lens": "radial", **options}))  # type: ignore[arg-type]
 
 
 def _with_prior(seed: int) -> Observations:
@@ -79,7 +80,7 @@ CLEAN: dict[str, Problem] = {
     "field and boards, 10 % outliers": _plain(overhead, OUTLIERS),
     "field alone": _plain(lambda: overhead(boards=0)),
     "field alone, one frame": _plain(lambda: overhead(boards=0, frames=1)),
-    "field, height measured": Problem(_with_prior, Options()),
+    "field, height measured": Problem(_with_prior, RADIAL),
     "field, lines solved for": _plain(
         lambda: overhead(boards=0, frames=4), tolerances={"field": Tolerance(lines_m=0.01)}
     ),
@@ -225,15 +226,19 @@ def bump(seed: int) -> Observations:
 
 FAULTS: dict[str, tuple[Problem, str, str]] = {
     "polynomial too short (r^2)": (Problem(short_polynomial, Options(powers=(3,))), "radius", "overhead"),
-    "polynomial too short (r^5)": (Problem(longer_polynomial, Options()), "radius", "overhead"),
-    "line 12 mm aside": (Problem(line_aside, Options()), "curve aside", "field/LeftPenaltyStretch"),
-    "one mislabelled corner": (Problem(wrong_label, Options()), "wrong label", "field/LeftFieldRightPenaltyCorner"),
-    "bumped by 0.05 degrees after frame 5": (Problem(bumped, Options()), "moved after", "overhead"),
-    "noise of points twice what was stated": (Problem(noisier, Options()), "noise", "points"),
-    "pixels lean by 4 mrad": (Problem(skewed, Options()), "skew", "overhead"),
-    "tangential displacement of 1 px": (Problem(decentred, Options()), "decentring", "overhead"),
-    "floor bowed by 15 mm": (Problem(bowed_floor, Options()), "floor bowed", "field"),
-    "bump of 20 mm": (Problem(bump, Options()), "floor uneven", "field at x -2.0, y 3.0 m"),
-    "neighbours along lines agree": (Problem(agreeing, Options()), "correlated", "curves"),
+    "polynomial too short (r^5)": (Problem(longer_polynomial, RADIAL), "radius", "overhead"),
+    "line 12 mm aside": (Problem(line_aside, RADIAL), "curve aside", "field/LeftPenaltyStretch"),
+    "one mislabelled corner": (
+        Problem(wrong_label, RADIAL),
+        "wrong label",
+        "field/LeftFieldRightPenaltyCorner",
+    ),
+    "bumped by 0.05 degrees after frame 5": (Problem(bumped, RADIAL), "moved after", "overhead"),
+    "noise of points twice what was stated": (Problem(noisier, RADIAL), "noise", "points"),
+    "pixels lean by 4 mrad": (Problem(skewed, RADIAL), "skew", "overhead"),
+    "tangential displacement of 1 px": (Problem(decentred, RADIAL), "decentring", "overhead"),
+    "floor bowed by 15 mm": (Problem(bowed_floor, RADIAL), "floor bowed", "field"),
+    "bump of 20 mm": (Problem(bump, RADIAL), "floor uneven", "field at x -2.0, y 3.0 m"),
+    "neighbours along lines agree": (Problem(agreeing, RADIAL), "correlated", "curves"),
 }
 """Name -> problem, and kind and subject of the one finding it must give."""

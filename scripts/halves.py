@@ -69,7 +69,7 @@ def _ov_plane() -> Observations:
     return Observations(board_target, sizes, views, points, _NO_CURVES)
 
 
-_ORDINARY = Options()
+_ORDINARY = Options(lens="radial")
 _WIDE = Options(lens="kannala-brandt", free_aspect=True)
 SETS: Mapping[str, RealSet] = {
     "opencv left": RealSet(partial(_photographed, "opencv_left_right/left*.jpg", 9, 6, 0.025), _ORDINARY),

@@ -30,7 +30,7 @@ from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
 from ceres_cal.detect.boards import detect_boards
 from ceres_cal.model.keys import Key
-from ceres_cal.model.parameters import Estimate
+from ceres_cal.model.parameters import Estimate, Options
 from ceres_cal.model.quantities import difference
 from ceres_cal.model.structure import make_structure
 from ceres_cal.moves import refit
@@ -69,7 +69,7 @@ def calibrated(seed: int, disturbance: Disturbance = NOISE, boards: int = 12) ->
     stations = {"overhead": Station("overhead", HOME)}
     scene = field_scene(FIELD, {"overhead": CAMERA}, stations, spacing_m=0.15)
     shown = board_scene(checkerboard(9, 6, 0.1), {"overhead": CAMERA}, stations, boards, seed=1)
-    return calibrate(simulate(join(scene, shown), disturbance, seed).observations)
+    return calibrate(simulate(join(scene, shown), disturbance, seed).observations, Options(lens="radial"))
 
 
 def seen(
@@ -222,7 +222,7 @@ def clean(simulation: Simulation) -> Observations:
 def _from_scratch(observations: Observations, seed: int) -> Calibration | None:
     """From 200 line points (or as many as there are), nothing known of phi or height."""
     try:
-        return calibrate(thinned(observations, (), 200, seed))
+        return calibrate(thinned(observations, (), 200, seed), Options(lens="radial"))
     except CalibrationError:
         return None
 
@@ -266,7 +266,7 @@ def _from_photographs(folder: Path, seed: int) -> Calibration:
     shown = [_saved(folder, boards, frame, 100 * seed + i) for i, (_, frame) in enumerate(frames(boards))]
     fields = [_field_photograph(folder, HOME, 10_000 + 100 * seed + i) for i in range(FIELD_SHOTS)]
     lines = detect_field(fields, FIELD, CAMERA.at(HOME), options=FieldOptions("overhead")).observations
-    return calibrate(combine([lines, detect_boards(shown, BOARD, "overhead").observations]))
+    return calibrate(combine([lines, detect_boards(shown, BOARD, "overhead").observations]), Options(lens="radial"))
 
 
 def _field_photograph(folder: Path, pose: Pose, seed: int) -> Path:

@@ -37,7 +37,7 @@ LENSES: tuple[tuple[float, Lens], ...] = (
     (700.0, Radial((0.0, 0.0), (2, 3))),
     (760.0, KannalaBrandt((-0.012, 0.004, -0.003, 0.0006))),
 )
-OPTIONS = {"brown": Options(lens="brown"), "kannala-brandt": Options(lens="kannala-brandt"), "radial": Options()}
+OPTIONS = {kind: Options(lens=kind) for kind in ("brown", "kannala-brandt", "radial")}
 CORNERS = ("TopLeftCorner", "BottomLeftCorner", "TopHalfwayCrossing", "BottomHalfwayCrossing")
 OFF_PX, OFF_DEG, CLICK_PX = 100.0, 5.0, 8.0
 NEAR_PX = 1.5
@@ -322,7 +322,7 @@ def real_rows(folder: Path, picture: Path | None) -> Iterator[Row]:
     for number in np.unique(lines.course.curve):
         share = float(np.mean(lines.found[lines.course.curve == number]))
         yield Row("real photograph", f"share of {names[number]} followed", share, least=0.3)
-    options = Options(tolerances={"field": Tolerance(lines_m=0.03, points_m=0.03)})
+    options = Options(lens="radial", tolerances={"field": Tolerance(lines_m=0.03, points_m=0.03)})
     calibration = calibrate(found.observations, options)
     yield Row("real photograph", "rms of line residuals, px", calibration.fit.curves_rms_px, most=0.7)
     taken_out = sum(entry.kind == "curve" for entry in calibration.rejected)

@@ -7,6 +7,7 @@ from dataclasses import replace
 from functools import partial
 
 from ceres_cal.base.transforms import Pose
+from ceres_cal.model.parameters import Options
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Brown, KannalaBrandt, Lens, Radial, Spline
 from ceres_cal.scene.targets import Segment, Target, checkerboard, custom, rings, ssl_field
@@ -41,6 +42,9 @@ _MORE: dict[str, tuple[float, Lens, float]] = {
 }
 EVERY_LENS = (*_LENSES, *_MORE)
 """Also with terms that a lens has only where they are asked for."""
+
+RADIAL = Options(lens="radial")
+"""The paper's lens, of tests that do not ask which lens it is."""
 
 _SPACING_M = 0.2
 _LINES = tuple(name for name in ssl_field("B").curve_names if name != "CenterCircle")

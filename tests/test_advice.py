@@ -18,6 +18,7 @@ from accuracy_bound import make_trial
 from accuracy_scenes import CLEAN_NOISE, FIELD, tilted, two_cameras
 from accuracy_scenes import Problem as Case
 from advice import CASES, Kept, followed, promised_for
+from scenes import RADIAL
 
 from ceres_cal.advice import Advice, Errors, Measurement, Promise, advise, promised
 from ceres_cal.advice.measurements import Ground, _observed, together
@@ -327,7 +328,7 @@ def test_advice_needs_a_field_a_station_and_an_uncertainty() -> None:
     alone = board_scene(checkerboard(9, 6, 0.1), scene.cameras, scene.stations, count=8, seed=1)
     seen = simulate(alone, Disturbance(points_sigma_px=0.3), 1).observations
     with pytest.raises(InputError, match="advice is about a map of a field, and there is none"):
-        advise(calibrate(seen, Options()))
+        advise(calibrate(seen, RADIAL))
 
 
 # ---- the command ----------------------------------------------------------------------------------------------------

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scenes import SCENES
+from scenes import RADIAL, SCENES
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import DegenerateError
@@ -28,7 +28,7 @@ def test_exact_with_the_lens_given() -> None:
     scene = SCENES["radial-2-3/corners"]()
     (camera,) = scene.cameras.values()
     fixed = {"phi": camera.phi, "cx": camera.principal_point[0], "cy": camera.principal_point[1]}
-    options = Options(fixed={**fixed, **camera.lens.coefficients}, closed_form_only=True)
+    options = Options(lens="radial", fixed={**fixed, **camera.lens.coefficients}, closed_form_only=True)
     calibration = calibrate(simulate(scene).observations, options)
     assert calibration.station().position == pytest.approx(scene.camera_at("overhead").position, abs=1e-9)
     assert calibration.rounds == 0 and not calibration.converged
@@ -39,9 +39,11 @@ def test_bundle_beats_it_on_the_papers_own_camera() -> None:
     scene, _ = built_in_scene("field-2004")
     truth = scene.camera_at("overhead")
     pixels = truth.project(places())
-    baseline = calibrate(observations, Options(fixed={"phi": truth.phi}, closed_form_only=True)).station()
+    baseline = calibrate(
+        observations, Options(lens="radial", fixed={"phi": truth.phi}, closed_form_only=True)
+    ).station()
     height = Prior("station", "overhead", "height_m", (2.5,), (0.005,))
-    bundle = calibrate(observations, Options(priors=(height,))).station()
+    bundle = calibrate(observations, Options(lens="radial", priors=(height,))).station()
     errors_mm = [
         1e3 * float(np.mean(np.linalg.norm(camera.locate(pixels) - places()[:, :2], axis=1)))
         for camera in (baseline, bundle)
@@ -53,4 +55,4 @@ def test_bundle_beats_it_on_the_papers_own_camera() -> None:
 def test_needs_four_points_of_the_floor() -> None:
     observations = simulate(SCENES["radial-2-3/lines"]()).observations
     with pytest.raises(DegenerateError, match="needs four points of the floor, not 0"):
-        calibrate(observations, replace(Options(), closed_form_only=True))
+        calibrate(observations, replace(RADIAL, closed_form_only=True))

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scenes import SCENES
+from scenes import RADIAL, SCENES
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
@@ -52,7 +52,7 @@ def test_another_image_size_is_refused(tmp_path: Path, size: tuple[int, int], ch
     """With the cause, and view, feature and pixel of the first; from a file with its name, too."""
     wrong = replace(with_pixels(change), cameras={"overhead": size})
     with pytest.raises(InputError) as refused:
-        calibrate(wrong)
+        calibrate(wrong, RADIAL)
     text = str(refused.value)
     assert text.startswith("camera 'overhead': ") and "\n" not in text and words in text
     assert "view 0 (frame '0001'), curve 'TopTouchLine': pixel (" in text
@@ -71,7 +71,7 @@ def test_more_than_one_in_a_hundred_are_refused(rows: int, refused: bool) -> Non
         with pytest.raises(InputError, match=r"^camera 'overhead': 3 of 223 observations lie outside its image: "):
             wrong.require_inside()
         return
-    calibration = calibrate(wrong)
+    calibration = calibrate(wrong, RADIAL)
     assert calibration.warnings[0] == (
         "camera 'overhead': 2 of 223 observations lie outside its image of 1280 x 960 px, the first is "
         "view 0 (frame '0001'), curve 'TopTouchLine': pixel (1300.0, 200.0): correct or remove what lies outside"

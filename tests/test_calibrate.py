@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scenes import SCENES
+from scenes import RADIAL, SCENES
 from scipy.optimize import least_squares
 
 from ceres_cal.base.arrays import Array, Indices
@@ -474,7 +474,9 @@ def test_a_prior_may_come_with_the_observations() -> None:
     by_option = calibrate(simulation.observations, options_for(simulation.scene, priors=(prior,), **PLAIN))
     along = calibrate(replace(simulation.observations, priors=(prior,)), options_for(simulation.scene, **PLAIN))
     assert along.station() == by_option.station()
-    assert along.station().position[2] != pytest.approx(calibrate(simulation.observations).station().position[2])
+    assert along.station().position[2] != pytest.approx(
+        calibrate(simulation.observations, RADIAL).station().position[2]
+    )
 
 
 def test_a_height_prior_cures_the_view_from_straight_above() -> None:
@@ -483,11 +485,11 @@ def test_a_height_prior_cures_the_view_from_straight_above() -> None:
     stations = {"up": Station("camera", overhead_pose(0.1, -0.2, 5.0))}
     scene = field_scene(ssl_field("B"), {"camera": Camera((1280, 960), 868.0, (650.0, 470.0), lens)}, stations)
     observations = simulate(scene, NOISE, 2).observations
-    free = calibrate(observations)
+    free = calibrate(observations, RADIAL)
     assert free.phi_from == {"camera": "guess"}
     assert any("frontal" in line and "height" in line for line in free.warnings)
     prior = Prior("station", "up", "height_m", (5.0,), (0.005,))
-    held = calibrate(observations, Options(priors=(prior,)))
+    held = calibrate(observations, Options(lens="radial", priors=(prior,)))
     assert held.phi_from == {"camera": "prior"}
     assert held.warnings == ()
     assert held.station().position[2] == pytest.approx(5.0, abs=0.015)
@@ -502,7 +504,7 @@ def test_priors_and_fixed_numbers_that_do_not_fit_are_refused() -> None:
         (Prior("camera", "overhead", "k1", (0.0,), (1.0,)), "no 'k1', only phi, aspect, cx, cy, a2, a3"),
     ):
         with pytest.raises(InputError, match=message):
-            calibrate(observations, Options(priors=(prior,)))
+            calibrate(observations, Options(lens="radial", priors=(prior,)))
 
 
 # ---- what is held ---------------------------------------------------------------------------------------------------
@@ -612,13 +614,13 @@ def fourth_board_with(*rows: int) -> Observations:
 )
 def test_observations_that_cannot_tell(observations: Callable[[], Observations], message: str) -> None:
     with pytest.raises(DegenerateError, match=message) as caught:
-        calibrate(observations())
+        calibrate(observations(), RADIAL)
     assert "\n" not in str(caught.value)
 
 
 def test_one_board_is_enough_for_a_pose_but_not_many() -> None:
     """Four corners of one board among others with 54 are used."""
-    calibration = calibrate(fourth_board_with(0, 8, 45, 53))
+    calibration = calibrate(fourth_board_with(0, 8, 45, 53), RADIAL)
     assert calibration.fit.points == 7 * 54 + 4
     assert calibration.cameras["camera"].phi == pytest.approx(868.0, rel=0.01)
 
@@ -643,7 +645,7 @@ def test_pixels_that_mean_nothing_give_no_camera(pixels: str) -> None:
     rng, shape = np.random.default_rng(0), observations.points.pixels.shape
     values = np.full(shape, 300.0) if pixels == "one place" else rng.uniform(0.0, 900.0, shape)
     with pytest.raises((SolutionError, DegenerateError)):
-        calibrate(replace(observations, points=replace(observations.points, pixels=values)))
+        calibrate(replace(observations, points=replace(observations.points, pixels=values)), RADIAL)
 
 
 def test_a_lens_that_folds_inside_the_image_is_no_solution() -> None:
@@ -654,7 +656,7 @@ def test_a_lens_that_folds_inside_the_image_is_no_solution() -> None:
     with pytest.raises(
         SolutionError, match=r"camera 'camera'.*radial lens folds 7\d\d px.*corner at 801 px.*fewer"
     ) as caught:
-        calibrate(simulate(scene, NOISE).observations)
+        calibrate(simulate(scene, NOISE).observations, RADIAL)
     assert caught.value.exit_code == 3
 
 
@@ -734,7 +736,7 @@ def floor_error_m(camera: Camera, truth: Camera, height_m: float) -> float:
 def test_the_papers_camera_comes_back_from_rings_and_field() -> None:
     """data/field_2004 in the paper's own scaling; the standard deviations are those of 30 seeds of the same scenes."""
     parts = [Observations.load(ROOT / f"data/field_2004/{name}.json") for name in ("rings", "field")]
-    calibration = calibrate(combine(parts))
+    calibration = calibrate(combine(parts), RADIAL)
     camera, scene = calibration.station(), built_in_scene("field-2004")[0]
     lens = camera.lens
     assert isinstance(lens, Radial)
@@ -754,7 +756,7 @@ def test_the_papers_camera_comes_back_from_rings_and_field() -> None:
 def test_the_sample_field_comes_back() -> None:
     """data/ssl_field: one camera over half a field with 5 % wrong observations, and boards."""
     scene, _ = built_in_scene("ssl-field")
-    calibration = calibrate(Observations.load(ROOT / "data/ssl_field/observations.json"))
+    calibration = calibrate(Observations.load(ROOT / "data/ssl_field/observations.json"), RADIAL)
     camera, truth = calibration.station(), scene.camera_at("overhead")
     assert camera.phi == pytest.approx(truth.phi, rel=0.005)  # 0.0011 measured
     assert np.linalg.norm(camera.position - truth.position) < 0.01  # 2.5 mm measured

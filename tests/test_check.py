@@ -95,7 +95,7 @@ def test_what_is_not_understood_does_not_hold(calibration: Calibration) -> None:
 def test_each_station_by_itself() -> None:
     cameras, stations = side_by_side(CAMERA)
     scene = field_scene(FIELD, cameras, stations, spacing_m=0.2)
-    options = Options(tolerances={"field": Tolerance(lines_m=0.003)})
+    options = Options(lens="radial", tolerances={"field": Tolerance(lines_m=0.003)})
     both = calibrate(simulate(scene, NOISE, 0).observations, options)
     pose = stations["right"].cam_from_world
     moved = Station("right", Pose.looking(pose.position, rotation_exp((0.003, 0.0, 0.0)) @ pose.rotation))

@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 from accuracy_bound import make_trial
 from accuracy_scenes import CLEAN_NOISE, tilted
+from scenes import RADIAL
 
 import ceres_cal.calibrating
 from ceres_cal.base.errors import InputError
@@ -373,7 +374,7 @@ def test_calibrate_as_json_is_the_file_and_more(say: Say, tmp_path: Path) -> Non
     assert 0.1 < floor["mean_sd_mm"] < robots["mean_sd_mm"] < robots["worst_sd_mm"] < 1.0
     assert known["weak_directions"] == [] and known["unknown_placements"] == {} and known["seams"] == []
     # Nothing given on the command line is what nothing given in Python is.
-    assert data["calibration"]["options"] == _plain(Options())
+    assert data["calibration"]["options"] == _plain(RADIAL)
 
 
 def test_options_arrive(say: Say) -> None:
@@ -510,13 +511,18 @@ def test_a_baseline_says_nothing_of_its_uncertainty(say: Say) -> None:
 
 def test_warns_of_a_lens_that_does_not_suit(say: Say, tmp_path: Path) -> None:
     say("simulate", "fisheye", "-o", tmp_path)
-    said = say("calibrate", tmp_path / "observations.json", "--json")
+    said = say("calibrate", tmp_path / "observations.json", "--lens", "radial", "--json")
     assert any("times the stated sigmas" in warning for warning in json.loads(said.out)["warnings"])
+
+
+def test_nothing_is_taken_for_usual_where_that_is_asked_for(say: Say) -> None:
+    given = [json.loads(say("calibrate", SAMPLE, *more, "--json").out) for more in ((), ("--no-usual-camera",))]
+    assert [one["calibration"]["options"]["usual_camera"] for one in given] == [True, False]
 
 
 def test_says_what_boards_alone_cannot_tell(say: Say, tmp_path: Path) -> None:
     say("simulate", "boards", "-o", tmp_path)
-    said = say("calibrate", tmp_path / "observations.json", "--fix", "a3=6.1e-7", "--free-aspect")
+    said = say("calibrate", tmp_path / "observations.json", "--lens", "radial", "--fix", "a3=6.1e-7", "--free-aspect")
     assert "held as the world" in said.out and "height" not in said.out
     assert "a3              6.1e-07 (held)" in said.out and "aspect          1.000" in said.out
 

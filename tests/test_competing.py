@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from diagnostic_scenes import held_boards
-from scenes import boards, lines_and_arcs
+from scenes import RADIAL, boards, lines_and_arcs
 
 from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.transforms import Pose
@@ -77,11 +77,11 @@ def error_sd(calibration: Calibration, scene: Scene) -> Array:
 def test_line_aside_in_the_only_frame_is_named_and_taken_out(line: str, aside_px: float) -> None:
     sound = simulate(half_field(), NOISE, 1).observations
     observations = moved_aside(sound, line, aside_px)
-    calibration = calibrate(observations)
+    calibration = calibrate(observations, RADIAL)
     assert wholes(calibration) == {f"the whole of line {line!r} in frame '0001'"}
     assert not np.any(calibration.inlier_masks(observations)[1][rows_of(observations, line)])
     assert len(calibration.rejected) == np.count_nonzero(rows_of(observations, line))
-    without = calibrate(sound.part(np.ones(len(sound.points), bool), ~rows_of(sound, line)))
+    without = calibrate(sound.part(np.ones(len(sound.points), bool), ~rows_of(sound, line)), RADIAL)
     phi, reference = (one.cameras["overhead"].phi for one in (calibration, without))
     assert phi == pytest.approx(reference, rel=1e-5)  # 1e-7 measured: it is the calibration without the line
     assert np.max(np.abs(error_sd(calibration, half_field()))) < 5.0  # 2.9 measured
@@ -90,7 +90,7 @@ def test_line_aside_in_the_only_frame_is_named_and_taken_out(line: str, aside_px
 @pytest.mark.parametrize("line", LINES)
 def test_line_a_little_aside_is_taken_out_or_named_in_doubt(line: str) -> None:
     """1.2 px: four times the noise of one observation; standard deviations then hold for either explanation."""
-    calibration = calibrate(moved_aside(simulate(half_field(), NOISE, 2).observations, line, 1.2))
+    calibration = calibrate(moved_aside(simulate(half_field(), NOISE, 2).observations, line, 1.2), RADIAL)
     about = [warning for warning in calibration.warnings if f"line {line!r} in frame '0001'" in warning]
     assert len(about) == 1
     assert np.max(np.abs(error_sd(calibration, half_field()))) < 5.0  # 3.2 measured
@@ -99,12 +99,12 @@ def test_line_a_little_aside_is_taken_out_or_named_in_doubt(line: str) -> None:
 @pytest.mark.parametrize("aside_px", [1.2, 6.0, 40.0])
 def test_line_aside_in_all_frames_is_one_whole(aside_px: float) -> None:
     observations = moved_aside(simulate(half_field(4), NOISE, 3).observations, "HalfwayLine", aside_px)
-    assert wholes(calibrate(observations)) == {"the whole of line 'HalfwayLine' in all 4 frames"}
+    assert wholes(calibrate(observations, RADIAL)) == {"the whole of line 'HalfwayLine' in all 4 frames"}
 
 
 def test_line_aside_in_one_of_four_frames_leaves_the_others_in() -> None:
     observations = moved_aside(simulate(half_field(4), NOISE, 4).observations, "BottomTouchLine", 3.0, "0002")
-    calibration = calibrate(observations)
+    calibration = calibrate(observations, RADIAL)
     assert wholes(calibration) == {"the whole of line 'BottomTouchLine' in frame '0002'"}
     assert len(calibration.rejected) == np.count_nonzero(rows_of(observations, "BottomTouchLine", "0002"))
 
@@ -114,7 +114,7 @@ def test_two_lines_aside_do_not_hide_each_other(pair: tuple[str, str]) -> None:
     observations = simulate(half_field(), NOISE, 28).observations
     for line, aside_px in zip(pair, (6.0, -6.0), strict=True):
         observations = moved_aside(observations, line, aside_px)
-    assert wholes(calibrate(observations)) == {f"the whole of line {line!r} in frame '0001'" for line in pair}
+    assert wholes(calibrate(observations, RADIAL)) == {f"the whole of line {line!r} in frame '0001'" for line in pair}
 
 
 # ---- frames and placements ------------------------------------------------------------------------------------------
@@ -128,7 +128,7 @@ def test_frame_of_a_camera_that_was_elsewhere_is_taken_out() -> None:
     stations = {**scene.stations, "turned": Station("overhead", turned)}
     seen = simulate(replace(scene, stations=stations, views=plans), NOISE, 5).observations
     seen = replace(seen, views=tuple(replace(view, station="overhead") for view in seen.views))
-    assert wholes(calibrate(seen)) == {"the whole of frame '0005'"}
+    assert wholes(calibrate(seen, RADIAL)) == {"the whole of frame '0005'"}
 
 
 def test_board_that_is_not_its_drawing_is_taken_out() -> None:
@@ -143,7 +143,7 @@ def test_board_that_is_not_its_drawing_is_taken_out() -> None:
     seen = scene.camera_at(view.station).project(scene.placements[view.placement].transform(places))
     pixels[own] = seen + 0.3 * np.random.default_rng(6).standard_normal(seen.shape)
     observations = replace(observations, points=replace(observations.points, pixels=pixels))
-    calibration = calibrate(observations)
+    calibration = calibrate(observations, RADIAL)
     assert wholes(calibration) == {f"the whole of placement {view.placement!r}"}
     assert len(calibration.rejected) == np.count_nonzero(own)
     assert np.max(np.abs(error_sd(calibration, scene))) < 4.0  # 1.9 measured; 5.3 with the board in
@@ -156,7 +156,7 @@ def test_board_that_is_not_its_drawing_is_taken_out() -> None:
 @pytest.mark.parametrize("make", [half_field, lambda: lines_and_arcs("radial-2-3"), lambda: boards("brown")])
 def test_sound_scenes_lose_nothing(make: object, seed: int) -> None:
     """0 of 200 in one frame of half a field, and none in doubt."""
-    calibration = calibrate(simulate(make(), NOISE, seed).observations)  # type: ignore[operator]
+    calibration = calibrate(simulate(make(), NOISE, seed).observations, RADIAL)  # type: ignore[operator]
     assert not wholes(calibration)
     assert not any("belongs" in warning for warning in calibration.warnings)
 
@@ -174,13 +174,13 @@ def test_errors_that_agree_along_lines_take_no_line_out(length_m: float) -> None
         observations = simulate(half_field(), replace(NOISE, curves_sigma_px=0.0), seed).observations
         pixels = np.clip(truth.pixels + 0.3 * noise, 0.0, (1279.0, 959.0))
         curves = replace(observations.curves, pixels=pixels, sigma_px=np.full(len(noise), 0.3))
-        assert not wholes(calibrate(replace(observations, curves=curves)))
+        assert not wholes(calibrate(replace(observations, curves=curves), RADIAL))
 
 
 def test_outliers_that_lie_here_and_there_are_taken_out_one_by_one() -> None:
     gross = replace(NOISE, outliers=0.3)
     for seed in range(3):
-        assert not wholes(calibrate(simulate(half_field(), gross, seed).observations))
+        assert not wholes(calibrate(simulate(half_field(), gross, seed).observations, RADIAL))
 
 
 # ---- words, files and numbers ---------------------------------------------------------------------------------------
@@ -188,7 +188,7 @@ def test_outliers_that_lie_here_and_there_are_taken_out_one_by_one() -> None:
 
 def test_rejected_warning_and_screen_say_which_and_how_far(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     observations = moved_aside(simulate(half_field(), NOISE, 7).observations, "CenterLine", 6.0)
-    calibration = calibrate(observations)
+    calibration = calibrate(observations, RADIAL)
     reason = "the whole of line 'CenterLine' in frame '0001': 25 rows, "
     assert {one.reason[: len(reason)] for one in calibration.rejected} == {reason}
     aside_px = float(calibration.rejected[0].reason.removeprefix(reason).removesuffix(" px aside"))
@@ -210,7 +210,7 @@ def test_a_suspect_without_which_nothing_is_determined_stays_in() -> None:
     for line in ("TopTouchLine", "HalfwayLine"):
         kept |= rows_of(seen, line)
     few = seen.part(np.ones(len(seen.points), bool), kept)
-    assert not wholes(calibrate(moved_aside(few, "HalfwayLine", 0.3)))
+    assert not wholes(calibrate(moved_aside(few, "HalfwayLine", 0.3), RADIAL))
 
 
 def test_covariance_is_widened_by_what_is_in_doubt() -> None:
@@ -251,7 +251,7 @@ def test_solving_without_a_line_needs_the_placements_that_are_left() -> None:
     """The problem of some observations frees no placement that nothing shows."""
     scene = boards("radial-3")
     observations = simulate(scene, NOISE, 0).observations
-    calibration = calibrate(observations)
+    calibration = calibrate(observations, RADIAL)
     problem: Problem = calibration.problem(observations)
     kept = observations.points.view != 0
     others = problem.used(kept, np.zeros(0, dtype=bool))

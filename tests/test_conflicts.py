@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scenes import SCENES, camera
+from scenes import RADIAL, SCENES, camera
 
 from ceres_cal.base.errors import SolutionError
 from ceres_cal.calibrating import calibrate
@@ -49,7 +49,7 @@ def height(value: float, sigma: float) -> Prior:
 
 
 def under(*priors: Prior, fixed: Mapping[str, float] | None = None, **options: bool) -> Options:
-    return Options(priors=priors, fixed=fixed or {}, **options)  # type: ignore[arg-type]
+    return Options(**{"lens": "radial", "priors": priors, "fixed": fixed or {}, **options})  # type: ignore[arg-type]
 
 
 @cache
@@ -66,7 +66,7 @@ def verdict(calibration: Calibration, observations: Observations) -> Judgement:
 
 def test_a_wrong_height_is_named_with_both_values() -> None:
     (conflict,) = wrong().conflicts
-    free = calibrate(seen())
+    free = calibrate(seen(), RADIAL)
     assert (conflict.kind, conflict.owner, conflict.quantity, conflict.unit) == ("prior", "overhead", "height", "m")
     assert conflict.stated == 3.0 and conflict.stated_sd == pytest.approx(0.005)
     # What is said of the observations is what they say by themselves, at their own noise: solved, not extrapolated.
@@ -182,7 +182,7 @@ def askew(*lines: str) -> Observations:
 def test_a_tolerance_that_is_too_tight() -> None:
     """The calibration keeps its word, since lines under a tolerance are solved for."""
     observed = askew("HalfwayLine", "CenterLine", "LeftPenaltyStretch")
-    calibration = calibrate(observed, Options(tolerances={"field": Tolerance(lines_m=0.002)}))
+    calibration = calibrate(observed, Options(lens="radial", tolerances={"field": Tolerance(lines_m=0.002)}))
     conflicts = {conflict.quantity: conflict for conflict in calibration.conflicts}
     assert {conflict.kind for conflict in conflicts.values()} == {"tolerance"}
     assert abs(conflicts["CenterLine"].seen - 0.012) < 0.003  # 13 mm
@@ -190,12 +190,14 @@ def test_a_tolerance_that_is_too_tight() -> None:
 
 
 def test_one_line_aside_under_a_tolerance_is_a_whole_in_doubt() -> None:
-    calibration = calibrate(askew("HalfwayLine"), Options(tolerances={"field": Tolerance(lines_m=0.002)}))
+    calibration = calibrate(
+        askew("HalfwayLine"), Options(lens="radial", tolerances={"field": Tolerance(lines_m=0.002)})
+    )
     assert any("the whole of line 'HalfwayLine'" in warning for warning in calibration.warnings)
 
 
 def test_a_height_measured_after_a_move_is_tested() -> None:
-    old, new = calibrate(seen(15.0)), seen(14.0, seed=3)
+    old, new = calibrate(seen(15.0), RADIAL), seen(14.0, seed=3)
     assert refit(old, new, options=RefitOptions(priors=(height(*RIGHT),))).conflicts == ()
     with pytest.raises(SolutionError, match=r"the stated height of station 'overhead', 3.000 ± 0.005 m.*; or else "):
         refit(old, new, options=RefitOptions(priors=(height(*WRONG),)))
@@ -232,7 +234,7 @@ def test_boards_in_another_unit_are_refused(name: str, square_m: float, why: str
     observed = simulate(SCENES[f"radial-2-3/{name}"](), NOISE).observations
     targets = {**observed.targets, "board": checkerboard(9, 6, square_m)}
     with pytest.raises(SolutionError, match=why):
-        calibrate(replace(observed, targets=targets))
+        calibrate(replace(observed, targets=targets), RADIAL)
 
 
 # ---- the algebra ----------------------------------------------------------------------------------------------------
@@ -266,3 +268,34 @@ def test_what_is_in_dispute_is_in_the_covariance(seed: int) -> None:
     after = before.in_doubt(keys[::-1], [shift[::-1] for shift in shifts])
     expected = before.covariance + sum(np.outer(shift, shift) for shift in shifts)
     assert after.covariance == pytest.approx(expected, rel=1e-6, abs=1e-6)
+
+
+# ---- what is usual --------------------------------------------------------------------------------------------------
+
+
+def cropped(left_px: int) -> Observations:
+    """The picture without its left part: the principal point is no longer near the middle."""
+    whole = seen(15.0)
+    kept_points, kept_curves = (column.pixels[:, 0] >= left_px for column in (whole.points, whole.curves))
+    part = whole.part(kept_points, kept_curves)
+    (name, (width, height_px)) = next(iter(whole.cameras.items()))
+    return replace(
+        part,
+        cameras={name: (width - left_px, height_px)},
+        points=replace(part.points, pixels=part.points.pixels - (left_px, 0.0)),
+        curves=replace(part.curves, pixels=part.curves.pixels - (left_px, 0.0)),
+    )
+
+
+def test_a_cropped_picture_has_no_usual_principal_point() -> None:
+    """The data say where it is: what is usual is left out, and a warning says so."""
+    calibration = calibrate(cropped(400), RADIAL)
+    assert any("the usual cx of camera 'overhead'" in line for line in calibration.warnings)
+    assert not calibration.conflicts and not calibration.options.usual_camera
+    assert calibration.station().phi == pytest.approx(868.0, rel=0.02)
+
+
+def test_what_is_usual_moves_nothing_that_the_data_determine() -> None:
+    with_it, without = (calibrate(seen(15.0), replace(RADIAL, usual_camera=on)) for on in (True, False))
+    sd = without.uncertainty.posterior.sd_of("camera", "overhead", "phi")
+    assert with_it.station().phi == pytest.approx(without.station().phi, abs=0.1 * sd)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scenes import SCENES
+from scenes import RADIAL, SCENES
 
 from ceres_cal.base.arrays import AnyArray
 from ceres_cal.calibrating import calibrate
@@ -31,7 +31,7 @@ def seen(name: str = "radial-2-3/field-boards") -> Observations:
 
 @cache
 def calibrated(name: str = "radial-2-3/field-boards") -> Calibration:
-    return calibrate(seen(name))
+    return calibrate(seen(name), RADIAL)
 
 
 def again(observations: Observations, name: str = "again") -> Observations:
@@ -51,7 +51,7 @@ def assert_same(one: Calibration, other: Calibration) -> None:
 
 
 def test_one_file_given_twice_counts_once() -> None:
-    twice = calibrate(combine([seen(), seen()]))
+    twice = calibrate(combine([seen(), seen()]), RADIAL)
     assert_same(twice, calibrated())
     assert twice.warnings == (
         "936 observations of frame '0001', '0002', 'board_01', ... are there more than once: counted once",
@@ -65,7 +65,7 @@ def test_one_file_given_twice_counts_once() -> None:
 @pytest.mark.parametrize("times", [1, 99])
 def test_frames_under_other_names_count_once(times: int) -> None:
     """The boards in them, too, whose placements are not solved for."""
-    many = calibrate(combine([seen(), *(again(seen(), f"again {n}") for n in range(times))]))
+    many = calibrate(combine([seen(), *(again(seen(), f"again {n}") for n in range(times))]), RADIAL)
     assert_same(many, calibrated())
     others = f", and so do {8 * times - 1} other frames"
     assert many.warnings[0] == f"frame '0001 again 0' repeats frame '0001' point by point{others}: counted once"
@@ -75,7 +75,7 @@ def test_frames_under_other_names_count_once(times: int) -> None:
 
 def test_rows_twice_in_one_frame_count_once() -> None:
     points = taken(seen().points, np.sort(np.concatenate([np.arange(len(seen().points)), np.arange(5, 17)])))
-    doubled = calibrate(replace(seen(), points=points))
+    doubled = calibrate(replace(seen(), points=points), RADIAL)
     assert_same(doubled, calibrated())
     assert doubled.warnings[0] == "12 observations of frame '0001' are there more than once: counted once"
     assert [entry.row for entry in doubled.rejected] == list(range(6, 30, 2))
@@ -83,7 +83,7 @@ def test_rows_twice_in_one_frame_count_once() -> None:
 
 def test_files_diagnosis_and_moves_count_them_once_too(tmp_path: Path) -> None:
     double = combine([seen(), again(seen())])
-    calibration = calibrate(double)
+    calibration = calibrate(double, RADIAL)
     calibration.save(tmp_path / "calibration.json")
     loaded = Calibration.load(tmp_path / "calibration.json")
     found, expected = diagnose(loaded, double), diagnose(calibrated(), seen())

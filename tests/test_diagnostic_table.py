@@ -8,6 +8,7 @@ from pathlib import Path
 import diagnostic_scenes as scenes
 import numpy as np
 import pytest
+from scenes import RADIAL
 
 from ceres_cal import write_report
 from ceres_cal.base.arrays import Array
@@ -71,7 +72,7 @@ def swayed() -> Observations:
 
 @pytest.fixture(scope="module")
 def calibration(swayed: Observations) -> Calibration:
-    return calibrate(swayed)
+    return calibrate(swayed, RADIAL)
 
 
 def test_a_diagnostic_of_one_s_own_names_its_fault(calibration: Calibration, swayed: Observations) -> None:
@@ -87,10 +88,10 @@ def test_a_diagnostic_of_one_s_own_names_its_fault(calibration: Calibration, swa
 
 def test_it_counts_among_the_tests_and_is_silent_on_sound_data(monkeypatch: pytest.MonkeyPatch) -> None:
     sound = simulate(scenes.overhead(boards=4), scenes.NOISE, 2).observations
-    diagnosis = diagnose(calibrate(sound), sound)
+    diagnosis = diagnose(calibrate(sound, RADIAL), sound)
     assert not diagnosis.findings
     monkeypatch.delitem(DIAGNOSTICS, "wave")
-    assert diagnose(calibrate(sound), sound).tests == diagnosis.tests - 1
+    assert diagnose(calibrate(sound, RADIAL), sound).tests == diagnosis.tests - 1
 
 
 def test_it_is_in_the_command_s_answer_and_in_the_report(

@@ -11,6 +11,7 @@ import diagnostic_scenes as scenes
 import numpy as np
 import pytest
 import scenes as usual
+from scenes import RADIAL
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
@@ -28,7 +29,7 @@ from ceres_cal.observations.sights import gather_sights
 from ceres_cal.simulate import Disturbance, simulate
 from ceres_cal.solve.linear_model import Weights, make_linear_model
 
-PLAIN = Options(loss="trivial")
+PLAIN = Options(lens="radial", loss="trivial")
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +39,7 @@ def observations() -> Observations:
 
 @pytest.fixture(scope="module")
 def calibration(observations: Observations) -> Calibration:
-    return calibrate(observations)
+    return calibrate(observations, RADIAL)
 
 
 @pytest.fixture(scope="module")
@@ -152,7 +153,7 @@ def test_leverage_is_the_diagonal_of_the_hat_matrix() -> None:
 
 def test_leverage_foretells_the_residual_without_the_observation() -> None:
     seen = simulate(scenes.overhead(frames=1, boards=0), scenes.NOISE, 5).observations
-    options = Options(loss="trivial", noise_scale="stated", reject_sigma=100.0)
+    options = Options(lens="radial", loss="trivial", noise_scale="stated", reject_sigma=100.0)
     table = diagnose(calibrate(seen, options), seen).table
     chosen = int(np.argmax(np.where(table.is_curve, table.leverage, 0.0)))
     row = int(table.row[chosen])
@@ -281,7 +282,7 @@ def test_a_line_that_was_taken_out_whole_speaks(sigma_px: float, monkeypatch: py
     quiet = Disturbance(points_sigma_px=sigma_px, curves_sigma_px=sigma_px)
     monkeypatch.setattr(scenes, "NOISE", quiet)
     seen = scenes.line_aside(1)
-    calibration = calibrate(seen)
+    calibration = calibrate(seen, RADIAL)
     gone = sum(entry.feature == "LeftPenaltyStretch" for entry in calibration.rejected)
     line = seen.targets["field"].curve_names.index("LeftPenaltyStretch")
     assert gone > 0.9 * np.count_nonzero(seen.curves.feature == line)
@@ -361,7 +362,7 @@ def test_a_single_frame_cannot_be_held_out() -> None:
     with pytest.raises(InputError, match="two frames"):
         cross_validate(seen)
     with pytest.raises(InputError, match="two frames"):
-        choose(seen, Options())
+        choose(seen, RADIAL)
 
 
 # ---- real photographs -----------------------------------------------------------------------------------------------
@@ -413,7 +414,7 @@ def test_the_command(run: Run, tmp_path: Path, observations: Observations, calib
     faulty.save(tmp_path / "bumped.json")
     code, _, err = run("diagnose", tmp_path / "c.json", tmp_path / "bumped.json")
     assert code == 2 and "--new-data" in err
-    calibrate(faulty).save(tmp_path / "b.json")
+    calibrate(faulty, RADIAL).save(tmp_path / "b.json")
     code, out, _ = run("diagnose", tmp_path / "b.json", tmp_path / "bumped.json")
     assert code == 1 and "moved after frame '0005'" in out and "no covariance" in out
     code, out, _ = run("diagnose", tmp_path / "b.json", tmp_path / "bumped.json", "--json")

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scenes import lines_and_arcs
+from scenes import RADIAL, lines_and_arcs
 
 from ceres_cal import Calibration, InputError, calibrate
 from ceres_cal.cli import main
@@ -52,7 +52,7 @@ def in_the_table(monkeypatch: pytest.MonkeyPatch) -> None:
 @cache
 def calibrated() -> Calibration:
     noise = Disturbance(curves_sigma_px=0.2)
-    return calibrate(simulate(lines_and_arcs("radial-2-3"), noise, seed=1).observations)
+    return calibrate(simulate(lines_and_arcs("radial-2-3"), noise, seed=1).observations, RADIAL)
 
 
 @cache

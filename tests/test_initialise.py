@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scenes import SCENES
+from scenes import RADIAL, SCENES
 
 from ceres_cal.base.errors import DegenerateError
 from ceres_cal.base.transforms import Pose, rotation_log
@@ -36,7 +36,7 @@ CAMERA = Camera((1280, 960), 868.0, (651.3, 468.9), Radial((-5.2e-5, 6.1e-7)))
 
 
 def start_of(observations: Observations, options: Options | None = None) -> Start:
-    return initialise(observations, gather_sights(observations), options or Options())
+    return initialise(observations, gather_sights(observations), options or RADIAL)
 
 
 def options_for(scene: Scene, **more: Any) -> Options:
@@ -121,7 +121,7 @@ def test_phi_of_a_frontal_view_is_a_guess() -> None:
 @pytest.mark.parametrize("phi_error", [0.9, 1.0, 1.15])
 def test_a_prior_on_phi_is_taken(phi_error: float) -> None:
     prior = Prior("camera", "camera", "phi", (phi_error * 868.0,), (10.0,))
-    start = start_of(simulate(alone(FRONTAL), NOISE).observations, Options(priors=(prior,)))
+    start = start_of(simulate(alone(FRONTAL), NOISE).observations, Options(lens="radial", priors=(prior,)))
     assert start.phi_from == {"camera": "prior"}
     assert start.estimate.cameras["camera"].phi == pytest.approx(phi_error * 868.0, rel=0.03)
 
@@ -138,7 +138,9 @@ def test_a_prior_on_the_height_tells_phi(quantity: str, height_m: float) -> None
 
 
 def test_a_fixed_phi_is_kept() -> None:
-    start = start_of(simulate(alone(FRONTAL), NOISE).observations, Options(fixed={"phi": 900.0, "a2": -5e-5}))
+    start = start_of(
+        simulate(alone(FRONTAL), NOISE).observations, Options(lens="radial", fixed={"phi": 900.0, "a2": -5e-5})
+    )
     assert start.phi_from == {"camera": "fixed"}
     assert start.estimate.cameras["camera"].phi == 900.0
     assert start.estimate.cameras["camera"].lens.coefficients["a2"] == -5e-5
@@ -164,8 +166,11 @@ def test_the_principal_point_starts_at_its_prior(
 ) -> None:
     prior = Prior("camera", "camera", quantity, value, (1.0,) * len(value))
     observations = simulate(alone(overhead_pose(0.0, 0.0, 5.0, 10.0, 8.0)), NOISE).observations
-    assert start_of(observations, Options(priors=(prior,))).estimate.cameras["camera"].principal_point == expected
-    fixed = Options(priors=(prior,), fixed={"cx": 655.0, "cy": 465.0})
+    assert (
+        start_of(observations, Options(lens="radial", priors=(prior,))).estimate.cameras["camera"].principal_point
+        == expected
+    )
+    fixed = Options(lens="radial", priors=(prior,), fixed={"cx": 655.0, "cy": 465.0})
     assert start_of(observations, fixed).estimate.cameras["camera"].principal_point == (655.0, 465.0)
 
 

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 import refit_after_move
+from scenes import RADIAL
 from test_cli import ROOT, Say, refused, say
 
 from ceres_cal.base.errors import InputError, NothingShownError
@@ -34,7 +35,7 @@ def calibration() -> Calibration:
     scene, _ = built_in_scene("ssl-field")
     field = detect_field([HOME / "0001.jpg", HOME / "0002.jpg"], scene.targets["field"], scene.camera_at("overhead"))
     boards = detect_boards([HOME / f"board_{i:02d}.jpg" for i in range(1, 5)], scene.targets["board"])
-    return calibrate(combine([field.observations, boards.observations]))
+    return calibrate(combine([field.observations, boards.observations]), RADIAL)
 
 
 @pytest.fixture(scope="module")

@@ -48,7 +48,9 @@ def lines() -> tuple[Calibration, Observations]:
 def stations() -> tuple[Calibration, Observations]:
     cameras, there = side_by_side(CAMERA)
     scene = field_scene(FIELD, cameras, there, frames=2, spacing_m=0.15)
-    before = calibrate(simulate(scene, NOISE, 0).observations, Options(tolerances={"field": Tolerance(lines_m=0.005)}))
+    before = calibrate(
+        simulate(scene, NOISE, 0).observations, Options(lens="radial", tolerances={"field": Tolerance(lines_m=0.005)})
+    )
     observed = simulate(field_scene(FIELD, cameras, there, spacing_m=0.3), NOISE, 5).observations
     return refit(before, observed, moved=["right"]), observed
 

@@ -8,6 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 from diagnostic_scenes import held_boards
+from scenes import RADIAL
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.calibrating import calibrate
@@ -27,7 +28,7 @@ def exact() -> Observations:
 def calibrated(noise_px: Array) -> Calibration:
     points = exact().points
     pixels = np.clip(points.pixels + noise_px, 0.0, (1279.0, 959.0))
-    return calibrate(replace(exact(), points=replace(points, pixels=pixels)))
+    return calibrate(replace(exact(), points=replace(points, pixels=pixels)), RADIAL)
 
 
 @pytest.mark.parametrize("degrees", [np.inf, 5.0, 3.0, 2.0])

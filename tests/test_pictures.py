@@ -281,7 +281,7 @@ def test_the_model_of_a_field_is_where_the_camera_sees_it(shot: script.Shot, tmp
 
 def test_the_real_field_s_overlay_lies_on_the_paint(real_data: Path) -> None:
     path, found = script.real_detection(real_data)
-    calibration = calibrate(found.observations, Options(tolerances={"field": Tolerance(0.03, 0.03)}))
+    calibration = calibrate(found.observations, Options(lens="radial", tolerances={"field": Tolerance(0.03, 0.03)}))
     (frame,) = frames_of(found.observations)
     model = model_of(calibration, frame)
     grey = read_grey(path).astype(float)

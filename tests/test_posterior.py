@@ -220,8 +220,10 @@ def test_a_calibration_knows_how_well_it_is_known(noise_scale: str) -> None:
     """At the noise that was found, four times what was stated, or at the stated one."""
     observations = simulate(SCENES["radial-2-3/lines"](), NOISE, 1).observations
     stated = replace(observations, curves=replace(observations.curves, sigma_px=0.25 * observations.curves.sigma_px))
-    told = calibrate(observations, Options(noise_scale="stated", loss="trivial", reject_sigma=50.0)).posterior
-    found = calibrate(stated, Options(noise_scale=noise_scale, loss="trivial", reject_sigma=50.0))
+    told = calibrate(
+        observations, Options(lens="radial", noise_scale="stated", loss="trivial", reject_sigma=50.0)
+    ).posterior
+    found = calibrate(stated, Options(lens="radial", noise_scale=noise_scale, loss="trivial", reject_sigma=50.0))
     assert told is not None and found.posterior is not None
     assert found.posterior.by_model is not None and told.by_model is not None
     ratio = found.posterior.by_model.spread.sd / told.by_model.spread.sd
@@ -231,4 +233,4 @@ def test_a_calibration_knows_how_well_it_is_known(noise_scale: str) -> None:
 
 def test_the_closed_form_alone_knows_nothing_of_it() -> None:
     observations = simulate(SCENES["radial-2-3/corners"](), NOISE, 1).observations
-    assert calibrate(observations, Options(closed_form_only=True)).posterior is None
+    assert calibrate(observations, Options(lens="radial", closed_form_only=True)).posterior is None

@@ -9,6 +9,7 @@ import pytest
 import scenes
 from hypothesis import given
 from hypothesis import strategies as st
+from scenes import RADIAL
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.transforms import Pose, rotation_exp
@@ -73,7 +74,9 @@ def test_priors_of_file_and_options_come_together() -> None:
     one = Prior("camera", "overhead", "phi", (800.0,), (5.0,))
     two = Prior("station", "overhead", "height_m", (4.0,), (0.01,))
     seen = replace(observed(), priors=(one,))
-    first, second = gather_priors(seen, Options(priors=(two,)), estimated().structure)
+    first, second = gather_priors(
+        seen, Options(lens="radial", usual_camera=False, priors=(two,)), estimated().structure
+    )
     assert (first.keys, first.mean.tolist()) == ((PHI,), [800.0])
     assert (second.keys, second.mean.tolist()) == ((HEIGHT,), [4.0])
 
@@ -88,12 +91,14 @@ def test_priors_of_file_and_options_come_together() -> None:
 )
 def test_priors_on_what_is_not_there(prior: Prior, message: str) -> None:
     with pytest.raises(InputError, match=message):
-        gather_priors(observed(), Options(priors=(prior,)), estimated().structure)
+        gather_priors(observed(), Options(lens="radial", priors=(prior,)), estimated().structure)
 
 
 def test_tolerances_are_priors_of_mean_nought() -> None:
     structure = make_structure({"field": FIELD}, {"field": Tolerance(lines_m=0.01)})
-    (prior,) = gather_priors(replace(observed(), targets={"field": FIELD}), Options(), structure)
+    (prior,) = gather_priors(
+        replace(observed(), targets={"field": FIELD}), replace(RADIAL, usual_camera=False), structure
+    )
     assert [key.structure_name for key in prior.keys] == list(structure.names)
     assert not np.any(prior.mean)
     assert prior.information.spread.sd == pytest.approx(structure.sigma_m, rel=1e-12)
@@ -171,7 +176,7 @@ def test_given_and_without() -> None:
 def test_of_numbers_that_are_held_a_problem_hears_nothing() -> None:
     """The other numbers of the prior still count, with those held at their mean; what is known uses up no equation."""
     estimate, seen = estimated(), observed()
-    options = Options(fixed={"cx": 651.3})
+    options = Options(lens="radial", fixed={"cx": 651.3})
     prior = known_prior(estimate)
     problem = Problem(gather_sights(seen), make_layout(seen, options), (prior,), options=options)
     (heard,) = problem.priors_at(estimate)
@@ -180,3 +185,20 @@ def test_of_numbers_that_are_held_a_problem_hears_nothing() -> None:
     assert problem.unknowns(estimate) == problem.layout.size - len(heard.keys) == 0
     nobody = GaussianPrior(Information.of_sigmas({Key("camera", "overhead", "cx", "px"): 1.0}), np.array([651.3]))
     assert replace(problem, priors=(nobody,)).priors_at(estimate) == []
+
+
+# ---- what is usual --------------------------------------------------------------------------------------------------
+
+
+def test_a_principal_point_that_nobody_states_lies_near_the_middle() -> None:
+    """Not where it is stated, held back by the options, or known by an earlier calibration."""
+    seen, structure = observed(), estimated().structure
+    (usual,) = [one for one in gather_priors(seen, RADIAL, structure) if one.is_usual]
+    assert usual.mean == pytest.approx(0.5 * (np.array(next(iter(seen.cameras.values()))) - 1.0))
+    assert {key.quantity for key in usual.keys} == {"cx", "cy"}
+    name = next(iter(seen.cameras))
+    stated = replace(RADIAL, priors=(Prior("camera", name, "cx", (640.0,), (1.0,)),))
+    carried = gather_priors(seen, RADIAL, structure, GaussianPrior(usual.information, usual.mean))
+    for priors in (gather_priors(seen, replace(RADIAL, usual_camera=False), structure), carried):
+        assert not any(one.is_usual for one in priors)
+    assert not any(one.is_usual for one in gather_priors(seen, stated, structure))

@@ -28,6 +28,7 @@ import photographs
 import pytest
 import refit_after_move
 import watching
+from scenes import RADIAL
 
 from ceres_cal.base.errors import CalibrationError, InputError
 from ceres_cal.base.files import LIMIT, read_bytes, write_bytes
@@ -57,7 +58,7 @@ def observations() -> Observations:
 
 @pytest.fixture(scope="module")
 def calibration(observations: Observations) -> Calibration:
-    return calibrate(observations)
+    return calibrate(observations, RADIAL)
 
 
 @pytest.fixture(scope="module")
@@ -265,14 +266,14 @@ def test_pixels_far_off_and_another_origin(observations: Observations) -> None:
     pixels = observations.curves.pixels.copy()
     pixels[:9] = (99999.0, -5.0)
     with pytest.raises(InputError, match="lie outside its image"):
-        calibrate(replace(observations, curves=replace(observations.curves, pixels=pixels)))
+        calibrate(replace(observations, curves=replace(observations.curves, pixels=pixels)), RADIAL)
     moved = replace(observations.curves, pixels=observations.curves.pixels + 300.0)
     size = next(iter(observations.cameras.values()))
     inside = np.all(moved.pixels < size, axis=1)
     points = replace(observations.points, pixels=observations.points.pixels + 300.0)
     shifted = replace(observations, points=points, curves=moved)
     shifted = shifted.part(np.all(points.pixels < size, axis=1), inside)
-    assert any("principal point lies" in line for line in calibrate(shifted).warnings)
+    assert any("principal point lies" in line for line in calibrate(shifted, RADIAL).warnings)
 
 
 def test_a_field_in_millimetres(observations: Observations) -> None:
@@ -283,7 +284,10 @@ def test_a_field_in_millimetres(observations: Observations) -> None:
         "line_thickness_m": 10.0,
     }  # fmt: skip
     large = replace(observations, targets={name: ssl_field(None, **lengths)}, priors=())
-    assert f"target {name!r} reaches 4500 m from its origin: are its numbers metres" in calibrate(large).warnings[0]
+    assert (
+        f"target {name!r} reaches 4500 m from its origin: are its numbers metres"
+        in calibrate(large, RADIAL).warnings[0]
+    )
 
 
 @pytest.mark.parametrize("scale", [0.001, 1000.0])
@@ -298,7 +302,7 @@ def test_scenes_of_a_centimetre_and_of_kilometres(scale: float, phi: float) -> N
     scene = field_scene(custom(points), {"c": camera}, {"c": Station("c", pose)})
     noise_px = 1e-4 * phi
     seen = simulate(scene, Disturbance(noise_px, noise_px)).observations
-    found = calibrate(seen, Options(free_principal_point=False))
+    found = calibrate(seen, Options(lens="radial", free_principal_point=False))
     known = found.uncertainty.verdict("camera", "c", "phi")
     assert abs(known.value - phi) < 4.0 * known.sd < 0.1 * phi
 
@@ -326,7 +330,7 @@ def test_a_sigma_beyond_all_measure(observations: Observations, sigma_px: float)
 def test_what_is_nearly_singular_is_answered_or_named(observations: Observations) -> None:
     for number, odd in enumerate(_nearly_singular(observations)):
         try:
-            found = calibrate(odd)
+            found = calibrate(odd, RADIAL)
         except CalibrationError:
             continue
         assert all(np.isfinite(camera.phi) for camera in found.cameras.values()), number
@@ -345,7 +349,7 @@ def test_a_table_without_nodes(good: Path, tmp_path: Path, capsys: pytest.Captur
 
 
 def _phi(path: str) -> bytes:
-    found = calibrate(Observations.load(path))
+    found = calibrate(Observations.load(path), RADIAL)
     return b"".join(np.float64(camera.phi).tobytes() for camera in found.cameras.values())
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from chromium import Browser, browser
-from scenes import SCENES, camera
+from scenes import RADIAL, SCENES, camera
 
 from ceres_cal import Calibration, Observations, Options, Pose, calibrate, write_report
 from ceres_cal.base.errors import InputError
@@ -75,7 +75,7 @@ class Outline(HTMLParser):
 @cache
 def sample() -> tuple[Calibration, Observations]:
     observations = Observations.load(SAMPLE)
-    return calibrate(observations), observations
+    return calibrate(observations, RADIAL), observations
 
 
 @cache
@@ -88,7 +88,7 @@ def tilted(degrees: float) -> tuple[Calibration, Observations]:
     stations = {"overhead": Station("overhead", overhead_pose(0.2, 0.1, 5.2, tilt_x_deg=degrees))}
     scene = field_scene(ssl_field("B"), {"overhead": camera("radial-2-3")}, stations, points=(), spacing_m=0.25)
     observations = simulate(scene, Disturbance(0.3, 0.3), seed=2).observations
-    return calibrate(observations), observations
+    return calibrate(observations, RADIAL), observations
 
 
 def headline(page: str) -> str:
@@ -167,7 +167,7 @@ def test_names_from_files_do_no_harm() -> None:
         for number, view in enumerate(plain.views)
     )
     observations = replace(plain, views=views, cameras={HOSTILE: plain.cameras["overhead"]})
-    page = make_report(calibrate(observations), observations)
+    page = make_report(calibrate(observations, RADIAL), observations)
     outline = Outline(page)
     assert "script" not in {tag for tag, _ in outline.elements}
     assert any(HOSTILE in text for text in "".join(outline.text).split("\n"))
@@ -215,7 +215,7 @@ def test_no_accuracy_is_stated_where_the_noise_is_three_times_the_stated_one() -
         points=replace(points, sigma_px=points.sigma_px / 3.5),
         curves=replace(curves, sigma_px=curves.sigma_px / 3.5),
     )
-    judged = judge_quality(quality_of(calibrate(stated), stated))
+    judged = judge_quality(quality_of(calibrate(stated, RADIAL), stated))
     assert judged.level == "care"
     assert judged.headline == "Use it with care, no accuracy can be stated: the noise is 3.5 times what was stated."
 
@@ -241,7 +241,7 @@ def test_very_many_observations_are_diagnosed_by_a_sample() -> None:
 def test_boards_alone_tell_no_places() -> None:
     scene, disturbance = built_in_scene("boards")
     observations = simulate(scene, disturbance, seed=1).observations
-    page = make_report(calibrate(observations), observations)
+    page = make_report(calibrate(observations, RADIAL), observations)
     assert headline(page) == (
         "good: The intrinsics can be trusted. No station sees a field: places in the world cannot be told."
     )
@@ -250,7 +250,7 @@ def test_boards_alone_tell_no_places() -> None:
 
 def test_the_closed_form_alone_is_not_to_be_used() -> None:
     observations = sample()[1]
-    page = make_report(calibrate(observations, Options(closed_form_only=True)), observations)
+    page = make_report(calibrate(observations, Options(lens="radial", closed_form_only=True)), observations)
     assert headline(page).startswith("no: Not to be used: nothing was minimised")
 
 
@@ -413,7 +413,7 @@ def window() -> Iterator[Browser]:
 def two_cameras_page() -> str:
     scene, disturbance = built_in_scene("two-cameras")
     observations = simulate(scene, disturbance, seed=1).observations
-    return make_report(calibrate(observations), observations)
+    return make_report(calibrate(observations, RADIAL), observations)
 
 
 def crowded() -> Scene:

@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from scenes import camera, rings_and_field
+from scenes import RADIAL, camera, rings_and_field
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
@@ -74,7 +74,7 @@ def test_the_papers_rings(tmp_path: Path, how: Photography) -> None:
 def test_calibrates_from_photographed_rings_and_the_field(tmp_path: Path) -> None:
     found = detect_rings(taken(tmp_path, Photography()), RADII, camera="overhead")
     field = simulate(*built_in_scene("field-2004"), seed=2).observations
-    calibration = calibrate(combine([found.observations, field]))
+    calibration = calibrate(combine([found.observations, field]), RADIAL)
     truth = before_sheet()
     radius = np.linspace(0.0, 420.0, 100)
     solved = calibration.cameras["overhead"].lens.ideal_radius(radius)  # type: ignore[attr-defined]

@@ -83,7 +83,7 @@ def left_over(errors: dict[str, float]) -> Array:
 @pytest.mark.parametrize("seed", range(3))
 def test_painted_offsets_come_back(seed: int) -> None:
     offsets, observations = from_six_stations(seed)
-    calibration = calibrate(observations, Options(tolerances={"field": Tolerance(lines_m=0.01)}))
+    calibration = calibrate(observations, Options(lens="radial", tolerances={"field": Tolerance(lines_m=0.01)}))
     structure = calibration.estimate.structure
     found = dict(zip(structure.names, structure.values, strict=True))
     errors = left_over({name: found[f"field/{name}"] - offset for name, offset in offsets.items()})
@@ -101,7 +101,7 @@ def test_a_bent_board_is_straightened() -> None:
     stations = {"a": Station("a", overhead_pose(0.0, 0.0, 4.0, 0.0, 0.0, 0.0))}
     seen = simulate(board_scene(bent, {"a": CAMERA}, stations, count=12, seed=3), NOISE, 3).observations
     observations = replace(seen, targets={"board": board})
-    calibration = calibrate(observations, Options(tolerances={"board": Tolerance(warp_m=0.01)}))
+    calibration = calibrate(observations, Options(lens="radial", tolerances={"board": Tolerance(warp_m=0.01)}))
     assert calibration.estimate.structure.names == ("board/bow.x", "board/bow.y")
     assert calibration.estimate.structure.values == pytest.approx([0.004, -0.002], abs=3e-4)  # 1e-4
     assert calibration.fit.points_rms_px < 0.44  # 0.41; 0.55 with a flat board
@@ -109,7 +109,7 @@ def test_a_bent_board_is_straightened() -> None:
 
 def test_the_file_keeps_the_corrections(tmp_path: object) -> None:
     _, observations = from_six_stations(0)
-    calibration = calibrate(observations, Options(tolerances={"field": Tolerance(lines_m=0.01)}))
+    calibration = calibrate(observations, Options(lens="radial", tolerances={"field": Tolerance(lines_m=0.01)}))
     path = f"{tmp_path}/calibration.json"
     calibration.save(path)
     again = Calibration.load(path)

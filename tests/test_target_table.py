@@ -95,7 +95,7 @@ def test_a_kind_of_one_s_own_goes_all_the_way(tmp_path: Path, capsys: pytest.Cap
     observations = Observations.load(tmp_path / "observations.json")
     assert {target.kind for target in observations.targets.values()} == {"court", "dots"}
     bowed = next(name for name, target in observations.targets.items() if target.bows)
-    options = Options(tolerances={bowed: Tolerance(warp_m=0.001)})
+    options = Options(lens="radial", tolerances={bowed: Tolerance(warp_m=0.001)})
     calibration = calibrate(observations, options)
     assert calibration.converged and calibration.fit.point_scale == pytest.approx(1.0, rel=0.1)
     assert np.max(np.abs(calibration.estimate.structure.values)) < 0.001  # the boards were flat
@@ -147,7 +147,7 @@ def test_what_is_asked_of_a_target_is_its_own() -> None:
     smaller = mistaken_targets(observations)["the other court"]
     assert smaller.targets["field"] == court(4.0)
     with pytest.raises(InputError, match="does not bow"):
-        calibrate(observations, Options(tolerances={"field": Tolerance(warp_m=0.001)}))
+        calibrate(observations, Options(lens="radial", tolerances={"field": Tolerance(warp_m=0.001)}))
     with pytest.raises(InputError, match=r"here.size_m: Expected `float`, got `str`"):
         target_from_spec({"kind": "court", "size_m": "6"}, "here")
 

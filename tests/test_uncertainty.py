@@ -15,7 +15,7 @@ import pytest
 from accuracy_bound import bound, make_trial
 from accuracy_scenes import CLEAN_NOISE, FIELD, painted_by_two_cameras, tilted, two_cameras
 from coverage import CASES, cover, share
-from scenes import SCENES
+from scenes import RADIAL, SCENES
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
@@ -48,7 +48,7 @@ def observed(tilt_deg: float, seed: int = 1) -> Observations:
 
 @cache
 def calibrated(tilt_deg: float, seed: int = 1) -> Calibration:
-    return calibrate(observed(tilt_deg, seed))
+    return calibrate(observed(tilt_deg, seed), RADIAL)
 
 
 def phi_of(calibration: Calibration, name: str = "overhead") -> Verdict:
@@ -115,7 +115,7 @@ def test_more_tilt_tells_more(tilt_deg: float, verdict: str) -> None:
 
 def cost_at(calibration: Calibration, observations: Observations, phi: float | None) -> float:
     """Twice the least cost, at the calibration's noise, with phi held somewhere or free."""
-    options = Options(fixed={} if phi is None else {"phi": phi})
+    options = Options(lens="radial", fixed={} if phi is None else {"phi": phi})
     fit, estimate = calibration.fit, calibration.estimate
     if phi is not None:
         camera = replace(estimate.cameras["overhead"], phi=phi)
@@ -155,7 +155,7 @@ def test_bounds_are_where_the_cost_has_risen_by_four(tilt_deg: float) -> None:
 def test_a_prior_on_phi_is_part_of_its_profile() -> None:
     """Too wide for the quadratic picture, and almost all that is known: the bounds are the prior's own."""
     prior = Prior("camera", "overhead", "phi", (560.0,), (60.0,))
-    calibration = calibrate(observed(1.0), Options(priors=(prior,)))
+    calibration = calibrate(observed(1.0), Options(lens="radial", priors=(prior,)))
     verdict = phi_of(calibration)
     assert verdict.by_profile and verdict.verdict == "weak" and calibration.warnings == ()
     assert (verdict.low, verdict.high) == pytest.approx((560.0 - 117.6, 560.0 + 117.6), abs=12.0)  # 447, 683 measured
@@ -166,7 +166,7 @@ def test_no_camera_a_hands_breadth_over_the_floor(seed: int) -> None:
     """At 1 degree a quarter of all least costs lie at a phi of a few px, and so do two cameras over an askew field."""
     for calibration in (
         calibrated(1.0, seed),
-        calibrate(painted_by_two_cameras(seed, heights_known=False).observations),
+        calibrate(painted_by_two_cameras(seed, heights_known=False).observations, RADIAL),
     ):
         for name, camera in calibration.cameras.items():
             assert PHI_RANGE[0] * unit_px(camera) <= camera.phi <= PHI_RANGE[1] * unit_px(camera)
@@ -302,7 +302,7 @@ def test_what_no_map_can_be_made_of() -> None:
         known.map_sd_mm("gone")
     with pytest.raises(InputError, match="has no free number 'aspect'"):
         known.verdict("camera", "overhead", "aspect")
-    boards = calibrate(make_trial(CASES["boards"].make(), CLEAN_NOISE, 0).observations).uncertainty
+    boards = calibrate(make_trial(CASES["boards"].make(), CLEAN_NOISE, 0).observations, RADIAL).uncertainty
     with pytest.raises(InputError, match="station 'camera' was held as the world"):
         boards.map_sd_mm(x_m=[0.0], y_m=[0.0])
     with pytest.raises(InputError, match="no field to draw a map of: give x_m and y_m"):
@@ -382,7 +382,7 @@ def test_values_are_the_calibrations_own() -> None:
 
 def test_a_ring_sheet_does_not_say_how_it_is_turned() -> None:
     parts = [Observations.load(ROOT / f"data/field_2004/{name}.json") for name in ("rings", "field")]
-    known = calibrate(combine(parts)).uncertainty
+    known = calibrate(combine(parts), RADIAL).uncertainty
     assert known.unknown_placements == {"rings": ("turn_z",)}
 
 

@@ -10,15 +10,16 @@ import numpy as np
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import CalibrationError, DegenerateError, SolutionError
 from ceres_cal.base.threads import at_most, meanwhile, single_threaded_blas
-from ceres_cal.base.words import bounds_text
+from ceres_cal.base.words import bounds_text, two_digits
 from ceres_cal.calibration import COPY, Calibration, Fit, Rejected
-from ceres_cal.lens_choice import choose_lens
+from ceres_cal.lens_choice import choose_lens, papers
+from ceres_cal.model.keys import Key
 from ceres_cal.model.parameters import AUTO, Estimate, Layout, Options, make_layout
 from ceres_cal.model.priors import gather_priors
 from ceres_cal.model.quantities import difference
 from ceres_cal.model.residuals import residuals
 from ceres_cal.observations import Observations
-from ceres_cal.observations.sights import gather_sights
+from ceres_cal.observations.sights import Sights, gather_sights
 from ceres_cal.solve import (
     AsBuilt,
     Conflicts,
@@ -37,18 +38,20 @@ from ceres_cal.solve.conflicts import contradicted_by
 from ceres_cal.solve.explanation import Explanation
 from ceres_cal.solve.noise import Inliers, visible_from
 from ceres_cal.solve.possible import require_possible
+from ceres_cal.solve.usable import require_fits, require_usable
 from ceres_cal.start.baseline import four_point_baseline
 from ceres_cal.start.initialise import Start, initialise
 from ceres_cal.uncertainty import Posterior, Scatter, Uncertainty, assess, measure_scatter
 
-# Of the image's diagonal, 24 px of 1600: half of a camera's observations farther off is no calibration, while a lens
-# that is too simple stays below a few pixels. Nothing changes from half to double.
-_NO_FIT = 0.015
-# Of the image's diagonal, 240 px of 1600: lenses are mounted within some hundredths, unless a picture was cropped.
-_OFF_CENTRE = 0.15
 _UNKNOWN = (
     "camera {!r}: its views are too frontal to tell phi, which is {} at 95 %, and its heights go with phi: the floor "
     "is right, what is above it is not: add boards tilted by 20 degrees, or a prior on height_m where it sees the field"
+)
+# Times the standard deviation of phi without what is usual of principal points: what rests on it is said.
+_RESTING = 1.5
+_USUAL = (
+    "camera {!r}: phi, and what goes with it, rests on its principal point lying near the middle of the image, as is "
+    "usual: by the observations alone its standard deviation is {}: show tilted views, or state the principal point"
 )
 _OTHERWISE = (
     "no calibration agrees with what was stated beforehand, though the observations make one without it: check the "
@@ -88,16 +91,39 @@ def _calibrated(
 ) -> Calibration:
     """See `calibrate`."""
     observations.require_inside()
-    if options.lens == AUTO:
-        chosen, lens_choice = choose_lens(observations, options)
-        return replace(_calibrated(observations, chosen, progress), lens_choice=lens_choice)
-    sights, layout = gather_sights(observations), make_layout(observations, options)
-    start = initialise(observations, sights, options)
+    sights = gather_sights(observations)
+    start = initialise(observations, sights, options if options.lens != AUTO else papers(options))
+    if options.lens != AUTO:
+        return _of_lens(start, observations, sights, options, progress)
+    if options.closed_form_only:
+        return _of_lens(start, observations, sights, papers(options), progress)
+    chosen = choose_lens(observations, options, start)
+    try:
+        calibration = _of_lens(chosen.start, observations, sights, chosen.options, progress)
+    except CalibrationError as error:  # of all observations, not of those that took part in the choice
+        chosen = chosen.without(str(error), papers(options), start)
+        calibration = _of_lens(start, observations, sights, chosen.options, progress)
+    return replace(calibration, lens_choice=chosen.choice)
+
+
+def _of_lens(
+    start: Start,
+    observations: Observations,
+    sights: Sights,
+    options: Options,
+    progress: Callable[[Progress], None] | None,
+) -> Calibration:
+    """With a lens that is named."""
     priors = gather_priors(observations, options, start.estimate.structure)
-    problem = Problem(sights, layout, priors, options=options)
+    problem = Problem(sights, make_layout(observations, options), priors, options=options)
     if options.closed_form_only:
         return _closed_form(start, observations, problem)
-    return solved_from(start, observations, problem, progress=progress)
+    calibration = solved_from(start, observations, problem, progress=progress)
+    unusual = [one.words for one in calibration.conflicts if one.kind == "usual"]
+    if not unusual:
+        return calibration
+    calibration = _of_lens(start, observations, sights, replace(options, usual_camera=False), progress)
+    return replace(calibration, warnings=(*calibration.warnings, *unusual))
 
 
 def _without_priors(observations: Observations, options: Options) -> Calibration | None:
@@ -112,7 +138,7 @@ def _without_priors(observations: Observations, options: Options) -> Calibration
 
 def _contradicted(observations: Observations, options: Options, free: Calibration) -> str | None:
     """What the priors that no calibration came out of contradict, when one comes out without them."""
-    stated = gather_priors(observations, options, free.estimate.structure)
+    stated = gather_priors(observations, replace(free.options, priors=options.priors), free.estimate.structure)
     posterior = free.uncertainty.posterior
     return contradicted_by(stated, free.estimate, posterior.information, posterior.degrees_of_freedom)
 
@@ -146,7 +172,7 @@ def solved_from(
     """
     digest = meanwhile(lambda: observations.digest)
     usual = again.scales if again else None
-    end = solve_robustly(problem, observations, start.estimate, usual, progress)
+    end = solve_robustly(problem, observations, start.estimate, usual, progress, is_near=start.is_near)
 
     def solved(others: Problem) -> RobustSolution:
         return solve_robustly(others, observations, _start_of(others, problem, observations, start, again), usual)
@@ -155,7 +181,7 @@ def solved_from(
     as_built: tuple[AsBuilt, ...] = ()
     if again is None and problem.options.as_built == "estimate":
         end, problem, explanations, as_built = solve_as_built(problem, observations, end, explanations, solved)
-    _require_fits(end, problem)
+    require_fits(end, problem)
     require_possible(observations, problem.sights, end.solution.estimate, end.residuals)
     warnings = tuple(one.warning for one in explanations)
     posterior, conflicts = None, Conflicts()
@@ -164,9 +190,10 @@ def solved_from(
         end, posterior = _assess(end, observations, problem, again)
         posterior = _with_doubts(posterior.in_doubt(conflicts.keys, conflicts.shifts), end, explanations)
         warnings = (*warnings, *(one.words for one in conflicts.every), *_unknown(end, posterior))
+        warnings = (*warnings, *_resting(end, problem))
     digest.result()  # which the observations remember
     calibration = _calibration(start, observations, problem, end, explanations)
-    warnings = (*calibration.warnings, *_require_usable(end, problem, explanations), *warnings)
+    warnings = (*calibration.warnings, *require_usable(end, problem, explanations), *warnings)
     calibration = replace(calibration, warnings=warnings, posterior=posterior, conflicts=conflicts.every)
     tolerances = {**problem.options.tolerances, **tolerances_of(as_built)}
     return replace(calibration, options=replace(problem.options, tolerances=tolerances), as_built=as_built)
@@ -252,63 +279,26 @@ def _unknown(end: RobustSolution, posterior: Posterior) -> Iterator[str]:
             yield _UNKNOWN.format(name, bounds_text(verdict.low, verdict.high, "px"))
 
 
-# ---- may it be used? ------------------------------------------------------------------------------------------------
+def _resting(end: RobustSolution, problem: Problem) -> Iterator[str]:
+    """Warnings of cameras whose phi rests on where principal points usually lie."""
+    estimate, reduced = end.solution.estimate, end.reduced
+    usual = [prior for prior in problem.priors_at(estimate) if prior.is_usual]
+    if reduced is None or not usual:
+        return
+    without = reduced.shared
+    for prior in usual:
+        without = without + replace(prior.information, matrix=-prior.information.matrix)
+    for name in estimate.cameras:
+        key = Key("camera", name, "phi", "px")
+        if key in reduced.shared.keys:
+            at = reduced.shared.columns([key])[0]
+            sd, alone = reduced.shared.spread.sd[at], without.spread.sd[at]
+            if alone > _RESTING * sd:
+                yield _USUAL.format(name, _share_text(alone / estimate.cameras[name].phi))
 
 
-def _require_fits(end: RobustSolution, problem: Problem) -> None:
-    """Raise SolutionError where the solve failed, or its end explains too little."""
-    if end.solution.failed:
-        raise SolutionError(f"the solve failed ({end.solution.termination}): check labels and target dimensions")
-    points, curves = end.residuals.lengths
-    for name, camera in end.solution.estimate.cameras.items():
-        own = problem.sights.of_camera(name)
-        limit_px = _NO_FIT * float(np.hypot(*camera.image_size))
-        met = np.count_nonzero(points[own.point_rows] <= limit_px)  # NaN is not
-        met += np.count_nonzero(curves[own.curve_rows] <= limit_px)
-        if 2 * met < len(own.point_rows) + len(own.curve_rows):
-            raise SolutionError(
-                f"camera {name!r}: the best solution misses half of its observations by more than {limit_px:.0f} px: "
-                "check labels, target dimensions and which lens it is"
-            )
-
-
-def _require_usable(end: RobustSolution, problem: Problem, explanations: Sequence[Explanation]) -> tuple[str, ...]:
-    """Warnings about the solution; SolutionError where it must not be used."""
-    warnings = []
-    for name, camera in end.solution.estimate.cameras.items():
-        width, height = camera.image_size
-        off_px = float(np.hypot(*(camera.principal_point - 0.5 * (np.array(camera.image_size) - 1.0))))
-        if off_px > _OFF_CENTRE * np.hypot(width, height):
-            warnings.append(
-                f"camera {name!r}: its principal point lies {off_px:.0f} px from the middle of its image: "
-                "is image_size that of the pictures, and are pixels counted from their top-left corner?"
-            )
-        if not camera.folds:
-            continue
-        fold, corner = camera.lens.monotone_radius(camera.phi), camera.corner_radius
-        where = f"camera {name!r}: the solved {camera.lens.kind} lens folds {fold:.0f} px from the principal point"
-        farthest = end.problem.sights.of_camera(name).about(camera).reach_px
-        if not camera.lens.may_fold or fold <= farthest:
-            raise SolutionError(
-                f"{where}, inside the image (corner at {corner:.0f} px): "
-                "choose fewer or other coefficients, or observe nearer to the corners"
-            )
-        warnings.append(
-            f"{where}: from there to the corner ({corner:.0f} px) pixels have no answer; "
-            f"observations reach {farthest:.0f} px"
-        )
-    return (*warnings, *_lost(end.inliers, problem, explanations))
-
-
-def _lost(inliers: Inliers, problem: Problem, explanations: Sequence[Explanation]) -> Iterator[str]:
-    """Sights most of whose observations were taken out one by one: they were not understood, whatever the rest says."""
-    used = np.concatenate([inliers.points, inliers.curves])
-    for one in explanations:
-        used |= one.rows & one.is_taken
-    shares = problem.sights.used_share(used[: len(inliers.points)], used[len(inliers.points) :])
-    for number in np.flatnonzero(shares < 0.5):
-        out = f"{100.0 * (1.0 - shares[number]):.0f} % of its observations were taken out"
-        yield f"{problem.sights.keys[number]}: {out}: check its labels, do not use its pose"
+def _share_text(share: float) -> str:
+    return f"{two_digits(100.0 * share)} %" if share < 1.0 else "larger than itself"
 
 
 # ---- what came out --------------------------------------------------------------------------------------------------

@@ -63,8 +63,10 @@ class LensChoice:
     @property
     def words(self) -> str:
         """In a line."""
+        if not self.groups:
+            return f"{self.chosen}, the paper's: the observations are too few to compare lenses by"
         others = [one for one in self.tried if one.worse is not None and one.label != self.chosen]
-        if not others:
+        if not others or self.tried[0].rms_px is None:
             return f"{self.chosen}, the only one that can be calibrated"
         over = ", ".join(f"{one.label} {one.rms_px:.4f} px ({one.worse:+.1f})" for one in others[:3])
         return (

@@ -30,13 +30,13 @@ if TYPE_CHECKING:
     from ceres_cal.solve import Progress
 
 
-_DEFAULT_LENS, _AUTO = "radial", "auto"
+_AUTO = "auto"
 _TERMS = "rational (OpenCV's k4 to k6) and prism (its s1 to s4) of brown, tangential (p1, p2) of kannala-brandt"
 
 
 def _lens_kind(name: str) -> str:
-    """A kind of lens that is in the table; the default is, and help and wrong usage need no table."""
-    if name not in (_DEFAULT_LENS, _AUTO):
+    """A kind of lens that is in the table; the default needs none, nor do help and wrong usage."""
+    if name != _AUTO:
         from ceres_cal.scene.lens import LENSES
 
         if name not in LENSES:
@@ -59,10 +59,14 @@ def _add_camera(parser: ArgumentParser) -> None:
     add = parser.add_argument_group("the camera").add_argument
     kinds = (
         "radial (the paper's), brown (OpenCV's), kannala-brandt (its fisheye), spline (no formula), ...: `--lens ?` "
-        "names all; auto: the simplest of all that predicts views as well as any other"
+        "names all; default: auto, the simplest of all with a formula that predicts views as well as any other"
     )
-    add("--lens", type=_lens_kind, metavar="KIND", default=_DEFAULT_LENS, help=kinds)
-    add("--powers", metavar="2,3", help="powers of a lens that leaves the choice; default: 2,3, the paper's")
+    add("--lens", type=_lens_kind, metavar="KIND", help=kinds)
+    add(
+        "--powers",
+        metavar="2,3",
+        help="of a lens that leaves the choice; of one that is named default: 2,3, the paper's",
+    )
     add("--terms", metavar="NAME,...", default="", help="terms that a lens may have besides: " + _TERMS)
     add(
         "--fix",
@@ -73,6 +77,7 @@ def _add_camera(parser: ArgumentParser) -> None:
     )
     add("--free-aspect", action="store_true", help="let fy / fx differ from 1")
     add("--free-skew", action="store_true", help="let the pixels' columns lean against their rows")
+    add("--no-usual-camera", action="store_true", help="nothing is taken for usual of the principal point")
     add("--hold-principal-point", action="store_true", help="hold it at the image's centre")
     add(
         "--tolerance",
@@ -172,11 +177,11 @@ def _solve_progress(bar: ProgressBar) -> Callable[[Progress], None]:
 
 def _powers(args: Namespace) -> tuple[int, ...]:
     if args.powers is None:
-        return (2, 3)
+        return ()
     from ceres_cal.scene.lens import LENSES
 
     choosing = [kind for kind, lens in LENSES.items() if lens.trial_powers]
-    if args.lens not in choosing:
+    if args.lens not in (None, *choosing):
         raise InputError(f"--powers is for the {' or '.join(choosing)} lens, not for {args.lens}: leave it out")
     try:
         return tuple(int(power) for power in args.powers.split(","))
@@ -201,16 +206,18 @@ def _options(
 ) -> Options:
     from ceres_cal.model.parameters import Options
 
+    lens = args.lens or _AUTO  # which powers make radial
     terms = tuple(parse_names(args.terms))
-    options = Options(lens=args.lens, powers=powers, terms=terms, fixed=fixed)
+    options = Options(lens=lens, powers=powers, terms=terms, fixed=fixed)
     names = PriorNames(("height_m", "position_m"), (*options.intrinsic_names, "principal_point"))
     return Options(
-        lens=args.lens,
+        lens=lens,
         powers=powers,
         free_principal_point=not args.hold_principal_point,
         free_aspect=args.free_aspect,
         free_skew=args.free_skew,
         terms=terms,
+        usual_camera=not args.no_usual_camera,
         fixed=fixed,
         priors=tuple(parse_prior(spec, observations, names) for spec in args.prior),
         tolerances=_tolerances(args.tolerance),

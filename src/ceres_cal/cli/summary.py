@@ -130,7 +130,7 @@ def _structure(calibration: Calibration) -> list[str]:
 
 def _intrinsics(name: str, camera: Camera, options: Options, phi_from: str, quality: Quality) -> list[str]:
     def held(*names: str) -> str:
-        return " (held)" if all(name in options.fixed for name in names) else ""
+        return " (held)" if all(name in options.held for name in names) else ""
 
     def known(quantity: str, value: float, unit: str = "px") -> str:
         return with_sd(value, unit, quality.verdicts.get(("camera", name, quantity)))

@@ -19,7 +19,7 @@ from ceres_cal.base.transforms import Pose
 from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
 from ceres_cal.diagnostics.table import error_mm
-from ceres_cal.lens_choice import candidates, choose_lens, coefficients_of, decide, label_of
+from ceres_cal.lens_choice import any_lens, candidates, coefficients_of, decide, label_of, size_of
 from ceres_cal.model.equations import write_equations
 from ceres_cal.model.parameters import Estimate, Layout, Options
 from ceres_cal.model.residuals import residuals
@@ -158,9 +158,9 @@ def choose(
     if len(frames_of(few)[0]) < 2:
         raise InputError("cross-validation by frame needs at least two frames: a single one cannot be held out")
     tried = candidates(options)
-    other, _ = choose_lens(few, options)
-    if label_of(other) not in map(label_of, tried):
-        tried = sorted([*tried, other], key=coefficients_of)
+    other = _attempt(few, any_lens(options))
+    if isinstance(other, Calibration) and label_of(other.options) not in map(label_of, tried):
+        tried = sorted([*tried, other.options], key=coefficients_of)
     wholes: list[Calibration | str] = [_attempt(few, one) for one in tried]
     good = [whole for whole in wholes if isinstance(whole, Calibration)]
     if not good:
@@ -177,7 +177,7 @@ def choose(
             errors.append(cross_validate(few, one, k, calibration=whole, counted=counted))
         except CalibrationError as error:
             errors.append(HeldOut(label_of(one), coefficients_of(one), failed=str(error)))
-    best, chosen = _decide(errors)
+    best, chosen = _decide(errors, tried)
     share = (len(few.points) + len(few.curves)) / (len(observations.points) + len(observations.curves))
     current = next(i for i, one in enumerate(tried) if label_of(one) == label_of(options))
     return Choice(tuple(errors), tuple(tried), best, chosen, current, share)
@@ -190,11 +190,11 @@ def _attempt(observations: Observations, options: Options) -> Calibration | str:
         return str(error)
 
 
-def _decide(tried: Sequence[HeldOut]) -> tuple[int, int]:
+def _decide(tried: Sequence[HeldOut], options: Sequence[Options]) -> tuple[int, int]:
     """Indices of the best candidate and of the simplest that is as good, on the frames that all predict."""
     common = np.all([one.frame_counts > 0 for one in tried if not one.failed], axis=0)
     squares = [None if one.failed else one.frame_squares[common] for one in tried]
-    return decide([one.label for one in tried], [one.coefficients for one in tried], squares)
+    return decide([one.label for one in tried], list(map(size_of, options)), squares)
 
 
 # ---- one fold -------------------------------------------------------------------------------------------------------

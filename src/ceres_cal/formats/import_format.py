@@ -79,7 +79,7 @@ class ImportedCameras:
         stations = {name: Station(name, camera.cam_from_world) for name, camera in cameras.items()}
         bare = {name: camera.at(type(camera.cam_from_world).identity()) for name, camera in cameras.items()}
         lens = next(iter(cameras.values())).lens
-        options = Options(lens=lens.kind, powers=lens.powers or (2, 3), terms=lens.terms)
+        options = Options(lens=lens.kind, powers=lens.powers, terms=lens.terms, usual_camera=False)
         return Calibration(
             Estimate(bare, stations, {}, EXACT),
             dict(self.targets),

@@ -24,6 +24,8 @@ from ceres_cal.scene.lens import Lens, lens_class, make_lens
 
 AUTO = "auto"
 """The lens that the data ask for: which it is, a calibration says in its options (`ceres_cal.lens_choice`)."""
+PAPERS_POWERS = (2, 3)
+_OF_POWERS = "radial"  # the lens that powers stand for where none is named
 OF_PIXELS = ("phi", "aspect", "cx", "cy")
 """The intrinsics that every camera has, in the order of the solver's vector; skew comes behind the coefficients."""
 LOSSES = ("trivial", "huber", "soft_l1", "cauchy", "tukey")
@@ -35,10 +37,13 @@ class Options:
 
     Attributes:
         lens: one of `scene.lens.LENSES`, or "auto": the one that the data ask for. powers: of a lens that leaves the
-            choice, as "radial" does.
+            choice, as "radial" does, which powers alone stand for; () for (2, 3).
+        coefficients: names of those of the lens that are solved for, the others are 0; None: all.
         free_principal_point: else it is held at the image centre, or where `fixed` says.
         free_aspect, free_skew: whether fy / fx and the lean of the pixels' columns are free; else 1 and 0, or what
             `fixed` says.
+        usual_camera: whether a principal point that nobody states is taken to lie near the middle of its image, as is
+            usual (`priors.USUAL_CENTRE`); where the data say otherwise it is left out.
         terms: of the lens, besides those that it always has: names of its `more_terms`.
         fixed: numbers held, by name: phi, aspect, cx, cy (px), skew and the lens's coefficients in the units of the
             files.
@@ -58,12 +63,14 @@ class Options:
         max_iterations: of each solve. threads: of the solver; 0 chooses.
     """
 
-    lens: str = "radial"
-    powers: tuple[int, ...] = (2, 3)
+    lens: str = AUTO
+    powers: tuple[int, ...] = ()
+    coefficients: tuple[str, ...] | None = None
     free_principal_point: bool = True
     free_aspect: bool = False
     free_skew: bool = False
     terms: tuple[str, ...] = ()
+    usual_camera: bool = True
     fixed: Mapping[str, float] = field(default_factory=dict)
     priors: tuple[Prior, ...] = ()
     tolerances: Mapping[str, Tolerance] = field(default_factory=dict)
@@ -77,8 +84,11 @@ class Options:
     threads: int = 0
 
     def __post_init__(self) -> None:
+        if self.lens == AUTO and self.powers:
+            object.__setattr__(self, "lens", _OF_POWERS)
         if self.lens != AUTO:
             lens_class(self.lens)
+            object.__setattr__(self, "powers", tuple(self.powers) or PAPERS_POWERS)
         elif self.terms:
             raise InputError("terms are of a lens that is named: leave them out, or name it")
         if self.loss not in LOSSES:
@@ -88,10 +98,11 @@ class Options:
         if self.as_built not in ("estimate", "as drawn"):
             raise InputError(f"as_built must be 'estimate' or 'as drawn', not {self.as_built!r}")
         names = self.intrinsic_names  # which refuses unknown terms, too
+        if unknown := [name for name in self.coefficients or () if name not in names[len(OF_PIXELS) : -1]]:
+            raise InputError(f"cannot solve for {unknown[0]!r}: {self._which} has {', '.join(names)}")
         for name, value in self.fixed.items():
             if name not in names:
-                which = "a lens that is still to be chosen" if self.lens == AUTO else f"the {self.lens} lens"
-                raise InputError(f"cannot fix {name!r}: {which} has {', '.join(names)}")
+                raise InputError(f"cannot fix {name!r}: {self._which} has {', '.join(names)}")
             if not np.isfinite(value):
                 raise InputError(f"cannot fix {name} at {value}: give a finite number")
         for name in ("loss_scale", "reject_sigma", "max_iterations"):
@@ -99,6 +110,18 @@ class Options:
                 raise InputError(f"{name} must be above 0, not {getattr(self, name)}")
         if self.threads < 0:
             raise InputError(f"threads must be 0 (to choose) or above, not {self.threads}")
+
+    @property
+    def _which(self) -> str:
+        return "a lens that is still to be chosen (name it)" if self.lens == AUTO else f"the {self.lens} lens"
+
+    @cached_property
+    def held(self) -> Mapping[str, float]:
+        """What `fixed` holds, and at 0 the coefficients that are not solved for."""
+        if self.coefficients is None:
+            return self.fixed
+        names = make_lens(self.lens, self.powers, terms=self.terms).names
+        return {**{name: 0.0 for name in names if name not in self.coefficients}, **self.fixed}
 
     @cached_property
     def intrinsic_names(self) -> tuple[str, ...]:
@@ -232,7 +255,7 @@ class Layout:
 def make_layout(observations: Observations, options: Options) -> Layout:
     """The layout of a calibration: everything free but what the options fix and what nothing can tell."""
     names = intrinsic_names(options.blank_lens)
-    held = {*options.fixed, *options.blank_lens.set_at_start}
+    held = {*options.held, *options.blank_lens.set_at_start}
     if not options.free_principal_point:
         held |= {"cx", "cy"}
     if not options.free_aspect:

@@ -142,7 +142,8 @@ def moved(estimate: Estimate, keys: Sequence[Key], step: Array) -> Estimate:
     Raises:
         InputError: the step leads to no camera (phi or aspect below 0).
     """
-    cameras, stations, placements = dict(estimate.cameras), dict(estimate.stations), dict(estimate.placements)
+    cameras, stations = dict(estimate.cameras), dict(estimate.stations)
+    placements: dict[str, Pose] = {}
     values = estimate.structure.values.copy()
     for (kind, owner), columns in columns_by_owner(keys).items():
         names = [keys[column].quantity for column in columns]
@@ -159,13 +160,13 @@ def moved(estimate: Estimate, keys: Sequence[Key], step: Array) -> Estimate:
                 pose = Pose.looking(old.position + change[:3], rotation_exp(change[3:]) @ old.rotation)
                 stations[owner] = Station(stations[owner].camera, pose)
             else:
-                held = placements[owner]
+                held = estimate.placements[owner]
                 placements[owner] = Pose(held.rotation @ rotation_exp(change[3:]), held.translation + change[:3])
     return replace(
         estimate,
         cameras=cameras,
         stations=stations,
-        placements=placements,
+        placements={**estimate.placements, **placements} if placements else estimate.placements,
         structure=estimate.structure.with_values(values),
     )
 

@@ -7,7 +7,7 @@ import numpy as np
 from ceres_cal.base.arrays import AnyArray, Indices
 from ceres_cal.observations.observations import Observations
 
-_FEWEST_FRAMES = 40
+FEWEST_FRAMES = 40
 
 
 def column_of(observations: Observations, name: str) -> AnyArray:
@@ -23,13 +23,13 @@ def frames_of(observations: Observations) -> tuple[tuple[str, ...], Indices]:
     return tuple(names), np.array([order.get(view.frame, -1) for view in observations.views])[views]
 
 
-def thinned(observations: Observations, most: int) -> Observations:
+def thinned(observations: Observations, most: int, fewest_frames: int = FEWEST_FRAMES) -> Observations:
     """Evenly spread frames, and of these evenly spread observations, about `most` in all."""
     total = len(observations.points) + len(observations.curves)
     if total <= most:
         return observations
     names, frame = frames_of(observations)
-    count = max(min(_FEWEST_FRAMES, len(names)), int(len(names) * most / total))
+    count = max(min(fewest_frames, len(names)), int(len(names) * most / total))
     chosen = np.isin(frame, np.linspace(0, len(names) - 1, count).round())
     step = max(1, round(np.count_nonzero(chosen) / most))
     masks = np.split(chosen, [len(observations.points)])

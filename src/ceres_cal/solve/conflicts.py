@@ -28,7 +28,7 @@ from ceres_cal.solve.wald import LARGEST_FREEDOM, Rest, linear_rest, log_probabi
 # Probability of a linear picture from which on it is worth another solve: 2.5 sigma.
 _SUSPICIOUS = 0.0124
 _MOST = 4  # solves
-_RIVAL = 0.7  # of the largest squared distance: a statement as far off may be the wrong one instead
+_RIVAL = 0.6  # of the largest squared distance: a statement as far off may be the wrong one instead
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +119,11 @@ class _Search:
         if number < 0 or tests[number].log_p > np.log(_SUSPICIOUS):
             return False
         suspect, test = self.left.pop(number), tests.pop(number)
-        rivals = [pair for pair in zip(self.left, tests, strict=True) if pair[1].squared > _RIVAL * test.squared]
+        rivals = [
+            (one, other)
+            for one, other in zip(self.left, tests, strict=True)
+            if one.kind != "usual" and other.squared > _RIVAL * test.squared
+        ]
         freed = suspect.left_out(self.problem, self.end.solution.estimate)
         after = None if suspect.kind == "earlier" else self._solved(freed)
         self.solves += 1
@@ -136,7 +140,9 @@ class _Search:
 
     def conflicts(self) -> list[Conflict]:
         """What is in conflict still when all of it is left out: a wrong height may have made others look wrong."""
-        alone, found = not self.problem.priors and len(self.out) == len(self.every), []
+        stated = [one for one in self.every if one.kind != "usual"]
+        alone = all(prior.is_usual for prior in self.problem.priors) and len(self.out) == len(stated)
+        found = []
         for number, (statement, test, rivals) in enumerate(self.out):
             if number < len(self.out) - 1 and statement.kind != "earlier":
                 test = worst_test(statement, rest_at(statement, self.end))

@@ -27,7 +27,8 @@ from ceres_cal.solve.problem import Problem, Weighting
 
 LEAST_LEFT = 1e-7
 """Share of an alternative's squared length that the free numbers must leave for it to be testable."""
-_SINGULAR = 1e-12  # share of its own information that a number must keep beside the others
+SINGULAR = 1e-12
+"""Share of its own information that a number must keep beside the others."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,11 +243,11 @@ def make_linear_model(problem: Problem, estimate: Estimate, equations: Equations
     keys = free_keys(estimate, problem.layout, problem.private)
     blank, columns = without_shared(problem, estimate, equations, weights)
     rest = blank.beyond_private(columns)
-    prior_rows, prior_values = _prior_equations(problem, estimate, keys)
+    prior_rows, prior_values = prior_equations(problem, estimate, keys)
     inside = rest[weights.used]
     normal = inside.T @ inside + prior_rows.T @ prior_rows
     sizes = np.sum(columns[weights.used] ** 2, axis=0) + np.sum(prior_rows**2, axis=0)
-    root = inverse_root(normal, sizes, _SINGULAR)
+    root = inverse_root(normal, sizes, SINGULAR)
     gradient = inside.T @ blank.score[weights.used] + prior_rows.T @ prior_values
     return replace(
         blank,
@@ -283,7 +284,7 @@ def _private_basis(equations: Equations, problem: Problem, weight: Array, used: 
     sizes = np.diagonal(normal, axis1=1, axis2=2)
     scale = 1.0 / np.sqrt(np.where(sizes > 0.0, sizes, 1.0))
     values, vectors = np.linalg.eigh(scale[:, :, None] * normal * scale[:, None, :])
-    kept = values > _SINGULAR
+    kept = values > SINGULAR
     roots = scale[:, :, None] * vectors * np.where(kept, values, np.inf)[:, None, :] ** -0.5
     for part, root in zip(parts, roots, strict=True):
         np.matmul(columns[part], root, out=basis[part])
@@ -321,7 +322,7 @@ def shared_columns(equations: Equations, estimate: Estimate, keys: Sequence[Key]
     return columns
 
 
-def _prior_equations(problem: Problem, estimate: Estimate, keys: Sequence[Key]) -> tuple[Array, Array]:
+def prior_equations(problem: Problem, estimate: Estimate, keys: Sequence[Key]) -> tuple[Array, Array]:
     """What priors say of the shared numbers, as rows (K, P) and values (K,) in their sigmas."""
     place = {key: column for column, key in enumerate(keys)}
     rows, values = [np.zeros((0, len(keys)))], [np.zeros(0)]

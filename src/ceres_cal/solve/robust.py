@@ -68,6 +68,7 @@ def solve_robustly(
     usual: tuple[float, float] | None = None,
     progress: Callable[[Progress], None] | None = None,
     most_rounds: int = _MOST_ROUNDS,
+    *,
     is_near: bool = False,
 ) -> RobustSolution:
     """The minimum over the inliers, at the noise that they show.
@@ -79,13 +80,13 @@ def solve_robustly(
         problem: of all the observations; its weighting is not looked at.
         usual: noise scales of points and curves that were seen before, where there are any.
         most_rounds: solves, the rough one counted; 2 end near the minimum.
-        is_near: whether the estimate tells outliers as it is: no rough solve is needed.
+        is_near: whether the start is near the minimum but for private placements: then there is no rough solve.
 
     Raises:
         CalibrationError: see `solve`.
     """
     rounds = _Rounds(problem, observations, usual, progress)
-    state = rounds.at(estimate) if is_near else rounds.first(estimate)
+    state = rounds.posed(estimate) if is_near else rounds.first(estimate)
     undecided = frozenset(state.problem.sights.keys)
     before: Inliers | None = None
     while state.rounds < most_rounds:
@@ -132,9 +133,20 @@ class _Rounds:
         return self._rough(estimate, there, visible_from(self._observations, there), 1)
 
     def at(self, estimate: Estimate) -> RobustSolution:
-        """A start as it is, judged."""
+        """An estimate as it is, judged."""
         there = residuals(self._observations, self._problem.sights, estimate)
         return self._weighted(Solution(estimate, np.nan, False, "", ()), there, 0)
+
+    def posed(self, estimate: Estimate) -> RobustSolution:
+        """A start near the minimum, its private placements at their best."""
+        there = residuals(self._observations, self._problem.sights, estimate)
+        visible = visible_from(self._observations, there)
+        weighting = Weighting(visible.point_scale, visible.curve_scale, "cauchy", loss_scale=1.0)
+        problem = replace(self._problem.used(visible.points, visible.curves), weighting=weighting, feet=there.feet)
+        estimate = with_placements_at_best(problem, estimate)
+        state = self._judged(Solution(estimate, np.nan, False, "", ()), there, 0)
+        self._visible = visible_from(self._observations, state.residuals)
+        return state
 
     def refined(self, state: RobustSolution) -> RobustSolution:
         """Further rough solves, each at the scale of the residuals that the one before left, while that falls."""
@@ -144,9 +156,8 @@ class _Rounds:
                 break
             state = self._rough(state.solution.estimate, state.residuals, visible, state.rounds + 1)
         # Of one kind of observations without priors the leverages add up to the count.
-        mixed = bool(self._problem.priors_at(state.solution.estimate)) or all(
-            kind.equations for kind in self._problem.sights.by_kind
-        )
+        stated = any(not prior.is_usual for prior in self._problem.priors_at(state.solution.estimate))
+        mixed = stated or all(kind.equations for kind in self._problem.sights.by_kind)
         return self.by_leverages(state)[0] if mixed and len(state.problem.sights) else state
 
     def _rough(self, estimate: Estimate, there: Residuals, visible: Inliers, rounds: int) -> RobustSolution:

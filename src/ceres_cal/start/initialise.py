@@ -20,7 +20,7 @@ from ceres_cal.observations import Observations, Prior
 from ceres_cal.observations.sights import Sights
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Lens
-from ceres_cal.start.closed_forms import RadialProfile, orthogonality_error, poses_from_homographies
+from ceres_cal.start.closed_forms import orthogonality_error, poses_from_homographies
 from ceres_cal.start.planes import Homographies, profile_and_homographies
 
 PHI_RANGE = (0.15, 15.0)
@@ -32,14 +32,21 @@ _ENOUGH_VIEWS = 50  # for phi
 _MARGIN = 1.15  # of what a start takes for the edge of the picture: its profile is least sure there
 _GRID = np.geomspace(*PHI_RANGE, 120)
 _NEAR = np.geomspace(1.0 / 1.04, 1.04, 13)  # a grid step to either side
+_RADII = np.linspace(0.02, 1.0, 50)  # of the observed ones, at which lenses are compared
+_GRAZING = 0.02  # cosine of the angle at which a ray has no ideal radius any more
 
 
 @dataclass(frozen=True)
 class Start:
-    """A start for the solve, and where phi of each camera came from: "fixed", "views", "prior" or "guess"."""
+    """A start for the solve, and where phi of each camera came from: "fixed", "views", "prior" or "guess".
+
+    Attributes:
+        is_near: whether it is near the minimum, but for private placements: no gross error decides from there.
+    """
 
     estimate: Estimate
     phi_from: Mapping[str, str]
+    is_near: bool = False
 
 
 def initialise(observations: Observations, sights: Sights, options: Options) -> Start:
@@ -89,10 +96,11 @@ def _start_camera(blank: Camera, sights: Sights, options: Options, priors: Seque
     unit = unit_px(blank)
     profile, homographies = profile_and_homographies(sights, unit)
     phi, phi_from = _choose_phi(sights, homographies, unit, options, priors)
-    edge = profile.lift(np.array([[sights.reach_px, 0.0]]))[0, 2]
+    r = _RADII * sights.reach_px
+    w = profile.lift(np.column_stack([r, np.zeros_like(r)]))[:, 2]
+    seen = LensProfile(r, np.arctan2(r, phi * w))
     beyond = _MARGIN * max(1.0, blank.corner_radius / sights.reach_px)
-    spanning = blank.lens.spanning(float(np.arctan2(sights.reach_px, phi * edge)), phi, beyond)
-    lens = _fit_lens(spanning, profile, phi, sights.reach_px, options.fixed)
+    lens = seen.nearest(blank.lens.spanning(float(seen.angles[-1]), phi, beyond), phi, options.held)
     camera = replace(blank, phi=phi, lens=lens)
     return _CameraStart(camera, phi_from, homographies.sights, _poses_at(homographies, phi))
 
@@ -126,7 +134,7 @@ def _blank_camera(name: str, image_size: tuple[int, int], options: Options, prio
                 skew = prior.value[0]
     cx, cy = options.fixed.get("cx", centre[0]), options.fixed.get("cy", centre[1])
     blank = Camera(image_size, 1.0, (cx, cy), options.blank_lens, aspect, skew=skew)
-    if set(blank.lens.names) <= set(options.fixed) and not blank.lens.may_fold:
+    if set(blank.lens.names) <= set(options.held) and not blank.lens.may_fold:
         blank.require_monotone(name)
     return blank
 
@@ -186,26 +194,50 @@ def _prior_cost(prior: Prior, phi: Array, sights: Sights, homographies: Homograp
     return np.asarray(((np.array(heights) - prior.value[-1]) / spread) ** 2)
 
 
-def _fit_lens(blank: Lens, profile: RadialProfile, phi: float, reach_px: float, fixed: Mapping[str, float]) -> Lens:
-    """The lens nearest to the profile over the observed radii: every model is linear in its coefficients there."""
-    r = np.linspace(0.02, 1.0, 50) * reach_px
-    w = profile.lift(np.column_stack([r, np.zeros_like(r)]))[:, 2]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ideal = np.where(w > 0.02, r / w, np.nan)
-    columns, right = blank.start_equations(r, ideal, np.arctan2(r, phi * w), phi)
-    free = [i for i, name in enumerate(blank.names) if name in columns and name not in fixed]
-    ahead = np.isfinite(right)
-    right = right - sum(
-        np.nan_to_num(columns[n]) * blank.coefficients[n] for n in blank.names if n in columns and n in fixed
-    )
-    for count in range(len(free), 0, -1):
-        basis = np.column_stack([columns[blank.names[i]] for i in free[:count]])[ahead]
-        values = np.array(blank.values)
-        values[free[:count]] = np.linalg.lstsq(basis, right[ahead], rcond=1e-8)[0]
-        lens = blank.with_values(values)
-        if lens.monotone_radius(phi) > 1.05 * reach_px:
-            return lens
-    return blank
+@dataclass(frozen=True, eq=False)
+class LensProfile:
+    """What a lens does: the angles (n,), rad, to the axis of what it shows at radii (n,), px, as far as was seen."""
+
+    radii_px: Array
+    angles: Array
+
+    @classmethod
+    def of(cls, camera: Camera, reach_px: float) -> LensProfile:
+        """A camera's up to some radius."""
+        r = _RADII * reach_px
+        rays = camera.lens.undistort(np.column_stack([r, np.zeros_like(r)]), camera.phi)
+        angles = np.arctan2(rays[:, 0], rays[:, 2])
+        known = np.isfinite(angles)
+        return cls(r[known], angles[known])
+
+    @property
+    def reach_px(self) -> float:
+        return float(np.max(self.radii_px, initial=0.0))
+
+    def nearest(self, blank: Lens, phi: float, held: Container[str]) -> Lens:
+        """The lens that comes nearest to it: every model is linear in its coefficients at given radii. Fewer of them
+        where it would fold.
+
+        Args:
+            blank: with the values of the coefficients that are held.
+        """
+        r = self.radii_px
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ideal = np.where(np.cos(self.angles) > _GRAZING, phi * np.tan(self.angles), np.nan)
+        columns, right = blank.start_equations(r, ideal, self.angles, phi)
+        free = [i for i, name in enumerate(blank.names) if name in columns and name not in held]
+        ahead = np.isfinite(right)
+        right = right - sum(
+            np.nan_to_num(columns[n]) * blank.coefficients[n] for n in blank.names if n in columns and n in held
+        )
+        for count in range(len(free), 0, -1):
+            basis = np.column_stack([columns[blank.names[i]] for i in free[:count]])[ahead]
+            values = np.array(blank.values)
+            values[free[:count]] = np.linalg.lstsq(basis, right[ahead], rcond=1e-8)[0]
+            lens = blank.with_values(values)
+            if lens.monotone_radius(phi) > 1.05 * self.reach_px:
+                return lens
+        return blank
 
 
 # ---- stations and placements ----------------------------------------------------------------------------------------

@@ -1,0 +1,85 @@
+"""Which lens the data ask for: the simplest of those that predict placements, or lines, as well as any other does.
+
+Some of the observations are solved once, robustly, and from there with the longest lens of each kind. Shorter ones are
+these with coefficients held at 0: what a solve without a group of equations would leave of it follows for every lens
+from the normal equations of each group (`solve/left_out.py`). Errors that go together within a group make a longer lens
+predict the others no better: a criterion that counts observations would take them for a lens.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ceres_cal.base.errors import CalibrationError
+from ceres_cal.base.transforms import Poses
+from ceres_cal.calibration import LensChoice, TriedLens
+from ceres_cal.lens_choice.forms import PAPER, papers
+from ceres_cal.lens_choice.kinds import Candidate, compared_kinds
+from ceres_cal.lens_choice.rule import decide, standard_errors
+from ceres_cal.model.parameters import Options
+from ceres_cal.observations import Observations
+from ceres_cal.start.initialise import Start
+
+
+@dataclass(frozen=True, eq=False)
+class Chosen:
+    """The lens that was chosen: options with it, where to start from, and what it was compared with."""
+
+    options: Options
+    start: Start
+    choice: LensChoice
+
+    def without(self, failure: str, options: Options, start: Start) -> Chosen:
+        """The paper's lens in its place, where all of the observations make no calibration with it."""
+        failed = [replace(one, failed=failure) if one.label == self.choice.chosen else one for one in self.choice.tried]
+        tried = sorted(failed, key=lambda one: one.label != PAPER)
+        return Chosen(options, start, replace(self.choice, chosen=PAPER, tried=tuple(tried)))
+
+
+def choose_lens(observations: Observations, options: Options, start: Start) -> Chosen:
+    """The lens that the data ask for, one for all cameras; the paper's where there is too little to tell by.
+
+    The paper's lens and the longest of each kind come first: only where the paper's is not as good as the best of them
+    are the shorter ones looked at.
+
+    Args:
+        options: their lens is not looked at. start: of everything, with whatever lens.
+    """
+    try:
+        kinds, share = compared_kinds(observations, options, start.estimate)
+        tried, best, chosen = _compare([one for kind in kinds for one in kind.candidates(first=True)])
+        if chosen.form.label != PAPER:
+            others = [one for longest in tried if longest.may_win(best) for one in longest.of.candidates(first=False)]
+            tried, _, chosen = _compare([*tried, *others])
+    except CalibrationError:
+        return Chosen(papers(options), start, LensChoice(PAPER, (TriedLens(PAPER, 2),), 0, 0.0))
+    there = chosen.estimate
+    placements = Poses.of(start.estimate.placements).updated(list(there.placements), Poses.of(there.placements).stack)
+    near = replace(start, estimate=replace(there, placements=placements), is_near=True)
+    return Chosen(chosen.form.of(options), near, _choice(tried, chosen, share))
+
+
+def _compare(tried: list[Candidate]) -> tuple[list[Candidate], Candidate, Candidate]:
+    """The lenses, the best and the one that is chosen: one that folds where it must not gives no answer."""
+    labels, sizes = [one.form.label for one in tried], [one.form.size for one in tried]
+    while True:
+        best, chosen = decide(labels, sizes, [one.squares for one in tried])
+        faults = {number: fault for number in (best, chosen) if (fault := tried[number].fault)}
+        if not faults:
+            return tried, tried[best], tried[chosen]
+        tried = [replace(one, squares=None, failed=faults[n]) if n in faults else one for n, one in enumerate(tried)]
+
+
+def _choice(tried: Sequence[Candidate], chosen: Candidate, share: float) -> LensChoice:
+    def as_told(one: Candidate) -> TriedLens:
+        label, count = one.form.label, len(one.form.names)
+        if one.squares is None or chosen.squares is None:
+            return TriedLens(label, count, failed=one.failed)
+        return TriedLens(label, count, one.rms_px, standard_errors(one.squares, chosen.squares))
+
+    order = sorted(tried, key=lambda one: (one is not chosen, one.rms_px if one.squares is not None else np.inf))
+    groups = 0 if chosen.squares is None else len(chosen.squares)
+    return LensChoice(chosen.form.label, tuple(map(as_told, order)), groups, share)

@@ -1,0 +1,105 @@
+"""The lenses that are compared."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cache
+
+import numpy as np
+
+from ceres_cal.model.parameters import AUTO, OF_PIXELS, PAPERS_POWERS, Options
+from ceres_cal.scene.lens import LENSES, make_lens
+
+PAPER = "radial 2,3"
+"""The lens that wins ties."""
+_ANY_PHI = 100.0
+_PROJECTION = 2  # coefficients that a projection of its own is worth
+
+
+def papers(options: Options) -> Options:
+    """The options with the paper's lens."""
+    return replace(options, lens="radial", powers=PAPERS_POWERS, coefficients=None, terms=())
+
+
+def any_lens(options: Options) -> Options:
+    """The options with the lens that the data ask for; coefficients that they hold belong to a lens of its own."""
+    fixed = {name: value for name, value in options.fixed.items() if name in (*OF_PIXELS, "skew")}
+    return replace(options, lens=AUTO, powers=(), coefficients=None, terms=(), fixed=fixed)
+
+
+def candidates(options: Options) -> list[Options]:
+    """Options with every sensible lens of the same kind, fewest coefficients first; the given one is among them."""
+    lens = options.blank_lens
+    if lens.powers:
+        powers = sorted({*lens.trial_powers, options.powers}, key=lambda p: (len(p), p))
+        if set(lens.names) & set(options.fixed):  # a held coefficient belongs to its own powers alone
+            powers = [options.powers]
+        return [replace(options, powers=one) for one in powers]
+    by_order = [name for _, name in sorted(zip(lens.orders, lens.names, strict=True)) if name not in options.fixed]
+    names = [name for name in by_order if name not in lens.decentring]
+    also = tuple(name for name in by_order if name in lens.decentring and name not in options.held)
+    shorter = [replace(options, coefficients=(*names[: count + 1], *also)) for count in range(len(names))]
+    if all(label_of(one) != label_of(options) for one in shorter):
+        shorter.append(options)
+    return shorter
+
+
+def label_of(options: Options) -> str:
+    """How a lens is called: "radial 2,3" or "brown k1 k2 p1 p2"."""
+    if options.blank_lens.powers:
+        return f"{options.lens} {','.join(map(str, options.powers))}"
+    return " ".join([options.lens, *(name for name in options.blank_lens.names if name not in options.held)])
+
+
+def coefficients_of(options: Options) -> int:
+    """How many coefficients of the lens are free."""
+    return len(set(options.blank_lens.names) - set(options.held))
+
+
+def size_of(options: Options) -> int:
+    """How much a lens may follow: its free coefficients, and two more where it is no pinhole without any: its series in
+    the tangent has its first two coefficients chosen.
+    """
+    blank = make_lens(options.lens, options.powers)
+    is_pinhole = np.isclose(blank.distort([[1.0, 0.0, 1.0]], _ANY_PHI)[0, 0], _ANY_PHI)
+    return coefficients_of(options) + (0 if is_pinhole else _PROJECTION)
+
+
+@dataclass(frozen=True)
+class Form:
+    """A lens to be tried: see `Options`.
+
+    Attributes:
+        names: of the coefficients that are free. label: how it is called. size: see `size_of`.
+    """
+
+    lens: str
+    powers: tuple[int, ...]
+    coefficients: tuple[str, ...] | None
+    names: tuple[str, ...]
+    label: str
+    size: int
+
+    @classmethod
+    def among(cls, options: Options) -> Form:
+        """The lens of some options."""
+        names = tuple(name for name in options.blank_lens.names if name not in options.held)
+        return cls(options.lens, options.powers, options.coefficients, names, label_of(options), size_of(options))
+
+    def of(self, options: Options) -> Options:
+        """The options with this lens."""
+        return replace(options, lens=self.lens, powers=self.powers, coefficients=self.coefficients)
+
+
+@cache
+def forms_of(kind: str) -> tuple[Form, ...]:
+    """Every sensible lens of a kind, with decentring terms and without, the longest first: all others are this one with
+    coefficients at 0.
+    """
+    lens = LENSES[kind]
+    powers = tuple(sorted({power for trial in lens.trial_powers for power in trial}))
+    longest = Options(lens=kind, powers=powers)
+    bare = tuple(name for name in longest.blank_lens.names if name not in lens.decentring)
+    starts = [longest, *([replace(longest, coefficients=bare)] if lens.decentring else [])]
+    every = [Form.among(one) for start in starts for one in candidates(start)]
+    return tuple(sorted(every, key=lambda one: -len(one.names)))
