@@ -15,12 +15,13 @@ from pathlib import Path
 from cases import Row, exit_code, json_text, printed
 from photograph_shots import floor_rows, line_figures, real_rows, rings_rows, speed_rows, start_rows
 from photographs_auto import auto_rows, real_auto_rows
+from photographs_shared import shared_rows
 from straightness import observed_boards, straight_rows
 
-CASES = ("lines", "floor", "starts", "auto", "speed", "rings", "real", "straight")
+CASES = ("lines", "floor", "starts", "auto", "speed", "rings", "real", "straight", "shared")
 
 
-def rows_of(case: str, runs: int, real: Path | None, picture: Path | None) -> Iterator[Row]:
+def rows_of(case: str, runs: int, real: Path | None, picture: Path | None, shared: Path | None) -> Iterator[Row]:
     if case == "lines":
         yield from line_figures(range(runs))
     elif case == "floor":
@@ -35,6 +36,9 @@ def rows_of(case: str, runs: int, real: Path | None, picture: Path | None) -> It
         yield from speed_rows(min(runs, 20))
     elif case == "rings":
         yield from rings_rows(min(runs, 20))
+    elif case == "shared":
+        if shared is not None:
+            yield from shared_rows(shared)
     elif real is not None and case == "straight":
         boards = observed_boards(real)
         for keep_scale in (False, True):

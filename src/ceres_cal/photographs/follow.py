@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 
@@ -29,6 +30,8 @@ _SURE_SHARE = 0.7
 _ABSENT, _MOST_ABSENT = 0.2, 0.08
 _ROUGH_SPACING_PX = 12.0
 _NEAR_REACHES_PX = (12.0, 6.0, 4.0)
+# From points that were shown: what stands farther beside a line than they are off cannot draw it away.
+_SHOWN_REACHES_PX = (12.0, 12.0, 12.0, 8.0, 8.0, 5.0)
 _FAR_REACHES_PX = (45.0, 45.0, 30.0, 30.0, 20.0, 12.0, 8.0, 5.0)
 _LAST_REACH_PX = 5.0
 _CANDIDATES = 5
@@ -103,8 +106,9 @@ def follow(
         tried = [tracker.close_in(camera, _NEAR_REACHES_PX) for camera in starts[:1]]
         if tried[0].holds and tried[0].share >= _SURE_SHARE:
             return tried[0]
-    for camera in tracker.shifted_starts(starts):
-        tried.append(tracker.close_in(camera, _FAR_REACHES_PX))
+    shown = (_SHOWN_REACHES_PX,) if tracker.free.hints is not None else ()
+    for reaches, camera in product((*shown, _FAR_REACHES_PX), tracker.shifted_starts(starts)):
+        tried.append(tracker.close_in(camera, reaches))
         if tried[-1].holds and tried[-1].share >= _SURE_SHARE:
             break
     tried = tried or [tracker.close_in(starts[0], ())]  # as it is: nothing to search
