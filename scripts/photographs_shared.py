@@ -5,8 +5,9 @@ from __future__ import annotations
 import json
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +22,10 @@ from ceres_cal.photographs import Auto, Clicks, Facing, detect_field
 from ceres_cal.scene.targets import targets_by_name
 
 CLICK_PX = 8.0
-CORNERS = ("TopLeftCorner", "BottomLeftCorner", "TopRightCorner", "BottomRightCorner")
-OTHERS = ("BottomHalfwayCrossing", "TopHalfwayCrossing")
+CORNERS = (
+    *("TopLeftCorner", "BottomLeftCorner", "TopRightCorner", "BottomRightCorner"),
+    *("BottomHalfwayCrossing", "TopHalfwayCrossing"),
+)
 ALLOWED_MM = {"combo": 3.0, "cam": 3.0}  # by kind; else as small pictures allow
 USUAL_MM, STATED = 1.5, 1.6
 
@@ -59,8 +62,19 @@ class Known:
         """Four corners, or crossings where those are not in the picture, clicked roughly."""
         rng = np.random.default_rng([5, sum(map(ord, self.name))])
         corners = self.truth["corners_px"]
-        names = [name for name in (*CORNERS, *OTHERS) if name in corners][:4]
+        names = max(
+            combinations([name for name in CORNERS if name in corners], 4), key=lambda four: _spread(corners, four)
+        )
         return Clicks({name: tuple(np.array(corners[name]) + rng.normal(0.0, CLICK_PX, 2)) for name in names})
+
+
+def _spread(corners: dict[str, list[float]], names: Sequence[str]) -> float:
+    """The least area of three of these points, px^2."""
+    areas = [
+        np.linalg.det(np.column_stack([[corners[name] for name in three], np.ones(3)]))
+        for three in combinations(names, 3)
+    ]
+    return float(np.min(np.abs(areas)))
 
 
 @dataclass(frozen=True)

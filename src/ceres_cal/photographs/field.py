@@ -124,7 +124,9 @@ def _looked_for(
             return search(grey, target, painted, start)
     starts, free = _starts(start, target, (int(grey.shape[1]), int(grey.shape[0])), path)
     followed = follow(grey, target, starts, painted, free)
-    return SearchResult(followed) if followed.holds else SearchResult(None, why_missed(followed, target, started=True))
+    if followed.holds and not followed.built.is_other:
+        return SearchResult(followed)
+    return SearchResult(None, why_missed(followed, target, started=True))
 
 
 def _starts(

@@ -38,6 +38,8 @@ def why_missed(followed: Followed, target: Target, *, started: bool) -> str:
     Args:
         started: whether somebody said where to start.
     """
+    if followed.built.is_other:
+        return "; ".join(followed.built.words())
     if followed.share >= LEAST_SHARE:
         names = ", ".join(target.curve_names[number] for number in followed.absent)
         return f"there is no {names} where they should be: say which lines are not painted, or check the dimensions"
@@ -48,7 +50,7 @@ def why_missed(followed: Followed, target: Target, *, started: bool) -> str:
 
 def objection(search: FieldSearch, followed: Followed) -> str:
     """What speaks against taking what was followed for the field, or nothing."""
-    if not followed.holds:
+    if not followed.holds or followed.built.is_other:
         return why_missed(followed, search.target, started=False)
     names = detected_curves(search, followed)
     if len(names) < _FEWEST_CURVES or not _in_two_directions(search, names):

@@ -19,7 +19,7 @@ from ceres_cal.photographs.facing import (
     require_sides,
     side_of,
 )
-from ceres_cal.photographs.follow import Followed, follow
+from ceres_cal.photographs.follow import Followed, FreeIntrinsics, approach, refine
 from ceres_cal.photographs.judgement import detected_curves, dice, explained, objection, same_labels
 from ceres_cal.photographs.refit import PointHints
 from ceres_cal.scene.camera import Camera, in_image
@@ -112,11 +112,14 @@ def _turned(problem: FieldSearch, auto: Auto, camera: Camera) -> Camera:
 
 def _followed(problem: FieldSearch, camera: Camera) -> Followed:
     """The target's lines from a camera that is about right, held by the points that it puts into the picture."""
+    return approach(problem.grey, problem.target, camera, problem.curves, _free(problem, camera))
+
+
+def _free(problem: FieldSearch, camera: Camera) -> FreeIntrinsics:
     pixels = camera.project(problem.target.point_array)
     rows = np.flatnonzero(in_image(pixels, camera.image_size))
     hints = PointHints(rows.astype(np.int32), pixels[rows], np.full(len(rows), SIGMA_PX))
-    free = unknown_optics(camera.image_size, camera.phi, hints)
-    return follow(problem.grey, problem.target, [camera], problem.curves, free)
+    return unknown_optics(camera.image_size, camera.phi, hints)
 
 
 # ---- which way round ------------------------------------------------------------------------------------------------
@@ -125,22 +128,20 @@ def _followed(problem: FieldSearch, camera: Camera) -> Followed:
 def _one_way(problem: FieldSearch, auto: Auto, distinct: Sequence[Followed]) -> SearchResult:
     """The one way that agrees with what is known; InputError where none does, or several."""
     target, curves = problem.target, problem.curves
-    ways = [(one, turn, one.camera.at(one.camera.cam_from_world @ turn)) for one in distinct for turn in problem.turns]
-    cameras = [camera for _, _, camera in ways]
-    agreeing = _consistent(problem, auto, cameras)
+    ways = [one.camera.at(one.camera.cam_from_world @ turn) for one in distinct for turn in problem.turns]
+    agreeing = _consistent(problem, auto, ways)
     if not agreeing:
         given = ", ".join(f"{one.feature}={one.side}" for one in auto.facing)
-        raise InputError(f"not with {given}: in this photograph {_sides(cameras, target, curves)}")
+        raise InputError(f"not with {given}: in this photograph {_sides(ways, target, curves)}")
     if len(agreeing) > 1:
         raise InputError(
             f"the field is found, but it looks alike in {len(agreeing)} ways: "
-            f"{_sides([cameras[number] for number in agreeing], target, curves)}"
+            f"{_sides([ways[number] for number in agreeing], target, curves)}"
         )
-    followed, turn, camera = ways[agreeing[0]]
-    if turn is not problem.turns[0]:
-        followed = follow(problem.grey, target, [camera], curves)
-        if against := objection(problem, followed):
-            return SearchResult(None, against)
+    camera = ways[agreeing[0]]
+    followed = refine(problem.grey, target, camera, curves, _free(problem, camera))
+    if against := objection(problem, followed):
+        return SearchResult(None, against)
     chosen_by = "" if len(ways) == 1 else "facing" if auto.facing else "before"
     return SearchResult(followed, "", len(ways), chosen_by)
 
