@@ -33,8 +33,8 @@ _SHAPE_WINDOWS = 150
 _AS_WIDE = 2.5
 # Blur, px, from which a line is so wide that it must be searched as such.
 _WIDE_BLUR_PX = 1.2
-# Of a wide blur: what is fitted. A camera does not move evenly, and not the brightest place of its smear is the mean one
-# but the middle of its weight, which a wider profile finds.
+# Of a wide blur: what is fitted. A camera does not move evenly, and not the brightest place of its smear is the mean
+# one but the middle of its weight, which a wider profile finds.
 _OF_WIDE = 1.5
 # Directions that lines run in, of which each has its own blur where the camera moved; windows to tell it by; and
 # windows that count as much as no direction having any.

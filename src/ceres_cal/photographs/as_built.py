@@ -21,7 +21,7 @@ from ceres_cal.model.parameters import intrinsic_names
 from ceres_cal.model.residuals import residuals
 from ceres_cal.model.structure import dimension_slopes
 from ceres_cal.observations import Prior
-from ceres_cal.photographs.refit import TARGET, observations_of, problem_of
+from ceres_cal.photographs.refit import observations_of, problem_of
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.targets import Target
 from ceres_cal.solve.linear_model import Weights, make_linear_model
@@ -201,7 +201,7 @@ class _Shape:
         return np.asarray(0.5 * explained - 0.5 * np.linalg.slogdet(wider)[1])
 
     def _amounts(self, root: Array, scatter_m: float) -> tuple[Array, Array]:
-        """Posterior mean and standard deviation (Z,) of what moves the curves by `root` (Q, Z), each of one beforehand."""
+        """Posterior mean and sd (Z,) of what moves the curves by `root` (Q, Z), each of one beforehand."""
         one = np.eye(len(self.slope))
         covariance = root @ root.T + scatter_m**2 * one
         taken = np.linalg.solve(one + covariance @ self.normal, covariance)  # posterior covariance of the numbers

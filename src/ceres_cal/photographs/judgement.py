@@ -67,12 +67,11 @@ def objection(search: FieldSearch, followed: Followed) -> str:
     return ""
 
 
-def dice(search: FieldSearch, camera: Camera) -> float:
-    """Dice's coefficient of strokes and target, by length: twice what one covers of the other, over both together."""
+def likelihood(search: FieldSearch, camera: Camera) -> float:
+    """How much likelier the target is where a camera puts it than lines laid anywhere: see `StrokeMap.likelihood`."""
     course = predict(search.target, camera, search.curves, _COURSE_PX)
-    in_view = _COURSE_PX * len(course)
-    covered = search.stroke_map.near.score(course.pixels) * in_view if len(course) else 0.0
-    return 2.0 * covered / (in_view + float(np.sum(search.stroke_map.strokes.length_px)))
+    near = search.stroke_map.near.at(*course.pixels.T)
+    return float(search.stroke_map.likelihood(_COURSE_PX * np.sum(near), np.array(_COURSE_PX * len(course))))
 
 
 def explained(search: FieldSearch, camera: Camera) -> float:

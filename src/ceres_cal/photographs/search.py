@@ -20,7 +20,7 @@ from ceres_cal.photographs.facing import (
     side_of,
 )
 from ceres_cal.photographs.follow import Followed, FreeIntrinsics, approach, refine
-from ceres_cal.photographs.judgement import detected_curves, dice, explained, objection, same_labels
+from ceres_cal.photographs.judgement import detected_curves, explained, likelihood, objection, same_labels
 from ceres_cal.photographs.refit import PointHints
 from ceres_cal.scene.camera import Camera, in_image
 from ceres_cal.scene.targets import Target
@@ -28,7 +28,7 @@ from ceres_cal.scene.targets import Target
 # Of the strokes explained, by the first without an objection: no other is followed. It only saves time. Nothing
 # changes from 0.82 to 0.95.
 _SURE = 0.9
-# Of the best one's Dice coefficient: another way to see the picture that is as good makes it ambiguous. Nothing
+# Of the best one's likelihood: another way to see the picture that is as good makes it ambiguous. Nothing
 # changes from 0.85 to 0.96.
 _AS_GOOD = 0.92
 _NO_LINES = (
@@ -92,12 +92,12 @@ def search(grey: Array32, target: Target, curves: Collection[str], auto: Auto) -
             break
     if not good:
         return SearchResult(None, reason)
-    best = max(good, key=lambda one: dice(problem, one.camera))
+    best = max(good, key=lambda one: likelihood(problem, one.camera))
     similar = alike(problem, best.camera, detected_curves(problem, best))
     others = [_followed(problem, _turned(problem, auto, camera)) for camera in similar]
     distinct = [best]
     for other in (*good, *(one for one in others if not objection(problem, one))):
-        as_good = dice(problem, other.camera) >= _AS_GOOD * dice(problem, best.camera)
+        as_good = likelihood(problem, other.camera) >= _AS_GOOD * likelihood(problem, best.camera)
         if as_good and not any(same_labels(problem, other, one) for one in distinct):
             distinct.append(other)
     return _one_way(problem, auto, distinct)
