@@ -18,10 +18,11 @@ from photographs_auto import auto_rows, real_auto_rows
 from photographs_shared import shared_rows
 from straightness import observed_boards, straight_rows
 
+SHARED = Path(os.environ.get("CERES_CAL_SHARED", Path(__file__).parents[2] / "shared")) / "photos"
 CASES = ("lines", "floor", "starts", "auto", "speed", "rings", "real", "straight", "shared")
 
 
-def rows_of(case: str, runs: int, real: Path | None, picture: Path | None, shared: Path | None) -> Iterator[Row]:
+def rows_of(case: str, runs: int, real: Path | None, picture: Path | None) -> Iterator[Row]:
     if case == "lines":
         yield from line_figures(range(runs))
     elif case == "floor":
@@ -36,9 +37,8 @@ def rows_of(case: str, runs: int, real: Path | None, picture: Path | None, share
         yield from speed_rows(min(runs, 20))
     elif case == "rings":
         yield from rings_rows(min(runs, 20))
-    elif case == "shared":
-        if shared is not None:
-            yield from shared_rows(shared)
+    elif case == "shared" and SHARED.is_dir():
+        yield from shared_rows(SHARED)
     elif real is not None and case == "straight":
         boards = observed_boards(real)
         for keep_scale in (False, True):
@@ -58,6 +58,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     real = None if options.real is None else Path(options.real)
     if real is not None and not real.is_dir():
         parser.error(f"{real}: there is no such folder of real images")
+    if not SHARED.is_dir() and "shared" in (options.case or ()):
+        parser.exit(
+            1, f"{SHARED}: the photographs of another renderer are not there: name their folder in CERES_CAL_SHARED\n"
+        )
     if real is None and {"real", "straight"} & set(options.case or ()):
         parser.error("real images are needed: name their folder with --real, or set CERES_CAL_REAL")
     rows = (row for case in options.case or CASES for row in rows_of(case, options.runs, real, options.picture))

@@ -105,8 +105,8 @@ def outcome(shown: Known, start: Auto | Clicks, lens: str = "auto") -> Outcome:
         found = detect_field([shown.path], targets_by_name()[shown.truth["asked_as"]], start)
         seconds = time.perf_counter() - began
         calibration = calibrate(found.observations, Options(lens=lens))
-    except (CalibrationError, InputError) as error:
-        return Outcome(time.perf_counter() - began, why=str(error))
+    except (CalibrationError, InputError) as refusal:
+        return Outcome(time.perf_counter() - began, why=str(refusal))
     pixels, places = shown.floor()
     camera = calibration.station()
     error = np.linalg.norm(camera.locate(pixels) - places, axis=1)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Array32, Indices, Mask
+from ceres_cal.base.arrays import AnyArray, Array, Array32, Indices, Mask
 
 _SCALES = (1, 2)  # a photograph is searched at full and at half size: for narrow paint and for wide
 _SIGMA_PX = 1.6
@@ -76,11 +76,11 @@ class _Ridge:
 
 
 def _ridge_points(grey: Array32) -> _Ridge:
-    soft = cv2.GaussianBlur(grey, (0, 0), _SIGMA_PX)
+    soft = _smoothed(grey, _SIGMA_PX)
     xx, yy, xy, bend = _bends(soft)
     strength = np.maximum(-bend, 0.0)
     usual = float(np.median(strength[::3, ::3]))
-    wider = np.maximum(-_bends(cv2.GaussianBlur(grey, (0, 0), 2.0 * _SIGMA_PX))[3], 0.0)
+    wider = np.maximum(-_bends(_smoothed(grey, 2.0 * _SIGMA_PX))[3], 0.0)
     # Noise differs over a picture, in sun and in shadow; of the noise nearby lines are no part.
     size = (_NEARBY_PX, _NEARBY_PX)
     nearby = cv2.boxFilter(np.minimum(strength, _NOISE * max(usual, 1e-3)), cv2.CV_32F, size, normalize=True)
@@ -106,7 +106,16 @@ def _bends(soft: Array32) -> tuple[Array32, Array32, Array32, Array32]:
     """Second derivatives by x, by y and by both, and the lower one of their eigenvalues."""
     xx, yy = (np.asarray(cv2.Sobel(soft, cv2.CV_32F, *order, ksize=3)) / 4.0 for order in ((2, 0), (0, 2)))
     xy = np.asarray(cv2.Sobel(soft, cv2.CV_32F, 1, 1, ksize=3)) / 4.0
-    return xx, yy, xy, 0.5 * (xx + yy) - np.sqrt((0.5 * (xx - yy)) ** 2 + xy**2)
+    lower = 0.5 * (xx + yy) - np.sqrt((0.5 * (xx - yy)) ** 2 + xy**2)
+    return _single(xx), _single(yy), _single(xy), _single(lower)
+
+
+def _smoothed(grey: Array32, sigma_px: float) -> Array32:
+    return _single(np.asarray(cv2.GaussianBlur(grey, (0, 0), sigma_px)))
+
+
+def _single(plane: AnyArray) -> Array32:
+    return np.asarray(plane, dtype=np.float32)
 
 
 def _strokes(ridge: _Ridge) -> Strokes:

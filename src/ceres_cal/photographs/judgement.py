@@ -71,7 +71,7 @@ def likelihood(search: FieldSearch, camera: Camera) -> float:
     """How much likelier the target is where a camera puts it than lines laid anywhere: see `StrokeMap.likelihood`."""
     course = predict(search.target, camera, search.curves, _COURSE_PX)
     near = search.stroke_map.near.at(*course.pixels.T)
-    return float(search.stroke_map.likelihood(_COURSE_PX * np.sum(near), np.array(_COURSE_PX * len(course))))
+    return float(search.stroke_map.likelihood(np.array(_COURSE_PX * np.sum(near)), np.array(_COURSE_PX * len(course))))
 
 
 def explained(search: FieldSearch, camera: Camera) -> float:
