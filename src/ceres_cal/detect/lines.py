@@ -31,8 +31,8 @@ _BAND_PX = 3.0  # of background, to either side of the paint, in the search
 _SHAPE_WINDOWS = 150
 # Of blur, in standard deviations: the part of a blurred line that is brightest.
 _AS_WIDE = 2.5
-# Blur, px, from which a line is so wide that it must be searched as such.
-_WIDE_BLUR_PX = 1.2
+# Blur, px, from which a line is so wide that it must be searched as such: no lens in focus has that.
+_WIDE_BLUR_PX = 1.7
 # Of a wide blur: what is fitted. A camera does not move evenly, and not the brightest place of its smear is the mean
 # one but the middle of its weight, which a wider profile finds.
 _OF_WIDE = 1.5

@@ -25,7 +25,7 @@ _SHAPE_SIGMA = np.array([1.0, 0.3])  # of the logarithms of blur and stretch, be
 _MOST_STEP_PX = 0.7
 # Grey levels: how much brighter one side of a line is than the other, beforehand. Of a line much narrower than its blur
 # the pixels alone tell such a step and the line's place hardly apart.
-_LEVEL_SIGMA = 20.0
+_LEVEL_SIGMA = 5.0
 _STEPS = 6
 _TINY = 1e-9
 

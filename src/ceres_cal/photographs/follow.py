@@ -49,11 +49,13 @@ class FreeIntrinsics:
     Attributes:
         names: of the free intrinsics, in the order in which they are freed. priors: that hold them.
         hints: points that somebody showed, which hold the camera while lines are far off.
+        keep: whether the starts are known to be near: nothing far off is looked at.
     """
 
     names: tuple[str, ...] = ()
     priors: tuple[Prior, ...] = ()
     hints: PointHints | None = None
+    keep: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,9 +153,11 @@ class _Tracker:
     def _reached(self, starts: Sequence[Camera]) -> Iterator[Followed]:
         if self.free.hints is None:
             yield self.close_in(starts[0], _NEAR_REACHES_PX)
+            if self.free.keep:
+                return
         shifted = self.shifted_starts(starts)
         shown = (_SHOWN_REACHES_PX,) if self.free.hints is not None else ()
-        for reaches, camera in product((*shown, _FAR_REACHES_PX), shifted):
+        for reaches, camera in product(shown if self.free.keep else (*shown, _FAR_REACHES_PX), shifted):
             yield self.close_in(camera, reaches)
         if not shifted:
             yield self.close_in(starts[0], ())  # as it is: nothing to search

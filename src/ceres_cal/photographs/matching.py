@@ -88,7 +88,7 @@ class StrokeMap:
 
 def divergence(share: Array | float, other: Array | float) -> Array:
     """Kullback and Leibler's, of two probabilities: what a trial tells of the first against the second."""
-    share = np.clip(share, 1e-9, 1.0 - 1e-9)
+    share, other = (np.clip(one, 1e-6, 1.0 - 1e-6) for one in (share, other))
     return np.asarray(share * np.log(share / other) + (1.0 - share) * np.log((1.0 - share) / (1.0 - other)))
 
 

@@ -56,6 +56,7 @@ class SearchResult:
 
     Attributes:
         followed: the field, or None. reason: why none was found.
+        seen: the best candidate, where none is the field.
         ways: in how many ways the photograph can be taken for the field; 0: none was looked for, a start was given.
             chosen_by: what chose one of them: "facing", "before", or nothing, where there is but one.
     """
@@ -64,6 +65,7 @@ class SearchResult:
     reason: str = ""
     ways: int = 0
     chosen_by: str = ""
+    seen: Followed | None = None
 
 
 def search(grey: Array32, target: Target, curves: Collection[str], auto: Auto) -> SearchResult:
@@ -80,18 +82,20 @@ def search(grey: Array32, target: Target, curves: Collection[str], auto: Auto) -
     """
     require_sides(auto.facing, target, curves)
     problem = prepare_search(grey, target, curves)
-    good, reason = [], _NO_LINES
-    for number, camera in enumerate(candidates(problem)):
+    good: list[Followed] = []
+    seen: Followed | None = None
+    reason = _NO_LINES
+    for camera in candidates(problem):
         followed = _followed(problem, _turned(problem, auto, camera))
         against = objection(problem, followed)
         if not against:
             good.append(followed)
-        elif number == 0:
-            reason = against
+        elif seen is None or followed.share > seen.share:
+            seen, reason = followed, against
         if good and explained(problem, good[-1].camera) > _SURE:
             break
     if not good:
-        return SearchResult(None, reason)
+        return SearchResult(None, reason, seen=seen)
     best = max(good, key=lambda one: likelihood(problem, one.camera))
     similar = alike(problem, best.camera, detected_curves(problem, best))
     others = [_followed(problem, _turned(problem, auto, camera)) for camera in similar]
@@ -141,7 +145,7 @@ def _one_way(problem: FieldSearch, auto: Auto, distinct: Sequence[Followed]) -> 
     camera = ways[agreeing[0]]
     followed = refine(problem.grey, target, camera, curves, _free(problem, camera))
     if against := objection(problem, followed):
-        return SearchResult(None, against)
+        return SearchResult(None, against, seen=followed)
     chosen_by = "" if len(ways) == 1 else "facing" if auto.facing else "before"
     return SearchResult(followed, "", len(ways), chosen_by)
 
