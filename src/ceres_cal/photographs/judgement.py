@@ -18,6 +18,9 @@ _NEAR_PX = 6.0
 # Of the strokes that could be lines of the target, the share that must lie on it. On photographs with cables, seams and
 # stripes of sun it is 0.83 at least, of other fields 0.6 at most.
 _EXPLAINED = 0.75
+# The same, also of those beside the target, where walls and boundary lines run: 0.61 at least where it is seen whole;
+# a corner alone may be any corner, so that fewer curves than that must explain as much of the rest of the picture.
+_OF_ALL, _MANY_CURVES = 0.55, 6
 # Sine of the angle between a stroke and the lines, at most: 4 degrees. Of the usual strength of strokes on the lines,
 # another line's at least.
 _PARALLEL, _AS_STRONG = 0.07, 0.5
@@ -59,7 +62,9 @@ def objection(search: FieldSearch, followed: Followed) -> str:
     if -followed.camera.cam_from_world.rotation[2, 2] < _LEAST_UPRIGHT or not PHI_RANGE[0] < phi < PHI_RANGE[1]:
         return "its lines were not found in any view from above: start from corners"
     share = explained(search, followed.camera)
-    if share < _EXPLAINED:
+    of_all = explained(search, followed.camera, everywhere=True)
+    if share < _EXPLAINED or of_all < (_OF_ALL if len(names) >= _MANY_CURVES else _EXPLAINED):
+        share = min(share, of_all)
         return (
             f"of the bright lines where the field would be, only {100.0 * share:.0f} % are lines of it: "
             "check the target's dimensions and which lines are painted, or start from corners"
@@ -74,8 +79,8 @@ def likelihood(search: FieldSearch, camera: Camera) -> float:
     return float(search.stroke_map.likelihood(np.array(_COURSE_PX * np.sum(near)), np.array(_COURSE_PX * len(course))))
 
 
-def explained(search: FieldSearch, camera: Camera) -> float:
-    """Of the strokes inside the target's outline that could be its lines, the share (by length) that lies on them.
+def explained(search: FieldSearch, camera: Camera, *, everywhere: bool = False) -> float:
+    """Of the strokes inside the target's outline, or everywhere, that could be its lines, the share that lies on them.
 
     Those could be that run along its lines or across, and are as strong as the ones on it: cables, seams, shadows and
     stripes of sun that run otherwise, or are fainter, say nothing against it.
@@ -88,6 +93,7 @@ def explained(search: FieldSearch, camera: Camera) -> float:
     margin = _RIM * np.ptp(places, axis=0)
     with np.errstate(invalid="ignore"):
         inside = np.all((middles > places.min(axis=0) - margin) & (middles < places.max(axis=0) + margin), axis=1)
+        inside |= everywhere
         inside &= along.min(axis=1) < _PARALLEL * along.max(axis=1)
     if not np.any(inside) or not len(course):
         return 0.0

@@ -134,6 +134,10 @@ def _one_way(problem: FieldSearch, auto: Auto, distinct: Sequence[Followed]) -> 
     target, curves = problem.target, problem.curves
     ways = [one.camera.at(one.camera.cam_from_world @ turn) for one in distinct for turn in problem.turns]
     agreeing = _consistent(problem, auto, ways)
+    camera = ways[agreeing[0]] if agreeing else ways[0]
+    followed = refine(problem.grey, target, camera, curves, _free(problem, camera))
+    if against := objection(problem, followed):
+        return SearchResult(None, against, seen=followed)
     if not agreeing:
         given = ", ".join(f"{one.feature}={one.side}" for one in auto.facing)
         raise InputError(f"not with {given}: in this photograph {_sides(ways, target, curves)}")
@@ -142,10 +146,6 @@ def _one_way(problem: FieldSearch, auto: Auto, distinct: Sequence[Followed]) -> 
             f"the field is found, but it looks alike in {len(agreeing)} ways: "
             f"{_sides([ways[number] for number in agreeing], target, curves)}"
         )
-    camera = ways[agreeing[0]]
-    followed = refine(problem.grey, target, camera, curves, _free(problem, camera))
-    if against := objection(problem, followed):
-        return SearchResult(None, against, seen=followed)
     chosen_by = "" if len(ways) == 1 else "facing" if auto.facing else "before"
     return SearchResult(followed, "", len(ways), chosen_by)
 
