@@ -36,6 +36,7 @@ from benchmark_problems import (
     field_observations,
     wide_lens,
 )
+from benchmark_process import process_rows
 
 from ceres_cal.scene.heights import ROBOT_TOP_M
 from ceres_cal.scene.lens import KannalaBrandt
@@ -308,6 +309,15 @@ GROWTH = {
 }
 
 
+PROCESS = {
+    "problem": ("whole process", ""),
+    "ours_wall": ("ours s", ".3f"),
+    "opencv_wall": ("OpenCV s", ".3f"),
+    "times_wall": ("ratio", ".2f"),
+    "ours_processor": ("ours CPU s", ".3f"),
+    "opencv_processor": ("OpenCV CPU s", ".3f"),
+    "times_processor": ("ratio", ".2f"),
+}
 PIXELS_TOLD = {"lens": ("lens", ""), "locate": ("locate s", ".3f"), "project": ("project s", ".3f")}
 
 
@@ -399,6 +409,13 @@ def measure(chosen: argparse.Namespace) -> dict[str, Any]:
     return report
 
 
+def measure_processes(repeat: int) -> dict[str, Any]:
+    """From start to exit, printed."""
+    rows = process_rows(repeat)
+    print_table(f"from start to exit, median of {repeat} turns; ratio: how many times OpenCV's", PROCESS, rows)
+    return {"environment": environment(), "process": rows}
+
+
 def compare_all(chosen: argparse.Namespace, imports: Mapping[str, float | None]) -> list[dict[str, Any]]:
     """Every size of the comparison, by the solvers that are there."""
     warm_up_s = chosen.warm_up
@@ -446,6 +463,7 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--memory", action="store_true", help="peak memory of each solver at the most frames, too")
     parser.add_argument("--json", type=Path, help="write everything measured to this file")
     parser.add_argument("--quick", action="store_true", help="smallest sizes, one turn: does it run?")
+    parser.add_argument("--process", action="store_true", help="whole processes in turns, and no more")
     parser.add_argument("--alone", nargs=3, help=argparse.SUPPRESS)
     chosen = parser.parse_args(arguments)
     if chosen.alone:
@@ -454,7 +472,7 @@ def main(arguments: Sequence[str]) -> int:
         return 0
     if chosen.quick:
         chosen.frames, chosen.growth, chosen.points, chosen.repeat = [20], [20, 40], [1000], 1
-    report = measure(chosen)
+    report = measure_processes(chosen.repeat) if chosen.process else measure(chosen)
     if chosen.json:
         chosen.json.write_text(json.dumps(report, indent=1), encoding="utf-8")
     return 0

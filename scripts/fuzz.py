@@ -16,6 +16,7 @@ import multiprocessing
 import os
 import re
 import resource
+import shutil
 import signal
 import sys
 import tempfile
@@ -29,6 +30,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from ssl_settings_file import settings
 
 from ceres_cal.base.errors import CalibrationError
 from ceres_cal.base.files import write_json
@@ -65,6 +67,10 @@ def _foreign(form: str, **options: Any) -> Reader:
     return lambda path: read_foreign(path, form, **options)
 
 
+def _model(path: Path) -> object:
+    return read_foreign(path.parent, "colmap")
+
+
 EXPORTED = {"opencv.yml": "opencv", "opencv.xml": "opencv", "opencv.json": "opencv", "ros.yaml": "ros"}
 EXPORTED |= {"chain.yaml": "kalibr", "own.cameramodel": "mrcal", "paper.txt": "paper"}
 EXPORTED |= {"geometry.pb": "ssl-vision", "geometry.yml": "vision-processor"}
@@ -79,6 +85,8 @@ READERS: dict[str, Reader] = {
     "table.csv": _foreign("csv", target="ssl-b", image_size="640x480"),
     "columns.npz": _foreign("npz-columns", image_size="640x480"),
     "boards.cameramodel": _foreign("mrcal-observations"),
+    "camera.xml": _foreign("ssl-vision-xml"),
+    **{f"colmap/{part}.txt": _model for part in ("cameras", "frames", "images", "rigs")},
     "observations.json": Observations.load,
     "observations.npz": Observations.load,
     "calibration.json": Calibration.load,
@@ -102,6 +110,8 @@ def corpus(folder: Path) -> None:
     for name, form in EXPORTED.items():
         options: dict[str, Any] = {"camera_id": "0"} if "geometry" in name else {}
         export(calibration, form, folder / name, [station], **options)
+    export(calibration, "colmap", folder / "colmap", [station])
+    (folder / "camera.xml").write_text(settings(cameras=1))
     foreign_observations(folder)
     write_json(folder / "scene.json", scene_to_json(*built_in_scene("ssl-field")))
     corners = {name: [10.0 * number, 20.0] for number, name in enumerate("abcd")}
@@ -223,7 +233,8 @@ def outcome(reader: Reader, path: Path) -> tuple[str, str]:
             whole = round_trip(loaded, path)
     except CalibrationError as error:
         text = str(error)
-        return ("refused" if "\n" not in text and text.startswith(f"{path}") else "many lines"), text
+        named = text.startswith((f"{path}", f"{path.parent}:"))  # a model of several files goes by its folder
+        return ("refused" if "\n" not in text and named else "many lines"), text
     except Exception as error:
         return "unexpected", repr(error)
     if heard:
@@ -237,6 +248,7 @@ def work(folder: Path, names: Sequence[str], seed: int, end: float, answers: Any
     rng = np.random.default_rng(seed)
     contents = {name: (folder / name).read_bytes() for name in names}
     place = Path(tempfile.mkdtemp(dir=folder))
+    shutil.copytree(folder / "colmap", place / "colmap")
     while time.time() < end:
         name = names[int(rng.integers(0, len(names)))]
         path = place / name
@@ -249,6 +261,7 @@ def work(folder: Path, names: Sequence[str], seed: int, end: float, answers: Any
         signal.alarm(0)
         peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
         what = "slow" if seconds > LONGEST_S else "memory" if peak_mb > MOST_MB else what
+        path.write_bytes(contents[name])  # the others of a model are whole
         answers.send((name, what, words, seconds, peak_mb))
         if what == "memory":  # whose peak would be that of all that follow
             return
@@ -293,7 +306,7 @@ def report(name: str, what: str, words: str, path: Path, keep: Path | None, numb
     print(f"{name}: {what}: {words[:300]}", flush=True)
     if keep is not None and path.exists():
         keep.mkdir(parents=True, exist_ok=True)
-        (keep / f"{what.replace(' ', '-')}-{number}-{name}").write_bytes(path.read_bytes())
+        (keep / f"{what} {number} {name}".replace(" ", "-").replace("/", "-")).write_bytes(path.read_bytes())
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

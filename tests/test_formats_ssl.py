@@ -14,6 +14,7 @@ import pytest
 import yaml
 from foreign_cases import LENSES, SSL_LENS, over_field, places, same_camera, two_cameras, with_lens
 from google.protobuf import descriptor_pb2, descriptor_pool, json_format, message_factory
+from ssl_settings_file import settings
 
 from ceres_cal import Calibration, InputError
 from ceres_cal.base.arrays import Array
@@ -233,39 +234,6 @@ def test_what_is_no_field_is_refused() -> None:
 
 
 # ---- ssl-vision's settings ------------------------------------------------------------------------------------------
-
-
-def var(name: str, kind: str, inside: str) -> str:
-    return f'<Var name="{name}" type="{kind}">{inside}</Var>\n'
-
-
-def settings(cameras: int = 2, opencv: str = "true") -> str:
-    """A robocup-ssl.xml."""
-    names = ["focal length", "principal point x", "principal point y", "distortion", *(f"q{n}" for n in range(4))]
-    size = {"Field Length": 9000, "Field Width": 6000, "Goal Width": 1000, "Penalty Area Depth": 1000}
-    size |= {"Penalty Area Width": 2000, "Center Circle Radius": 500, "Line Thickness": 10}
-    line = "".join(
-        var(name, "double", value)
-        for name, value in zip(
-            ("P1.x", "P1.y", "P2.x", "P2.y", "Line thickness"), ("-4500", "3000", "4500", "3000", "10"), strict=True
-        )
-    )
-    lines = var("TopTouchLine", "list", var("Name", "string", "TopTouchLine") + line)
-    field = "".join(var(name, "double", f"{value}.000000") for name, value in size.items())
-    text = var("Global", "list", var("Field Configuration", "list", field + var("Field Lines", "list", lines)))
-    for number in range(cameras):
-        values = [500.0, 320.0, 240.0, 0.1, 0.7, 0.7, 0.0, 0.1, 0.0, 0.0, 4000.0]
-        own = "".join(
-            f'<Var name="{name}" type="double" minval="" maxval="">\n  {str(value).replace(".", ",")}\n</Var>\n'
-            for name, value in zip([*names, "tx", "ty", "tz"], values, strict=True)
-        )
-        inner = var("Intrinsic Parameters", "list", var("focal_length_x", "double", "1.0"))
-        own = inner + var("use openCV camera model", "bool", opencv) + own
-        other = var("camera index", "int", str(number)) + var("Image width", "int", "1280")
-        other += var("Image height", "int", "960")
-        lists = var("Camera Parameters", "list", own) + var("Calibration Parameters", "list", other)
-        text += var(f"Thread {number}", "list", var("Camera Calibrator", "list", lists))
-    return f'<?xml version="1.0"?>\n<!-- by hand &amp; kept -->\n<VarXML>\n{text}</VarXML>\n'
 
 
 def test_settings_are_edited_in_place(tmp_path: Path) -> None:

@@ -124,10 +124,6 @@ def _run(args: Namespace) -> Answer:
     photographs = report_photographs(args, observations)
     options = _options(args, fixed, powers, observations)
     with progress_bar(args) as bar:
-        from ceres_cal.kernels.jit import CACHE_FOLDER
-
-        if next(CACHE_FOLDER.rglob("*.nbi"), None) is None:
-            bar.say("compiling the kernels (first run only)")
         from ceres_cal.calibrating import calibrate
         from ceres_cal.report.quality import quality_of
 

@@ -16,6 +16,7 @@ from ceres_cal.base.errors import DegenerateError, InputError
 from ceres_cal.base.transforms import Pose, rotation_log
 from ceres_cal.scene.foreign import (
     FISHEYE,
+    LARGEST,
     LARGEST_PX,
     OPENCV_MODELS,
     ForeignCamera,
@@ -61,11 +62,12 @@ class Camera:
         cx, cy = (float(c) for c in self.principal_point)
         if not (1 <= width <= LARGEST_PX and 1 <= height <= LARGEST_PX):
             raise InputError(f"image size must be two positive whole numbers, not {self.image_size}")
-        numbers = (self.phi, self.aspect, cx, cy, *self.lens.values)
-        if not np.all(np.isfinite(numbers)) or self.phi <= 0.0 or self.aspect <= 0.0:
+        numbers = (self.phi, self.aspect, cx, cy, *self.lens.values, *self.cam_from_world.translation)
+        if not np.all(np.abs(numbers) < LARGEST) or self.phi <= 0.0 or self.aspect <= 0.0:
             raise InputError(
-                f"intrinsics must be finite, phi and aspect positive: phi {self.phi}, aspect {self.aspect}, "
-                f"principal point {(cx, cy)}, {self.lens.coefficients}"
+                f"intrinsics must be finite and below {LARGEST:g}, phi and aspect positive: phi {self.phi}, "
+                f"aspect {self.aspect}, principal point {(cx, cy)}, {self.lens.coefficients}, "
+                f"translation {self.cam_from_world.translation}"
             )
         object.__setattr__(self, "image_size", (width, height))
         object.__setattr__(self, "phi", float(self.phi))

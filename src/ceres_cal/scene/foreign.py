@@ -22,6 +22,7 @@ from ceres_cal.scene.lens import Brown, KannalaBrandt, Lens, Radial
 OPENCV_MODELS = {"opencv4": 4, "opencv5": 5, "opencv8": 8, "opencv12": 12}
 """OpenCV's coefficients in its order, k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4]]], and how many there are."""
 LARGEST_PX = 10**9  # what is larger is no number of pixels
+LARGEST = 1e100  # of any number of a camera: squares and cubes of what is larger overflow
 FISHEYE = "fisheye"
 """OpenCV's fisheye model: k1 to k4."""
 _GRID = (41, 31)  # pixels of the image over which a fit is made
@@ -51,15 +52,17 @@ class ForeignCamera:
     distort: Callable[[Array], Array] | None = None
 
     def __post_init__(self) -> None:
-        numbers = (*self.focal, *self.centre, *self.coefficients)
+        place = () if self.cam_from_world is None else self.cam_from_world.translation
+        numbers = (*self.focal, *self.centre, *self.coefficients, *place)
         if (
-            not np.all(np.isfinite(numbers))
+            not np.all(np.abs(numbers) < LARGEST)
             or min(self.focal) <= 0.0
             or not all(1 <= size <= LARGEST_PX for size in self.image_size)
         ):
             raise InputError(
-                f"a camera needs an image size, focal lengths above 0 and finite numbers, not {self.image_size} px, "
-                f"fx, fy {self.focal}, cx, cy {self.centre}, coefficients {self.coefficients}: correct them"
+                f"a camera needs an image size, focal lengths above 0 and finite numbers below {LARGEST:g}, not "
+                f"{self.image_size} px, fx, fy {self.focal}, cx, cy {self.centre}, coefficients {self.coefficients}, "
+                f"translation {place}: correct them"
             )
 
     @classmethod
