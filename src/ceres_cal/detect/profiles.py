@@ -108,24 +108,32 @@ def fit_profiles(windows: Windows, edges: Array, blur_px: Array | float, reach_p
     normal, right = _linear(windows, edges, blur, offset)
     heights = _solve(normal, right)[:, 2:]
     squares = np.sum(windows.values**2, axis=1)
-    rough = (squares - np.sum(_solve(normal, right) * right, axis=1)) / windows.values.shape[1]
+    variance = (squares - np.sum(_solve(normal, right) * right, axis=1)) / windows.values.shape[1]
     level = np.zeros(normal.shape[1] + 1)
-    level[2:-1] = 1.0
-    known = np.maximum(rough, 1.0)[:, None, None] * np.outer(level, level) / _LEVEL_SIGMA**2
+    level[2:-1] = 1.0 if edges.shape[1] > 1 else 0.0
     for _ in range(_STEPS):
+        known = np.maximum(variance, 0.0)[:, None, None] * np.outer(level, level) / _LEVEL_SIGMA**2
         columns = _columns(windows, edges, blur, offset, heights)
         normal, right = _normal(columns, windows.values)
         solution = _solve(normal + known, right)
+        variance = _misfit(squares, normal, right, solution) / windows.values.shape[1]
         step = np.clip(solution[:, -1], -_MOST_STEP_PX, _MOST_STEP_PX)
         offset, heights = np.clip(offset + step, -reach_px - 1.0, reach_px + 1.0), solution[:, 2:-1]
         if np.all(np.abs(step) < 1e-3):
             break
     freedom = windows.values.shape[1] - columns.shape[1]
-    misfit = squares - np.sum(solution * (2.0 * right - np.matmul(normal, solution[:, :, None])[:, :, 0]), axis=1)
-    noise = np.sqrt(np.maximum(misfit, 0.0) / freedom + 1.0 / 12.0)  # what rounding to whole levels hides
+    misfit = np.maximum(_misfit(squares, normal, right, solution), 0.0)
+    noise = np.sqrt(misfit / freedom + 1.0 / 12.0)  # what rounding to whole levels hides
     sigma = noise * np.sqrt(np.maximum(_last_of_inverse(normal + known), 0.0))
     good = windows.inside & (np.abs(step) < 0.05) & (np.abs(offset) <= reach_px) & np.isfinite(sigma) & (sigma > 0.0)
     return Profiles(np.where(good, offset, np.nan), np.where(good, sigma, np.inf), heights, noise)
+
+
+def _misfit(squares: Array, normal: Array, right: Array, solution: Array) -> Array:
+    """(N,) squared residuals of any solution of the normal equations, or of none of them."""
+    return np.asarray(
+        squares - np.sum(solution * (2.0 * right - np.matmul(normal, solution[:, :, None])[:, :, 0]), axis=1)
+    )
 
 
 def fit_shape(
