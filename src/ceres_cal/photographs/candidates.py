@@ -27,11 +27,11 @@ _UPRIGHTS = 4  # answers for lens and tilt, at most, that are matched
 _SURE = 0.88
 _POWERS = (2, 3, 4, 5)
 # Of the best match's score: another's, and that of another way to take the picture. Nothing changes from 0.6 to 0.86.
-_COMPARABLE, _ALIKE = 0.5, 0.9
+_COMPARABLE, _ALIKE = 0.3, 0.9
 _MOST, _MOST_ALIKE = 4, 60
-# Where a candidate's lines are sought: so far apart, so far to either side; and how bright, of the usual brightest, is
-# paint. So many of any lines would be found there by chance.
-_SPACING_PX, _REACH_PX, _CLEAR, _FEWEST, _BY_CHANCE = 8.0, 12.0, 0.4, 12, 0.3
+# Where a candidate's lines are sought: px apart, and to either side as a share of half the image's diagonal; and how
+# bright, of the usual brightest, is paint. So many of any lines would be found there by chance.
+_SPACING_PX, _REACH, _CLEAR, _FEWEST, _BY_CHANCE = 8.0, 0.025, 0.4, 12, 0.3
 _SAME_PLACE, _SAME_TURN = 0.08, 0.1  # in heights, rad
 
 
@@ -93,7 +93,7 @@ def _on_lines(search: FieldSearch, camera: Camera) -> float:
     course = predict(search.target, camera, search.curves, _SPACING_PX, _SPACING_PX)
     if len(course) < _FEWEST:
         return -np.inf
-    bright = search_along(search.grey, course, _REACH_PX)[1]
+    bright = search_along(search.grey, course, _REACH * search.stroke_map.unit_px)[1]
     seen = bright > _CLEAR * float(np.quantile(bright, 0.8))
     places = np.bincount(course.curve)
     own = np.bincount(course.curve, seen) / np.maximum(places, 1)
