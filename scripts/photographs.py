@@ -15,10 +15,12 @@ from pathlib import Path
 from cases import Row, exit_code, json_text, printed
 from photograph_shots import floor_rows, line_figures, real_rows, rings_rows, speed_rows, start_rows
 from photographs_auto import auto_rows, real_auto_rows
+from photographs_shared import shared_rows
 from real_data import real_folder
 from straightness import observed_boards, straight_rows
 
-CASES = ("lines", "floor", "starts", "auto", "speed", "rings", "real", "straight")
+SHARED = Path(os.environ.get("CERES_CAL_SHARED", Path(__file__).parents[2] / "shared")) / "photos"
+CASES = ("lines", "floor", "starts", "auto", "speed", "rings", "real", "straight", "shared")
 
 
 def rows_of(case: str, runs: int, real: Path | None, picture: Path | None) -> Iterator[Row]:
@@ -36,6 +38,8 @@ def rows_of(case: str, runs: int, real: Path | None, picture: Path | None) -> It
         yield from speed_rows(min(runs, 20))
     elif case == "rings":
         yield from rings_rows(min(runs, 20))
+    elif case == "shared" and SHARED.is_dir():
+        yield from shared_rows(SHARED)
     elif real is not None and case == "straight":
         boards = observed_boards(real)
         for keep_scale in (False, True):
@@ -55,6 +59,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     real = None if options.real is None else Path(options.real)
     if real is not None and not real.is_dir():
         raise SystemExit(f"{real}: there is no such folder of real images")
+    if not SHARED.is_dir() and "shared" in (options.case or ()):
+        raise SystemExit(
+            f"{SHARED}: the photographs of another renderer are not there: name their folder in CERES_CAL_SHARED"
+        )
     if real is None and {"real", "straight"} & set(options.case or ()):
         real = real_folder()
     rows = (row for case in options.case or CASES for row in rows_of(case, options.runs, real, options.picture))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -20,7 +20,7 @@ from ceres_cal.cli.photographs import missed_data
 from ceres_cal.cli.progress import progress_bar
 
 if TYPE_CHECKING:
-    from ceres_cal.photographs import Auto, Clicks, Facing, FieldDetections
+    from ceres_cal.photographs import Auto, Clicks, Facing, FieldDetections, SearchResult
     from ceres_cal.scene.camera import Camera
     from ceres_cal.scene.targets import Target
 
@@ -35,6 +35,13 @@ def _add_arguments(parser: ArgumentParser) -> None:
     )
     _add_start(parser)
     add("--not-painted", default="", metavar="NAME,...", help="lines of the target that this field does not have")
+    add(
+        "--mask",
+        metavar="FILE",
+        type=Path,
+        help="a picture of the same size: what is black in it is left out (hall, people)",
+    )
+    add("--picture", metavar="FILE", type=Path, help="draw what was seen in the first photograph that is refused")
     add("--edges", action="store_true", help="both edges of each line instead of its middle")
     add("--lines-only", action="store_true", help="no corners and crossings")
     add("--camera", metavar="NAME", help="name of the camera; default: that of the calibration, or camera")
@@ -65,6 +72,7 @@ def _add_start(parser: ArgumentParser) -> None:
         action="store_true",
         help="without any start: find the field in the photograph; with --start CALIBRATION, however far it has moved",
     )
+    add("--keep-start", action="store_true", help="the start is good to 12 px: nothing farther off is looked at")
     add(
         "--facing",
         action="append",
@@ -80,6 +88,7 @@ def _run(args: Namespace) -> Answer:
     images = image_files(args.images)
     require_observations_output(args.output, [*images, *([args.start] if args.start else [])])
     _require_fitting(args)
+    from ceres_cal.detect.images import read_grey
     from ceres_cal.photographs import FieldOptions, detect_field
 
     start = _start(args)
@@ -90,7 +99,15 @@ def _run(args: Namespace) -> Answer:
     if unknown := sorted(set(not_painted) - target.curves.keys()):
         raise InputError(f"--not-painted: curve {unknown[0]!r} is not one of the target's: see `ceres-cal targets`")
     painted = [name for name in target.curves if name not in not_painted]
-    options = FieldOptions(start.camera, start.station, points=not args.lines_only, edges=args.edges)
+    options = FieldOptions(
+        start.camera,
+        start.station,
+        points=not args.lines_only,
+        edges=args.edges,
+        left_out=None if args.mask is None else read_grey(args.mask) == 0,
+        keep_start=args.keep_start,
+        refused=_drawing(args.picture, target),
+    )
     with progress_bar(args) as bar:
         found = partial(detect_field, images, target, start.start, painted, options, bar.update)
         detections = detected(args, found)
@@ -113,6 +130,25 @@ COMMANDS = (
         ),
     ),
 )
+
+
+def _drawing(picture: Path | None, target: Target) -> Callable[[Path, SearchResult], None] | None:
+    """Draws what was seen in the first photograph that is refused."""
+    if picture is None:
+        return None
+    from ceres_cal.base.files import write_bytes
+    from ceres_cal.detect.images import encoded, read_colour
+    from ceres_cal.pictures.refused import draw_seen
+
+    drawn: list[Path] = []
+
+    def draw(path: Path, result: SearchResult) -> None:
+        if not drawn:
+            content = encoded(draw_seen(read_colour(path), result.seen, target), ".png", 90)
+            write_bytes(picture, content)
+            drawn.append(path)
+
+    return draw
 
 
 def _require_fitting(args: Namespace) -> None:
@@ -238,6 +274,7 @@ def _image_data(path: str, detections: FieldDetections) -> dict[str, Any]:
         "sigma_px": float(sigmas[len(sigmas) // 2]),
         "blur_px": lines.blur_px,
         "width_factor": lines.stretch,
+        "not_as_drawn": list(detections.found[path].built.words()),
     }
     if path in detections.searched:
         searched = detections.searched[path]
@@ -259,6 +296,7 @@ def _text(data: dict[str, Any]) -> str:
     lines += [
         f"{one['image']}: found without a start, {_ways(one['searched'])}" for one in data["found"] if "searched" in one
     ]
+    lines += [f"{one['image']}: {words}" for one in data["found"] for words in one["not_as_drawn"]]
     lines += [f"{one['image']}: {one['reason']}" for one in data["missed"]]
     return "\n".join([*lines, f"written to {data['output']}"])
 

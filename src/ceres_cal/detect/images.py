@@ -7,12 +7,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from ceres_cal.base.arrays import Image
+from ceres_cal.base.arrays import Array32, Image, Mask
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import read_bytes, require_room
 from ceres_cal.detect.headers import claimed_size
 
 _BYTES_PER_PIXEL = 3
+_AROUND_PX = (301, 101, 31)  # over which what is left out is filled, ever nearer
 _PIXELS_PER_BYTE = 8 * 1032  # the most that PNG's compression makes of a byte, at a bit each
 
 
@@ -51,6 +52,18 @@ def _require_believable(size: tuple[int, int], length: int, path: str) -> None:
     require_room(_BYTES_PER_PIXEL * pixels, f"{path}: an image of {size[0]} x {size[1]} px")
     if pixels > _PIXELS_PER_BYTE * length:
         raise InputError(f"{path}: {size[0]} x {size[1]} px, as it says, do not fit into {length} bytes: leave it out")
+
+
+def filled(grey: Array32, left_out: Mask) -> Array32:
+    """A photograph (height, width) whose pixels under a mask are as light as what is around them, without a line."""
+    shown, plane = (~left_out).astype(np.float32), grey.copy()
+    plane[left_out] = float(np.median(grey[~left_out])) if not left_out.all() else 0.0
+    for size in _AROUND_PX:
+        weight = np.asarray(cv2.blur(shown, (size, size)))
+        light = np.asarray(cv2.blur(grey * shown, (size, size)))
+        near = left_out & (weight > 1e-3)
+        plane[near] = light[near] / weight[near]
+    return plane
 
 
 def encoded(image: Image, ending: str, jpeg_quality: int) -> bytes:

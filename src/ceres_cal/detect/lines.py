@@ -11,9 +11,17 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Array32, Indices32, Mask
+from ceres_cal.base.arrays import Array, Array32, Indices, Indices32, Mask
 from ceres_cal.detect.courses import Course
-from ceres_cal.detect.profiles import Profiles, Windows, cut_windows, fit_profiles, fit_shape
+from ceres_cal.detect.profiles import (
+    LEAST_BLUR_PX,
+    MOST_BLUR_PX,
+    Profiles,
+    Windows,
+    cut_windows,
+    fit_profiles,
+    fit_shape,
+)
 
 HALF_WIDTH_PX = 3  # of a window, along the line
 SPACING_PX = 2.0 * HALF_WIDTH_PX + 2.0  # neighbouring windows share no pixels
@@ -21,6 +29,16 @@ _BEYOND_PX = 4.5  # of a window, past the paint's border
 _SEARCH_STEP_PX = 0.5
 _BAND_PX = 3.0  # of background, to either side of the paint, in the search
 _SHAPE_WINDOWS = 150
+# Of blur, in standard deviations: the part of a blurred line that is brightest.
+_AS_WIDE = 2.5
+# Blur, px, from which a line is so wide that it must be searched as such: no lens in focus has that.
+_WIDE_BLUR_PX = 1.7
+# Of a wide blur: what is fitted. A camera does not move evenly, and not the brightest place of its smear is the mean
+# one but the middle of its weight, which a wider profile finds.
+_OF_WIDE = 1.5
+# Directions that lines run in, of which each has its own blur where the camera moved; windows to tell it by; and
+# windows that count as much as no direction having any.
+_SECTORS, _FEWEST_IN_SECTOR, _ALIKE = 4, 12, 10.0
 # Contrast over noise. Of 3100 line centres two more are taken at half of it, 77 fewer at double, none of them wrong.
 _LEAST_CLARITY = 4.0
 # Share of the usual contrast. Nothing changes from half to double.
@@ -80,13 +98,17 @@ class Lines:
         return float(np.mean(self.found)) if len(self.found) else 0.0
 
 
-def search(grey: Array32, course: Course, reach_px: float, spare_px: float = 0.0) -> tuple[Array, Array]:
+def search(
+    grey: Array32, course: Course, reach_px: float, spare_px: float = 0.0, blur_px: Array | float = 0.0
+) -> tuple[Array, Array]:
     """Where along the normals there is most likely paint: offsets (N,) px, and how much brighter it is, grey levels.
 
     Args:
         reach_px: how far to look to either side. spare_px: of two lines alike the one nearer than by this is taken.
+        blur_px: standard deviation of what makes lines wider, (N,) or one.
     """
-    far = reach_px + float(np.max(course.width_px)) + _BAND_PX + 2.0
+    width_px = np.maximum(course.width_px, np.maximum(_AS_WIDE * np.asarray(blur_px), 1.0))
+    far = reach_px + float(np.max(width_px)) + _BAND_PX + 2.0
     steps = np.arange(-np.ceil(far / _SEARCH_STEP_PX), np.ceil(far / _SEARCH_STEP_PX) + 1.0) * _SEARCH_STEP_PX
     light = np.mean([_along_normals(grey, course, steps, shift) for shift in (-2.0, 0.0, 2.0)], axis=0)
     total = np.cumsum(np.column_stack([np.zeros(len(light)), light]), axis=1)
@@ -100,7 +122,7 @@ def search(grey: Array32, course: Course, reach_px: float, spare_px: float = 0.0
         rows = np.arange(len(light))[:, None]
         return np.asarray((total[rows, b] - total[rows, a]) / (b - a))
 
-    half = 0.5 * np.maximum(course.width_px, 1.0)
+    half = 0.5 * width_px
     left, right = mean(-half - 1.0 - _BAND_PX, -half - 1.0), mean(half + 1.0, half + 1.0 + _BAND_PX)
     response = mean(-half, half) - np.maximum(left, right)
     response[:, np.abs(steps) > reach_px] = -np.inf
@@ -127,14 +149,11 @@ def measure(grey: Array32, course: Course, reach_px: float) -> Lines:
     if not len(course):
         none = np.empty(0)
         return Lines(course, np.empty(0, dtype=bool), none, none, none, 1.0, 1.0)
-    rough, bright = search(grey, course, reach_px)
-    places = course.pixels + rough[:, None] * course.normals
-    half_length = 0.5 * course.width_px + _BEYOND_PX
-    usual_length = float(np.quantile(half_length, 0.9))
-    windows = cut_windows(grey, places, course.normals, course.curvature, usual_length, HALF_WIDTH_PX)
+    rough, windows, blur, stretch = _shaped(grey, course, reach_px, 0.0)
+    if np.max(blur) > _WIDE_BLUR_PX:
+        rough, windows, blur, stretch = _shaped(grey, course, reach_px, blur)
     edges = np.column_stack([-0.5 * course.width_px, 0.5 * course.width_px])
-    blur, stretch = _shape(windows, edges, bright)
-    fits = fit_profiles(windows, stretch * edges, blur, 1.5)
+    fits = fit_profiles(windows, stretch * edges, np.where(blur > _WIDE_BLUR_PX, _OF_WIDE, 1.0) * blur, 1.5)
     contrast = np.minimum(fits.heights[:, 0], -fits.heights[:, 1])
     offset = rough + fits.offset_px
     found = _is_paint(course, fits, contrast)
@@ -147,7 +166,7 @@ def measure(grey: Array32, course: Course, reach_px: float) -> Lines:
         np.where(found, offset, np.nan),
         factor * fits.sigma_px,
         contrast,
-        blur,
+        float(np.sqrt(np.mean(blur**2))),
         stretch,
     )
 
@@ -157,15 +176,51 @@ def window_px(course: Course) -> Array:
     return np.asarray(1.2 * (course.width_px + _BEYOND_PX) + HALF_WIDTH_PX)
 
 
-def _shape(windows: Windows, edges: Array, bright: Array) -> tuple[float, float]:
+def _shaped(
+    grey: Array32, course: Course, reach_px: float, blur_px: Array | float
+) -> tuple[Array, Windows, Array, float]:
+    """Where the paint is, roughly, (N,) px along the normals; the windows there; the blur (N,) and stretch of all."""
+    rough, bright = search(grey, course, reach_px, 0.0, blur_px)
+    places = course.pixels + rough[:, None] * course.normals
+    usual_length = float(np.quantile(0.5 * course.width_px + _BEYOND_PX, 0.9))
+    windows = cut_windows(grey, places, course.normals, course.curvature, usual_length, HALF_WIDTH_PX)
+    return (rough, windows, *_shape(windows, course, bright))
+
+
+def _shape(windows: Windows, course: Course, bright: Array) -> tuple[Array, float]:
+    """The blur (N,) across each place, of a picture that may be moved in one direction, and the stretch of all."""
+    angle = np.mod(np.arctan2(course.normals[:, 1], course.normals[:, 0]), np.pi)
     rows = np.flatnonzero(windows.inside)
     if not len(rows):
-        return 1.0, 1.0
+        return np.ones(len(course)), 1.0
     limit = 0.5 * np.quantile(bright[rows], 0.8)
     rows = rows[bright[rows] >= limit]
+    edges = np.column_stack([-0.5 * course.width_px, 0.5 * course.width_px])
+    blur, stretch = _shape_of(windows, edges, rows, 1.0, 1.0)
+    sector = np.floor(angle[rows] / np.pi * _SECTORS + 0.5) % _SECTORS
+    own = [rows[sector == number] for number in range(_SECTORS)]
+    own = [some for some in own if len(some) >= _FEWEST_IN_SECTOR]
+    if len(own) < 2:
+        return np.full(len(course), blur), stretch
+    squares = np.array([_shape_of(windows, edges, some, blur, stretch)[0] ** 2 for some in own])
+    towards = np.array([np.mean(_doubled(angle[some]), axis=0) for some in own])
+    count = np.array([float(min(len(some), _SHAPE_WINDOWS)) for some in own])
+    # s^2 = a + b cos 2t + c sin 2t: what any blur that is an ellipse does across a line in direction t.
+    columns = np.column_stack([np.ones(len(own)), towards])
+    normal = columns.T @ (count[:, None] * columns) + np.diag([0.0, _ALIKE, _ALIKE])
+    a, b, c = np.linalg.solve(normal, columns.T @ (count * squares))
+    across = a + _doubled(angle) @ [b, c]
+    return np.sqrt(np.clip(across, LEAST_BLUR_PX**2, MOST_BLUR_PX**2)), stretch
+
+
+def _doubled(angle: Array) -> Array:
+    return np.column_stack([np.cos(2.0 * angle), np.sin(2.0 * angle)])
+
+
+def _shape_of(windows: Windows, edges: Array, rows: Indices, blur: float, stretch: float) -> tuple[float, float]:
     rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), _SHAPE_WINDOWS)).astype(int)]
     some = Windows(windows.values[rows], windows.distance[rows], windows.inside[rows])
-    return fit_shape(some, edges[rows], 1.0)
+    return fit_shape(some, edges[rows], blur, stretch)
 
 
 def _is_paint(course: Course, fits: Profiles, contrast: Array) -> Mask:

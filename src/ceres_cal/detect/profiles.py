@@ -23,6 +23,9 @@ LEAST_BLUR_PX, MOST_BLUR_PX = 0.3, 4.0
 _SHAPE_RANGE = (np.log([LEAST_BLUR_PX, 0.4]), np.log([MOST_BLUR_PX, 2.5]))
 _SHAPE_SIGMA = np.array([1.0, 0.3])  # of the logarithms of blur and stretch, beforehand
 _MOST_STEP_PX = 0.7
+# Grey levels: how much brighter one side of a line is than the other, beforehand. Of a line much narrower than its blur
+# the pixels alone tell such a step and the line's place hardly apart.
+_LEVEL_SIGMA = 5.0
 _STEPS = 6
 _TINY = 1e-9
 
@@ -102,21 +105,35 @@ def fit_profiles(windows: Windows, edges: Array, blur_px: Array | float, reach_p
     """
     offset = np.zeros(len(windows.values))
     blur = np.broadcast_to(np.asarray(blur_px, dtype=float), offset.shape)
-    heights = _solve(*_linear(windows, edges, blur, offset))[:, 2:]
+    normal, right = _linear(windows, edges, blur, offset)
+    heights = _solve(normal, right)[:, 2:]
+    squares = np.sum(windows.values**2, axis=1)
+    variance = (squares - np.sum(_solve(normal, right) * right, axis=1)) / windows.values.shape[1]
+    level = np.zeros(normal.shape[1] + 1)
+    level[2:-1] = 1.0 if edges.shape[1] > 1 else 0.0
     for _ in range(_STEPS):
+        known = np.maximum(variance, 0.0)[:, None, None] * np.outer(level, level) / _LEVEL_SIGMA**2
         columns = _columns(windows, edges, blur, offset, heights)
         normal, right = _normal(columns, windows.values)
-        solution = _solve(normal, right)
+        solution = _solve(normal + known, right)
+        variance = _misfit(squares, normal, right, solution) / windows.values.shape[1]
         step = np.clip(solution[:, -1], -_MOST_STEP_PX, _MOST_STEP_PX)
         offset, heights = np.clip(offset + step, -reach_px - 1.0, reach_px + 1.0), solution[:, 2:-1]
         if np.all(np.abs(step) < 1e-3):
             break
     freedom = windows.values.shape[1] - columns.shape[1]
-    squares = np.sum(windows.values**2, axis=1) - np.sum(solution * right, axis=1)
-    noise = np.sqrt(np.maximum(squares, 0.0) / freedom + 1.0 / 12.0)  # what rounding to whole levels hides
-    sigma = noise * np.sqrt(np.maximum(_last_of_inverse(normal), 0.0))
+    misfit = np.maximum(_misfit(squares, normal, right, solution), 0.0)
+    noise = np.sqrt(misfit / freedom + 1.0 / 12.0)  # what rounding to whole levels hides
+    sigma = noise * np.sqrt(np.maximum(_last_of_inverse(normal + known), 0.0))
     good = windows.inside & (np.abs(step) < 0.05) & (np.abs(offset) <= reach_px) & np.isfinite(sigma) & (sigma > 0.0)
     return Profiles(np.where(good, offset, np.nan), np.where(good, sigma, np.inf), heights, noise)
+
+
+def _misfit(squares: Array, normal: Array, right: Array, solution: Array) -> Array:
+    """(N,) squared residuals of any solution of the normal equations, or of none of them."""
+    return np.asarray(
+        squares - np.sum(solution * (2.0 * right - np.matmul(normal, solution[:, :, None])[:, :, 0]), axis=1)
+    )
 
 
 def fit_shape(

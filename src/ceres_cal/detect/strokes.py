@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Array32, Indices, Mask
+from ceres_cal.base.arrays import AnyArray, Array, Array32, Indices, Mask
 
 _SCALES = (1, 2)  # a photograph is searched at full and at half size: for narrow paint and for wide
 _SIGMA_PX = 1.6
@@ -23,8 +23,12 @@ _STRAIGHT_PX = 0.6
 # Times the usual response. At half of it the carpet's texture becomes strokes, and two of nine fields are missed; at
 # double nothing changes.
 _NOISE = 5.0
-# Of a bright ridge's response: worn paint in shadow keeps more. Nothing changes from half to double.
-_OF_BRIGHTEST = 0.15
+# Pixels around, over which noise is alike; times that noise.
+_NEARBY_PX, _NOISE_NEARBY = 41, 3.0
+# Of the response, that at twice the scale: 0.125 of a thin line, more of stripes of sun and walls.
+_WIDEST = 0.45
+# Between pieces of one stroke; of a stroke's length, what is paint: worn lines are dashes.
+_GAP_PX, _DENSE = 3, 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,14 +76,17 @@ class _Ridge:
 
 
 def _ridge_points(grey: Array32) -> _Ridge:
-    soft = cv2.GaussianBlur(grey, (0, 0), _SIGMA_PX)
-    xx, yy = (np.asarray(cv2.Sobel(soft, cv2.CV_32F, *order, ksize=3)) / 4.0 for order in ((2, 0), (0, 2)))
-    xy = np.asarray(cv2.Sobel(soft, cv2.CV_32F, 1, 1, ksize=3)) / 4.0
-    bend = 0.5 * (xx + yy) - np.sqrt((0.5 * (xx - yy)) ** 2 + xy**2)  # the lower eigenvalue
+    soft = _smoothed(grey, _SIGMA_PX)
+    xx, yy, xy, bend = _bends(soft)
     strength = np.maximum(-bend, 0.0)
     usual = float(np.median(strength[::3, ::3]))
-    bright = float(np.quantile(strength[::3, ::3], 0.995))
-    rows, columns = np.nonzero(strength > max(_NOISE * usual, _OF_BRIGHTEST * bright, 1e-3))
+    wider = np.maximum(-_bends(_smoothed(grey, 2.0 * _SIGMA_PX))[3], 0.0)
+    # Noise differs over a picture, in sun and in shadow; of the noise nearby lines are no part.
+    size = (_NEARBY_PX, _NEARBY_PX)
+    nearby = cv2.boxFilter(np.minimum(strength, _NOISE * max(usual, 1e-3)), cv2.CV_32F, size, normalize=True)
+    nearby = cv2.boxFilter(np.minimum(strength, 2.0 * _NOISE * nearby), cv2.CV_32F, size, normalize=True)
+    limit = np.maximum(_NOISE_NEARBY * nearby, max(_NOISE * usual, 1e-3))
+    rows, columns = np.nonzero((strength > limit) & (wider < _WIDEST * strength))
     a, b, c = xx[rows, columns], xy[rows, columns], bend[rows, columns]
     angle = 0.5 * np.arctan2(2.0 * b, a - yy[rows, columns]) + 0.5 * np.pi  # of the direction that bends most downwards
     nx, ny = np.cos(angle), np.sin(angle)
@@ -89,9 +96,26 @@ def _ridge_points(grey: Array32) -> _Ridge:
     top = np.maximum(np.abs(step * nx), np.abs(step * ny)) <= 0.6
     mask = np.zeros(grey.shape, np.uint8)
     mask[rows[top], columns[top]] = 1
-    _, labels = cv2.connectedComponents(mask, connectivity=8)
+    joined = cv2.dilate(mask, cv2.getStructuringElement(cv2.MORPH_RECT, (_GAP_PX, _GAP_PX)))
+    _, labels = cv2.connectedComponents(joined, connectivity=8)
     pixels = np.column_stack([columns + step * nx, rows + step * ny])[top]
     return _Ridge(pixels, -c[top], labels[rows[top], columns[top]].astype(np.int64))
+
+
+def _bends(soft: Array32) -> tuple[Array32, Array32, Array32, Array32]:
+    """Second derivatives by x, by y and by both, and the lower one of their eigenvalues."""
+    xx, yy = (np.asarray(cv2.Sobel(soft, cv2.CV_32F, *order, ksize=3)) / 4.0 for order in ((2, 0), (0, 2)))
+    xy = np.asarray(cv2.Sobel(soft, cv2.CV_32F, 1, 1, ksize=3)) / 4.0
+    lower = 0.5 * (xx + yy) - np.sqrt((0.5 * (xx - yy)) ** 2 + xy**2)
+    return _single(xx), _single(yy), _single(xy), _single(lower)
+
+
+def _smoothed(grey: Array32, sigma_px: float) -> Array32:
+    return _single(np.asarray(cv2.GaussianBlur(grey, (0, 0), sigma_px)))
+
+
+def _single(plane: AnyArray) -> Array32:
+    return np.asarray(plane, dtype=np.float32)
 
 
 def _strokes(ridge: _Ridge) -> Strokes:
@@ -102,8 +126,11 @@ def _strokes(ridge: _Ridge) -> Strokes:
     key = (ridge.piece * 4096 + tile[:, 0]) * 4096 + tile[:, 1]
     _, group, count = np.unique(key, return_inverse=True, return_counts=True)
 
+    weight = ridge.strength**2  # at the ends of dashes ridges fan out, ever fainter
+    total = np.bincount(group, weight)
+
     def mean(values: Array) -> Array:
-        return np.asarray(np.bincount(group, values) / count)
+        return np.asarray(np.bincount(group, weight * values) / total)
 
     x, y = ridge.pixels.T
     cx, cy = mean(x), mean(y)
@@ -114,6 +141,6 @@ def _strokes(ridge: _Ridge) -> Strokes:
     root = np.sqrt((0.5 * (xx - yy)) ** 2 + xy**2)
     half = np.sqrt(3.0 * np.maximum(0.5 * (xx + yy) + root, 0.0))  # of an even line with that second moment
     across = np.sqrt(np.maximum(0.5 * (xx + yy) - root, 0.0))
-    good = (2.0 * half >= _LEAST_PX) & (across < _STRAIGHT_PX) & (count > 1.2 * half)
+    good = (2.0 * half >= _LEAST_PX) & (across < _STRAIGHT_PX) & (count > 2.0 * _DENSE * half)
     centre, reach = np.column_stack([cx, cy]), np.column_stack([half * along_x, half * along_y])
     return Strokes(np.stack([centre - reach, centre + reach], axis=1)[good], mean(ridge.strength)[good])

@@ -76,6 +76,14 @@ class Equations:
             slots[self.is_curve, :3] = structure.track_slots[self.feature[self.is_curve]]
         return slots
 
+    def structure_columns(self, structure: Structure) -> Array:
+        """(E, Q) px per metre of each of the structure's numbers."""
+        columns, slots = np.zeros((len(self), len(structure.names))), self.slots(structure)
+        for k in range(slots.shape[1]):
+            moved = np.flatnonzero(slots[:, k] >= 0)
+            columns[moved, slots[moved, k]] += self.built[moved, k]
+        return columns
+
 
 def whole_structure(targets: Mapping[str, Target]) -> Structure:
     """Everything that could be built otherwise than it is drawn."""

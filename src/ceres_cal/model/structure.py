@@ -7,7 +7,7 @@ metres; 0 is the nominal target.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -16,11 +16,12 @@ import numpy as np
 from ceres_cal.base.arrays import Array, Indices, Indices32, Mask
 from ceres_cal.base.errors import InputError
 from ceres_cal.observations.sights import Sights
-from ceres_cal.scene.targets import Arc, Target
+from ceres_cal.scene.targets import Arc, Segment, Target, target_from_spec
 
 Kind = Literal["lines", "points", "warp"]
 """What a tolerance speaks of."""
 _NONE = -1
+_STEP = 1e-3  # of a dimension: features move in proportion
 
 
 @dataclass(frozen=True)
@@ -204,6 +205,40 @@ def numbers_by_kind(structure: Structure, targets: Mapping[str, Target]) -> dict
         every = {(name, kind): np.unique(slots[slots >= 0]).astype(np.int64) for kind, slots in kinds}
         numbers |= {of: slots for of, slots in every.items() if len(slots)}
     return numbers
+
+
+def dimension_slopes(structure: Structure, targets: Mapping[str, Target]) -> tuple[tuple[str, ...], Array]:
+    """How the targets' own dimensions move the structure: "target/dimension", and (Q, D) metres per metre of each."""
+    place = {name: row for row, name in enumerate(structure.names)}
+    names, columns = [], []
+    for name, target in targets.items():
+        for dimension, length in target.dimensions.items():
+            other = target_from_spec({**target.spec, dimension: (1.0 + _STEP) * length}, name)
+            column = np.zeros(len(place))
+            for feature, moved_m in _differences(name, target, other):
+                if feature in place:
+                    column[place[feature]] = moved_m / (_STEP * length)
+            names.append(f"{name}/{dimension}")
+            columns.append(column)
+    return tuple(names), np.reshape(columns, (len(names), len(place))).T
+
+
+def _differences(name: str, target: Target, other: Target) -> Iterator[tuple[str, float]]:
+    """By how much each number of one target's structure brings it to another, m."""
+    for feature, curve in target.curves.items():
+        there = other.curves[feature]
+        if isinstance(curve, Arc) and isinstance(there, Arc):
+            x, y = np.subtract(there.centre, curve.centre)[:2]
+            yield f"{name}/{feature}.x", float(x)
+            yield f"{name}/{feature}.y", float(y)
+            yield f"{name}/{feature}.radius", there.radius_m - curve.radius_m
+        elif isinstance(curve, Segment) and isinstance(there, Segment):
+            x, y = np.subtract(curve.end, curve.start)[:2] / curve.length_m
+            yield f"{name}/{feature}", float(np.subtract(there.start, curve.start)[:2] @ (-y, x))
+    for feature, place in target.points.items():
+        x, y = np.subtract(other.points[feature], place)[:2]
+        yield f"{name}/{feature}.x", float(x)
+        yield f"{name}/{feature}.y", float(y)
 
 
 def bends_of(target: Target) -> Array:

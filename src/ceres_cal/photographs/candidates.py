@@ -9,10 +9,12 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array32
 from ceres_cal.base.transforms import Pose, rotation_log
+from ceres_cal.detect.courses import predict
+from ceres_cal.detect.lines import search as search_along
 from ceres_cal.detect.registration import nearness_to
 from ceres_cal.detect.strokes import drawn, find_strokes
 from ceres_cal.photographs.grid import Grid, grid_of, offsets_of
-from ceres_cal.photographs.matching import FloorLines, Match, StrokeMap, lines_seen, match
+from ceres_cal.photographs.matching import FloorLines, Match, StrokeMap, divergence, lines_seen, match
 from ceres_cal.photographs.upright import Upright, find_upright
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Radial
@@ -25,8 +27,11 @@ _UPRIGHTS = 4  # answers for lens and tilt, at most, that are matched
 _SURE = 0.88
 _POWERS = (2, 3, 4, 5)
 # Of the best match's score: another's, and that of another way to take the picture. Nothing changes from 0.6 to 0.86.
-_COMPARABLE, _ALIKE = 0.75, 0.9
-_MOST, _MOST_ALIKE = 3, 5
+_COMPARABLE, _ALIKE = 0.3, 0.9
+_MOST, _MOST_ALIKE = 4, 60
+# Where a candidate's lines are sought: px apart, and to either side as a share of half the image's diagonal; and how
+# bright, of the usual brightest, is paint. So many of any lines would be found there by chance.
+_SPACING_PX, _REACH, _CLEAR, _FEWEST, _BY_CHANCE = 8.0, 0.025, 0.4, 12, 0.3
 _SAME_PLACE, _SAME_TURN = 0.08, 0.1  # in heights, rad
 
 
@@ -75,7 +80,25 @@ def candidates(search: FieldSearch) -> list[Camera]:
         scored += [(one.score, _posed(optics, one)) for one in matches]
         if scored and max(score for score, _ in scored) > _SURE:
             break
-    return _distinct(sorted(scored, key=lambda one: -one[0]), search.turns, _COMPARABLE)[:_MOST]
+    distinct = _distinct(sorted(scored, key=lambda one: -one[0]), search.turns, _COMPARABLE)
+    return sorted(distinct, key=lambda camera: -_on_lines(search, camera))[:_MOST]
+
+
+def _on_lines(search: FieldSearch, camera: Camera) -> float:
+    """How much likelier the target is there than elsewhere, by where its own lines are seen in the picture itself.
+
+    The log-likelihood ratio of so many places with paint, less what tells that the curves do not share one share: of a
+    target that is elsewhere some lie on paint and others do not, while wear and robots are everywhere.
+    """
+    course = predict(search.target, camera, search.curves, _SPACING_PX, _SPACING_PX)
+    if len(course) < _FEWEST:
+        return -np.inf
+    bright = search_along(search.grey, course, _REACH * search.stroke_map.unit_px)[1]
+    seen = bright > _CLEAR * float(np.quantile(bright, 0.8))
+    places = np.bincount(course.curve)
+    own = np.bincount(course.curve, seen) / np.maximum(places, 1)
+    share = max(float(np.mean(seen)), _BY_CHANCE)
+    return float(np.sum(places) * divergence(share, _BY_CHANCE) - np.sum(places * divergence(own, share)))
 
 
 def alike(search: FieldSearch, camera: Camera, detected: Collection[str]) -> list[Camera]:
@@ -91,7 +114,7 @@ def alike(search: FieldSearch, camera: Camera, detected: Collection[str]) -> lis
     lines = FloorLines((across - x) / camera.position[2], (along - y) / camera.position[2])
     optics = _optics(upright, stroke_map)
     others = [(one.score, _posed(optics, one)) for one in match(upright, stroke_map, search.grid, lines)]
-    return _distinct(others, search.turns, _ALIKE, camera)
+    return _distinct(others, search.turns, _ALIKE, camera)[:_MOST]
 
 
 def _posed(optics: Camera, one: Match) -> Camera:

@@ -100,7 +100,7 @@ def starts_from_clicks(
     return cameras, unknown_optics(image_size, phi, PointHints(index, pixels, np.full(len(index), SIGMA_PX)))
 
 
-def unknown_optics(image_size: tuple[int, int], phi: float, hints: PointHints) -> FreeIntrinsics:
+def unknown_optics(image_size: tuple[int, int], phi: float, hints: PointHints | None) -> FreeIntrinsics:
     """What a photograph may tell of a camera of which nothing is known but, roughly, its phi and where points are."""
     middle = 0.5 * (np.array(image_size) - 1.0)
     priors = (

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +13,7 @@ from ceres_cal.base.errors import InputError, NothingShownError, naming
 from ceres_cal.base.progress import ImageProgress
 from ceres_cal.base.words import frame_of
 from ceres_cal.detect.crossings import find_crossings
-from ceres_cal.detect.images import read_grey
+from ceres_cal.detect.images import filled, read_grey
 from ceres_cal.detect.lines import Lines
 from ceres_cal.observations import NO_POINTS, Curves, Observations, Points, View, combine
 from ceres_cal.photographs.clicks import Clicks, starts_from_clicks
@@ -51,12 +51,18 @@ class FieldOptions:
         camera, station: the names they bear; the station's is that of the camera by default.
         points: corners and crossings, too; else curve observations only.
         edges: both edges of the paint instead of its middle.
+        left_out: (height, width) pixels that show nothing of the field: hall, walls, people.
+        keep_start: nothing farther from the start than 12 px is looked at.
+        refused: called with the path of each image that does not show the field, and what was seen there instead.
     """
 
     camera: str = "camera"
     station: str | None = None
     points: bool = True
     edges: bool = False
+    left_out: Mask | None = None
+    keep_start: bool = False
+    refused: Callable[[Path, SearchResult], None] | None = None
 
 
 def detect_field(
@@ -91,8 +97,11 @@ def detect_field(
     results: dict[str, SearchResult] = {}
     last: Followed | None = None
     for number, path in enumerate(paths, start=1):
-        result = _looked_for(read_grey(path).astype(np.float32), target, painted, start if last is None else last, path)
+        grey = _without(read_grey(path).astype(np.float32), options.left_out, path)
+        result = _looked_for(grey, target, painted, start if last is None else last, (path, options.keep_start))
         results[str(path)] = result
+        if result.followed is None and options.refused is not None:
+            options.refused(path, result)
         last = result.followed or last
         if progress is not None:
             progress(number, len(paths), path.name)
@@ -115,16 +124,37 @@ def _painted(target: Target, curves: Collection[str] | None) -> tuple[str, ...]:
     return painted
 
 
+def _without(grey: Array32, left_out: Mask | None, path: Path) -> Array32:
+    """A photograph in which what is left out looks like what is around it."""
+    if left_out is None:
+        return grey
+    if left_out.shape != grey.shape:
+        size = f"{left_out.shape[1]} x {left_out.shape[0]}"
+        raise InputError(f"{path}: {grey.shape[1]} x {grey.shape[0]} px, but the mask has {size}: draw it on this one")
+    return filled(grey, left_out)
+
+
 def _looked_for(
-    grey: Array32, target: Target, painted: tuple[str, ...], start: Camera | Clicks | Auto | Followed, path: Path
+    grey: Array32,
+    target: Target,
+    painted: tuple[str, ...],
+    start: Camera | Clicks | Auto | Followed,
+    where: tuple[Path, bool],
 ) -> SearchResult:
-    """The field from where the last image showed it, or from the start that was given, or from none."""
+    """The field from where the last image showed it, or from the start that was given, or from none.
+
+    Args:
+        where: the image's path, and whether the start is to be kept to.
+    """
+    path, keep = where
     if isinstance(start, Auto):
         with naming(path):
             return search(grey, target, painted, start)
     starts, free = _starts(start, target, (int(grey.shape[1]), int(grey.shape[0])), path)
-    followed = follow(grey, target, starts, painted, free)
-    return SearchResult(followed) if followed.holds else SearchResult(None, why_missed(followed, target, started=True))
+    followed = follow(grey, target, starts, painted, replace(free, keep=keep))
+    if followed.holds and not followed.built.is_other:
+        return SearchResult(followed)
+    return SearchResult(None, why_missed(followed, target, started=True), seen=followed)
 
 
 def _starts(

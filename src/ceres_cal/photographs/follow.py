@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import islice, product
 
 import numpy as np
 
@@ -13,8 +14,9 @@ from ceres_cal.calibrating import calibrate
 from ceres_cal.detect.courses import Course, clear_px, predict
 from ceres_cal.detect.lines import SPACING_PX, Lines, measure, search, window_px
 from ceres_cal.detect.registration import nearness, shifted
-from ceres_cal.model.parameters import Options
+from ceres_cal.model.parameters import Options, intrinsic_names
 from ceres_cal.observations import Observations, Prior
+from ceres_cal.photographs.as_built import AS_DRAWN, AsBuilt, as_built
 from ceres_cal.photographs.refit import PointHints, observations_of, refit_camera
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import LENSES
@@ -29,10 +31,13 @@ _SURE_SHARE = 0.7
 _ABSENT, _MOST_ABSENT = 0.2, 0.08
 _ROUGH_SPACING_PX = 12.0
 _NEAR_REACHES_PX = (12.0, 6.0, 4.0)
+# From points that were shown: what stands farther beside a line than they are off cannot draw it away.
+_SHOWN_REACHES_PX = (12.0, 12.0, 12.0, 8.0, 8.0, 5.0)
 _FAR_REACHES_PX = (45.0, 45.0, 30.0, 30.0, 20.0, 12.0, 8.0, 5.0)
 _LAST_REACH_PX = 5.0
 _CANDIDATES = 5
 _FEWEST = 12
+_MOST_OTHERS = 3  # ways to see the field that are tried where the best looks like another field
 _ROUNDS = 6
 _AT_REST_PX = 0.02
 
@@ -44,11 +49,13 @@ class FreeIntrinsics:
     Attributes:
         names: of the free intrinsics, in the order in which they are freed. priors: that hold them.
         hints: points that somebody showed, which hold the camera while lines are far off.
+        keep: whether the starts are known to be near: nothing far off is looked at.
     """
 
     names: tuple[str, ...] = ()
     priors: tuple[Prior, ...] = ()
     hints: PointHints | None = None
+    keep: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,13 +63,15 @@ class Followed:
     """A field's lines as they were followed.
 
     Attributes:
-        camera: the posed camera that predicts them. lines: what was measured there.
+        camera: the posed camera that predicts them. lines: what was measured there, but for curves that lie aside.
         moved_px: how far the last refit moved the prediction; at rest below 0.02.
+        built: how the curves lie, where the photograph had to tell the lens, too.
     """
 
     camera: Camera
     lines: Lines
     moved_px: float
+    built: AsBuilt = AS_DRAWN
 
     @property
     def share(self) -> float:
@@ -98,18 +107,28 @@ def follow(
         The best that was reached; whether it is the field, `Followed.holds` tells.
     """
     tracker = _Tracker(grey, target, curves, free or FreeIntrinsics())
-    tried: list[Followed] = []
-    if tracker.free.hints is None:
-        tried = [tracker.close_in(camera, _NEAR_REACHES_PX) for camera in starts[:1]]
-        if tried[0].holds and tried[0].share >= _SURE_SHARE:
-            return tried[0]
-    for camera in tracker.shifted_starts(starts):
-        tried.append(tracker.close_in(camera, _FAR_REACHES_PX))
-        if tried[-1].holds and tried[-1].share >= _SURE_SHARE:
+    tried = tracker.tried(starts)
+    best = next(tried)
+    if not (best.holds and tracker.free.names):
+        return best
+    best = tracker.refined(best)
+    for one in islice(tried, _MOST_OTHERS):
+        if best.holds and not best.built.is_other:
             break
-    tried = tried or [tracker.close_in(starts[0], ())]  # as it is: nothing to search
-    best = max(tried, key=lambda one: (one.holds, one.share))
-    return tracker.with_best_lens(best) if best.holds and tracker.free.names else best
+        again = tracker.refined(one) if one.holds else one
+        best = again if again.holds and not again.built.is_other else best
+    return best
+
+
+def approach(grey: Array32, target: Target, camera: Camera, curves: Collection[str], free: FreeIntrinsics) -> Followed:
+    """`follow` from one start, up to where the lens remains that it started from."""
+    return next(_Tracker(grey, target, curves, free).tried([camera]))
+
+
+def refine(grey: Array32, target: Target, camera: Camera, curves: Collection[str], free: FreeIntrinsics) -> Followed:
+    """From a camera that is right but for its lens: the kind that suits best, without curves that lie aside."""
+    tracker = _Tracker(grey, target, curves, free)
+    return tracker.refined(Followed(camera, tracker.measured(camera), np.inf))
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,6 +139,28 @@ class _Tracker:
     target: Target
     curves: Collection[str]
     free: FreeIntrinsics
+
+    def tried(self, starts: Sequence[Camera]) -> Iterator[Followed]:
+        """What is reached from each start: what is surely the field at once, then the others, the best first."""
+        left: list[Followed] = []
+        for one in self._reached(starts):
+            if one.holds and one.share >= _SURE_SHARE:
+                yield one
+            else:
+                left.append(one)
+        yield from sorted(left, key=lambda one: (one.holds, one.share), reverse=True)
+
+    def _reached(self, starts: Sequence[Camera]) -> Iterator[Followed]:
+        if self.free.hints is None:
+            yield self.close_in(starts[0], _NEAR_REACHES_PX)
+            if self.free.keep:
+                return
+        shifted = self.shifted_starts(starts)
+        shown = (_SHOWN_REACHES_PX,) if self.free.hints is not None else ()
+        for reaches, camera in product(shown if self.free.keep else (*shown, _FAR_REACHES_PX), shifted):
+            yield self.close_in(camera, reaches)
+        if not shifted:
+            yield self.close_in(starts[0], ())  # as it is: nothing to search
 
     def shifted_starts(self, starts: Sequence[Camera]) -> list[Camera]:
         """Cameras that put the lines near something thin and bright, the best first."""
@@ -145,18 +186,45 @@ class _Tracker:
         for number, reach in enumerate(reaches_px):
             names = self.free.names[: max(0, 2 * number - 1)]
             camera = self._search_step(camera, names, reach) or camera
-        lines, moved = self._measured(camera), np.inf
+        return self.at_rest(camera, self.free.names)
+
+    def at_rest(self, camera: Camera, names: tuple[str, ...]) -> Followed:
+        """Measured and refitted, with these intrinsics free, until nothing moves any more."""
+        lines, moved = self.measured(camera), np.inf
         for _ in range(_ROUNDS):
             if np.count_nonzero(lines.found) < _FEWEST:
                 break
-            refitted = refit_camera(camera, self._observed(lines, camera), self.free.names, self.free.priors)
+            refitted = refit_camera(camera, self._observed(lines, camera), names, self.free.priors)
             if refitted is None:
                 break
             moved = _moved_px(camera, refitted, lines.course.pixels)
-            camera, lines = refitted, self._measured(refitted)
+            camera, lines = refitted, self.measured(refitted)
             if moved < _AT_REST_PX:
                 break
         return Followed(camera, lines, moved)
+
+    def refined(self, followed: Followed) -> Followed:
+        """The same, predicted with the lens that suits the curves best, without those that lie aside."""
+        followed = self.without_aside(followed)
+        if followed.built.is_other:
+            return followed
+        left = replace(self, curves=[name for name in self.curves if name not in followed.built.aside_m])
+        return self.without_aside(left.with_best_lens(followed))
+
+    def without_aside(self, followed: Followed) -> Followed:
+        """The same without the curves that lie aside: none of them draws the camera to where others look aside."""
+        free = tuple(name for name in intrinsic_names(followed.camera.lens) if name != "aspect")
+        left, built = self, AS_DRAWN
+        for _ in range(_ROUNDS):
+            known, built = (
+                built,
+                as_built(self.measured(followed.camera), followed.camera, self.target, self.free.priors),
+            )
+            if built.is_other or built.aside_m.keys() == known.aside_m.keys():
+                break
+            left = replace(self, curves=[name for name in self.curves if name not in built.aside_m])
+            followed = left.at_rest(followed.camera, free)
+        return replace(followed, built=built, lines=left.measured(followed.camera))
 
     def with_best_lens(self, followed: Followed) -> Followed:
         """What is found when the lines are predicted with the kind of lens that suits them best.
@@ -176,7 +244,7 @@ class _Tracker:
         if not fits:
             return followed
         camera = min(fits, key=lambda fit: fit[0])[1].station()
-        lines = self._measured(camera)
+        lines = self.measured(camera)
         refined = Followed(camera, lines, _moved_px(followed.camera, camera, lines.course.pixels))
         return refined if refined.holds and refined.share > followed.share - 0.02 else followed
 
@@ -199,7 +267,7 @@ class _Tracker:
     def _predicted(self, camera: Camera, margin_px: float = 0.0) -> Course:
         return predict(self.target, camera, self.curves, _ROUGH_SPACING_PX, margin_px)
 
-    def _measured(self, camera: Camera) -> Lines:
+    def measured(self, camera: Camera) -> Lines:
         course = predict(self.target, camera, self.curves, SPACING_PX, SPACING_PX)
         clear = clear_px(self.target, camera, course, self.curves) > window_px(course)
         return measure(self.grey, course.take(clear), _LAST_REACH_PX)

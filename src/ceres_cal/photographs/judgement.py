@@ -15,8 +15,15 @@ _COURSE_PX = 3.0
 # Of the target: a stroke that lies on it. Wide paint's edge is that far from its middle. Nothing changes from half to
 # double.
 _NEAR_PX = 6.0
-# Of the strokes inside the target's outline, the share that must lie on it. Nothing changes from 0.67 to 0.89.
-_EXPLAINED = 0.8
+# Of the strokes that could be lines of the target, the share that must lie on it. On photographs with cables, seams and
+# stripes of sun it is 0.83 at least, of other fields 0.6 at most.
+_EXPLAINED = 0.75
+# The same, also of those beside the target, where walls and boundary lines run: 0.61 at least where it is seen whole;
+# a corner alone may be any corner, so that fewer curves than that must explain as much of the rest of the picture.
+_OF_ALL, _MANY_CURVES = 0.55, 6
+# Sine of the angle between a stroke and the lines, at most: 4 degrees. Of the usual strength of strokes on the lines,
+# another line's at least.
+_PARALLEL, _AS_STRONG = 0.07, 0.5
 _RIM = 0.02  # of its size
 # Found on a curve, and curves of which so many were: fewer could be any lines. Nothing changes from half to double.
 _FEWEST_PLACES, _FEWEST_CURVES = 5, 3
@@ -34,6 +41,8 @@ def why_missed(followed: Followed, target: Target, *, started: bool) -> str:
     Args:
         started: whether somebody said where to start.
     """
+    if followed.built.is_other:
+        return "; ".join(followed.built.words())
     if followed.share >= LEAST_SHARE:
         names = ", ".join(target.curve_names[number] for number in followed.absent)
         return f"there is no {names} where they should be: say which lines are not painted, or check the dimensions"
@@ -44,7 +53,7 @@ def why_missed(followed: Followed, target: Target, *, started: bool) -> str:
 
 def objection(search: FieldSearch, followed: Followed) -> str:
     """What speaks against taking what was followed for the field, or nothing."""
-    if not followed.holds:
+    if not followed.holds or followed.built.is_other:
         return why_missed(followed, search.target, started=False)
     names = detected_curves(search, followed)
     if len(names) < _FEWEST_CURVES or not _in_two_directions(search, names):
@@ -53,7 +62,9 @@ def objection(search: FieldSearch, followed: Followed) -> str:
     if -followed.camera.cam_from_world.rotation[2, 2] < _LEAST_UPRIGHT or not PHI_RANGE[0] < phi < PHI_RANGE[1]:
         return "its lines were not found in any view from above: start from corners"
     share = explained(search, followed.camera)
-    if share < _EXPLAINED:
+    of_all = explained(search, followed.camera, everywhere=True)
+    if share < _EXPLAINED or of_all < (_OF_ALL if len(names) >= _MANY_CURVES else _EXPLAINED):
+        share = min(share, of_all)
         return (
             f"of the bright lines where the field would be, only {100.0 * share:.0f} % are lines of it: "
             "check the target's dimensions and which lines are painted, or start from corners"
@@ -61,28 +72,37 @@ def objection(search: FieldSearch, followed: Followed) -> str:
     return ""
 
 
-def dice(search: FieldSearch, camera: Camera) -> float:
-    """Dice's coefficient of strokes and target, by length: twice what one covers of the other, over both together."""
+def likelihood(search: FieldSearch, camera: Camera) -> float:
+    """How much likelier the target is where a camera puts it than lines laid anywhere: see `StrokeMap.likelihood`."""
     course = predict(search.target, camera, search.curves, _COURSE_PX)
-    in_view = _COURSE_PX * len(course)
-    covered = search.stroke_map.near.score(course.pixels) * in_view if len(course) else 0.0
-    return 2.0 * covered / (in_view + float(np.sum(search.stroke_map.strokes.length_px)))
+    near = search.stroke_map.near.at(*course.pixels.T)
+    return float(search.stroke_map.likelihood(np.array(_COURSE_PX * np.sum(near)), np.array(_COURSE_PX * len(course))))
 
 
-def explained(search: FieldSearch, camera: Camera) -> float:
-    """Of the strokes inside the target's outline, the share (by length) that lies on its curves."""
+def explained(search: FieldSearch, camera: Camera, *, everywhere: bool = False) -> float:
+    """Of the strokes inside the target's outline, or everywhere, that could be its lines, the share that lies on them.
+
+    Those could be that run along its lines or across, and are as strong as the ones on it: cables, seams, shadows and
+    stripes of sun that run otherwise, or are fainter, say nothing against it.
+    """
     strokes = search.stroke_map.strokes
-    middles = strokes.ends.mean(axis=1)
+    course = predict(search.target, camera, search.curves, _COURSE_PX)
+    ends = np.stack([camera.locate(strokes.ends[:, end]) @ search.grid.turn for end in (0, 1)])
+    middles, along = ends.mean(axis=0), np.abs(ends[1] - ends[0])
     places = search.grid.outline
     margin = _RIM * np.ptp(places, axis=0)
-    floor = camera.locate(middles) @ search.grid.turn
     with np.errstate(invalid="ignore"):
-        inside = np.all((floor > places.min(axis=0) - margin) & (floor < places.max(axis=0) + margin), axis=1)
-    course = predict(search.target, camera, search.curves, _COURSE_PX)
+        inside = np.all((middles > places.min(axis=0) - margin) & (middles < places.max(axis=0) + margin), axis=1)
+        inside |= everywhere
+        inside &= along.min(axis=1) < _PARALLEL * along.max(axis=1)
     if not np.any(inside) or not len(course):
         return 0.0
-    away = np.min(np.linalg.norm(middles[inside, None] - course.pixels, axis=2), axis=1)
-    return float(np.average(away < _NEAR_PX, weights=strokes.length_px[inside]))
+    away = np.linalg.norm(strokes.ends[inside].mean(axis=1)[:, None] - course.pixels, axis=2)
+    on_it, strength = np.min(away, axis=1) < _NEAR_PX, strokes.strength[inside]
+    if not np.any(on_it):
+        return 0.0
+    strong = strength > _AS_STRONG * np.median(strength[on_it])
+    return float(np.average(on_it[strong], weights=strokes.length_px[inside][strong]))
 
 
 def same_labels(search: FieldSearch, one: Followed, other: Followed) -> bool:

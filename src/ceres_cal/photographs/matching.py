@@ -1,14 +1,15 @@
 """Which line of a target is which in a photograph whose floor is known but for place, size and quarter turns.
 
 Two parallel lines of the floor taken for two of the target tell the camera's height and one coordinate of its place,
-one line across tells the other: every such choice, in all four turns, is a hypothesis. Its score is Dice's coefficient
-of the target that it predicts in view and the paint that was found. Mirrored choices do not arise: the camera stands
-above a floor whose z points up, and a rotation mirrors nothing.
+one line across tells the other: every such choice, in all four turns, is a hypothesis. Its score is how much likelier
+it makes the paint that was found than lines laid anywhere. Mirrored choices do not arise: the camera stands above a
+floor whose z points up, and a rotation mirrors nothing.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from math import gcd
 
 import numpy as np
@@ -28,6 +29,7 @@ _PARALLEL = 0.15
 _CELL = 0.03
 _FEW, _MANY = 60, 300  # places on the target at which all, and the best, are tried
 _KEPT = 800
+_TELLS_PX = 40.0  # of a line, as much as one place on it tells
 # Of the places on the target: a camera nearer than that sees too little of it.
 _LEAST_IN_VIEW = 0.03
 _BLOCK = 2000
@@ -61,6 +63,33 @@ class StrokeMap:
     def ends(self) -> Array:
         """(N, 2, 2) the strokes' ends from the centre, in half image diagonals."""
         return np.asarray((self.strokes.ends - self.centre) / self.unit_px)
+
+    @cached_property
+    def paint_px(self) -> float:
+        """The length of all strokes."""
+        return float(self.strokes.length_px.sum())
+
+    @cached_property
+    def _by_chance(self) -> float:
+        """The share of any line that strokes cover by chance."""
+        return float(np.clip(np.mean(self.near.plane), 1e-3, 0.5))
+
+    def likelihood(self, covered_px: Array, shown_px: Array) -> Array:
+        """How much likelier a target is than lines laid anywhere, by how much of what it shows strokes cover.
+
+        The log-likelihood ratio of so many successes, at whatever share of the paint is left, over what it would be if
+        the target were the strokes: from 0 to about 1.
+        """
+        chance = self._by_chance
+        covered_px = np.minimum(covered_px, self.paint_px)
+        share = np.clip(covered_px / np.maximum(shown_px, 1e-9), chance, 1.0 - 1e-9)
+        return np.asarray(shown_px * divergence(share, chance) / max(-self.paint_px * np.log(chance), 1e-9))
+
+
+def divergence(share: Array | float, other: Array | float) -> Array:
+    """Kullback and Leibler's, of two probabilities: what a trial tells of the first against the second."""
+    share, other = (np.clip(one, 1e-6, 1.0 - 1e-6) for one in (share, other))
+    return np.asarray(share * np.log(share / other) + (1.0 - share) * np.log((1.0 - share) / (1.0 - other)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,9 +211,8 @@ def _scored(stroke_map: StrokeMap, upright: Upright, hypotheses: Array, places: 
     with np.errstate(invalid="ignore"):
         inside = np.all((pixels > -0.5) & (pixels < np.array(stroke_map.image_size) - 0.5), axis=2)
     step = np.linalg.norm(np.diff(pixels, axis=1, prepend=pixels[:, :1]), axis=2)
-    step = np.where(inside & ~places.first & np.isfinite(step), step, 0.0)
+    step = np.where(inside & ~places.first & np.isfinite(step), np.minimum(step, _TELLS_PX), 0.0)
     near = stroke_map.near.at(pixels[..., 0], pixels[..., 1])
-    paint_px = float(stroke_map.strokes.length_px.sum())
-    covered, shown = np.minimum(np.sum(step * near, axis=1), paint_px), np.sum(step, axis=1)
+    covered, shown = np.sum(step * near, axis=1), np.sum(step, axis=1)
     enough = np.mean(inside, axis=1) >= _LEAST_IN_VIEW
-    return np.asarray(np.where(enough, 2.0 * covered / (shown + paint_px), 0.0))
+    return np.where(enough, stroke_map.likelihood(covered, shown), 0.0)

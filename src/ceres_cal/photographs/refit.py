@@ -52,14 +52,10 @@ def observations_of(
     )
 
 
-def refit_camera(
-    camera: Camera, observations: Observations, free: tuple[str, ...] = (), priors: tuple[Prior, ...] = ()
-) -> Camera | None:
-    """The posed camera that one view's observations tell, from one that is near; None where they tell none.
-
-    Args:
-        free: names of the intrinsics that are free too. priors: on them.
-    """
+def problem_of(
+    camera: Camera, observations: Observations, free: tuple[str, ...], priors: tuple[Prior, ...]
+) -> tuple[Problem, Estimate]:
+    """What `refit_camera` solves, and where from."""
     names = intrinsic_names(camera.lens)
     freed = np.array(sorted(names.index(name) for name in free), dtype=np.int64)
     estimate = Estimate(
@@ -70,7 +66,19 @@ def refit_camera(
     )
     layout = Layout({CAMERA: freed}, frozenset({STATION}), frozenset())
     known = tuple(stated_prior(prior, camera.lens) for prior in priors)
-    problem = Problem(gather_sights(observations), layout, known, Weighting(loss="cauchy", loss_scale=2.0), _QUICK)
+    weighting = Weighting(loss="cauchy", loss_scale=2.0)
+    return Problem(gather_sights(observations), layout, known, weighting, _QUICK), estimate
+
+
+def refit_camera(
+    camera: Camera, observations: Observations, free: tuple[str, ...] = (), priors: tuple[Prior, ...] = ()
+) -> Camera | None:
+    """The posed camera that one view's observations tell, from one that is near; None where they tell none.
+
+    Args:
+        free: names of the intrinsics that are free too. priors: on them.
+    """
+    problem, estimate = problem_of(camera, observations, free, priors)
     try:
         solution = solve(problem, estimate, precision=1e-6)
         refitted = solution.estimate.camera_at(STATION)

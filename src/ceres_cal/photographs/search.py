@@ -19,8 +19,8 @@ from ceres_cal.photographs.facing import (
     require_sides,
     side_of,
 )
-from ceres_cal.photographs.follow import Followed, follow
-from ceres_cal.photographs.judgement import detected_curves, dice, explained, objection, same_labels
+from ceres_cal.photographs.follow import Followed, FreeIntrinsics, approach, refine
+from ceres_cal.photographs.judgement import detected_curves, explained, likelihood, objection, same_labels
 from ceres_cal.photographs.refit import PointHints
 from ceres_cal.scene.camera import Camera, in_image
 from ceres_cal.scene.targets import Target
@@ -28,7 +28,7 @@ from ceres_cal.scene.targets import Target
 # Of the strokes explained, by the first without an objection: no other is followed. It only saves time. Nothing
 # changes from 0.82 to 0.95.
 _SURE = 0.9
-# Of the best one's Dice coefficient: another way to see the picture that is as good makes it ambiguous. Nothing
+# Of the best one's likelihood: another way to see the picture that is as good makes it ambiguous. Nothing
 # changes from 0.85 to 0.96.
 _AS_GOOD = 0.92
 _NO_LINES = (
@@ -56,6 +56,7 @@ class SearchResult:
 
     Attributes:
         followed: the field, or None. reason: why none was found.
+        seen: the best candidate, where none is the field.
         ways: in how many ways the photograph can be taken for the field; 0: none was looked for, a start was given.
             chosen_by: what chose one of them: "facing", "before", or nothing, where there is but one.
     """
@@ -64,6 +65,7 @@ class SearchResult:
     reason: str = ""
     ways: int = 0
     chosen_by: str = ""
+    seen: Followed | None = None
 
 
 def search(grey: Array32, target: Target, curves: Collection[str], auto: Auto) -> SearchResult:
@@ -80,24 +82,26 @@ def search(grey: Array32, target: Target, curves: Collection[str], auto: Auto) -
     """
     require_sides(auto.facing, target, curves)
     problem = prepare_search(grey, target, curves)
-    good, reason = [], _NO_LINES
-    for number, camera in enumerate(candidates(problem)):
+    good: list[Followed] = []
+    seen: Followed | None = None
+    reason = _NO_LINES
+    for camera in candidates(problem):
         followed = _followed(problem, _turned(problem, auto, camera))
         against = objection(problem, followed)
         if not against:
             good.append(followed)
-        elif number == 0:
-            reason = against
+        elif seen is None or followed.share > seen.share:
+            seen, reason = followed, against
         if good and explained(problem, good[-1].camera) > _SURE:
             break
     if not good:
-        return SearchResult(None, reason)
-    best = max(good, key=lambda one: dice(problem, one.camera))
+        return SearchResult(None, reason, seen=seen)
+    best = max(good, key=lambda one: likelihood(problem, one.camera))
     similar = alike(problem, best.camera, detected_curves(problem, best))
     others = [_followed(problem, _turned(problem, auto, camera)) for camera in similar]
     distinct = [best]
     for other in (*good, *(one for one in others if not objection(problem, one))):
-        as_good = dice(problem, other.camera) >= _AS_GOOD * dice(problem, best.camera)
+        as_good = likelihood(problem, other.camera) >= _AS_GOOD * likelihood(problem, best.camera)
         if as_good and not any(same_labels(problem, other, one) for one in distinct):
             distinct.append(other)
     return _one_way(problem, auto, distinct)
@@ -112,11 +116,14 @@ def _turned(problem: FieldSearch, auto: Auto, camera: Camera) -> Camera:
 
 def _followed(problem: FieldSearch, camera: Camera) -> Followed:
     """The target's lines from a camera that is about right, held by the points that it puts into the picture."""
+    return approach(problem.grey, problem.target, camera, problem.curves, _free(problem, camera))
+
+
+def _free(problem: FieldSearch, camera: Camera) -> FreeIntrinsics:
     pixels = camera.project(problem.target.point_array)
     rows = np.flatnonzero(in_image(pixels, camera.image_size))
     hints = PointHints(rows.astype(np.int32), pixels[rows], np.full(len(rows), SIGMA_PX))
-    free = unknown_optics(camera.image_size, camera.phi, hints)
-    return follow(problem.grey, problem.target, [camera], problem.curves, free)
+    return unknown_optics(camera.image_size, camera.phi, hints)
 
 
 # ---- which way round ------------------------------------------------------------------------------------------------
@@ -125,22 +132,20 @@ def _followed(problem: FieldSearch, camera: Camera) -> Followed:
 def _one_way(problem: FieldSearch, auto: Auto, distinct: Sequence[Followed]) -> SearchResult:
     """The one way that agrees with what is known; InputError where none does, or several."""
     target, curves = problem.target, problem.curves
-    ways = [(one, turn, one.camera.at(one.camera.cam_from_world @ turn)) for one in distinct for turn in problem.turns]
-    cameras = [camera for _, _, camera in ways]
-    agreeing = _consistent(problem, auto, cameras)
+    ways = [one.camera.at(one.camera.cam_from_world @ turn) for one in distinct for turn in problem.turns]
+    agreeing = _consistent(problem, auto, ways)
+    camera = ways[agreeing[0]] if agreeing else ways[0]
+    followed = refine(problem.grey, target, camera, curves, _free(problem, camera))
+    if against := objection(problem, followed):
+        return SearchResult(None, against, seen=followed)
     if not agreeing:
         given = ", ".join(f"{one.feature}={one.side}" for one in auto.facing)
-        raise InputError(f"not with {given}: in this photograph {_sides(cameras, target, curves)}")
+        raise InputError(f"not with {given}: in this photograph {_sides(ways, target, curves)}")
     if len(agreeing) > 1:
         raise InputError(
             f"the field is found, but it looks alike in {len(agreeing)} ways: "
-            f"{_sides([cameras[number] for number in agreeing], target, curves)}"
+            f"{_sides([ways[number] for number in agreeing], target, curves)}"
         )
-    followed, turn, camera = ways[agreeing[0]]
-    if turn is not problem.turns[0]:
-        followed = follow(problem.grey, target, [camera], curves)
-        if against := objection(problem, followed):
-            return SearchResult(None, against)
     chosen_by = "" if len(ways) == 1 else "facing" if auto.facing else "before"
     return SearchResult(followed, "", len(ways), chosen_by)
 

@@ -315,10 +315,7 @@ def shared_columns(equations: Equations, estimate: Estimate, keys: Sequence[Key]
             columns[here, own] = equations.pose[here] @ from_placement(pose, world)[0]
     structure = [column for column, key in enumerate(keys) if key.kind == "structure"]
     if structure:
-        slots, rows = equations.slots(estimate.structure), np.arange(len(equations))
-        for k in range(slots.shape[1]):
-            moved = rows[slots[:, k] >= 0]
-            columns[moved, structure[0] + slots[moved, k]] += equations.built[moved, k]
+        columns[:, structure] = equations.structure_columns(estimate.structure)
     return columns
 
 

@@ -67,7 +67,7 @@ def ssl_field(division: str | None = None, **dimensions_m: float) -> Target:
     spec = {"kind": "ssl-field", **({"division": division} if division else {}), **given}
     others = [other for other in _DIVISIONS if division not in (None, other)]
     mistaken_for = {f"a division {other} field": {"kind": "ssl-field", "division": other} for other in others}
-    return Target(spec, _points(dimensions), _curves(dimensions), mistaken_for=mistaken_for)
+    return Target(spec, _points(dimensions), _curves(dimensions), mistaken_for=mistaken_for, dimensions=dimensions)
 
 
 def _curves(d: Mapping[str, float]) -> dict[str, Curve]:

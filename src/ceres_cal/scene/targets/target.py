@@ -52,6 +52,8 @@ class Target:
         grid: how its points stand in columns and rows; None where they do not.
         paper: the sheet that it is printed on; None for what is painted on the floor.
         mistaken_for: in words -> spec of another target that has features of the same names.
+        dimensions: the lengths, m, that its spec gives or implies, by their names there; with another value in the
+            spec its features lie elsewhere.
     """
 
     spec: Mapping[str, Any]
@@ -62,6 +64,7 @@ class Target:
     grid: Grid | None = None
     paper: Paper | None = None
     mistaken_for: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    dimensions: Mapping[str, float] = field(default_factory=dict)
 
     def __eq__(self, other: object) -> bool:
         return (

@@ -1,0 +1,210 @@
+"""Whether the lines that were followed are where the target says: which lie aside, and which dimensions are others.
+
+One linear model of the camera and of all that may be painted otherwise: every curve's offset, and the target's own
+dimensions, which move several curves at once. The camera is projected out, and what is left decides by evidence
+(marginal likelihood) between curves that belong, scattering by as much as paint does, single curves that lie aside, and
+dimensions that are others: a spike and slab prior (Mitchell and Beauchamp, JASA 83, 1988), its sets searched by beam.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from ceres_cal.base.arrays import Array
+from ceres_cal.base.errors import SolutionError
+from ceres_cal.detect.lines import Lines
+from ceres_cal.model.equations import whole_structure, write_equations
+from ceres_cal.model.parameters import intrinsic_names
+from ceres_cal.model.residuals import residuals
+from ceres_cal.model.structure import dimension_slopes
+from ceres_cal.observations import Prior
+from ceres_cal.photographs.refit import observations_of, problem_of
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.targets import Target
+from ceres_cal.solve.linear_model import Weights, make_linear_model
+
+_SCATTER_M = np.array([0.0005, 0.001, 0.002, 0.004, 0.008])  # of paint about its drawing
+_ASIDE_M, _OTHER = 0.04, 0.1  # of a curve that lies aside; of a dimension that is another one, as a share of it
+_LOG_ODDS = np.log(0.1 / 0.9)  # that a curve lies aside, or a dimension is another one
+_BEAM, _MOST = 24, 9
+# Of a dimension, another field; what a tape measure, a strange lens and a floor that is not flat make of one is less.
+_OTHER_FIELD = 0.02
+_SURELY = 10.0  # standard deviations of it, which take lines to be taped independently of each other
+_FARTHEST_M = 0.12  # of a curve that lies aside: farther, it is another curve
+_LEAST_SIGMA_PX = 0.05  # of places on a curve: what a model of its shape is good for
+_TOGETHER = 4.0  # neighbouring places whose errors go together
+
+
+@dataclass(frozen=True, eq=False)
+class AsBuilt:
+    """What explains best how curves lie.
+
+    Attributes:
+        aside_m: name of a curve -> by how much it lies beside its drawing, m, where it does.
+        dimensions: name of a dimension -> its most likely value, m, where it is another one than the target's.
+        sd_m: name of each of those -> its standard deviation, m.
+        drawn: name of a dimension -> its value by the target, m. curves: how many there are to tell.
+    """
+
+    aside_m: Mapping[str, float]
+    dimensions: Mapping[str, float]
+    sd_m: Mapping[str, float]
+    drawn: Mapping[str, float]
+    curves: int
+
+    @property
+    def is_other(self) -> bool:
+        """Whether this is another field: a dimension too far off for a tape measure, or lines all over the place."""
+        changes = [
+            abs(length / self.drawn[name] - 1.0)
+            for name, length in self.dimensions.items()
+            if abs(length - self.drawn[name]) > _SURELY * self.sd_m[name]
+        ]
+        far = max((abs(aside) for aside in self.aside_m.values()), default=0.0)
+        return max(changes, default=0.0) > _OTHER_FIELD or far > _FARTHEST_M or 2 * len(self.aside_m) > self.curves
+
+    def words(self) -> tuple[str, ...]:
+        """A sentence on each dimension and each curve that is not as drawn."""
+        dimensions = [
+            f"{_spoken(name)} is {_change(length / self.drawn[name])} than the target says, "
+            f"{length:.3f} ± {self.sd_m[name]:.3f} m instead of {self.drawn[name]:g}: other dimensions?"
+            for name, length in self.dimensions.items()
+        ]
+        curves = [
+            f"{name} lies {1e3 * abs(aside):.0f} ± {1e3 * self.sd_m[name]:.0f} mm beside its drawing"
+            for name, aside in self.aside_m.items()
+        ]
+        return (*dimensions, *curves)
+
+
+AS_DRAWN = AsBuilt({}, {}, {}, {}, 0)
+"""Nothing is known of how a target is painted."""
+
+
+def _spoken(name: str) -> str:
+    """center_circle_radius_m -> the center circle radius"""
+    return f"the {name.removesuffix('_m').replace('_', ' ')}"
+
+
+def _change(factor: float) -> str:
+    return f"{100.0 * abs(factor - 1.0):.1f} % {'larger' if factor > 1.0 else 'smaller'}"
+
+
+def as_built(lines: Lines, camera: Camera, target: Target, priors: tuple[Prior, ...]) -> AsBuilt:
+    """What the lines that were found say of how the target is painted: as drawn where they do not say it.
+
+    All of the camera but its aspect may follow.
+
+    Args:
+        priors: on its intrinsics.
+    """
+    rows = lines.found
+    sigma = np.sqrt(_TOGETHER) * np.maximum(lines.sigma_px[rows], _LEAST_SIGMA_PX)
+    seen = observations_of(target, camera.image_size, lines.course.curve[rows], lines.pixels[rows], sigma)
+    free = tuple(name for name in intrinsic_names(camera.lens) if name != "aspect")
+    problem, estimate = problem_of(camera, seen, free, priors)
+    try:
+        equations = write_equations(seen, problem.sights, estimate, residuals(seen, problem.sights, estimate))
+    except SolutionError:
+        return AS_DRAWN
+    every = np.ones(len(equations), dtype=bool)
+    weights = Weights(1.0 / sigma[equations.observation], every, np.ones(len(equations)))
+    model = make_linear_model(problem, estimate, equations, weights)
+    structure = whole_structure(seen.targets)
+    columns = equations.structure_columns(structure)
+    there = np.flatnonzero(np.any(columns != 0.0, axis=0))
+    normal, slope = model.left_of(columns[:, there])
+    bent = model.freed(columns[:, there])  # lines that no offset straightens: wavy tape, another lens
+    left = float(model.left_over @ model.left_over) - bent.decrease
+    noise = max(1.0, left / max(model.spare - bent.root.shape[1], 1))
+    names, moves = dimension_slopes(structure, seen.targets)
+    owner = np.array([_curve_of(structure.names[row]) for row in there])
+    shape = _Shape(
+        normal / noise, slope / noise, owner, moves[there], names, np.array(list(target.dimensions.values()))
+    )
+    return shape.explained()
+
+
+def _curve_of(name: str) -> str:
+    """field/CenterCircle.x -> CenterCircle"""
+    return name.partition("/")[2].partition(".")[0]
+
+
+@dataclass(frozen=True, eq=False)
+class _Shape:
+    """What is left of the curves' Q numbers once the camera followed: their normal equations, and what moves them.
+
+    Attributes:
+        normal: (Q, Q). slope: (Q,). owner: (Q,) names of curves. moves: (Q, D) of the dimensions, whose values (D,) are
+            `lengths`.
+    """
+
+    normal: Array
+    slope: Array
+    owner: Array
+    moves: Array
+    names: tuple[str, ...]
+    lengths: Array
+
+    def explained(self) -> AsBuilt:
+        """The set of curves and dimensions of most evidence."""
+        curves = list(dict.fromkeys(self.owner.tolist()))
+        moving = [int(d) for d in np.flatnonzero(np.any(self.moves != 0.0, axis=0))]
+        roots = [_ASIDE_M * np.eye(len(self.owner))[:, self.owner == name] for name in curves]
+        roots += [_OTHER * self.lengths[d] * self.moves[:, d : d + 1] for d in moving]
+        chosen, scatter_m = self._searched(np.array([root @ root.T for root in roots]))
+        mean, sd = self._amounts(np.hstack([np.empty((len(self.owner), 0)), *(roots[n] for n in chosen)]), scatter_m)
+        aside, dimensions, sds, at = {}, {}, {}, 0
+        for number in chosen:
+            size = roots[number].shape[1]
+            values, own = mean[at : at + size], sd[at : at + size]
+            at += size
+            worst = int(np.argmax(np.abs(values)))
+            if number < len(curves):
+                aside[curves[number]] = _ASIDE_M * float(values[worst])
+                sds[curves[number]] = _ASIDE_M * float(own[worst])
+                continue
+            d = moving[number - len(curves)]
+            name = self.names[d].partition("/")[2]
+            dimensions[name] = float(self.lengths[d] * (1.0 + _OTHER * values[0]))
+            sds[name] = float(self.lengths[d] * _OTHER * own[0])
+        drawn = {name.partition("/")[2]: float(length) for name, length in zip(self.names, self.lengths, strict=True)}
+        return AsBuilt(aside, dimensions, sds, drawn, len(curves))
+
+    def _searched(self, parts: Array) -> tuple[list[int], float]:
+        """The best set of the parts (P, Q, Q) of a covariance, and the scatter of paint, m, beside it."""
+        beam: list[frozenset[int]] = [frozenset()]
+        best, most, scatter_m = frozenset[int](), -np.inf, float(_SCATTER_M[0])
+        for _ in range(_MOST + 1):
+            evidence = self._log_evidence(np.array([sum((parts[n] for n in one), 0.0 * self.normal) for one in beam]))
+            score = evidence.max(axis=1) + _LOG_ODDS * len(beam[0])
+            order = np.argsort(-score)
+            if score[order[0]] > most:
+                best, most = beam[order[0]], float(score[order[0]])
+                scatter_m = float(_SCATTER_M[np.argmax(evidence[order[0]])])
+            kept = [beam[row] for row in order[:_BEAM]]
+            beam = list({one | {n} for one in kept for n in range(len(parts)) if n not in one})
+            if not beam:
+                break
+        return sorted(best), scatter_m
+
+    def _log_evidence(self, covariance: Array) -> Array:
+        """(K, S) of covariances (K, Q, Q) of the curves' numbers, with each scatter besides."""
+        one = np.eye(len(self.slope))
+        root = np.linalg.cholesky(covariance[:, None] + _SCATTER_M[:, None, None] ** 2 * one)
+        wider = one + np.swapaxes(root, 2, 3) @ self.normal @ root
+        right = np.swapaxes(root, 2, 3) @ self.slope
+        explained = np.sum(right * np.linalg.solve(wider, right[..., None])[..., 0], axis=-1)
+        return np.asarray(0.5 * explained - 0.5 * np.linalg.slogdet(wider)[1])
+
+    def _amounts(self, root: Array, scatter_m: float) -> tuple[Array, Array]:
+        """Posterior mean and sd (Z,) of what moves the curves by `root` (Q, Z), each of one beforehand."""
+        one = np.eye(len(self.slope))
+        covariance = root @ root.T + scatter_m**2 * one
+        taken = np.linalg.solve(one + covariance @ self.normal, covariance)  # posterior covariance of the numbers
+        mixed = np.linalg.solve(covariance, root)
+        posterior = np.eye(root.shape[1]) - root.T @ mixed + mixed.T @ taken @ mixed
+        return -mixed.T @ taken @ self.slope, np.sqrt(np.maximum(np.diag(posterior), 0.0))

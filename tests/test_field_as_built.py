@@ -1,0 +1,169 @@
+"""How lines lie beside their drawing, and dimensions that are others: told apart, named, refused."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import photograph_shots as script
+import pytest
+
+from ceres_cal.base.errors import NothingShownError
+from ceres_cal.cli import main
+from ceres_cal.detect.courses import predict
+from ceres_cal.detect.images import filled
+from ceres_cal.detect.lines import Lines, measure
+from ceres_cal.detect.strokes import find_strokes
+from ceres_cal.photographs import Auto, Clicks, FieldOptions, detect_field
+from ceres_cal.photographs.as_built import AsBuilt, as_built
+from ceres_cal.photographs.clicks import unknown_optics
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.lens import Radial
+from ceres_cal.scene.targets import Segment, Target, custom, ssl_field
+from ceres_cal.simulate import overhead_pose
+
+FIELD = ssl_field("B")
+CAMERA = Camera(
+    (780, 580),
+    340.0,
+    (389.5, 289.5),
+    Radial((0.0, 1.0e-6, 0.0, 0.0), (2, 3, 4, 5)),
+    1.0,
+    overhead_pose(0.2, -0.1, 5.0, 4.0),
+)
+
+
+def told(painted: Target, asked: Target = FIELD, noise_px: float = 0.1) -> AsBuilt:
+    """What lines that are painted so tell of the field that is asked for."""
+    course = predict(painted, CAMERA, painted.curve_names, 8.0, 8.0)
+    offset = np.random.default_rng(3).normal(0.0, noise_px, len(course))
+    every = np.ones(len(course), dtype=bool)
+    lines = Lines(course, every, offset, np.full(len(course), noise_px), np.full(len(course), 50.0), 0.8, 1.0)
+    return as_built(lines, CAMERA, asked, unknown_optics(CAMERA.image_size, CAMERA.phi, None).priors)
+
+
+def moved(aside_m: dict[str, tuple[float, float]]) -> Target:
+    """The field with some of its lines elsewhere."""
+    curves = dict(FIELD.curves)
+    for name, (x, y) in aside_m.items():
+        line = curves[name]
+        assert isinstance(line, Segment)
+        ends = [(a + x, b + y, c) for a, b, c in (line.start, line.end)]
+        curves[name] = Segment(ends[0], ends[1], line.width_m)
+    painted = custom(FIELD.points, {name: curves[name] for name in FIELD.curve_names})
+    assert painted.curve_names == FIELD.curve_names
+    return painted
+
+
+def test_a_field_as_drawn_and_one_of_its_own_scale() -> None:
+    for painted in (FIELD, custom(FIELD.points, FIELD.curves)):
+        built = told(painted)
+        assert not built.aside_m and not built.dimensions and not built.is_other and built.words() == ()
+
+
+def test_lines_that_lie_aside_are_named_and_measured() -> None:
+    true = {"BottomTouchLine": -0.03, "RightGoalLine": -0.031, "HalfwayLine": 0.019, "LeftPenaltyStretch": -0.024}
+    built = told(moved({name: (0.0, a) if "Touch" in name else (-a, 0.0) for name, a in true.items()}))
+    assert built.aside_m.keys() == true.keys() and not built.dimensions and not built.is_other
+    for name, aside in true.items():
+        assert abs(built.aside_m[name] - aside) < 0.004  # 0.002 m
+    assert any(words.startswith("BottomTouchLine lies ") for words in built.words())
+
+
+@pytest.mark.parametrize("share", [0.92, 0.95, 0.97])
+def test_a_smaller_field_with_the_same_circle_and_areas_is_another_one(share: float) -> None:
+    built = told(ssl_field("B", field_length_m=9.0 * share, field_width_m=6.0 * share))
+    assert built.is_other and not built.aside_m
+    assert built.dimensions.keys() == {"field_length_m", "field_width_m"}
+    assert abs(built.dimensions["field_length_m"] / (9.0 * share) - 1.0) < 0.005  # 0.002 at 0.92
+    assert "the field length is" in built.words()[0] and "other dimensions?" in built.words()[0]
+
+
+@pytest.mark.parametrize(
+    "name, length_m", [("field_width_m", 5.8), ("center_circle_radius_m", 0.55), ("penalty_area_depth_m", 1.1)]
+)
+def test_one_other_dimension_is_named(name: str, length_m: float) -> None:
+    built = told(ssl_field("B", **{name: length_m}))
+    assert built.is_other and abs(built.dimensions[name] / length_m - 1.0) < 0.01  # 0.002
+
+
+def test_a_target_without_dimensions_has_lines_only() -> None:
+    asked = custom(FIELD.points, FIELD.curves)
+    built = told(moved({"HalfwayLine": (0.05, 0.0)}), asked)
+    assert built.aside_m.keys() == {"HalfwayLine"} and not built.dimensions
+
+
+# ---- through photographs --------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def shot() -> script.Shot:
+    return script.take(0)
+
+
+@pytest.fixture(scope="module")
+def path(shot: script.Shot, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("built") / "shot.png"
+    cv2.imwrite(str(path), shot.picture.image)
+    return path
+
+
+def test_another_field_is_refused_by_name_and_drawn(shot: script.Shot, path: Path, tmp_path: Path) -> None:
+    asked = ssl_field("B", field_length_m=9.3, field_width_m=6.2)
+    clicks = script.clicks(shot, 0)
+    with pytest.raises(NothingShownError, match=r"the field (length|width) is 3\.\d % smaller than the target says"):
+        detect_field([path], asked, clicks)
+    picture, target = tmp_path / "refused.png", tmp_path / "target.json"
+    target.write_text('{"kind": "ssl-field", "division": "B", "field_length_m": 9.3, "field_width_m": 6.2}')
+    corners = [f"--corner={name}={x},{y}" for name, (x, y) in clicks.points.items()]
+    command = ["detect", "field", str(path), *corners, "-o", str(tmp_path / "o.json"), "--picture", str(picture)]
+    assert main([*command, "--target", str(target)]) != 0
+    drawn = cv2.imread(str(picture))
+    assert drawn is not None and drawn.shape == shot.picture.image.shape
+    assert np.any(drawn != shot.picture.image)
+
+
+def test_what_is_left_out_and_a_start_that_is_kept(shot: script.Shot, path: Path) -> None:
+    height, width = shot.grey.shape
+    left_out = np.zeros((height, width), dtype=bool)
+    left_out[:, : width // 4] = True
+    pixels = shot.camera.project([shot.target.points[name] for name in script.CORNERS])
+    exact = Clicks({name: (float(x), float(y)) for name, (x, y) in zip(script.CORNERS, pixels, strict=True)})
+    options = FieldOptions(left_out=left_out, keep_start=True)
+    found = detect_field([path], FIELD, exact, options=options)
+    assert found.observations.curves.pixels[:, 0].min() > width // 4 - 2.0
+    plane = filled(shot.grey, left_out)
+    assert np.array_equal(plane[~left_out], shot.grey[~left_out])
+    assert np.std(np.diff(plane[:, : width // 4 - 20], axis=1)) < 0.5 * np.std(np.diff(shot.grey, axis=1))
+
+
+def test_a_moved_camera_smears_lines_across_its_way_alone(shot: script.Shot) -> None:
+    smear = np.full((1, 9), 1.0 / 9.0, np.float32)
+    grey = np.asarray(cv2.filter2D(shot.grey, -1, smear), dtype=np.float32)
+    course = predict(FIELD, shot.camera, ["LeftGoalLine", "HalfwayLine", "TopTouchLine", "BottomTouchLine"], 8.0, 12.0)
+    lines = measure(grey, course, 3.0)
+    assert lines.share > 0.5  # 0.54: what is 9 px wide is left out where other paint is near
+    errors = script.distances_px(shot, course.curve[lines.found], lines.pixels[lines.found])
+    assert abs(np.mean(errors)) < 0.1 and lines.blur_px > 1.2
+
+
+def test_strokes_are_of_thin_lines_in_sun_and_of_dashes() -> None:
+    rng = np.random.default_rng(1)
+    grey = rng.normal(60.0, 1.0, (400, 600))
+    for x in range(20, 600, 80):  # stripes of sun, noisy
+        stripe = grey[:, x : x + 24]
+        stripe += 90.0 + rng.normal(0.0, 12.0, stripe.shape)
+    line = np.zeros((400, 600), np.float32)
+    line[99:101, 20:580] = 1.0
+    dashed = (np.arange(580 - 20) % 28) < 20
+    line[299:301, 20:580] = dashed
+    picture = (grey + 40.0 * cv2.GaussianBlur(line, (0, 0), 0.8)).astype(np.float32)
+    strokes = find_strokes(picture)
+    middles, length = strokes.ends.mean(axis=1), strokes.length_px
+    solid, dashes = (length[np.abs(middles[:, 1] - y) < 2.0].sum() for y in (99.5, 299.5))
+    assert solid > 300.0 and dashes > 200.0
+    assert solid + dashes > 0.7 * length.sum()
+
+
+def test_auto_takes_no_other_target(path: Path) -> None:
+    with pytest.raises(NothingShownError):
+        detect_field([path], ssl_field("A"), Auto())
