@@ -47,6 +47,9 @@ _UNKNOWN = (
     "camera {!r}: its views are too frontal to tell phi, which is {} at 95 %, and its heights go with phi: the floor "
     "is right, what is above it is not: add boards tilted by 20 degrees, or a prior on height_m where it sees the field"
 )
+# Share of the standard deviation of usual principal points: observations that say as much need nothing usual. Half and
+# double leave ordinary fields and boards, whose share is under a tenth, as they are.
+_SAYS_LESS = 0.5
 # Times the standard deviation of phi without what is usual of principal points: what rests on it is said.
 _RESTING = 1.5
 _USUAL = (
@@ -113,17 +116,42 @@ def _of_lens(
     options: Options,
     progress: Callable[[Progress], None] | None,
 ) -> Calibration:
-    """With a lens that is named."""
-    priors = gather_priors(observations, options, start.estimate.structure)
-    problem = Problem(sights, make_layout(observations, options), priors, options=options)
-    if options.closed_form_only:
-        return _closed_form(start, observations, problem)
-    calibration = solved_from(start, observations, problem, progress=progress)
+    """With a lens that is named, and what is usual of cameras where the observations say less."""
+
+    def solved(given: Options) -> Calibration:
+        priors = gather_priors(observations, given, start.estimate.structure)
+        problem = Problem(sights, make_layout(observations, given), priors, options=given)
+        if given.closed_form_only:
+            return _closed_form(start, observations, problem)
+        return solved_from(start, observations, problem, progress=progress)
+
+    if not options.usual_camera:
+        return solved(options)
+    try:
+        alone = solved(replace(options, usual_camera=False))
+    except CalibrationError:
+        return solved(options)
+    if _says_centres(alone, observations, options):
+        return alone
+    try:
+        calibration = solved(options)
+    except CalibrationError:
+        return alone
     unusual = [one.words for one in calibration.conflicts if one.kind == "usual"]
-    if not unusual:
-        return calibration
-    calibration = _of_lens(start, observations, sights, replace(options, usual_camera=False), progress)
-    return replace(calibration, warnings=(*calibration.warnings, *unusual))
+    return replace(alone, warnings=(*alone.warnings, *unusual)) if unusual else calibration
+
+
+def _says_centres(calibration: Calibration, observations: Observations, options: Options) -> bool:
+    """Whether observations say more about principal points than what is usual of cameras does."""
+    if calibration.posterior is None:
+        return True
+    known = calibration.posterior.information
+    for prior in gather_priors(observations, options, calibration.estimate.structure):
+        keys = [key for key in prior.keys if prior.is_usual and key in known.keys]
+        sd, usual = known.marginal(keys).spread.sd, prior.information.marginal(keys).spread.sd
+        if not np.all(sd < _SAYS_LESS * usual):
+            return False
+    return True
 
 
 def _without_priors(observations: Observations, options: Options) -> Calibration | None:

@@ -88,10 +88,10 @@ def _add_camera(parser: ArgumentParser) -> None:
         "(a sigma in metres, or such as 10mm; repeatable)",
     )
     add(
-        "--as-drawn",
+        "--as-built",
         action="store_true",
-        help="take targets without a tolerance as drawn; else corners, bows and lines whose residuals repeat over the "
-        "views are solved for, with a sigma from the data",
+        help="solve for corners, bows and lines whose residuals repeat over the views, with a sigma from the data; else "
+        "targets without a tolerance are taken as drawn",
     )
     add_prior(parser)
 
@@ -221,7 +221,7 @@ def _options(
         fixed=fixed,
         priors=tuple(parse_prior(spec, observations, names) for spec in args.prior),
         tolerances=_tolerances(args.tolerance),
-        as_built="as drawn" if args.as_drawn else "estimate",
+        as_built="estimate" if args.as_built else "as drawn",
         loss=args.loss,
         loss_scale=args.loss_scale,
         reject_sigma=args.reject_sigma,

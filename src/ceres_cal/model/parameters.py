@@ -78,7 +78,7 @@ class Options:
     loss_scale: float = 2.5
     reject_sigma: float = 5.0
     noise_scale: str = "estimate"
-    as_built: str = "estimate"
+    as_built: str = "as drawn"
     closed_form_only: bool = False
     max_iterations: int = 100
     threads: int = 0
