@@ -40,7 +40,9 @@ def case(name: str) -> tuple[Observations, Options]:
     """Noisy observations, some of them 5 px off, and the options that fit the scene's lens."""
     scene = SCENES[name]()
     lens = next(iter(scene.cameras.values())).lens
-    return simulate(scene, NOISE, 3).observations, Options(lens=lens.kind, powers=getattr(lens, "powers", (2, 3)))
+    return simulate(scene, NOISE, 3).observations, Options(
+        lens=lens.kind, powers=getattr(lens, "powers", (2, 3)), usual_camera=False
+    )
 
 
 def start_of(name: str) -> Estimate:

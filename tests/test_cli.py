@@ -10,7 +10,7 @@ import shlex
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -261,7 +261,7 @@ def test_help_and_wrong_usage_bring_in_nothing_heavy() -> None:
         (("calibrate", "x", "--frobnicate"), "unrecognized arguments: --frobnicate"),
         (("calibrate", "x", "--lens", "zoom"), "invalid choice: 'zoom'"),
         (("calibrate", "x", "--powers", "2,x"), "--powers '2,x': give whole numbers"),
-        (("calibrate", "x", "--powers", "3", "--lens", "brown"), "--powers is for the radial lens"),
+        (("calibrate", "x", "--powers", "3", "--lens", "brown"), "--powers is for the radial or spline lens"),
         (("calibrate", "x", "--fix", "k3"), "--fix 'k3': write NAME=VALUE"),
         (("calibrate", "x", "--fix", "k3=0", "--fix", "k3=1"), "k3 is fixed twice"),
         (("calibrate", "x", "--fix", "k3=nan"), "'nan' is not a finite number"),
@@ -374,7 +374,7 @@ def test_calibrate_as_json_is_the_file_and_more(say: Say, tmp_path: Path) -> Non
     assert 0.1 < floor["mean_sd_mm"] < robots["mean_sd_mm"] < robots["worst_sd_mm"] < 1.0
     assert known["weak_directions"] == [] and known["unknown_placements"] == {} and known["seams"] == []
     # Nothing given on the command line is what nothing given in Python is.
-    assert data["calibration"]["options"] == _plain(RADIAL)
+    assert data["calibration"]["options"] == _plain(replace(RADIAL, usual_camera=False))  # the observations say more
 
 
 def test_options_arrive(say: Say) -> None:
@@ -401,6 +401,7 @@ def test_options_arrive(say: Say) -> None:
         noise_scale="stated",
         max_iterations=50,
         threads=1,
+        usual_camera=False,  # the principal point is held
     )
     assert calibration["options"] == {name: value for name, value in _plain(options).items() if name != "priors"}
     assert calibration["cameras"]["overhead"]["lens"]["coefficients"]["p1"] == 1e-4
@@ -515,8 +516,14 @@ def test_warns_of_a_lens_that_does_not_suit(say: Say, tmp_path: Path) -> None:
     assert any("times the stated sigmas" in warning for warning in json.loads(said.out)["warnings"])
 
 
-def test_nothing_is_taken_for_usual_where_that_is_asked_for(say: Say) -> None:
-    given = [json.loads(say("calibrate", SAMPLE, *more, "--json").out) for more in ((), ("--no-usual-camera",))]
+def test_what_is_usual_of_cameras_is_taken_where_observations_say_less(say: Say, tmp_path: Path) -> None:
+    few = tmp_path / "few.json"
+    observations = Observations.load(SAMPLE)
+    field = np.array([observations.views[view].target == "field" for view in observations.points.view])
+    corners = observations.part(field & (np.cumsum(field) <= 8), np.zeros(len(observations.curves), bool))
+    replace(corners, points=replace(corners.points, sigma_px=np.full(8, 20.0))).save(few)
+    lens = ("--powers", "3", "--noise-scale", "stated")
+    given = [json.loads(say("calibrate", few, *lens, *more, "--json").out) for more in ((), ("--no-usual-camera",))]
     assert [one["calibration"]["options"]["usual_camera"] for one in given] == [True, False]
 
 

@@ -180,7 +180,7 @@ def test_of_numbers_that_are_held_a_problem_hears_nothing() -> None:
     prior = known_prior(estimate)
     problem = Problem(gather_sights(seen), make_layout(seen, options), (prior,), options=options)
     (heard,) = problem.priors_at(estimate)
-    assert [key.quantity for key in prior.keys if key not in heard.keys] == ["aspect", "cx"]
+    assert [key.quantity for key in prior.keys if key not in heard.keys] == ["aspect", "cx", "skew"]
     assert heard.information.matrix == pytest.approx(prior.information.given(heard.keys).matrix)
     assert problem.unknowns(estimate) == problem.layout.size - len(heard.keys) == 0
     nobody = GaussianPrior(Information.of_sigmas({Key("camera", "overhead", "cx", "px"): 1.0}), np.array([651.3]))

@@ -90,8 +90,8 @@ def _add_camera(parser: ArgumentParser) -> None:
     add(
         "--as-built",
         action="store_true",
-        help="solve for corners, bows and lines whose residuals repeat over the views, with a sigma from the data; else "
-        "targets without a tolerance are taken as drawn",
+        help="solve for corners, bows and lines whose residuals repeat over the views, with a sigma from the data; "
+        "else targets without a tolerance are taken as drawn",
     )
     add_prior(parser)
 
