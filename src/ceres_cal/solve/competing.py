@@ -149,7 +149,7 @@ class _Competition:
         """Those that the offsets speak against: single ones, and the pair of most evidence."""
         if not wholes.of_features:
             excess = self._excess(end, wholes)
-            if np.max(excess) < _STANDS_OUT + np.sqrt(2.0 * np.log(max(np.count_nonzero(excess), 1))):
+            if np.max(excess) < _STANDS_OUT + np.sqrt(2.0 * np.log(max(int(np.count_nonzero(excess)), 1))):
                 return
         chosen, offsets = self._offsets(end, wholes, ())
         if offsets is None:
