@@ -10,8 +10,8 @@ from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import DegenerateError
 from ceres_cal.lens_choice.forms import PAPER
 
-# How much worse than the best, in standard errors of the difference, is as good. Of 180 scenes with the paper's lens it
-# was recognised in 92 % at 1, in 97 % at 1.5; at 2 the decentring of real sets is missed.
+# How much worse than the best, in standard errors of the difference, is as good: at 1 the paper's lens is missed more
+# often, at 2 the decentring of real sets.
 AS_GOOD = 1.5
 
 

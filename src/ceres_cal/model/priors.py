@@ -26,8 +26,7 @@ from ceres_cal.scene.lens import Lens
 
 USUAL_CENTRE = 0.015
 """Of the image's diagonal, 24 px of 1600: the standard deviation of either coordinate of principal points about the
-middle of pictures that were not cropped. Twelve of ours lie within 0.029; where data know them to a few pixels it moves
-them by less than a tenth of their standard deviation."""
+middle of pictures that were not cropped."""
 _QUANTITIES = {"principal_point": ("cx", "cy"), "height_m": ("height",), "position_m": ("x", "y", "height")}
 
 
