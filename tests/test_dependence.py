@@ -15,12 +15,17 @@ from ceres_cal.base.arrays import Array
 from ceres_cal.base.tails import NORMAL_95, student_95
 from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
+from ceres_cal.model.parameters import Options
+from ceres_cal.model.residuals import residuals
 from ceres_cal.moves import refit
 from ceres_cal.observations import Observations
+from ceres_cal.observations.sights import gather_sights
 from ceres_cal.simulate import Disturbance, simulate
+from ceres_cal.start.initialise import initialise
 from ceres_cal.uncertainty.between import _averaged, _expected
 from ceres_cal.uncertainty.correlation import _freedom_of_mixture
 from ceres_cal.uncertainty.likelihood import likelihoods
+from ceres_cal.uncertainty.sample import _shown
 from ceres_cal.uncertainty.strands import Family, Strand, decay
 
 HALF = SSL_PROBLEMS["half, paper's lens"]()
@@ -299,3 +304,15 @@ def test_intervals_hold_where_errors_go_together(name: str) -> None:
     assert 0.88 < share(found.parameters)[0] < 0.995
     for held in found.points.values():
         assert 0.88 < share(held)[0] < 0.995
+
+
+def test_rows_without_a_residual_take_no_part() -> None:
+    """A lens in the middle of its valley may not show them all: their scores would be no numbers."""
+    observations = Observations.load(Path(__file__).parents[1] / "data" / "ssl_field" / "observations.json")
+    sights = gather_sights(observations)
+    there = residuals(observations, sights, initialise(observations, sights, Options(lens="radial")).estimate)
+    assert _shown(sights, there) is sights
+    points = there.points.copy()
+    points[5] = np.nan
+    shown = _shown(sights, replace(there, points=points))
+    assert len(shown.point_rows) == len(sights.point_rows) - 1 and 5 not in shown.point_rows

@@ -101,10 +101,10 @@ def take_sample(
         problem: as it was solved, at the noise that was found. there: residuals at the estimate. reduced: what the
             problem says there.
     """
-    information = reduced.shared.matrix
-    if not len(information):
+    sights = _shown(problem.sights, there)
+    if not len(reduced.shared.matrix) or not len(sights):
         return None
-    equations = equations_of(observations, _some(observations, problem.sights), estimate, there)
+    equations = equations_of(observations, _some(observations, sights), estimate, there)
     weights = equation_weights(observations, problem.weighting, equations, there).within_sigma
     blank, columns = without_shared(problem, estimate, equations, weights)
     placed = blank.beyond_private(np.column_stack([columns, blank.score]))
@@ -137,6 +137,14 @@ def _root(shared: Information) -> Array:
     follows[~rest] = -np.linalg.solve(matrix[np.ix_(~rest, ~rest)], matrix[np.ix_(~rest, rest)])
     left = matrix[rest] @ follows
     return np.asarray(follows @ inverse_root(0.5 * (left + left.T), np.diagonal(left), _DETERMINED))
+
+
+def _shown(sights: Sights, there: Residuals) -> Sights:
+    """Without the rows that have no residual: a lens in the middle of its valley may not reach as far."""
+    points, curves = (np.isfinite(lengths) for lengths in there.lengths)
+    if points[sights.point_rows].all() and curves[sights.curve_rows].all():
+        return sights
+    return sights.used(points, curves)
 
 
 def _some(observations: Observations, sights: Sights) -> Sights:
