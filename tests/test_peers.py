@@ -224,7 +224,9 @@ def test_sony_boards(sony_boards: BoardDetections) -> None:
     calibration = calibrate(sony_boards.observations, options)
     assert calibration.fit.points_rms_px <= 0.139  # 0.1384 measured
     assert calibration.fit.points == 13 * 24
-    assert abs(calibration.station().phi - 702.6) <= 0.7  # 702.09 measured
+    everything = replace(options, loss="trivial", noise_scale="stated", reject_sigma=1e9)
+    plain = calibrate(sony_boards.observations, everything)
+    assert abs(plain.station().phi - 702.6) <= 0.5  # 702.58 measured
 
 
 def test_gopro_boards(gopro_boards: BoardDetections) -> None:

@@ -9,7 +9,6 @@ import numpy as np
 
 from ceres_cal.model.information import Information
 from ceres_cal.model.parameters import Estimate, unit_px
-from ceres_cal.model.structure import EXACT
 from ceres_cal.scene.camera import Camera
 from ceres_cal.solve import Problem, ReducedInformation, information
 from ceres_cal.start.initialise import PHI_RANGE, USUAL_PHI, USUAL_PHI_FACTOR
@@ -65,22 +64,15 @@ def assess(
 
 
 def _with_bends(posterior: Posterior, problem: Problem, estimate: Estimate) -> Posterior:
-    """The posterior with what bends in it; across its valleys, where phi is held, that is put into what they say.
-
-    Targets stay as they are built, which bends nothing.
-    """
+    """The posterior with what bends in it; across its valleys, where phi is held, that is put into what they say."""
     followed = {profile.keys[0] for profile in posterior.profiles.values()}
     held = [key for key in posterior.keys if key not in followed]
-    plain = [key for key in held if key.kind != "structure"]
-    by_model = (posterior.by_model or posterior.information).given(plain)
+    by_model = posterior.by_model or posterior.information
     for name in posterior.profiles:
         problem = problem.holding(name, 0)
-    problem = replace(problem, sights=estimate.structure.built_into(problem.sights))
-    drawn = replace(estimate, structure=EXACT)
-    bent = bends(problem, drawn, posterior.information.given(held).marginal(plain), by_model, posterior.half_width)
+    bent = bends(problem, estimate, posterior.information.given(held), by_model.given(held), posterior.half_width)
     if bent is None:
         return posterior
-    bent = bent.over(held)
     profiles = {
         name: replace(profile, across=tuple(map(bent.widened, profile.across)))
         for name, profile in posterior.profiles.items()

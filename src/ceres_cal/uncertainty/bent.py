@@ -53,13 +53,6 @@ class Bends:
         """(B, K) by how much the ends are farther off, in standard deviations' worth."""
         return np.asarray((self.ends - self.steps) / self.half_width)
 
-    def over(self, keys: Sequence[Key]) -> Bends:
-        """The same over more keys, which do not move."""
-        steps, ends = np.zeros((2, len(self.steps), len(keys)))
-        at = [keys.index(key) for key in self.keys]
-        steps[:, at], ends[:, at] = self.steps, self.ends
-        return Bends(tuple(keys), steps, ends, self.half_width)
-
     def widened(self, information: Information) -> Information:
         """Information about some of the keys with the excesses as variances of their own."""
         return information.widened(self.excesses[:, [self.keys.index(key) for key in information.keys]])
