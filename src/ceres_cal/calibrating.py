@@ -35,6 +35,7 @@ from ceres_cal.solve import (
 from ceres_cal.solve.as_built import solve_as_built, tolerances_of
 from ceres_cal.solve.competing import compete
 from ceres_cal.solve.conflicts import contradicted_by
+from ceres_cal.solve.dimensions import free_dimensions, require_measured
 from ceres_cal.solve.explanation import Explanation
 from ceres_cal.solve.noise import Inliers, visible_from
 from ceres_cal.solve.possible import require_possible
@@ -52,6 +53,9 @@ _UNKNOWN = (
 _SAYS_LESS = 0.5
 # Times the standard deviation of phi without what is usual of principal points: what rests on it is said.
 _RESTING = 1.5
+# Share of a dimension by which it may come out another than drawn without a second solve from there, whose start and
+# outliers are those of the right drawing; and how many there may be. Half and double change no figure.
+_REDRAWN, _MOST_DRAWINGS = 0.005, 4
 _USUAL = (
     "camera {!r}: phi, and what goes with it, rests on its principal point lying near the middle of the image, as is "
     "usual: by the observations alone its standard deviation is {}: show tilted views, or state the principal point"
@@ -77,16 +81,29 @@ def calibrate(
         SolutionError: no usable camera came out.
         InputError: a prior or a fixed number that the camera does not have; pixels outside their image.
     """
-    options = options or Options()
+    observations, options = free_dimensions(observations, options or Options())
     with single_threaded_blas(), at_most(options.threads):
         try:
-            return _calibrated(observations, options, progress)
+            return _measured(observations, options, progress)
         except (DegenerateError, SolutionError):
             free = _without_priors(observations, options)
             if free is None:
                 raise
             words = _contradicted(observations, options, free)
             raise SolutionError(words or _OTHERWISE) from None
+
+
+def _measured(observations: Observations, options: Options, progress: Callable[[Progress], None] | None) -> Calibration:
+    """With targets drawn as long as they were found to be; from there again where that is not how they were drawn."""
+    for _ in range(_MOST_DRAWINGS):
+        calibration = _calibrated(observations, options, progress)
+        before = calibration.estimate.structure
+        calibration = calibration.redrawn()
+        moved = calibration.estimate.structure.drawn_m / before.drawn_m - 1.0
+        if float(np.max(np.abs(moved), initial=0.0)) < _REDRAWN:
+            break
+        observations = calibration.drawn_alike(observations)
+    return calibration
 
 
 def _calibrated(
@@ -201,6 +218,8 @@ def solved_from(
     digest = meanwhile(lambda: observations.digest)
     usual = again.scales if again else None
     end = solve_robustly(problem, observations, start.estimate, usual, progress, is_near=start.is_near)
+    if again is None:
+        require_measured(end.problem, end.solution.estimate)
 
     def solved(others: Problem) -> RobustSolution:
         return solve_robustly(others, observations, _start_of(others, problem, observations, start, again), usual)

@@ -83,7 +83,8 @@ class Statement:
         if self.kind == "earlier":
             return "the earlier calibration"
         names = " and ".join(key.quantity for key in self.keys)
-        return f"the {_STATED[self.kind]} {names} of {self.keys[0].kind} {self.keys[0].owner!r}"
+        owner = "target" if self.keys[0].kind == "dimension" else self.keys[0].kind
+        return f"the {_STATED[self.kind]} {names} of {owner} {self.keys[0].owner!r}"
 
     def left_out(self, problem: Problem, estimate: Estimate) -> Problem:
         """The problem without it."""
