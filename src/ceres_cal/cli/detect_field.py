@@ -14,6 +14,7 @@ from ceres_cal.base.words import plural
 from ceres_cal.cli.arguments import add_output, add_quiet, add_station, add_timeout, parse_names, parse_numbers
 from ceres_cal.cli.command import Answer, Command
 from ceres_cal.cli.detection import detected
+from ceres_cal.cli.estimate import add_estimate, parse_estimates
 from ceres_cal.cli.inputs import image_files
 from ceres_cal.cli.outputs import finishing, require_observations_output
 from ceres_cal.cli.photographs import missed_data
@@ -34,6 +35,7 @@ def _add_arguments(parser: ArgumentParser) -> None:
         "images", nargs="+", metavar="IMAGE", help="photographs that one camera took at one station, or folders of them"
     )
     _add_start(parser)
+    add_estimate(parser)
     add("--not-painted", default="", metavar="NAME,...", help="lines of the target that this field does not have")
     add(
         "--mask",
@@ -104,6 +106,7 @@ def _run(args: Namespace) -> Answer:
         start.station,
         points=not args.lines_only,
         edges=args.edges,
+        lengths=parse_estimates(args.estimate, {"field": target}),
         left_out=None if args.mask is None else read_grey(args.mask) == 0,
         keep_start=args.keep_start,
         refused=_drawing(args.picture, target),

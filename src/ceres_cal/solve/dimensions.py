@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,6 +11,7 @@ from ceres_cal.base.errors import DegenerateError
 from ceres_cal.model.parameters import Estimate, Options
 from ceres_cal.model.structure import redrawn
 from ceres_cal.observations import Observations, Prior
+from ceres_cal.scene.targets import Target
 from ceres_cal.solve.information import information
 from ceres_cal.solve.problem import Problem
 
@@ -22,16 +24,17 @@ def free_dimensions(observations: Observations, options: Options) -> tuple[Obser
     """The observations of targets drawn with the lengths that are stated of them, and options that name those."""
     priors = (*observations.priors, *options.priors)
     names = dict.fromkeys((*options.dimensions, *(prior.dimension for prior in priors if prior.dimension)))
-    return _drawn_as_stated(observations, priors), replace(options, dimensions=tuple(names))
+    drawn = observations.with_targets(drawn_as_stated(observations.targets, priors))
+    return drawn, replace(options, dimensions=tuple(names))
 
 
-def _drawn_as_stated(observations: Observations, priors: tuple[Prior, ...]) -> Observations:
+def drawn_as_stated(targets: Mapping[str, Target], priors: Sequence[Prior]) -> dict[str, Target]:
+    """The targets with the dimensions that priors state."""
     stated: dict[str, dict[str, float]] = {}
     for prior in sorted(priors, key=lambda prior: not prior.is_open):  # what is known better comes last
-        if prior.dimension and prior.quantity in observations.targets[prior.name].dimensions:
+        if prior.dimension and prior.name in targets and prior.quantity in targets[prior.name].dimensions:
             stated.setdefault(prior.name, {})[prior.quantity] = prior.value[0]
-    targets = {name: redrawn(target, stated.get(name, {})) for name, target in observations.targets.items()}
-    return observations.with_targets(targets)
+    return {name: redrawn(target, stated.get(name, {})) for name, target in targets.items()}
 
 
 def require_measured(problem: Problem, estimate: Estimate) -> None:
