@@ -54,7 +54,7 @@ _SAYS_LESS = 0.5
 # Times the standard deviation of phi without what is usual of principal points: what rests on it is said.
 _RESTING = 1.5
 # Share of a dimension by which it may come out another than drawn without a second solve from there, whose start and
-# outliers are those of the right drawing; and how many there may be. Half and double change no figure.
+# outliers are those of the right drawing; and how many there may be.
 _REDRAWN, _MOST_DRAWINGS = 0.005, 4
 _USUAL = (
     "camera {!r}: phi, and what goes with it, rests on its principal point lying near the middle of the image, as is "

@@ -156,6 +156,7 @@ COMMANDS = (
             "field.json board.json -o calibration.json --report report.html",
             "field.json --lens auto --prior height_m=4.02:10mm -o calibration.json",
             "field.json --powers 3 --tolerance field.lines_m=10mm -o calibration.json",
+            "field.json --estimate length,width=5.50:20mm -o calibration.json",
         ),
     ),
 )

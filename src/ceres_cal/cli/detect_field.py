@@ -129,6 +129,7 @@ COMMANDS = (
         (
             "photographs/ --target ssl-b --auto --facing LeftGoalLine=top -o field.json",
             "0001.png --start calibration.json -o field.json",
+            "0001.png --target ssl-b --auto --facing LeftGoalLine=top --estimate length,width -o field.json",
             "0001.png --target ssl-a --start corners.json -o field.json",
         ),
     ),

@@ -17,6 +17,7 @@ from ceres_cal.cli.calibrate import COMMANDS as CALIBRATE
 from ceres_cal.cli.command import Answer, Command
 from ceres_cal.cli.detect import COMMANDS as DETECT_BOARD
 from ceres_cal.cli.detect_field import COMMANDS as DETECT_FIELD
+from ceres_cal.cli.estimate import add_estimate
 from ceres_cal.cli.export import COMMANDS as EXPORT
 from ceres_cal.cli.inputs import IMAGE_ENDINGS, image_files
 from ceres_cal.cli.outputs import section, sections_of
@@ -40,6 +41,7 @@ def _add_arguments(parser: ArgumentParser) -> None:
     )
     add("--lens", metavar="KIND", default="auto", help="as of `calibrate`; default: auto")
     add_prior(parser)
+    add_estimate(parser)
     add("--camera", default="camera", metavar="NAME", help="name of the camera; default: camera")
     add("--to", metavar="FORMAT", action="append", default=[], help="export it, too, as of `export`; repeatable")
     add("--frames", type=int, default=30, metavar="N", help="how many photographs to take out of a video; default: 30")
@@ -148,8 +150,9 @@ def _observed(args: Namespace, images: list[Path]) -> Iterator[_Step]:
             raise InputError("every photograph shows the board, and none is left for the field: take one without it")
         facing = [word for name in args.facing for word in ("--facing", name)]
         missing = ["--not-painted", args.not_painted] if args.not_painted else []
+        lengths = [word for names in args.estimate for word in ("--estimate", names)]
         goal = ["--camera", args.camera, "-o", str(args.output / "field.json")]
-        asked = [*rest, "--target", args.target, "--auto", *facing, *missing, *goal]
+        asked = [*rest, "--target", args.target, "--auto", *facing, *missing, *lengths, *goal]
         yield _step(args, DETECT_FIELD[0], asked, most=1)
 
 

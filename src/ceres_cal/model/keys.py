@@ -41,6 +41,11 @@ class Key(NamedTuple):
         return cls(kind, target, feature, "m")
 
     @property
+    def whose(self) -> str:
+        """Its owner in words: station 'overhead', target 'field'."""
+        return f"{'target' if self.is_structure else self.kind} {self.owner!r}"
+
+    @property
     def is_structure(self) -> bool:
         """Whether it is one of the numbers of the targets as built."""
         return self.kind in ("structure", "dimension")

@@ -43,7 +43,8 @@ def why_missed(followed: Followed, target: Target, *, started: bool) -> str:
         started: whether somebody said where to start.
     """
     if followed.built.is_other:
-        return "; ".join(followed.built.words())
+        help_ = ": correct the target, or have them found (--estimate)" if followed.built.dimensions else ""
+        return "; ".join(followed.built.words()) + help_
     if followed.share >= LEAST_SHARE:
         names = ", ".join(target.curve_names[number] for number in followed.absent)
         return f"there is no {names} where they should be: say which lines are not painted, or check the dimensions"

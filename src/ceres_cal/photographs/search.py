@@ -85,12 +85,12 @@ def search(grey: Array32, target: Target, curves: Collection[str], auto: Auto) -
             too few straight lines; or nothing that `auto.facing` names.
     """
     require_sides(auto.facing, target, curves)
-    problem = prepare_search(grey, target, curves)
+    problem = prepare_search(grey, target, curves, auto.lengths)
     good: list[Followed] = []
     seen: Followed | None = None
     reason = _NO_LINES
-    for camera in candidates(problem):
-        followed = _followed(problem, auto, _turned(problem, auto, camera))
+    for camera, grid in candidates(problem):
+        followed = _followed(replace(problem, grid=grid), auto, _turned(problem, auto, camera))
         against = objection(problem, followed)
         if not against:
             good.append(followed)
