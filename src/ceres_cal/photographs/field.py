@@ -25,7 +25,7 @@ from ceres_cal.scene.targets import Target
 from ceres_cal.solve.dimensions import drawn_as_stated
 
 TARGET_NAME = "field"
-# Of a length, the standard deviation under which lines are followed: it keeps what a few lines leave open from running off.
+# Of a length, the standard deviation under which lines are followed: what a few lines leave open does not run off.
 _ABOUT = 0.15
 
 

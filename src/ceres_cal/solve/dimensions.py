@@ -15,8 +15,8 @@ from ceres_cal.scene.targets import Target
 from ceres_cal.solve.information import information
 from ceres_cal.solve.problem import Problem
 
-# Of a dimension, its standard deviation from which on it is not measured. What nothing measures has an infinite one, but
-# for rounding.
+# Of a dimension, its standard deviation from which on it is not measured. What nothing measures has an infinite one,
+# but for rounding.
 _UNMEASURED = 0.3
 
 
