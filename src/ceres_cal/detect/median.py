@@ -28,7 +28,8 @@ _BLOCKS, _OF_BLOCK, _FEWEST = 8, 120, 30  # to a side; pixels that count of each
 _CLEAR = 4.0  # times the median gradient, which is noise and texture
 _ALIKE = 0.6  # correlation of a block that shows the same; most must, as people hide some
 _ROUNDS, _BEND = 8, 2.0  # of the fit, and of what agrees; standard deviations from which on a level counts less
-_BAND = 64  # rows worked on at once
+_BAND, _EVERY = 64, 31  # rows worked on at once; pixels apart that tell the noise
+_NEAR = 3.0  # times the noise
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +48,7 @@ class Merged:
 
 
 def merged(pictures: Iterable[tuple[str, Image]]) -> Merged:
-    """What the pictures show that stands still: the mean of the middle half of each pixel's grey levels.
+    """What the pictures show that stands still: each pixel's median, made finer by the mean of what is near it.
 
     They are read one by one and kept in grey; of a camera that was moved in between those count that most agree with.
 
@@ -178,11 +179,15 @@ class _Reference:
 
 
 def _middle(greys: Sequence[Image]) -> Array32:
-    """The mean of the middle half of each pixel's levels, (height, width)."""
-    count = len(greys)
-    cut = (count - 1) // 4 + (count > 2 and count < 5)  # of three and four only the middle one or two
+    """Each pixel's median, made finer: the mean of the levels that are near it, (height, width)."""
+    some = np.stack([grey.ravel()[::_EVERY] for grey in greys]).astype(np.float32)
+    noise = 1.4826 * float(np.median(np.abs(some - np.median(some, axis=0))))
     picture = np.empty(greys[0].shape, dtype=np.float32)
     for row in range(0, len(picture), _BAND):
-        band = np.sort(np.stack([grey[row : row + _BAND] for grey in greys]), axis=0)
-        picture[row : row + _BAND] = band[cut : count - cut].mean(axis=0, dtype=np.float32)
+        band = np.stack([grey[row : row + _BAND] for grey in greys]).astype(np.float32)
+        median = np.median(band, axis=0)
+        near = np.abs(band - median) <= max(_NEAR * noise, 1.0)
+        count = np.count_nonzero(near, axis=0)
+        mean = np.sum(band, axis=0, where=near) / np.maximum(count, 1)
+        picture[row : row + _BAND] = np.where(count > 0, mean, median)  # of two that differ there is no level near
     return picture
