@@ -18,7 +18,7 @@ from ceres_cal.base.transforms import Pose
 from ceres_cal.formats.export_format import Exported, ExportFormat, ExportRequest, Loss
 from ceres_cal.formats.import_format import ImportedCameras, ImportFormat, ImportRequest
 from ceres_cal.formats.loss import as_foreign, field_box, loss_words
-from ceres_cal.scene.foreign import FISHEYE, ForeignCamera, image_grid
+from ceres_cal.scene.foreign import FISHEYE, LARGEST, ForeignCamera, image_grid
 
 _ENDINGS = (".yml", ".yaml", ".xml", ".json")
 _MATRIX = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "M1", "K")
@@ -196,7 +196,7 @@ def _mat(storage: Any, names: tuple[str, ...], shape: tuple[int, int] | None, *,
             raise InputError(f"{name} must be a matrix: its rows and cols do not fit its data") from None
         if matrix is None:
             continue
-        if (shape is not None and matrix.shape != shape) or not np.all(np.isfinite(matrix)):
+        if (shape is not None and matrix.shape != shape) or not np.all(np.abs(matrix) < LARGEST):
             raise InputError(f"{name} must be {shape or 'finite'} numbers, not {np.asarray(matrix).tolist()}")
         return np.asarray(matrix, dtype=float)
     if needed:
