@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import base64
+import faulthandler
 import io
 import json
 import multiprocessing
@@ -48,6 +49,7 @@ from ceres_cal.simulate.files import scene_to_json
 
 DATA = Path(__file__).resolve().parents[1] / "data"
 LONGEST_S, LONGEST_WAIT_S, MOST_MB = 10, 60, 1024
+TRACE = "where.txt"  # a process that took too long was
 FAILURES = ("unexpected", "warning", "changed", "many lines", "slow", "died", "memory")
 TOKENS = b'0 -1 1 2 1e400 -0.0 1e308 5e-324 NaN -Infinity 9000000000 1e24 null true [] {} "" "a"'.split()
 TOKENS += [b'"\\ud800"', b'"\\u0000"', b'"' + b"x" * 300 + b'"', b"[" * 500, b"1" + b"0" * 400, b"[[1,2],[3]]"]
@@ -264,6 +266,9 @@ def outcome(reader: Reader, path: Path) -> tuple[str, str]:
 def work(folder: Path, names: Sequence[str], seed: int, goal: Goal, keep: Path | None, answers: Any) -> None:
     """Mutate and read until the goal is reached; each answer is (reader, outcome, words, seconds, MB)."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # what image libraries say
+    trace = (folder / TRACE).open("w")
+    for number in (signal.SIGALRM, signal.SIGPROF):
+        faulthandler.register(number, trace, all_threads=True, chain=True)
     rng = np.random.default_rng(seed)
     contents = {name: (folder / name).read_bytes() for name in names}
     place = Path(tempfile.mkdtemp(dir=folder))
@@ -317,7 +322,8 @@ def fuzz(folder: Path, goal: Goal, seed: int, keep: Path | None, names: Sequence
             worker.join()
         if worker.exitcode and name:
             counts[name, "died"] += 1
-            print(f"{name}: died: exit code {worker.exitcode}", flush=True)
+            where = (folder / TRACE).read_text()
+            print(f"{name}: died: exit code {worker.exitcode}\n{where}", end="", flush=True)
             put_aside(Path(path), keep, "died", name)
         seed += 1
     print(f"slowest {slowest_s:.2f} s, peak {peak_mb:.0f} MB", flush=True)

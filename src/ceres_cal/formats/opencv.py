@@ -186,22 +186,31 @@ def _real(storage: Any, names: tuple[str, ...]) -> float | None:
 
 
 def _mat(storage: Any, names: tuple[str, ...], shape: tuple[int, int] | None, *, needed: bool = True) -> Array:
-    import cv2
-
     for name in names:
         node = storage.getNode(name)
-        try:
-            matrix = node.mat() if node.isMap() else None
-        except cv2.error:
-            raise InputError(f"{name} must be a matrix: its rows and cols do not fit its data") from None
-        if matrix is None:
+        if not node.isMap():
             continue
+        matrix = _matrix(node)
+        if matrix is None:
+            raise InputError(f"{name} must be a matrix: its rows and cols do not fit its data")
         if (shape is not None and matrix.shape != shape) or not np.all(np.abs(matrix) < LARGEST):
             raise InputError(f"{name} must be {shape or 'finite'} numbers, not {np.asarray(matrix).tolist()}")
         return np.asarray(matrix, dtype=float)
     if needed:
         raise InputError(f"it has no matrix {names[0]!r}")
     return np.empty((0, 0))
+
+
+def _matrix(node: Any) -> Array | None:
+    """What a node holds; None where its rows and cols, which OpenCV takes as they are, do not fit its data."""
+    import cv2
+
+    rows, cols = (_real(node, (name,)) or 0.0 for name in ("rows", "cols"))
+    try:
+        fits = rows > 0.0 and cols > 0.0 and rows * cols == node.getNode("data").size()
+        return np.asarray(node.mat()) if fits else None
+    except cv2.error:
+        return None
 
 
 def _recognises(content: bytes) -> bool:
