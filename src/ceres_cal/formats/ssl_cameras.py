@@ -154,7 +154,7 @@ def to_camera(entry: Mapping[str, Any], image_size: str = "") -> Camera:
     f, cx, cy, d, *rest = values
     turn, shift = np.array(rest[:4]), np.array(rest[4:])
     norm = float(np.linalg.norm(turn)) if np.all(np.abs(values) < LARGEST) else np.nan
-    if not (f > 0.0 and abs(norm - 1.0) < 0.05):
+    if not (f > 1.0 / LARGEST and abs(norm - 1.0) < 0.05):
         raise InputError(f"{here}: focal_length {f:g}, or the length {norm:g} of its quaternion, makes no camera")
     sizes = [entry.get("pixel_image_width"), entry.get("pixel_image_height")]
     width, height = (int(float(size)) for size in sizes) if all(sizes) else parse_size(image_size)  # type: ignore[arg-type]
