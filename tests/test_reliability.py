@@ -267,6 +267,7 @@ def test_tables_that_contradict_themselves(
         ),
         ("camera.xml", rb"(\"focal length\"[^>]*>\s*)[0-9.,]+", rb"\g<1>5e-324", "makes no camera"),
         ("camera.xml", rb"(camera index[^>]*>)[0-9]+", rb"\g<1>1e400", "is no number"),
+        ("opencv.json", rb'"overhead"', rb'"\\ud800"', "stations is not UTF-8"),
         ("geometry.yml", rb"(?<=focal_length: )[0-9.]+", b"1" + b"0" * 400, "too large"),
     ],
 )

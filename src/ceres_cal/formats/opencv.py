@@ -126,7 +126,7 @@ def _read(request: ImportRequest) -> Any:
     try:
         storage = cv2.FileStorage(request.text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
         names = storage.root().keys()
-    except (cv2.error, SystemError) as error:
+    except (cv2.error, SystemError, UnicodeDecodeError) as error:
         raise InputError(f"not a FileStorage of OpenCV (cut short?): {str(error).splitlines()[0]}") from None
     if not any(name in names for name in _MATRIX):
         raise InputError(f"it has no camera matrix: none of {', '.join(_MATRIX)}")
@@ -177,7 +177,10 @@ def parse_size(text: str) -> tuple[int, int]:
 
 def _text(storage: Any, name: str) -> str:
     node = storage.getNode(name)
-    return str(node.string()) if node.isString() else ""
+    try:
+        return str(node.string()) if node.isString() else ""
+    except UnicodeDecodeError:
+        raise InputError(f"{name} is not UTF-8") from None
 
 
 def _real(storage: Any, names: tuple[str, ...]) -> float | None:
