@@ -36,6 +36,7 @@ from ceres_cal.solve.as_built import solve_as_built, tolerances_of
 from ceres_cal.solve.competing import compete
 from ceres_cal.solve.conflicts import contradicted_by
 from ceres_cal.solve.explanation import Explanation
+from ceres_cal.solve.looked_at import Asked
 from ceres_cal.solve.noise import Inliers, visible_from
 from ceres_cal.solve.possible import require_possible
 from ceres_cal.solve.usable import require_fits, require_usable
@@ -202,8 +203,8 @@ def solved_from(
     usual = again.scales if again else None
     end = solve_robustly(problem, observations, start.estimate, usual, progress, is_near=start.is_near)
 
-    def solved(others: Problem) -> RobustSolution:
-        return solve_robustly(others, observations, _start_of(others, problem, observations, start, again), usual)
+    def solved(others: Problem, some: Asked) -> RobustSolution:
+        return solve_robustly(others, some.observations, _start_of(others, some, start, again), usual)
 
     end, explanations = compete(problem, observations, end, solved)
     as_built: tuple[AsBuilt, ...] = ()
@@ -282,13 +283,11 @@ def _assess(
     return (end if assessed is estimate else end.moved_to(assessed, observations, problem)), posterior
 
 
-def _start_of(
-    others: Problem, problem: Problem, observations: Observations, start: Start, again: Again | None
-) -> Estimate:
+def _start_of(others: Problem, some: Asked, start: Start, again: Again | None) -> Estimate:
     """A start for some of the observations that the rest had no part in; the one there is where it was known before."""
-    if again is not None or set(others.sights.keys) != set(problem.sights.keys):
+    if again is not None or set(others.sights.keys) != set(some.problem.sights.keys):
         return start.estimate
-    return initialise(observations, others.sights, problem.options).estimate
+    return initialise(some.observations, others.sights, others.options).estimate
 
 
 def _with_doubts(posterior: Posterior, end: RobustSolution, explanations: Sequence[Explanation]) -> Posterior:

@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from ceres_cal import kernels
-from ceres_cal.base.arrays import Array
+from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.threads import parts_of, run_parts
 from ceres_cal.model.parameters import Estimate, intrinsics_vector, unit_px
 from ceres_cal.model.structure import Structure
@@ -40,6 +40,10 @@ class Residuals:
         """Lengths of the residuals of points (N,) and of curves (M,), px."""
         x, y = self.points.T
         return np.sqrt(x * x + y * y), np.abs(self.curves)
+
+    def of_rows(self, points: Indices, curves: Indices) -> Residuals:
+        """Those of some of the observations, as if there were no others."""
+        return Residuals(self.points[points], self.curves[curves], self.feet[curves])
 
     def in_sigmas(self, sights: Sights, scales: tuple[float, float]) -> tuple[Array, Array]:
         """(N,) of the sights' points and (M,) of their curve observations: lengths of the residuals at these noise

@@ -16,7 +16,7 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ceres_cal.base.arrays import Mask
+from ceres_cal.base.arrays import Indices, Mask
 from ceres_cal.base.errors import InputError, naming
 from ceres_cal.observations.bounds import odd_sizes, stray_pixels
 from ceres_cal.observations.columns import Columns, Curves, Points, Prior, View, choices, taken, view_label
@@ -153,8 +153,8 @@ class Observations(Content):
 
     # ---- parts --------------------------------------------------------------------------------------------------
 
-    def part(self, points: Mask, curves: Mask) -> Observations:
-        """The same views with some of the observations."""
+    def part(self, points: Mask | Indices, curves: Mask | Indices) -> Observations:
+        """The same views with some of the observations: their numbers, or True for each that stays."""
         return replace(self, points=taken(self.points, points), curves=taken(self.curves, curves))
 
     def of_station(self, name: str) -> Observations:

@@ -186,6 +186,13 @@ class Sights(Sequence["Sights"]):
         numbers = np.flatnonzero(point_sizes + curve_sizes)
         return self._rows(numbers, p, c, point_sizes[numbers], curve_sizes[numbers])
 
+    def renumbered(self, points: Indices, curves: Indices) -> Sights:
+        """The sights of some of the observations, by ascending row, as rows of these alone."""
+        p, c = (np.full(int(rows.max(initial=-1)) + 1, -1) for rows in (self.point_rows, self.curve_rows))
+        p[points], c[curves] = np.arange(len(points)), np.arange(len(curves))
+        own = self.used(p >= 0, c >= 0)
+        return replace(own, point_rows=p[own.point_rows], curve_rows=c[own.curve_rows])
+
     @property
     def by_kind(self) -> tuple[Sights, Sights]:
         """The same sights with their points alone, and with their curve observations alone."""

@@ -6,11 +6,11 @@ Residuals are taken in units of their stated sigma; the noise scale is the facto
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Mask
+from ceres_cal.base.arrays import Array, Indices, Mask
 from ceres_cal.model.parameters import Options
 from ceres_cal.model.residuals import Residuals
 from ceres_cal.observations import Observations
@@ -89,6 +89,12 @@ class Inliers:
             and abs(self.point_scale - other.point_scale) <= relative * other.point_scale
             and abs(self.curve_scale - other.curve_scale) <= relative * other.curve_scale
         )
+
+    def of_rows(self, points: Indices, curves: Indices) -> Inliers:
+        """Those of some of the observations, as if there were no others."""
+        sigmas = self.point_sigmas[points], self.curve_sigmas[curves]
+        both = Inliers(self.points[points], self.curves[curves], self.point_scale, self.curve_scale, *sigmas)
+        return replace(both, degrees_of_freedom=self.degrees_of_freedom)
 
     def weighting(self, options: Options) -> Weighting:
         """Of the observations at these noise scales."""

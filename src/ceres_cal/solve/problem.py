@@ -107,6 +107,11 @@ class Problem:
         """The problem of these rows of the observations alone."""
         return replace(self, sights=self.sights.used(points, curves))
 
+    def of_rows(self, points: Indices, curves: Indices) -> Problem:
+        """The problem of some of the observations, in their order, as if there were no others."""
+        sights = self.sights.renumbered(points, curves)
+        return replace(self, sights=sights, layout=self.layout.of(sights.keys))
+
     def of_sights(self, numbers: Indices) -> Problem:
         """The problem of some of the sights: no placement that they do not show is free."""
         sights = self.sights.take(numbers)
