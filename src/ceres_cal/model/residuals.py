@@ -12,7 +12,7 @@ from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.threads import parts_of, run_parts
 from ceres_cal.model.parameters import Estimate, intrinsics_vector, unit_px
 from ceres_cal.model.structure import Structure
-from ceres_cal.observations import Observations
+from ceres_cal.observations.files import Content
 from ceres_cal.observations.sights import Sights, nearest_feet
 from ceres_cal.scene.camera import Camera
 
@@ -111,7 +111,7 @@ def curve_columns(sights: Sights, structure: Structure, feet: Array, noise_scale
     )
 
 
-def residuals(observations: Observations, sights: Sights, estimate: Estimate, feet: Array | None = None) -> Residuals:
+def residuals(observations: Content, sights: Sights, estimate: Estimate, feet: Array | None = None) -> Residuals:
     """Residuals of every observation in the sights; NaN for rows in none of them.
 
     Args:

@@ -15,6 +15,7 @@ from ceres_cal.base.arrays import Array, Indices, Mask
 from ceres_cal.model.parameters import Options
 from ceres_cal.model.residuals import Residuals
 from ceres_cal.observations import Observations
+from ceres_cal.observations.files import Content
 from ceres_cal.observations.sights import Sights
 from ceres_cal.solve.problem import Weighting
 
@@ -126,7 +127,7 @@ class Inliers:
         return self.point_scale < share * other.point_scale or self.curve_scale < share * other.curve_scale
 
 
-def relative_lengths(observations: Observations, residuals: Residuals) -> tuple[Array, Array]:
+def relative_lengths(observations: Content, residuals: Residuals) -> tuple[Array, Array]:
     """Lengths of the residuals of points and of curves in their stated sigmas; infinite where there is none."""
     points, curves = residuals.lengths
     points, curves = points / observations.points.sigma_px, curves / observations.curves.sigma_px
