@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Protocol
 
 import numpy as np
@@ -79,6 +80,16 @@ def test_whole_that_does_not_belong_is_taken_out_of_all(frame: str | None, in_sh
 def test_boards_beside_the_world_stay_at_hand(in_shares: Calibrated) -> None:
     observations = simulate(two_cameras("radial-2-3"), OUTLIERS, 4).observations
     assert_same(in_shares(observations), calibrate(observations, RADIAL))
+
+
+def test_from_files_the_answer_is_the_same_to_the_last_bit(in_shares: Calibrated, tmp_path: Path) -> None:
+    observations = simulate(half_field(32), OUTLIERS, 4).observations
+    observations.save(tmp_path / "day.columns")
+    stored, at_hand = in_shares(Observations.load(tmp_path / "day.columns")), in_shares(observations)
+    assert stored.estimate.stations["overhead"] == at_hand.estimate.stations["overhead"]
+    assert stored.cameras["overhead"].phi == at_hand.cameras["overhead"].phi
+    assert stored.fit == at_hand.fit
+    assert stored.rejected == at_hand.rejected
 
 
 def test_what_the_caller_raises_ends_it(in_shares: Calibrated) -> None:

@@ -72,9 +72,7 @@ def is_bulk(observations: Observations) -> bool:
     if len(observations.points) + len(observations.curves) <= MANY:
         return False
     world = np.array([view.placement is None for view in observations.views])
-    return (
-        sum(int(np.count_nonzero(world[column.view])) for column in (observations.points, observations.curves)) > MANY
-    )
+    return sum(int(np.diff(ends)[world].sum()) for ends in observations.ends) > MANY
 
 
 class Bulk:
@@ -82,15 +80,14 @@ class Bulk:
 
     def __init__(self, observations: Observations, client: Any = None) -> None:
         self.observations, self._client = observations, client
-        copies = observations.copies.originals
-        self._left_out = None if all(mask.all() for mask in copies) else (~copies[0], ~copies[1])
+        self._left_out = None
+        if observations.copies.are_there:
+            points, curves = observations.copies.originals
+            self._left_out = ~points, ~curves
         self._engine = self._engine_without(self._left_out)
         views = observations.views
         self._world = np.array([view.placement is None for view in views])
         self.keys = tuple({SightKey(v.camera, v.station, None): None for v in views if v.placement is None})
-        self._ends = [
-            np.searchsorted(c.view, np.arange(len(views) + 1)) for c in (observations.points, observations.curves)
-        ]
 
     def _engine_without(self, left_out: tuple[Mask, Mask] | None) -> Engine:
         shares = list(cut(self.observations, left_out))
@@ -100,7 +97,7 @@ class Bulk:
 
     def part(self, besides: Indices | None = None) -> Part:
         """Views of the world, evenly, and these besides; everything that is not of the world."""
-        counts = np.diff(self._ends[0]) + np.diff(self._ends[1])
+        counts = np.diff(self.observations.ends[0]) + np.diff(self.observations.ends[1])
         shown = np.flatnonzero(self._world & (counts > 0))
         most = min(max(_FEWEST_VIEWS, len(shown) * _PART // int(counts[shown].sum())), len(shown))
         chosen = ~self._world
@@ -111,7 +108,7 @@ class Bulk:
             np.concatenate(
                 [np.arange(ends[v], ends[v + 1], step if self._world[v] else 1) for v in np.flatnonzero(chosen)]
             )
-            for ends in self._ends
+            for ends in self.observations.ends
         ]
         return Part(self.observations.part(*rows), (rows[0], rows[1]))
 

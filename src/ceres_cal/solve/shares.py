@@ -10,18 +10,16 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ceres_cal.base.arrays import AnyArray, Array, Indices, Indices32, Mask
-from ceres_cal.base.errors import InputError
 from ceres_cal.model.parameters import Estimate, Layout
 from ceres_cal.model.residuals import Residuals, residuals
 from ceres_cal.observations import Observations
-from ceres_cal.observations.columns import Curves, Points, View
+from ceres_cal.observations.columns import Curves, FileRows, Points, View, read_rows, rows_of
 from ceres_cal.observations.files import Content
 from ceres_cal.observations.sights import SightKey, Sights, sights_of
 from ceres_cal.scene.targets import Target
@@ -35,34 +33,6 @@ _FAR = 0.5
 _ROWS = 1 << 20  # of a share: what is made of them for an answer takes some 100 MB
 # Bins of a histogram of lengths in stated sigmas, to 2e7: from which on one is, and how much wider than the last.
 _LEAST, _WIDTH, _BINS = 1e-6, 0.00375, 8192
-
-
-class _File(NamedTuple):
-    """Rows of a column in a file."""
-
-    path: str
-    offset: int
-    dtype: str
-    shape: tuple[int, ...]
-
-    def read(self) -> AnyArray:
-        try:
-            with Path(self.path).open("rb") as file:
-                values = np.fromfile(file, self.dtype, int(np.prod(self.shape)), offset=self.offset)
-        except OSError as error:
-            raise InputError(f"{self.path}: {error.strerror}: workers need the same files at the same place") from None
-        if values.size != np.prod(self.shape):
-            raise InputError(f"{self.path}: it ends before the observations do: write it again")
-        return values.reshape(self.shape)
-
-
-def _rows_of(column: AnyArray, start: int, stop: int) -> AnyArray | _File:
-    """Some rows of a column, where they are."""
-    rows = column[start:stop]
-    if isinstance(column, np.memmap):
-        offset = column.offset + start * column.strides[0]
-        return _File(str(column.filename), offset, column.dtype.str, rows.shape)
-    return rows
 
 
 class Asked(NamedTuple):
@@ -252,8 +222,8 @@ class Share:
     views: tuple[View, ...]
     first_view: int
     first_rows: tuple[int, int]
-    points: Mapping[str, AnyArray | _File]
-    curves: Mapping[str, AnyArray | _File]
+    points: Mapping[str, AnyArray | FileRows]
+    curves: Mapping[str, AnyArray | FileRows]
     left_out: tuple[Mask, Mask] | None = None
 
     def __post_init__(self) -> None:
@@ -265,8 +235,7 @@ class Share:
 
     def _content(self) -> Content:
         points, curves = (
-            {name: column.read() if isinstance(column, _File) else column for name, column in columns.items()}
-            for columns in (self.points, self.curves)
+            {name: read_rows(column) for name, column in columns.items()} for columns in (self.points, self.curves)
         )
         for columns in (points, curves):
             columns["view"] = columns["view"] - np.int32(self.first_view)
@@ -388,9 +357,9 @@ def cut(observations: Observations, left_out: tuple[Mask, Mask] | None = None) -
     """The observations of targets that lie in the world, in shares of whole views."""
     points, curves = observations.points, observations.curves
     for first, last in _ranges(observations):
-        (p, q), (c, d) = (np.searchsorted(column.view, (first, last)).tolist() for column in (points, curves))
+        (p, q), (c, d) = ((int(ends[first]), int(ends[last])) for ends in observations.ends)
         own = [
-            {name: _rows_of(array, start, stop) for name, array in vars(column).items()}
+            {name: rows_of(array, start, stop) for name, array in vars(column).items()}
             for column, start, stop in ((points, p, q), (curves, c, d))
         ]
         out = None if left_out is None else (left_out[0][p:q], left_out[1][c:d])
@@ -399,7 +368,6 @@ def cut(observations: Observations, left_out: tuple[Mask, Mask] | None = None) -
 
 def _ranges(observations: Observations) -> list[tuple[int, int]]:
     """First view and the one after the last of each share."""
-    columns = observations.points, observations.curves
-    longest = max(columns, key=len).view
-    stops = dict.fromkeys([*longest[_ROWS::_ROWS].tolist(), len(observations.views)])
-    return list(pairwise([0, *(stop for stop in stops if stop)]))
+    before = observations.ends[0] + observations.ends[1]
+    stops = np.searchsorted(before, np.arange(_ROWS, int(before[-1]), _ROWS))
+    return list(pairwise(dict.fromkeys([0, *stops.tolist(), len(observations.views)])))
