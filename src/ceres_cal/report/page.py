@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import json
 from base64 import b64encode
 from collections.abc import Sequence
 from dataclasses import dataclass
+from hashlib import sha256
 from html import escape
 from importlib.resources import files
 from typing import Protocol
 
 from ceres_cal.base.words import grouped
-from ceres_cal.report.canvas import NARROW_IN, WIDE_IN, Drawing, to_svg
+from ceres_cal.report.canvas import NARROW_IN, WIDE_IN, Drawing, Hover, to_svg
 
 _MOST_ROWS = 200  # of a table
 _SHORT = 14  # letters that stay on one line
@@ -80,7 +82,8 @@ class Table:
 class Figure:
     """A picture with a title, a sentence that says how to read it, and the table behind it.
 
-    A wide one is drawn twice, for a wide and for a narrow window.
+    A wide one is drawn twice, for a wide and for a narrow window. `hover` is what is said beside the pointer; whoever
+    has none finds it in the table.
     """
 
     name: str
@@ -90,9 +93,12 @@ class Figure:
     table: Table
     wide: bool = False
     narrow_drawing: Drawing | None = None
+    hover: Hover | None = None
 
     def html(self) -> str:
         label = f'role="img" aria-label="{escape(self.title)}"'
+        if self.hover is not None:
+            label += f' data-hover="{escape(json.dumps(vars(self.hover), separators=(",", ":"), ensure_ascii=False))}"'
         narrow = to_svg(self.narrow_drawing or self.drawing, NARROW_IN, f"{self.name}-narrow")
         if self.wide:
             wide = to_svg(self.drawing, WIDE_IN, f"{self.name}-wide")
@@ -136,6 +142,18 @@ class Gallery:
         if sum(not picture.wide for picture in self.pictures) % 2 and not self.pictures[-1].wide:
             elements[-1] = elements[-1].replace("<figure ", '<figure class="lone" ', 1)
         return f'<div class="gallery">{"".join(elements)}</div>'
+
+
+@dataclass(frozen=True)
+class Folded:
+    """Pieces that are there when somebody asks for them."""
+
+    title: str
+    pieces: tuple[Piece, ...]
+
+    def html(self) -> str:
+        body = "".join(piece.html() for piece in self.pieces)
+        return f'<details class="folded"><summary>{escape(self.title)}</summary>{body}</details>'
 
 
 @dataclass(frozen=True)
@@ -203,16 +221,21 @@ def _class(*names: str) -> str:
 
 
 def page(title: str, about: str, chapters: Sequence[Chapter], foot: str) -> str:
-    """The whole page, which needs nothing from elsewhere."""
-    style = files("ceres_cal.report").joinpath("style.css").read_text(encoding="utf-8")
+    """The whole page, which needs nothing from elsewhere, and in which no script but its own runs."""
+    style, script = (
+        files("ceres_cal.report").joinpath(name).read_text(encoding="utf-8") for name in ("style.css", "hover.js")
+    )
+    own = b64encode(sha256(script.encode()).digest()).decode("ascii")
     links = "".join(f'<a href="#{c.name}">{escape(c.title)}</a>' for c in chapters[1:])
     head, *rest = (chapter.html() for chapter in chapters)
     return (
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         "<meta http-equiv=\"Content-Security-Policy\" content=\"default-src 'none'; style-src 'unsafe-inline'; "
-        'img-src data:">\n<link rel="icon" href="data:,">\n'
+        f"script-src 'sha256-{own}'; img-src data:\">\n"
+        '<meta name="color-scheme" content="light dark">\n<link rel="icon" href="data:,">\n'
         f"<title>{escape(title)}</title>\n<style>\n{style}</style>\n</head>\n<body>\n"
         f"<header><p>Calibration report</p><h1>{escape(title)}</h1><p>{escape(about)}</p></header>\n<main>\n"
-        f"{head}\n<nav>{links}</nav>\n{chr(10).join(rest)}\n</main>\n<footer>{escape(foot)}</footer>\n</body>\n</html>\n"
+        f"{head}\n<nav>{links}</nav>\n{chr(10).join(rest)}\n</main>\n<footer>{escape(foot)}</footer>\n"
+        f"<script>{script}</script>\n</body>\n</html>\n"
     )
