@@ -10,11 +10,11 @@ from hashlib import sha256
 from html import escape
 from importlib.resources import files
 from typing import Protocol
+from urllib.parse import quote
 
 from ceres_cal.base.words import grouped
 from ceres_cal.report.canvas import NARROW_IN, WIDE_IN, Drawing, Hover, to_svg
 
-_MOST_ROWS = 200  # of a table
 _SHORT = 14  # letters that stay on one line
 
 
@@ -52,16 +52,17 @@ class BulletList:
 class Table:
     """Columns under their heads; the first column names its row.
 
-    Of more than 200 rows the first are shown, and how many there are. `stacked`: on a phone each row becomes a card.
+    Of more than `most` rows the first are shown, and how many there are. `stacked`: on a phone each row becomes a card.
     """
 
     head: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
     caption: str = ""
     stacked: bool = False
+    most: int = 200
 
     def html(self) -> str:
-        shown = self.rows[:_MOST_ROWS]
+        shown = self.rows[: self.most]
         head = "".join(f'<th scope="col">{escape(name)}</th>' for name in self.head)
         body = "".join(self._row(row) for row in shown)
         caption = f"<caption>{escape(self.caption)}</caption>" if self.caption else ""
@@ -186,19 +187,19 @@ class Tiles:
 
 @dataclass(frozen=True)
 class Card:
-    """One finding: a sentence, what to do, and small facts."""
+    """One finding: a sentence, what to do where that is known, small facts, and a file beside the page to look at."""
 
     level: str
     sentence: str
     advice: str
     facts: tuple[str, ...]
+    link: str = ""
 
     def html(self) -> str:
         facts = "".join(f"<li>{escape(fact)}</li>" for fact in self.facts)
-        return (
-            f"<article{_class('card', self.level)}><h3>{escape(self.sentence)}</h3>"
-            f'<p>{escape(self.advice)}</p><ul class="facts">{facts}</ul></article>'
-        )
+        title = f'<a href="{quote(self.link)}">{escape(self.sentence)}</a>' if self.link else escape(self.sentence)
+        advice = f"<p>{escape(self.advice)}</p>" if self.advice else ""
+        return f'<article{_class("card", self.level)}><h3>{title}</h3>{advice}<ul class="facts">{facts}</ul></article>'
 
 
 @dataclass(frozen=True)
@@ -220,7 +221,7 @@ def _class(*names: str) -> str:
     return f' class="{known}"' if known else ""
 
 
-def page(title: str, about: str, chapters: Sequence[Chapter], foot: str) -> str:
+def page(title: str, about: str, chapters: Sequence[Chapter], foot: str, kind: str = "Calibration report") -> str:
     """The whole page, which needs nothing from elsewhere, and in which no script but its own runs."""
     style, script = (
         files("ceres_cal.report").joinpath(name).read_text(encoding="utf-8") for name in ("style.css", "hover.js")
@@ -235,7 +236,7 @@ def page(title: str, about: str, chapters: Sequence[Chapter], foot: str) -> str:
         f"script-src 'sha256-{own}'; img-src data:\">\n"
         '<meta name="color-scheme" content="light dark">\n<link rel="icon" href="data:,">\n'
         f"<title>{escape(title)}</title>\n<style>\n{style}</style>\n</head>\n<body>\n"
-        f"<header><p>Calibration report</p><h1>{escape(title)}</h1><p>{escape(about)}</p></header>\n<main>\n"
+        f"<header><p>{escape(kind)}</p><h1>{escape(title)}</h1><p>{escape(about)}</p></header>\n<main>\n"
         f"{head}\n<nav>{links}</nav>\n{chr(10).join(rest)}\n</main>\n<footer>{escape(foot)}</footer>\n"
         f"<script>{script}</script>\n</body>\n</html>\n"
     )
