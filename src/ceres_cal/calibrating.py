@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.errors import CalibrationError, DegenerateError, SolutionError
 from ceres_cal.base.threads import at_most, meanwhile, single_threaded_blas
-from ceres_cal.base.words import bounds_text, two_digits
-from ceres_cal.calibration import COPY, Calibration, Fit, Rejected
+from ceres_cal.calibration import Calibration
+from ceres_cal.calibration.caveats import resting_phi, unknown_phi
+from ceres_cal.calibration.outcome import came_out, of_all
 from ceres_cal.lens_choice import choose_lens, papers
-from ceres_cal.model.keys import Key
 from ceres_cal.model.parameters import AUTO, Estimate, Layout, Options, make_layout
 from ceres_cal.model.priors import gather_priors
 from ceres_cal.model.quantities import difference
@@ -46,24 +45,14 @@ from ceres_cal.solve.possible import require_possible
 from ceres_cal.solve.usable import require_fits, require_usable
 from ceres_cal.start.baseline import four_point_baseline
 from ceres_cal.start.initialise import Start, initialise
-from ceres_cal.uncertainty import Posterior, Scatter, Uncertainty, assess, measure_scatter
+from ceres_cal.uncertainty import Posterior, Scatter, assess, measure_scatter
 
-_UNKNOWN = (
-    "camera {!r}: its views are too frontal to tell phi, which is {} at 95 %, and its heights go with phi: the floor "
-    "is right, what is above it is not: add boards tilted by 20 degrees, or a prior on height_m where it sees the field"
-)
 # Share of the standard deviation of usual principal points: observations that say as much need nothing usual. Half and
 # double leave ordinary fields and boards, whose share is under a tenth, as they are.
 _SAYS_LESS = 0.5
-# Times the standard deviation of phi without what is usual of principal points: what rests on it is said.
-_RESTING = 1.5
 # Share of a dimension by which it may come out another than drawn without a second solve from there, whose start and
 # outliers are those of the right drawing; and how many there may be.
 _REDRAWN, _MOST_DRAWINGS = 0.005, 4
-_USUAL = (
-    "camera {!r}: phi, and what goes with it, rests on its principal point lying near the middle of the image, as is "
-    "usual: by the observations alone its standard deviation is {}: show tilted views, or state the principal point"
-)
 _OTHERWISE = (
     "no calibration agrees with what was stated beforehand, though the observations make one without it: check the "
     "priors and their units"
@@ -288,13 +277,13 @@ def solved_from(
     if assessed:
         end, posterior = _assess(end, observations, problem, again)
         posterior = _with_doubts(posterior.in_doubt(conflicts.keys, conflicts.shifts), end, explanations)
-        warnings = (*warnings, *(one.words for one in conflicts.every), *_unknown(end, posterior))
-        warnings = (*warnings, *_resting(end, problem))
+        warnings = (*warnings, *(one.words for one in conflicts.every), *unknown_phi(end, posterior))
+        warnings = (*warnings, *resting_phi(end, problem))
     if digest is not None:
         digest.result()  # which the observations remember
-    calibration = _calibration(start, observations, problem, end, explanations)
+    calibration = came_out(start.phi_from, observations, problem, end, explanations)
     if settled is not None:
-        calibration = _of_all(calibration, settled)
+        calibration = of_all(calibration, settled)
     warnings = (*calibration.warnings, *require_usable(end, problem, explanations), *warnings)
     calibration = replace(calibration, warnings=warnings, posterior=posterior, conflicts=conflicts.every)
     tolerances = {**problem.options.tolerances, **tolerances_of(as_built)}
@@ -308,33 +297,7 @@ def _closed_form(start: Start, observations: Observations, problem: Problem) -> 
     require_possible(observations, problem.sights, estimate, there)
     solution = Solution(estimate, np.nan, False, "the paper's closed form, nothing was minimised", ())
     end = RobustSolution(problem, solution, visible_from(observations, there), there, 0)
-    return _calibration(start, observations, problem, end)
-
-
-def _calibration(
-    start: Start,
-    observations: Observations,
-    problem: Problem,
-    end: RobustSolution,
-    explanations: Sequence[Explanation] = (),
-) -> Calibration:
-    """What came out, not assessed."""
-    out = [np.flatnonzero(~mask) for mask in (end.inliers.points, end.inliers.curves)]
-    far = end.inliers.point_sigmas[out[0]], end.inliers.curve_sigmas[out[1]]
-    return Calibration(
-        end.solution.estimate,
-        observations.targets,
-        _fit(end, problem.layout),
-        _rejected(observations, out, far, explanations),
-        end.solution.termination,
-        end.solution.converged,
-        end.rounds,
-        end.solution.history,
-        start.phi_from,
-        observations.warnings,
-        problem.options,
-        observations.digest,
-    )
+    return came_out(start.phi_from, observations, problem, end)
 
 
 def _assess(
@@ -370,101 +333,3 @@ def _with_doubts(posterior: Posterior, end: RobustSolution, explanations: Sequen
     doubtful = [one for one in explanations if one.is_doubtful]
     shifts = [one.doubt**0.5 * difference(one.other, end.solution.estimate, posterior.keys) for one in doubtful]
     return posterior.in_doubt(posterior.keys, shifts)
-
-
-def _unknown(end: RobustSolution, posterior: Posterior) -> Iterator[str]:
-    """Warnings of cameras whose phi the observations leave open."""
-    known = Uncertainty(end.solution.estimate, posterior, {})
-    for name in posterior.profiles:
-        verdict = known.verdict("camera", name, "phi")
-        if verdict.verdict == "unknown":
-            yield _UNKNOWN.format(name, bounds_text(verdict.low, verdict.high, "px"))
-
-
-def _resting(end: RobustSolution, problem: Problem) -> Iterator[str]:
-    """Warnings of cameras whose phi rests on where principal points usually lie."""
-    estimate, reduced = end.solution.estimate, end.reduced
-    usual = [prior for prior in problem.priors_at(estimate) if prior.is_usual]
-    if reduced is None or not usual:
-        return
-    without = reduced.shared
-    for prior in usual:
-        without = without + replace(prior.information, matrix=-prior.information.matrix)
-    for name in estimate.cameras:
-        key = Key("camera", name, "phi", "px")
-        if key in reduced.shared.keys:
-            at = reduced.shared.columns([key])[0]
-            sd, alone = reduced.shared.spread.sd[at], without.spread.sd[at]
-            if alone > _RESTING * sd:
-                yield _USUAL.format(name, _share_text(alone / estimate.cameras[name].phi))
-
-
-def _share_text(share: float) -> str:
-    return f"{two_digits(100.0 * share)} %" if share < 1.0 else "larger than itself"
-
-
-# ---- what came out --------------------------------------------------------------------------------------------------
-
-
-def _of_all(calibration: Calibration, settled: Settled) -> Calibration:
-    """What came out of all observations, where a part of them decided."""
-    observations, used, scales = settled.observations, settled.used, calibration.fit.scales
-    points, curves = used.sums
-    sigmas = [own / scale for own, scale in zip(used.sigmas, scales, strict=True)]
-    mean = [np.sqrt(sums[1:] / max(sums[0], 1.0)) for sums in (points, curves)]
-    return replace(
-        calibration,
-        fit=replace(
-            calibration.fit,
-            points=int(points[0]),
-            curves=int(curves[0]),
-            points_rms_px=float(mean[0][0]),
-            curves_rms_px=float(mean[1][0]),
-            point_sigma_px=float(mean[0][1]),
-            curve_sigma_px=float(mean[1][1]),
-        ),
-        rejected=_rejected(observations, used.rows, sigmas, settled.explanations),
-        warnings=observations.warnings,
-    )
-
-
-def _fit(end: RobustSolution, layout: Layout) -> Fit:
-    points, curves = end.residuals.lengths
-    used = points[end.inliers.points], curves[end.inliers.curves]
-    sigmas = end.problem.sights.sigma_px, end.problem.sights.curve_sigma_px
-    return Fit(
-        len(used[0]),
-        len(used[1]),
-        _rms(used[0]),
-        _rms(used[1]),
-        end.inliers.point_scale,
-        end.inliers.curve_scale,
-        layout.size,
-        _rms(sigmas[0]),
-        _rms(sigmas[1]),
-    )
-
-
-def _rms(values: Array) -> float:
-    """Root mean square; 0 of nothing."""
-    return float(np.sqrt(values @ values / max(len(values), 1)))
-
-
-def _rejected(
-    observations: Observations, rows: Sequence[Indices], sigmas: Sequence[Array], explanations: Sequence[Explanation]
-) -> tuple[Rejected, ...]:
-    """The rows of points and of curve observations that did not take part, and how far off they are."""
-    wholes = [one for one in explanations if one.is_taken]
-    entries, views, copies = [], observations.views, observations.copies
-    for kind, out, far, column, copy_of, first in (
-        ("point", rows[0], sigmas[0], observations.points, copies.points, 0),
-        ("curve", rows[1], sigmas[1], observations.curves, copies.curves, len(observations.points)),
-    ):
-        for row, sigma in zip(out.tolist(), far.tolist(), strict=True):
-            reason = f"{sigma:.1f} sigma off" if np.isfinite(sigma) else "cannot be seen from there"
-            reason = next((one.words for one in wholes if one.rows[first + row]), reason)
-            if copy_of[row] >= 0:
-                reason = f"{COPY} of frame {views[copy_of[row]].frame!r}"
-            frame = views[column.view[row]].frame
-            entries.append(Rejected(kind, row, frame, observations.feature_name(kind, row), reason))
-    return tuple(entries)
