@@ -56,7 +56,7 @@ def require_sides(facings: Sequence[Facing], target: Target, curves: Collection[
     """Raise InputError for a feature that the target does not have, or that lies in its middle."""
     size, middle = size_of(target, curves), middle_of(target, curves)[:2]
     for one in facings:
-        if one.feature not in target.points and one.feature not in target.curves:
+        if one.feature not in target.point_index and one.feature not in target.curves:
             raise InputError(
                 f"facing {one.feature}={one.side}: the target has no line, arc or point {one.feature!r}: "
                 "`ceres-cal targets` lists the names"
@@ -108,6 +108,6 @@ def distinguishing_feature(target: Target, curves: Collection[str]) -> str:
 
 
 def _place(feature: str, target: Target) -> Array:
-    if feature in target.points:
-        return np.array(target.points[feature][:2])
+    if feature in target.point_index:
+        return np.asarray(target.point_array[target.point_index[feature], :2])
     return np.asarray(curve_points(target.curves[feature], 0, 2)[1, :2])
