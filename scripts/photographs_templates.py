@@ -24,12 +24,15 @@ GREEN, GREY, WOOD, CLAY, BLUE = (
 WHITE, YELLOW = (1.0, 1.0, 1.0), (0.35, 1.0, 1.0)
 FLOORS: dict[str, tuple[tuple[float, tuple[float, float, float], tuple[float, float, float]], ...]] = {
     "vss": ((0.05, GREY, WHITE), (0.08, BLUE, WHITE)),
-    "basketball": ((0.35, WOOD, WHITE), (0.2, BLUE, YELLOW)),
+    "basketball": ((0.25, WOOD, WHITE), (0.2, BLUE, YELLOW)),
     "tennis": ((0.25, CLAY, WHITE), (0.2, BLUE, WHITE)),
     "tape-grid": ((0.3, GREY, YELLOW), (0.15, GREY, WHITE)),
     "": ((0.2, GREEN, WHITE), (0.12, GREEN, WHITE)),
 }
 """By the beginning of a target's name: brightness and colour of the floor, colour of its lines."""
+
+
+SMOOTH = ("basketball", "tennis")  # no carpets
 
 
 def known() -> dict[str, Target]:
@@ -43,6 +46,8 @@ def floored(name: str, target: Target, seed: int) -> Photography:
     floors = next(floors for begins, floors in FLOORS.items() if name.startswith(begins))
     carpet, carpet_colour, paint_colour = floors[seed // 2 % len(floors)]
     how = replace(varied(seed), carpet=carpet, carpet_colour=carpet_colour, paint_colour=paint_colour)
+    if name in SMOOTH:
+        how = replace(how, carpet_texture=0.5 * how.carpet_texture)
     small = float(np.max(np.ptp(target.box, axis=0))) < ROBOTS_FROM_M
     return replace(how, robots=min(how.robots, 1), balls=0) if small else how
 

@@ -37,6 +37,13 @@ class Grid:
     across: Array
 
     @property
+    def least_share(self) -> float:
+        """Of the length of all painted curves, that of the straight lines in the direction that has fewer."""
+        lines = _segments(self.target, self.curves)
+        along = [sum(one.length_m for one in lines if abs(_way(one) @ self.turn[:, axis]) < _AXIS) for axis in (0, 1)]
+        return min(along) / sum(self.target.curves[name].length_m for name in self.curves)
+
+    @property
     def outline(self) -> Array:
         """(P, 2) places all along the painted curves, in the grid."""
         return places_along(self, _OUTLINE).grid

@@ -96,12 +96,12 @@ def search(grey: Array32, target: Target, curves: Collection[str], auto: Auto) -
             break
     if not good:
         return SearchResult(None, reason, seen=seen)
-    best = max(good, key=lambda one: likelihood(problem, one.camera))
+    best = max(good, key=likelihood)
     similar = alike(problem, best.camera, detected_curves(problem, best))
     others = [_followed(problem, _turned(problem, auto, camera)) for camera in similar]
     distinct = [best]
     for other in (*good, *(one for one in others if not objection(problem, one))):
-        as_good = likelihood(problem, other.camera) >= _AS_GOOD * likelihood(problem, best.camera)
+        as_good = likelihood(other) >= _AS_GOOD * likelihood(best)
         if as_good and not any(same_labels(problem, other, one) for one in distinct):
             distinct.append(other)
     return _one_way(problem, auto, distinct)
