@@ -32,7 +32,7 @@ _MOST, _MOST_ALIKE = 4, 60
 # Where a candidate's lines are sought: px apart, and to either side as a share of half the image's diagonal; and how
 # bright, of the usual brightest, is paint. So many of any lines would be found there by chance.
 _SPACING_PX, _REACH, _CLEAR, _FEWEST = 8.0, 0.025, 0.4, 12
-BY_CHANCE = 0.3
+BY_CHANCE = 0.3  # of the places on any lines, those that lie on paint
 _SAME_PLACE, _SAME_TURN = 0.08, 0.1  # in heights, rad
 
 
