@@ -3,14 +3,17 @@
 import json
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from photographs_templates import take_field
 from scenes import camera
 
 from ceres_cal import InputError, Observations, calibrate, painted_field, ssl_field, tape_grid
 from ceres_cal.cli import main
+from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.curves import Arc, Segment, curve_points, distance_to_curve
 from ceres_cal.scene.symmetry import counterparts, turns_of
 from ceres_cal.scene.targets import Target, target_from_spec, targets_by_name
@@ -172,6 +175,27 @@ def test_it_is_drawn_and_spelled_out(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert main(["targets", "vss-field", "--picture", str(picture)]) == 2  # two of them
     assert main(["targets", "--picture", str(picture)]) == 2
     assert main(["targets", "checkerboard", "--picture", str(picture)]) == 2
+
+
+def test_a_photograph_of_another_league(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Without a start; and where nothing says which way round it is, what was seen is drawn."""
+    shot = take_field("vss-3", EVERY["vss-3"], 2)
+    path, refused, out = (str(tmp_path / name) for name in ("vss.png", "refused.png", "o.json"))
+    cv2.imwrite(path, shot.picture.image)
+    command = ["detect", "field", path, "--target", "vss-3", "--auto", "-o", out, "--picture", refused]
+    assert main(command) == 2
+    assert "it looks alike in 2 ways: LeftGoalLine lies towards" in capsys.readouterr().err
+    assert cv2.imread(refused) is not None
+    assert main([*command, "--facing", f"LeftGoalLine={_towards(shot.camera)}"]) == 0
+    observations = Observations.load(out)
+    truth = shot.camera.project(shot.target.point_array[observations.points.feature])
+    assert np.max(np.linalg.norm(observations.points.pixels - truth, axis=1)) < 0.5  # 0.11 px
+    assert {observations.feature_name("point", row) for row in range(len(truth))} & {"LeftGoalArea*LeftAreaArc#1"}
+
+
+def _towards(seen: Camera) -> str:
+    left, right = seen.project([[-0.7, 0.0, 0.0], [0.7, 0.0, 0.0]])
+    return "left" if left[0] < right[0] else "right"
 
 
 def test_boxes_end_where_arcs_do() -> None:

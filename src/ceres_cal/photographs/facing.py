@@ -31,6 +31,7 @@ _FACES = 0.3
 _AS_WELL = 0.2
 # By which an old calibration must be nearer to one turn than to the next: quarters are 90 degrees apart.
 _NEARER_DEG = 30.0
+_LONG = 0.4  # of the longest curve: one that people know by its name
 _MIDDLE = 0.02  # of the target's size: nearer to its middle a feature lies on no side
 
 
@@ -102,9 +103,11 @@ def side_of(feature: str, camera: Camera, target: Target, curves: Collection[str
 
 
 def distinguishing_feature(target: Target, curves: Collection[str]) -> str:
-    """The painted curve whose middle lies farthest from the target's: to say by it which way round the target is."""
+    """The long painted curve whose middle lies farthest from the target's: to say by it which way round the target is."""
     middle = middle_of(target, curves)[:2]
-    return max(curves, key=lambda name: round(float(np.linalg.norm(_place(name, target) - middle)), 6))
+    longest = max(target.curves[name].length_m for name in curves)
+    long = [name for name in curves if target.curves[name].length_m >= _LONG * longest]  # no marks in corners
+    return max(long, key=lambda name: round(float(np.linalg.norm(_place(name, target) - middle)), 6))
 
 
 def _place(feature: str, target: Target) -> Array:

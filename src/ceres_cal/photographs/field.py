@@ -19,7 +19,7 @@ from ceres_cal.observations import NO_POINTS, Curves, Observations, Points, View
 from ceres_cal.photographs.clicks import Clicks, starts_from_clicks
 from ceres_cal.photographs.follow import Followed, FreeIntrinsics, follow
 from ceres_cal.photographs.judgement import why_missed
-from ceres_cal.photographs.search import Auto, SearchResult, search
+from ceres_cal.photographs.search import Auto, SearchResult, SeveralWaysError, search
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.targets import Target
 
@@ -98,7 +98,7 @@ def detect_field(
     last: Followed | None = None
     for number, path in enumerate(paths, start=1):
         grey = _without(read_grey(path).astype(np.float32), options.left_out, path)
-        result = _looked_for(grey, target, painted, start if last is None else last, (path, options.keep_start))
+        result = _looked_for(grey, target, painted, start if last is None else last, path, options)
         results[str(path)] = result
         if result.followed is None and options.refused is not None:
             options.refused(path, result)
@@ -139,19 +139,20 @@ def _looked_for(
     target: Target,
     painted: tuple[str, ...],
     start: Camera | Clicks | Auto | Followed,
-    where: tuple[Path, bool],
+    path: Path,
+    options: FieldOptions,
 ) -> SearchResult:
-    """The field from where the last image showed it, or from the start that was given, or from none.
-
-    Args:
-        where: the image's path, and whether the start is to be kept to.
-    """
-    path, keep = where
+    """The field from where the last image showed it, or from the start that was given, or from none."""
     if isinstance(start, Auto):
         with naming(path):
-            return search(grey, target, painted, start)
+            try:
+                return search(grey, target, painted, start)
+            except SeveralWaysError as error:
+                if options.refused is not None:
+                    options.refused(path, SearchResult(None, str(error), seen=error.seen))
+                raise
     starts, free = _starts(start, target, (int(grey.shape[1]), int(grey.shape[0])), path)
-    followed = follow(grey, target, starts, painted, replace(free, keep=keep))
+    followed = follow(grey, target, starts, painted, replace(free, keep=options.keep_start))
     if followed.holds and not followed.built.is_other:
         return SearchResult(followed)
     return SearchResult(None, why_missed(followed, target, started=True), seen=followed)
