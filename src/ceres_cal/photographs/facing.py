@@ -103,7 +103,7 @@ def side_of(feature: str, camera: Camera, target: Target, curves: Collection[str
 
 
 def distinguishing_feature(target: Target, curves: Collection[str]) -> str:
-    """The long painted curve whose middle lies farthest from the target's: to say by it which way round the target is."""
+    """The long painted curve whose middle lies farthest from the target's: to say by it which way round it is."""
     middle = middle_of(target, curves)[:2]
     longest = max(target.curves[name].length_m for name in curves)
     long = [name for name in curves if target.curves[name].length_m >= _LONG * longest]  # no marks in corners
