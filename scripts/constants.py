@@ -120,13 +120,14 @@ DECIDING: tuple[Constant, ...] = (
     *_of("photographs.clicks", "SIGMA_PX _SQUARE", "clicks"),
     *_of("photographs.follow", "LEAST_SHARE _SURE_SHARE _ABSENT _MOST_ABSENT", "lines", "auto"),
     *_of("photographs.facing", "_FACES _AS_WELL _NEARER_DEG", "auto"),
-    *_of("photographs.candidates", "_SURE _COMPARABLE _ALIKE _CLEAR _BY_CHANCE", "auto"),
+    *_of("photographs.candidates", "_SURE _COMPARABLE _ALIKE _CLEAR BY_CHANCE", "auto"),
+    *_of("photographs.grid", "_SHORT", "auto"),
     *_of("photographs.as_built", "_OTHER_FIELD _SURELY _FARTHEST_M", "lines", "auto"),
     *_of("photographs.judgement", "_NEAR_PX _EXPLAINED _OF_ALL _FEWEST_PLACES _FEWEST_CURVES", "auto"),
     *_of("photographs.judgement", "_LEAST_UPRIGHT _SAME_FLOOR", "auto"),
-    *_of("photographs.matching", "_PEAK _LEAST_PEAK _PARALLEL _CELL _LEAST_IN_VIEW", "auto"),
+    *_of("photographs.matching", "_PEAK _LEAST_PEAK _PARALLEL _CELL _PAIRS _LEAST_IN_VIEW", "auto"),
     *_of("photographs.search", "_SURE _AS_GOOD", "auto"),
-    *_of("photographs.upright", "_USUAL_TILT _PRIOR_WEIGHT _LEAST_SHARE _APART", "auto"),
+    *_of("photographs.upright", "_USUAL_TILT _PRIOR_WEIGHT _LEAST_SHARE _LEAST_OF_OWN _APART", "auto"),
 )  # fmt: skip
 """Those that say what is an outlier, a lost board, a competing pose, a move, a finding, a found field and the like."""
 

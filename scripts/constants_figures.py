@@ -52,7 +52,7 @@ from ceres_cal.photographs import Auto, follow
 from ceres_cal.photographs.clicks import starts_from_clicks
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import KannalaBrandt, Radial
-from ceres_cal.scene.targets import checkerboard
+from ceres_cal.scene.targets import checkerboard, ssl_field
 from ceres_cal.simulate import Held, Station, board_scene, built_in_scene, overhead_pose, simulate
 from ceres_cal.simulate.photograph import frames, photograph
 
@@ -356,7 +356,7 @@ def auto(runs: int, folder: Path) -> Figures:
     for name, view in (*list(VIEWS.items())[::3], ("near", near)):
         what += [one.what for one in searched(_shots(folder, name, partial(take_view, name, view), few))]
     silent = [outcome(shot, Auto()).what for shot in shots[:few]]
-    other = [outcome(shot, FACING, "A").what for shot in shots[:few]]
+    other = [outcome(shot, FACING, ssl_field("A")).what for shot in shots[:few]]
     return {
         f"found of {len(what)}": what.count("right"),
         "wrong": what.count("wrong"),

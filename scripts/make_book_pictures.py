@@ -1,6 +1,6 @@
 """Draws the pictures of the book that commands make: python scripts/make_book_pictures.py [FOLDER]
 
-The model in a photograph, and where two calibrations differ; docs/pictures by default.
+The fields, the model in a photograph, and where two calibrations differ; docs/pictures by default.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from ceres_cal.cli import main
 ROOT = Path(__file__).resolve().parents[1]
 HOME, MOVED = (ROOT / "data" / name / "photographs" for name in ("ssl_field", "ssl_field_moved"))
 SMALLER, QUALITY = 0.75, 85
+FIELDS = ("ssl-b", "vss-3", "vss-5", "spl", "humanoid-kid", "football", "basketball", "tennis", "tape-grid")
 
 
 def run(*arguments: object) -> None:
@@ -27,6 +28,8 @@ def run(*arguments: object) -> None:
 
 def draw(to: Path, folder: Path) -> None:
     """See above; `folder` is for what is made on the way."""
+    for name in FIELDS:
+        run("targets", name, "--picture", to / f"field_{name}.svg", "--json")
     field, camera, new = folder / "field.json", folder / "camera.json", folder / "new.json"
     images = sorted(HOME.glob("000*.jpg"))
     found = ("--target", "ssl-b", "--auto", "--facing", "LeftGoalLine=top", "-o", field, "--quiet")

@@ -22,7 +22,7 @@ from ceres_cal.photographs import Auto, Facing
 from ceres_cal.photographs.search import search
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import KannalaBrandt, Radial
-from ceres_cal.scene.targets import ssl_field
+from ceres_cal.scene.targets import Target, ssl_field
 from ceres_cal.simulate import Station, field_scene, overhead_pose
 from ceres_cal.simulate.photograph import photograph
 
@@ -100,9 +100,9 @@ class Outcome:
     why: str = ""
 
 
-def outcome(shot: Shot, auto: Auto, division: str = "B") -> Outcome:
-    """Search one photograph for a field of a division; of any but its own, whatever is found is wrong."""
-    target, grey = ssl_field(division), shot.grey
+def outcome(shot: Shot, auto: Auto, other: Target | None = None) -> Outcome:
+    """Search one photograph for its field, or for another one: then whatever is found is wrong."""
+    target, grey = other or shot.target, shot.grey
     began = time.perf_counter()
     try:
         found = search(grey, target, target.curve_names, auto)
@@ -113,7 +113,7 @@ def outcome(shot: Shot, auto: Auto, division: str = "B") -> Outcome:
         return Outcome("miss", seconds, found.reason)
     lines = found.followed.lines
     error_px = np.abs(distances_px(shot, lines.course.curve[lines.found], lines.pixels[lines.found]))
-    right = division == "B" and float(np.mean(error_px < RIGHT_PX)) >= RIGHT_SHARE
+    right = other is None and float(np.mean(error_px < RIGHT_PX)) >= RIGHT_SHARE
     return Outcome("right" if right else "wrong", seconds)
 
 
@@ -156,7 +156,7 @@ def auto_rows(runs: int) -> Iterator[Row]:
     yield from rows_for("auto, very near", outcomes)
     silent = [outcome(take(seed), Auto()).what for seed in range(few)]
     yield Row("auto, no --facing", "refused, both ways named", silent.count("several ways") / few, least=1.0)
-    other = [outcome(take(seed), FACING, "A").what for seed in range(few)]
+    other = [outcome(take(seed), FACING, ssl_field("A")).what for seed in range(few)]
     yield Row("auto, for a division A field", "found", other.count("wrong"), most=0.0, note=f"{few} photographs")
 
 

@@ -57,6 +57,11 @@ def polynomial_error_px(found: RingsDetection) -> float:
     return float(np.max(np.abs(np.power.outer(radius, [1, 2, 3]) @ polynomial - posed.lens.ideal_radius(radius))))  # type: ignore[attr-defined]
 
 
+def test_in_the_dark_it_asks_for_light(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"too dark, from black to white \d grey levels .*expose longer"):
+        detect_rings(taken(tmp_path, Photography(exposure=6.0, read_noise=1.5)), RADII)
+
+
 @pytest.mark.parametrize("how", [Photography(), HARSH], ids=["good light", "bad light"])
 def test_the_papers_rings(tmp_path: Path, how: Photography) -> None:
     found = detect_rings(taken(tmp_path, how), RADII)

@@ -331,7 +331,7 @@ def test_the_designs_custom_target() -> None:
         },
     }
     target = target_from_spec(spec, "here")
-    assert target.points == {"pole_top": (1.0, 2.0, 1.0)}
+    assert target.points == {"pole_top": (1.0, 2.0, 1.0), "edge*circle": (0.5, 0.0, 0.0)}
     assert target.curves == {
         "edge": Segment((0.0, 0.0, 0.0), (4.0, 0.0, 0.0), 0.01),
         "circle": Arc((0.0, 0.0, 0.0), 0.5, 0.0, 2.0 * np.pi, 0.01),
@@ -359,7 +359,10 @@ def test_the_order_of_features_counts() -> None:
 
 WIDE_ARC = {"centre": [0, 0, 0], "radius_m": 0.1, "width_m": 0.2}
 BAD_SPECS: list[tuple[Any, str]] = [
-    (None, "unknown kind None: choose one of ssl-field, checkerboard, circle-grid, april-grid, rings, custom"),
+    (
+        None,
+        "unknown kind None: choose one of ssl-field, .*tape-grid, checkerboard, circle-grid, april-grid, rings, custom",
+    ),
     ([1, 2], "unknown kind None"),
     ({"kind": "ssl"}, "unknown kind 'ssl'"),
     ({"kind": ["ssl-field"]}, r"unknown kind \['ssl-field'\]"),

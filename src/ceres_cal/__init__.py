@@ -39,8 +39,10 @@ if TYPE_CHECKING:
     from ceres_cal.scene.targets import checkerboard as checkerboard
     from ceres_cal.scene.targets import circle_grid as circle_grid
     from ceres_cal.scene.targets import custom as custom
+    from ceres_cal.scene.targets import painted_field as painted_field
     from ceres_cal.scene.targets import rings as rings
     from ceres_cal.scene.targets import ssl_field as ssl_field
+    from ceres_cal.scene.targets import tape_grid as tape_grid
 
 _HOME = {
     "advise": "advice",
@@ -66,7 +68,10 @@ _HOME = {
     "Curves": "observations",
     "Prior": "observations",
     **dict.fromkeys(
-        ("Target", "Segment", "Arc", "april_grid", "checkerboard", "circle_grid", "custom", "rings", "ssl_field"),
+        (
+            *("Target", "Segment", "Arc", "april_grid", "checkerboard", "circle_grid", "custom", "painted_field"),
+            *("rings", "ssl_field", "tape_grid"),
+        ),
         "scene.targets",
     ),
     "Options": "model.parameters",

@@ -15,7 +15,7 @@ from ceres_cal.cli.arguments import add_output, add_quiet, add_station, add_time
 from ceres_cal.cli.command import Answer, Command
 from ceres_cal.cli.detection import detected
 from ceres_cal.cli.estimate import add_estimate, parse_estimates
-from ceres_cal.cli.inputs import images_and_videos
+from ceres_cal.cli.inputs import images_and_videos, spelled_target
 from ceres_cal.cli.median import add_median, median_path, median_text, write_median
 from ceres_cal.cli.outputs import finishing, require_observations_output
 from ceres_cal.cli.photographs import missed_data
@@ -63,8 +63,9 @@ def _add_start(parser: ArgumentParser) -> None:
     add(
         "--target",
         metavar="TARGET",
-        help="a field by its name (such as ssl-a, ssl-b: `ceres-cal targets`), or a JSON file with a target "
-        "({'kind': ...}) or with a target named 'field'; default: that of the calibration to start from",
+        help="a field by its name (such as ssl-b, vss-3: `ceres-cal targets`), spelled out "
+        '(\'{"kind": "vss-field", "size": "3v3", "field_length_m": 1.6}\'), or a JSON file with a target or with a '
+        "target named 'field'; default: that of the calibration to start from",
     )
     add("--start", metavar="FILE", type=Path, help="a calibration of before, or a file of corners (ceres-cal/corners)")
     add(
@@ -245,6 +246,8 @@ def _corners(specs: list[str]) -> Clicks:
 def _target(text: str) -> Target:
     from ceres_cal.scene.targets import target_from_spec, targets_by_name
 
+    if (spelled := spelled_target(text, "--target")) is not None:
+        return spelled
     by_name = targets_by_name()
     if text in by_name:
         return by_name[text]

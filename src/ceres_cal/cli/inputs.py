@@ -14,6 +14,7 @@ from ceres_cal.base.errors import InputError
 if TYPE_CHECKING:
     from ceres_cal.calibration import Calibration
     from ceres_cal.observations import Observations
+    from ceres_cal.scene.targets import Target
 
 IMAGE_ENDINGS = {".bmp", ".jp2", ".jpeg", ".jpg", ".pbm", ".pgm", ".png", ".pnm", ".ppm", ".tif", ".tiff", ".webp"}
 
@@ -47,6 +48,16 @@ def _files(name: str) -> Iterator[Path]:
         if not matches:
             raise InputError(f"{name}: no such file")
         yield from map(Path, matches)
+
+
+def spelled_target(text: str, where: str) -> Target | None:
+    """The target that somebody spelled out as `{"kind": ...}`; None for anything else, such as a name or a file."""
+    if not text.lstrip().startswith("{"):
+        return None
+    from ceres_cal.base.files import parse_json
+    from ceres_cal.scene.targets import target_from_spec
+
+    return target_from_spec(parse_json(text.encode(), where), where)
 
 
 def require_different(files: Iterable[str | Path]) -> None:

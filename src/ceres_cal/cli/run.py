@@ -32,7 +32,7 @@ def _add_arguments(parser: ArgumentParser) -> None:
     add = parser.add_argument
     add("images", nargs="+", metavar="IMAGE", help="photographs of one camera, a folder of them, or a video")
     add("-o", "--output", metavar="FOLDER", type=Path, required=True, help="for everything that is made")
-    add("--target", metavar="TARGET", help="the field: ssl-a, ssl-b, or a file, as of `detect field`")
+    add("--target", metavar="TARGET", help="the field: its name, such as ssl-b, or a file, as of `detect field`")
     add("--facing", metavar="NAME=SIDE", action="append", default=[], help="which way round it is, likewise")
     add("--not-painted", metavar="NAME,...", help="lines that this field does not have")
     add(

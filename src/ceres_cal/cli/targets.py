@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from ceres_cal.base.errors import InputError
 from ceres_cal.cli.arguments import add_output
 from ceres_cal.cli.command import Answer, Command
+from ceres_cal.cli.inputs import spelled_target
 from ceres_cal.cli.outputs import finishing, require_ending, require_output, section
 
 if TYPE_CHECKING:
@@ -22,21 +23,44 @@ def _add_arguments(parser: ArgumentParser) -> None:
         "target",
         nargs="?",
         metavar="TARGET",
-        help=f"list the features of a kind ({', '.join(TARGET_KINDS)}), of {' or '.join(targets_by_name())}, or of the "
-        "targets in a file of observations; without it the kinds are listed",
+        help=f"list the features of a kind ({', '.join(TARGET_KINDS)}), of {' or '.join(targets_by_name())}, of one "
+        "that is spelled out as in files ('{\"kind\": ...}'), or of the targets in a file of observations; without it "
+        "the kinds are listed",
+    )
+    parser.add_argument(
+        "--picture", metavar="SVG", type=Path, help="draw the target there, with the names of its lines"
     )
 
 
 def _run(args: Namespace) -> Answer:
     from ceres_cal.scene.targets import TARGET_KINDS
 
+    if args.picture is not None:
+        require_output(args.picture, [])
+        require_ending(args.picture, "pictures are", ".svg")
+        if args.target is None:
+            raise InputError("--picture draws one target: name it, such as vss-3")
     if args.target is None:
         return Answer({"kinds": {name: _kind_data(kind) for name, kind in TARGET_KINDS.items()}}, _kinds_text)
     targets = _targets(args.target)
+    if args.picture is not None:
+        _draw(targets, args.target, args.picture)
     return Answer(
         {"targets": {name: _target_data(target) for name, target in targets.items()}},
         lambda: "\n\n".join(_target_text(name, target) for name, target in targets.items()),
     )
+
+
+def _draw(targets: dict[str, Target], wanted: str, picture: Path) -> None:
+    from ceres_cal.base.files import write_bytes
+    from ceres_cal.report.target_picture import target_svg
+
+    if len(targets) > 1:
+        raise InputError(f"{wanted}: it has several targets: {', '.join(targets)}: --picture draws one of them")
+    ((name, target),) = targets.items()
+    content = target_svg(target, name).encode()
+    with finishing():
+        write_bytes(picture, content)
 
 
 def _add_print(parser: ArgumentParser) -> None:
@@ -52,7 +76,7 @@ def _print(args: Namespace) -> Answer:
     from ceres_cal.base.files import write_bytes
     from ceres_cal.report.sheet import sheet_pdf
 
-    targets = _given(args.target)
+    targets = _targets(args.target)
     if len(targets) > 1:
         raise InputError(f"{args.target}: it has several targets: {', '.join(targets)}: give the description of one")
     (target,) = targets.values()
@@ -62,26 +86,13 @@ def _print(args: Namespace) -> Answer:
     return Answer({"output": str(args.output), "spec": target.spec}, lambda: section("written", [str(args.output)]))
 
 
-def _given(wanted: str) -> dict[str, Target]:
-    if not wanted.lstrip().startswith("{"):
-        return _targets(wanted)
-    from json import JSONDecodeError, loads
-
-    from ceres_cal.scene.targets import target_from_spec
-
-    try:
-        return {"board": target_from_spec(loads(wanted), "BOARD")}
-    except JSONDecodeError as error:
-        raise InputError(f"BOARD: no JSON: {error}") from None
-
-
 COMMANDS = (
     Command(
         "targets",
         "the kinds of targets and the names of their features",
         _add_arguments,
         _run,
-        ("", "ssl-b", "observations.json"),
+        ("", "vss-3 --picture vss-3.svg", "observations.json"),
     ),
     Command(
         "targets print",
@@ -98,6 +109,8 @@ def _targets(wanted: str) -> dict[str, Target]:
 
     if wanted in TARGET_KINDS:
         return TARGET_KINDS[wanted].examples()
+    if (spelled := spelled_target(wanted, "TARGET")) is not None:
+        return {spelled.kind: spelled}
     by_name = targets_by_name()
     if wanted in by_name:
         return {wanted: by_name[wanted]}

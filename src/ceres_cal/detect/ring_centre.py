@@ -8,6 +8,8 @@ import numpy as np
 from ceres_cal.base.arrays import Array, Array32
 from ceres_cal.base.errors import InputError
 
+_CLEAR = 12.0  # from black to white over the noise: rings have been found from 8 on
+
 
 def ring_centre(grey: Array32) -> Array:
     """Where the gradients' lines meet, (2,) px: by votes on a grid, then by least squares."""
@@ -29,6 +31,12 @@ def ring_centre(grey: Array32) -> Array:
         centre = centre + np.linalg.solve(weighted.T @ normal + 1e-9 * np.eye(2), weighted.T @ away)
     share = float(np.mean(np.abs(np.sum((places - centre) * normal, axis=1)) < 6.0))
     if share < 0.3:
+        contrast, noise = float(np.ptp(np.quantile(soft, (0.01, 0.99)))), 1.48 * float(np.median(np.abs(grey - soft)))
+        if contrast < _CLEAR * noise:
+            raise InputError(
+                f"no rings found: too dark, from black to white {contrast:.0f} grey levels in a noise of {noise:.1f}: "
+                "give more light, expose longer, or take the mean of several pictures"
+            )
         raise InputError(
             "no concentric rings found: edges point to no common centre: let the rings fill most of the picture"
         )

@@ -137,10 +137,10 @@ def _from_rows(rows: Sequence[Mapping[str, Any]], names: tuple[str, ...], option
             side = row.get("side") or "centre"
             if side not in SIDES:
                 raise InputError(f"line {number}: side {side!r} is unknown: {', '.join(SIDES)}")
-            curves.append((view, _index(target.curve_names, row["curve"], number), pixel, sigma, SIDES[side]))
+            curves.append((view, _index(target.curve_index, row["curve"], number), pixel, sigma, SIDES[side]))
         else:
             name = _place_name(places[number - 2]) if places else row.get("point") or ""
-            points.append((view, _index(target.point_names, name, number), pixel, sigma))
+            points.append((view, _index(target.point_index, name, number), pixel, sigma))
     points.sort(key=lambda one: one[0])
     curves.sort(key=lambda one: one[0])
     size = parse_size(options.image_size)
@@ -191,10 +191,10 @@ def _number(row: Mapping[str, Any], name: str, number: int) -> float:
     return value
 
 
-def _index(names: Sequence[str], name: str, number: int) -> int:
-    if name not in names:
+def _index(numbers: Mapping[str, int], name: str, number: int) -> int:
+    if name not in numbers:
         raise InputError(f"line {number}: there is no feature {name!r}: `ceres-cal targets` lists the names")
-    return names.index(name)
+    return numbers[name]
 
 
 # ---- what others keep beside their cameras --------------------------------------------------------------------------

@@ -48,16 +48,16 @@ def target_of(field: Mapping[str, Any]) -> Target:
     for name in ("field_length", "field_width", "goal_width"):
         if not isinstance(field.get(name), (int, float)):
             raise InputError(f"the field has no {name} in mm")
+    try:
+        curves = _curves(field)
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"a line or an arc of the field has something else than its numbers: {error}") from None
     by_rule = ssl_field("A" if field["field_length"] > _A_LENGTH_MM else "B")
     given = {ours: 1e-3 * float(field[name]) for name, ours in _SIZES.items() if field.get(name)}
     division = "A" if field["field_length"] > _A_LENGTH_MM else "B"
     nominal = ssl_field(division, **given)
     if nominal.curves == by_rule.curves and nominal.points == by_rule.points:
         nominal = by_rule
-    try:
-        curves = _curves(field)
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"a line or an arc of the field has something else than its numbers: {error}") from None
     if all(name in nominal.curves and _alike(curve, nominal.curves[name]) for name, curve in curves.items()):
         return nominal
     return custom({}, curves)
@@ -126,21 +126,7 @@ def _sizes_of(target: Target) -> dict[str, int]:
     """The sizes of a field of the league; none of another target."""
     if target.kind != "ssl-field":
         return {}
-    spec = {name: value for name, value in target.spec.items() if name not in ("kind", "division")}
-    x, y = target.points["TopRightCorner"][:2]
-    px, py = (abs(v) for v in target.points["LeftFieldRightPenaltyCorner"][:2])
-    circle = target.curves["CenterCircle"]
-    found = {
-        "field_length": 2.0 * x,
-        "field_width": 2.0 * y,
-        "penalty_area_depth": x - px,
-        "penalty_area_width": 2.0 * py,
-        "center_circle_radius": circle.radius_m if isinstance(circle, Arc) else 0.5,
-        "line_thickness": circle.width_m,
-        "goal_center_to_penalty_mark": x + target.points["RightPenaltyMark"][0],
-        "goal_width": spec.get("goal_width_m", 1.8 if target.spec.get("division") == "A" else 1.0),
-    }
-    return {name: round(1e3 * value) for name, value in found.items()}
+    return {theirs: round(1e3 * target.dimensions[ours]) for theirs, ours in _SIZES.items()}
 
 
 def _reach(curve: Curve) -> Any:

@@ -233,8 +233,8 @@ def _from_json(content: bytes, where: str) -> Content:
             )
     points = [(i, entry.points) for i, entry in enumerate(data.views) if entry.points is not None]
     curves = [(i, entry.curves) for i, entry in enumerate(data.views) if entry.curves is not None]
-    point_index = {name: {f: i for i, f in enumerate(target.point_names)} for name, target in targets.items()}
-    curve_index = {name: {f: i for i, f in enumerate(target.curve_names)} for name, target in targets.items()}
+    point_index = {name: target.point_index for name, target in targets.items()}
+    curve_index = {name: target.curve_index for name, target in targets.items()}
     sides = [_sides(entry, view_label(i, views)) for i, entry in curves]
     return replace(
         header,

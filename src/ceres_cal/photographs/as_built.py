@@ -8,12 +8,12 @@ dimensions that are others: a spike and slab prior (Mitchell and Beauchamp, JASA
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array
+from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.errors import SolutionError
 from ceres_cal.detect.lines import Lines
 from ceres_cal.model.equations import whole_structure, write_equations
@@ -153,7 +153,7 @@ class _Shape:
         moving = [int(d) for d in np.flatnonzero(np.any(self.moves != 0.0, axis=0))]
         roots = [_ASIDE_M * np.eye(len(self.owner))[:, self.owner == name] for name in curves]
         roots += [_OTHER * self.lengths[d] * self.moves[:, d : d + 1] for d in moving]
-        chosen, scatter_m = self._searched(np.array([root @ root.T for root in roots]))
+        chosen, scatter_m = self._searched(roots)
         mean, sd = self._amounts(np.hstack([np.empty((len(self.owner), 0)), *(roots[n] for n in chosen)]), scatter_m)
         aside, dimensions, sds, at = {}, {}, {}, 0
         for number in chosen:
@@ -172,31 +172,23 @@ class _Shape:
         drawn = {name.partition("/")[2]: float(length) for name, length in zip(self.names, self.lengths, strict=True)}
         return AsBuilt(aside, dimensions, sds, drawn, len(curves))
 
-    def _searched(self, parts: Array) -> tuple[list[int], float]:
-        """The best set of the parts (P, Q, Q) of a covariance, and the scatter of paint, m, beside it."""
+    def _searched(self, roots: Sequence[Array]) -> tuple[list[int], float]:
+        """The best set of the parts, each a root (Q, Z) of a covariance, and the scatter of paint, m, beside it."""
+        evidence_of = _Evidence.of(self.normal, self.slope, roots)
         beam: list[frozenset[int]] = [frozenset()]
         best, most, scatter_m = frozenset[int](), -np.inf, float(_SCATTER_M[0])
         for _ in range(_MOST + 1):
-            evidence = self._log_evidence(np.array([sum((parts[n] for n in one), 0.0 * self.normal) for one in beam]))
+            evidence = evidence_of.sets([sorted(one) for one in beam])
             score = evidence.max(axis=1) + _LOG_ODDS * len(beam[0])
             order = np.argsort(-score)
             if score[order[0]] > most:
                 best, most = beam[order[0]], float(score[order[0]])
                 scatter_m = float(_SCATTER_M[np.argmax(evidence[order[0]])])
             kept = [beam[row] for row in order[:_BEAM]]
-            beam = list({one | {n} for one in kept for n in range(len(parts)) if n not in one})
+            beam = list({one | {n} for one in kept for n in range(len(roots)) if n not in one})
             if not beam:
                 break
         return sorted(best), scatter_m
-
-    def _log_evidence(self, covariance: Array) -> Array:
-        """(K, S) of covariances (K, Q, Q) of the curves' numbers, with each scatter besides."""
-        one = np.eye(len(self.slope))
-        root = np.linalg.cholesky(covariance[:, None] + _SCATTER_M[:, None, None] ** 2 * one)
-        wider = one + np.swapaxes(root, 2, 3) @ self.normal @ root
-        right = np.swapaxes(root, 2, 3) @ self.slope
-        explained = np.sum(right * np.linalg.solve(wider, right[..., None])[..., 0], axis=-1)
-        return np.asarray(0.5 * explained - 0.5 * np.linalg.slogdet(wider)[1])
 
     def _amounts(self, root: Array, scatter_m: float) -> tuple[Array, Array]:
         """Posterior mean and sd (Z,) of what moves the curves by `root` (Q, Z), each of one beforehand."""
@@ -206,3 +198,41 @@ class _Shape:
         mixed = np.linalg.solve(covariance, root)
         posterior = np.eye(root.shape[1]) - root.T @ mixed + mixed.T @ taken @ mixed
         return -mixed.T @ taken @ self.slope, np.sqrt(np.maximum(np.diag(posterior), 0.0))
+
+
+@dataclass(frozen=True, eq=False)
+class _Evidence:
+    """Log evidence of sets of parts, from what is left of their columns once the scatter of paint is integrated out.
+
+    Attributes:
+        base: (S,) of no part, for each scatter. columns: (P, Z) which of the V columns below are a part's; those that
+            it lacks are the last one, which is 0. normal: (S, V, V). slope: (S, V).
+    """
+
+    base: Array
+    columns: Indices
+    normal: Array
+    slope: Array
+
+    @classmethod
+    def of(cls, normal: Array, slope: Array, roots: Sequence[Array]) -> _Evidence:
+        """Of normal equations (Q, Q) and (Q,) of the curves' numbers."""
+        sizes = [root.shape[1] for root in roots]
+        ends = np.cumsum([0, *sizes])
+        columns = np.full((len(roots), max(sizes, default=1)), ends[-1])
+        for number, size in enumerate(sizes):
+            columns[number, :size] = np.arange(ends[number], ends[number + 1])
+        every = np.hstack([*roots, np.zeros((len(slope), 1))])
+        wide = np.eye(len(slope)) + _SCATTER_M[:, None, None] ** 2 * normal
+        left = np.linalg.solve(wide, np.broadcast_to(normal, wide.shape))  # (N^-1 + s^2)^-1
+        right = np.linalg.solve(wide, np.broadcast_to(slope[:, None], (*wide.shape[:2], 1)))[..., 0]
+        base = 0.5 * _SCATTER_M**2 * (right @ slope) - 0.5 * np.linalg.slogdet(wide)[1]
+        return cls(base, columns, every.T @ left @ every, np.asarray(right @ every, dtype=float))
+
+    def sets(self, parts: Sequence[Sequence[int]]) -> Array:
+        """(K, S) of sets of parts, all of one size, with each scatter besides."""
+        columns = self.columns[np.array(parts, dtype=int)].reshape(len(parts), -1)
+        slope = self.slope[:, columns]
+        normal = self.normal[:, columns[:, :, None], columns[:, None, :]] + np.eye(columns.shape[1])
+        explained = np.sum(slope * np.linalg.solve(normal, slope[..., None])[..., 0], axis=-1)
+        return np.asarray((self.base[:, None] + 0.5 * explained - 0.5 * np.linalg.slogdet(normal)[1]).T)

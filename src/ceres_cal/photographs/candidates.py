@@ -35,7 +35,8 @@ _COMPARABLE, _ALIKE = 0.3, 0.9
 _MOST, _MOST_ALIKE = 4, 60
 # Where a candidate's lines are sought: px apart, and to either side as a share of half the image's diagonal; and how
 # bright, of the usual brightest, is paint. So many of any lines would be found there by chance.
-_SPACING_PX, _REACH, _CLEAR, _FEWEST, _BY_CHANCE = 8.0, 0.025, 0.4, 12, 0.3
+_SPACING_PX, _REACH, _CLEAR, _FEWEST = 8.0, 0.025, 0.4, 12
+BY_CHANCE = 0.3  # of the places on any lines, those that lie on paint
 # Share of a length that is not known by which it is drawn longer and shorter, too: a match is nearly as good up to half
 # of that beside it.
 _LENGTH_STEP = 0.06
@@ -108,7 +109,8 @@ def candidates(search: FieldSearch) -> list[tuple[Camera, Grid]]:
     """Cameras that may have taken it, the best first, each once for all turns of the target; and how it was drawn."""
     scored: list[tuple[float, Camera]] = []
     drawn: dict[int, Grid] = {}
-    for upright in find_upright(search.stroke_map.ends, search.stroke_map.strokes.length_px, _UPRIGHTS):
+    strokes = search.stroke_map.strokes
+    for upright in find_upright(search.stroke_map.ends, strokes.length_px, _UPRIGHTS, search.grid.least_share):
         optics = _optics(upright, search.stroke_map)
         seen = lines_seen(upright, search.stroke_map)
         for grid in (search.grid, *search.others):
@@ -135,8 +137,8 @@ def _on_lines(search: FieldSearch, camera: Camera) -> float:
     seen = bright > _CLEAR * float(np.quantile(bright, 0.8))
     places = np.bincount(course.curve)
     own = np.bincount(course.curve, seen) / np.maximum(places, 1)
-    share = max(float(np.mean(seen)), _BY_CHANCE)
-    return float(np.sum(places) * divergence(share, _BY_CHANCE) - np.sum(places * divergence(own, share)))
+    share = max(float(np.mean(seen)), BY_CHANCE)
+    return float(np.sum(places) * divergence(share, BY_CHANCE) - np.sum(places * divergence(own, share)))
 
 
 def alike(search: FieldSearch, camera: Camera, detected: Collection[str]) -> list[Camera]:

@@ -80,9 +80,9 @@ def starts_from_clicks(
         InputError: a point that the target does not have, or points of which three lie on a line.
     """
     for name in clicks.points:
-        if name not in target.points:
+        if name not in target.point_index:
             raise InputError(f"point {name!r} is not one of the target's: `ceres-cal targets` lists the names")
-    index = np.array([target.point_names.index(name) for name in clicks.points], dtype=np.int32)
+    index = np.array([target.point_index[name] for name in clicks.points], dtype=np.int32)
     pixels, plane = np.array(list(clicks.points.values()), dtype=float), target.point_array[index]
     middle = 0.5 * (np.array(image_size) - 1.0)
     half = 0.5 * float(np.hypot(*image_size))

@@ -31,6 +31,7 @@ _FACES = 0.3
 _AS_WELL = 0.2
 # By which an old calibration must be nearer to one turn than to the next: quarters are 90 degrees apart.
 _NEARER_DEG = 30.0
+_LONG = 0.4  # of the longest curve: one that people know by its name
 _MIDDLE = 0.02  # of the target's size: nearer to its middle a feature lies on no side
 
 
@@ -56,7 +57,7 @@ def require_sides(facings: Sequence[Facing], target: Target, curves: Collection[
     """Raise InputError for a feature that the target does not have, or that lies in its middle."""
     size, middle = size_of(target, curves), middle_of(target, curves)[:2]
     for one in facings:
-        if one.feature not in target.points and one.feature not in target.curves:
+        if one.feature not in target.point_index and one.feature not in target.curves:
             raise InputError(
                 f"facing {one.feature}={one.side}: the target has no line, arc or point {one.feature!r}: "
                 "`ceres-cal targets` lists the names"
@@ -102,12 +103,14 @@ def side_of(feature: str, camera: Camera, target: Target, curves: Collection[str
 
 
 def distinguishing_feature(target: Target, curves: Collection[str]) -> str:
-    """The painted curve whose middle lies farthest from the target's: to say by it which way round the target is."""
+    """The long painted curve whose middle lies farthest from the target's: to say by it which way round it is."""
     middle = middle_of(target, curves)[:2]
-    return max(curves, key=lambda name: round(float(np.linalg.norm(_place(name, target) - middle)), 6))
+    longest = max(target.curves[name].length_m for name in curves)
+    long = [name for name in curves if target.curves[name].length_m >= _LONG * longest]  # no marks in corners
+    return max(long, key=lambda name: round(float(np.linalg.norm(_place(name, target) - middle)), 6))
 
 
 def _place(feature: str, target: Target) -> Array:
-    if feature in target.points:
-        return np.array(target.points[feature][:2])
+    if feature in target.point_index:
+        return np.asarray(target.point_array[target.point_index[feature], :2])
     return np.asarray(curve_points(target.curves[feature], 0, 2)[1, :2])

@@ -19,7 +19,7 @@ from ceres_cal.observations import NO_POINTS, Curves, Observations, Points, Prio
 from ceres_cal.photographs.clicks import Clicks, starts_from_clicks
 from ceres_cal.photographs.follow import Followed, FreeIntrinsics, follow
 from ceres_cal.photographs.judgement import why_missed
-from ceres_cal.photographs.search import Auto, SearchResult, search
+from ceres_cal.photographs.search import Auto, SearchResult, SeveralWaysError, search
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.targets import Target
 from ceres_cal.solve.dimensions import drawn_as_stated
@@ -166,7 +166,12 @@ def _looked_for(
     lengths = _tracked(options.lengths)
     if isinstance(start, Auto):
         with naming(path):
-            return search(grey, target, painted, replace(start, lengths=lengths))
+            try:
+                return search(grey, target, painted, replace(start, lengths=lengths))
+            except SeveralWaysError as error:
+                if options.refused is not None:
+                    options.refused(path, SearchResult(None, str(error), seen=error.seen))
+                raise
     target = start.target if isinstance(start, Followed) else target
     starts, free = _starts(start, target, (int(grey.shape[1]), int(grey.shape[0])), (path, lengths))
     followed = follow(grey, target, starts, painted, replace(free, keep=options.keep_start))

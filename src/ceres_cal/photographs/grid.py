@@ -16,6 +16,7 @@ from ceres_cal.scene.targets import Target
 _AXIS = 1e-6  # sine of the angle to the main direction of a line that is parallel to it
 _DIGITS = 6  # of metres, after which two offsets are one
 _OUTLINE = 300
+_SHORT = 0.015  # of the length of all straight lines: what is shorter is no line to find the target by
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,6 +35,13 @@ class Grid:
     turn: Array
     along: Array
     across: Array
+
+    @property
+    def least_share(self) -> float:
+        """Of the length of all painted curves, that of the straight lines in the direction that has fewer."""
+        lines = _segments(self.target, self.curves)
+        along = [sum(one.length_m for one in lines if abs(_way(one) @ self.turn[:, axis]) < _AXIS) for axis in (0, 1)]
+        return min(along) / sum(self.target.curves[name].length_m for name in self.curves)
 
     @property
     def outline(self) -> Array:
@@ -101,14 +109,24 @@ def _way(line: Segment) -> Array:
 
 
 def _offsets(lines: Sequence[Segment], turn: Array, axis: int) -> Array:
-    """The grid coordinates x (axis 0) or y that lines keep, of those that keep it."""
-    kept = [line.start[:2] @ turn[:, axis] for line in lines if abs(_way(line) @ turn[:, axis]) < _AXIS]
-    return np.unique(np.round(kept, _DIGITS))
+    """The grid coordinates x (axis 0) or y that lines keep, of those that keep it and are long enough to be seen."""
+    kept = [line for line in lines if abs(_way(line) @ turn[:, axis]) < _AXIS]
+    offsets, which = np.unique(
+        np.round([line.start[:2] @ turn[:, axis] for line in kept], _DIGITS), return_inverse=True
+    )
+    lengths = np.bincount(which, [line.length_m for line in kept], len(offsets))
+    return np.asarray(offsets[lengths > _SHORT * sum(line.length_m for line in lines)])
 
 
-def _tangents(target: Target, curves: Collection[str], turn: Array) -> Array:
-    """(2, T) grid coordinates x and y of the lines across and along that touch the painted arcs."""
+def _tangents(target: Target, curves: Collection[str], turn: Array) -> tuple[Array, ...]:
+    """Grid coordinates, first x, then y, of the lines across and along that touch the painted arcs."""
     arcs = [c for name, c in target.curves.items() if name in curves and isinstance(c, Arc)]
-    centres = np.array([arc.centre[:2] for arc in arcs]).reshape(-1, 2) @ turn
-    radii = np.array([[arc.radius_m] for arc in arcs]).reshape(-1, 1)
-    return np.asarray(np.round(np.concatenate([centres - radii, centres + radii]).T, _DIGITS))
+    return tuple(np.round([p for arc in arcs for p in _touched(arc, turn[:, axis])], _DIGITS) for axis in (0, 1))
+
+
+def _touched(arc: Arc, way: Array) -> list[float]:
+    """Offsets along `way` (2,) of the lines across it that touch an arc somewhere along it."""
+    angles = np.arctan2(way[1], way[0]) + np.array([0.0, np.pi])
+    within = np.mod(angles - arc.from_rad, 2.0 * np.pi) < arc.to_rad - arc.from_rad
+    offsets = way @ arc.centre[:2] + arc.radius_m * np.array([1.0, -1.0])
+    return [float(one) for one in offsets[within]]

@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 
 from ceres_cal.detect.courses import predict
-from ceres_cal.photographs.candidates import FieldSearch
+from ceres_cal.photographs.candidates import BY_CHANCE, FieldSearch
 from ceres_cal.photographs.follow import LEAST_SHARE, Followed
+from ceres_cal.photographs.matching import divergence
 from ceres_cal.scene.targets import Target
 from ceres_cal.start.initialise import PHI_RANGE
 
@@ -73,11 +74,14 @@ def objection(search: FieldSearch, followed: Followed) -> str:
     return ""
 
 
-def likelihood(search: FieldSearch, followed: Followed) -> float:
-    """How much likelier the target is where it was followed than lines laid anywhere: see `StrokeMap.likelihood`."""
-    course = predict(followed.target, followed.camera, search.curves, _COURSE_PX)
-    near = search.stroke_map.near.at(*course.pixels.T)
-    return float(search.stroke_map.likelihood(np.array(_COURSE_PX * np.sum(near)), np.array(_COURSE_PX * len(course))))
+def likelihood(followed: Followed) -> float:
+    """How much likelier the paint that was found is of the target there than of lines laid anywhere.
+
+    The log-likelihood ratio of so many places with paint: a grid that is moved by a line has fewer of them.
+    """
+    found = followed.lines.found
+    share = float(np.mean(found)) if len(found) else 0.0
+    return float(len(found) * divergence(max(share, BY_CHANCE), BY_CHANCE))
 
 
 def explained(search: FieldSearch, followed: Followed, *, everywhere: bool = False) -> float:

@@ -27,6 +27,8 @@ _MOST_PEAKS, _LEAST_PEAK = 9, 0.015  # of lines in one direction; of all strokes
 _PARALLEL = 0.15
 # Within which two hypotheses are one, in camera heights.
 _CELL = 0.03
+# Choices of two lines one way, at least, that are tried with each one across: it only saves time.
+_PAIRS = 120
 _FEW, _MANY = 60, 300  # places on the target at which all, and the best, are tried
 _KEPT = 800
 _TELLS_PX = 40.0  # of a line, as much as one place on it tells
@@ -171,7 +173,19 @@ def _pairs(peaks: Array, lines: Array) -> tuple[Array, Array]:
     i, j = np.triu_indices(len(peaks), 1)
     a, b = np.triu_indices(len(lines), 1)
     height = (lines[b] - lines[a])[None] / (peaks[j] - peaks[i])[:, None]
-    return height.ravel(), (lines[a][None] - height * peaks[i][:, None]).ravel()
+    place = lines[a][None] - height * peaks[i][:, None]
+    return _telling(height.ravel(), place.ravel(), peaks, lines)
+
+
+def _telling(height: Array, place: Array, peaks: Array, lines: Array) -> tuple[Array, Array]:
+    """Those that put most of the lines seen on lines of the grid; where many are as good, all of them."""
+    if len(height) <= _PAIRS:
+        return height, place
+    where = (lines - place[:, None]) / height[:, None]
+    near = np.min(np.abs(where[:, None] - peaks[:, None]), axis=2) < 2.0 * _PEAK
+    count = np.count_nonzero(near, axis=1)
+    kept = count >= np.sort(count)[-_PAIRS]
+    return height[kept], place[kept]
 
 
 def _crossed(height: Array, place: Array, peaks: Array, lines: Array) -> Array:

@@ -54,6 +54,14 @@ class Auto:
     lengths: tuple[Prior, ...] = ()
 
 
+class SeveralWaysError(InputError):
+    """The field is found, but what is known does not say which way round, or contradicts all ways; `seen` is one."""
+
+    def __init__(self, message: str, seen: Followed) -> None:
+        super().__init__(message)
+        self.seen = seen
+
+
 @dataclass(frozen=True, eq=False)
 class SearchResult:
     """What came of looking for the field.
@@ -81,8 +89,8 @@ def search(grey: Array32, target: Target, curves: Collection[str], auto: Auto) -
     image looks like another one's: it cannot be told, and is not.
 
     Raises:
-        InputError: the photograph can be taken for the field in several ways, and nothing says which; the target has
-            too few straight lines; or nothing that `auto.facing` names.
+        SeveralWaysError: the photograph can be taken for the field in several ways, and nothing says which.
+        InputError: the target has too few straight lines, or nothing that `auto.facing` names.
     """
     require_sides(auto.facing, target, curves)
     problem = prepare_search(grey, target, curves, auto.lengths)
@@ -100,13 +108,13 @@ def search(grey: Array32, target: Target, curves: Collection[str], auto: Auto) -
             break
     if not good:
         return SearchResult(None, reason, seen=seen)
-    best = max(good, key=lambda one: likelihood(problem, one))
+    best = max(good, key=likelihood)
     problem = replace(problem, grid=grid_of(best.target, curves))
     similar = alike(problem, best.camera, detected_curves(problem, best))
     others = [_followed(problem, auto, _turned(problem, auto, camera)) for camera in similar]
     distinct = [best]
     for other in (*good, *(one for one in others if not objection(problem, one))):
-        as_good = likelihood(problem, other) >= _AS_GOOD * likelihood(problem, best)
+        as_good = likelihood(other) >= _AS_GOOD * likelihood(best)
         if as_good and not any(same_labels(problem, other, one) for one in distinct):
             distinct.append(other)
     return _one_way(problem, auto, distinct)
@@ -136,7 +144,7 @@ def _free(target: Target, auto: Auto, camera: Camera) -> FreeIntrinsics:
 
 
 def _one_way(problem: FieldSearch, auto: Auto, distinct: Sequence[Followed]) -> SearchResult:
-    """The one way that agrees with what is known; InputError where none does, or several."""
+    """The one way that agrees with what is known; SeveralWaysError where none does, or several."""
     target, curves = problem.target, problem.curves
     ways = [one.camera.at(one.camera.cam_from_world @ turn) for one in distinct for turn in problem.turns]
     agreeing = _consistent(problem, auto, ways)
@@ -147,11 +155,12 @@ def _one_way(problem: FieldSearch, auto: Auto, distinct: Sequence[Followed]) -> 
         return SearchResult(None, against, seen=followed)
     if not agreeing:
         given = ", ".join(f"{one.feature}={one.side}" for one in auto.facing)
-        raise InputError(f"not with {given}: in this photograph {_sides(ways, target, curves)}")
+        raise SeveralWaysError(f"not with {given}: in this photograph {_sides(ways, target, curves)}", followed)
     if len(agreeing) > 1:
-        raise InputError(
+        raise SeveralWaysError(
             f"the field is found, but it looks alike in {len(agreeing)} ways: "
-            f"{_sides([ways[number] for number in agreeing], target, curves)}"
+            f"{_sides([ways[number] for number in agreeing], target, curves)}",
+            followed,
         )
     chosen_by = "" if len(ways) == 1 else "facing" if auto.facing else "before"
     return SearchResult(followed, "", len(ways), chosen_by)

@@ -31,8 +31,9 @@ _RINGS_DEG = ((0.0, 1), (11.0, 6), (22.0, 12), (33.0, 16), (44.0, 20), (54.0, 24
 _ROLL_DEG = 5.0
 _ROUGH, _FINE = 0.06, 0.015  # sine of the angle by which a stroke may be off
 _ROUNDS = 12
-# Of the strokes, in the direction that has fewer: a floor needs both. Nothing changes from half to double.
-_LEAST_SHARE = 0.06
+# Of the strokes, in the direction that has fewer: a floor needs both. Nothing changes from half to double. And of what
+# the target has there: fields without touch lines have little.
+_LEAST_SHARE, _LEAST_OF_OWN = 0.06, 0.3
 _DOWN = np.diag([1.0, -1.0, -1.0])
 _FROM_EACH, _REFINED = 2, 14  # of each lens and focal length, and of all
 # Of two answers' uprights, rad: nearer ones count as one. Nothing changes from half to double.
@@ -75,20 +76,25 @@ class Upright:
             return np.asarray(2.0 * ideal / (1.0 + root))
 
 
-def find_upright(ends: Array, weights: Array, most: int) -> list[Upright]:
-    """The best answers for strokes with these ends (N, 2, 2), in half image diagonals from the middle, best first."""
+def find_upright(ends: Array, weights: Array, most: int, own_share: float = 1.0) -> list[Upright]:
+    """The best answers for strokes with these ends (N, 2, 2), in half image diagonals from the middle, best first.
+
+    Args:
+        own_share: of the target's lines, those in the direction that has fewer.
+    """
+    least = min(_LEAST_SHARE, _LEAST_OF_OWN * own_share)
     scored: list[tuple[float, Upright]] = []
     rotations = _rotations()
     lean = _PRIOR_WEIGHT * (np.arccos(np.clip(-rotations[:, 2, 2], -1.0, 1.0)) / _USUAL_TILT) ** 2
     for bend in BENDS:
         for phi in PHIS:
             optics = Upright(bend, phi, _DOWN, 0.0)
-            value = _score(_normals(optics, ends), weights, rotations, _ROUGH) - lean
+            value = _score(_normals(optics, ends), weights, rotations, _ROUGH, least) - lean
             for best in np.argsort(-value)[:_FROM_EACH]:
                 turned = replace(optics, rotation=rotations[best].astype(float))
                 scored.append((float(value[best]) - _penalty(optics), turned))
     scored.sort(key=lambda one: -one[0])
-    refined = [_refined(one, ends, weights) for _, one in scored[:_REFINED]]
+    refined = [_refined(one, ends, weights, least) for _, one in scored[:_REFINED]]
     refined.sort(key=lambda one: -(one.share - _penalty(one)))
     chosen: list[Upright] = []
     for one in refined:
@@ -114,14 +120,14 @@ def _normals(optics: Upright, ends: Array) -> Array:
     return np.asarray(normal / np.linalg.norm(normal, axis=1, keepdims=True))
 
 
-def _score(normals: Array, weights: Array, rotations: Array, tolerance: float) -> Array:
+def _score(normals: Array, weights: Array, rotations: Array, tolerance: float, least: float) -> Array:
     """(B,) share of the strokes that run along x or y, none where hardly any runs along one of them."""
     single = np.float32  # twice as fast, and good enough for a share
     off = np.matmul(normals.astype(single), rotations[:, :, :2].astype(single)) / single(tolerance)
     along, weight = np.exp(-(off**2)), (weights / weights.sum()).astype(single)  # (B, N, 2), (N,)
     shares = np.einsum("bnk,n->bk", along, weight)
     both = np.einsum("bn,n->b", along.max(axis=2), weight)
-    return np.asarray(np.where(shares.min(axis=1) > _LEAST_SHARE, both, 0.0))
+    return np.asarray(np.where(shares.min(axis=1) > least, both, 0.0))
 
 
 def _penalty(optics: Upright) -> float:
@@ -139,7 +145,7 @@ def _moved(one: Upright, step: Array) -> Upright:
     )
 
 
-def _refined(one: Upright, ends: Array, weights: Array) -> Upright:
+def _refined(one: Upright, ends: Array, weights: Array, least: float) -> Upright:
     """Gauss-Newton on turn, bend and log phi, robust and ever finer."""
     step_sizes = 1e-5 * np.eye(5)
     for tolerance in np.geomspace(_ROUGH, _FINE, _ROUNDS):
@@ -152,7 +158,7 @@ def _refined(one: Upright, ends: Array, weights: Array) -> Upright:
         step = np.linalg.solve(normal, -(columns * weight) @ base - prior @ off)
         one = _moved(one, np.clip(step, -0.1, 0.1))
     normals = _normals(one, ends)
-    return replace(one, share=float(_score(normals, weights, one.rotation[None], 2.0 * _FINE)[0]))
+    return replace(one, share=float(_score(normals, weights, one.rotation[None], 2.0 * _FINE, least)[0]))
 
 
 def _deviation(one: Upright, ends: Array, which: Array | None) -> tuple[Array, Array]:

@@ -20,7 +20,6 @@ from ceres_cal.simulate.things import Ball, Robot, Shadow, Thing, outline, patch
 Stretches = Mapping[str, tuple[tuple[float, float], ...]]
 """Curve -> (from, to) m along it."""
 
-_CARPET_COLOUR = (0.55, 1.25, 0.65)  # blue, green and red, times the carpet's brightness: a green one
 _TRACE_PX = 0.25  # how finely curves are followed for what hides them
 _PENUMBRA_PX = 12.0
 _LIGHT_STEP = 8  # light changes slowly: it is drawn at an eighth of the size
@@ -187,11 +186,11 @@ def _reflected(
     sheet = _blurred(paper.astype(np.float32), how.blur_px) if paper.any() else np.float32(0.0)
     floor = np.maximum(1.0 - sheet - hidden - np.where(sheet > 0.0, np.float32(0.0), paint), 0.0)
     carpet = _carpet(paint.shape, how, rng) * floor
-    bright = paint * np.where(sheet > 0.5, np.float32(1.0), np.float32(how.paint))
     things = _blurred(render.averaged(colours) / 255.0, how.blur_px) if cover.any() else None
     channels = []
-    for channel, share in enumerate(_CARPET_COLOUR):
-        plane = bright + carpet * np.float32(share)
+    for channel, (share, painted) in enumerate(zip(how.carpet_colour, how.paint_colour, strict=True)):
+        bright = np.where(sheet > 0.5, np.float32(1.0), np.float32(how.paint * painted))
+        plane = paint * bright + carpet * np.float32(share)
         channels.append(plane if things is None else plane + things[..., channel])
     return np.asarray(np.dstack(channels), dtype=np.float32)
 

@@ -23,6 +23,7 @@ class Photography:
         robots: number of robots on the field, balls: number of balls; both hide what is behind them.
         wear: share of the paint that is worn off.
         carpet: brightness of the carpet, paint: of paint and paper, as shares of white.
+        carpet_colour, paint_colour: blue, green and red of each, times its brightness.
         carpet_texture: standard deviation of the carpet's brightness, as a share of it.
         exposure: grey level of white in full light.
         read_noise: standard deviation of the sensor's noise in the dark, grey levels.
@@ -43,6 +44,8 @@ class Photography:
     wear: float = 0.0
     carpet: float = 0.2
     paint: float = 0.85
+    carpet_colour: tuple[float, float, float] = (0.55, 1.25, 0.65)  # a green one
+    paint_colour: tuple[float, float, float] = (1.0, 1.0, 1.0)
     carpet_texture: float = 0.05
     exposure: float = 230.0
     read_noise: float = 1.0
@@ -51,7 +54,7 @@ class Photography:
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
-            if not (np.isfinite(value) and value >= 0.0):
+            if not np.all(np.isfinite(value) & np.greater_equal(value, 0.0)):
                 raise InputError(f"photography: {name} must be a number from 0 on, not {value}")
         for name in ("vignetting", "unevenness", "shadow_depth", "wear", "carpet", "paint"):
             if getattr(self, name) > 1.0:

@@ -258,5 +258,9 @@ class _Normals:
         """
         normals = np.empty((last - first, self._size, self._size))
         if not kernels.sight_normals(first, last, *self._arguments, normals):
-            raise SolutionError("an observation cannot be projected where the solve ended: no uncertainty can be given")
+            raise SolutionError(
+                "an observation cannot be projected where the solve ended: no uncertainty can be given: choose another "
+                "lens (for wide ones kannala-brandt or spline), free what is held of this one, or leave out what lies "
+                "nearest to the image's corners"
+            )
         return normals if self._chain is None else self._chain.T @ normals @ self._chain

@@ -8,12 +8,14 @@ from ceres_cal.scene.targets.april_grids import april_grid as april_grid
 from ceres_cal.scene.targets.checkerboards import checkerboard as checkerboard
 from ceres_cal.scene.targets.circle_grids import circle_grid as circle_grid
 from ceres_cal.scene.targets.custom_targets import custom as custom
+from ceres_cal.scene.targets.painted_fields import painted_field as painted_field
+from ceres_cal.scene.targets.painted_fields import ssl_field as ssl_field
 from ceres_cal.scene.targets.registry import TARGET_KINDS as TARGET_KINDS
 from ceres_cal.scene.targets.registry import target_from_spec as target_from_spec
 from ceres_cal.scene.targets.registry import targets_by_name as targets_by_name
 from ceres_cal.scene.targets.registry import targets_from_specs as targets_from_specs
 from ceres_cal.scene.targets.ring_sheets import rings as rings
-from ceres_cal.scene.targets.ssl_fields import ssl_field as ssl_field
+from ceres_cal.scene.targets.tape_grids import tape_grid as tape_grid
 from ceres_cal.scene.targets.target import Grid as Grid
 from ceres_cal.scene.targets.target import Target as Target
 from ceres_cal.scene.targets.target import TargetKind as TargetKind

@@ -11,6 +11,7 @@ import numpy as np
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import convert
 from ceres_cal.scene.curves import Arc, Curve, Segment, xyz
+from ceres_cal.scene.targets.crossings import with_crossings
 from ceres_cal.scene.targets.target import Target, TargetKind
 
 
@@ -24,7 +25,7 @@ class _Spec(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True):
 def custom(
     points: Mapping[str, tuple[float, float, float]] | None = None, curves: Mapping[str, Curve] | None = None
 ) -> Target:
-    """A target given in full.
+    """A target given in full; where its curves cross, there are points besides, such as "edge*circle".
 
     Raises:
         InputError: no features at all, a number that is not finite, a curve without length, or paint that covers the
@@ -45,7 +46,8 @@ def custom(
     segments = {name: curve for name, curve in curves.items() if isinstance(curve, Segment)}
     arcs = {name: curve for name, curve in curves.items() if isinstance(curve, Arc)}
     spec = msgspec.to_builtins(_Spec("custom", points, segments, arcs))
-    return Target(spec, points, {**segments, **arcs})  # in the order in which a file would give them back
+    curves = {**segments, **arcs}  # in the order in which a file would give them back
+    return Target(spec, with_crossings(points, curves), curves)
 
 
 def _from_spec(spec: dict[str, Any], where: str) -> Target:
@@ -64,7 +66,7 @@ KIND = TargetKind(
     "custom",
     "anything flat or not, given in full",
     "points (name: x, y, z), segments (from, to, width_m), arcs (centre, radius_m, from_rad, to_rad, width_m)",
-    "as named there",
+    'as named there, and points "A*B" where curves A and B cross ("A*B#1" and "A*B#2" where they do so twice)',
     _example,
     _from_spec,
 )

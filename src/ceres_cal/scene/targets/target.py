@@ -11,7 +11,8 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.errors import InputError
-from ceres_cal.scene.curves import Arc, Curve
+from ceres_cal.scene.curves import Arc, Curve, along_curve
+from ceres_cal.scene.targets.crossings import aliases
 from ceres_cal.scene.targets.paper import Paper
 
 MOST_FEATURES = 100_000
@@ -88,8 +89,19 @@ class Target:
         return tuple(self.points)
 
     @cached_property
+    def point_index(self) -> Mapping[str, int]:
+        """The number of each point, by its name and by those of the crossing that lies there: see `crossings`."""
+        index = {name: number for number, name in enumerate(self.points)}
+        return index | {alias: index[name] for alias, name in aliases(self.points, self.curves).items()}
+
+    @cached_property
     def curve_names(self) -> tuple[str, ...]:
         return tuple(self.curves)
+
+    @cached_property
+    def curve_index(self) -> Mapping[str, int]:
+        """The number of each curve, by its name."""
+        return {name: number for number, name in enumerate(self.curves)}
 
     @cached_property
     def point_array(self) -> Array:
@@ -111,13 +123,16 @@ class Target:
     @cached_property
     def box(self) -> Array:
         """(2, 2) m, the lowest and the highest x and y of its points and curves."""
-        reach = [self.point_array[:, :2]]
-        for track, is_arc in zip(self.tracks[0], self.is_arc, strict=True):
-            middle, along = track[0, :2], track[1, :2]
-            size = np.linalg.norm(along)
-            reach.append(np.array([middle - size, middle + size] if is_arc else [middle, middle + along]))
-        every = np.concatenate(reach)
+        reach = [along_curve(curve, _farthest(curve))[:, :2] for curve in self.curves.values()]
+        every = np.concatenate([self.point_array[:, :2], *reach])
         return np.array([every.min(axis=0), every.max(axis=0)])
+
+
+def _farthest(curve: Curve) -> Array:
+    """Parameters of a curve's ends, and of where an arc runs along x or y."""
+    low, high = curve.parameter_range
+    turns = 0.5 * np.pi * np.arange(np.ceil(low / (0.5 * np.pi)), high / (0.5 * np.pi))
+    return np.array([low, *(turns if isinstance(curve, Arc) else ()), high])
 
 
 @dataclass(frozen=True)
