@@ -128,7 +128,7 @@ def cross_validate(
         else:
             errors[part & kept] = found
     kept = kept & np.isfinite(errors[:, 0])
-    fit_px = _errors(observations, kept, whole.estimate)[kept, 0]
+    fit_px = _errors(whole.drawn_alike(observations), kept, whole.estimate)[kept, 0]
     squares, counts = np.zeros(len(names)), np.zeros(len(names))
     np.add.at(squares, frame[kept], (errors[kept, 0] / column_of(observations, "sigma_px")[kept]) ** 2)
     np.add.at(counts, frame[kept], 1.0)
@@ -228,7 +228,7 @@ def _part(observations: Observations, rows: Mask) -> Observations:
 
 def _predicted(observations: Observations, held: Mask, trained: Calibration, whole: Calibration) -> Array:
     """Errors (N + M, 2), px and mm, of held-out observations under a calibration that did not see them."""
-    estimate = trained.estimate
+    estimate, observations = trained.estimate, trained.drawn_alike(observations)
     sights = gather_sights(observations).used(*np.split(held, [len(observations.points)]))
     new = {key.placement for key in sights.keys if key.placement is not None} - set(estimate.placements)
     missing = {key.station for key in sights.keys} - set(estimate.stations)

@@ -168,9 +168,16 @@ def _angles_deg(rotation: Array) -> Array:
 
 def _as_built(material: Material) -> Iterator[Piece]:
     structure = material.calibration.estimate.structure
-    if not len(structure.names):
+    lengths = [(name, *name.partition("/")[::2], length) for name, length in structure.dimensions.items()]
+    solved = tuple(
+        _row(name, length, "m", material.verdicts.get(("dimension", target, one)))
+        for name, target, one, length in lengths
+    )
+    if solved:
+        yield Table(_HEAD, solved, "Dimensions that were solved for", stacked=True)
+    if not structure.own:
         return
-    order = np.argsort(-np.abs(structure.values), kind="stable")[:_MOST_OFFSETS]
+    order = np.argsort(-np.abs(structure.values[: structure.own]), kind="stable")[:_MOST_OFFSETS]
     rows = []
     for i in order:
         target, _, feature = structure.names[i].partition("/")
@@ -178,7 +185,7 @@ def _as_built(material: Material) -> Iterator[Piece]:
         sd = 1e3 * verdict.sd if verdict is not None else np.nan
         rows.append((structure.names[i], f"{1e3 * structure.values[i]:+.2f} mm", f"{short(sd)} mm",
                      f"{short(1e3 * float(structure.sigma_m[i]))} mm"))  # fmt: skip
-    rest = len(structure.names) - len(order)
+    rest = structure.own - len(order)
     yield from (Text(f"{sentence(words)}.") for words in words_of(material.calibration.as_built))
     yield Table(("", "off its drawing", "± sd", "tolerance"), tuple(rows), "Targets as built", stacked=True)
     if rest:

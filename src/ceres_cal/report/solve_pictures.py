@@ -81,7 +81,7 @@ def label(key: Key, others: Sequence[Key]) -> str:
     """A number's name, with its owner where several have one of that name."""
     same = {other.owner for other in others if (other.kind, other.quantity) == (key.kind, key.quantity)}
     name = key.quantity.replace("_", " ")
-    whole = f"{name} {key.owner}" if len(same) > 1 or key.kind in ("placement", "structure") else name
+    whole = f"{name} {key.owner}" if len(same) > 1 or key.kind in ("placement", "structure", "dimension") else name
     return whole if len(whole) <= 22 else f"{whole[:21]}…"
 
 
