@@ -17,7 +17,7 @@ from ceres_cal.report.canvas import INK, OUTLIER, QUIET, Drawing, Hover
 from ceres_cal.report.grounds import worst_radius
 from ceres_cal.report.material import Material, image_border, paint_of
 from ceres_cal.report.page import Figure, Table
-from ceres_cal.report.scale import COLORS, MM, ON_COLOR, PX, Scale, spoken
+from ceres_cal.report.scale import COLORS, MM, PX, Scale, spoken
 from ceres_cal.scene.heights import at_height
 from ceres_cal.uncertainty import FieldMap, image_grid
 
@@ -65,7 +65,7 @@ class MapDrawing:
             axes.plot(*line.T, color="white", linewidth=1.8, alpha=0.8)
             axes.plot(*line.T, color=QUIET, linewidth=0.6)
         if self.observed is not None:
-            canvas.dots(axes, self.observed, ON_COLOR, _DOT, alpha=_DOT_ALPHA)
+            canvas.dots(axes, self.observed, MM.ink(self.values), _DOT, alpha=_DOT_ALPHA)
         axes.plot(*self.border.T, color=QUIET, linewidth=0.8, dashes=(3, 2))
         axes.plot(*self.camera[:2], "^", color=INK, markersize=4, markeredgecolor="white", markeredgewidth=0.6)
         if self.worst_m is not None:
@@ -90,8 +90,8 @@ def fill(axes: Axes, scale: Scale, grid: tuple[Array, Array], values: Array) -> 
     if np.isfinite(known).any():
         levels = levels_of(known)
         few = levels[1 :: -(-len(levels) // _MOST_LINES)]
-        lines = axes.contour(*grid, known, few, colors=ON_COLOR, linewidths=0.4)
-        for text in axes.clabel(lines, fmt=short, fontsize=6.5, colors=ON_COLOR):
+        lines = axes.contour(*grid, known, few, colors=[scale.ink(level) for level in few], linewidths=0.4)
+        for text in axes.clabel(lines, fmt=short, fontsize=6.5, colors=scale.ink(0.0)):
             text.set_bbox({"facecolor": COLORS[0], "edgecolor": "none", "pad": 0.6, "alpha": 0.75})
 
 
@@ -202,7 +202,7 @@ class _OverImage:
         """The map with the observations on top."""
         width, height = self.image_size
         fill(axes, self.scale, (self.x, self.y), self.radii)
-        canvas.dots(axes, self.observed, ON_COLOR, _DOT, alpha=_DOT_ALPHA)
+        canvas.dots(axes, self.observed, self.scale.ink(self.radii), _DOT, alpha=_DOT_ALPHA)
         axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), aspect="equal", xlabel="px")
         axes.grid(visible=False)
         self.scale.bar(axes, f"95 % within, {self.scale.unit}")
