@@ -170,13 +170,15 @@ def test_from_a_photograph(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     corners = [word for name, (x, y) in zip(names, clicked, strict=True) for word in ("--corner", f"{name}={x},{y}")]
     asked = ["detect", "field", path, "--target", "ssl-b", *corners, "-o", observed]
     assert main(asked) == 2 and "--estimate" in capsys.readouterr().err  # says what would help
+    assert main([*asked, "--estimate", "mark"]) == 2
+    assert "no painted line lies elsewhere with another goal_center_to_penalty_mark_m" in capsys.readouterr().err
     assert main([*asked, "--estimate", "length,width"]) == 0
+    assert "lengths, roughly, for `calibrate` to solve for: field_length_m 8.2" in capsys.readouterr().out
     priors = json.loads(Path(observed).read_text())["priors"]
     assert [prior["sigma_m"] for prior in priors] == [None, None]
-    capsys.readouterr()
     assert main(["calibrate", observed, "-o", out, "--lens", "radial", "--report", str(tmp_path / "report.html")]) == 0
     printed = capsys.readouterr().out
-    assert "lengths   field_length_m" in printed and "(field, solved for)" in printed
+    assert "lengths   field/field_length_m" in printed and "mm (solved for)" in printed
     dimensions = Calibration.load(out).targets["field"].dimensions
     for name, true in TRUE.items():
         assert abs(dimensions[name] - true) < 0.003  # 0.5 mm
