@@ -18,6 +18,8 @@ from ceres_cal.calibration import Calibration
 from ceres_cal.cli import main
 from ceres_cal.cli.estimate import parse_estimates
 from ceres_cal.diagnostics import diagnose
+from ceres_cal.lens_choice.forms import PAPER
+from ceres_cal.lens_choice.rule import AS_GOOD_BESIDE_LENGTHS, decide, standard_errors
 from ceres_cal.model.parameters import Options
 from ceres_cal.model.structure import Tolerance
 from ceres_cal.moves import check, refit
@@ -125,6 +127,15 @@ def test_beside_tolerances_and_boards() -> None:
     assert structure.own == 65 == len(structure.offsets) and len(structure.values) == 67
     known = calibration.uncertainty.verdict("dimension", "field", "field_length_m")
     assert known.low < 8.28 < known.high and 0.002 < known.sd < 0.02  # 5 mm: its lines may lie aside
+
+
+def test_no_lens_that_is_too_simple_beside_lengths() -> None:
+    rng = np.random.default_rng(0)
+    best = rng.uniform(0.9, 1.1, 50)
+    worse = best + rng.normal(0.01, 0.07, 50)  # by one standard error
+    tried = ([PAPER, "brown k1 k2"], [2, 3], [worse, best])
+    assert 0.5 < standard_errors(worse, best) < 1.5
+    assert decide(*tried) == (1, 0) and decide(*tried, AS_GOOD_BESIDE_LENGTHS) == (1, 1)
 
 
 def test_what_is_typed() -> None:
