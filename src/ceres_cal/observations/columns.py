@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import math
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import TypeVar
+from pathlib import Path
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Codes, Indices, Indices32, Mask
+from ceres_cal.base.arrays import AnyArray, Array, Codes, Indices, Indices32, Mask
 from ceres_cal.base.errors import InputError
 
 
@@ -85,6 +87,8 @@ class Columns:
 
     def __post_init__(self) -> None:
         for name, values in vars(self).items():
+            if isinstance(values, np.memmap):  # which stays in its file
+                continue
             column = np.array(values, dtype=TYPES[name])
             column.setflags(write=False)
             object.__setattr__(self, name, column)
@@ -107,6 +111,7 @@ class Curves(Columns):
     side: Codes
 
 
+_BLOCK = 1 << 20  # rows at once: what is made of them stays small beside very many
 _NOBODY, _NOWHERE = np.empty(0, np.int32), np.empty((0, 2))
 NO_POINTS = Points(_NOBODY, _NOBODY, _NOWHERE, np.empty(0))
 NO_CURVES = Curves(_NOBODY, _NOBODY, _NOWHERE, np.empty(0), np.empty(0, np.int8))
@@ -116,6 +121,54 @@ C = TypeVar("C")
 def taken(columns: C, rows: Indices | Indices32 | Mask) -> C:
     """Points, curves, or columns of another kind, at these rows only: their numbers, or True for each that stays."""
     return type(columns)(**{name: column[rows] for name, column in vars(columns).items()})
+
+
+class FileRows(NamedTuple):
+    """Rows of a column in a file, which are read without becoming part of the process's memory for good."""
+
+    path: str
+    offset: int
+    dtype: str
+    shape: tuple[int, ...]
+
+    def read(self) -> AnyArray:
+        """The rows.
+
+        Raises:
+            InputError: the file is not there, or ends too early.
+        """
+        size = math.prod(self.shape)
+        try:
+            with Path(self.path).open("rb") as file:
+                values = np.fromfile(file, self.dtype, size, offset=self.offset)
+        except OSError as error:
+            raise InputError(f"{self.path}: cannot be read: {error.strerror}") from None
+        if values.size != size:
+            raise InputError(f"{self.path}: it ends before its observations do: write it again")
+        return values.reshape(self.shape)
+
+
+def rows_of(column: AnyArray, start: int, stop: int) -> AnyArray | FileRows:
+    """Some rows of a column, where they are."""
+    rows = column[start:stop]
+    if not isinstance(column, np.memmap):
+        return rows
+    offset = int(column.offset) + start * int(column.strides[0])
+    return FileRows(str(column.filename), offset, column.dtype.str, rows.shape)
+
+
+def read_rows(rows: AnyArray | FileRows) -> AnyArray:
+    """The rows, in memory."""
+    return rows.read() if isinstance(rows, FileRows) else rows
+
+
+def in_blocks(columns: C) -> Iterator[tuple[int, C]]:
+    """The columns block by block, each in memory, with the number of its first row: at least one."""
+    arrays = vars(columns)
+    total = len(next(iter(arrays.values())))
+    for first in range(0, max(total, 1), _BLOCK):
+        stop = min(first + _BLOCK, total)
+        yield first, type(columns)(**{name: read_rows(rows_of(array, first, stop)) for name, array in arrays.items()})
 
 
 def view_label(number: int, views: Sequence[View]) -> str:

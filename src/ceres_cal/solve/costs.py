@@ -80,6 +80,18 @@ class SightCost(pyceres.CostFunction):
             jacobian[:] = known
         return True
 
+    def block(self, parameters: Sequence[Array]) -> Array | None:
+        """(N, K + 1) the Jacobians side by side and the residuals, None where an observation cannot be projected."""
+        known = self._evaluated(kernels.NOTHING, parameters)
+        if known is None:
+            return None
+        return np.column_stack([*(each.reshape(self.num_residuals(), -1) for each in known[2]), known[1]])
+
+    @property
+    def feet(self) -> Array:
+        """(M,) where the last evaluation left the feet."""
+        return self._curves.feet
+
     def _evaluated(self, at: Array, parameters: Sequence[Array]) -> tuple[Array, Array, list[Array]] | None:
         """(place, residuals, flat Jacobians), or None where an observation cannot be projected from there."""
         numbers, jacobians = [kernels.NOTHING, *self._poses, kernels.NOTHING], [kernels.NOTHING] * 4

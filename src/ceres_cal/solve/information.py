@@ -6,7 +6,7 @@ added up over what is shared, in the coordinates of `model.keys`.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property, reduce
 from operator import add
@@ -97,6 +97,17 @@ def information(problem: Problem, estimate: Estimate) -> ReducedInformation:
     return _Sums(problem, estimate).result()
 
 
+def normals_of(sight: Sights, problem: Problem, estimate: Estimate) -> dict[int, Array]:
+    """Normal equations (K, K) of a single sight by kind: of points (0) and of curves (1), where there are any. K is
+    [free intrinsics in the units of the files | structure | left perturbation of the pose: turn, shift].
+
+    Raises:
+        SolutionError: an observation cannot be projected.
+    """
+    kinds = enumerate(sight.by_kind)
+    return {kind: _Normals(own, problem, estimate).of(0, 1)[0] for kind, own in kinds if own.equations}
+
+
 class _Sums:
     """The sums of one pass over the sights."""
 
@@ -121,6 +132,9 @@ class _Sums:
             sight = sights[int(number)]
             for pose, normals in self._normals(sight):
                 self._add(sight.key, pose[0], {kind: normal[0] for kind, normal in normals.items()})
+        if self._problem.elsewhere is not None:
+            for key, kinds in self._problem.elsewhere.normals(self._problem, self._estimate).items():
+                self._add(key, self._estimate.pose_stack([key])[0], kinds)
         points, curves = (Information(self._keys, 0.5 * (matrix + matrix.T)) for matrix in self._matrices)
         priors = [prior.information for prior in self._problem.priors_at(self._estimate)]
         known = reduce(add, priors, Information.nothing(self._keys))
@@ -191,7 +205,7 @@ class _Sums:
             self._matrices[kind][np.ix_(lead, lead)] += reduced
             self._leverages[kind] += float(np.sum(normal[:, -6:, -6:] * covariance))
 
-    def _add(self, key: SightKey, pose: Array, normals: dict[int, Array]) -> None:
+    def _add(self, key: SightKey, pose: Array, normals: Mapping[int, Array]) -> None:
         """What a sight that nothing is eliminated from says, added to the sums."""
         world, lead = self._estimate.stations[key.station].cam_from_world, len(next(iter(normals.values()))) - 6
         at = [self._owned("camera", key.camera), self._structure]
