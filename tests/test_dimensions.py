@@ -18,6 +18,8 @@ from ceres_cal.calibration import Calibration
 from ceres_cal.cli import main
 from ceres_cal.cli.estimate import parse_estimates
 from ceres_cal.diagnostics import diagnose
+from ceres_cal.lens_choice.forms import PAPER
+from ceres_cal.lens_choice.rule import AS_GOOD_BESIDE_LENGTHS, decide, standard_errors
 from ceres_cal.model.parameters import Options
 from ceres_cal.model.structure import Tolerance
 from ceres_cal.moves import check, refit
@@ -127,6 +129,15 @@ def test_beside_tolerances_and_boards() -> None:
     assert known.low < 8.28 < known.high and 0.002 < known.sd < 0.02  # 5 mm: its lines may lie aside
 
 
+def test_no_lens_that_is_too_simple_beside_lengths() -> None:
+    rng = np.random.default_rng(0)
+    best = rng.uniform(0.9, 1.1, 50)
+    worse = best + rng.normal(0.01, 0.07, 50)  # by one standard error
+    tried = ([PAPER, "brown k1 k2"], [2, 3], [worse, best])
+    assert 0.5 < standard_errors(worse, best) < 1.5
+    assert decide(*tried) == (1, 0) and decide(*tried, AS_GOOD_BESIDE_LENGTHS) == (1, 1)
+
+
 def test_what_is_typed() -> None:
     length, width, circle = parse_estimates(["length,width=5.5", "circle=500mm:1mm"], {"field": FIELD})
     assert length == Prior("target", "field", "field_length_m", (9.0,), (np.inf,)) and length.is_open
@@ -170,13 +181,15 @@ def test_from_a_photograph(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     corners = [word for name, (x, y) in zip(names, clicked, strict=True) for word in ("--corner", f"{name}={x},{y}")]
     asked = ["detect", "field", path, "--target", "ssl-b", *corners, "-o", observed]
     assert main(asked) == 2 and "--estimate" in capsys.readouterr().err  # says what would help
+    assert main([*asked, "--estimate", "mark"]) == 2
+    assert "no painted line lies elsewhere with another goal_center_to_penalty_mark_m" in capsys.readouterr().err
     assert main([*asked, "--estimate", "length,width"]) == 0
+    assert "lengths, roughly, for `calibrate` to solve for: field_length_m 8.2" in capsys.readouterr().out
     priors = json.loads(Path(observed).read_text())["priors"]
     assert [prior["sigma_m"] for prior in priors] == [None, None]
-    capsys.readouterr()
     assert main(["calibrate", observed, "-o", out, "--lens", "radial", "--report", str(tmp_path / "report.html")]) == 0
     printed = capsys.readouterr().out
-    assert "lengths   field_length_m" in printed and "(field, solved for)" in printed
+    assert "lengths   field/field_length_m" in printed and "mm (solved for)" in printed
     dimensions = Calibration.load(out).targets["field"].dimensions
     for name, true in TRUE.items():
         assert abs(dimensions[name] - true) < 0.003  # 0.5 mm

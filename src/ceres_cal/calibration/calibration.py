@@ -25,10 +25,10 @@ from ceres_cal.calibration.file import (
     options_to_json,
 )
 from ceres_cal.calibration.origin import COPY, Fit, LensChoice, Refitted, Rejected, package_versions
+from ceres_cal.model.dimensions import redrawn
 from ceres_cal.model.keys import Key
 from ceres_cal.model.parameters import Estimate, Options, make_layout
 from ceres_cal.model.priors import GaussianPrior, gather_priors
-from ceres_cal.model.structure import redrawn
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import gather_sights
 from ceres_cal.scene.camera import Camera

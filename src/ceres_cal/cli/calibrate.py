@@ -207,8 +207,8 @@ def _fixed(specs: list[str]) -> dict[str, float]:
 def _options(
     args: Namespace, fixed: Mapping[str, float], powers: tuple[int, ...], observations: Observations
 ) -> Options:
+    from ceres_cal.model.dimensions import dimensions_of
     from ceres_cal.model.parameters import Options
-    from ceres_cal.model.structure import dimensions_of
 
     lens = args.lens or _AUTO  # which powers make radial
     terms = tuple(parse_names(args.terms))

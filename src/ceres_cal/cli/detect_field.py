@@ -278,6 +278,7 @@ def _data(detections: FieldDetections, output: Path) -> dict[str, Any]:
         "output": str(output),
         "points": len(detections.observations.points),
         "curves": len(detections.observations.curves),
+        "lengths_m": {prior.quantity: prior.value[0] for prior in detections.observations.priors},
         "found": [_image_data(path, detections) for path in detections.found],
         "missed": missed_data(detections.missed),
     }
@@ -307,6 +308,9 @@ def _text(data: dict[str, Any]) -> str:
         f"{number} of {every} images show the field: {plural(data['curves'], 'line observation')}, "
         f"{plural(data['points'], 'corner')} and crossings"
     ]
+    if data["lengths_m"]:
+        found = ", ".join(f"{name} {length:.3f}" for name, length in data["lengths_m"].items())
+        lines.append(f"lengths, roughly, for `calibrate` to solve for: {found} m")
     lines += [median_text(data["median"])] if "median" in data else []
     lines += [
         f"{one['image']}: paint at {one['found']} of {one['places']} places, good to {one['sigma_px']:.3f} px; "

@@ -131,12 +131,9 @@ def _structure(calibration: Calibration) -> list[str]:
 
 
 def _dimensions(quality: Quality) -> list[str]:
-    lines = []
-    for name, length_m in quality.calibration.estimate.structure.dimensions.items():
-        target, _, one = name.partition("/")
-        known = with_sd(length_m, "m", quality.verdicts.get(("dimension", target, one)))
-        lines.append(f"{one:30}{known} ({target}, solved for)")
-    return lines
+    lengths = quality.calibration.estimate.structure.dimensions
+    known = {f"{key[1]}/{key[2]}": verdict for key, verdict in quality.verdicts.items() if key[0] == "dimension"}
+    return [f"{name:36}{with_sd(length, 'm', known.get(name))} (solved for)" for name, length in lengths.items()]
 
 
 def _intrinsics(name: str, camera: Camera, options: Options, phi_from: str, quality: Quality) -> list[str]:

@@ -18,7 +18,7 @@ from ceres_cal.base.transforms import Poses
 from ceres_cal.calibration import LensChoice, TriedLens
 from ceres_cal.lens_choice.forms import PAPER, papers
 from ceres_cal.lens_choice.kinds import Candidate, compared_kinds
-from ceres_cal.lens_choice.rule import decide, standard_errors
+from ceres_cal.lens_choice.rule import AS_GOOD, AS_GOOD_BESIDE_LENGTHS, decide, standard_errors
 from ceres_cal.model.parameters import Options
 from ceres_cal.observations import Observations
 from ceres_cal.start.initialise import Start
@@ -48,12 +48,13 @@ def choose_lens(observations: Observations, options: Options, start: Start) -> C
     Args:
         options: their lens is not looked at. start: of everything, with whatever lens.
     """
+    as_good = AS_GOOD_BESIDE_LENGTHS if options.dimensions else AS_GOOD
     try:
         kinds, share = compared_kinds(observations, options, start.estimate)
-        tried, best, chosen = _compare([one for kind in kinds for one in kind.candidates(first=True)])
+        tried, best, chosen = _compare([one for kind in kinds for one in kind.candidates(first=True)], as_good)
         if chosen.form.label != PAPER:
             others = [one for longest in tried if longest.may_win(best) for one in longest.of.candidates(first=False)]
-            tried, _, chosen = _compare([*tried, *others])
+            tried, _, chosen = _compare([*tried, *others], as_good)
     except CalibrationError:
         return Chosen(papers(options), start, LensChoice(PAPER, (TriedLens(PAPER, 2),), 0, 0.0))
     there = chosen.estimate
@@ -62,11 +63,11 @@ def choose_lens(observations: Observations, options: Options, start: Start) -> C
     return Chosen(chosen.form.of(options), near, _choice(tried, chosen, share))
 
 
-def _compare(tried: list[Candidate]) -> tuple[list[Candidate], Candidate, Candidate]:
+def _compare(tried: list[Candidate], as_good: float) -> tuple[list[Candidate], Candidate, Candidate]:
     """The lenses, the best and the one that is chosen: one that folds where it must not gives no answer."""
     labels, sizes = [one.form.label for one in tried], [one.form.size for one in tried]
     while True:
-        best, chosen = decide(labels, sizes, [one.squares for one in tried])
+        best, chosen = decide(labels, sizes, [one.squares for one in tried], as_good)
         faults = {number: fault for number in (best, chosen) if (fault := tried[number].fault)}
         if not faults:
             return tried, tried[best], tried[chosen]

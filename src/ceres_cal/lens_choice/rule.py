@@ -13,9 +13,13 @@ from ceres_cal.lens_choice.forms import PAPER
 # How much worse than the best, in standard errors of the difference, is as good: at 1 the paper's lens is missed more
 # often, at 2 the decentring of real sets.
 AS_GOOD = 1.5
+AS_GOOD_BESIDE_LENGTHS = 0.5
+"""The same where dimensions of targets are solved for: what a lens that is too simple cannot follow, they do."""
 
 
-def decide(labels: Sequence[str], sizes: Sequence[int], squares: Sequence[Array | None]) -> tuple[int, int]:
+def decide(
+    labels: Sequence[str], sizes: Sequence[int], squares: Sequence[Array | None], as_good: float = AS_GOOD
+) -> tuple[int, int]:
     """Indices of the best lens and of the simplest that is as good; the paper's comes before all others.
 
     As good is what exceeds the least error by no more than 1.5 standard errors of their difference, group by group (the
@@ -23,6 +27,7 @@ def decide(labels: Sequence[str], sizes: Sequence[int], squares: Sequence[Array 
 
     Args:
         sizes: see `forms.size_of`. squares: (G,) squared errors by group of each lens; None where there is no answer.
+        as_good: in place of those 1.5.
 
     Raises:
         DegenerateError: no lens has one.
@@ -33,7 +38,7 @@ def decide(labels: Sequence[str], sizes: Sequence[int], squares: Sequence[Array 
     totals = {i: float(one.sum()) for i, one in known.items()}
     best = min(totals, key=totals.__getitem__)
     order = sorted(totals, key=lambda i: (labels[i] != PAPER, sizes[i], totals[i]))
-    return best, next(i for i in order if standard_errors(known[i], known[best]) <= AS_GOOD)
+    return best, next(i for i in order if standard_errors(known[i], known[best]) <= as_good)
 
 
 def standard_errors(squares: Array, others: Array) -> float:

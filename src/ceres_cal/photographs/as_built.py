@@ -16,10 +16,10 @@ import numpy as np
 from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.errors import SolutionError
 from ceres_cal.detect.lines import Lines
+from ceres_cal.model.dimensions import dimension_slopes, dimensions_of
 from ceres_cal.model.equations import whole_structure, write_equations
 from ceres_cal.model.parameters import intrinsic_names
 from ceres_cal.model.residuals import residuals
-from ceres_cal.model.structure import dimension_slopes, dimensions_of
 from ceres_cal.observations import Prior
 from ceres_cal.photographs.refit import observations_of, problem_of
 from ceres_cal.scene.camera import Camera

@@ -14,7 +14,7 @@ from ceres_cal.detect.courses import predict
 from ceres_cal.detect.lines import search as search_along
 from ceres_cal.detect.registration import nearness_to
 from ceres_cal.detect.strokes import drawn, find_strokes
-from ceres_cal.model.structure import redrawn
+from ceres_cal.model.dimensions import redrawn
 from ceres_cal.observations import Prior
 from ceres_cal.photographs.grid import Grid, grid_of, offsets_of
 from ceres_cal.photographs.matching import FloorLines, Match, StrokeMap, divergence, lines_seen, match

@@ -15,6 +15,7 @@ from ceres_cal.base.words import frame_of
 from ceres_cal.detect.crossings import find_crossings
 from ceres_cal.detect.images import filled, read_grey
 from ceres_cal.detect.lines import Lines
+from ceres_cal.model.dimensions import features_of
 from ceres_cal.observations import NO_POINTS, Curves, Observations, Points, Prior, View, combine
 from ceres_cal.photographs.clicks import Clicks, starts_from_clicks
 from ceres_cal.photographs.follow import Followed, FreeIntrinsics, follow
@@ -92,13 +93,18 @@ def detect_field(
         progress: called after each image.
 
     Raises:
-        InputError: an image cannot be read or has another size than the camera, a name that the target does not have,
-            or it cannot be told which way round the field is.
+        InputError: an image cannot be read or has another size than the camera, a name that the target does not have, a
+            length that no painted line shows, or it cannot be told which way round the field is.
         NothingShownError: no image shows the field.
     """
     options = options or FieldOptions()
     painted = _painted(target, curves)
     paths, drawn = [Path(path) for path in images], drawn_as_stated({TARGET_NAME: target}, options.lengths)[TARGET_NAME]
+    for prior in options.lengths:
+        if not features_of(target, prior.quantity) & set(painted):
+            raise InputError(
+                f"no painted line lies elsewhere with another {prior.quantity}: it cannot be found, leave it out"
+            )
     results: dict[str, SearchResult] = {}
     last: Followed | None = None
     for number, path in enumerate(paths, start=1):
@@ -116,8 +122,12 @@ def detect_field(
         raise NothingShownError(f"no field in any of {len(paths)} images; {missed[0][0]}: {missed[0][1]}", missed)
     parts = [_observations(frame_of(path), one, target, options) for path, one in followed.items()]
     searched = {path: result for path, result in results.items() if result.followed is not None and result.ways}
-    lengths = tuple(_found(prior, next(iter(followed.values()))) for prior in options.lengths)
-    return FieldDetections(replace(combine(parts), priors=lengths), followed, missed, searched)
+    every = combine(parts)
+    seen = {target.curve_names[number] for number in np.unique(every.curves.feature)}
+    seen |= {target.point_names[number] for number in np.unique(every.points.feature)}
+    lengths = [_found(one, next(iter(followed.values()))) for one in options.lengths]
+    lengths = [one for one in lengths if features_of(target, one.quantity) & seen]  # else it may stay as drawn
+    return FieldDetections(replace(every, priors=tuple(lengths)), followed, missed, searched)
 
 
 def _found(prior: Prior, followed: Followed) -> Prior:

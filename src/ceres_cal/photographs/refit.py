@@ -8,9 +8,10 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices32
 from ceres_cal.base.errors import CalibrationError
+from ceres_cal.model.dimensions import redrawn
 from ceres_cal.model.parameters import Estimate, Layout, Options, Station, intrinsic_names
 from ceres_cal.model.priors import stated_prior
-from ceres_cal.model.structure import make_structure, redrawn
+from ceres_cal.model.structure import make_structure
 from ceres_cal.observations import NO_POINTS, Curves, Observations, Points, Prior, View
 from ceres_cal.observations.sights import gather_sights
 from ceres_cal.scene.camera import Camera

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from ceres_cal.base.errors import DegenerateError
+from ceres_cal.model.dimensions import redrawn
 from ceres_cal.model.parameters import Estimate, Options
-from ceres_cal.model.structure import redrawn
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.scene.targets import Target
 from ceres_cal.solve.information import information
