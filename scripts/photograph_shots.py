@@ -19,6 +19,7 @@ from ceres_cal.base.arrays import Array, Array32, Indices32, Mask
 from ceres_cal.base.errors import CalibrationError
 from ceres_cal.base.transforms import Pose, rotation_exp
 from ceres_cal.calibrating import calibrate
+from ceres_cal.detect.images import light
 from ceres_cal.detect.rings import detect_rings
 from ceres_cal.model.parameters import Options
 from ceres_cal.model.structure import Tolerance
@@ -65,7 +66,7 @@ class Shot:
 
     @property
     def grey(self) -> Array32:
-        return cv2.cvtColor(self.picture.image, cv2.COLOR_BGR2GRAY).astype(np.float32)
+        return light(self.picture.image)
 
 
 def varied(seed: int) -> Photography:

@@ -232,7 +232,14 @@ def _exposed(light: Array32, reflected: Array32, how: Photography, rng: np.rando
     signal = reflected * (light * np.float32(how.exposure))[..., None]
     noise = rng.standard_normal(signal.shape, dtype=np.float32)
     noise *= np.sqrt(np.float32(how.read_noise**2) + np.float32(how.shot_noise) * np.maximum(signal, 0.0))
-    return np.asarray(np.clip(np.round(signal + noise), 0.0, 255.0), dtype=np.uint8)
+    image = np.asarray(np.clip(np.round(signal + noise), 0.0, 255.0), dtype=np.uint8)
+    return _through_mosaic(image) if how.mosaic else image
+
+
+def _through_mosaic(image: Image8) -> Image8:
+    raw = image[..., 1].copy()
+    raw[::2, ::2], raw[1::2, 1::2] = image[::2, ::2, 2], image[1::2, 1::2, 0]
+    return np.asarray(cv2.demosaicing(raw, cv2.COLOR_BayerRGGB2BGR), dtype=np.uint8)
 
 
 def _compressed(image: Image8, how: Photography) -> Image8:

@@ -27,6 +27,8 @@ class Photography:
         exposure: grey level of white in full light.
         read_noise: standard deviation of the sensor's noise in the dark, grey levels.
         shot_noise: variance that each grey level of signal adds, in grey levels squared (photon noise).
+        mosaic: whether each of the sensor's pixels sees one colour (red and green in every other row, green and blue in
+            the others), the other two filled in from those around.
         jpeg_quality: 1 to 100; 0: no compression.
 
     Raises:
@@ -47,6 +49,7 @@ class Photography:
     exposure: float = 230.0
     read_noise: float = 1.0
     shot_noise: float = 0.01
+    mosaic: bool = False
     jpeg_quality: int = 0
 
     def __post_init__(self) -> None:
