@@ -185,8 +185,8 @@ def line_figures(seeds: Sequence[int]) -> Iterator[Row]:
         errors = np.concatenate(good)
         yield Row("lines", "mean error of line centres, good light, px", float(np.mean(errors)), 0.0, -0.03, 0.03)
         yield Row("lines", "spread of line centres, good light, px", float(np.std(errors)), most=0.15)
-    for light, name in ((True, "good"), (False, "bad")):
-        if pulls := [one.pulls for one in seen if one.good_light == light]:
+    for good_light, name in ((True, "good"), (False, "bad")):
+        if pulls := [one.pulls for one in seen if one.good_light == good_light]:
             pull = np.concatenate(pulls)
             note = f"{len(pull)} observations, largest {np.max(np.abs(pull)):.1f}"
             yield Row("lines", f"spread over stated sigma, {name} light", float(np.std(pull)), 0.0, 0.8, 1.2, note)

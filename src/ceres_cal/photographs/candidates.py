@@ -31,7 +31,7 @@ _COMPARABLE, _ALIKE = 0.3, 0.9
 _MOST, _MOST_ALIKE = 4, 60
 # Where a candidate's lines are sought: px apart, and to either side as a share of half the image's diagonal; and how
 # bright, of the usual brightest, is paint. So many of any lines would be found there by chance.
-_SPACING_PX, _REACH, _CLEAR, _FEWEST, _BY_CHANCE = 8.0, 0.025, 0.4, 12, 0.3
+_SPACING_PX, _REACH, _CLEAR, _FEWEST, _BY_CHANCE = 8.0, 0.035, 0.4, 12, 0.3
 _SAME_PLACE, _SAME_TURN = 0.08, 0.1  # in heights, rad
 
 
