@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array
+from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.errors import SolutionError
 from ceres_cal.detect.lines import Lines
 from ceres_cal.model.equations import whole_structure, write_equations
@@ -129,7 +129,7 @@ def as_built(lines: Lines, camera: Camera, target: Target, priors: tuple[Prior, 
     return shape.explained()
 
 
-def _places_together(residuals: Array, curve: Array) -> float:
+def _places_together(residuals: Array, curve: Indices) -> float:
     """How many neighbouring places count as one: their correlation, summed until it has fallen to nothing."""
     products, pairs = np.zeros(_APART), np.zeros(_APART)
     for number in np.unique(curve):
