@@ -16,6 +16,7 @@ import numpy as np
 from cases import Row
 from msgspec import structs
 
+from ceres_cal.base.arrays import Image8
 from ceres_cal.base.errors import CalibrationError, InputError
 from ceres_cal.calibrating import calibrate
 from ceres_cal.photographs import Auto, Facing, detect_field
@@ -44,7 +45,7 @@ class Taken:
 
     camera: Camera
     painted: Target
-    image: np.ndarray
+    image: Image8
 
 
 # ---- what is painted ------------------------------------------------------------------------------------------------

@@ -91,6 +91,25 @@ def test_a_mosaic_of_colours_draws_no_line_aside(tmp_path: Path) -> None:
         assert np.array_equal(read_light(tmp_path / "picture.png"), light(picture))
 
 
+def test_what_windows_cannot_know_is_added_to_their_sigmas() -> None:
+    """Paint thinner than a pixel, sampled without blur: errors of a tenth of a pixel, alike over several places."""
+    angles = np.deg2rad(np.linspace(1.0, 4.0, 12))
+    lines = {
+        f"line {k}": Segment((-6.0, y, 0.0), (6.0, y + 12.0 * np.tan(angle), 0.0), 0.03)
+        for k, (y, angle) in enumerate(zip(np.linspace(-5.0, 4.0, 12), angles, strict=True))
+    }
+    optics, pose = Camera((320, 240), 100.0, (159.5, 119.5), Radial((0.0,), (3,))), overhead_pose(0.0, 0.0, 5.0)
+    scene = field_scene(custom(curves=lines), {"overhead": optics}, {"overhead": Station("overhead", pose)})
+    dim = np.linspace(0.2, 1.0, 320)[None, :, None]  # windows on the right know much better than those on the left
+    picture = photograph(scene, "overhead", "0001", Photography(blur_px=0.0, vignetting=0.0, read_noise=0.0), 1).image
+    course = predict(scene.targets["field"], scene.camera_at("overhead"), tuple(lines), SPACING_PX, 12.0)
+    noise = np.random.default_rng(2).normal(0.0, 2.0, picture.shape[:2])
+    found = measure((light(picture) * dim[..., 0] + noise).astype(np.float32), course, 3.0)
+    off = found.offset_px / found.sigma_px
+    for half in (course.pixels[:, 0] < 160.0, course.pixels[:, 0] > 160.0):
+        assert 0.7 < np.nanstd(off[half & found.found]) < 1.4
+
+
 def test_what_robots_hide_is_not_observed(shot: script.Shot) -> None:
     crowded = photograph(shot.scene, "overhead", "0001", replace(script.varied(0), robots=100, balls=100), seed=4)
     picture = replace(shot, picture=crowded)

@@ -123,19 +123,19 @@ def test_what_falls_on_the_ground_and_how_the_camera_takes_it() -> None:
     optics, pose = Camera((240, 180), 90.0, (119.5, 89.5), Radial((0.0,), (3,))), overhead_pose(0.0, 0.0, 4.0)
     scene = field_scene(custom(curves=line), {"o": optics}, {"o": Station("o", pose)})
 
-    def green(**how: float) -> Array:
-        return photograph(scene, "o", "0001", replace(PLAIN, **how), seed=2).image[..., 1].astype(float)
+    def green(how: Photography) -> Array:
+        return photograph(scene, "o", "0001", how, seed=2).image[..., 1].astype(float)
 
-    plain = green()
+    plain = green(PLAIN)
     carpet, paint = plain[0, 0], plain.max()
-    sunny = green(sun=0.5) / plain
+    sunny = green(replace(PLAIN, sun=0.5)) / plain
     assert np.mean(np.abs(sunny - 1.5) < 0.02) > 0.2 and np.mean(np.abs(sunny - 1.0) < 0.02) > 0.3
-    strips = green(strips=0.3)
+    strips = green(replace(PLAIN, strips=0.3))
     assert strips.max() == paint and np.ptp(strips[strips < 0.7 * paint]) > 0.2 * carpet
     assert len(np.unique(np.round(strips[:, :100]))) < 20  # strips, not a texture
-    glare = green(glare=0.4) - plain
+    glare = green(replace(PLAIN, glare=0.4)) - plain
     assert glare.max() > 20.0 and np.median(glare) < 5.0
-    moved = green(motion_px=8.0)
+    moved = green(replace(PLAIN, motion_px=8.0))
     assert np.sum(moved) == pytest.approx(np.sum(plain), rel=2e-3)
     assert np.sum(moved > 1.2 * carpet) > 1.5 * np.sum(plain > 1.2 * carpet)
     mosaic = photograph(scene, "o", "0001", replace(PLAIN, mosaic=True), seed=2).image.astype(float)
