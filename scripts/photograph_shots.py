@@ -19,6 +19,7 @@ from ceres_cal.base.arrays import Array, Array32, Indices32, Mask
 from ceres_cal.base.errors import CalibrationError
 from ceres_cal.base.transforms import Pose, rotation_exp
 from ceres_cal.calibrating import calibrate
+from ceres_cal.detect.images import light
 from ceres_cal.detect.rings import detect_rings
 from ceres_cal.model.parameters import Options
 from ceres_cal.model.structure import Tolerance
@@ -65,7 +66,7 @@ class Shot:
 
     @property
     def grey(self) -> Array32:
-        return cv2.cvtColor(self.picture.image, cv2.COLOR_BGR2GRAY).astype(np.float32)
+        return light(self.picture.image)
 
 
 def varied(seed: int) -> Photography:
@@ -184,8 +185,8 @@ def line_figures(seeds: Sequence[int]) -> Iterator[Row]:
         errors = np.concatenate(good)
         yield Row("lines", "mean error of line centres, good light, px", float(np.mean(errors)), 0.0, -0.03, 0.03)
         yield Row("lines", "spread of line centres, good light, px", float(np.std(errors)), most=0.15)
-    for light, name in ((True, "good"), (False, "bad")):
-        if pulls := [one.pulls for one in seen if one.good_light == light]:
+    for good_light, name in ((True, "good"), (False, "bad")):
+        if pulls := [one.pulls for one in seen if one.good_light == good_light]:
             pull = np.concatenate(pulls)
             note = f"{len(pull)} observations, largest {np.max(np.abs(pull)):.1f}"
             yield Row("lines", f"spread over stated sigma, {name} light", float(np.std(pull)), 0.0, 0.8, 1.2, note)

@@ -15,13 +15,27 @@ from pathlib import Path
 from cases import Row, exit_code, json_text, printed
 from photograph_shots import floor_rows, line_figures, real_rows, rings_rows, speed_rows, start_rows
 from photographs_auto import auto_rows, real_auto_rows
+from photographs_disturbed import disturbed_rows, wrong_rows
 from photographs_shared import shared_rows
 from photographs_templates import template_rows
 from real_data import real_folder
 from straightness import observed_boards, straight_rows
 
 SHARED = Path(os.environ.get("CERES_CAL_SHARED", Path(__file__).parents[2] / "shared")) / "photos"
-CASES = ("lines", "floor", "starts", "auto", "speed", "rings", "real", "straight", "shared", "templates")
+CASES = (
+    "lines",
+    "floor",
+    "starts",
+    "auto",
+    "speed",
+    "rings",
+    "real",
+    "straight",
+    "shared",
+    "disturbed",
+    "wrong",
+    "templates",
+)
 
 
 def rows_of(case: str, runs: int, real: Path | None, picture: Path | None) -> Iterator[Row]:
@@ -37,6 +51,10 @@ def rows_of(case: str, runs: int, real: Path | None, picture: Path | None) -> It
             yield from real_auto_rows(real)
     elif case == "templates":
         yield from template_rows(min(runs, 20))
+    elif case == "disturbed":
+        yield from disturbed_rows(runs)
+    elif case == "wrong":
+        yield from wrong_rows(runs)
     elif case == "speed":
         yield from speed_rows(min(runs, 20))
     elif case == "rings":

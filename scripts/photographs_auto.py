@@ -15,9 +15,8 @@ import numpy as np
 from cases import Row
 from photograph_shots import LENSES, NOT_PAINTED, Shot, distances_px, real_target, take, varied
 
-from ceres_cal.base.arrays import Array32
 from ceres_cal.base.errors import InputError
-from ceres_cal.detect.images import read_grey
+from ceres_cal.detect.images import read_light
 from ceres_cal.photographs import Auto, Facing
 from ceres_cal.photographs.search import search
 from ceres_cal.scene.camera import Camera
@@ -177,7 +176,7 @@ def process_seconds(runs: int) -> float:
 
 def real_auto_rows(folder: Path) -> Iterator[Row]:
     """The real photograph, without its clicks."""
-    grey: Array32 = read_grey(folder / "ssl_tigers_line_corners" / "camera_frame_1224x1024_crop.png").astype(np.float32)
+    grey = read_light(folder / "ssl_tigers_line_corners" / "camera_frame_1224x1024_crop.png")
     target = real_target()
     painted = [name for name in target.curve_names if name not in NOT_PAINTED]
     began = time.perf_counter()

@@ -26,7 +26,7 @@ CORNERS = (
     *("TopLeftCorner", "BottomLeftCorner", "TopRightCorner", "BottomRightCorner"),
     *("BottomHalfwayCrossing", "TopHalfwayCrossing"),
 )
-ALLOWED_MM = {"combo": 3.0, "cam": 3.0}  # by kind; else as small pictures allow
+ALLOWED_MM = {"combo": 3.0, "camera": 3.0}  # by kind; else as small pictures allow
 USUAL_MM, STATED = 1.5, 1.6
 
 

@@ -15,11 +15,15 @@ from ceres_cal.calibrating import calibrate
 from ceres_cal.cli import main
 from ceres_cal.detect.courses import clear_px, predict
 from ceres_cal.detect.crossings import find_crossings
+from ceres_cal.detect.images import light, read_light
 from ceres_cal.detect.lines import SPACING_PX, measure, window_px
 from ceres_cal.observations import Observations
 from ceres_cal.photographs import Clicks, FieldOptions, detect_field, follow, load_clicks
 from ceres_cal.photographs.clicks import FORMAT, clicks_from_json
-from ceres_cal.scene.targets import ssl_field
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.lens import Radial
+from ceres_cal.scene.targets import Segment, custom, ssl_field
+from ceres_cal.simulate import Photography, Station, field_scene, overhead_pose
 from ceres_cal.simulate.photograph import photograph
 
 FIELD = ssl_field("B")
@@ -68,6 +72,42 @@ def test_lines_are_unbiased_and_their_sigmas_honest(light: str) -> None:
     assert {row.what for row in rows if row.verdict == "no"} == set(), figures
     assert figures["largest mean error of one photograph, px"].value < 0.03
     assert len(rows) == (6 if light == "good" else 4)
+
+
+def test_a_mosaic_of_colours_draws_no_line_aside(tmp_path: Path) -> None:
+    lines = {f"line {k}": Segment((-6.0, float(k), 0.0), (6.0, float(k), 0.0), 0.03) for k in range(-4, 5)}
+    optics, pose = Camera((320, 240), 100.0, (159.5, 119.5), Radial((0.0,), (3,))), overhead_pose(0.0, 0.0, 5.0)
+    scene = field_scene(custom(curves=lines), {"overhead": optics}, {"overhead": Station("overhead", pose)})
+    image = photograph(scene, "overhead", "0001", Photography(mosaic=True, carpet=0.3), 1).image
+    target, camera = scene.targets["field"], scene.camera_at("overhead")
+    course = predict(target, camera, target.curve_names, SPACING_PX, 12.0)
+    assert np.allclose(course.pixels[:, 1] % 1.0, 0.5) and np.max(course.width_px) < 0.7
+    assert np.ptp(cv2.cvtColor(image, cv2.COLOR_BGR2HSV)[..., 0][course.pixels[:, 1].astype(int)]) > 20  # hue
+    as_eyes_do = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY).astype(np.float32)
+    assert abs(np.mean(measure(light(image), course, 3.0).offset_px)) < 0.02  # 0.006 px
+    assert abs(np.mean(measure(as_eyes_do, course, 3.0).offset_px)) > 0.1  # 0.12 px
+    for picture in (image, image[..., 1]):
+        cv2.imwrite(str(tmp_path / "picture.png"), picture)
+        assert np.array_equal(read_light(tmp_path / "picture.png"), light(picture))
+
+
+def test_what_windows_cannot_know_is_added_to_their_sigmas() -> None:
+    """Paint thinner than a pixel, sampled without blur: errors of a tenth of a pixel, alike over several places."""
+    angles = np.deg2rad(np.linspace(1.0, 4.0, 12))
+    lines = {
+        f"line {k}": Segment((-6.0, y, 0.0), (6.0, y + 12.0 * np.tan(angle), 0.0), 0.03)
+        for k, (y, angle) in enumerate(zip(np.linspace(-5.0, 4.0, 12), angles, strict=True))
+    }
+    optics, pose = Camera((320, 240), 100.0, (159.5, 119.5), Radial((0.0,), (3,))), overhead_pose(0.0, 0.0, 5.0)
+    scene = field_scene(custom(curves=lines), {"overhead": optics}, {"overhead": Station("overhead", pose)})
+    dim = np.linspace(0.2, 1.0, 320)[None, :, None]  # windows on the right know much better than those on the left
+    picture = photograph(scene, "overhead", "0001", Photography(blur_px=0.0, vignetting=0.0, read_noise=0.0), 1).image
+    course = predict(scene.targets["field"], scene.camera_at("overhead"), tuple(lines), SPACING_PX, 12.0)
+    noise = np.random.default_rng(2).normal(0.0, 2.0, picture.shape[:2])
+    found = measure((light(picture) * dim[..., 0] + noise).astype(np.float32), course, 3.0)
+    off = found.offset_px / found.sigma_px
+    for half in (course.pixels[:, 0] < 160.0, course.pixels[:, 0] > 160.0):
+        assert 0.7 < np.nanstd(off[half & found.found]) < 1.4
 
 
 def test_what_robots_hide_is_not_observed(shot: script.Shot) -> None:

@@ -15,9 +15,11 @@ from ceres_cal.base.transforms import Pose
 from ceres_cal.cli import main
 from ceres_cal.detect.images import read_grey
 from ceres_cal.detect.saddles import measure_saddles
+from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.curves import curve_points
 from ceres_cal.scene.heights import ROBOT_TOP_M
-from ceres_cal.scene.targets import checkerboard, custom, rings, ssl_field
+from ceres_cal.scene.lens import Radial
+from ceres_cal.scene.targets import Segment, checkerboard, custom, rings, ssl_field
 from ceres_cal.simulate import (
     Held,
     Photography,
@@ -114,6 +116,32 @@ def tilted_field(how: Photography) -> Scene:
         ssl_field("B"), {"overhead": camera("radial-2-3")}, {"overhead": Station("overhead", pose)}, 2, spacing_m=0.02
     )
     return replace(scene, photography=how)
+
+
+def test_what_falls_on_the_ground_and_how_the_camera_takes_it() -> None:
+    line = {"line": Segment((0.0, -4.0, 0.0), (0.0, 4.0, 0.0), 0.1)}
+    optics, pose = Camera((240, 180), 90.0, (119.5, 89.5), Radial((0.0,), (3,))), overhead_pose(0.0, 0.0, 4.0)
+    scene = field_scene(custom(curves=line), {"o": optics}, {"o": Station("o", pose)})
+
+    def green(how: Photography) -> Array:
+        return photograph(scene, "o", "0001", how, seed=2).image[..., 1].astype(float)
+
+    plain = green(PLAIN)
+    carpet, paint = plain[0, 0], plain.max()
+    sunny = green(replace(PLAIN, sun=0.5)) / plain
+    assert np.mean(np.abs(sunny - 1.5) < 0.02) > 0.2 and np.mean(np.abs(sunny - 1.0) < 0.02) > 0.3
+    strips = green(replace(PLAIN, strips=0.3))
+    assert strips.max() == paint and np.ptp(strips[strips < 0.7 * paint]) > 0.2 * carpet
+    assert len(np.unique(np.round(strips[:, :100]))) < 20  # strips, not a texture
+    glare = green(replace(PLAIN, glare=0.4)) - plain
+    assert glare.max() > 20.0 and np.median(glare) < 5.0
+    moved = green(replace(PLAIN, motion_px=8.0))
+    assert np.sum(moved) == pytest.approx(np.sum(plain), rel=2e-3)
+    assert np.sum(moved > 1.2 * carpet) > 1.5 * np.sum(plain > 1.2 * carpet)
+    mosaic = photograph(scene, "o", "0001", replace(PLAIN, mosaic=True), seed=2).image.astype(float)
+    assert np.allclose(mosaic[20, 20], photograph(scene, "o", "0001", PLAIN, seed=2).image[20, 20])
+    red = mosaic[..., 2] - carpet
+    assert np.max(red) > 0 and not np.allclose(mosaic[..., 2], mosaic[..., 0], atol=20.0)
 
 
 def test_robots_stand_up_and_hide_lines() -> None:

@@ -56,13 +56,13 @@ def write_median(path: Path, images: Sequence[Path], videos: Sequence[Path], bar
 
 
 def _pictures(images: Sequence[Path], videos: Sequence[Path], bar: ProgressBar) -> Iterator[tuple[str, Image]]:
-    from ceres_cal.detect.images import read_grey
+    from ceres_cal.detect.images import read_colour
     from ceres_cal.detect.median import MOST_PICTURES
     from ceres_cal.detect.video import spread_frames
 
     each = max(1, MOST_PICTURES // (len(videos) + bool(images)))  # of every video, and of the photographs together
     for path in images[:: -(-len(images) // each) or 1]:
-        yield str(path), read_grey(path)
+        yield str(path), read_colour(path)
     for video in videos[:MOST_PICTURES]:
         yield from spread_frames(video, each, bar.update)
 

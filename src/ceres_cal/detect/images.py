@@ -13,6 +13,8 @@ from ceres_cal.base.files import read_bytes, require_room
 from ceres_cal.detect.headers import claimed_size
 
 _BYTES_PER_PIXEL = 3
+# Of the pixels of a colour sensor, those that see blue, green and red.
+_OF_MOSAIC = np.array([0.25, 0.5, 0.25], np.float32)
 _AROUND_PX = (301, 101, 31)  # over which what is left out is filled, ever nearer
 _PIXELS_PER_BYTE = 8 * 1032  # the most that PNG's compression makes of a byte, at a bit each
 
@@ -24,6 +26,28 @@ def read_grey(path: str | Path) -> Image:
         InputError: the file is missing or no image.
     """
     return _decoded(path, cv2.IMREAD_GRAYSCALE)
+
+
+def read_light(path: str | Path) -> Array32:
+    """An image as (height, width) grey levels in which each pixel of a colour sensor counts alike: see `light`.
+
+    Raises:
+        InputError: as of `read_grey`.
+    """
+    return light(read_colour(path))
+
+
+def light(image: Image) -> Array32:
+    """(height, width) grey levels of an image (height, width) or (height, width, 3) blue, green, red: their mean, green
+    twice.
+
+    A sensor sees red in every other row of pixels and blue in the others. Of a line two pixels wide, most cameras' file
+    has red drawn towards the one and blue towards the other; as human eyes weigh them that leaves up to 0.13 px of a
+    whole line. Weighed as the sensor's pixels are, what is white or grey stays where it is.
+    """
+    if image.ndim == 2:
+        return image.astype(np.float32)
+    return np.asarray(cv2.transform(image.astype(np.float32), _OF_MOSAIC[None, :]), dtype=np.float32)
 
 
 def read_colour(path: str | Path) -> Image:

@@ -54,7 +54,10 @@ _NEARBY = 4  # places to each side that a place is compared with
 _FAR, _FAR_PX = 5.0, 0.25
 # Times the spread of its neighbours. Of line centres 0.2 % go at half of it and come at double.
 _WANDERING = 4.0
-_FACTOR_RANGE = (0.8, 6.0)
+# Places between those whose scatter is looked at: on a line that is nearly level, errors follow its place in the pixel
+# and are alike over less. And what may be found of it, px.
+_APART = 3
+_SCATTER_PX = np.concatenate([[0.0], np.geomspace(0.002, 1.0, 60)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,13 +161,13 @@ def measure(grey: Array32, course: Course, reach_px: float) -> Lines:
     offset = rough + fits.offset_px
     found = _is_paint(course, fits, contrast)
     found = _goes_on(course, found, offset, fits.sigma_px)
-    factor = _scatter(course, found, offset, fits.sigma_px)
-    found = _goes_on(course, found, offset, factor * fits.sigma_px)
+    sigma = np.hypot(fits.sigma_px, _scatter(course, found, offset, fits.sigma_px))
+    found = _goes_on(course, found, offset, sigma)
     return Lines(
         course,
         found,
         np.where(found, offset, np.nan),
-        factor * fits.sigma_px,
+        sigma,
         contrast,
         float(np.sqrt(np.mean(blur**2))),
         stretch,
@@ -268,13 +271,21 @@ def _goes_on(course: Course, found: Mask, offset: Array, sigma: Array) -> Mask:
 
 
 def _scatter(course: Course, found: Mask, offset: Array, sigma: Array) -> float:
-    """The factor on sigma that makes it what the offsets of three places in a row tell of their scatter.
+    """The standard deviation, px, that besides sigma makes what the offsets of three places on a curve tell of their
+    scatter.
 
-    Carpet, wear and compression are not white noise, which is all that a window knows.
+    Carpet, wear, compression and the sampling of lines thinner than a pixel are not white noise, which is all that a
+    window knows; and what a window in good light knows best suffers from them no less.
     """
-    middle = np.flatnonzero(found[:-2] & found[1:-1] & found[2:] & (course.curve[:-2] == course.curve[2:])) + 1
+    before, after = slice(None, -2 * _APART), slice(2 * _APART, None)
+    middle = np.flatnonzero(
+        found[before] & found[_APART:-_APART] & found[after] & (course.curve[before] == course.curve[after])
+    )
+    middle += _APART
     if len(middle) < 20:
-        return 1.0
-    change = offset[middle - 1] - 2.0 * offset[middle] + offset[middle + 1]
-    spread = np.sqrt(sigma[middle - 1] ** 2 + 4.0 * sigma[middle] ** 2 + sigma[middle + 1] ** 2)
-    return float(np.clip(np.median(np.abs(change) / spread) / 0.6745, *_FACTOR_RANGE))
+        return 0.0
+    three = middle[:, None] + (-_APART, 0, _APART)
+    change, weight = np.abs(offset[three] @ (1.0, -2.0, 1.0)), np.array([1.0, 4.0, 1.0])
+    more = _SCATTER_PX[:, None]
+    usual = np.median(change / np.sqrt(sigma[three] ** 2 @ weight + np.sum(weight) * more**2), axis=1)
+    return float(_SCATTER_PX[np.argmin(np.abs(usual / 0.6745 - 1.0))])

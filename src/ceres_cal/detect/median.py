@@ -16,6 +16,7 @@ import numpy as np
 from ceres_cal.base.arrays import Array, Array32, Image
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import most_bytes
+from ceres_cal.detect.images import light
 
 MOST_PICTURES = 25
 """That one is made of: of video frames and photographs, evenly."""
@@ -97,7 +98,7 @@ def _read(pictures: Iterable[tuple[str, Image]]) -> tuple[list[str], list[Image]
     names: list[str] = []
     greys: list[Image] = []
     for name, picture in pictures:
-        grey = picture if picture.ndim == 2 else np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY))
+        grey = picture if picture.ndim == 2 else np.round(light(picture)).astype(picture.dtype)
         if greys and (grey.shape != greys[0].shape or grey.dtype != greys[0].dtype):
             size, first = (f"{one.shape[1]} x {one.shape[0]} px of {one.dtype}" for one in (grey, greys[0]))
             raise InputError(f"{name}: {size}, but {names[0]} has {first}: give pictures of one camera")

@@ -33,9 +33,10 @@ _BEAM, _MOST = 24, 9
 # Of a dimension, another field; what a tape measure, a strange lens and a floor that is not flat make of one is less.
 _OTHER_FIELD = 0.02
 _SURELY = 10.0  # standard deviations of it, which take lines to be taped independently of each other
-_FARTHEST_M = 0.12  # of a curve that lies aside: farther, it is another curve
+_FARTHEST_M = 0.12  # of all curves that lie aside, root sum of squares: farther, they are others
 _LEAST_SIGMA_PX = 0.05  # of places on a curve: what a model of its shape is good for
-_TOGETHER = 4.0  # neighbouring places whose errors go together
+_TOGETHER = 4.0  # neighbouring places whose errors go together, at least
+_APART, _ALIKE = 40, 0.1  # places up to which, and correlation down to which, errors are seen to go together
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +64,7 @@ class AsBuilt:
             for name, length in self.dimensions.items()
             if abs(length - self.drawn[name]) > _SURELY * self.sd_m[name]
         ]
-        far = max((abs(aside) for aside in self.aside_m.values()), default=0.0)
+        far = float(np.linalg.norm(list(self.aside_m.values())))
         return max(changes, default=0.0) > _OTHER_FIELD or far > _FARTHEST_M or 2 * len(self.aside_m) > self.curves
 
     def words(self) -> tuple[str, ...]:
@@ -117,13 +118,26 @@ def as_built(lines: Lines, camera: Camera, target: Target, priors: tuple[Prior, 
     columns = equations.structure_columns(structure)
     there = np.flatnonzero(np.any(columns != 0.0, axis=0))
     normal, slope = model.left_of(columns[:, there])
-    bent = model.freed(columns[:, there])  # lines that no offset straightens: wavy tape, another lens
-    left = float(model.left_over @ model.left_over) - bent.decrease
-    noise = max(1.0, left / max(model.spare - bent.root.shape[1], 1))
+    bent = model.with_columns(columns[:, there])  # lines that no offset straightens: wavy tape, another lens
+    noise = max(1.0, float(bent.left_over @ bent.left_over) / max(bent.spare, 1))
+    noise *= max(1.0, _places_together(bent.left_over, equations.feature) / _TOGETHER)
     names = tuple(dimensions_of(seen.targets))
     drawn_m, moves = dimension_slopes(structure.names, seen.targets, names)
     owner = np.array([_curve_of(structure.names[row]) for row in there])
     return _Shape(normal / noise, slope / noise, owner, moves[there], names, drawn_m).explained()
+
+
+def _places_together(residuals: Array, curve: Indices) -> float:
+    """How many neighbouring places count as one: their correlation, summed until it has fallen to nothing."""
+    products, pairs = np.zeros(_APART), np.zeros(_APART)
+    for number in np.unique(curve):
+        own = residuals[curve == number]
+        for apart in range(min(_APART, len(own))):
+            products[apart] += float(own[: len(own) - apart] @ own[apart:])
+            pairs[apart] += len(own) - apart
+    correlation = products / np.maximum(pairs, 1.0) * pairs[0] / max(products[0], 1e-300)
+    ends = int(np.argmax(np.append(correlation, 0.0) < _ALIKE))
+    return float(1.0 + 2.0 * np.sum(correlation[1:ends]))
 
 
 def _curve_of(name: str) -> str:

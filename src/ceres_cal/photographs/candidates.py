@@ -35,7 +35,7 @@ _COMPARABLE, _ALIKE = 0.3, 0.9
 _MOST, _MOST_ALIKE = 4, 60
 # Where a candidate's lines are sought: px apart, and to either side as a share of half the image's diagonal; and how
 # bright, of the usual brightest, is paint. So many of any lines would be found there by chance.
-_SPACING_PX, _REACH, _CLEAR, _FEWEST = 8.0, 0.025, 0.4, 12
+_SPACING_PX, _REACH, _CLEAR, _FEWEST = 8.0, 0.035, 0.4, 12
 BY_CHANCE = 0.3  # of the places on any lines, those that lie on paint
 # Share of a length that is not known by which it is drawn longer and shorter, too: a match is nearly as good up to half
 # of that beside it.

@@ -13,7 +13,7 @@ from ceres_cal.base.errors import InputError, NothingShownError, naming
 from ceres_cal.base.progress import ImageProgress
 from ceres_cal.base.words import frame_of
 from ceres_cal.detect.crossings import find_crossings
-from ceres_cal.detect.images import filled, read_grey
+from ceres_cal.detect.images import filled, read_light
 from ceres_cal.detect.lines import Lines
 from ceres_cal.model.dimensions import features_of
 from ceres_cal.observations import NO_POINTS, Curves, Observations, Points, Prior, View, combine
@@ -108,7 +108,7 @@ def detect_field(
     results: dict[str, SearchResult] = {}
     last: Followed | None = None
     for number, path in enumerate(paths, start=1):
-        grey = _without(read_grey(path).astype(np.float32), options.left_out, path)
+        grey = _without(read_light(path), options.left_out, path)
         result = _looked_for(grey, drawn, painted, start if last is None else last, (path, options))
         results[str(path)] = result
         if result.followed is None and options.refused is not None:

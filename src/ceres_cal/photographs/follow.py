@@ -20,7 +20,7 @@ from ceres_cal.photographs.as_built import AS_DRAWN, AsBuilt, as_built
 from ceres_cal.photographs.refit import TARGET, PointHints, observations_of, refit_camera
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import LENSES
-from ceres_cal.scene.targets import Target
+from ceres_cal.scene.targets import Target, target_from_spec
 
 FAR_PX = 130.0  # how far off the start may be
 # Of the places in view where paint must be found: robots and wear hide a third. Nothing changes from 0.33 to 0.67.
@@ -39,6 +39,8 @@ _CANDIDATES = 5
 _FEWEST = 12
 _MOST_OTHERS = 3  # ways to see the field that are tried where the best looks like another field
 _ROUNDS = 6
+_NEARER = 2  # times that lines of other dimensions are looked for again
+_LESS = 0.02  # of the share: by so much less is no worse
 _AT_REST_PX = 0.02
 
 
@@ -119,7 +121,8 @@ def follow(
         if best.holds and not best.built.is_other:
             break
         again = tracker.refined(one) if one.holds else one
-        best = again if again.holds and not again.built.is_other else best
+        if again.holds and not again.built.is_other and not again.built.dimensions:
+            best = again
     return best
 
 
@@ -224,14 +227,32 @@ class _Tracker:
         whole, built = replace(self, target=followed.target), AS_DRAWN
         left = whole
         for _ in range(_ROUNDS):
-            known, lines = built, whole.measured(followed.camera)
-            built = as_built(lines, followed.camera, whole.target, self.free.priors)
+            known, built = built, whole.as_built(followed, free)
             if built.is_other or built.aside_m.keys() == known.aside_m.keys():
                 break
             left = replace(whole, curves=[name for name in self.curves if name not in built.aside_m])
             followed = left.at_rest(followed.camera, free)
             whole, left = (replace(one, target=followed.target) for one in (whole, left))
         return replace(followed, built=built, lines=left.measured(followed.camera))
+
+    def as_built(self, followed: Followed, free: tuple[str, ...]) -> AsBuilt:
+        """How all curves lie.
+
+        Lines of other dimensions are several pixels from where they were looked for, and some are missed or taken for
+        others; so they are looked for again, and measured, where those dimensions put them.
+        """
+        lines, camera, target = self.measured(followed.camera), followed.camera, self.target
+        built = as_built(lines, camera, target, self.free.priors)
+        for _ in range(_NEARER):
+            if not built.dimensions:
+                break
+            there = replace(self, target=target_from_spec({**target.spec, **built.dimensions}, target.kind))
+            nearer = there.at_rest(camera, free)
+            if nearer.share < lines.share - _LESS:
+                break
+            lines, camera = nearer.lines, nearer.camera
+            built = as_built(lines, camera, target, self.free.priors)
+        return built
 
     def with_best_lens(self, followed: Followed) -> Followed:
         """What is found when the lines are predicted with the kind of lens that suits them best.
@@ -256,7 +277,7 @@ class _Tracker:
         camera, target = best.station(), best.targets[TARGET]
         lines = replace(self, target=target).measured(camera)
         refined = Followed(camera, target, lines, _moved_px(followed.camera, camera, lines.course.pixels))
-        return refined if refined.holds and refined.share > followed.share - 0.02 else followed
+        return refined if refined.holds and refined.share > followed.share - _LESS else followed
 
     def _refitted(
         self, camera: Camera, observations: Observations, names: tuple[str, ...]

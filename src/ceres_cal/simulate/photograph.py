@@ -13,6 +13,7 @@ from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.curves import along_curve, curve_points
 from ceres_cal.scene.targets import Target
 from ceres_cal.simulate import render
+from ceres_cal.simulate.ground import Ground, ground_of
 from ceres_cal.simulate.photography import Photography
 from ceres_cal.simulate.scene import Scene
 from ceres_cal.simulate.things import Ball, Robot, Shadow, Thing, outline, patches, shadow_outline
@@ -25,6 +26,8 @@ _PENUMBRA_PX = 12.0
 _LIGHT_STEP = 8  # light changes slowly: it is drawn at an eighth of the size
 _WEAR_PATCH_PX, _BLOTCH_PX = 2.0, 30.0
 _TRIES = 200
+_FINE = 8  # parts of a pixel in which a camera's way is drawn
+_GROUND = 1  # its random numbers are its own: pictures without it stay what they are
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,10 +87,12 @@ def photograph(
     shown = {plan.target: plan.placement for plan in scene.views if plan.station == station and frame in plan.frames}
     things, shadows = _placed(camera, how, rng) if None in shown.values() else ((), ())
     paint, sheet = _painted(scene, shown, camera)
-    colours, cover = _drawn(things, camera)
-    image = _exposed(_light(camera, shadows, how, rng), _reflected(paint, sheet, colours, cover, how, rng), how, rng)
-    hidden = {name: _hidden(scene, name, placement, camera, cover) for name, placement in shown.items()}
-    return Photograph(station, frame, shown, _compressed(image, how), things, shadows, hidden, cover)
+    drawn = _drawn(things, camera)
+    ground = ground_of(camera, how, np.random.default_rng([seed, number, _GROUND]))
+    light = _light(camera, shadows, how, rng) + ground.sun
+    image = _exposed(light, _reflected(paint, sheet, drawn, ground, how, rng), how, rng)
+    hidden = {name: _hidden(scene, name, placement, camera, drawn[1]) for name, placement in shown.items()}
+    return Photograph(station, frame, shown, _compressed(image, how), things, shadows, hidden, drawn[1])
 
 
 # ---- what stands where ----------------------------------------------------------------------------------------------
@@ -172,9 +177,19 @@ def _painted(scene: Scene, shown: Mapping[str, str | None], camera: Camera) -> t
 
 
 def _reflected(
-    canvas: render.Canvas, paper: Image8, colours: Image8, cover: Image8, how: Photography, rng: np.random.Generator
+    canvas: render.Canvas,
+    paper: Image8,
+    drawn: tuple[Image8, Image8],
+    ground: Ground,
+    how: Photography,
+    rng: np.random.Generator,
 ) -> Array32:
-    """(height, width, 3) share of the light that comes from each pixel, through the lens."""
+    """(height, width, 3) share of the light that comes from each pixel, through the lens.
+
+    Args:
+        drawn: the things' colours and cover, see `_drawn`.
+    """
+    colours, cover = drawn
     printed = np.repeat(np.repeat(paper, render.SUBPIXELS, axis=0), render.SUBPIXELS, axis=1) if paper.any() else None
     if how.wear > 0.0:
         kept = 1.0 - _worn(canvas.shape, how.wear, rng)
@@ -185,14 +200,14 @@ def _reflected(
     hidden = _blurred(render.averaged(cover.astype(np.float32)), how.blur_px) if cover.any() else np.float32(0.0)
     sheet = _blurred(paper.astype(np.float32), how.blur_px) if paper.any() else np.float32(0.0)
     floor = np.maximum(1.0 - sheet - hidden - np.where(sheet > 0.0, np.float32(0.0), paint), 0.0)
-    carpet = _carpet(paint.shape, how, rng) * floor
+    carpet = _carpet(paint.shape, how, rng) * floor * ground.carpet
     things = _blurred(render.averaged(colours) / 255.0, how.blur_px) if cover.any() else None
     channels = []
     for channel, (share, painted) in enumerate(zip(how.carpet_colour, how.paint_colour, strict=True)):
         bright = np.where(sheet > 0.5, np.float32(1.0), np.float32(how.paint * painted))
         plane = paint * bright + carpet * np.float32(share)
         channels.append(plane if things is None else plane + things[..., channel])
-    return np.asarray(np.dstack(channels), dtype=np.float32)
+    return np.asarray(np.dstack(channels) + ground.glare[..., None], dtype=np.float32)
 
 
 def _blurred(plane: Array32, sigma: float) -> Array32:
@@ -229,9 +244,29 @@ def _carpet(shape: Sequence[int], how: Photography, rng: np.random.Generator) ->
 
 def _exposed(light: Array32, reflected: Array32, how: Photography, rng: np.random.Generator) -> Image8:
     signal = reflected * (light * np.float32(how.exposure))[..., None]
+    if how.motion_px > 0.0:
+        signal = _smeared(signal, how.motion_px, rng)
     noise = rng.standard_normal(signal.shape, dtype=np.float32)
     noise *= np.sqrt(np.float32(how.read_noise**2) + np.float32(how.shot_noise) * np.maximum(signal, 0.0))
-    return np.asarray(np.clip(np.round(signal + noise), 0.0, 255.0), dtype=np.uint8)
+    image = np.asarray(np.clip(np.round(signal + noise), 0.0, 255.0), dtype=np.uint8)
+    return _through_mosaic(image) if how.mosaic else image
+
+
+def _smeared(signal: Array32, length_px: float, rng: np.random.Generator) -> Array32:
+    """As a camera that moves evenly, anywhere across, while the shutter is open takes it."""
+    direction, size = rng.uniform(0.0, np.pi), 2 * int(np.ceil(0.5 * length_px)) + 1
+    fine = np.zeros((size * _FINE, size * _FINE), np.float32)
+    end = 0.5 * length_px * _FINE * np.array([np.cos(direction), np.sin(direction)])
+    places = 0.5 * (size * _FINE - 1) + np.linspace(-1.0, 1.0, 50 * size)[:, None] * end
+    np.add.at(fine, tuple(np.round(places[:, ::-1]).astype(np.intp).T), 1.0)
+    kernel = cv2.resize(fine, (size, size), interpolation=cv2.INTER_AREA)
+    return np.asarray(cv2.filter2D(signal, -1, kernel / kernel.sum(), borderType=cv2.BORDER_REPLICATE), np.float32)
+
+
+def _through_mosaic(image: Image8) -> Image8:
+    raw = image[..., 1].copy()
+    raw[::2, ::2], raw[1::2, 1::2] = image[::2, ::2, 2], image[1::2, 1::2, 0]
+    return np.asarray(cv2.demosaicing(raw, cv2.COLOR_BayerRGGB2BGR), dtype=np.uint8)
 
 
 def _compressed(image: Image8, how: Photography) -> Image8:

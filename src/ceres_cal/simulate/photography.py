@@ -24,10 +24,16 @@ class Photography:
         wear: share of the paint that is worn off.
         carpet: brightness of the carpet, paint: of paint and paper, as shares of white.
         carpet_colour, paint_colour: blue, green and red of each, times its brightness.
+        sun: light of the sun, times the lamps', in stripes as windows let it in.
+        strips: share by which strips of carpet, which meet in seams, differ in brightness.
+        glare: share of white that a lamp mirrored by the floor adds where it is brightest.
         carpet_texture: standard deviation of the carpet's brightness, as a share of it.
         exposure: grey level of white in full light.
         read_noise: standard deviation of the sensor's noise in the dark, grey levels.
         shot_noise: variance that each grey level of signal adds, in grey levels squared (photon noise).
+        mosaic: whether each of the sensor's pixels sees one colour (red and green in every other row, green and blue in
+            the others), the other two filled in from those around.
+        motion_px: way of the camera while the shutter is open.
         jpeg_quality: 1 to 100; 0: no compression.
 
     Raises:
@@ -50,13 +56,18 @@ class Photography:
     exposure: float = 230.0
     read_noise: float = 1.0
     shot_noise: float = 0.01
+    sun: float = 0.0
+    strips: float = 0.0
+    glare: float = 0.0
+    motion_px: float = 0.0
+    mosaic: bool = False
     jpeg_quality: int = 0
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
             if not np.all(np.isfinite(value) & np.greater_equal(value, 0.0)):
                 raise InputError(f"photography: {name} must be a number from 0 on, not {value}")
-        for name in ("vignetting", "unevenness", "shadow_depth", "wear", "carpet", "paint"):
+        for name in ("vignetting", "unevenness", "shadow_depth", "wear", "carpet", "paint", "strips"):
             if getattr(self, name) > 1.0:
                 raise InputError(f"photography: {name} is a share and at most 1, not {getattr(self, name)}")
         for name in ("shadows", "robots", "balls"):

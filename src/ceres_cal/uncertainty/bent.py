@@ -97,13 +97,20 @@ def bends(
         at_one = by_model.spread.covariance @ slopes
         rise = float((axis / sizes) @ (axis / sizes)) ** 2 / float(slopes @ at_one)
         for step in (axis, -axis):
-            for factor in (1.0, _FAR_OUT) if few else (1.0,):
-                end = _end(problem, estimate, keys, factor * step)
-                ends.append((step / sizes, _excess(end, factor, step / sizes, least, rise)))
-                other = _minimum(problem, end) if factor > 1.0 else None
-                if other is not None and 2.0 * other.cost <= least + rise:
-                    steps.append(np.zeros(len(keys)))
-                    excesses.append(difference(other.estimate, estimate, keys) / sizes)
+            end = _end(problem, estimate, keys, step)
+            ends.append((step / sizes, _excess(end, step / sizes, least, rise)))
+            far = _end(problem, estimate, keys, _FAR_OUT * step) if few else None
+            if far is None:
+                continue
+            other = _minimum(problem, far)
+            if other is not None and 2.0 * other.cost <= least + rise:
+                steps.append(np.zeros(len(keys)))
+                excesses.append(difference(other.estimate, estimate, keys) / sizes)
+            # Where the cost rises ever less, the interval ends between; what far ends are by themselves tells nothing.
+            nearer = _FAR_OUT * _reach(far, least, rise)
+            if nearer > 1.0:
+                end = _end(problem, estimate, keys, nearer * step)
+                ends.append((step / sizes, _excess(end, step / sizes, least, rise, nearer)))
         step, excess = max(ends, key=lambda one: float(np.linalg.norm(np.clip(one[1], -1.0, 1.0))))
         steps.append(step)
         excesses.append(excess)
@@ -148,15 +155,17 @@ def _minimum(problem: Problem, end: _End | None) -> Solution | None:
     return None if end is None else _solved(problem, end.estimate)
 
 
-def _excess(end: _End | None, factor: float, step: Array, least: float, rise: float) -> Array:
-    """(K,) in natural sizes: the end of so many steps, brought to where the cost has risen as it should by one, less
-    that.
+def _reach(end: _End, least: float, rise: float) -> float:
+    """How many times as far as an end the cost has risen as it should, if it is a parabola up to there."""
+    return float(np.clip(np.sqrt(rise / max(end.cost - least, 1e-12)), 1.0 / _FARTHEST, _FARTHEST))
+
+
+def _excess(end: _End | None, step: Array, least: float, rise: float, factor: float = 1.0) -> Array:
+    """(K,) in natural sizes: an end that is so many steps away, brought to where the cost has risen as it should by
+    one, less that.
     """
-    if end is None and factor > 1.0:
-        return np.zeros(len(step))
     if end is None:
-        return (_FARTHEST - 1.0) * step
-    reach = np.sqrt(rise / max(end.cost - least, 1e-12))
-    excess = end.off * np.clip(reach, 1.0 / _FARTHEST, _FARTHEST) - step
+        return (_FARTHEST - 1.0) * step if factor == 1.0 else np.zeros(len(step))
+    excess = end.off * _reach(end, least, rise) - step
     along = step / np.linalg.norm(step)
     return np.asarray(excess - min(float(along @ excess), 0.0) * along)  # that it ends earlier narrows nothing
