@@ -47,6 +47,7 @@ DOORS = {
     "matplotlib": {"report"},
     "google": {"formats"},  # protobuf
     "yaml": {"formats"},
+    "distributed": {"cli"},
     "scipy": set(),  # for the tests only
 }
 
