@@ -78,6 +78,7 @@ class Bulk:
 
     def __init__(self, observations: Observations, client: Any = None) -> None:
         self.observations, self._client = observations, client
+        self._engines: list[InProcess | OnWorkers] = []
         self._left_out = None
         if observations.copies.are_there:
             points, curves = observations.copies.originals
@@ -89,7 +90,14 @@ class Bulk:
 
     def _engine_without(self, left_out: tuple[Mask, Mask] | None) -> Engine:
         shares = list(cut(self.observations, left_out))
-        return InProcess(shares) if self._client is None else OnWorkers(self._client, shares)
+        engine = InProcess(shares) if self._client is None else OnWorkers(self._client, shares)
+        self._engines.append(engine)
+        return engine
+
+    def close(self) -> None:
+        """Let all shares go, wherever they are."""
+        for engine in self._engines:
+            engine.close()
 
     # ---- the part that decides --------------------------------------------------------------------------------------
 
