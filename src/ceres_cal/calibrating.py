@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.errors import CalibrationError, DegenerateError, SolutionError
 from ceres_cal.base.threads import at_most, meanwhile, single_threaded_blas
 from ceres_cal.base.words import bounds_text, two_digits
-from ceres_cal.calibration import COPY, Calibration, Fit, Rejected
+from ceres_cal.calibration import Calibration
+from ceres_cal.calibration.outcome import fit_of, of_all, rejected_rows
 from ceres_cal.lens_choice import choose_lens, papers
 from ceres_cal.model.keys import Key
 from ceres_cal.model.parameters import AUTO, Estimate, Layout, Options, make_layout
@@ -276,7 +276,7 @@ def solved_from(
         digest.result()  # which the observations remember
     calibration = _calibration(start, observations, problem, end, explanations)
     if settled is not None:
-        calibration = _of_all(calibration, settled)
+        calibration = of_all(calibration, settled)
     warnings = (*calibration.warnings, *require_usable(end, problem, explanations), *warnings)
     calibration = replace(calibration, warnings=warnings, posterior=posterior, conflicts=conflicts.every)
     tolerances = {**problem.options.tolerances, **tolerances_of(as_built)}
@@ -306,8 +306,8 @@ def _calibration(
     return Calibration(
         end.solution.estimate,
         observations.targets,
-        _fit(end, problem.layout),
-        _rejected(observations, out, far, explanations),
+        fit_of(end, problem.layout),
+        rejected_rows(observations, out, far, explanations),
         end.solution.termination,
         end.solution.converged,
         end.rounds,
@@ -383,70 +383,3 @@ def _resting(end: RobustSolution, problem: Problem) -> Iterator[str]:
 
 def _share_text(share: float) -> str:
     return f"{two_digits(100.0 * share)} %" if share < 1.0 else "larger than itself"
-
-
-# ---- what came out --------------------------------------------------------------------------------------------------
-
-
-def _of_all(calibration: Calibration, settled: Settled) -> Calibration:
-    """What came out of all observations, where a part of them decided."""
-    observations, used, scales = settled.observations, settled.used, calibration.fit.scales
-    points, curves = used.sums
-    sigmas = [own / scale for own, scale in zip(used.sigmas, scales, strict=True)]
-    mean = [np.sqrt(sums[1:] / max(sums[0], 1.0)) for sums in (points, curves)]
-    return replace(
-        calibration,
-        fit=replace(
-            calibration.fit,
-            points=int(points[0]),
-            curves=int(curves[0]),
-            points_rms_px=float(mean[0][0]),
-            curves_rms_px=float(mean[1][0]),
-            point_sigma_px=float(mean[0][1]),
-            curve_sigma_px=float(mean[1][1]),
-        ),
-        rejected=_rejected(observations, used.rows, sigmas, settled.explanations),
-        warnings=observations.warnings,
-    )
-
-
-def _fit(end: RobustSolution, layout: Layout) -> Fit:
-    points, curves = end.residuals.lengths
-    used = points[end.inliers.points], curves[end.inliers.curves]
-    sigmas = end.problem.sights.sigma_px, end.problem.sights.curve_sigma_px
-    return Fit(
-        len(used[0]),
-        len(used[1]),
-        _rms(used[0]),
-        _rms(used[1]),
-        end.inliers.point_scale,
-        end.inliers.curve_scale,
-        layout.size,
-        _rms(sigmas[0]),
-        _rms(sigmas[1]),
-    )
-
-
-def _rms(values: Array) -> float:
-    """Root mean square; 0 of nothing."""
-    return float(np.sqrt(values @ values / max(len(values), 1)))
-
-
-def _rejected(
-    observations: Observations, rows: Sequence[Indices], sigmas: Sequence[Array], explanations: Sequence[Explanation]
-) -> tuple[Rejected, ...]:
-    """The rows of points and of curve observations that did not take part, and how far off they are."""
-    wholes = [one for one in explanations if one.is_taken]
-    entries, views, copies = [], observations.views, observations.copies
-    for kind, out, far, column, copy_of, first in (
-        ("point", rows[0], sigmas[0], observations.points, copies.points, 0),
-        ("curve", rows[1], sigmas[1], observations.curves, copies.curves, len(observations.points)),
-    ):
-        for row, sigma in zip(out.tolist(), far.tolist(), strict=True):
-            reason = f"{sigma:.1f} sigma off" if np.isfinite(sigma) else "cannot be seen from there"
-            reason = next((one.words for one in wholes if one.rows[first + row]), reason)
-            if copy_of[row] >= 0:
-                reason = f"{COPY} of frame {views[copy_of[row]].frame!r}"
-            frame = views[column.view[row]].frame
-            entries.append(Rejected(kind, row, frame, observations.feature_name(kind, row), reason))
-    return tuple(entries)

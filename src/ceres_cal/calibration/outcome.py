@@ -1,0 +1,82 @@
+"""What came out of a solve, as a calibration keeps it: how well it fits, and what was left out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ceres_cal.base.arrays import Array, Indices
+from ceres_cal.calibration.calibration import Calibration
+from ceres_cal.calibration.origin import COPY, Fit, Rejected
+from ceres_cal.model.parameters import Layout
+from ceres_cal.observations import Observations
+from ceres_cal.solve.bulk import Settled
+from ceres_cal.solve.explanation import Explanation
+from ceres_cal.solve.robust import RobustSolution
+
+
+def of_all(calibration: Calibration, settled: Settled) -> Calibration:
+    """What came out of all observations, where a part of them decided."""
+    observations, used, scales = settled.observations, settled.used, calibration.fit.scales
+    points, curves = used.sums
+    sigmas = [own / scale for own, scale in zip(used.sigmas, scales, strict=True)]
+    mean = [np.sqrt(sums[1:] / max(sums[0], 1.0)) for sums in (points, curves)]
+    return replace(
+        calibration,
+        fit=replace(
+            calibration.fit,
+            points=int(points[0]),
+            curves=int(curves[0]),
+            points_rms_px=float(mean[0][0]),
+            curves_rms_px=float(mean[1][0]),
+            point_sigma_px=float(mean[0][1]),
+            curve_sigma_px=float(mean[1][1]),
+        ),
+        rejected=rejected_rows(observations, used.rows, sigmas, settled.explanations),
+        warnings=observations.warnings,
+    )
+
+
+def fit_of(end: RobustSolution, layout: Layout) -> Fit:
+    """How well those that took part are fitted."""
+    points, curves = end.residuals.lengths
+    used = points[end.inliers.points], curves[end.inliers.curves]
+    sigmas = end.problem.sights.sigma_px, end.problem.sights.curve_sigma_px
+    return Fit(
+        len(used[0]),
+        len(used[1]),
+        _rms(used[0]),
+        _rms(used[1]),
+        end.inliers.point_scale,
+        end.inliers.curve_scale,
+        layout.size,
+        _rms(sigmas[0]),
+        _rms(sigmas[1]),
+    )
+
+
+def _rms(values: Array) -> float:
+    """Root mean square; 0 of nothing."""
+    return float(np.sqrt(values @ values / max(len(values), 1)))
+
+
+def rejected_rows(
+    observations: Observations, rows: Sequence[Indices], sigmas: Sequence[Array], explanations: Sequence[Explanation]
+) -> tuple[Rejected, ...]:
+    """The rows of points and of curve observations that did not take part, and how far off they are."""
+    wholes = [one for one in explanations if one.is_taken]
+    entries, views, copies = [], observations.views, observations.copies
+    for kind, out, far, column, copy_of, first in (
+        ("point", rows[0], sigmas[0], observations.points, copies.points, 0),
+        ("curve", rows[1], sigmas[1], observations.curves, copies.curves, len(observations.points)),
+    ):
+        for row, sigma in zip(out.tolist(), far.tolist(), strict=True):
+            reason = f"{sigma:.1f} sigma off" if np.isfinite(sigma) else "cannot be seen from there"
+            reason = next((one.words for one in wholes if one.rows[first + row]), reason)
+            if copy_of[row] >= 0:
+                reason = f"{COPY} of frame {views[copy_of[row]].frame!r}"
+            frame = views[column.view[row]].frame
+            entries.append(Rejected(kind, row, frame, observations.feature_name(kind, row), reason))
+    return tuple(entries)
