@@ -73,7 +73,8 @@ def _of(module: str, names: str, *figures: str) -> list[Constant]:
 DECIDING: tuple[Constant, ...] = (
     *_of("model.parameters", "Options.loss_scale Options.reject_sigma", "calibrate", "diagnose"),
     *_of("solve.usable", "_NO_FIT _OFF_CENTRE", "calibrate"),
-    *_of("calibrating", "_SAYS_LESS _RESTING", "calibrate"),
+    *_of("calibrating", "_SAYS_LESS", "calibrate"),
+    *_of("calibration.caveats", "_RESTING", "calibrate"),
     *_of("observations.bounds", "_LARGE_M", "calibrate"),
     *_of("solve.robust", "_AT_REST _ENOUGH_PLACEMENTS _MUCH_LESS", "calibrate"),
     *_of("solve.robust", "_AT_REST_AGAIN", "refit"),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -11,11 +11,10 @@ import numpy as np
 
 from ceres_cal.base.errors import CalibrationError, DegenerateError, SolutionError
 from ceres_cal.base.threads import at_most, meanwhile, single_threaded_blas
-from ceres_cal.base.words import bounds_text, two_digits
 from ceres_cal.calibration import Calibration
-from ceres_cal.calibration.outcome import fit_of, of_all, rejected_rows
+from ceres_cal.calibration.caveats import resting_phi, unknown_phi
+from ceres_cal.calibration.outcome import came_out, of_all
 from ceres_cal.lens_choice import choose_lens, papers
-from ceres_cal.model.keys import Key
 from ceres_cal.model.parameters import AUTO, Estimate, Layout, Options, make_layout
 from ceres_cal.model.priors import gather_priors
 from ceres_cal.model.quantities import difference
@@ -38,6 +37,7 @@ from ceres_cal.solve.as_built import solve_as_built, tolerances_of
 from ceres_cal.solve.bulk import Bulk, Part, Settled, is_bulk
 from ceres_cal.solve.competing import compete
 from ceres_cal.solve.conflicts import contradicted_by
+from ceres_cal.solve.dimensions import free_dimensions, require_measured
 from ceres_cal.solve.explanation import Explanation
 from ceres_cal.solve.looked_at import Asked
 from ceres_cal.solve.noise import visible_from
@@ -45,21 +45,14 @@ from ceres_cal.solve.possible import require_possible
 from ceres_cal.solve.usable import require_fits, require_usable
 from ceres_cal.start.baseline import four_point_baseline
 from ceres_cal.start.initialise import Start, initialise
-from ceres_cal.uncertainty import Posterior, Scatter, Uncertainty, assess, measure_scatter
+from ceres_cal.uncertainty import Posterior, Scatter, assess, measure_scatter
 
-_UNKNOWN = (
-    "camera {!r}: its views are too frontal to tell phi, which is {} at 95 %, and its heights go with phi: the floor "
-    "is right, what is above it is not: add boards tilted by 20 degrees, or a prior on height_m where it sees the field"
-)
 # Share of the standard deviation of usual principal points: observations that say as much need nothing usual. Half and
 # double leave ordinary fields and boards, whose share is under a tenth, as they are.
 _SAYS_LESS = 0.5
-# Times the standard deviation of phi without what is usual of principal points: what rests on it is said.
-_RESTING = 1.5
-_USUAL = (
-    "camera {!r}: phi, and what goes with it, rests on its principal point lying near the middle of the image, as is "
-    "usual: by the observations alone its standard deviation is {}: show tilted views, or state the principal point"
-)
+# Share of a dimension by which it may come out another than drawn without a second solve from there, whose start and
+# outliers are those of the right drawing; and how many there may be.
+_REDRAWN, _MOST_DRAWINGS = 0.005, 4
 _OTHERWISE = (
     "no calibration agrees with what was stated beforehand, though the observations make one without it: check the "
     "priors and their units"
@@ -87,16 +80,31 @@ def calibrate(
         SolutionError: no usable camera came out.
         InputError: a prior or a fixed number that the camera does not have; pixels outside their image.
     """
-    options = options or Options()
+    observations, options = free_dimensions(observations, options or Options())
     with single_threaded_blas(), at_most(options.threads):
         try:
-            return _calibrated(observations, options, progress, client)
+            return _measured(observations, options, progress, client)
         except (DegenerateError, SolutionError):
             free = _without_priors(observations, options)
             if free is None:
                 raise
             words = _contradicted(observations, options, free)
             raise SolutionError(words or _OTHERWISE) from None
+
+
+def _measured(
+    observations: Observations, options: Options, progress: Callable[[Progress], None] | None, client: Any
+) -> Calibration:
+    """With targets drawn as long as they were found to be; from there again where that is not how they were drawn."""
+    for _ in range(_MOST_DRAWINGS):
+        calibration = _calibrated(observations, options, progress, client)
+        before = calibration.estimate.structure
+        calibration = calibration.redrawn()
+        moved = calibration.estimate.structure.drawn_m / before.drawn_m - 1.0
+        if float(np.max(np.abs(moved), initial=0.0)) < _REDRAWN:
+            break
+        observations = calibration.drawn_alike(observations)
+    return calibration
 
 
 def _calibrated(
@@ -249,6 +257,8 @@ def solved_from(
     digest = meanwhile(lambda: observations.digest) if watched.settle is None else None
     usual = again.scales if again else None
     end = solve_robustly(problem, observations, start.estimate, usual, watched.progress, is_near=start.is_near)
+    if again is None:
+        require_measured(end.problem, end.solution.estimate)
 
     def solved(others: Problem, some: Asked) -> RobustSolution:
         return solve_robustly(others, some.observations, _start_of(others, some, start, again), usual)
@@ -270,11 +280,11 @@ def solved_from(
     if assessed:
         end, posterior = _assess(end, observations, problem, again)
         posterior = _with_doubts(posterior.in_doubt(conflicts.keys, conflicts.shifts), end, explanations)
-        warnings = (*warnings, *(one.words for one in conflicts.every), *_unknown(end, posterior))
-        warnings = (*warnings, *_resting(end, problem))
+        warnings = (*warnings, *(one.words for one in conflicts.every), *unknown_phi(end, posterior))
+        warnings = (*warnings, *resting_phi(end, problem))
     if digest is not None:
         digest.result()  # which the observations remember
-    calibration = _calibration(start, observations, problem, end, explanations)
+    calibration = came_out(start.phi_from, observations, problem, end, explanations)
     if settled is not None:
         calibration = of_all(calibration, settled)
     warnings = (*calibration.warnings, *require_usable(end, problem, explanations), *warnings)
@@ -290,33 +300,7 @@ def _closed_form(start: Start, observations: Observations, problem: Problem) -> 
     require_possible(observations, problem.sights, estimate, there)
     solution = Solution(estimate, np.nan, False, "the paper's closed form, nothing was minimised", ())
     end = RobustSolution(problem, solution, visible_from(observations, there), there, 0)
-    return _calibration(start, observations, problem, end)
-
-
-def _calibration(
-    start: Start,
-    observations: Observations,
-    problem: Problem,
-    end: RobustSolution,
-    explanations: Sequence[Explanation] = (),
-) -> Calibration:
-    """What came out, not assessed."""
-    out = [np.flatnonzero(~mask) for mask in (end.inliers.points, end.inliers.curves)]
-    far = end.inliers.point_sigmas[out[0]], end.inliers.curve_sigmas[out[1]]
-    return Calibration(
-        end.solution.estimate,
-        observations.targets,
-        fit_of(end, problem.layout),
-        rejected_rows(observations, out, far, explanations),
-        end.solution.termination,
-        end.solution.converged,
-        end.rounds,
-        end.solution.history,
-        start.phi_from,
-        observations.warnings,
-        problem.options,
-        observations.digest,
-    )
+    return came_out(start.phi_from, observations, problem, end)
 
 
 def _assess(
@@ -352,34 +336,3 @@ def _with_doubts(posterior: Posterior, end: RobustSolution, explanations: Sequen
     doubtful = [one for one in explanations if one.is_doubtful]
     shifts = [one.doubt**0.5 * difference(one.other, end.solution.estimate, posterior.keys) for one in doubtful]
     return posterior.in_doubt(posterior.keys, shifts)
-
-
-def _unknown(end: RobustSolution, posterior: Posterior) -> Iterator[str]:
-    """Warnings of cameras whose phi the observations leave open."""
-    known = Uncertainty(end.solution.estimate, posterior, {})
-    for name in posterior.profiles:
-        verdict = known.verdict("camera", name, "phi")
-        if verdict.verdict == "unknown":
-            yield _UNKNOWN.format(name, bounds_text(verdict.low, verdict.high, "px"))
-
-
-def _resting(end: RobustSolution, problem: Problem) -> Iterator[str]:
-    """Warnings of cameras whose phi rests on where principal points usually lie."""
-    estimate, reduced = end.solution.estimate, end.reduced
-    usual = [prior for prior in problem.priors_at(estimate) if prior.is_usual]
-    if reduced is None or not usual:
-        return
-    without = reduced.shared
-    for prior in usual:
-        without = without + replace(prior.information, matrix=-prior.information.matrix)
-    for name in estimate.cameras:
-        key = Key("camera", name, "phi", "px")
-        if key in reduced.shared.keys:
-            at = reduced.shared.columns([key])[0]
-            sd, alone = reduced.shared.spread.sd[at], without.spread.sd[at]
-            if alone > _RESTING * sd:
-                yield _USUAL.format(name, _share_text(alone / estimate.cameras[name].phi))
-
-
-def _share_text(share: float) -> str:
-    return f"{two_digits(100.0 * share)} %" if share < 1.0 else "larger than itself"

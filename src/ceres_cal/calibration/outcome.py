@@ -1,8 +1,8 @@
-"""What came out of a solve, as a calibration keeps it: how well it fits, and what was left out."""
+"""What came out of a solve, as a calibration that is not assessed yet."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -12,9 +12,35 @@ from ceres_cal.calibration.calibration import Calibration
 from ceres_cal.calibration.origin import COPY, Fit, Rejected
 from ceres_cal.model.parameters import Layout
 from ceres_cal.observations import Observations
+from ceres_cal.solve import Problem, RobustSolution
 from ceres_cal.solve.bulk import Settled
 from ceres_cal.solve.explanation import Explanation
-from ceres_cal.solve.robust import RobustSolution
+
+
+def came_out(
+    phi_from: Mapping[str, str],
+    observations: Observations,
+    problem: Problem,
+    end: RobustSolution,
+    explanations: Sequence[Explanation] = (),
+) -> Calibration:
+    """What came out, not assessed."""
+    out = [np.flatnonzero(~mask) for mask in (end.inliers.points, end.inliers.curves)]
+    far = end.inliers.point_sigmas[out[0]], end.inliers.curve_sigmas[out[1]]
+    return Calibration(
+        end.solution.estimate,
+        observations.targets,
+        _fit(end, problem.layout),
+        _rejected(observations, out, far, explanations),
+        end.solution.termination,
+        end.solution.converged,
+        end.rounds,
+        end.solution.history,
+        phi_from,
+        observations.warnings,
+        problem.options,
+        observations.digest,
+    )
 
 
 def of_all(calibration: Calibration, settled: Settled) -> Calibration:
@@ -34,13 +60,12 @@ def of_all(calibration: Calibration, settled: Settled) -> Calibration:
             point_sigma_px=float(mean[0][1]),
             curve_sigma_px=float(mean[1][1]),
         ),
-        rejected=rejected_rows(observations, used.rows, sigmas, settled.explanations),
+        rejected=_rejected(observations, used.rows, sigmas, settled.explanations),
         warnings=observations.warnings,
     )
 
 
-def fit_of(end: RobustSolution, layout: Layout) -> Fit:
-    """How well those that took part are fitted."""
+def _fit(end: RobustSolution, layout: Layout) -> Fit:
     points, curves = end.residuals.lengths
     used = points[end.inliers.points], curves[end.inliers.curves]
     sigmas = end.problem.sights.sigma_px, end.problem.sights.curve_sigma_px
@@ -62,7 +87,7 @@ def _rms(values: Array) -> float:
     return float(np.sqrt(values @ values / max(len(values), 1)))
 
 
-def rejected_rows(
+def _rejected(
     observations: Observations, rows: Sequence[Indices], sigmas: Sequence[Array], explanations: Sequence[Explanation]
 ) -> tuple[Rejected, ...]:
     """The rows of points and of curve observations that did not take part, and how far off they are."""

@@ -25,19 +25,23 @@ class View:
     placement: str | None = None
 
 
+PRIOR_OWNERS = ("camera", "station", "target")
+
+
 @dataclass(frozen=True)
 class Prior:
-    """What is known beforehand: `quantity` of a camera or station is `value` with standard deviation `sigma`.
+    """What is known beforehand: `quantity` of a camera, station or target is `value` with standard deviation `sigma`.
 
     Quantities of a station: height_m, position_m (m). Of a camera: phi, principal_point (px), aspect, and the lens's
-    coefficients by name in the units of the files.
+    coefficients by name in the units of the files. Of a target: its dimensions (m), which are solved for then; a sigma
+    that is infinite says that the value is only where to start from.
 
     Raises:
         InputError: on construction: an unknown owner, numbers that are not finite, a sigma that is not above 0.
     """
 
     owner: str
-    """"camera" or "station"."""
+    """"camera", "station" or "target"."""
     name: str
     quantity: str
     value: tuple[float, ...]
@@ -47,13 +51,26 @@ class Prior:
         object.__setattr__(self, "value", tuple(float(v) for v in self.value))
         object.__setattr__(self, "sigma", tuple(float(s) for s in self.sigma))
         here = f"prior on {self.quantity!r} of {self.name!r}"
-        if self.owner not in ("camera", "station"):
-            raise InputError(f"{here}: its owner must be 'camera' or 'station', not {self.owner!r}")
+        if self.owner not in PRIOR_OWNERS:
+            raise InputError(f"{here}: its owner must be one of {', '.join(PRIOR_OWNERS)}, not {self.owner!r}")
         size = {"position_m": 3, "principal_point": 2}.get(self.quantity, 1)
         if len(self.value) != size or len(self.sigma) != size:
             raise InputError(f"{here}: give {size} numbers and {size} sigmas")
-        if not np.all(np.isfinite((*self.value, *self.sigma))) or min(self.sigma) <= 0.0:
+        finite = np.all(np.isfinite(self.value)) and (self.is_open or np.all(np.isfinite(self.sigma)))
+        if not finite or not min(self.sigma) > 0.0:
             raise InputError(f"{here}: finite numbers and a sigma above 0")
+        if self.owner == "target" and not self.value[0] > 0.0:
+            raise InputError(f"{here}: a length is above 0 m, not {self.value[0]:g}")
+
+    @property
+    def is_open(self) -> bool:
+        """Whether a target's dimension is not known at all."""
+        return self.owner == "target" and self.sigma == (np.inf,)
+
+    @property
+    def dimension(self) -> str:
+        """The "target/dimension" that it is about; nothing where it is about a camera or a station."""
+        return f"{self.name}/{self.quantity}" if self.owner == "target" else ""
 
 
 TYPES = {"view": np.int32, "feature": np.int32, "pixels": np.float64, "sigma_px": np.float64, "side": np.int8}

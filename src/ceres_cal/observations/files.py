@@ -30,6 +30,7 @@ from ceres_cal.base.files import (
 from ceres_cal.observations.columns import (
     NO_CURVES,
     NO_POINTS,
+    PRIOR_OWNERS,
     TYPES,
     Columns,
     Curves,
@@ -175,9 +176,13 @@ def header_of(content: Content) -> ObservationsFile:
 
 
 def prior_to_json(prior: Prior) -> dict[str, Any]:
-    """A prior as the files have it: `{"station": "a", "height_m": 4.02, "sigma_m": 0.01}`."""
+    """A prior as the files have it: `{"station": "a", "height_m": 4.02, "sigma_m": 0.01}`; null: nothing is known."""
     value, sigma = (v[0] if len(v) == 1 else list(v) for v in (prior.value, prior.sigma))
-    return {prior.owner: prior.name, prior.quantity: value, "sigma_m" if prior.owner == "station" else "sigma": sigma}
+    return {prior.owner: prior.name, prior.quantity: value, _sigma_of(prior.owner): None if prior.is_open else sigma}
+
+
+def _sigma_of(owner: str) -> str:
+    return "sigma" if owner == "camera" else "sigma_m"
 
 
 def prior_from_json(entry: Mapping[str, Any], where: str) -> Prior:
@@ -187,13 +192,14 @@ def prior_from_json(entry: Mapping[str, Any], where: str) -> Prior:
         InputError: naming `where`, when the entry does not name one owner, one quantity and one sigma.
     """
     rest = dict(entry)
-    owners = [key for key in ("camera", "station") if key in rest]
+    owners = [key for key in PRIOR_OWNERS if key in rest]
     if len(owners) != 1:
-        raise InputError(f'{where}: a prior names one "camera" or one "station"')
-    name = rest.pop(owners[0])
-    sigma_key = "sigma_m" if owners[0] == "station" else "sigma"
-    sigma = rest.pop(sigma_key, None)
-    if sigma is None or len(rest) != 1:
+        raise InputError(f'{where}: a prior names one "camera" or one "station", or one "target"')
+    name, sigma_key = rest.pop(owners[0]), _sigma_of(owners[0])
+    sigma = rest.pop(sigma_key, msgspec.UNSET)
+    if sigma is None and owners[0] == "target":
+        sigma = np.inf
+    if sigma in (None, msgspec.UNSET) or len(rest) != 1:
         raise InputError(f'{where}: a prior of a {owners[0]} has one quantity and "{sigma_key}", not {sorted(entry)}')
     ((quantity, value),) = rest.items()
     size = {"position_m": 3, "principal_point": 2}.get(quantity, 1)

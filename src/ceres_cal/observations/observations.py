@@ -178,6 +178,14 @@ class Observations(Content):
         """The same views with some of the observations: their numbers, or True for each that stays."""
         return replace(self, points=taken(self.points, points), curves=taken(self.curves, curves))
 
+    def with_targets(self, targets: Mapping[str, Target]) -> Observations:
+        """The same observations of targets that are drawn otherwise; their digest stays."""
+        if all(targets[name] == target for name, target in self.targets.items()):
+            return self
+        drawn = replace(self, targets=dict(targets))
+        vars(drawn)["digest"] = self.digest
+        return drawn
+
     def of_station(self, name: str) -> Observations:
         """One station's views with all their observations, without priors."""
         chosen = np.array([view.station == name for view in self.views])
@@ -262,8 +270,9 @@ class Observations(Content):
         return stray_pixels(self)
 
     def require_owner(self, prior: Prior) -> None:
-        """Raise InputError where a prior names a camera or station that is not there."""
-        names: Iterable[str] = self.cameras if prior.owner == "camera" else self.stations
+        """Raise InputError where a prior names a camera, a station or a target that is not there."""
+        every: dict[str, Iterable[str]] = {"camera": self.cameras, "station": self.stations, "target": self.targets}
+        names = every[prior.owner]
         if prior.name not in names:
             raise InputError(f"a prior names {prior.owner} {prior.name!r}, which is not there: {choices(names)}")
 

@@ -115,7 +115,7 @@ class _Sums:
         self._problem, self._estimate = problem, estimate
         self._keys = free_keys(estimate, problem.layout, problem.private)
         self._columns = {owner: np.array(at, dtype=np.int64) for owner, at in columns_by_owner(self._keys).items()}
-        structure = [column for column, key in enumerate(self._keys) if key.kind == "structure"]
+        structure = [column for column, key in enumerate(self._keys) if key.is_structure]
         self._structure = np.array(structure, dtype=np.int64)
         size = len(self._keys)
         self._matrices, self._leverages = np.zeros((2, size, size)), np.zeros(2)  # of points, of curves
@@ -236,12 +236,13 @@ class _Normals:
     def __init__(self, sights: Sights, problem: Problem, estimate: Estimate) -> None:
         camera = estimate.cameras[sights.keys[0].camera]
         free, structure, weighting = problem.layout.free[sights.keys[0].camera], estimate.structure, problem.weighting
-        self._size = len(free) + len(structure.values) + 6
-        units = np.ones(self._size)
+        offsets = len(structure.offsets)
+        units = np.ones(len(free) + offsets + 6)
         units[: len(free)] = intrinsics_scales(camera)[free]
+        self._size, self._chain = len(units), structure.chain(len(free), 6)
         self._arguments = (
             camera_optics(camera),
-            kernels.Unknowns(free, len(structure.values)),
+            kernels.Unknowns(free, offsets),
             point_columns(sights, structure, weighting.point_scale),
             curve_columns(sights, structure, starting_feet(sights, estimate, problem.feet), weighting.curve_scale),
             kernel_loss(weighting),
@@ -258,4 +259,4 @@ class _Normals:
         normals = np.empty((last - first, self._size, self._size))
         if not kernels.sight_normals(first, last, *self._arguments, normals):
             raise SolutionError("an observation cannot be projected where the solve ended: no uncertainty can be given")
-        return normals
+        return normals if self._chain is None else self._chain.T @ normals @ self._chain
