@@ -37,6 +37,7 @@ from benchmark_problems import (
     wide_lens,
 )
 from benchmark_process import process_rows
+from benchmark_scale import FOLDER, stored_growth, write_field
 
 from ceres_cal.scene.heights import ROBOT_TOP_M
 from ceres_cal.scene.lens import KannalaBrandt
@@ -233,6 +234,7 @@ TASKS: dict[str, Callable[[int, int], Any]] = {
     "first": first_call,
     "corners": corners_memory,
     "field": field_growth,
+    "stored": stored_growth,
 }
 
 
@@ -318,6 +320,18 @@ PROCESS = {
     "ours_processor": ("ours CPU s", ".3f"),
     "opencv_processor": ("OpenCV CPU s", ".3f"),
     "times_processor": ("ratio", ".2f"),
+}
+SCALE = {
+    "size": ("line points", "d"),
+    "workers": ("workers", "d"),
+    "seconds": ("seconds", ".1f"),
+    "open_seconds": ("opened in", ".1f"),
+    "peak_mib": ("peak MiB", ".0f"),
+    "worker_mib": ("of a worker", ".0f"),
+    "iterations": ("iterations", "d"),
+    "iteration_seconds": ("s each", ".3f"),
+    "iteration_bytes": ("bytes each", "d"),
+    "focal_error_px": ("focal error px", "+.3f"),
 }
 PIXELS_TOLD = {"lens": ("lens", ""), "locate": ("locate s", ".3f"), "project": ("project s", ".3f")}
 
@@ -410,6 +424,23 @@ def measure(chosen: argparse.Namespace) -> dict[str, Any]:
     return report
 
 
+def measure_scale(chosen: argparse.Namespace) -> dict[str, Any]:
+    """Line points in files, in one process and with Dask's workers; frames; and how they grow."""
+    rows = []
+    for count in chosen.scale:
+        with tempfile.TemporaryDirectory() as folder:
+            os.environ[FOLDER] = str(Path(folder) / "field.columns")
+            write_field(Path(os.environ[FOLDER]), count)
+            for workers in chosen.workers:
+                rows.append(alone("stored", count, workers))
+                print_table("line points in files", SCALE, rows[-1:])
+    for workers in chosen.workers:
+        print_growth(f"with {workers} workers", [row for row in rows if row["workers"] == workers])
+    frames = [frames_growth(count, chosen.repeat) for count in chosen.growth]
+    print_growth("growth with the frames", frames)
+    return {"environment": environment(), "stored": rows, "frames": frames}
+
+
 def measure_processes(repeat: int) -> dict[str, Any]:
     """From start to exit, printed."""
     rows = process_rows(repeat)
@@ -464,6 +495,14 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--memory", action="store_true", help="peak memory of each solver at the most frames, too")
     parser.add_argument("--json", type=Path, help="write everything measured to this file")
     parser.add_argument("--quick", action="store_true", help="smallest sizes, one turn: does it run?")
+    parser.add_argument(
+        "--scale",
+        type=numbers,
+        nargs="?",
+        const="1e7,1e8",
+        help="line points in files, and --growth; no more: %(const)s",
+    )
+    parser.add_argument("--workers", type=numbers, default="0,1,2", help="of Dask in --scale, 0 is none: %(default)s")
     parser.add_argument("--process", action="store_true", help="whole processes in turns, and no more")
     parser.add_argument("--alone", nargs=3, help=argparse.SUPPRESS)
     chosen = parser.parse_args(arguments)
@@ -473,7 +512,10 @@ def main(arguments: Sequence[str]) -> int:
         return 0
     if chosen.quick:
         chosen.frames, chosen.growth, chosen.points, chosen.repeat = [20], [20, 40], [1000], 1
-    report = measure_processes(chosen.repeat) if chosen.process else measure(chosen)
+    if chosen.scale:
+        report = measure_scale(chosen)
+    else:
+        report = measure_processes(chosen.repeat) if chosen.process else measure(chosen)
     if chosen.json:
         chosen.json.write_text(json.dumps(report, indent=1), encoding="utf-8")
     return 0

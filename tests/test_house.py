@@ -48,6 +48,7 @@ DOORS = {
     "matplotlib": {"report"},
     "google": {"formats"},  # protobuf
     "yaml": {"formats"},
+    "distributed": {"cli"},
     "scipy": set(),  # for the tests only
 }
 

@@ -118,8 +118,11 @@ def _calibrated(
     if options.closed_form_only or not (client is not None or is_bulk(observations)):
         return _chosen(observations, options, Watched(progress))
     digest, bulk = meanwhile(lambda: observations.digest), Bulk(observations, client)
-    part = _part(bulk, options)
-    calibration = _chosen(part.observations, options, Watched(progress, partial(bulk.settled, part)))
+    try:
+        part = _part(bulk, options)
+        calibration = _chosen(part.observations, options, Watched(progress, partial(bulk.settled, part)))
+    finally:
+        bulk.close()
     return replace(calibration, digest=digest.result())
 
 

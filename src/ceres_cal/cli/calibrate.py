@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from argparse import ArgumentParser, ArgumentTypeError, Namespace
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING
+from contextlib import AbstractContextManager, nullcontext
+from typing import TYPE_CHECKING, Any
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.cli.arguments import (
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
 
 
 _AUTO = "auto"
+_PATIENCE_S = 5.0  # with a scheduler
 _TERMS = "rational (OpenCV's k4 to k6) and prism (its s1 to s4) of brown, tangential (p1, p2) of kannala-brandt"
 
 
@@ -47,7 +49,10 @@ def _lens_kind(name: str) -> str:
 
 def _add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
-        "observations", nargs="+", metavar="OBS", help="files of observations (.json or .npz), taken together"
+        "observations",
+        nargs="+",
+        metavar="OBS",
+        help="files of observations (.json or .npz, or one folder .columns), taken together",
     )
     add_output(parser, "the calibration", required=False)
     add_report(parser)
@@ -122,6 +127,7 @@ def _add_solve(parser: ArgumentParser) -> None:
     )
     add("--max-iterations", type=int, default=100, metavar="N", help="of each solve; default: 100")
     add("--threads", type=int, default=0, metavar="N", help="default: the solver chooses")
+    add("--scheduler", metavar="ADDRESS", help="of Dask, whose workers keep the observations, such as tcp://host:8786")
 
 
 def _run(args: Namespace) -> Answer:
@@ -133,17 +139,32 @@ def _run(args: Namespace) -> Answer:
     observations = read_observations(args.observations)
     photographs = report_photographs(args, observations)
     options = _options(args, fixed, powers, observations)
-    with progress_bar(args) as bar:
+    with progress_bar(args) as bar, _client(args.scheduler) as client:
         from ceres_cal.calibrating import calibrate
         from ceres_cal.report.quality import quality_of
 
-        calibration = calibrate(observations, options, _solve_progress(bar))
+        calibration = calibrate(observations, options, _solve_progress(bar), client=client)
     page = report_page(args, calibration, observations, photographs)
     quality = quality_of(calibration, observations)
     write_results(args, calibration.save, page)
     return Answer(
         calibration_data(quality, args.observations, args), lambda: calibration_text(quality, args.observations, args)
     )
+
+
+def _client(address: str | None) -> AbstractContextManager[Any]:
+    """Of the scheduler there, whose answer is awaited for some seconds; nothing without an address."""
+    if address is None:
+        return nullcontext()
+    try:
+        from distributed import Client
+    except ImportError:
+        raise InputError("--scheduler needs Dask: pip install 'ceres-cal[dask]'") from None
+    try:
+        client: AbstractContextManager[Any] = Client(address, timeout=_PATIENCE_S)
+    except (OSError, ValueError) as error:
+        raise InputError(f"--scheduler {address}: no scheduler answers there ({str(error).splitlines()[0]})") from None
+    return client
 
 
 COMMANDS = (

@@ -115,12 +115,25 @@ _BLOCK = 1 << 20  # rows at once: what is made of them stays small beside very m
 _NOBODY, _NOWHERE = np.empty(0, np.int32), np.empty((0, 2))
 NO_POINTS = Points(_NOBODY, _NOBODY, _NOWHERE, np.empty(0))
 NO_CURVES = Curves(_NOBODY, _NOBODY, _NOWHERE, np.empty(0), np.empty(0, np.int8))
+_MOST_RUNS = 10_000  # of rows side by side that are read one by one
 C = TypeVar("C")
 
 
 def taken(columns: C, rows: Indices | Indices32 | Mask) -> C:
     """Points, curves, or columns of another kind, at these rows only: their numbers, or True for each that stays."""
-    return type(columns)(**{name: column[rows] for name, column in vars(columns).items()})
+    return type(columns)(**{name: _taken(column, rows) for name, column in vars(columns).items()})
+
+
+def _taken(column: AnyArray, rows: Indices | Indices32 | Mask) -> AnyArray:
+    """Rows of a column; of one in a file, where they lie side by side, without mapping what is around them."""
+    if not isinstance(column, np.memmap):
+        return column[rows]
+    numbers = np.flatnonzero(rows) if rows.dtype == bool else rows
+    starts = np.flatnonzero(np.diff(numbers, prepend=-2) != 1)
+    if not len(numbers) or len(starts) > _MOST_RUNS:
+        return np.array(column[rows])
+    runs = zip(numbers[starts].tolist(), np.diff(starts, append=len(numbers)).tolist(), strict=True)
+    return np.concatenate([read_rows(rows_of(column, start, start + count)) for start, count in runs])
 
 
 class FileRows(NamedTuple):

@@ -18,6 +18,7 @@ from collections import Counter
 from collections.abc import Container, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from operator import itemgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -100,7 +101,7 @@ class Sights(Sequence["Sights"]):
     @cached_property
     def seen_once(self) -> frozenset[str | None]:
         """Placements that a single one of the sights shows."""
-        times = Counter([key.placement for key in self.keys])
+        times = Counter(map(itemgetter(2), self.keys))
         return frozenset(name for name, count in times.items() if count == 1)
 
     @property
@@ -113,10 +114,10 @@ class Sights(Sequence["Sights"]):
         """Measured numbers: two of each point, one of each curve observation."""
         return 2 * len(self.point_rows) + len(self.curve_rows)
 
-    @property
+    @cached_property
     def cameras(self) -> tuple[str, ...]:
         """Names of the cameras, each once."""
-        return tuple(dict.fromkeys(key.camera for key in self.keys))
+        return tuple(dict.fromkeys(map(itemgetter(0), self.keys)))
 
     def numbers(
         self,
@@ -206,9 +207,11 @@ class Sights(Sequence["Sights"]):
     def _rows(
         self, numbers: Indices, p: Indices | slice, c: Indices | slice, point_sizes: Indices, curve_sizes: Indices
     ) -> Sights:
+        every = len(numbers) == len(self) and np.array_equal(numbers, np.arange(len(self)))
+        chosen = () if every else numbers.tolist()
         return Sights(
-            tuple(self.keys[i] for i in numbers),
-            tuple(self.views[i] for i in numbers),
+            self.keys if every else tuple(map(self.keys.__getitem__, chosen)),
+            self.views if every else tuple(map(self.views.__getitem__, chosen)),
             bounds_of(point_sizes),
             _at(self.point_rows, p),
             _at(self.point_index, p),

@@ -23,7 +23,7 @@ from ceres_cal.solve.bundle import Progress, solve
 from ceres_cal.solve.engines import Engine, InProcess, OnWorkers
 from ceres_cal.solve.explanation import Explanation
 from ceres_cal.solve.information import information
-from ceres_cal.solve.noise import Inliers, Noise, Redundancy, noise_of, relative_lengths
+from ceres_cal.solve.noise import SAME, Inliers, Noise, Redundancy, noise_of, relative_lengths
 from ceres_cal.solve.problem import Problem, Weighting
 from ceres_cal.solve.robust import RobustSolution
 from ceres_cal.solve.shared_cost import Judged, of_world
@@ -35,8 +35,6 @@ MANY = 2_000_000
 _PART, _FEWEST_VIEWS = 300_000, 200
 _STANDING_OUT = 12  # views besides, of the largest residuals and of most outliers each
 _MOST_ROUNDS = 8
-# Of the root of how many there are: so many outliers more or fewer move no number by a hundredth sd.
-_SAME = 4e-3
 _AT_REST = 1e-2  # relative change of a noise scale that is no change, as in `robust`
 
 
@@ -80,6 +78,7 @@ class Bulk:
 
     def __init__(self, observations: Observations, client: Any = None) -> None:
         self.observations, self._client = observations, client
+        self._engines: list[InProcess | OnWorkers] = []
         self._left_out = None
         if observations.copies.are_there:
             points, curves = observations.copies.originals
@@ -91,7 +90,14 @@ class Bulk:
 
     def _engine_without(self, left_out: tuple[Mask, Mask] | None) -> Engine:
         shares = list(cut(self.observations, left_out))
-        return InProcess(shares) if self._client is None else OnWorkers(self._client, shares)
+        engine = InProcess(shares) if self._client is None else OnWorkers(self._client, shares)
+        self._engines.append(engine)
+        return engine
+
+    def close(self) -> None:
+        """Let all shares go, wherever they are."""
+        for engine in self._engines:
+            engine.close()
 
     # ---- the part that decides --------------------------------------------------------------------------------------
 
@@ -318,4 +324,4 @@ def _alike(noise: Noise, before: Noise) -> bool:
 
 def _same_rows(now: tuple[int, int], before: tuple[int, int]) -> bool:
     """Whether about as many take part."""
-    return all(abs(one - other) <= _SAME * other**0.5 for one, other in zip(now, before, strict=True))
+    return all(abs(one - other) <= SAME * other**0.5 for one, other in zip(now, before, strict=True))

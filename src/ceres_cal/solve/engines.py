@@ -22,6 +22,9 @@ class Engine(Protocol):
     def ask(self, answer: Callable[..., _A], *request: Any) -> _A:
         """The sum of answer(share, *request) over all shares."""
 
+    def close(self) -> None:
+        """Let the shares go."""
+
 
 class InProcess:
     """Shares that this process asks, a thread each."""
@@ -32,6 +35,10 @@ class InProcess:
     def ask(self, answer: Callable[..., _A], *request: Any) -> _A:
         """The sum of answer(share, *request) over all shares."""
         return asked_of(self._shares, answer, request, available())
+
+    def close(self) -> None:
+        """Let the shares go."""
+        self._shares = ()
 
 
 def asked_of(shares: Sequence[Share], answer: Callable[..., _A], request: Sequence[Any], threads: int) -> _A:
@@ -63,6 +70,7 @@ class OnWorkers:
         workers = sorted(client.scheduler_info(n_workers=-1)["workers"])
         if not workers:
             raise SolutionError("the scheduler has no workers: start some with `dask worker ADDRESS`")
+        workers = workers[: len(shares)]
         count = len(workers)
         # In tasks, not scattered: what a lost worker had is made again from them.
         self._kept = [
@@ -91,6 +99,11 @@ class OnWorkers:
         finally:
             for one in asked:
                 one.release()
+
+    def close(self) -> None:
+        """Let the shares go."""
+        for one in self._kept:
+            one.release()
 
 
 def _kept(shares: Sequence[Share]) -> Sequence[Share]:

@@ -28,6 +28,8 @@ _AT_REST, _AT_REST_AGAIN = 1e-2, 1e-5
 # Of a camera: with them it is known well enough to place all others; fewer cost another round, more cost time.
 # Nothing changes from half to double.
 _ENOUGH_PLACEMENTS = 20
+# Of very many: a camera of 20 has so many others' rows on the wrong side of the bound that another solve follows.
+_SHARE_OF_PLACEMENTS = 25
 # Of a lens that says nothing of where it was not seen; they are solved to the end, and tell how smooth it is.
 _ENOUGH_WITHOUT_FORMULA = 100
 _STILL = 0.05  # variances by which a lens that is as smooth as the data say stands off: no number is off by 0.23 sd
@@ -91,6 +93,8 @@ def solve_robustly(
     before: Inliers | None = None
     while state.rounds < most_rounds:
         at_rest = before is not None and state.inliers.same_as(before, rounds.no_change)
+        if at_rest and before is not None:
+            state = rounds.with_rows_of(state, before)
         if not at_rest and before is not None:
             undecided = frozenset(state.problem.sights.keys)  # another lens had decided about mirrored poses
         if at_rest or before is None:
@@ -201,6 +205,12 @@ class _Rounds:
             state = self._judged(replace(state.solution, estimate=estimate), state.residuals, state.rounds)
         return state, lost + turned, undecided
 
+    def with_rows_of(self, state: RobustSolution, before: Inliers) -> RobustSolution:
+        """The state with the rows that it was solved with, where others are as good."""
+        inliers = state.inliers.with_rows_of(before)
+        used = self._problem.used(inliers.points, inliers.curves)
+        return replace(state, inliers=inliers, problem=replace(state.problem, sights=used.sights))
+
     def with_leverages(self, state: RobustSolution) -> RobustSolution:
         """The state with what its problem says there, where the noise is judged no other by the leverages, and nothing
         moves by how smooth lenses are; else judged by them, for another round.
@@ -243,6 +253,6 @@ def _evenly(problem: Problem) -> Indices:
     for camera in problem.sights.cameras:
         boards = problem.sights.numbers(camera, placements=private).tolist()
         enough = _ENOUGH_WITHOUT_FORMULA if problem.options.blank_lens.roughness else _ENOUGH_PLACEMENTS
-        chosen += boards[:: max(1, len(boards) // enough)]
+        chosen += boards[:: max(1, min(len(boards) // enough, _SHARE_OF_PLACEMENTS))]
         chosen += set(problem.sights.numbers(camera).tolist()) - set(boards)
     return np.array(sorted(chosen), dtype=np.int64)

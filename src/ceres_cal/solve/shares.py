@@ -30,7 +30,7 @@ from ceres_cal.solve.problem import Problem, Weighting
 
 # Of the bounds of outliers: longer residuals are remembered, so that bounds may move.
 _FAR = 0.5
-_ROWS = 1 << 20  # of a share: what is made of them for an answer takes some 100 MB
+_ROWS = 1 << 19  # of a share: what is made of them for an answer takes some 100 MB
 # Bins of a histogram of lengths in stated sigmas, to 2e7: from which on one is, and how much wider than the last.
 _LEAST, _WIDTH, _BINS = 1e-6, 0.00375, 8192
 

@@ -1,0 +1,117 @@
+"""Growth past memory and past one process, for scripts/benchmark.py --scale."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import resource
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+from benchmark_peers import peak_mib
+from benchmark_problems import field_observations
+
+from ceres_cal.observations import Observations
+from ceres_cal.observations.columns import View
+from ceres_cal.observations.files import header_of
+from ceres_cal.observations.folders import HEADER
+
+FOLDER = "CERES_CAL_BENCHMARK"  # the environment's name of where the observations are
+_FRAMES = 2000  # written at once
+_WARM_UP = 20_000
+
+
+def write_field(path: Path, line_points: int) -> None:
+    """`field_observations` as a folder of columns, of which never more than a part is in memory."""
+    one = field_observations(_WARM_UP)
+    per_frame = int(np.count_nonzero(one.curves.view == 0))
+    frames = -(-line_points // per_frame)
+    counts = {"points": frames * int(np.count_nonzero(one.points.view == 0)), "curves": line_points}
+    views = tuple(View(str(frame), "overhead", "overhead", "field") for frame in range(frames))
+    path.mkdir()
+    (path / HEADER).write_bytes(msgspec.json.encode(header_of(replace(one, points=one.points, views=views))))
+    columns = {
+        f"{kind}_{name}": np.lib.format.open_memmap(
+            path / f"{kind}_{name}.npy", "w+", array.dtype, (counts[kind], *array.shape[1:])
+        )
+        for kind, column in (("points", one.points), ("curves", one.curves))
+        for name, array in vars(column).items()
+    }
+    start = {"points": 0, "curves": 0}
+    for first in range(0, frames, _FRAMES):
+        part = field_observations(min(_FRAMES * per_frame, line_points - first * per_frame), seed=first)
+        for kind, column in (("points", part.points), ("curves", part.curves)):
+            for name, array in vars(column).items():
+                rows = array + np.int32(first) if name == "view" else array
+                columns[f"{kind}_{name}"][start[kind] : start[kind] + len(rows)] = rows
+            start[kind] += len(column)
+
+
+def stored_growth(line_points: int, workers: int) -> dict[str, Any]:
+    """Seconds of a calibration from the folder, peak memory of the process and of a worker, what an iteration takes.
+
+    Args:
+        workers: of Dask, in processes of their own with a thread each; 0 for none.
+    """
+    from ceres_cal.calibrating import calibrate
+    from ceres_cal.model.parameters import Options
+
+    options = Options(lens="radial")
+    calibrate(field_observations(_WARM_UP), options)
+    with ExitStack() as stack:
+        client = stack.enter_context(_cluster(workers)) if workers else None
+        start = time.perf_counter()
+        observations = Observations.load(os.environ[FOLDER])
+        opened = time.perf_counter()
+        trips = _watched(stack)
+        calibration = calibrate(observations, options, client=client)
+        seconds = time.perf_counter() - start
+        peaks = client.run(resource.getrusage, resource.RUSAGE_SELF).values() if client else ()
+        return {
+            "size": line_points,
+            "workers": workers,
+            "seconds": seconds,
+            "open_seconds": opened - start,
+            "focal_error_px": calibration.cameras["overhead"].phi - 600.0,
+            "phi": calibration.cameras["overhead"].phi,
+            "peak_mib": peak_mib(),
+            "worker_mib": max((one.ru_maxrss / 1024.0 for one in peaks), default=None),
+            "iterations": len(trips),
+            "iteration_seconds": float(np.median([seconds for seconds, _ in trips])),
+            "iteration_bytes": max(size for _, size in trips),
+        }
+
+
+def _cluster(workers: int) -> Any:
+    """A client of so many worker processes on this machine."""
+    from distributed import Client, LocalCluster
+
+    return Client(LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address=None, memory_limit=0))
+
+
+def _watched(stack: ExitStack) -> list[tuple[float, int]]:
+    """Seconds of each evaluation from now on, and the bytes that go to a worker and back for it."""
+    from ceres_cal.solve import engines
+    from ceres_cal.solve.shares import Share
+
+    trips: list[tuple[float, int]] = []
+    for engine in (engines.InProcess, engines.OnWorkers):
+        whole: Callable[..., Any] = engine.ask
+
+        def ask(self: Any, answer: Callable[..., Any], *request: Any, whole: Callable[..., Any] = whole) -> Any:
+            start = time.perf_counter()
+            told = whole(self, answer, *request)
+            if answer is Share.blocks:
+                size = len(pickle.dumps(request)) + len(pickle.dumps(told))
+                trips.append((time.perf_counter() - start, size))
+            return told
+
+        engine.ask = ask  # type: ignore[method-assign]
+        stack.callback(setattr, engine, "ask", whole)
+    return trips
