@@ -17,7 +17,7 @@ from ceres_cal.model.equations import Equations, write_equations
 from ceres_cal.model.parameters import Estimate, Options, make_layout
 from ceres_cal.model.priors import gather_priors
 from ceres_cal.model.quantities import moved, values_of
-from ceres_cal.model.residuals import residuals
+from ceres_cal.model.residuals import Residuals, residuals
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights, gather_sights
 from ceres_cal.observations.thinning import thinned
@@ -36,6 +36,7 @@ _QUIETER = 0.7
 _MOST_ROUNDS = 8
 _SOUND_PX = 1.0  # noise beyond which a first solve may have ended in a wrong valley: others are tried from nothing
 _PRECISION = 1e-2  # relative change of the cost from which on normal equations say where the least is
+_MOST_STEPS = 10  # a kind that takes more is no lens for these observations
 _FEWEST_PLACEMENTS = 5  # with fewer the features of each are held out one by one
 
 
@@ -241,24 +242,32 @@ class _Seen:
         options = forms[0].of(self.options)
         estimate = _seen_through(self.end.solution.estimate, options, self._profiles)
         try:
-            problem = _problem(self.observations, self.sights, options, estimate)
-            problem = problem.weighted(self.end.problem.weighting)
+            few = replace(options, max_iterations=_MOST_STEPS)
+            problem = _problem(self.observations, self.sights, few, estimate)
+            # All inliers weigh the same with every kind: what one of them misses must not weigh less with it.
+            problem = problem.weighted(replace(self.end.problem.weighting, loss="trivial"))
+            there = self._shown(estimate)
             if not is_solved:
-                estimate = solve(problem, estimate, precision=_PRECISION).estimate
-            normals, sigma_px = self._normals(problem, estimate)
+                estimate = solve(problem, estimate, precision=_PRECISION, is_near=False).estimate
+                there = self._shown(estimate)
+            normals, sigma_px = self._normals(problem, estimate, there)
         except CalibrationError as error:
             return Kind(forms, estimate, failed=str(error))
         reach_px = {name: profile.reach_px for name, profile in self._profiles.items()}
         return Kind(forms, estimate, normals, sigma_px, reach_px)
 
-    def _normals(self, problem: Problem, estimate: Estimate) -> tuple[GroupNormals, float]:
-        """The normal equations of each group, and the sigma of a typical observation, px."""
-        there = residuals(self.observations, self.sights, estimate)
+    def _shown(self, estimate: Estimate) -> Residuals:
+        """The residuals there; DegenerateError where something is not seen."""
+        there = residuals(self.observations, self.sights, estimate, self.end.residuals.feet)
         points, curves = there.lengths
         if not np.isfinite([*points[self.sights.point_rows], *curves[self.sights.curve_rows]]).all():
             raise DegenerateError("cannot show all that another lens shows")
+        return there
+
+    def _normals(self, problem: Problem, estimate: Estimate, there: Residuals) -> tuple[GroupNormals, float]:
+        """The normal equations of each group, and the sigma of a typical observation, px."""
         equations = write_equations(self.observations, self.sights, estimate, there)
-        weights = equation_weights(self.observations, problem.weighting, equations, there).within_sigma
+        weights = equation_weights(self.observations, problem.weighting, equations, there)
         normals = group_normals(problem, estimate, equations, weights, _groups(equations, problem))
         return normals, 1.0 / float(np.mean(weights.inverse_sigma))
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import DegenerateError
-from ceres_cal.lens_choice.forms import PAPER
+from ceres_cal.lens_choice.forms import PAPER, is_usual
 
 # How much worse than the best, in standard errors of the difference, is as good: at 1 the paper's lens is missed more
 # often, at 2 the decentring of real sets.
@@ -32,7 +32,7 @@ def decide(labels: Sequence[str], sizes: Sequence[int], squares: Sequence[Array 
         raise DegenerateError("no lens can be calibrated: check labels and target dimensions")
     totals = {i: float(one.sum()) for i, one in known.items()}
     best = min(totals, key=totals.__getitem__)
-    order = sorted(totals, key=lambda i: (labels[i] != PAPER, sizes[i], totals[i]))
+    order = sorted(totals, key=lambda i: (labels[i] != PAPER, sizes[i], not is_usual(labels[i]), totals[i]))
     return best, next(i for i in order if standard_errors(known[i], known[best]) <= AS_GOOD)
 
 
