@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -118,3 +119,8 @@ def forms_of(kind: str) -> tuple[Form, ...]:
     starts = [longest, *([replace(plain, coefficients=bare)] if _tangential(lens) else [])]
     every = {(form := Form.among(one)).label: form for start in starts for one in candidates(start)}
     return tuple(sorted(every.values(), key=lambda one: -len(one.names)))
+
+
+def kinds() -> Iterator[tuple[Form, ...]]:
+    """The lenses of each kind that has a formula: one without has no shorter ones."""
+    return (forms_of(kind) for kind, lens in LENSES.items() if not lens.set_at_start)

@@ -11,7 +11,7 @@ import numpy as np
 from ceres_cal.base.arrays import Array, Indices, Mask
 from ceres_cal.base.errors import CalibrationError, DegenerateError
 from ceres_cal.base.transforms import Poses
-from ceres_cal.lens_choice.forms import PAPER, Form, forms_of
+from ceres_cal.lens_choice.forms import PAPER, Form, kinds
 from ceres_cal.lens_choice.rule import AS_GOOD, standard_errors
 from ceres_cal.model.equations import Equations, write_equations
 from ceres_cal.model.parameters import Estimate, Options, make_layout
@@ -21,7 +21,6 @@ from ceres_cal.model.residuals import Residuals, residuals
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights, gather_sights
 from ceres_cal.observations.thinning import thinned
-from ceres_cal.scene.lens import LENSES
 from ceres_cal.solve import Problem, RobustSolution, solve, solve_robustly
 from ceres_cal.solve.left_out import GroupNormals, group_normals
 from ceres_cal.solve.linear_model import equation_weights
@@ -144,19 +143,18 @@ def compared_kinds(observations: Observations, options: Options, start: Estimate
     Raises:
         CalibrationError: too little to tell lenses apart, or no calibration.
     """
-    formulas = [kind for kind, lens in LENSES.items() if not lens.set_at_start]  # one without has no shorter ones
-    kinds = sorted(map(forms_of, formulas), key=lambda forms: forms[0].lens != _WIDEST)
+    every = sorted(kinds(), key=lambda forms: forms[0].lens != _WIDEST)
     total = len(observations.points) + len(observations.curves)
     few = thinned(observations, max(_LEAST_ROWS, int(_SHARE * total)), _FEWEST_FRAMES)
     sights = gather_sights(few)
     _require_groups(sights)
     names = list(dict.fromkeys(key.placement for key in sights.keys if key.placement is not None))
     start = replace(start, placements=Poses.stacked(names, Poses.of(start.placements).of_names(names)))
-    tried = kinds
+    tried = every
     while True:
         end, used = _solved(few, options, sights, start, tried)
         seen = _Seen(few, end, options)
-        compared = [seen.kind(forms, is_solved=forms is used) for forms in kinds]
+        compared = [seen.kind(forms, is_solved=forms is used) for forms in every]
         best = min(compared, key=lambda one: one.least)
         least = next(one.least for one in compared if one.forms is used)
         if len(tried) == 1 or best.least > _QUIETER * least:
