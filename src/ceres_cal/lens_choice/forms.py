@@ -84,6 +84,7 @@ class Form:
 
     Attributes:
         names: of the coefficients that are free. label: how it is called. size: see `size_of`.
+        blank: with every coefficient 0.
     """
 
     lens: str
@@ -93,13 +94,14 @@ class Form:
     names: tuple[str, ...]
     label: str
     size: int
+    blank: Lens
 
     @classmethod
     def among(cls, options: Options) -> Form:
         """The lens of some options."""
         names = tuple(name for name in options.blank_lens.names if name not in options.held)
         chosen = options.lens, options.powers, options.coefficients, options.terms
-        return cls(*chosen, names, label_of(options), size_of(options))
+        return cls(*chosen, names, label_of(options), size_of(options), options.blank_lens)
 
     def of(self, options: Options) -> Options:
         """The options with this lens."""

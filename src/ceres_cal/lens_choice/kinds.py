@@ -107,7 +107,7 @@ class Candidate:
             InputError: there is no camera there.
         """
         there = moved(self.of.estimate, self.of.normals.keys if self.of.normals else (), self.step)
-        blank = self.form.of(Options()).blank_lens
+        blank = self.form.blank
         cameras = {}
         for name, camera in there.cameras.items():
             values = camera.lens.coefficients
@@ -237,15 +237,15 @@ class _Seen:
 
     def kind(self, forms: tuple[Form, ...], *, is_solved: bool) -> Kind:
         """A kind near its best, and the normal equations of each group there; `is_solved`: the one that was solved."""
-        options = forms[0].of(self.options)
-        estimate = _seen_through(self.end.solution.estimate, options, self._profiles)
+        options = replace(forms[0].of(self.options), max_iterations=_MOST_STEPS)
+        estimate, there = self.end.solution.estimate, self.end.residuals
         try:
-            few = replace(options, max_iterations=_MOST_STEPS)
-            problem = _problem(self.observations, self.sights, few, estimate)
+            problem = _problem(self.observations, self.sights, options, estimate)
             # All inliers weigh the same with every kind: what one of them misses must not weigh less with it.
             problem = problem.weighted(replace(self.end.problem.weighting, loss="trivial"))
-            there = self._shown(estimate)
             if not is_solved:
+                estimate = _seen_through(estimate, options, self._profiles)
+                self._shown(estimate)
                 estimate = solve(problem, estimate, precision=_PRECISION, is_near=False).estimate
                 there = self._shown(estimate)
             normals, sigma_px = self._normals(problem, estimate, there)
@@ -257,8 +257,8 @@ class _Seen:
     def _shown(self, estimate: Estimate) -> Residuals:
         """The residuals there; DegenerateError where something is not seen."""
         there = residuals(self.observations, self.sights, estimate, self.end.residuals.feet)
-        points, curves = there.lengths
-        if not np.isfinite([*points[self.sights.point_rows], *curves[self.sights.curve_rows]]).all():
+        known = np.isfinite(there.points[self.sights.point_rows]), np.isfinite(there.curves[self.sights.curve_rows])
+        if not (known[0].all() and known[1].all()):
             raise DegenerateError("cannot show all that another lens shows")
         return there
 
