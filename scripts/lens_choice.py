@@ -19,16 +19,19 @@ from ceres_cal.calibrating import calibrate
 from ceres_cal.lens_choice import PAPER
 from ceres_cal.model.parameters import Options
 from ceres_cal.scene.camera import Camera
-from ceres_cal.scene.lens import Brown, KannalaBrandt, Lens, Radial
+from ceres_cal.scene.lens import Brown, KannalaBrandt, Lens, Radial, Spline
 from ceres_cal.scene.targets import checkerboard, ssl_field
 from ceres_cal.simulate import Disturbance, Scene, Station, board_scene, field_scene, join, overhead_pose, simulate
 
 _NOISE = Disturbance(points_sigma_px=0.3, curves_sigma_px=0.3)
 _BOARD, _FIELD = checkerboard(9, 6, 0.1), ssl_field("B")
+_ALONG = (-1.2, -4.0, -9.0, -15.0, -21.0, -26.0, -29.0, -30.0, -29.5, -28.0, -27.0)  # px, from the axis to the rim
+_ACROSS = (0.9, -1.3, 0.4, 0.7) * 3 + (0.9, -1.3)
 LENSES: Mapping[str, tuple[float, Lens]] = {
     PAPER: (868.0, Radial((-5.2e-5, 6.1e-7))),
     "brown k1 k2": (825.0, Brown((-0.24, 0.082, 0.0, 0.0, 0.0))),
     "kannala-brandt k1 k2 p1 p2": (548.0, KannalaBrandt((-0.012, 0.004, 0.0, 0.0, 3e-3, -2e-3), ("tangential",))),
+    "spline 2,3": (825.0, Spline((620.0, *_ALONG, *_ACROSS))),
 }
 
 

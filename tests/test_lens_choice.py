@@ -91,6 +91,19 @@ def test_a_decentred_fisheye_is_recognised() -> None:
     assert label_of(calibration.options).endswith("p1 p2")
 
 
+def test_a_lens_that_no_formula_has_is_seen_in_what_all_others_leave() -> None:
+    scene = scenes.MIXES["boards"]("brown")
+    cameras = {name: scenes.camera("spline") for name in scene.cameras}
+    noise = Disturbance(points_sigma_px=0.1)
+    choice = calibrate(simulate(replace(scene, cameras=cameras), noise, 1).observations).lens_choice
+    assert choice is not None and choice.chosen == "spline 2,3"
+    first, second, *_ = (one.rms_px for one in choice.tried)
+    assert first and second and second > 1.8 * first  # 2.3 times, and four standard errors, in each of four runs
+    seen = _seen("radial-2-3", "boards")
+    plain = calibrate(seen).lens_choice  # where nothing is left behind it is not looked at
+    assert plain is not None and not [one for one in plain.tried if one.label.startswith("spline")]
+
+
 def _normals(observations: Observations, calibration: Calibration) -> tuple[GroupNormals, LinearModel]:
     """Of each sight, with the linear model that they follow from."""
     problem, estimate = calibration.problem(observations), calibration.estimate

@@ -126,3 +126,8 @@ def forms_of(kind: str) -> tuple[Form, ...]:
 def kinds() -> Iterator[tuple[Form, ...]]:
     """The lenses of each kind that has a formula: one without has no shorter ones."""
     return (forms_of(kind) for kind, lens in LENSES.items() if not lens.set_at_start)
+
+
+def without_formula() -> Iterator[tuple[Form, ...]]:
+    """The lenses of all other kinds."""
+    return ((Form.among(Options(lens=kind)),) for kind, lens in LENSES.items() if lens.set_at_start)
