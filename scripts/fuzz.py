@@ -1,15 +1,17 @@
-"""Damaged and hostile files before every reader: python scripts/fuzz.py --minutes N [--seed N] [--keep FOLDER]
+"""Damaged files before every reader: scripts/fuzz.py [--files N | --minutes N] [--seed N] [--keep FOLDER]
 
 Files of a small corpus, made of what the package ships, are mutated: bytes, numbers and names of JSON, columns of
 archives, headers of images. A reader must refuse in one line that names the file, or accept; what is accepted must
-survive being written and read again. Counted as failures: other exceptions, warnings, over 10 s, over 1 GiB, deaths of
-the process, and what does not come back. Exits with 1 when there is one; --keep keeps the files that did it.
+survive being written and read again. Counted as failures: other exceptions, warnings, over 10 s of processor time or
+60 s on the wall, over 1 GiB, deaths of the process, and what does not come back. Exits with 1 when there is one; --keep
+keeps the files that did it.
 """
 
 from __future__ import annotations
 
 import argparse
 import base64
+import faulthandler
 import io
 import json
 import multiprocessing
@@ -24,7 +26,9 @@ import time
 import warnings
 import zipfile
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -44,7 +48,8 @@ from ceres_cal.simulate import built_in_scene, load_scene
 from ceres_cal.simulate.files import scene_to_json
 
 DATA = Path(__file__).resolve().parents[1] / "data"
-LONGEST_S, MOST_MB = 10, 1024
+LONGEST_S, LONGEST_WAIT_S, MOST_MB = 10, 60, 1024
+TRACE = "where.txt"  # a process that took too long was
 FAILURES = ("unexpected", "warning", "changed", "many lines", "slow", "died", "memory")
 TOKENS = b'0 -1 1 2 1e400 -0.0 1e308 5e-324 NaN -Infinity 9000000000 1e24 null true [] {} "" "a"'.split()
 TOKENS += [b'"\\ud800"', b'"\\u0000"', b'"' + b"x" * 300 + b'"', b"[" * 500, b"1" + b"0" * 400, b"[[1,2],[3]]"]
@@ -224,6 +229,22 @@ def mutated(name: str, content: bytes, rng: np.random.Generator) -> bytes:
 # ---- work -----------------------------------------------------------------------------------------------------------
 
 
+@dataclass(frozen=True)
+class Goal:
+    """So many files, or until a time of the clock."""
+
+    files: int
+    end: float
+
+    def after(self, files: int) -> Goal | None:
+        """What is left after so many files; None where nothing is."""
+        left = replace(self, files=self.files - files)
+        return left if left.files > 0 and time.time() < self.end else None
+
+    def __iter__(self) -> Iterator[int]:
+        return takewhile(lambda _: time.time() < self.end, range(self.files))
+
+
 def outcome(reader: Reader, path: Path) -> tuple[str, str]:
     """What a reader made of a file, and in which words."""
     try:
@@ -242,42 +263,47 @@ def outcome(reader: Reader, path: Path) -> tuple[str, str]:
     return ("accepted" if whole else "changed"), ""
 
 
-def work(folder: Path, names: Sequence[str], seed: int, end: float, answers: Any) -> None:
-    """Mutate and read until the time is over; each answer is (reader, outcome, words, seconds, MB)."""
+def work(folder: Path, names: Sequence[str], seed: int, goal: Goal, keep: Path | None, answers: Any) -> None:
+    """Mutate and read until the goal is reached; each answer is (reader, outcome, words, seconds, MB)."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # what image libraries say
+    trace = (folder / TRACE).open("w")
+    for number in (signal.SIGALRM, signal.SIGPROF):
+        faulthandler.register(number, trace, all_threads=True, chain=True)
     rng = np.random.default_rng(seed)
     contents = {name: (folder / name).read_bytes() for name in names}
     place = Path(tempfile.mkdtemp(dir=folder))
     shutil.copytree(folder / "colmap", place / "colmap")
-    while time.time() < end:
+    for _ in goal:
         name = names[int(rng.integers(0, len(names)))]
         path = place / name
         path.write_bytes(mutated(name, contents[name], rng))
         answers.send((name, "begun", str(path), 0.0, 0.0))
-        signal.alarm(LONGEST_S + 5)  # ends this process, even in native code
-        begin = time.perf_counter()
+        signal.setitimer(signal.ITIMER_PROF, LONGEST_S + 5)  # ends this process, even in native code
+        signal.alarm(LONGEST_WAIT_S)  # the same for one that sleeps
+        begin = time.process_time()
         what, words = outcome(READERS[name], path)
-        seconds = time.perf_counter() - begin
+        seconds = time.process_time() - begin
+        signal.setitimer(signal.ITIMER_PROF, 0.0)
         signal.alarm(0)
         peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
         what = "slow" if seconds > LONGEST_S else "memory" if peak_mb > MOST_MB else what
+        if what in FAILURES:
+            put_aside(path, keep, what, name)
         path.write_bytes(contents[name])  # the others of a model are whole
         answers.send((name, what, words, seconds, peak_mb))
         if what == "memory":  # whose peak would be that of all that follow
             return
 
 
-def fuzz(
-    folder: Path, minutes: float, seed: int, keep: Path | None, names: Sequence[str] = ()
-) -> Counter[tuple[str, str]]:
+def fuzz(folder: Path, goal: Goal, seed: int, keep: Path | None, names: Sequence[str] = ()) -> Counter[tuple[str, str]]:
     """How often each reader came to each outcome."""
     names = names or tuple(READERS)
     counts: Counter[tuple[str, str]] = Counter()
-    end, slowest_s, peak_mb = time.time() + 60.0 * minutes, 0.0, 0.0
+    slowest_s = peak_mb = 0.0
     context = multiprocessing.get_context("fork")
-    while time.time() < end:
+    while (left := goal.after(sum(counts.values()))) is not None:
         answers, theirs = context.Pipe(duplex=False)
-        worker = context.Process(target=work, args=(folder, names, seed, end, theirs))
+        worker = context.Process(target=work, args=(folder, names, seed, left, keep, theirs))
         worker.start()
         theirs.close()
         name = path = ""
@@ -290,28 +316,31 @@ def fuzz(
                 counts[name, what] += 1
                 slowest_s, peak_mb = max(slowest_s, seconds), max(peak_mb, megabytes)
                 if what in FAILURES:
-                    report(name, what, words, Path(path), keep, sum(counts.values()))
+                    print(f"{name}: {what}: {words[:300]}", flush=True)
                 name = ""
         except EOFError:
             worker.join()
         if worker.exitcode and name:
             counts[name, "died"] += 1
-            report(name, "died", f"exit code {worker.exitcode}", Path(path), keep, sum(counts.values()))
+            where = (folder / TRACE).read_text()
+            print(f"{name}: died: exit code {worker.exitcode}\n{where}", end="", flush=True)
+            put_aside(Path(path), keep, "died", name)
         seed += 1
     print(f"slowest {slowest_s:.2f} s, peak {peak_mb:.0f} MB", flush=True)
     return counts
 
 
-def report(name: str, what: str, words: str, path: Path, keep: Path | None, number: int) -> None:
-    print(f"{name}: {what}: {words[:300]}", flush=True)
-    if keep is not None and path.exists():
+def put_aside(path: Path, keep: Path | None, what: str, name: str) -> None:
+    if keep is not None:
         keep.mkdir(parents=True, exist_ok=True)
-        (keep / f"{what} {number} {name}".replace(" ", "-").replace("/", "-")).write_bytes(path.read_bytes())
+        (keep / f"{what} {time.time_ns()} {name}".replace(" ", "-").replace("/", "-")).write_bytes(path.read_bytes())
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--minutes", type=float, default=1.0)
+    how_many = parser.add_mutually_exclusive_group()
+    how_many.add_argument("--minutes", type=float, default=1.0)
+    how_many.add_argument("--files", type=int, metavar="N", help="so many, however long it takes")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--keep", type=Path, metavar="FOLDER", help="for files that were not handled well")
     parser.add_argument("--reader", action="append", default=[], choices=tuple(READERS), help="only this; repeatable")
@@ -319,7 +348,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = parser.parse_args(arguments)
     with tempfile.TemporaryDirectory() as folder:
         corpus(Path(folder))
-        counts = fuzz(Path(folder), given.minutes, given.seed, given.keep, given.reader)
+        goal = Goal(given.files or sys.maxsize, np.inf if given.files else time.time() + 60.0 * given.minutes)
+        counts = fuzz(Path(folder), goal, given.seed, given.keep, given.reader)
     failures = sum(count for (_, what), count in counts.items() if what in FAILURES)
     if given.json:
         print(json.dumps({f"{name}: {what}": count for (name, what), count in sorted(counts.items())}))

@@ -3,16 +3,16 @@
 Each half is calibrated by itself. What the two differ by, over the standard deviation that both together state: of the
 intrinsics (Mahalanobis length over the square root of their number) and of where rays are seen over the part of the
 image that the views fill (root mean square over a grid, the rotation that fits best taken out, for nothing says which
-way a camera frame looks). Both are 1 where the statement is honest. Each set stands beside its control: the same views
-as the calibration of the whole set sees them, with independent normal noise of the size that it found. Exits with 1
-when a figure is missed by more than two of its standard errors; the folder of real sets is $CERES_CAL_REAL, or
-shared/real beside the repository.
+way a camera frame looks). Both are 1 where the statement is honest. "By defaults" each half chooses its lens, too. Each
+set stands beside its control: the same views as the calibration of the whole set sees them, with independent normal
+noise of the size that it found. Exits with 1 when a figure is missed by more than two of its standard errors; the
+folder of real sets is $CERES_CAL_REAL, or shared/real beside the repository.
 """
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -27,12 +27,14 @@ from ceres_cal.base.transforms import Pose, skew
 from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
 from ceres_cal.detect.boards import detect_boards
+from ceres_cal.model.keys import Key
 from ceres_cal.model.parameters import Options
-from ceres_cal.model.quantities import camera_moved, difference, natural_sizes
+from ceres_cal.model.quantities import camera_moved, natural_sizes, values_of
 from ceres_cal.observations import Curves, Observations, Points, View
 from ceres_cal.observations.columns import taken
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.targets import checkerboard
+from ceres_cal.uncertainty import Posterior
 
 LEAST, MOST = 0.85, 1.25
 _CONTROL = 0.9, 1.1
@@ -71,13 +73,15 @@ def _ov_plane() -> Observations:
 
 _ORDINARY = Options(lens="radial")
 _WIDE = Options(lens="kannala-brandt", free_aspect=True)
-SETS: Mapping[str, RealSet] = {
+SETS: dict[str, RealSet] = {
     "opencv left": RealSet(partial(_photographed, "opencv_left_right/left*.jpg", 9, 6, 0.025), _ORDINARY),
     "opencv right": RealSet(partial(_photographed, "opencv_left_right/right*.jpg", 9, 6, 0.025), _ORDINARY),
     "sony": RealSet(partial(_photographed, "boofcv_sony_chess/*.jpg", 4, 6, 0.03), _ORDINARY),
     "gopro": RealSet(partial(_photographed, "udacity_gopro_wide/GOPR*.jpg", 8, 6, 1.0), _WIDE),
     "ov plane": RealSet(_ov_plane, _WIDE),
 }
+_DEFAULTS = ", by defaults"
+SETS |= {f"{name}{_DEFAULTS}": replace(one, options=Options()) for name, one in SETS.items()}
 
 
 def control(calibration: Calibration, observations: Observations, seed: int) -> Observations:
@@ -124,28 +128,35 @@ class Agreement:
 
 
 def agreement(first: Calibration, second: Calibration, pixels: Array) -> Agreement:
-    """Of the only camera of two calibrations from different observations; projections at pixels (N, 2)."""
-    posteriors = first.uncertainty.posterior, second.uncertainty.posterior
-    keys = [key for key in posteriors[0].keys if key.kind == "camera"]
-    name = keys[0].owner
-    spread = np.zeros((len(keys), len(keys)))
-    for posterior in posteriors:
-        at = [posterior.keys.index(key) for key in keys]
-        spread += posterior.covariance[np.ix_(at, at)]
-    step = difference(first.estimate, second.estimate, keys)
+    """Of the only camera of two calibrations from different observations; projections at pixels (N, 2). Of two lenses,
+    the intrinsics that both have.
+    """
+    posteriors = [one.uncertainty.posterior for one in (first, second)]
+    keys = [key for key in posteriors[0].keys if key.kind == "camera" and key in posteriors[1].keys]
     sizes = natural_sizes(first.estimate, keys)
-    scaled = step / sizes
-    mahalanobis = float(scaled @ np.linalg.solve(spread / sizes[:, None] / sizes, scaled)) / len(keys)
-    one, other = (calibration.estimate.cameras[name].at(Pose.identity()) for calibration in (first, second))
-    rays = one.rays(pixels)
+    step = (values_of(first.estimate, keys) - values_of(second.estimate, keys)) / sizes
+    spread = sum(_covariance(posterior, keys) for posterior in posteriors) / sizes[:, None] / sizes
+    mahalanobis = float(step @ np.linalg.solve(spread, step)) / len(keys)
+    cameras = [one.estimate.cameras[keys[0].owner].at(Pose.identity()) for one in (first, second)]
+    rays = cameras[0].rays(pixels)
     pixels, rays = pixels[np.isfinite(rays[:, 0])], rays[np.isfinite(rays[:, 0])]
-    slopes = _projection_slopes(one, rays, [key.quantity for key in keys], _STEP * sizes)
-    turned = np.linalg.qr(_turn_slopes(one, rays))[0]
-    off = (other.project(rays) - pixels).ravel()
+    turned = np.linalg.qr(_turn_slopes(cameras[0], rays))[0]
+    off = (cameras[1].project(rays) - pixels).ravel()
     off -= turned @ (turned.T @ off)
-    slopes -= turned @ (turned.T @ slopes)
-    stated = np.einsum("ni,ij,nj->n", slopes, spread, slopes)
+    stated = np.zeros(len(off))
+    for one, camera, posterior in zip((first, second), cameras, posteriors, strict=True):
+        own = [key for key in posterior.keys if key.kind == "camera"]
+        slopes = _projection_slopes(
+            camera, rays, [key.quantity for key in own], _STEP * natural_sizes(one.estimate, own)
+        )
+        slopes -= turned @ (turned.T @ slopes)
+        stated += np.einsum("ni,ij,nj->n", slopes, _covariance(posterior, own), slopes)
     return Agreement(mahalanobis, float(np.mean(_pairs(off**2) / _pairs(stated))))
+
+
+def _covariance(posterior: Posterior, keys: Sequence[Key]) -> Array:
+    at = [posterior.keys.index(key) for key in keys]
+    return np.asarray(posterior.covariance[np.ix_(at, at)])
 
 
 def _pairs(values: Array) -> Array:

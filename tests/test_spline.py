@@ -25,8 +25,6 @@ from ceres_cal.scene.lens import Spline, make_lens
 from ceres_cal.scene.targets import checkerboard
 from ceres_cal.simulate import Disturbance, Simulation, simulate
 
-REAL = Path(__file__).parents[2] / "shared" / "real" / "babelcalib_ov_plane"
-
 
 @st.composite
 def splines(draw: st.DrawFn) -> Spline:
@@ -154,10 +152,9 @@ def test_it_is_saved_loaded_and_exported(tmp_path: Path) -> None:
     assert loss.image_px is not None and loss.image_px[0] < 0.05
 
 
-@pytest.mark.skipif(not REAL.is_dir(), reason="the corners are not there")
-def test_a_real_fisheye_to_93_degrees() -> None:
+def test_a_real_fisheye_to_93_degrees(real_data: Path) -> None:
     """BabelCalib's OV-plane: kannala-brandt leaves 0.482 px of its training views, plain least squares."""
-    with np.load(REAL / "train.npz") as data:
+    with np.load(real_data / "babelcalib_ov_plane" / "train.npz") as data:
         places, view, point, pixels, size = (data[n] for n in ("board_m", "view", "point", "pixels", "image_size"))
     pitch_m = float(places[0, 0])
     column, row = np.rint(places[:, :2] / pitch_m).astype(np.int32).T - 1

@@ -29,8 +29,6 @@ from ceres_cal.solve import Problem, solve
 from ceres_cal.solve.problem import Weighting
 from ceres_cal.start.initialise import initialise
 
-REAL = Path(__file__).parents[2] / "shared" / "real" / "opencv_left_right"
-
 
 def seen(lens: str, camera: Camera | None = None, sigma_px: float = 0.1) -> Simulation:
     """Boards before a camera of `scenes`, or before another one."""
@@ -100,11 +98,10 @@ def test_a_thin_prism_is_named() -> None:
     assert "--terms prism" in finding.advice
 
 
-@pytest.mark.skipif(not REAL.is_dir(), reason="the photographs are not there")
-def test_the_optimum_is_opencvs() -> None:
+def test_the_optimum_is_opencvs(real_data: Path) -> None:
     """Its rational model on its own photographs, to 1e-6 of rms: measured 5e-8, its corners being float32."""
     board, corners = checkerboard(9, 6, 0.025), []
-    for path in sorted(REAL.glob("right*.jpg")):
+    for path in sorted((real_data / "opencv_left_right").glob("right*.jpg")):
         picture: Any = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
         found, places = cv2.findChessboardCorners(picture, (9, 6))
         assert found

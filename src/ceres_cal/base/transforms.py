@@ -14,7 +14,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ceres_cal.base.arrays import Array
+from ceres_cal.base.errors import InputError
 
+_ROUNDING = 1e-6  # numbers that somebody copied have six digits or more
 _SMALL_ANGLE = 1e-4  # below it the series below are exact to rounding
 
 
@@ -84,6 +86,17 @@ def left_jacobian(rotation_vector: ArrayLike) -> Array:
         rest = (angle - np.sin(angle)) / angle**3
     hat = skew(w)
     return np.asarray(np.eye(3) + versine * hat + rest * hat @ hat)
+
+
+def require_rotation(matrix: ArrayLike, name: str) -> Array:
+    """A 3 x 3 matrix that somebody wrote with six digits or more; InputError where it is no rotation matrix."""
+    m = np.asarray(matrix, dtype=float)
+    off = float(np.max([*np.abs(m @ m.T - np.eye(3)).flat, abs(np.linalg.det(m) - 1.0)]))
+    if not off < _ROUNDING:
+        raise InputError(
+            f"{name} is no rotation matrix: R R^T and its determinant are {off:.2g} from the identity and 1"
+        )
+    return m
 
 
 def nearest_rotation(matrix: ArrayLike) -> Array:

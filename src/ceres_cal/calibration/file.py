@@ -11,14 +11,14 @@ import numpy as np
 
 from ceres_cal.base.errors import InputError, naming
 from ceres_cal.base.files import PixelOrigin, Units, convert
-from ceres_cal.base.transforms import euler_from_rotation, rotation_from_euler
+from ceres_cal.base.transforms import euler_from_rotation, require_rotation, rotation_from_euler
 from ceres_cal.calibration.origin import Fit, LensChoice, Refitted, Rejected
 from ceres_cal.model.keys import Key
 from ceres_cal.model.parameters import Estimate, Options, Station
 from ceres_cal.model.priors import GaussianPrior
 from ceres_cal.model.structure import EXACT, make_structure
 from ceres_cal.observations import prior_from_json, prior_to_json
-from ceres_cal.scene.files import CameraFile, Matrix, PoseFile, Vector, rotation_of
+from ceres_cal.scene.files import CameraFile, Matrix, PoseFile, Vector
 from ceres_cal.scene.targets import Target
 from ceres_cal.solve import AsBuilt, Conflict
 from ceres_cal.uncertainty import PosteriorFile, information_from, lower_triangle
@@ -76,7 +76,8 @@ class PriorFile(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True):
         if self.mean is not None:
             if len(self.mean) != len(self.keys):
                 raise InputError("refitted.prior.mean does not fit its keys: calibrate again")
-            rotations = {name: rotation_of(rotation) for name, rotation in (self.rotations or {}).items()}
+            turns = (self.rotations or {}).items()
+            rotations = {name: require_rotation(turn, f"rotation of {name}") for name, turn in turns}
             return GaussianPrior(information, np.array(self.mean), rotations)
         cameras = {name: entry.camera() for name, entry in (self.cameras or {}).items()}
         stations = {name: Station("", entry.pose()) for name, entry in (self.stations or {}).items()}

@@ -111,7 +111,7 @@ def _read(request: ImportRequest) -> Any:
         raise InputError("the model has no image: where its cameras stood is not said")
     cameras, warnings = {}, []
     for image in model.images.values():
-        name = Path(image.name).stem if Path(image.name).suffix else image.name
+        name = _name(image)
         if not image.has_pose:
             warnings.append(f"image {image.name!r} has no pose and was left out")
             continue
@@ -121,6 +121,14 @@ def _read(request: ImportRequest) -> Any:
         raise InputError("none of its images has a pose")
     warnings.append("COLMAP's lengths have the unit of whoever made the model: here they count as metres")
     return ImportedCameras(cameras, warnings=warnings).calibration("COLMAP")
+
+
+def _name(image: Any) -> str:
+    try:
+        path = Path(image.name)
+    except UnicodeDecodeError:
+        raise InputError(f"the name of image {image.image_id} is not UTF-8: rename it") from None
+    return path.stem if path.suffix else str(image.name)
 
 
 def _foreign(camera: Any, pose: Pose) -> ForeignCamera:

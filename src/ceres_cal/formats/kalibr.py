@@ -13,7 +13,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.transforms import Pose
+from ceres_cal.base.transforms import Pose, require_rotation
 from ceres_cal.formats.export_format import Exported, ExportFormat, ExportRequest
 from ceres_cal.formats.import_format import ImportedCameras, ImportFormat, ImportRequest
 from ceres_cal.formats.loss import as_foreign, field_box, loss_words
@@ -23,7 +23,6 @@ from ceres_cal.scene.foreign import FISHEYE, ForeignCamera
 _MODELS = {"opencv4": "radtan", FISHEYE: "equidistant"}
 _PROJECTIONS = {"pinhole": 0, "omni": 1, "ds": 2, "eucm": 2}  # how many numbers stand before the four of K
 _DISTORTIONS = {"none": 0, "radtan": 4, "equidistant": 4, "fov": 1}
-_ROUNDING = 1e-6  # of a pose that was written with few digits
 
 
 def _export(request: ExportRequest) -> Exported:
@@ -72,10 +71,7 @@ def _read(request: ImportRequest) -> Any:
 
 def _pose(entry: Mapping[str, Any], key: str) -> Pose:
     matrix = numbers_at(entry["T_cn_cnm1"], f"{key}.T_cn_cnm1", 16).reshape(4, 4)
-    turn = matrix[:3, :3]
-    if np.max(np.abs(turn @ turn.T - np.eye(3))) > _ROUNDING or np.linalg.det(turn) < 0.0:
-        raise InputError(f"{key}.T_cn_cnm1 holds no rotation")
-    return Pose(turn, matrix[:3, 3])
+    return Pose(require_rotation(matrix[:3, :3], f"the turn of {key}.T_cn_cnm1"), matrix[:3, 3])
 
 
 def _camera(entry: Mapping[str, Any], key: str, pose: Pose | None) -> ForeignCamera:

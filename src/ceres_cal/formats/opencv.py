@@ -18,7 +18,7 @@ from ceres_cal.base.transforms import Pose
 from ceres_cal.formats.export_format import Exported, ExportFormat, ExportRequest, Loss
 from ceres_cal.formats.import_format import ImportedCameras, ImportFormat, ImportRequest
 from ceres_cal.formats.loss import as_foreign, field_box, loss_words
-from ceres_cal.scene.foreign import FISHEYE, ForeignCamera, image_grid
+from ceres_cal.scene.foreign import FISHEYE, LARGEST, ForeignCamera, image_grid
 
 _ENDINGS = (".yml", ".yaml", ".xml", ".json")
 _MATRIX = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "M1", "K")
@@ -126,7 +126,7 @@ def _read(request: ImportRequest) -> Any:
     try:
         storage = cv2.FileStorage(request.text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
         names = storage.root().keys()
-    except (cv2.error, SystemError) as error:
+    except (cv2.error, SystemError, UnicodeDecodeError) as error:
         raise InputError(f"not a FileStorage of OpenCV (cut short?): {str(error).splitlines()[0]}") from None
     if not any(name in names for name in _MATRIX):
         raise InputError(f"it has no camera matrix: none of {', '.join(_MATRIX)}")
@@ -177,7 +177,10 @@ def parse_size(text: str) -> tuple[int, int]:
 
 def _text(storage: Any, name: str) -> str:
     node = storage.getNode(name)
-    return str(node.string()) if node.isString() else ""
+    try:
+        return str(node.string()) if node.isString() else ""
+    except UnicodeDecodeError:
+        raise InputError(f"{name} is not UTF-8") from None
 
 
 def _real(storage: Any, names: tuple[str, ...]) -> float | None:
@@ -186,22 +189,31 @@ def _real(storage: Any, names: tuple[str, ...]) -> float | None:
 
 
 def _mat(storage: Any, names: tuple[str, ...], shape: tuple[int, int] | None, *, needed: bool = True) -> Array:
-    import cv2
-
     for name in names:
         node = storage.getNode(name)
-        try:
-            matrix = node.mat() if node.isMap() else None
-        except cv2.error:
-            raise InputError(f"{name} must be a matrix: its rows and cols do not fit its data") from None
-        if matrix is None:
+        if not node.isMap():
             continue
-        if (shape is not None and matrix.shape != shape) or not np.all(np.isfinite(matrix)):
+        matrix = _matrix(node)
+        if matrix is None:
+            raise InputError(f"{name} must be a matrix: its rows and cols do not fit its data")
+        if (shape is not None and matrix.shape != shape) or not np.all(np.abs(matrix) < LARGEST):
             raise InputError(f"{name} must be {shape or 'finite'} numbers, not {np.asarray(matrix).tolist()}")
         return np.asarray(matrix, dtype=float)
     if needed:
         raise InputError(f"it has no matrix {names[0]!r}")
     return np.empty((0, 0))
+
+
+def _matrix(node: Any) -> Array | None:
+    """What a node holds; None where its rows and cols, which OpenCV takes as they are, do not fit its data."""
+    import cv2
+
+    rows, cols = (_real(node, (name,)) or 0.0 for name in ("rows", "cols"))
+    try:
+        fits = rows > 0.0 and cols > 0.0 and rows * cols == node.getNode("data").size()
+        return np.asarray(node.mat()) if fits else None
+    except cv2.error:
+        return None
 
 
 def _recognises(content: bytes) -> bool:

@@ -14,6 +14,7 @@ from ceres_cal.formats.export_format import Exported, ExportFormat, ExportReques
 from ceres_cal.formats.import_format import ImportedCameras, ImportFormat, ImportRequest
 from ceres_cal.formats.loss import camera_loss, field_box, loss_words
 from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.foreign import LARGEST
 from ceres_cal.scene.lens import Radial
 
 
@@ -58,7 +59,7 @@ def _read(request: ImportRequest) -> Any:
             values = np.array([float(v) for v in given[name].replace(";", " ").split()])
         except (KeyError, ValueError):
             values = np.empty(0)
-        if len(values) != count or not np.all(np.isfinite(values)):
+        if len(values) != count or not np.all(np.abs(values) < LARGEST):
             raise InputError(f"{name} must be {count} finite numbers, not {given.get(name, 'missing')!r}")
         return values
 

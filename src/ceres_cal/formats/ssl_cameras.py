@@ -21,6 +21,7 @@ from ceres_cal.formats.export_format import ExportRequest, Loss
 from ceres_cal.formats.loss import Box, camera_loss, field_pixels
 from ceres_cal.formats.opencv import parse_size
 from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.foreign import LARGEST
 from ceres_cal.scene.heights import HEIGHTS_M
 from ceres_cal.scene.lens import Radial
 
@@ -152,8 +153,8 @@ def to_camera(entry: Mapping[str, Any], image_size: str = "") -> Camera:
             raise InputError(f"{here}: {name} is no number, but {entry.get(name)!r}") from None
     f, cx, cy, d, *rest = values
     turn, shift = np.array(rest[:4]), np.array(rest[4:])
-    norm = float(np.linalg.norm(turn))
-    if not (np.all(np.isfinite(values)) and f > 0.0 and abs(norm - 1.0) < 0.05):
+    norm = float(np.linalg.norm(turn)) if np.all(np.abs(values) < LARGEST) else np.nan
+    if not (f > 1.0 / LARGEST and abs(norm - 1.0) < 0.05):
         raise InputError(f"{here}: focal_length {f:g}, or the length {norm:g} of its quaternion, makes no camera")
     sizes = [entry.get("pixel_image_width"), entry.get("pixel_image_height")]
     width, height = (int(float(size)) for size in sizes) if all(sizes) else parse_size(image_size)  # type: ignore[arg-type]

@@ -89,7 +89,7 @@ def to_bytes(name: str, data: Mapping[str, Any]) -> bytes:
 
     try:
         message = json_format.ParseDict(data, message_class(name)())
-    except json_format.ParseError as error:
+    except (json_format.ParseError, OverflowError) as error:
         raise InputError(f"not what {name} holds: {error}") from None
     if not message.IsInitialized():
         raise InputError(f"{name} lacks {message.FindInitializationErrors()[0]}")

@@ -7,6 +7,7 @@ settings.xml. ssl-vision reads it at its start and overwrites it at its end: edi
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 from xml.parsers import expat
@@ -19,6 +20,7 @@ from ceres_cal.formats.loss import field_box
 from ceres_cal.formats.ssl_cameras import NAMES, SslOptions, reader_traps, to_camera, to_entries
 from ceres_cal.formats.ssl_fields import target_of
 from ceres_cal.formats.ssl_geometry import SslReadOptions
+from ceres_cal.scene.foreign import LARGEST
 from ceres_cal.scene.targets import Target
 
 _CAMERA, _PARAMETERS, _FIELD = "Camera Calibrator", "Camera Parameters", "Field Configuration"
@@ -119,10 +121,11 @@ def _beside(values: list[_Var], first: int, last: int) -> dict[str, _Var]:
 
 
 def _number(one: _Var) -> float:
-    try:
-        return float(one.text.replace(",", "."))  # some locales' printf
-    except ValueError:
-        raise InputError(f"{one.path[-1]!r} is no number, but {one.text!r}") from None
+    with suppress(ValueError):
+        number = float(one.text.replace(",", "."))  # some locales' printf
+        if abs(number) < LARGEST:
+            return number
+    raise InputError(f"{one.path[-1]!r} is no number, but {one.text!r}")
 
 
 # ---- writing --------------------------------------------------------------------------------------------------------

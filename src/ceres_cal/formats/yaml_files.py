@@ -13,6 +13,7 @@ import numpy as np
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import require_room
+from ceres_cal.scene.foreign import LARGEST
 
 _BYTES_PER_LETTER = 200  # of memory, and 10 us, while YAML is read
 _BYTES_PER_VALUE = 100
@@ -83,6 +84,6 @@ def numbers_at(values: Any, where: str, count: int | None = None) -> Array:
         numbers = np.array(values, dtype=float).ravel()
     except (TypeError, ValueError, OverflowError):
         numbers = np.full(1, np.nan)
-    if not np.all(np.isfinite(numbers)) or (count is not None and len(numbers) != count):
+    if not np.all(np.abs(numbers) < LARGEST) or (count is not None and len(numbers) != count):
         raise InputError(f"{where} must be {count if count is not None else 'some'} finite numbers, not {values}")
     return numbers

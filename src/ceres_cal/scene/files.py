@@ -7,13 +7,10 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.transforms import Pose
+from ceres_cal.base.transforms import Pose, require_rotation
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import make_lens
-
-_TOLERANCE = 1e-6  # numbers that somebody copied have six digits or more
 
 Vector = tuple[float, float, float]
 Matrix = tuple[Vector, Vector, Vector]
@@ -77,18 +74,7 @@ class PoseFile(msgspec.Struct, forbid_unknown_fields=True):
 
     def pose(self) -> Pose:
         """The pose; InputError where the rotation is none."""
-        return Pose(rotation_of(self.rotation), np.array(self.translation_m))
-
-
-def rotation_of(matrix: Matrix) -> Array:
-    """A rotation as a file has it; InputError where it is none."""
-    rotation = np.array(matrix)
-    off = max(np.max(np.abs(rotation @ rotation.T - np.eye(3))), abs(np.linalg.det(rotation) - 1.0))
-    if not off < _TOLERANCE:
-        raise InputError(
-            f"rotation is no rotation matrix: R R^T and its determinant are {off:.2g} from the identity and 1"
-        )
-    return rotation
+        return Pose(require_rotation(self.rotation, "rotation"), np.array(self.translation_m))
 
 
 def camera_to_json(camera: Camera) -> dict[str, Any]:

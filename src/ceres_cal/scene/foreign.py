@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.least_squares import least_squares
-from ceres_cal.base.transforms import Pose
+from ceres_cal.base.transforms import Pose, require_rotation
 from ceres_cal.scene.lens import Brown, KannalaBrandt, Lens, Radial, make_lens
 
 OPENCV_MODELS = {"opencv4": 4, "opencv5": 5, "opencv8": 8, "opencv12": 12}
@@ -63,7 +63,10 @@ class ForeignCamera:
     distort: Callable[[Array], Array] | None = None
 
     def __post_init__(self) -> None:
-        place = () if self.cam_from_world is None else self.cam_from_world.translation
+        place = np.empty(0)
+        if self.cam_from_world is not None:
+            require_rotation(self.cam_from_world.rotation, "the camera's rotation")
+            place = self.cam_from_world.translation
         numbers = (*self.focal, *self.centre, *self.coefficients, *place)
         if (
             not np.all(np.abs(numbers) < LARGEST)
