@@ -2,7 +2,7 @@
 
 from ceres_cal.lens_choice.choice import Chosen, choose_lens
 from ceres_cal.lens_choice.forms import PAPER, any_lens, candidates, coefficients_of, kinds, label_of, papers, size_of
-from ceres_cal.lens_choice.rule import decide
+from ceres_cal.lens_choice.rule import decide, surprise
 
 __all__ = [
     "PAPER",
@@ -16,4 +16,5 @@ __all__ = [
     "label_of",
     "papers",
     "size_of",
+    "surprise",
 ]

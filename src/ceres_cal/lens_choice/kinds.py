@@ -12,7 +12,7 @@ from ceres_cal.base.arrays import Array, Indices, Mask
 from ceres_cal.base.errors import CalibrationError, DegenerateError
 from ceres_cal.base.transforms import Poses
 from ceres_cal.lens_choice.forms import PAPER, Form, kinds
-from ceres_cal.lens_choice.rule import AS_GOOD, CLEARLY, standard_errors
+from ceres_cal.lens_choice.rule import AS_GOOD, CLEARLY, standard_errors, surprise
 from ceres_cal.model.equations import Equations, write_equations
 from ceres_cal.model.parameters import Estimate, Options, make_layout
 from ceres_cal.model.priors import gather_priors
@@ -74,7 +74,7 @@ class Kind:
         held = [key for key in self.normals.keys if key.kind == "camera" and key.quantity in lens]
         squares, step = self.normals.held_out(dict(zip(held, -values_of(self.estimate, held), strict=True)))
         rms_px = self.sigma_px * float(np.sqrt(squares.sum() / self.normals.counts.sum()))
-        return Candidate(form, self, _surprise(squares, self.normals.counts), rms_px, step)
+        return Candidate(form, self, surprise(squares, self.normals.counts), rms_px, step)
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,13 +133,6 @@ class Candidate:
             if camera.folds and (not camera.lens.may_fold or camera.lens.monotone_radius(camera.phi) <= reach_px):
                 return "folds inside the image"
         return ""
-
-
-def _surprise(squares: Array, counts: Array) -> Array:
-    """(G,) squares that grow by their logarithm where a group is off by more than the noise: a line that lies aside, or
-    a feature whose label is wrong, must not decide.
-    """
-    return np.asarray(counts * np.log1p(squares / counts))
 
 
 def compared_kinds(observations: Observations, options: Options, start: Estimate) -> tuple[Seen, list[Kind], float]:

@@ -39,6 +39,16 @@ def decide(labels: Sequence[str], sizes: Sequence[int], squares: Sequence[Array 
     return best, next(i for i in order if standard_errors(known[i], known[best]) <= AS_GOOD)
 
 
+def surprise(squares: Array, counts: Array) -> Array:
+    """(G,) squares that grow by their logarithm where a group is off by more than the noise: a line that lies aside, or
+    a feature whose label is wrong, must not decide.
+
+    Args:
+        squares: (G,) of each group's counts (G,) of residuals, in standard deviations.
+    """
+    return np.asarray(counts * np.log1p(squares / counts))
+
+
 def standard_errors(squares: Array, others: Array) -> float:
     """By how many standard errors of the difference squared errors by group exceed others; 0 of the same."""
     more = squares - others
