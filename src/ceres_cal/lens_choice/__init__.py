@@ -1,7 +1,7 @@
 """Which lens the data ask for (design, section 4)."""
 
 from ceres_cal.lens_choice.choice import Chosen, choose_lens
-from ceres_cal.lens_choice.forms import PAPER, any_lens, candidates, coefficients_of, kinds, label_of, papers, size_of
+from ceres_cal.lens_choice.forms import PAPER, any_lens, candidates, coefficients_of, label_of, papers, size_of
 from ceres_cal.lens_choice.rule import decide, surprise
 
 __all__ = [
@@ -12,7 +12,6 @@ __all__ = [
     "choose_lens",
     "coefficients_of",
     "decide",
-    "kinds",
     "label_of",
     "papers",
     "size_of",

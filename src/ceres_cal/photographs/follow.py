@@ -14,12 +14,12 @@ from ceres_cal.calibrating import calibrate
 from ceres_cal.detect.courses import Course, clear_px, predict
 from ceres_cal.detect.lines import SPACING_PX, Lines, measure, search, window_px
 from ceres_cal.detect.registration import nearness, shifted
-from ceres_cal.lens_choice import kinds
 from ceres_cal.model.parameters import Options, intrinsic_names
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.photographs.as_built import AS_DRAWN, AsBuilt, as_built
 from ceres_cal.photographs.refit import PointHints, observations_of, refit_camera
 from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.lens import LENSES
 from ceres_cal.scene.targets import Target
 
 FAR_PX = 130.0  # how far off the start may be
@@ -233,9 +233,11 @@ class _Tracker:
         """
         lines, fits = followed.lines, []
         observations = self._observed(lines, followed.camera)
-        for longest, *_ in kinds():
+        for kind, lens in LENSES.items():
+            if lens.set_at_start:
+                continue  # a few lines do not tell a lens without a formula
             try:
-                calibration = calibrate(observations, longest.of(Options()))
+                calibration = calibrate(observations, Options(lens=kind, powers=(lens.trial_powers or ((),))[-1]))
             except CalibrationError:
                 continue
             fits.append((calibration.fit.curve_scale * len(lines.found) / calibration.fit.curves, calibration))
