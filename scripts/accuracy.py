@@ -27,7 +27,7 @@ from accuracy_scenes import (
     small_boards,
 )
 from benchmark_problems import corner_observations, wide_lens
-from cases import Row, run
+from cases import Row, over, run
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.calibrating import calibrate
@@ -99,24 +99,27 @@ def mirrored_count(calibration: Calibration, observations: Observations, cam_fro
 
 def mirrored_case(runs: int, frames: int = 1000) -> Iterator[Row]:
     seeds = min(runs, 20)
-    counts, rms = [], []
-    for seed in range(seeds):
-        problem = wide_lens(frames, seed)
-        observations = corner_observations(problem.corners)
-        calibration = calibrate(observations, Options(lens="brown"))
-        rotations = {str(number): rotation for number, rotation in enumerate(problem.rotations)}
-        counts.append(mirrored_count(calibration, observations, rotations))
-        rms.append(calibration.rms_px)
+    counts, rms = zip(*over(partial(_mirrored_wide, frames), range(seeds)), strict=True)
     note = f"of {seeds} x {frames}"
     yield Row("mirrored, wide lens", "mirrored poses", sum(counts), most=0.0, note=note)
     yield Row("mirrored, wide lens", "rms, px", float(np.mean(rms)), 0.0, 0.415, 0.419, "0.417 expected")
-    counts = []
-    for seed in range(seeds):
-        simulation = simulate(small_boards(frames, seed), CLEAN_NOISE, seed)
-        calibration = calibrate(simulation.observations, Options(lens="brown"))
-        rotations = {name: pose.rotation for name, pose in simulation.scene.placements.items()}
-        counts.append(mirrored_count(calibration, simulation.observations, rotations))
-    yield Row("mirrored, small boards", "mirrored poses", sum(counts), most=0.0, note=note)
+    small = sum(over(partial(_mirrored_small, frames), range(seeds)))
+    yield Row("mirrored, small boards", "mirrored poses", small, most=0.0, note=note)
+
+
+def _mirrored_wide(frames: int, seed: int) -> tuple[int, float]:
+    problem = wide_lens(frames, seed)
+    observations = corner_observations(problem.corners)
+    calibration = calibrate(observations, Options(lens="brown"))
+    rotations = {str(number): rotation for number, rotation in enumerate(problem.rotations)}
+    return mirrored_count(calibration, observations, rotations), calibration.rms_px
+
+
+def _mirrored_small(frames: int, seed: int) -> int:
+    simulation = simulate(small_boards(frames, seed), CLEAN_NOISE, seed)
+    calibration = calibrate(simulation.observations, Options(lens="brown"))
+    rotations = {name: pose.rotation for name, pose in simulation.scene.placements.items()}
+    return mirrored_count(calibration, simulation.observations, rotations)
 
 
 # ---- the scenes of ssl-vision's table -------------------------------------------------------------------------------
@@ -213,12 +216,14 @@ def _moved_by_the_whole(name: str, field: Target) -> tuple[float, float, float, 
 def as_built_case(runs: int) -> Iterator[Row]:
     fields = min(runs, 40)
     case, note = "as built, six stations", f"{fields} fields"
-    errors = np.array([_offsets_from_six_stations(seed) for seed in range(fields)])
+    errors = np.array(list(over(_offsets_from_six_stations, range(fields))))
     yield Row(case, "rms error of an offset, mm", float(np.sqrt(np.mean(errors**2))), most=1.0, note=note)
     yield Row(case, "largest error of an offset, mm", float(np.max(np.abs(errors))), most=1.0, note=note)
     for heights in ("unknown", "known"):
         case = f"as built, two heights {heights}"
-        found = np.array([floor_errors_of_two_cameras(seed, heights == "known") for seed in range(fields)])
+        found = np.array(
+            list(over(partial(floor_errors_of_two_cameras, heights_known=heights == "known"), range(fields)))
+        )
         yield Row(case, "mean field error, nominal field, mm", *mean_and_error(found[:, 0]), note=note)
         yield Row(case, "mean field error, tolerances, mm", *mean_and_error(found[:, 1]), note=note)
         yield Row(case, "tolerances less nominal, mm", *mean_and_error(found[:, 1] - found[:, 0]), most=0.0)

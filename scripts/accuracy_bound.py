@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from accuracy_scenes import Problem
+from cases import over
 
 from ceres_cal import solve
 from ceres_cal.base.arrays import Array
@@ -137,12 +139,15 @@ def attempts(
     problem: Problem, disturbance: Disturbance, seeds: Sequence[int]
 ) -> Iterator[tuple[Trial, Calibration | None]]:
     """A trial for each seed and its calibration from a cold start, None where that fails."""
-    for seed in seeds:
-        trial = make_trial(problem, disturbance, seed)
-        try:
-            yield trial, calibrate(trial.observations, problem.options)
-        except CalibrationError:
-            yield trial, None
+    return over(partial(_attempt, problem, disturbance), seeds)
+
+
+def _attempt(problem: Problem, disturbance: Disturbance, seed: int) -> tuple[Trial, Calibration | None]:
+    trial = make_trial(problem, disturbance, seed)
+    try:
+        return trial, calibrate(trial.observations, problem.options)
+    except CalibrationError:
+        return trial, None
 
 
 def mean_and_error(values: Array) -> tuple[float, float]:
@@ -152,23 +157,25 @@ def mean_and_error(values: Array) -> tuple[float, float]:
 
 def efficiency(problem: Problem, disturbance: Disturbance, seeds: Sequence[int]) -> Efficiency:
     """Calibrate the problem once per seed, from a cold start."""
-    keys: tuple[Key, ...] = ()
-    errors, squared, best_squared, rejected = [], [], [], []
-    for trial, calibration in attempts(problem, disturbance, seeds):
-        if calibration is None:
-            continue
-        known = bound(trial)
-        keys, matrix = known.keys, known.matrix
-        errors.append(difference(trial, calibration.estimate))
-        squared.append(errors[-1] @ matrix @ errors[-1] / len(keys))
-        ideal = difference(trial, best(trial))
-        best_squared.append(ideal @ matrix @ ideal / len(keys))
-        rejected.append(len(calibration.rejected))
+    every = over(partial(_error_of, problem, disturbance), seeds)
+    keys, errors, squared, best_squared, rejected = zip(*(one for one in every if one is not None), strict=True)
     return Efficiency(
-        keys,
+        keys[0],
         np.array(errors),
         np.array(squared),
         np.array(best_squared),
         len(seeds) - len(squared),
         float(np.mean(rejected)),
     )
+
+
+def _error_of(
+    problem: Problem, disturbance: Disturbance, seed: int
+) -> tuple[tuple[Key, ...], Array, float, float, int] | None:
+    """Keys, errors, squared error, that of the best on this noise, and how many were taken out; None where it fails."""
+    trial, calibration = _attempt(problem, disturbance, seed)
+    if calibration is None:
+        return None
+    known, error, ideal = bound(trial), difference(trial, calibration.estimate), difference(trial, best(trial))
+    ours, least = (float(one @ known.matrix @ one) / len(known.keys) for one in (error, ideal))
+    return known.keys, error, ours, least, len(calibration.rejected)

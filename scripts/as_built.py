@@ -15,7 +15,7 @@ from functools import partial
 
 import numpy as np
 from accuracy_scenes import RADIAL
-from cases import Row, run
+from cases import Row, over, run
 from halves import SETS
 
 from ceres_cal.base.arrays import Array
@@ -82,13 +82,17 @@ def sigmas_off(calibration: Calibration, scene: Scene) -> Array:
     return np.asarray(difference(calibration.estimate, truth, keys) / spread)
 
 
+def _both(board: Board, seed: int) -> tuple[Scene, Calibration, Calibration]:
+    """The scene of a seed, and what it comes to as built and as drawn."""
+    scene, observations = observed(board, seed)
+    return scene, calibrate(observations, BUILT), calibrate(observations, DRAWN)
+
+
 def board_rows(case: str, board: Board, runs: int) -> Iterator[Row]:
     """The figures of one kind of board."""
     found, offs, squares, spreads = [], [], [], []
     sigmas: dict[str, list[float]] = {"points": [], "warp": []}
-    for seed in range(runs):
-        scene, observations = observed(board, seed)
-        as_built, drawn = calibrate(observations, BUILT), calibrate(observations, DRAWN)
+    for scene, as_built, drawn in over(partial(_both, board), range(runs)):
         found.append(bool(as_built.as_built))
         offs.append(sigmas_off(as_built, scene))
         widths = np.array([np.sqrt(np.diagonal(one.uncertainty.posterior.covariance)[:5]) for one in (as_built, drawn)])

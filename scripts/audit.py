@@ -11,9 +11,11 @@ import sys
 import tempfile
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
+from cases import add_jobs, over, over_processes
 
 from ceres_cal import CalibrationError, Camera, Options, audit, calibrate
 from ceres_cal.base.transforms import Pose
@@ -74,7 +76,7 @@ def one_run(seed: int, fault: str | None, folder: Path) -> str | None:
         return one_run(seed + 100_000, fault, folder)
     faulty = FAULTS[fault](first.station()) if fault else first.station()
     written = ImportedCameras({"overhead": faulty}, first.targets).calibration("this script")
-    path = folder / "camera.yml"
+    path = folder / f"camera-{seed}.yml"
     export(written, "opencv", path)
     given = import_calibration(path)
     there = scene_of(knocked(true, seed)) if fault == "moved" else scene
@@ -87,12 +89,13 @@ def main(runs: int) -> None:
         found = named = 0
         each = -(-runs // len(FAULTS))
         for fault in FAULTS:
-            causes = [one_run(1000 + seed, fault, Path(name)) for seed in range(each)]
+            causes = list(over(partial(one_run, fault=fault, folder=Path(name)), range(1000, 1000 + each)))
             found += sum(cause is not None for cause in causes)
             named += causes.count(fault)
             print(f"{fault:24} {sum(c is not None for c in causes)} of {each} found, {causes.count(fault)} by its name")
         total = each * len(FAULTS)
-        alarms = sum(one_run(5000 + seed, None, Path(name)) is not None for seed in range(runs))
+        sound = over(partial(one_run, fault=None, folder=Path(name)), range(5000, 5000 + runs))
+        alarms = sum(cause is not None for cause in sound)
     print(f"{'all faults':24} {found} of {total} found, {named} by their names")
     print(f"{'sound':24} {alarms} of {runs} false alarms")
     sys.stdout.flush()
@@ -101,4 +104,7 @@ def main(runs: int) -> None:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--runs", type=int, default=100, help="of sound ones, and of faulty ones together")
-    main(parser.parse_args().runs)
+    add_jobs(parser)
+    given = parser.parse_args()
+    with over_processes(given.jobs):
+        main(given.runs)

@@ -6,11 +6,40 @@ import argparse
 import json
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
+
+from ceres_cal.base.executing import each, processes
+
+_T = TypeVar("_T")
+_executor: ContextVar[Executor | None] = ContextVar("executor", default=None)
+
+
+@contextmanager
+def over_processes(jobs: int) -> Iterator[None]:
+    """While it lasts, what `over` does goes over so many processes; 0 is one a core."""
+    with processes(jobs) as executor:
+        token = _executor.set(executor)
+        try:
+            yield
+        finally:
+            _executor.reset(token)
+
+
+def over(function: Callable[..., _T], *items: Iterable[Any]) -> Iterator[_T]:
+    """What a function, defined at the top of a module, makes of each of the items, in order: of seeds, mostly."""
+    return each(function, *items, executor=_executor.get())
+
+
+def add_jobs(parser: argparse.ArgumentParser) -> None:
+    """The option --jobs."""
+    parser.add_argument("--jobs", type=int, default=1, help="processes; 0 is one a core (default 1): the same figures")
 
 
 @dataclass(frozen=True)
@@ -81,14 +110,16 @@ def run(
     parser.add_argument("--runs", type=int, default=runs[0], help=f"{runs[1]} (default {runs[0]})")
     parser.add_argument("--case", nargs="+", choices=cases, default=list(cases), help="only these")
     parser.add_argument("--json", type=Path, help="write the figures there, too")
+    add_jobs(parser)
     given = parser.parse_args(arguments)
     if given.runs < least_runs:
         parser.error(f"--runs must be {least_runs} or more: one run has no spread")
     rows: list[Row] = []
-    for name in given.case:
-        start = time.perf_counter()
-        rows += printed(cases[name](given.runs))
-        print(f"  {name}: {time.perf_counter() - start:.0f} s", flush=True)
+    with over_processes(given.jobs):
+        for name in given.case:
+            start = time.perf_counter()
+            rows += printed(cases[name](given.runs))
+            print(f"  {name}: {time.perf_counter() - start:.0f} s", flush=True)
     rows = [*rows, *printed(over_all(rows))]
     if given.json:
         given.json.write_text(json_text(rows), encoding="utf-8")

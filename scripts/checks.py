@@ -10,10 +10,10 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
-from cases import Row, run
+from cases import Row, over, run
 from dependent_errors import along_lines
 from moves import ALARMS, DAY, HOME, NOISE, calibrated, clean, seen, thinned, truth_of
 
@@ -67,10 +67,14 @@ def checked(kind: Kind, number: int, seed: int, pose: Pose = HOME) -> StationChe
     return check(calibration_of(number), kind.seen(pose, 10_000 + seed), ALARMS).stations["overhead"]
 
 
+def _checked_by_turns(kind: Kind, number: int, first: int = 0, pose: Pose = HOME) -> StationCheck:
+    return checked(kind, number % CALIBRATIONS, first + number, pose)
+
+
 def false_case(runs: int) -> Iterator[Row]:
     """False alarms of each kind of observations, over all calibrations."""
     for kind in KINDS:
-        share = np.mean([not checked(kind, seed % CALIBRATIONS, seed).holds for seed in range(runs)])
+        share = np.mean([not one.holds for one in over(partial(_checked_by_turns, kind), range(runs))])
         note = f"{runs} unmoved cases, {min(runs, CALIBRATIONS)} calibrations"
         yield Row("false alarms at 1 %", kind.name, float(share), _error(ALARMS, runs), 0.005, 0.015, note)
 
@@ -80,8 +84,9 @@ def unlucky_case(runs: int) -> Iterator[Row]:
     order = np.argsort([_off(calibration_of(number)) for number in range(CALIBRATIONS)])
     for what, some in (("the luckiest 20 of 40", order[:20]), ("the unluckiest 4 of 40", order[-4:])):
         each = max(runs // len(some), 1)
-        rare = [[checked(KINDS[0], n, 50_000 + 1000 * n + i).probability for i in range(each)] for n in some.tolist()]
-        rates = np.mean(np.array(rare) < ALARMS, axis=1)
+        asked = [(n, 50_000 + 1000 * n + i) for n in some.tolist() for i in range(each)]
+        rare = [one.probability for one in over(partial(checked, KINDS[0]), *zip(*asked, strict=True))]
+        rates = np.mean(np.reshape(rare, (len(some), each)) < ALARMS, axis=1)
         note = (
             f"{each} checks each, {100 * rates.max():.1f} % at most; off by {_off(calibration_of(int(some[-1]))):.1f}"
         )
@@ -93,7 +98,7 @@ def unlucky_case(runs: int) -> Iterator[Row]:
             most=0.015,
             note=note,
         )
-        twice = np.mean(np.array(rare) < np.sqrt(ALARMS / MONTH), axis=1)
+        twice = np.mean(np.reshape(rare, (len(some), each)) < np.sqrt(ALARMS / MONTH), axis=1)
         both = np.mean((twice**2 - twice * (1.0 - twice) / max(each - 1, 1)).clip(0.0))
         yield Row(
             "hourly for a month, asked twice", what, float(MONTH * both), most=0.015, note="acts on nothing, times"
@@ -139,9 +144,8 @@ def _smallest(kind: Kind, moved: Callable[[float], Pose], sizes: Sequence[float]
     """The smallest of the sizes that is found in 95 %, between two of them by a straight line in their logarithms."""
     before = 0.0
     for at, size in enumerate(sizes):
-        found = float(
-            np.mean([not checked(kind, i % CALIBRATIONS, 90_000 + i, moved(size)).holds for i in range(runs)])
-        )
+        one_of_them = partial(_checked_by_turns, kind, first=90_000, pose=moved(size))
+        found = float(np.mean([not one.holds for one in over(one_of_them, range(runs))]))
         if found >= 0.95:
             if at == 0 or found == before:
                 return size

@@ -16,7 +16,7 @@ from functools import partial
 import numpy as np
 from accuracy_bound import Trial, make_trial
 from accuracy_scenes import CLEAN_NOISE, GROSS_NOISE, PROBLEMS, RADIAL, SSL_PROBLEMS, Problem, boards, tilted
-from cases import Row, run
+from cases import Row, over, run
 from dependent_errors import SIGMA_PX, Errors, along_lines, in_rows, line_aside, warped
 
 from ceres_cal.base.arrays import Array, Mask
@@ -112,19 +112,35 @@ class Coverage:
     far: int = 0
     factors: list[Array] = field(default_factory=list)
 
+    def add(self, other: Coverage) -> None:
+        """More runs of the same case."""
+        self.names = other.names or self.names
+        for mine, theirs in ((self.points, other.points), (self.open, other.open)):
+            for height_m, runs in theirs.items():
+                mine.setdefault(height_m, []).extend(runs)
+        for name in ("parameters", "placements", "verdicts", "factors"):
+            getattr(self, name).extend(getattr(other, name))
+        self.failed += other.failed
+        self.far += other.far
+
 
 def cover(case: Case, seeds: Sequence[int]) -> Coverage:
     """Calibrate once for each seed."""
     found = Coverage()
-    problem = case.make()
-    for seed in seeds:
-        trial = make_trial(problem, case.disturbance, seed)
-        if case.errors is not None:
-            trial = replace(trial, observations=case.errors(trial.observations, problem.scene, seed))
-        try:
-            _add(found, case, trial, calibrate(trial.observations, problem.options))
-        except CalibrationError:
-            found.failed += 1
+    for one in over(partial(_cover_one, case), seeds):
+        found.add(one)
+    return found
+
+
+def _cover_one(case: Case, seed: int) -> Coverage:
+    found, problem = Coverage(), case.make()
+    trial = make_trial(problem, case.disturbance, seed)
+    if case.errors is not None:
+        trial = replace(trial, observations=case.errors(trial.observations, problem.scene, seed))
+    try:
+        _add(found, case, trial, calibrate(trial.observations, problem.options))
+    except CalibrationError:
+        found.failed += 1
     return found
 
 

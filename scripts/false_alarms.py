@@ -16,14 +16,16 @@ import tempfile
 import time
 from collections import Counter
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
+from cases import add_jobs, over, over_processes
 from diagnostic_scenes import CLEAN, FAULTS, NOISE, USUAL, Problem, held_boards
 
 from ceres_cal.base.tails import log_binomial_tail
 from ceres_cal.calibrating import calibrate
-from ceres_cal.diagnostics import FALSE_ALARM_RATE, Diagnosis, diagnose
+from ceres_cal.diagnostics import FALSE_ALARM_RATE, Diagnosis, Finding, diagnose
 from ceres_cal.model.parameters import Options
 from ceres_cal.simulate import simulate
 
@@ -64,10 +66,13 @@ def diagnosed(problem: Problem, seed: int) -> Diagnosis:
     return diagnose(calibrate(observations, problem.options), observations)
 
 
+def _found(name: str, seed: int) -> tuple[Finding, ...]:
+    return diagnosed(CLEAN[name] if name in CLEAN else FAULTS[name][0], seed).findings
+
+
 def clean_row(name: str, seeds: range) -> Row:
     alarms, kinds = 0, Counter[str]()
-    for seed in seeds:
-        findings = diagnosed(CLEAN[name], seed).findings
+    for findings in over(partial(_found, name), seeds):
         alarms += bool(findings)
         kinds.update(finding.kind for finding in findings)
     return Row(name, len(seeds), alarms, dict(kinds))
@@ -75,10 +80,9 @@ def clean_row(name: str, seeds: range) -> Row:
 
 def fault_row(name: str, seeds: range) -> Row:
     """A scene counts as named when the finding of most effect is of the planted kind and subject."""
-    problem, kind, subject = FAULTS[name]
+    _, kind, subject = FAULTS[name]
     named, alarms, kinds = 0, 0, Counter[str]()
-    for seed in seeds:
-        findings = diagnosed(problem, seed).findings
+    for findings in over(partial(_found, name), seeds):
         named += bool(findings) and (findings[0].kind, findings[0].subject) == (kind, subject)
         others = [one for one in findings if (one.kind, one.subject) != (kind, subject)]
         alarms += bool(others)
@@ -110,19 +114,21 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--seed", type=int, default=0, help="of the first scene; default: 0")
     parser.add_argument("--time", action="store_true", help="measure the command on 100 000 observations instead")
     parser.add_argument("--json", action="store_true")
+    add_jobs(parser)
     args = parser.parse_args(arguments)
     if args.time:
         count, seconds = process_seconds()
         print(f"ceres-cal diagnose, {count} observations, whole process: {seconds:.2f} s (at most {MOST_SECONDS:g} s)")
         return int(seconds > MOST_SECONDS)
     rows, start = [], time.perf_counter()
-    for number, name in enumerate([*CLEAN, *FAULTS]):
-        if args.case in (None, name):
-            make, count = (clean_row, args.runs) if name in CLEAN else (fault_row, args.faults)
-            first = args.seed + 1000 * number  # one draw of noise before two lenses is no two draws
-            rows.append(make(name, range(first, first + count)))
-            if not args.json:
-                print(rows[-1], flush=True)
+    with over_processes(args.jobs):
+        for number, name in enumerate([*CLEAN, *FAULTS]):
+            if args.case in (None, name):
+                make, count = (clean_row, args.runs) if name in CLEAN else (fault_row, args.faults)
+                first = args.seed + 1000 * number  # one draw of noise before two lenses is no two draws
+                rows.append(make(name, range(first, first + count)))
+                if not args.json:
+                    print(rows[-1], flush=True)
     clean = [row for row in rows if row.named is None]
     scenes, alarms = sum(row.scenes for row in clean), sum(row.alarms for row in clean)
     total = Row(f"all clean, at most {100 * FALSE_ALARM_RATE:g} % by design", scenes, alarms, {})

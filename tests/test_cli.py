@@ -117,6 +117,7 @@ def test_help_lists_every_command(say: Say) -> None:
         "publish",
         "listen",
         "audit",
+        "batch",
         "undistort",
         "completion",
     }

@@ -24,7 +24,7 @@ from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Radial
 from ceres_cal.scene.targets import ssl_field
 from ceres_cal.simulate import Disturbance, Scene, Station, field_scene, overhead_pose, simulate
-from ceres_cal.solve import Problem, solve_robustly
+from ceres_cal.solve import Problem, competing, looked_at, solve_robustly
 from ceres_cal.solve.offsets import Offsets
 
 NOISE = Disturbance(points_sigma_px=0.3, curves_sigma_px=0.3)
@@ -115,6 +115,30 @@ def test_two_lines_aside_do_not_hide_each_other(pair: tuple[str, str]) -> None:
     for line, aside_px in zip(pair, (6.0, -6.0), strict=True):
         observations = moved_aside(observations, line, aside_px)
     assert wholes(calibrate(observations, RADIAL)) == {f"the whole of line {line!r} in frame '0001'" for line in pair}
+
+
+@pytest.mark.parametrize("frame", [None, "0017"])
+def test_of_very_many_observations_a_part_is_asked_and_all_of_a_whole_is_taken_out(
+    frame: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    observations = moved_aside(simulate(half_field(24), NOISE, 4).observations, "HalfwayLine", 4.0, frame)
+    of_all = calibrate(observations, RADIAL)
+    monkeypatch.setattr(looked_at, "_MOST_ASKED", 1_000)
+    monkeypatch.setattr(looked_at, "_FEWEST_ASKED", 4)
+    parts: list[looked_at.Asked] = []
+
+    def spied(every: looked_at.Asked) -> looked_at.Asked:
+        parts.append(looked_at.asked(every))
+        return parts[0]
+
+    monkeypatch.setattr(competing, "asked", spied)
+    of_some = calibrate(observations, RADIAL)
+    assert len(parts[0].observations.curves) < 0.9 * len(observations.curves)
+    where = "all 24 frames" if frame is None else f"frame {frame!r}"
+    assert wholes(of_some) == wholes(of_all) == {f"the whole of line 'HalfwayLine' in {where}"}
+    assert [entry.row for entry in of_some.rejected] == [entry.row for entry in of_all.rejected]
+    phi, reference = (one.cameras["overhead"].phi for one in (of_some, of_all))
+    assert phi == pytest.approx(reference, rel=1e-9)
 
 
 # ---- frames and placements ------------------------------------------------------------------------------------------

@@ -35,6 +35,7 @@ FLOORS = {
     "pictures": 10,
     "formats": 10,
     "report": 11,
+    "batch": 11,
     "cli": 12,
 }
 

@@ -16,19 +16,21 @@ import pytest
 from chromium import Browser, browser
 from scenes import RADIAL, SCENES, camera
 
-from ceres_cal import Calibration, Observations, Options, Pose, calibrate, write_report
+from ceres_cal import Calibration, Observations, Options, Pose, Prior, calibrate, write_report
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.transforms import rotation_exp
+from ceres_cal.base.transforms import euler_from_rotation, rotation_exp
 from ceres_cal.base.words import at_precision, short
 from ceres_cal.cli import main
 from ceres_cal.diagnostics import diagnose
+from ceres_cal.model.quantities import camera_moved
 from ceres_cal.report import make_report
-from ceres_cal.report.grounds import judge_quality, level_of, worst
+from ceres_cal.report.grounds import CARE_MM, GOOD_MM, judge_quality, level_of, worst
 from ceres_cal.report.lens_picture import ideal_radii
 from ceres_cal.report.maps import levels_of
 from ceres_cal.report.material import Material
 from ceres_cal.report.quality import quality_of
 from ceres_cal.report.residual_pictures import significant_means
+from ceres_cal.report.scale import COLORS, MM, PX
 from ceres_cal.report.verdict import verdict_chapter
 from ceres_cal.scene.lens import Radial
 from ceres_cal.scene.targets import ssl_field
@@ -38,8 +40,8 @@ ROOT = Path(__file__).parents[1]
 SAMPLE = ROOT / "data" / "ssl_field" / "observations.json"
 HOSTILE = '<script>alert("x")</script>&\'$a_b$'
 PICTURES = (
-    "vectors-0", "radius-0", "lens-0", "frames", "outliers", "map-0-0", "map-0-1", "correlation", "convergence",
-    "closed-form",
+    "vectors-0", "radius-0", "lens-0", "frames", "outliers", "map-0-0", "image-0", "map-0-1", "correlation",
+    "convergence", "closed-form",
 )  # fmt: skip
 
 
@@ -91,6 +93,11 @@ def tilted(degrees: float) -> tuple[Calibration, Observations]:
     return calibrate(observations, RADIAL), observations
 
 
+@cache
+def frontal_page() -> str:
+    return make_report(*tilted(0.5))
+
+
 def headline(page: str) -> str:
     found = re.search(r'<section id="verdict" class="(\w+)"><h2>(.*?)</h2>', page)
     assert found is not None
@@ -108,7 +115,8 @@ def test_the_page_needs_nothing_from_elsewhere() -> None:
         for name in ("src", "href", "xlink:href", "srcset", "data", "action", "poster"):
             assert re.match(r"#|data:", attributes.get(name, "#")), (tag, attributes)
     assert not re.search(r"url\((?!#)|@import|https?://", page)
-    assert {"script", "iframe", "object", "base", "form"}.isdisjoint(tag for tag, _ in outline.elements)
+    assert {"iframe", "object", "base", "form"}.isdisjoint(tag for tag, _ in outline.elements)
+    assert [attributes for tag, attributes in outline.elements if tag == "script"] == [{}]  # its own, and inline
 
 
 def test_every_reference_in_the_page_leads_to_one_place() -> None:
@@ -169,10 +177,9 @@ def test_names_from_files_do_no_harm() -> None:
     observations = replace(plain, views=views, cameras={HOSTILE: plain.cameras["overhead"]})
     page = make_report(calibrate(observations, RADIAL), observations)
     outline = Outline(page)
-    assert "script" not in {tag for tag, _ in outline.elements}
+    assert [tag for tag, _ in outline.elements].count("script") == 1 == page.count("<script")  # the page's own
     assert any(HOSTILE in text for text in "".join(outline.text).split("\n"))
     assert "alert(&quot;x&quot;)" in page and 'alert("x")' not in re.sub(r"<text.*?</text>", "", page, flags=re.S)
-    assert "<script" not in page
 
 
 def test_a_report_of_other_observations_says_so(tmp_path: Path) -> None:
@@ -191,7 +198,7 @@ def test_a_report_of_other_observations_says_so(tmp_path: Path) -> None:
 
 
 def test_a_frontal_view_is_trusted_on_the_floor_alone() -> None:
-    page = make_report(*tilted(0.5))
+    page = frontal_page()
     assert headline(page).startswith("care: Trust it on the floor alone, to ")
     assert headline(page).endswith("places at robot height (150\N{NO-BREAK SPACE}mm) cannot be told.")
     assert "only their ratio is known" in page and "the observations cannot tell how far off" in page.lower()
@@ -345,6 +352,69 @@ def test_short_numbers(value: float, text: str) -> None:
     assert short(value) == text
 
 
+def test_angles_have_the_sd_of_the_turns_that_make_them() -> None:
+    calibration, _ = sample()
+    pose = calibration.stations["overhead"].cam_from_world.rotation
+    posterior = calibration.posterior
+    assert posterior is not None
+    at = [posterior.column("station", "overhead", f"turn_{axis}") for axis in "xyz"]
+    turns = np.random.default_rng(0).multivariate_normal(np.zeros(3), posterior.covariance[np.ix_(at, at)], 4000)
+    alpha, beta, gamma = np.degrees([euler_from_rotation(rotation_exp(turn) @ pose) for turn in turns]).std(axis=0)
+    page = sample_page()
+    for name, sd in (("alpha", alpha), ("beta", beta), ("gamma", gamma)):
+        row = re.search(rf">{name}, the paper.*?</tr>", page)
+        assert row is not None
+        value, shown = re.findall(r'data-head="(?:value|± sd)">(-?[\d.]+)°', row[0])
+        assert float(shown) == pytest.approx(sd, rel=0.06), name  # 0.03: two digits
+        assert len(value.partition(".")[2]) == len(shown.partition(".")[2]), name  # and no more of the angle
+
+
+def test_the_colours_say_the_same_in_every_report() -> None:
+    good, bad = sample_page(), frontal_page()
+    borders = [f"{border:g}" for border in MM.borders]
+    for page in (good, bad):
+        drawn = re.search(r'<figure id="map-0-0".*?(<svg.*?</svg>)', page, flags=re.S)
+        assert drawn is not None
+        texts = re.findall(r"<text[^>]*>([^<]+)</text>", drawn[1])
+        assert texts[texts.index("95 % within, mm") - len(borders) : texts.index("95 % within, mm")] == borders
+    assert {GOOD_MM, CARE_MM} < set(MM.borders) and len(COLORS) == len(MM.borders) + 1 == len(PX.borders) + 1
+    lightness = [sum(w * int(color[i : i + 2], 16) for w, i in ((0.3, 1), (0.6, 3), (0.1, 5))) for color in COLORS]
+    assert np.all(np.diff(lightness) < -10.0)  # grey print has the same order; 14.9 measured
+
+
+def test_no_number_is_green_under_a_verdict_that_promises_nothing() -> None:
+    observations = sample()[1]
+    calibration = calibrate(
+        observations, replace(RADIAL, priors=(Prior("station", "overhead", "height_m", (4.5,), (0.01,)),))
+    )
+    page = make_report(calibration, observations)
+    assert headline(page).startswith("no: ") and 'class="tile good"' not in page
+    assert "these maps hold only if what it doubts is set right" in page
+    assert "these maps hold only" not in sample_page() and 'class="tile good"' in sample_page()
+
+
+def test_what_a_lens_shows_is_as_uncertain_as_lenses_scatter() -> None:
+    scene, disturbance = built_in_scene("boards")
+    calibration = calibrate(simulate(scene, disturbance, seed=1).observations, RADIAL)
+    known, (name, seen) = calibration.uncertainty.map_px(), next(iter(calibration.cameras.items()))
+    posterior = calibration.posterior
+    assert posterior is not None
+    keys = [key for key in posterior.keys if key[:2] == ("camera", name)]
+    at = posterior.information.columns(keys)
+    steps = np.random.default_rng(0).multivariate_normal(np.zeros(len(at)), posterior.covariance[np.ix_(at, at)], 400)
+    pixels = np.column_stack([part.ravel() for part in np.meshgrid(known.x_px, known.y_px)])
+    rays, every = seen.rays(pixels), []
+    for step in steps:
+        other = camera_moved(seen, [key.quantity for key in keys], step)
+        u, _, vt = np.linalg.svd(other.rays(pixels).T @ rays)  # Kabsch: the turn that brings them together
+        every.append(np.linalg.norm(other.project(rays @ (u @ vt).T) - pixels, axis=1))
+    scattered = np.quantile(every, 0.95, axis=0).reshape(known.radius_95_px.shape)
+    assert np.median(known.radius_95_px / scattered) == pytest.approx(1.0, abs=0.1)
+    assert np.all((known.radius_95_px / scattered > 0.6) & (known.radius_95_px / scattered < 1.6))
+    with pytest.raises(InputError, match="there is no camera 'other'"):
+        calibration.uncertainty.map_px("other")
+
+
 # ---- commands -------------------------------------------------------------------------------------------------------
 
 
@@ -403,6 +473,29 @@ _CUT_OFF = """
 """
 
 
+# Letters with less contrast than 4.5 : 1 (WCAG AA) to what lies behind them; pictures have the page's own ground.
+_PALE = """
+(() => {
+  const rgb = text => (text.match(/[\\d.]+/g) || []).map(Number), found = new Set();
+  const light = c => c.slice(0, 3).map(v => v / 255).map(v => v <= .03928 ? v / 12.92 : ((v + .055) / 1.055) ** 2.4)
+    .reduce((sum, v, i) => sum + v * [.2126, .7152, .0722][i], 0);
+  document.querySelectorAll('details').forEach(d => d.open = true);
+  for (const e of document.querySelectorAll('body *')) {
+    const own = [...e.childNodes].some(n => n.nodeType == 3 && n.textContent.trim());
+    if (!own || !e.getBoundingClientRect().width || e.closest('[id^=map] svg, [id^=image] svg, script')) continue;
+    let behind = e;
+    const colour = () => rgb(getComputedStyle(behind).backgroundColor);
+    while (behind.parentElement && colour()[3] === 0) behind = behind.parentElement;
+    const style = getComputedStyle(e), ink = light(rgb(e.tagName == 'text' ? style.fill : style.color));
+    const ground = light(colour());
+    const ratio = (Math.max(ink, ground) + .05) / (Math.min(ink, ground) + .05);
+    if (ratio < 4.5) found.add(`${e.tagName} ${ratio.toFixed(1)}: ${e.textContent.trim().slice(0, 30)}`);
+  }
+  return [...found];
+})()
+"""
+
+
 @pytest.fixture(scope="module")
 def window() -> Iterator[Browser]:
     with browser() as found:
@@ -426,7 +519,7 @@ def test_nothing_is_cut_off_and_nothing_complains(window: Browser, tmp_path: Pat
     if name == "sample":
         page = sample_page()
     elif name == "frontal":
-        page = make_report(*tilted(0.5))
+        page = frontal_page()
     elif name == "two-cameras":
         page = two_cameras_page()
     else:
@@ -439,6 +532,38 @@ def test_nothing_is_cut_off_and_nothing_complains(window: Browser, tmp_path: Pat
     assert window.complaints == [] and window.requests == [file.as_uri()]
     drawn = window.run("[...document.querySelectorAll('figure svg')].filter(s => s.clientWidth).length")
     assert drawn == page.count("<figure")
+
+
+def test_the_pointer_says_what_is_there(window: Browser, tmp_path: Path) -> None:
+    file = tmp_path / "page.html"
+    file.write_text(sample_page(), encoding="utf-8")
+    window.open(file, 1280)
+    known = sample()[0].uncertainty.map_sd_mm(height_m=0.0)
+    row, column = len(known.y_m) // 2, int(np.argmin(np.abs(known.x_m + 2.0)))
+    said = window.run(f"""(() => {{
+        const svg = document.querySelector('#map-0-0 svg'), box = svg.getBoundingClientRect();
+        const [l, t, r, b, x0, y0, x1, y1] = svg.dataset.axes.split(' ').map(Number);
+        const x = l + (r - l) * ({known.x_m[column]} - x0) / (x1 - x0);
+        const y = t + (b - t) * ({known.y_m[row]} - y0) / (y1 - y0);
+        const at = {{clientX: box.left + x * box.width, clientY: box.top + y * box.height, bubbles: true}};
+        svg.dispatchEvent(new PointerEvent('pointermove', at));
+        const tip = document.querySelector('#tip'), shown = tip.hidden ? '' : tip.textContent;
+        document.body.dispatchEvent(new PointerEvent('pointermove', {{clientX: 5, clientY: 5, bubbles: true}}));
+        return [shown, tip.hidden];
+    }})()""")
+    value = short(float(known.radius_95_mm[row, column]))
+    assert said == [f"x {known.x_m[column]:g} m, y {known.y_m[row]:g} m: 95 % within {value} mm", True]
+    assert window.complaints == []
+
+
+@pytest.mark.parametrize("mode", ["light", "dark"])
+def test_every_letter_stands_out(window: Browser, tmp_path: Path, mode: str) -> None:
+    file = tmp_path / "page.html"
+    file.write_text(frontal_page(), encoding="utf-8")
+    window.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": mode}])
+    window.open(file, 1280)
+    assert window.run(_PALE) == []
+    window.call("Emulation.setEmulatedMedia", features=[])
 
 
 def test_hostile_names_run_nothing(window: Browser, tmp_path: Path) -> None:
@@ -455,4 +580,4 @@ def test_it_prints_on_a_few_pages(window: Browser, tmp_path: Path) -> None:
     window.open(file, 1280)
     window.print_pdf(tmp_path / "page.pdf")
     content = (tmp_path / "page.pdf").read_bytes()
-    assert content.startswith(b"%PDF") and 4 <= len(re.findall(rb"/Type\s*/Page\b(?!s)", content)) <= 7  # 6 measured
+    assert content.startswith(b"%PDF") and 4 <= len(re.findall(rb"/Type\s*/Page\b(?!s)", content)) <= 5  # 4 measured

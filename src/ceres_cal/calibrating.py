@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import CalibrationError, DegenerateError, SolutionError
 from ceres_cal.base.threads import at_most, meanwhile, single_threaded_blas
-from ceres_cal.base.words import bounds_text, two_digits
-from ceres_cal.calibration import COPY, Calibration, Fit, Rejected
+from ceres_cal.calibration import Calibration
+from ceres_cal.calibration.caveats import resting_phi, unknown_phi
+from ceres_cal.calibration.outcome import came_out, of_all
 from ceres_cal.lens_choice import choose_lens, papers
-from ceres_cal.model.keys import Key
 from ceres_cal.model.parameters import AUTO, Estimate, Layout, Options, make_layout
 from ceres_cal.model.priors import gather_priors
 from ceres_cal.model.quantities import difference
@@ -33,29 +34,25 @@ from ceres_cal.solve import (
     solve_robustly,
 )
 from ceres_cal.solve.as_built import solve_as_built, tolerances_of
+from ceres_cal.solve.bulk import Bulk, Part, Settled, is_bulk
 from ceres_cal.solve.competing import compete
 from ceres_cal.solve.conflicts import contradicted_by
+from ceres_cal.solve.dimensions import free_dimensions, require_measured
 from ceres_cal.solve.explanation import Explanation
-from ceres_cal.solve.noise import Inliers, visible_from
+from ceres_cal.solve.looked_at import Asked
+from ceres_cal.solve.noise import visible_from
 from ceres_cal.solve.possible import require_possible
 from ceres_cal.solve.usable import require_fits, require_usable
 from ceres_cal.start.baseline import four_point_baseline
 from ceres_cal.start.initialise import Start, initialise
-from ceres_cal.uncertainty import Posterior, Scatter, Uncertainty, assess, measure_scatter
+from ceres_cal.uncertainty import Posterior, Scatter, assess, measure_scatter
 
-_UNKNOWN = (
-    "camera {!r}: its views are too frontal to tell phi, which is {} at 95 %, and its heights go with phi: the floor "
-    "is right, what is above it is not: add boards tilted by 20 degrees, or a prior on height_m where it sees the field"
-)
 # Share of the standard deviation of usual principal points: observations that say as much need nothing usual. Half and
 # double leave ordinary fields and boards, whose share is under a tenth, as they are.
 _SAYS_LESS = 0.5
-# Times the standard deviation of phi without what is usual of principal points: what rests on it is said.
-_RESTING = 1.5
-_USUAL = (
-    "camera {!r}: phi, and what goes with it, rests on its principal point lying near the middle of the image, as is "
-    "usual: by the observations alone its standard deviation is {}: show tilted views, or state the principal point"
-)
+# Share of a dimension by which it may come out another than drawn without a second solve from there, whose start and
+# outliers are those of the right drawing; and how many there may be.
+_REDRAWN, _MOST_DRAWINGS = 0.005, 4
 _OTHERWISE = (
     "no calibration agrees with what was stated beforehand, though the observations make one without it: check the "
     "priors and their units"
@@ -66,21 +63,27 @@ def calibrate(
     observations: Observations,
     options: Options | None = None,
     progress: Callable[[Progress], None] | None = None,
+    *,
+    client: Any = None,
 ) -> Calibration:
     """Calibrate every camera, station and placement that the observations show.
 
+    Of very many observations of the world a part decides the lens, what does not belong and which statements are in
+    conflict; all of them are judged and solved for, in shares (docs/scale.md).
+
     Args:
         progress: called at every iteration of every solve, from this thread.
+        client: a `distributed.Client` whose workers keep the shares, however many observations there are.
 
     Raises:
         DegenerateError: the observations cannot determine the unknowns; the message names the frame or the numbers.
         SolutionError: no usable camera came out.
         InputError: a prior or a fixed number that the camera does not have; pixels outside their image.
     """
-    options = options or Options()
+    observations, options = free_dimensions(observations, options or Options())
     with single_threaded_blas(), at_most(options.threads):
         try:
-            return _calibrated(observations, options, progress)
+            return _measured(observations, options, progress, client)
         except (DegenerateError, SolutionError):
             free = _without_priors(observations, options)
             if free is None:
@@ -89,24 +92,62 @@ def calibrate(
             raise SolutionError(words or _OTHERWISE) from None
 
 
+def _measured(
+    observations: Observations, options: Options, progress: Callable[[Progress], None] | None, client: Any
+) -> Calibration:
+    """With targets drawn as long as they were found to be; from there again where that is not how they were drawn."""
+    for _ in range(_MOST_DRAWINGS):
+        calibration = _calibrated(observations, options, progress, client)
+        before = calibration.estimate.structure
+        calibration = calibration.redrawn()
+        moved = calibration.estimate.structure.drawn_m / before.drawn_m - 1.0
+        if float(np.max(np.abs(moved), initial=0.0)) < _REDRAWN:
+            break
+        observations = calibration.drawn_alike(observations)
+    return calibration
+
+
 def _calibrated(
-    observations: Observations, options: Options, progress: Callable[[Progress], None] | None = None
+    observations: Observations,
+    options: Options,
+    progress: Callable[[Progress], None] | None = None,
+    client: Any = None,
 ) -> Calibration:
     """See `calibrate`."""
     observations.require_inside()
+    if options.closed_form_only or not (client is not None or is_bulk(observations)):
+        return _chosen(observations, options, Watched(progress))
+    digest, bulk = meanwhile(lambda: observations.digest), Bulk(observations, client)
+    part = _part(bulk, options)
+    calibration = _chosen(part.observations, options, Watched(progress, partial(bulk.settled, part)))
+    return replace(calibration, digest=digest.result())
+
+
+def _chosen(observations: Observations, options: Options, watched: Watched) -> Calibration:
+    """With the lens that is named, or the one that is chosen."""
     sights = gather_sights(observations)
     start = initialise(observations, sights, options if options.lens != AUTO else papers(options))
     if options.lens != AUTO:
-        return _of_lens(start, observations, sights, options, progress)
+        return _of_lens(start, observations, sights, options, watched)
     if options.closed_form_only:
-        return _of_lens(start, observations, sights, papers(options), progress)
+        return _of_lens(start, observations, sights, papers(options), watched)
     chosen = choose_lens(observations, options, start)
     try:
-        calibration = _of_lens(chosen.start, observations, sights, chosen.options, progress)
+        calibration = _of_lens(chosen.start, observations, sights, chosen.options, watched)
     except CalibrationError as error:  # of all observations, not of those that took part in the choice
         chosen = chosen.without(str(error), papers(options), start)
-        calibration = _of_lens(start, observations, sights, chosen.options, progress)
+        calibration = _of_lens(start, observations, sights, chosen.options, watched)
     return replace(calibration, lens_choice=chosen.choice)
+
+
+def _part(bulk: Bulk, options: Options) -> Part:
+    """The part that decides: of the world some views, with those that stand out at a first solution of others."""
+    part, given = bulk.part(), options if options.lens != AUTO else papers(options)
+    few, sights = part.observations, gather_sights(part.observations)
+    start = initialise(few, sights, given)
+    priors = gather_priors(few, given, start.estimate.structure)
+    problem = Problem(sights, make_layout(few, given), priors, options=given)
+    return bulk.part(bulk.standing_out(solve_robustly(problem, few, start.estimate, is_near=start.is_near)))
 
 
 def _of_lens(
@@ -114,7 +155,7 @@ def _of_lens(
     observations: Observations,
     sights: Sights,
     options: Options,
-    progress: Callable[[Progress], None] | None,
+    watched: Watched,
 ) -> Calibration:
     """With a lens that is named, and what is usual of cameras where the observations say less."""
 
@@ -123,7 +164,7 @@ def _of_lens(
         problem = Problem(sights, make_layout(observations, given), priors, options=given)
         if given.closed_form_only:
             return _closed_form(start, observations, problem)
-        return solved_from(start, observations, problem, progress=progress)
+        return solved_from(start, observations, problem, watched=watched)
 
     if not options.usual_camera:
         return solved(options)
@@ -186,24 +227,38 @@ class Again:
     assessed: bool = True
 
 
+@dataclass(frozen=True, eq=False)
+class Watched:
+    """Who is told of the solves, and what solves for all observations where these are a part.
+
+    Attributes:
+        progress: called at every iteration. settle: from the end of the part, see `Bulk.settled`.
+    """
+
+    progress: Callable[[Progress], None] | None = None
+    settle: Callable[..., Settled] | None = None
+
+
 def solved_from(
     start: Start,
     observations: Observations,
     problem: Problem,
     again: Again | None = None,
-    progress: Callable[[Progress], None] | None = None,
+    watched: Watched = Watched(),
 ) -> Calibration:
     """Solve, reject, solve, let explanations compete, solve for targets as built, assess, from a start.
 
     Raises:
         CalibrationError: see `calibrate`.
     """
-    digest = meanwhile(lambda: observations.digest)
+    digest = meanwhile(lambda: observations.digest) if watched.settle is None else None
     usual = again.scales if again else None
-    end = solve_robustly(problem, observations, start.estimate, usual, progress, is_near=start.is_near)
+    end = solve_robustly(problem, observations, start.estimate, usual, watched.progress, is_near=start.is_near)
+    if again is None:
+        require_measured(end.problem, end.solution.estimate)
 
-    def solved(others: Problem) -> RobustSolution:
-        return solve_robustly(others, observations, _start_of(others, problem, observations, start, again), usual)
+    def solved(others: Problem, some: Asked) -> RobustSolution:
+        return solve_robustly(others, some.observations, _start_of(others, some, start, again), usual)
 
     end, explanations = compete(problem, observations, end, solved)
     as_built: tuple[AsBuilt, ...] = ()
@@ -211,16 +266,24 @@ def solved_from(
         end, problem, explanations, as_built = solve_as_built(problem, observations, end, explanations, solved)
     require_fits(end, problem)
     require_possible(observations, problem.sights, end.solution.estimate, end.residuals)
-    warnings = tuple(one.warning for one in explanations)
-    posterior, conflicts = None, Conflicts()
-    if again is None or again.assessed:
+    posterior, conflicts, settled = None, Conflicts(), None
+    assessed = again is None or again.assessed
+    if assessed:
         conflicts = find_conflicts(problem, observations, end, usual)
+    if watched.settle is not None:
+        settled = watched.settle(problem, end, explanations, watched.progress)
+        end = settled.end
+    warnings = tuple(one.warning for one in (settled.explanations if settled else explanations))
+    if assessed:
         end, posterior = _assess(end, observations, problem, again)
         posterior = _with_doubts(posterior.in_doubt(conflicts.keys, conflicts.shifts), end, explanations)
-        warnings = (*warnings, *(one.words for one in conflicts.every), *_unknown(end, posterior))
-        warnings = (*warnings, *_resting(end, problem))
-    digest.result()  # which the observations remember
-    calibration = _calibration(start, observations, problem, end, explanations)
+        warnings = (*warnings, *(one.words for one in conflicts.every), *unknown_phi(end, posterior))
+        warnings = (*warnings, *resting_phi(end, problem))
+    if digest is not None:
+        digest.result()  # which the observations remember
+    calibration = came_out(start.phi_from, observations, problem, end, explanations)
+    if settled is not None:
+        calibration = of_all(calibration, settled)
     warnings = (*calibration.warnings, *require_usable(end, problem, explanations), *warnings)
     calibration = replace(calibration, warnings=warnings, posterior=posterior, conflicts=conflicts.every)
     tolerances = {**problem.options.tolerances, **tolerances_of(as_built)}
@@ -234,31 +297,7 @@ def _closed_form(start: Start, observations: Observations, problem: Problem) -> 
     require_possible(observations, problem.sights, estimate, there)
     solution = Solution(estimate, np.nan, False, "the paper's closed form, nothing was minimised", ())
     end = RobustSolution(problem, solution, visible_from(observations, there), there, 0)
-    return _calibration(start, observations, problem, end)
-
-
-def _calibration(
-    start: Start,
-    observations: Observations,
-    problem: Problem,
-    end: RobustSolution,
-    explanations: Sequence[Explanation] = (),
-) -> Calibration:
-    """What came out, not assessed."""
-    return Calibration(
-        end.solution.estimate,
-        observations.targets,
-        _fit(end, problem.layout),
-        _rejected(observations, end.inliers, explanations),
-        end.solution.termination,
-        end.solution.converged,
-        end.rounds,
-        end.solution.history,
-        start.phi_from,
-        observations.warnings,
-        problem.options,
-        observations.digest,
-    )
+    return came_out(start.phi_from, observations, problem, end)
 
 
 def _assess(
@@ -282,13 +321,11 @@ def _assess(
     return (end if assessed is estimate else end.moved_to(assessed, observations, problem)), posterior
 
 
-def _start_of(
-    others: Problem, problem: Problem, observations: Observations, start: Start, again: Again | None
-) -> Estimate:
+def _start_of(others: Problem, some: Asked, start: Start, again: Again | None) -> Estimate:
     """A start for some of the observations that the rest had no part in; the one there is where it was known before."""
-    if again is not None or set(others.sights.keys) != set(problem.sights.keys):
+    if again is not None or set(others.sights.keys) != set(some.problem.sights.keys):
         return start.estimate
-    return initialise(observations, others.sights, problem.options).estimate
+    return initialise(some.observations, others.sights, others.options).estimate
 
 
 def _with_doubts(posterior: Posterior, end: RobustSolution, explanations: Sequence[Explanation]) -> Posterior:
@@ -296,78 +333,3 @@ def _with_doubts(posterior: Posterior, end: RobustSolution, explanations: Sequen
     doubtful = [one for one in explanations if one.is_doubtful]
     shifts = [one.doubt**0.5 * difference(one.other, end.solution.estimate, posterior.keys) for one in doubtful]
     return posterior.in_doubt(posterior.keys, shifts)
-
-
-def _unknown(end: RobustSolution, posterior: Posterior) -> Iterator[str]:
-    """Warnings of cameras whose phi the observations leave open."""
-    known = Uncertainty(end.solution.estimate, posterior, {})
-    for name in posterior.profiles:
-        verdict = known.verdict("camera", name, "phi")
-        if verdict.verdict == "unknown":
-            yield _UNKNOWN.format(name, bounds_text(verdict.low, verdict.high, "px"))
-
-
-def _resting(end: RobustSolution, problem: Problem) -> Iterator[str]:
-    """Warnings of cameras whose phi rests on where principal points usually lie."""
-    estimate, reduced = end.solution.estimate, end.reduced
-    usual = [prior for prior in problem.priors_at(estimate) if prior.is_usual]
-    if reduced is None or not usual:
-        return
-    without = reduced.shared
-    for prior in usual:
-        without = without + replace(prior.information, matrix=-prior.information.matrix)
-    for name in estimate.cameras:
-        key = Key("camera", name, "phi", "px")
-        if key in reduced.shared.keys:
-            at = reduced.shared.columns([key])[0]
-            sd, alone = reduced.shared.spread.sd[at], without.spread.sd[at]
-            if alone > _RESTING * sd:
-                yield _USUAL.format(name, _share_text(alone / estimate.cameras[name].phi))
-
-
-def _share_text(share: float) -> str:
-    return f"{two_digits(100.0 * share)} %" if share < 1.0 else "larger than itself"
-
-
-# ---- what came out --------------------------------------------------------------------------------------------------
-
-
-def _fit(end: RobustSolution, layout: Layout) -> Fit:
-    points, curves = end.residuals.lengths
-    used = points[end.inliers.points], curves[end.inliers.curves]
-    sigmas = end.problem.sights.sigma_px, end.problem.sights.curve_sigma_px
-    return Fit(
-        len(used[0]),
-        len(used[1]),
-        _rms(used[0]),
-        _rms(used[1]),
-        end.inliers.point_scale,
-        end.inliers.curve_scale,
-        layout.size,
-        _rms(sigmas[0]),
-        _rms(sigmas[1]),
-    )
-
-
-def _rms(values: Array) -> float:
-    """Root mean square; 0 of nothing."""
-    return float(np.sqrt(values @ values / max(len(values), 1)))
-
-
-def _rejected(
-    observations: Observations, inliers: Inliers, explanations: Sequence[Explanation]
-) -> tuple[Rejected, ...]:
-    wholes = [one for one in explanations if one.is_taken]
-    entries, views, copies = [], observations.views, observations.copies
-    for kind, mask, sigmas, column, copy_of, first in (
-        ("point", inliers.points, inliers.point_sigmas, observations.points, copies.points, 0),
-        ("curve", inliers.curves, inliers.curve_sigmas, observations.curves, copies.curves, len(observations.points)),
-    ):
-        for row in np.flatnonzero(~mask):
-            reason = f"{sigmas[row]:.1f} sigma off" if np.isfinite(sigmas[row]) else "cannot be seen from there"
-            reason = next((one.words for one in wholes if one.rows[first + row]), reason)
-            if copy_of[row] >= 0:
-                reason = f"{COPY} of frame {views[copy_of[row]].frame!r}"
-            frame = views[column.view[row]].frame
-            entries.append(Rejected(kind, int(row), frame, observations.feature_name(kind, int(row)), reason))
-    return tuple(entries)

@@ -94,7 +94,8 @@ class Ground:
 
     def _with(self, measurement: Measurement, targets: Mapping[str, Target]) -> Estimate:
         """The estimate with what the measurement brings along; of the placements those that are still free."""
-        structure = make_structure(targets, {**self.tolerances, **measurement.tolerances})
+        solved = tuple(self.estimate.structure.dimensions)
+        structure = make_structure(targets, {**self.tolerances, **measurement.tolerances}, solved)
         shared = dict.fromkeys(key.owner for key in self.keys if key.kind == "placement")
         return replace(
             self.estimate,

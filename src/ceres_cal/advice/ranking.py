@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -11,6 +13,7 @@ from ceres_cal.advice.candidates import BOARD, Search, still
 from ceres_cal.advice.measurements import Ground, Measurement
 from ceres_cal.advice.outlook import BENT, Errors, Outlook
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.executing import each
 from ceres_cal.base.progress import StepProgress
 from ceres_cal.calibration import Calibration, Fit
 from ceres_cal.model.information import Information
@@ -80,6 +83,7 @@ def advise(
     good_enough_mm: float | None = None,
     board: Target | None = None,
     progress: StepProgress | None = None,
+    executor: Executor | None = None,
 ) -> Advice:
     """What to measure besides, ranked by the worst error that it leaves on a station's map.
 
@@ -90,6 +94,7 @@ def advise(
     Args:
         station: may be left out where there is only one. board: that could be shown; by default the calibration's own,
             or one of 9 x 6 corners, 100 mm apart. progress: called after each measurement that was looked at.
+        executor: over which the measurements go; the same advice whatever it is.
 
     Raises:
         InputError: no such station, one that was held as the world, or a calibration that says nothing of how well it
@@ -100,12 +105,13 @@ def advise(
     ground, outlook = _prepared(calibration, station, height_m)
     search = Search(ground, outlook, _board(calibration.targets, board), calibration.fit.curves > 0)
     candidates = list(search.candidates())
-    informations = [ground.information_of(measurement) for measurement in candidates]
+    informations = list(each(ground.information_of, candidates, executor=executor))
     promises = []
-    for number, each in enumerate(zip(candidates, informations, strict=True), start=1):
-        promises.append(_promise(*each, ground, outlook))
+    one_promise = partial(_promise, ground=ground, outlook=outlook)
+    for number, promise in enumerate(each(one_promise, candidates, informations, executor=executor), start=1):
+        promises.append(promise)
         if progress is not None:
-            progress(number, len(candidates), each[0].words)
+            progress(number, len(candidates), promise.measurement.words)
     enough = 0.0 if good_enough_mm is None else good_enough_mm
     best = _chosen(promises, outlook.before, enough)
     then = None if best is None else _next(best, candidates, informations, outlook, enough)
@@ -155,7 +161,7 @@ def _prepared(calibration: Calibration, station: str | None, height_m: float) ->
 def _of_camera(posterior: Posterior, estimate: Estimate, camera: str) -> Posterior:
     """What is known of a camera, its stations and the targets as built, all else integrated out."""
     owners = {("camera", camera), *(("station", name) for name, s in estimate.stations.items() if s.camera == camera)}
-    keys = [key for key in posterior.keys if key[:2] in owners or key.kind == "structure"]
+    keys = [key for key in posterior.keys if key[:2] in owners or key.is_structure]
     return replace(posterior, information=posterior.information.marginal(keys), bends=None)
 
 

@@ -95,6 +95,13 @@ def _header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, Any]:
     return tuple(shape), in_columns, dtype
 
 
+def require_columns(arrays: Mapping[str, AnyArray], columns: Mapping[str, Column], where: str) -> None:
+    """Raise InputError where a column is of another type or shape than it must be."""
+    for name, column in columns.items():
+        _require_type(name, arrays[name].dtype, arrays[name].shape, column, where)
+    _require_fitting(arrays, columns, where)
+
+
 def _require_type(name: str, dtype: Any, shape: tuple[int, ...], column: Column, where: str) -> None:
     wanted = np.dtype(column.dtype)
     same = dtype.kind == "U" if wanted.kind == "U" else dtype == wanted

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
@@ -41,12 +42,18 @@ def _controller() -> ThreadpoolController:
 
 @contextmanager
 def at_most(threads: int) -> Iterator[None]:
-    """While it lasts this thread's work is cut into so many parts at most; 0 chooses."""
-    token = _allowed.set(threads)
+    """While it lasts this thread's work is cut into so many parts at most; 0 leaves it as it is."""
+    token = _allowed.set(threads or _allowed.get())
     try:
         yield
     finally:
         _allowed.reset(token)
+
+
+def share_cores(processes: int) -> None:
+    """From now on this thread takes no more than its share of the cores, and Ctrl-C is for who started the process."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    _allowed.set(max(_cores() // processes, 1))
 
 
 @contextmanager

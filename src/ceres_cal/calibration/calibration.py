@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -28,6 +28,7 @@ from ceres_cal.calibration.origin import COPY, Fit, LensChoice, Refitted, Reject
 from ceres_cal.model.keys import Key
 from ceres_cal.model.parameters import Estimate, Options, make_layout
 from ceres_cal.model.priors import GaussianPrior, gather_priors
+from ceres_cal.model.structure import redrawn
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import gather_sights
 from ceres_cal.scene.camera import Camera
@@ -131,8 +132,7 @@ class Calibration:
         """
         if observations.digest != self.digest:
             raise InputError("these are not the observations that the calibration was made from: give those")
-        points, curves = self.inlier_masks(observations)
-        used = observations.part(points, curves)
+        used = self.drawn_alike(observations).part(*self.inlier_masks(observations))
         return disagreement(used, self.estimate, self.uncertainty.posterior, self.fit.scales, (first, second))
 
     def inlier_masks(self, observations: Observations) -> tuple[Mask, Mask]:
@@ -141,6 +141,28 @@ class Calibration:
         for entry in self.rejected:
             masks[entry.kind == "curve"][entry.row] = False
         return masks
+
+    def redrawn(self) -> Calibration:
+        """The same with targets that are drawn with the dimensions that were solved for."""
+        found = self.estimate.structure.dimensions
+        targets = {
+            name: redrawn(
+                target, {one: found[f"{name}/{one}"] for one in target.dimensions if f"{name}/{one}" in found}
+            )
+            for name, target in self.targets.items()
+        }
+        estimate = replace(self.estimate, structure=self.estimate.structure.redrawn())
+        return replace(self, estimate=estimate, targets=targets) if found else self
+
+    def drawn_alike(self, observations: Observations) -> Observations:
+        """The observations of targets whose dimensions are those that were solved for here."""
+        targets = dict(observations.targets)
+        for name, target in targets.items():
+            own = [one for one in target.dimensions if f"{name}/{one}" in self.options.dimensions]
+            if own and name in self.targets:
+                known = self.targets[name].dimensions
+                targets[name] = redrawn(target, {one: known[one] for one in own if one in known})
+        return observations.with_targets(targets)
 
     @property
     def outliers(self) -> tuple[Rejected, ...]:
@@ -153,7 +175,8 @@ class Calibration:
         Args:
             new_data: that the observations are others: then as if they were calibrated with the same options.
         """
-        sights, options = gather_sights(observations), self.options
+        observations, options = self.drawn_alike(observations), self.options
+        sights = gather_sights(observations)
         prior = None if self.refitted is None else self.refitted.prior
         weighting = Weighting(*self.fit.scales, options.loss, options.loss_scale)
         if new_data or prior is None or self.posterior is None:

@@ -153,7 +153,7 @@ class CalibrationFile(msgspec.Struct, forbid_unknown_fields=True):
         for name, placement in self.placements.items():
             with naming(f"placement {name!r}"):
                 placements[name] = placement.pose()
-        structure = make_structure(targets, options.tolerances)
+        structure = make_structure(targets, options.tolerances, options.dimensions)
         if structure.names != tuple(self.structure_m):
             raise InputError("structure_m does not fit the targets and the tolerances: calibrate again")
         built = structure.with_values(np.array(list(self.structure_m.values())))

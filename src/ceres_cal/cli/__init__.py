@@ -17,6 +17,7 @@ from ceres_cal.base.written import noting
 from ceres_cal.cli import colour
 from ceres_cal.cli.advise import COMMANDS as ADVISE
 from ceres_cal.cli.audit import COMMANDS as AUDIT
+from ceres_cal.cli.batch import COMMANDS as BATCH
 from ceres_cal.cli.calibrate import COMMANDS as CALIBRATE
 from ceres_cal.cli.check import COMMANDS as CHECK
 from ceres_cal.cli.command import Command, print_answer
@@ -41,7 +42,7 @@ from ceres_cal.cli.undistort import COMMANDS as UNDISTORT
 _GROUPS = (
     RUN,
     *(DETECT_BOARD, DETECT_RINGS, DETECT_FIELD),
-    *(JOIN, CALIBRATE, DIAGNOSE, ADVISE, REFIT, CHECK, SCORE, COMPARE, AUDIT),
+    *(JOIN, CALIBRATE, DIAGNOSE, ADVISE, REFIT, CHECK, SCORE, COMPARE, AUDIT, BATCH),
     *(LOCATE, UNDISTORT, EXPORT, FOREIGN, SIMULATE, TARGETS, (completion(lambda: COMMANDS),)),
 )
 COMMANDS: dict[str, Command] = {command.name: command for group in _GROUPS for command in group}

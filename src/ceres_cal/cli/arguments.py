@@ -34,6 +34,12 @@ def add_quiet(parser: ArgumentParser) -> None:
     parser.add_argument("--quiet", action="store_true", help="no progress")
 
 
+def add_jobs(parser: ArgumentParser, what: str, default: int) -> None:
+    """The option --jobs: how many processes; 0 is one a core."""
+    shown = default or "one a core"
+    parser.add_argument("--jobs", type=int, default=default, metavar="N", help=f"{what} at a time; default: {shown}")
+
+
 def add_output(parser: ArgumentParser, what: str, *, required: bool) -> None:
     """The option -o FILE."""
     parser.add_argument("-o", "--output", metavar="FILE", type=Path, required=required, help=f"file for {what}")

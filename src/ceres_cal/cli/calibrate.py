@@ -19,6 +19,7 @@ from ceres_cal.cli.arguments import (
     parse_prior,
 )
 from ceres_cal.cli.command import Answer, Command
+from ceres_cal.cli.estimate import add_estimate, parse_estimates
 from ceres_cal.cli.inputs import read_observations, require_different
 from ceres_cal.cli.outputs import report_page, report_photographs, require_outputs, write_results
 from ceres_cal.cli.progress import ProgressBar, progress_bar
@@ -94,6 +95,7 @@ def _add_camera(parser: ArgumentParser) -> None:
         "else targets without a tolerance are taken as drawn",
     )
     add_prior(parser)
+    add_estimate(parser)
 
 
 def _add_solve(parser: ArgumentParser) -> None:
@@ -154,6 +156,7 @@ COMMANDS = (
             "field.json board.json -o calibration.json --report report.html",
             "field.json --lens auto --prior height_m=4.02:10mm -o calibration.json",
             "field.json --powers 3 --tolerance field.lines_m=10mm -o calibration.json",
+            "field.json --estimate length,width=5.50:20mm -o calibration.json",
         ),
     ),
 )
@@ -205,10 +208,12 @@ def _options(
     args: Namespace, fixed: Mapping[str, float], powers: tuple[int, ...], observations: Observations
 ) -> Options:
     from ceres_cal.model.parameters import Options
+    from ceres_cal.model.structure import dimensions_of
 
     lens = args.lens or _AUTO  # which powers make radial
     terms = tuple(parse_names(args.terms))
     options = Options(lens=lens, powers=powers, terms=terms, fixed=fixed)
+    lengths, drawn = parse_estimates(args.estimate, observations.targets), dimensions_of(observations.targets)
     names = PriorNames(("height_m", "position_m"), (*options.intrinsic_names, "principal_point"))
     return Options(
         lens=lens,
@@ -219,7 +224,11 @@ def _options(
         terms=terms,
         usual_camera=not args.no_usual_camera,
         fixed=fixed,
-        priors=tuple(parse_prior(spec, observations, names) for spec in args.prior),
+        priors=(
+            *(parse_prior(spec, observations, names) for spec in args.prior),
+            *(one for one in lengths if not one.is_open or one.value[0] != drawn[one.dimension]),
+        ),
+        dimensions=tuple(prior.dimension for prior in lengths),
         tolerances=_tolerances(args.tolerance),
         as_built="estimate" if args.as_built else "as drawn",
         loss=args.loss,

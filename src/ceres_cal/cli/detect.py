@@ -11,7 +11,8 @@ from ceres_cal.base.errors import InputError
 from ceres_cal.cli.arguments import add_detection, add_quiet, length
 from ceres_cal.cli.command import Answer, Command
 from ceres_cal.cli.detection import detected
-from ceres_cal.cli.inputs import image_files
+from ceres_cal.cli.frames import add_frames, frames_of_videos
+from ceres_cal.cli.inputs import images_and_videos
 from ceres_cal.cli.outputs import finishing, require_observations_output
 from ceres_cal.cli.photographs import missed_data, missed_text
 from ceres_cal.cli.progress import progress_bar
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
 
 def _add_board(parser: ArgumentParser) -> None:
     add = parser.add_argument
-    add("images", nargs="+", metavar="IMAGE", help="images of one camera, or folders of them")
+    add("images", nargs="+", metavar="IMAGE", help="images of one camera, folders of them, or videos")
     add("--columns", type=int, required=True, metavar="N", help="inner corners, or circles, along a row of the board")
     add("--rows", type=int, required=True, metavar="N", help="inner corners, or circles, along a column of it")
     add("--square", type=length("m"), metavar="M", help="side of a square in metres, or such as 25mm")
@@ -47,19 +48,22 @@ def _add_board(parser: ArgumentParser) -> None:
         help="measure corners by the saddle around each (default), also of boards partly out of the picture, or as "
         "OpenCV does, whole boards alone",
     )
+    add_frames(parser)
     add_detection(parser)
     add_quiet(parser)
 
 
 def _run_board(args: Namespace) -> Answer:
-    images = image_files(args.images)
-    require_observations_output(args.output, images)
+    images, videos = images_and_videos(args.images)
+    require_observations_output(args.output, [*images, *videos])
     if (args.charuco is None) != (args.marker is None):
         raise InputError("--charuco DICT and --marker M go together: give both or neither")
     from ceres_cal.detect.boards import CharucoSpec, detect_boards
 
     board = _board(args)
     corners = args.corner_fit if args.charuco is None else CharucoSpec(args.charuco, args.marker, args.legacy)
+    with progress_bar(args) as bar:
+        images += detected(args, partial(frames_of_videos, args, videos, args.output.parent, bar))
     with progress_bar(args) as bar:
         found = partial(detect_boards, images, board, args.camera, args.station, corners, bar.update)
         detections = detected(args, found)

@@ -14,7 +14,9 @@ from ceres_cal.base.words import plural
 from ceres_cal.cli.arguments import add_output, add_quiet, add_station, add_timeout, parse_names, parse_numbers
 from ceres_cal.cli.command import Answer, Command
 from ceres_cal.cli.detection import detected
-from ceres_cal.cli.inputs import image_files
+from ceres_cal.cli.estimate import add_estimate, parse_estimates
+from ceres_cal.cli.inputs import images_and_videos
+from ceres_cal.cli.median import add_median, median_path, median_text, write_median
 from ceres_cal.cli.outputs import finishing, require_observations_output
 from ceres_cal.cli.photographs import missed_data
 from ceres_cal.cli.progress import progress_bar
@@ -31,9 +33,14 @@ _FACING = "LeftGoalLine=top"
 def _add_arguments(parser: ArgumentParser) -> None:
     add = parser.add_argument
     add(
-        "images", nargs="+", metavar="IMAGE", help="photographs that one camera took at one station, or folders of them"
+        "images",
+        nargs="+",
+        metavar="IMAGE",
+        help="photographs that one camera took at one station, folders of them, or a video",
     )
+    add_median(parser)
     _add_start(parser)
+    add_estimate(parser)
     add("--not-painted", default="", metavar="NAME,...", help="lines of the target that this field does not have")
     add(
         "--mask",
@@ -85,8 +92,9 @@ def _add_start(parser: ArgumentParser) -> None:
 
 
 def _run(args: Namespace) -> Answer:
-    images = image_files(args.images)
-    require_observations_output(args.output, [*images, *([args.start] if args.start else [])])
+    images, videos = images_and_videos(args.images)
+    require_observations_output(args.output, [*images, *videos, *([args.start] if args.start else [])])
+    one = median_path(args.output, [*images, *videos]) if videos or args.median else None
     _require_fitting(args)
     from ceres_cal.detect.images import read_grey
     from ceres_cal.photographs import FieldOptions, detect_field
@@ -104,16 +112,22 @@ def _run(args: Namespace) -> Answer:
         start.station,
         points=not args.lines_only,
         edges=args.edges,
+        lengths=parse_estimates(args.estimate, {"field": target}),
         left_out=None if args.mask is None else read_grey(args.mask) == 0,
         keep_start=args.keep_start,
         refused=_drawing(args.picture, target),
     )
+    merged = None
+    if one is not None:
+        with progress_bar(args) as bar:
+            merged = detected(args, partial(write_median, one, images, videos, bar))
+        images = [one]
     with progress_bar(args) as bar:
         found = partial(detect_field, images, target, start.start, painted, options, bar.update)
         detections = detected(args, found)
     with finishing():
         detections.observations.save(args.output)
-    data = _data(detections, args.output)
+    data = {**_data(detections, args.output), **({"median": merged} if merged else {})}
     return Answer(data, lambda: _text(data))
 
 
@@ -125,7 +139,9 @@ COMMANDS = (
         _run,
         (
             "photographs/ --target ssl-b --auto --facing LeftGoalLine=top -o field.json",
+            "game.mp4 --target ssl-b --auto --facing LeftGoalLine=top -o field.json",
             "0001.png --start calibration.json -o field.json",
+            "0001.png --target ssl-b --auto --facing LeftGoalLine=top --estimate length,width -o field.json",
             "0001.png --target ssl-a --start corners.json -o field.json",
         ),
     ),
@@ -288,6 +304,7 @@ def _text(data: dict[str, Any]) -> str:
         f"{number} of {every} images show the field: {plural(data['curves'], 'line observation')}, "
         f"{plural(data['points'], 'corner')} and crossings"
     ]
+    lines += [median_text(data["median"])] if "median" in data else []
     lines += [
         f"{one['image']}: paint at {one['found']} of {one['places']} places, good to {one['sigma_px']:.3f} px; "
         f"blur {one['blur_px']:.2f} px, lines {one['width_factor']:.2f} times as wide as the target says"

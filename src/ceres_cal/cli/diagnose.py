@@ -6,7 +6,7 @@ from argparse import ArgumentParser, Namespace
 from typing import TYPE_CHECKING
 
 from ceres_cal.base.errors import InputError
-from ceres_cal.cli.arguments import add_calibration, add_output, add_quiet, add_report, parse_number
+from ceres_cal.cli.arguments import add_calibration, add_jobs, add_output, add_quiet, add_report, parse_number
 from ceres_cal.cli.command import Answer, Command
 from ceres_cal.cli.inputs import read_calibration, read_observations
 from ceres_cal.cli.outputs import report_page, report_photographs, require_ending, require_outputs, write_results
@@ -32,6 +32,7 @@ def _add_arguments(parser: ArgumentParser) -> None:
     add_quiet(parser)
     add("--strict", action="store_true", help="exit with 1 for any finding, also one that does no harm")
     add("--folds", type=int, default=5, metavar="K", help="parts into which frames go for --held-out; default: 5")
+    add_jobs(parser, "folds, for --held-out,", 1)
     add(
         "--false-alarms",
         default="0.01",
@@ -42,15 +43,18 @@ def _add_arguments(parser: ArgumentParser) -> None:
 
 def _run(args: Namespace) -> Answer:
     rate = _require_fitting(args)
+    from ceres_cal.base.executing import processes
     from ceres_cal.cli.diagnosis import diagnosis_data, diagnosis_text
     from ceres_cal.diagnostics import choose, diagnose
 
     calibration, observations = read_calibration(args), read_observations(args.observations)
     photographs = report_photographs(args, observations)
     diagnosis = diagnose(calibration, observations, new_data=args.new_data, false_alarm_rate=rate)
-    with progress_bar(args) as bar:
-        options = calibration.options
-        choice = choose(observations, options, args.folds, progress=bar.update) if args.held_out else None
+    choice = None
+    if args.held_out:
+        with progress_bar(args) as bar, processes(args.jobs) as executor:
+            options = calibration.options
+            choice = choose(observations, options, args.folds, progress=bar.update, executor=executor)
     page = report_page(args, calibration, observations, photographs, diagnosis, choice)
     write_results(args, diagnosis.table.save, page)
     return Answer(

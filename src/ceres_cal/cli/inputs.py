@@ -18,6 +18,16 @@ if TYPE_CHECKING:
 IMAGE_ENDINGS = {".bmp", ".jp2", ".jpeg", ".jpg", ".pbm", ".pgm", ".png", ".pnm", ".ppm", ".tif", ".tiff", ".webp"}
 
 
+VIDEO_ENDINGS = {".3gp", ".avi", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".mts", ".ogv", ".webm", ".wmv"}
+
+
+def images_and_videos(given: Iterable[str]) -> tuple[list[Path], list[Path]]:
+    """The images as `image_files` has them, and the videos among what is given."""
+    files = image_files(given)
+    videos = [path for path in files if path.suffix.lower() in VIDEO_ENDINGS]
+    return [path for path in files if path not in videos], videos
+
+
 def image_files(given: Iterable[str]) -> list[Path]:
     """The files named; those of folders, and of patterns that no shell expanded, in the order of their names."""
     return [path for name in given for path in _files(name)]

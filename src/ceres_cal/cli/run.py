@@ -17,8 +17,10 @@ from ceres_cal.cli.calibrate import COMMANDS as CALIBRATE
 from ceres_cal.cli.command import Answer, Command
 from ceres_cal.cli.detect import COMMANDS as DETECT_BOARD
 from ceres_cal.cli.detect_field import COMMANDS as DETECT_FIELD
+from ceres_cal.cli.estimate import add_estimate
 from ceres_cal.cli.export import COMMANDS as EXPORT
-from ceres_cal.cli.inputs import IMAGE_ENDINGS, image_files
+from ceres_cal.cli.frames import add_frames, frames_of_videos
+from ceres_cal.cli.inputs import IMAGE_ENDINGS, images_and_videos
 from ceres_cal.cli.outputs import section, sections_of
 from ceres_cal.cli.progress import progress_bar
 
@@ -40,9 +42,10 @@ def _add_arguments(parser: ArgumentParser) -> None:
     )
     add("--lens", metavar="KIND", default="auto", help="as of `calibrate`; default: auto")
     add_prior(parser)
+    add_estimate(parser)
     add("--camera", default="camera", metavar="NAME", help="name of the camera; default: camera")
     add("--to", metavar="FORMAT", action="append", default=[], help="export it, too, as of `export`; repeatable")
-    add("--frames", type=int, default=30, metavar="N", help="how many photographs to take out of a video; default: 30")
+    add_frames(parser)
     add_quiet(parser)
 
 
@@ -113,17 +116,9 @@ def _typed(command: Command, arguments: Sequence[str]) -> str:
 
 def _photographs(args: Namespace) -> list[Path]:
     """The photographs that were given, and those taken out of a video."""
-    files = [path for path in map(Path, args.images) if path.is_file()]
-    videos = [path for path in files if path.suffix.lower() not in IMAGE_ENDINGS]
-    images = image_files(name for name in args.images if Path(name) not in videos)
-    if videos:
-        from ceres_cal.detect.video import sharpest_frames
-
-        if args.frames < 1:
-            raise InputError(f"--frames must be at least 1, not {args.frames}")
-        with progress_bar(args) as bar:
-            for video in videos:
-                images += sharpest_frames(video, args.output / video.stem, args.frames, bar.update)
+    images, videos = images_and_videos(args.images)
+    with progress_bar(args) as bar:
+        images += frames_of_videos(args, videos, args.output, bar)
     return images
 
 
@@ -148,8 +143,10 @@ def _observed(args: Namespace, images: list[Path]) -> Iterator[_Step]:
             raise InputError("every photograph shows the board, and none is left for the field: take one without it")
         facing = [word for name in args.facing for word in ("--facing", name)]
         missing = ["--not-painted", args.not_painted] if args.not_painted else []
+        lengths = [word for names in args.estimate for word in ("--estimate", names)]
         goal = ["--camera", args.camera, "-o", str(args.output / "field.json")]
-        asked = [*rest, "--target", args.target, "--auto", *facing, *missing, *goal]
+        still = [] if images_and_videos(args.images)[0] else ["--median"]  # of videos alone
+        asked = [*rest, *still, "--target", args.target, "--auto", *facing, *missing, *lengths, *goal]
         yield _step(args, DETECT_FIELD[0], asked, most=1)
 
 

@@ -75,7 +75,9 @@ def calibration_text(quality: Quality, inputs: Sequence[str], args: Namespace) -
         pose = _pose(name, camera, name in anchored, quality)
         owner = calibration.estimate.stations[name].camera
         sections.append(section("station", [name if owner == name else f"{name}, camera {owner}", *pose]))
-    if len(calibration.estimate.structure.names):
+    if lengths := _dimensions(quality):
+        sections.append(section("lengths", lengths))
+    if calibration.estimate.structure.own:
         sections.append(section("as built", _structure(calibration)))
     sections += [section(title, lines) for title, lines in _uncertainty_lines(quality)]
     sections.append(section("outliers", _outlier_lines(calibration)))
@@ -120,12 +122,21 @@ def _fit(calibration: Calibration) -> list[str]:
 
 def _structure(calibration: Calibration) -> list[str]:
     structure, estimated = calibration.estimate.structure, {one.target for one in calibration.as_built}
-    stated = [i for i, name in enumerate(structure.names) if name.partition("/")[0] not in estimated]
+    stated = [i for i, name in enumerate(structure.names[: structure.own]) if name.partition("/")[0] not in estimated]
     order = sorted(stated, key=lambda i: -abs(structure.values[i]))[:_MOST_FEATURES]
     lines = [line for words in words_of(calibration.as_built) for line in wrapped(words)]
     lines += [f"{1e3 * structure.values[i]:8.2f} mm  {structure.names[i]}" for i in order]
     rest = len(stated) - len(order)
     return [*lines, f"and {plural(rest, 'smaller correction')}"] if rest else lines
+
+
+def _dimensions(quality: Quality) -> list[str]:
+    lines = []
+    for name, length_m in quality.calibration.estimate.structure.dimensions.items():
+        target, _, one = name.partition("/")
+        known = with_sd(length_m, "m", quality.verdicts.get(("dimension", target, one)))
+        lines.append(f"{one:30}{known} ({target}, solved for)")
+    return lines
 
 
 def _intrinsics(name: str, camera: Camera, options: Options, phi_from: str, quality: Quality) -> list[str]:

@@ -1,8 +1,9 @@
-"""Photographs out of a video: the sharpest frame of each stretch of it."""
+"""Photographs out of a video, a frame at a time: spread over it, or the sharpest of each stretch of it."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -14,7 +15,81 @@ from ceres_cal.base.files import make_folder, require_room, write_bytes
 from ceres_cal.base.progress import ImageProgress
 from ceres_cal.detect.images import encoded
 
+MOST_FRAMES = 200_000
+"""Of a video, an hour and a half: each has to be passed over."""
 _LOOKED_AT = 10  # frames of each stretch: a hand that holds a board comes to rest in between
+
+
+@dataclass(frozen=True, eq=False)
+class Video:
+    """A video that OpenCV can read, and how many frames it has, as it says or, where it does not, as were counted."""
+
+    path: Path
+    capture: cv2.VideoCapture
+    total: int
+
+    def frames(self, step: int) -> Iterator[tuple[int, Image]]:
+        """Every so many-th frame of one size with its number; the rest is passed over without decoding it.
+
+        Raises:
+            InputError: none can be read.
+        """
+        shape: tuple[int, ...] | None = None
+        for number in range(self.total):
+            if not self.capture.grab():
+                break
+            if number % step == 0:
+                read, frame = self.capture.retrieve()
+                if read and frame.shape == (shape or frame.shape):
+                    shape = frame.shape
+                    yield number, np.asarray(frame)
+        if shape is None:
+            raise InputError(f"{self.path}: none of its {self.total} frames can be read: convert it to MP4")
+
+
+def open_video(path: Path) -> Video:
+    """A video that is to be read.
+
+    Raises:
+        InputError: OpenCV cannot read it as a video; or it has more than MOST_FRAMES, or frames that are too large.
+    """
+    capture = _opened(path)
+    width, height = capture.get(cv2.CAP_PROP_FRAME_WIDTH), capture.get(cv2.CAP_PROP_FRAME_HEIGHT)
+    require_room(int(6 * width * height), f"{path}: frames of {width:.0f} x {height:.0f} px")
+    total = int(min(max(capture.get(cv2.CAP_PROP_FRAME_COUNT), 0.0), 1e9))
+    if not total:  # some formats do not say
+        while total <= MOST_FRAMES and capture.grab():
+            total += 1
+        capture = _opened(path)
+    if not total:
+        raise _not_a_video(path)
+    if total > MOST_FRAMES:
+        raise InputError(f"{path}: more than {MOST_FRAMES} frames: cut out the part that shows what is to be detected")
+    return Video(path, capture, total)
+
+
+def _opened(path: Path) -> cv2.VideoCapture:
+    capture = cv2.VideoCapture(str(path)) if path.is_file() else None
+    if capture is None or not capture.isOpened():
+        raise _not_a_video(path)
+    return capture
+
+
+def _not_a_video(path: Path) -> InputError:
+    return InputError(f"{path}: not a video that OpenCV can read: give photographs, or convert it to MP4")
+
+
+def spread_frames(video: Path, count: int, progress: ImageProgress | None = None) -> Iterator[tuple[str, Image]]:
+    """At most so many frames, evenly over a video, with how messages name them.
+
+    Raises:
+        InputError: see `open_video` and `Video.frames`.
+    """
+    opened = open_video(video)
+    for number, frame in opened.frames(-(-opened.total // count)):
+        yield f"frame {number} of {video.name}", frame
+        if progress is not None:
+            progress(number + 1, opened.total, video.name)
 
 
 def sharpest_frames(video: Path, folder: Path, count: int, progress: ImageProgress | None = None) -> list[Path]:
@@ -23,37 +98,19 @@ def sharpest_frames(video: Path, folder: Path, count: int, progress: ImageProgre
     How sharp a frame is, is told by the variance of its Laplacian.
 
     Raises:
-        InputError: OpenCV cannot read it as a video.
+        InputError: see `open_video` and `Video.frames`.
     """
-    capture = cv2.VideoCapture(str(video)) if video.is_file() else None
-    total = 0 if capture is None else int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
-    if capture is None or total <= 0:
-        raise InputError(f"{video}: not a video that OpenCV can read: give photographs, or convert it to MP4")
-    width, height = capture.get(cv2.CAP_PROP_FRAME_WIDTH), capture.get(cv2.CAP_PROP_FRAME_HEIGHT)
-    require_room(int(6 * width * height), f"{video}: frames of {width:.0f} x {height:.0f} px")
-    stretches = min(count, total)
+    opened = open_video(video)
+    stretches = min(count, opened.total)
     best: dict[int, tuple[float, Path]] = {}
     make_folder(folder)
-    for number, frame in _frames(capture, total, max(1, total // (stretches * _LOOKED_AT))):
-        stretch = number * stretches // total
+    for number, frame in opened.frames(max(1, opened.total // (stretches * _LOOKED_AT))):
+        stretch = number * stretches // opened.total
         sharpness = float(np.var(cv2.Laplacian(cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY), cv2.CV_32F)))
         path = folder / f"{stretch + 1:04d}.png"
         if stretch not in best or sharpness > best[stretch][0]:
             best[stretch] = (sharpness, path)
             write_bytes(path, encoded(frame, ".png", 100))
         if progress is not None:
-            progress(number + 1, total, video.name)
-    if not best:
-        raise InputError(f"{video}: none of its {total} frames can be read: convert it to MP4")
+            progress(number + 1, opened.total, video.name)
     return [path for _, path in best.values()]
-
-
-def _frames(capture: cv2.VideoCapture, total: int, step: int) -> Iterator[tuple[int, Image]]:
-    """Every so many-th frame with its number; the rest is passed over without decoding it."""
-    for number in range(total):
-        if not capture.grab():
-            return
-        if number % step == 0:
-            read, frame = capture.retrieve()
-            if read:
-                yield number, np.asarray(frame)

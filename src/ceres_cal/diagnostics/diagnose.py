@@ -80,6 +80,7 @@ def diagnose(
             cameras or stations that it does not have.
         SolutionError: it can show none of them.
     """
+    observations = calibration.drawn_alike(observations)
     _require_known(calibration, observations, new_data)
     case = _case(calibration, observations, new_data)
     tested = _tested(case, false_alarm_rate)

@@ -8,12 +8,15 @@ below that of a field, by the same share whatever the lens.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.errors import CalibrationError, DegenerateError, InputError
+from ceres_cal.base.executing import each
 from ceres_cal.base.progress import StepProgress
 from ceres_cal.base.transforms import Pose
 from ceres_cal.calibrating import calibrate
@@ -90,12 +93,14 @@ def cross_validate(
     calibration: Calibration | None = None,
     counted: Mask | None = None,
     label: str | None = None,
+    executor: Executor | None = None,
 ) -> HeldOut:
     """The error with which frames are predicted by a calibration of the others, k-fold.
 
     Args:
         calibration: of all the observations with these options, where it is there already.
         counted: (N + M,) which observations count, points by row, then curves; those that the calibration of all kept.
+        executor: over which the folds go; the same errors whatever it is.
 
     Raises:
         InputError: k below 2, or fewer than two frames.
@@ -113,18 +118,17 @@ def cross_validate(
     fold = np.random.default_rng(0).permutation(len(names))[frame] % folds  # the same every time
     errors = np.full((len(frame), 2), np.nan)
     failed = 0
-    for number in range(folds):
-        held = (fold == number) & kept
-        try:
-            trained = calibrate(_part(observations, fold != number), options)
-        except CalibrationError:
+    parts = [fold == number for number in range(folds)]
+    one_fold = partial(_without, observations, options, whole, kept)
+    for part, found in zip(parts, each(one_fold, parts, executor=executor), strict=True):
+        if isinstance(found, CalibrationError):
             failed += 1
             if 2 * failed > folds:
-                raise
-            continue
-        errors[held] = _predicted(observations, held, trained, whole)[held]
+                raise found
+        else:
+            errors[part & kept] = found
     kept = kept & np.isfinite(errors[:, 0])
-    fit_px = _errors(observations, kept, whole.estimate)[kept, 0]
+    fit_px = _errors(whole.drawn_alike(observations), kept, whole.estimate)[kept, 0]
     squares, counts = np.zeros(len(names)), np.zeros(len(names))
     np.add.at(squares, frame[kept], (errors[kept, 0] / column_of(observations, "sigma_px")[kept]) ** 2)
     np.add.at(counts, frame[kept], 1.0)
@@ -143,6 +147,7 @@ def choose(
     *,
     most: int = MOST_OBSERVATIONS,
     progress: StepProgress | None = None,
+    executor: Executor | None = None,
 ) -> Choice:
     """The lens that predicts best, among those of the same kind and the one that all kinds together would choose.
 
@@ -150,6 +155,7 @@ def choose(
 
     Args:
         most: of more observations, evenly spread frames and rows take part. progress: called before each lens.
+        executor: over which lenses and folds go; the same choice whatever it is.
 
     Raises:
         InputError: fewer than two frames. DegenerateError: no candidate can be calibrated.
@@ -161,7 +167,7 @@ def choose(
     other = _attempt(few, any_lens(options))
     if isinstance(other, Calibration) and label_of(other.options) not in map(label_of, tried):
         tried = sorted([*tried, other.options], key=coefficients_of)
-    wholes: list[Calibration | str] = [_attempt(few, one) for one in tried]
+    wholes = list(each(partial(_attempt, few), tried, executor=executor))
     good = [whole for whole in wholes if isinstance(whole, Calibration)]
     if not good:
         raise DegenerateError(f"no lens can be calibrated: {wholes[0]}")
@@ -174,7 +180,7 @@ def choose(
             errors.append(HeldOut(label_of(one), coefficients_of(one), failed=whole))
             continue
         try:
-            errors.append(cross_validate(few, one, k, calibration=whole, counted=counted))
+            errors.append(cross_validate(few, one, k, calibration=whole, counted=counted, executor=executor))
         except CalibrationError as error:
             errors.append(HeldOut(label_of(one), coefficients_of(one), failed=str(error)))
     best, chosen = _decide(errors, tried)
@@ -202,6 +208,18 @@ def _decide(tried: Sequence[HeldOut], options: Sequence[Options]) -> tuple[int, 
 # ---- one fold -------------------------------------------------------------------------------------------------------
 
 
+def _without(
+    observations: Observations, options: Options, whole: Calibration, kept: Mask, part: Mask
+) -> Array | CalibrationError:
+    """Errors (n, 2), px and mm, of a part's rows that count, by a calibration without it; or why there is none."""
+    try:
+        trained = calibrate(_part(observations, ~part), options)
+    except CalibrationError as error:
+        return error
+    held = part & kept
+    return _predicted(observations, held, trained, whole)[held]
+
+
 def _inliers(calibration: Calibration, observations: Observations) -> Mask:
     return np.concatenate(calibration.inlier_masks(observations))
 
@@ -212,7 +230,7 @@ def _part(observations: Observations, rows: Mask) -> Observations:
 
 def _predicted(observations: Observations, held: Mask, trained: Calibration, whole: Calibration) -> Array:
     """Errors (N + M, 2), px and mm, of held-out observations under a calibration that did not see them."""
-    estimate = trained.estimate
+    estimate, observations = trained.estimate, trained.drawn_alike(observations)
     sights = gather_sights(observations).used(*np.split(held, [len(observations.points)]))
     new = {key.placement for key in sights.keys if key.placement is not None} - set(estimate.placements)
     missing = {key.station for key in sights.keys} - set(estimate.stations)

@@ -52,7 +52,8 @@ class _AsBuilt(ScoreTest):
     def families(self, case: Case) -> Iterator[Family]:
         equations, structure = case.equations, whole_structure(case.observations.targets)
         slot = equations.slots(structure)[:, self.places.start]
-        solved = equations.slots(case.estimate.structure)[:, self.places.start] >= 0
+        own = equations.slots(case.estimate.structure)[:, self.places.start]
+        solved = (own >= 0) & (own < case.estimate.structure.own)
         rows = (equations.is_curve == self.curves) & (slot >= 0) & ~solved
         numbers, group = grouped(slot, rows)
         counts = np.bincount(group[rows & case.model.used], minlength=len(numbers) + 1)  # group -1 finds the last, 0
@@ -92,7 +93,7 @@ def _solved_for(kind: str, one: AsBuilt, tested: Tested) -> Finding:
     """What the calibration found by itself, and has in it."""
     case, structure = tested.case, tested.case.estimate.structure
     numbers = numbers_by_kind(structure, case.observations.targets)[one.target, one.kind]
-    offsets = np.zeros(len(structure.values) + 1)
+    offsets = np.zeros(len(structure.offsets) + 1)
     offsets[numbers] = structure.values[numbers]
     shift = np.sum(case.equations.built * offsets[case.equations.slots(structure)], axis=1)
     rows = (shift != 0.0) & case.model.used

@@ -69,7 +69,7 @@ class Equations:
         return np.asarray(chosen[self.sight])
 
     def slots(self, structure: Structure) -> Indices:
-        """(E, 4) which of the structure's numbers are those of `built`, -1 for none."""
+        """(E, 4) which of the structure's offsets are those of `built`, -1 for none."""
         slots = np.full((len(self), 4), -1)
         if structure.names:
             slots[~self.is_curve] = structure.point_slots[self.feature[~self.is_curve]]
@@ -78,11 +78,11 @@ class Equations:
 
     def structure_columns(self, structure: Structure) -> Array:
         """(E, Q) px per metre of each of the structure's numbers."""
-        columns, slots = np.zeros((len(self), len(structure.names))), self.slots(structure)
+        columns, slots = np.zeros((len(self), len(structure.offsets))), self.slots(structure)
         for k in range(slots.shape[1]):
             moved = np.flatnonzero(slots[:, k] >= 0)
             columns[moved, slots[moved, k]] += self.built[moved, k]
-        return columns
+        return columns if structure.mixing is None else columns @ structure.mixing
 
 
 def whole_structure(targets: Mapping[str, Target]) -> Structure:

@@ -22,10 +22,11 @@ _LIMITS = {"rad": 1e2, "m": 1e6, "px": 1e7}
 
 
 class Key(NamedTuple):
-    """One number: whose it is (a "camera", "station", "placement" or "structure" by name), what, and in which unit.
+    """One number: whose it is (a "camera", "station", "placement", "structure" or "dimension" by name), what, and in
+    which unit.
 
     A camera, a station and a placement may carry the same name. Of a structure number the owner is the target, the
-    quantity the feature ("HalfwayLine", "CenterCircle.radius", "0,0.x", "bow.x").
+    quantity the feature ("HalfwayLine", "CenterCircle.radius", "0,0.x", "bow.x"), or a dimension of the target.
     """
 
     kind: str
@@ -34,10 +35,20 @@ class Key(NamedTuple):
     unit: str
 
     @classmethod
-    def of_structure(cls, name: str) -> Key:
+    def of_structure(cls, name: str, kind: str = "structure") -> Key:
         """Of a structure number by its full name, "target/feature"."""
         target, _, feature = name.partition("/")
-        return cls("structure", target, feature, "m")
+        return cls(kind, target, feature, "m")
+
+    @property
+    def whose(self) -> str:
+        """Its owner in words: station 'overhead', target 'field'."""
+        return f"{'target' if self.is_structure else self.kind} {self.owner!r}"
+
+    @property
+    def is_structure(self) -> bool:
+        """Whether it is one of the numbers of the targets as built."""
+        return self.kind in ("structure", "dimension")
 
     @property
     def structure_name(self) -> str:

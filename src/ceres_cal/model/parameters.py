@@ -50,6 +50,8 @@ class Options:
             They hold for every camera.
         priors: what is known beforehand, besides the observations' own.
         tolerances: target -> how far it may have been built from its drawing.
+        dimensions: lengths of targets that are solved for, "target/dimension" such as "field/field_length_m": from what
+            a prior says of them, or from the target as drawn. Those that a prior is about are among them.
         as_built: of a target without a tolerance "estimate" how far it was, from what repeats over the views (what it
             is, a calibration says in its tolerances), or take it "as drawn".
         loss: robust loss of each observation: one of LOSSES. loss_scale: where it starts to bend, in standard
@@ -74,6 +76,7 @@ class Options:
     fixed: Mapping[str, float] = field(default_factory=dict)
     priors: tuple[Prior, ...] = ()
     tolerances: Mapping[str, Tolerance] = field(default_factory=dict)
+    dimensions: tuple[str, ...] = ()
     loss: str = "huber"
     loss_scale: float = 2.5
     reject_sigma: float = 5.0
@@ -97,6 +100,8 @@ class Options:
             raise InputError(f"noise_scale must be 'estimate' or 'stated', not {self.noise_scale!r}")
         if self.as_built not in ("estimate", "as drawn"):
             raise InputError(f"as_built must be 'estimate' or 'as drawn', not {self.as_built!r}")
+        stated = (prior.dimension for prior in self.priors if prior.dimension)
+        object.__setattr__(self, "dimensions", tuple(dict.fromkeys((*self.dimensions, *stated))))
         names = self.intrinsic_names  # which refuses unknown terms, too
         if unknown := [name for name in self.coefficients or () if name not in names[len(OF_PIXELS) : -1]]:
             raise InputError(f"cannot solve for {unknown[0]!r}: {self._which} has {', '.join(names)}")

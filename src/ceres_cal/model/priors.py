@@ -7,7 +7,7 @@ of a prior is root (x - mean) with root^T root = information.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -99,9 +99,10 @@ def gather_priors(
     """
     lenses = {name: camera.lens for name, camera in (cameras or {}).items()}
     stated = []
-    for prior in (*observations.priors, *options.priors):
+    for prior in dict.fromkeys((*observations.priors, *options.priors)):  # what is said twice counts once
         observations.require_owner(prior)
-        stated.append(stated_prior(prior, lenses.get(prior.name, options.blank_lens)))
+        if not prior.is_open:
+            stated.append(stated_prior(prior, lenses.get(prior.name, options.blank_lens)))
     if carried:
         return (carried, *stated, *tolerances(structure, carried.keys))
     known = {key for prior in stated for key in prior.keys}
@@ -115,6 +116,9 @@ def stated_prior(prior: Prior, lens: Lens) -> GaussianPrior:
     Raises:
         InputError: the lens has no such number.
     """
+    if prior.owner == "target":
+        sigma = {Key.of_structure(prior.dimension, "dimension"): prior.sigma[0]}
+        return GaussianPrior(Information.of_sigmas(sigma), np.array(prior.value))
     names = intrinsic_names(lens)
     if prior.owner == "camera" and prior.quantity not in (*names, "principal_point"):
         raise InputError(f"prior on camera {prior.name!r}: it has no {prior.quantity!r}, only {', '.join(names)}")
@@ -137,7 +141,7 @@ def usual_centres(observations: Observations, stated: Collection[Key]) -> Iterat
 
 def tolerances(structure: Structure, known: Collection[Key] = ()) -> Iterator[GaussianPrior]:
     """How far the targets may have been built from their drawings; not of numbers that are known already."""
-    keys: Sequence[Key] = [Key.of_structure(name) for name in structure.names]
-    sigmas = {key: sigma for key, sigma in zip(keys, structure.sigma_m.tolist(), strict=True) if key not in set(known)}
+    stated = dict(zip(structure.keys[: structure.own], structure.sigma_m.tolist(), strict=False))
+    sigmas = {key: sigma for key, sigma in stated.items() if key not in set(known)}
     if sigmas:
         yield GaussianPrior(Information.of_sigmas(sigmas), np.zeros(len(sigmas)))

@@ -28,7 +28,8 @@ def natural_sizes(estimate: Estimate, keys: Sequence[Key]) -> Array:
     """(P,) what each number is compared with: an error of a hundredth of it moves a picture by about a hundredth.
 
     phi and the principal point go with phi, positions with the distance to what is seen, turns with 1 rad, coefficients
-    with the one that moves a pixel half an image diagonal from the middle by as much; structure with its tolerance.
+    with the one that moves a pixel half an image diagonal from the middle by as much; structure with its tolerance,
+    dimensions with themselves.
     """
     sizes = np.ones(len(keys))
     for (kind, owner), columns in columns_by_owner(keys).items():
@@ -37,9 +38,9 @@ def natural_sizes(estimate: Estimate, keys: Sequence[Key]) -> Array:
             known = {"phi": camera.phi, "cx": camera.phi, "cy": camera.phi, "aspect": 1.0, "skew": 1.0}
             known |= zip(camera.lens.names, camera.lens.natural_sizes(camera.phi, unit_px(camera)), strict=True)
             sizes[columns] = [known[keys[column].quantity] for column in columns]
-        elif kind == "structure":
-            names = [f"{owner}/{keys[column].quantity}" for column in columns]
-            sizes[columns] = estimate.structure.sigma_m[[estimate.structure.names.index(name) for name in names]]
+        elif keys[columns[0]].is_structure:
+            names = [keys[column].structure_name for column in columns]
+            sizes[columns] = estimate.structure.sizes_m[[estimate.structure.names.index(name) for name in names]]
         else:
             distance = _distance_m(estimate, kind, owner)
             sizes[columns] = [distance if keys[column].unit == "m" else 1.0 for column in columns]
@@ -58,13 +59,14 @@ def _distance_m(estimate: Estimate, kind: str, owner: str) -> float:
 def values_of(estimate: Estimate, keys: Sequence[Key]) -> Array:
     """(P,) the estimate's numbers in the units of the keys; 0 for a turn."""
     values = np.zeros(len(keys))
-    for column, (kind, owner, quantity, unit) in enumerate(keys):
+    for column, key in enumerate(keys):
+        kind, owner, quantity, unit = key
         if kind == "camera":
             camera = estimate.cameras[owner]
             at = intrinsic_names(camera.lens).index(quantity)
             values[column] = intrinsics_vector(camera)[at] / intrinsics_scales(camera)[at]
-        elif kind == "structure":
-            values[column] = estimate.structure.values[estimate.structure.names.index(f"{owner}/{quantity}")]
+        elif key.is_structure:
+            values[column] = estimate.structure.values[estimate.structure.names.index(key.structure_name)]
         elif unit == "m":
             if kind == "station":
                 position = estimate.stations[owner].cam_from_world.position
@@ -91,7 +93,7 @@ def free_keys(estimate: Estimate, layout: Layout, private: Set[str | None] = fro
     shared = layout.placements - private
     for name in estimate.placements if shared else ():
         keys += pose_keys("placement", name) if name in shared else []
-    return (*keys, *map(Key.of_structure, estimate.structure.names))
+    return (*keys, *estimate.structure.keys)
 
 
 def from_station(cam_from_frame: Array, cam_from_world: Pose) -> Array:
@@ -149,7 +151,7 @@ def moved(estimate: Estimate, keys: Sequence[Key], step: Array) -> Estimate:
         names = [keys[column].quantity for column in columns]
         if kind == "camera":
             cameras[owner] = camera_moved(cameras[owner], names, step[columns])
-        elif kind == "structure":
+        elif keys[columns[0]].is_structure:
             values[[estimate.structure.names.index(f"{owner}/{name}") for name in names]] += step[columns]
         else:
             change = np.zeros(6)
@@ -185,7 +187,7 @@ def _differences(kind: str, owner: str, estimate: Estimate, reference: Estimate)
         here, there = estimate.cameras[owner], reference.cameras[owner]
         change = (intrinsics_vector(here) - intrinsics_vector(there)) / intrinsics_scales(there)
         return dict(zip(intrinsic_names(there.lens), change.tolist(), strict=True))
-    if kind == "structure":
+    if kind in ("structure", "dimension"):
         change = estimate.structure.values - reference.structure.values
         names = [name.partition("/")[2] for name in reference.structure.names if name.partition("/")[0] == owner]
         mine = [name.partition("/")[0] == owner for name in reference.structure.names]

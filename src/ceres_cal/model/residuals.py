@@ -8,11 +8,11 @@ from functools import cached_property
 import numpy as np
 
 from ceres_cal import kernels
-from ceres_cal.base.arrays import Array
+from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.threads import parts_of, run_parts
 from ceres_cal.model.parameters import Estimate, intrinsics_vector, unit_px
 from ceres_cal.model.structure import Structure
-from ceres_cal.observations import Observations
+from ceres_cal.observations.files import Content
 from ceres_cal.observations.sights import Sights, nearest_feet
 from ceres_cal.scene.camera import Camera
 
@@ -40,6 +40,10 @@ class Residuals:
         """Lengths of the residuals of points (N,) and of curves (M,), px."""
         x, y = self.points.T
         return np.sqrt(x * x + y * y), np.abs(self.curves)
+
+    def of_rows(self, points: Indices, curves: Indices) -> Residuals:
+        """Those of some of the observations, as if there were no others."""
+        return Residuals(self.points[points], self.curves[curves], self.feet[curves])
 
     def in_sigmas(self, sights: Sights, scales: tuple[float, float]) -> tuple[Array, Array]:
         """(N,) of the sights' points and (M,) of their curve observations: lengths of the residuals at these noise
@@ -107,7 +111,7 @@ def curve_columns(sights: Sights, structure: Structure, feet: Array, noise_scale
     )
 
 
-def residuals(observations: Observations, sights: Sights, estimate: Estimate, feet: Array | None = None) -> Residuals:
+def residuals(observations: Content, sights: Sights, estimate: Estimate, feet: Array | None = None) -> Residuals:
     """Residuals of every observation in the sights; NaN for rows in none of them.
 
     Args:

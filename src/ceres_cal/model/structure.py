@@ -1,21 +1,25 @@
 """The target as built: how far painted lines, points and boards lie from where they should, as numbers under a sigma.
 
 One vector for everything observed, shared by all frames and cameras: for each segment its offset to the left, for each
-arc its centre's x and y and its radius, for each point its x and y, for each board two bows of a parabolic warp. All
-metres; 0 is the nominal target.
+arc its centre's x and y and its radius, for each point its x and y, for each board two bows of a parabolic warp: all in
+metres, 0 is the nominal target. Behind them come dimensions of targets that are not known, such as a field's length:
+each moves the offsets of many features at once.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Indices32, Mask
 from ceres_cal.base.errors import InputError
+from ceres_cal.model.keys import Key
 from ceres_cal.observations.sights import Sights
+from ceres_cal.scene.curves import Curve
 from ceres_cal.scene.targets import Arc, Segment, Target, target_from_spec
 
 Kind = Literal["lines", "points", "warp"]
@@ -58,11 +62,15 @@ class Structure:
     """The corrections of all targets.
 
     Attributes:
-        names: (Q) "target/feature" or "target/feature.x": what each number moves. values, sigma_m: (Q,).
-        point_slots: (P, 4) which numbers move each point of all targets: x, y, first and second bow; -1 for none.
+        names: (Z) "target/feature" or "target/feature.x": what each number moves; the last D are dimensions,
+            "target/dimension". values: (Z,) offsets, m, and lengths of dimensions, m. sigma_m: (Z,) tolerance of each;
+            infinite of a dimension, which has a prior, or none.
+        point_slots: (P, 4) which offset moves each point of all targets: x, y, first and second bow; -1 for none.
         bends: (P, 2) how much of each bow a point gets, along +z.
-        track_slots: (T, 3) which numbers move each track: of a segment the offset, of an arc x, y and radius.
+        track_slots: (T, 3) which offset moves each track: of a segment the offset, of an arc x, y and radius.
             These three are empty where nothing moves at all.
+        slopes: (Q, D) by how much a dimension moves each of the Q offsets: the numbers' own, and those of features that
+            dimensions alone move. drawn_m: (D,) the dimensions of the targets as drawn.
     """
 
     names: tuple[str, ...]
@@ -71,15 +79,70 @@ class Structure:
     point_slots: Indices32
     bends: Array
     track_slots: Indices32
+    slopes: Array = field(default_factory=lambda: np.empty((0, 0)))
+    drawn_m: Array = field(default_factory=lambda: np.empty(0))
+
+    @property
+    def own(self) -> int:
+        """How many of the numbers are offsets."""
+        return len(self.names) - len(self.drawn_m)
+
+    @property
+    def dimensions(self) -> dict[str, float]:
+        """Name and length, m, of each dimension that is among the numbers."""
+        return dict(zip(self.names[self.own :], self.values[self.own :].tolist(), strict=True))
+
+    @cached_property
+    def keys(self) -> tuple[Key, ...]:
+        """(Z) of the numbers."""
+        kinds = ["structure"] * self.own + ["dimension"] * len(self.drawn_m)
+        return tuple(Key.of_structure(name, kind) for name, kind in zip(self.names, kinds, strict=True))
+
+    @cached_property
+    def sizes_m(self) -> Array:
+        """(Z,) natural sizes: tolerances, and the dimensions as drawn."""
+        return np.concatenate([self.sigma_m[: self.own], self.drawn_m])
+
+    @property
+    def offsets(self) -> Array:
+        """(Q,) m."""
+        if not len(self.drawn_m):
+            return self.values
+        offsets = self.slopes @ (self.values[self.own :] - self.drawn_m)
+        offsets[: self.own] += self.values[: self.own]
+        return np.asarray(offsets)
+
+    @cached_property
+    def mixing(self) -> Array | None:
+        """(Q, Z) derivatives of the offsets by the numbers; None where these are the offsets."""
+        if not len(self.drawn_m):
+            return None
+        return np.hstack([np.eye(len(self.slopes))[:, : self.own], self.slopes])
+
+    def chain(self, before: int, behind: int) -> Array | None:
+        """(before + Q + behind, before + Z + behind) the same among other numbers, which stay what they are."""
+        if self.mixing is None:
+            return None
+        rows, columns = self.mixing.shape
+        whole = np.zeros((before + rows + behind, before + columns + behind))
+        whole[:before, :before], whole[before + rows :, before + columns :] = np.eye(before), np.eye(behind)
+        whole[before : before + rows, before : before + columns] = self.mixing
+        return whole
 
     def with_values(self, values: Array) -> Structure:
         """The same corrections with other numbers."""
         return replace(self, values=np.array(values, dtype=float)) if len(self.values) else self
 
-    def carrying(self, other: Structure) -> Structure:
-        """The same corrections with the numbers that others have for them; 0 where those have none."""
-        known = dict(zip(other.names, other.values.tolist(), strict=True))
+    def carrying(self, *others: Structure) -> Structure:
+        """The same corrections with the numbers that others have for them; as drawn where those have none."""
+        known = dict(zip(self.names[self.own :], self.drawn_m.tolist(), strict=True))
+        for other in others:
+            known |= zip(other.names, other.values.tolist(), strict=True)
         return self.with_values(np.array([known.get(name, 0.0) for name in self.names]))
+
+    def redrawn(self) -> Structure:
+        """The same of targets that are drawn with the dimensions as they are here."""
+        return replace(self, drawn_m=self.values[self.own :].copy())
 
     def points(self, sights: Sights) -> Array:
         """(N, 3) where the observed points of the sights lie, m."""
@@ -111,14 +174,14 @@ class Structure:
     def _points(self, points: Array, feature: Indices) -> Array:
         if not len(self.values):
             return points
-        moved = np.append(self.values, 0.0)[self.point_slots[feature]]  # slot -1 is the 0 at the end
+        moved = np.append(self.offsets, 0.0)[self.point_slots[feature]]  # slot -1 is the 0 at the end
         bow = np.sum(moved[:, 2:] * self.bends[feature], axis=1)
         return np.asarray(points + np.column_stack([moved[:, :2], bow]))
 
     def _tracks(self, given: Array, is_arc: Mask) -> Array:
         if not len(self.values):
             return given
-        moved = np.append(self.values, 0.0)[self.track_slots]
+        moved = np.append(self.offsets, 0.0)[self.track_slots]
         tracks = given.copy()
         straight = ~is_arc
         along = tracks[straight, 1, :2]
@@ -141,50 +204,72 @@ EXACT = Structure(
 """All targets as drawn."""
 
 
-def make_structure(targets: Mapping[str, Target], tolerances: Mapping[str, Tolerance]) -> Structure:
-    """The corrections that the tolerances free, all 0.
+def make_structure(
+    targets: Mapping[str, Target], tolerances: Mapping[str, Tolerance], dimensions: Collection[str] = ()
+) -> Structure:
+    """The corrections that the tolerances free, all 0, and dimensions, "target/dimension", as drawn.
 
     Raises:
-        InputError: a tolerance names a target that is not there, or a warp of a target that does not bow.
+        InputError: a tolerance or a dimension names a target that is not there, a dimension that it does not have or
+            that moves nothing, or a warp of a target that does not bow.
     """
     for name in tolerances:
         if name not in targets:
             raise InputError(f"a tolerance names target {name!r}: there are {', '.join(map(repr, targets))}")
-    if all(tolerance == Tolerance() for tolerance in tolerances.values()):
+    if all(tolerance == Tolerance() for tolerance in tolerances.values()) and not dimensions:
         return EXACT
-    names: list[str] = []
-    sigmas: list[float] = []
+    every = [of for name, target in targets.items() for of in _tolerated(name, target, tolerances)]
+    names = [name for name, sigma_m in every if sigma_m > 0.0]
+    sigmas = [sigma_m for _, sigma_m in every if sigma_m > 0.0]
+    others = [name for name, sigma_m in every if not sigma_m > 0.0] if dimensions else []
+    drawn_m, slopes = dimension_slopes((*names, *others), targets, dimensions)
+    for name, column in zip(dimensions, slopes.T, strict=True):
+        if not np.any(column):
+            raise InputError(f"no line or point lies elsewhere with another {name}: it cannot be solved for")
+    moved = np.any(slopes != 0.0, axis=1) | (np.arange(len(slopes)) < len(names))
+    place = {name: row for row, name in enumerate(np.array([*names, *others])[moved].tolist())}
+    return Structure(
+        (*names, *dimensions),
+        np.array([*np.zeros(len(names)), *drawn_m]),
+        np.array([*sigmas, *np.full(len(drawn_m), np.inf)]),
+        *_slots(targets, place),
+        slopes[moved],
+        drawn_m,
+    )
 
-    def free(name: str, sigma_m: float) -> int:
-        if sigma_m <= 0.0:
-            return _NONE
-        names.append(name)
-        sigmas.append(sigma_m)
-        return len(names) - 1
 
+def _tolerated(name: str, target: Target, tolerances: Mapping[str, Tolerance]) -> Iterator[tuple[str, float]]:
+    """Everything of a target that may be offset, and its tolerance, in the order of the solver's numbers."""
+    tolerance = tolerances.get(name, Tolerance())
+    for curve_name, curve in target.curves.items():
+        yield from ((f"{name}/{curve_name}{part}", tolerance.lines_m) for part in _parts_of(curve))
+    if tolerance.warp_m > 0.0 and not target.bows:
+        raise InputError(
+            f"a warp is for checkerboards and boards like them: target {name!r}, of kind {target.kind!r}, does not bow"
+        )
+    yield from ((f"{name}/bow.{side}", tolerance.warp_m) for side in "xy")
+    for point_name in target.points:
+        yield from ((f"{name}/{point_name}.{axis}", tolerance.points_m) for axis in "xy")
+
+
+def _parts_of(curve: Curve) -> tuple[str, ...]:
+    return (".x", ".y", ".radius") if isinstance(curve, Arc) else ("",)
+
+
+def _slots(targets: Mapping[str, Target], place: Mapping[str, int]) -> tuple[Indices32, Array, Indices32]:
+    """Point slots, bends and track slots, by the place of each offset."""
     point_slots, bends, track_slots = [], [], []
     for name, target in targets.items():
-        tolerance = tolerances.get(name, Tolerance())
         curves = []
         for curve_name, curve in target.curves.items():
-            parts = (".x", ".y", ".radius") if isinstance(curve, Arc) else ("",)
-            slots = [free(f"{name}/{curve_name}{part}", tolerance.lines_m) for part in parts]
+            slots = [place.get(f"{name}/{curve_name}{part}", _NONE) for part in _parts_of(curve)]
             curves.append(slots + [_NONE] * (3 - len(slots)))
         track_slots += curves * 3  # the paint's centre and both edges move together
-        bows = [free(f"{name}/bow.{side}", tolerance.warp_m) for side in "xy"]
+        bows = [place.get(f"{name}/bow.{side}", _NONE) for side in "xy"]
         for point_name in target.points:
-            own = [free(f"{name}/{point_name}.{axis}", tolerance.points_m) for axis in "xy"]
-            point_slots.append(own + bows)
-        if tolerance.warp_m > 0.0 and not target.bows:
-            raise InputError(
-                f"a warp is for checkerboards and boards like them: target {name!r}, of kind {target.kind!r}, does not "
-                "bow"
-            )
+            point_slots.append([place.get(f"{name}/{point_name}.{axis}", _NONE) for axis in "xy"] + bows)
         bends.append(bends_of(target))
-    return Structure(
-        tuple(names),
-        np.zeros(len(names)),
-        np.array(sigmas),
+    return (
         np.array(point_slots, dtype=np.int32).reshape(-1, 4),
         np.concatenate(bends),
         np.array(track_slots, dtype=np.int32).reshape(-1, 3),
@@ -202,25 +287,44 @@ def numbers_by_kind(structure: Structure, targets: Mapping[str, Target]) -> dict
         own = structure.point_slots[points[place] : points[place + 1]]
         tracks = structure.track_slots[curves[place] : curves[place + 1]]
         kinds: tuple[tuple[Kind, Indices32], ...] = (("lines", tracks), ("points", own[:, :2]), ("warp", own[:, 2:]))
-        every = {(name, kind): np.unique(slots[slots >= 0]).astype(np.int64) for kind, slots in kinds}
+        every = {
+            (name, kind): np.unique(slots[(slots >= 0) & (slots < structure.own)]).astype(np.int64)
+            for kind, slots in kinds
+        }
         numbers |= {of: slots for of, slots in every.items() if len(slots)}
     return numbers
 
 
-def dimension_slopes(structure: Structure, targets: Mapping[str, Target]) -> tuple[tuple[str, ...], Array]:
-    """How the targets' own dimensions move the structure: "target/dimension", and (Q, D) metres per metre of each."""
-    place = {name: row for row, name in enumerate(structure.names)}
-    names, columns = [], []
-    for name, target in targets.items():
-        for dimension, length in target.dimensions.items():
-            other = target_from_spec({**target.spec, dimension: (1.0 + _STEP) * length}, name)
-            column = np.zeros(len(place))
-            for feature, moved_m in _differences(name, target, other):
-                if feature in place:
-                    column[place[feature]] = moved_m / (_STEP * length)
-            names.append(f"{name}/{dimension}")
-            columns.append(column)
-    return tuple(names), np.reshape(columns, (len(names), len(place))).T
+def dimensions_of(targets: Mapping[str, Target]) -> dict[str, float]:
+    """The lengths, m, of all targets, as "target/dimension"."""
+    return {f"{name}/{one}": length for name, target in targets.items() for one, length in target.dimensions.items()}
+
+
+def dimension_slopes(
+    offsets: Sequence[str], targets: Mapping[str, Target], dimensions: Collection[str]
+) -> tuple[Array, Array]:
+    """Lengths (D,) of dimensions, m, and how they move features: (Q, D) metres of each offset per metre.
+
+    Raises:
+        InputError: a dimension that no target has.
+    """
+    place, known = {name: row for row, name in enumerate(offsets)}, dimensions_of(targets)
+    columns = np.zeros((len(offsets), len(dimensions)))
+    for column, name in enumerate(dimensions):
+        if name not in known:
+            raise InputError(f"there is no dimension {name!r} to be solved for: there are {', '.join(known) or 'none'}")
+        target, _, dimension = name.partition("/")
+        spec = targets[target].spec
+        other = target_from_spec({**spec, dimension: (1.0 + _STEP) * known[name]}, target)
+        for feature, moved_m in _differences(target, targets[target], other):
+            if feature in place:
+                columns[place[feature], column] = moved_m / (_STEP * known[name])
+    return np.array([known[name] for name in dimensions]), columns
+
+
+def redrawn(target: Target, lengths_m: Mapping[str, float]) -> Target:
+    """A target with other dimensions."""
+    return target_from_spec({**target.spec, **lengths_m}, "target") if lengths_m else target
 
 
 def _differences(name: str, target: Target, other: Target) -> Iterator[tuple[str, float]]:

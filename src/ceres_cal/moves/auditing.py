@@ -173,6 +173,7 @@ def _case(observations: Observations, given: Camera) -> _Case:
         raise failure or InputError("nothing was observed")
     ours = min(found, key=lambda one: one[0])[1]
     weighting = Weighting(*ours.fit.scales, "trivial")
+    observations = ours.drawn_alike(observations)
     sights = gather_sights(observations)
     problem = ours.problem(observations)
     used = replace(problem, sights=sights, weighting=weighting, priors=())

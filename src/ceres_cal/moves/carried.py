@@ -109,6 +109,7 @@ def make_plan(
     if what not in WHAT:
         raise InputError(f"what={what!r} is unknown: choose one of {', '.join(WHAT)}")
     require_posterior(calibration)
+    observations = calibration.drawn_alike(observations)
     require_same_things(calibration, observations)
     stations = observations.stations
     chosen = frozenset(stations if moved is None else moved)
@@ -142,7 +143,9 @@ def make_plan(
             calibration.cameras,
             {name: placed[name] for name in dict.fromkeys([*old, *stations]) if name in placed},
             {},
-            make_structure(observed.targets, options.tolerances).carrying(calibration.estimate.structure),
+            make_structure(observed.targets, options.tolerances, options.dimensions).carrying(
+                calibration.estimate.structure
+            ),
         ),
         prior,
         scales,
@@ -203,7 +206,7 @@ def carried_prior(calibration: Calibration, observations: Observations, stays: f
 
 
 def _is_kept(key: Key, stays: frozenset[str]) -> bool:
-    return key.kind in ("camera", "structure") or (key.kind == "station" and key.owner in stays)
+    return key.kind == "camera" or key.is_structure or (key.kind == "station" and key.owner in stays)
 
 
 def refit_problem(plan: RefitPlan, what: str, start: Estimate) -> tuple[Problem, Layout]:

@@ -130,6 +130,7 @@ def check(
     if checks < 1:
         raise InputError(f"checks must be 1 or more, not {checks}")
     require_posterior(calibration)
+    observations = calibration.drawn_alike(observations)
     require_same_things(calibration, observations)
     for name in observations.stations:
         if name not in calibration.estimate.stations:
@@ -205,10 +206,12 @@ def _case(calibration: Calibration, observed: Observations, sight: Sights) -> _C
     own = posterior.keys_of(old, key.station)
     if not posterior.knows_station(key.station):
         raise InputError(f"station {key.station!r} was held as the world: it cannot be said to have moved")
-    structure = make_structure(observed.targets, calibration.options.tolerances).carrying(old.structure)
+    structure = make_structure(
+        observed.targets, calibration.options.tolerances, calibration.options.dimensions
+    ).carrying(old.structure)
     estimate = Estimate({key.camera: old.cameras[key.camera]}, {key.station: old.stations[key.station]}, {}, structure)
     tested = tuple(k for k in own if k.kind == "station" or k.quantity == "phi")
-    kept = [k for k in posterior.keys if k in own or k.kind == "structure"]
+    kept = [k for k in posterior.keys if k in own or k.is_structure]
     return _Case(calibration, observed, sight, estimate, calibration.prior_of(kept), tested)
 
 

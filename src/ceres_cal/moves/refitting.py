@@ -13,7 +13,7 @@ import numpy as np
 
 from ceres_cal.base.errors import DegenerateError, SolutionError
 from ceres_cal.base.transforms import Pose
-from ceres_cal.calibrating import Again, solved_from
+from ceres_cal.calibrating import Again, Watched, solved_from
 from ceres_cal.calibration import Calibration, Refitted
 from ceres_cal.model.parameters import Estimate, Station
 from ceres_cal.moves.carried import RefitOptions, RefitPlan, make_plan, refit_problem
@@ -75,7 +75,7 @@ def refit(
     def attempt(what: str, start: Estimate, *, assessed: bool = False) -> Calibration:
         problem, known = refit_problem(plan, what, start)
         again = Again(known, plan.scales, assessed)
-        return solved_from(Start(start, phi_from), plan.observations, problem, again, progress)
+        return solved_from(Start(start, phi_from), plan.observations, problem, again, Watched(progress))
 
     result = attempt(what, estimate, assessed=True)
     try:

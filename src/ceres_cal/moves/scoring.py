@@ -89,9 +89,10 @@ def score(
         DegenerateError: naming the sight whose pose the observations do not determine.
         SolutionError: another camera or target than those calibrated, or intrinsics that do not explain them at all.
     """
+    observations = calibration.drawn_alike(observations)
     require_same_things(calibration, observations)
     observed = replace(observations, targets={**calibration.targets, **observations.targets})
-    given = replace(options or calibration.options, lens=calibration.options.lens, tolerances={})
+    given = replace(options or calibration.options, lens=calibration.options.lens, tolerances={}, dimensions=())
     sights = _as_built(observed, calibration)
     known = (
         {name: calibration.estimate.stations[name] for name in _held(calibration, observed)} if hold_stations else {}
@@ -128,7 +129,9 @@ def _held(calibration: Calibration, observations: Observations) -> list[str]:
 def _as_built(observations: Observations, calibration: Calibration) -> Sights:
     """The sights of targets as the calibration says that they were built."""
     sights = gather_sights(observations)
-    built: Structure = make_structure(observations.targets, calibration.options.tolerances)
+    built: Structure = make_structure(
+        observations.targets, calibration.options.tolerances, calibration.options.dimensions
+    )
     built = built.carrying(calibration.estimate.structure)
     return replace(sights, points=built.points(sights), tracks=built.tracks(sights))
 

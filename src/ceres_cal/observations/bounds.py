@@ -8,7 +8,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.errors import InputError
-from ceres_cal.observations.columns import Columns, Curves, view_label
+from ceres_cal.observations.columns import Columns, Curves, in_blocks, view_label
 from ceres_cal.observations.files import Content
 
 # The image ends half a pixel beyond the centres of its outermost ones; a detector that interpolates may go one further.
@@ -53,8 +53,9 @@ def _all_inside(content: Content) -> bool:
     return all(
         bool(numbers.min() >= -_MARGIN_PX and numbers.max() <= end)
         for column in (content.points, content.curves)
-        for numbers, end in zip(column.pixels.T, ends, strict=True)
-        if len(column)
+        for _, block in in_blocks(column)
+        for numbers, end in zip(block.pixels.T, ends, strict=True)
+        if len(block)
     )
 
 

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import math
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import TypeVar
+from pathlib import Path
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Codes, Indices, Indices32, Mask
+from ceres_cal.base.arrays import AnyArray, Array, Codes, Indices, Indices32, Mask
 from ceres_cal.base.errors import InputError
 
 
@@ -23,19 +25,23 @@ class View:
     placement: str | None = None
 
 
+PRIOR_OWNERS = ("camera", "station", "target")
+
+
 @dataclass(frozen=True)
 class Prior:
-    """What is known beforehand: `quantity` of a camera or station is `value` with standard deviation `sigma`.
+    """What is known beforehand: `quantity` of a camera, station or target is `value` with standard deviation `sigma`.
 
     Quantities of a station: height_m, position_m (m). Of a camera: phi, principal_point (px), aspect, and the lens's
-    coefficients by name in the units of the files.
+    coefficients by name in the units of the files. Of a target: its dimensions (m), which are solved for then; a sigma
+    that is infinite says that the value is only where to start from.
 
     Raises:
         InputError: on construction: an unknown owner, numbers that are not finite, a sigma that is not above 0.
     """
 
     owner: str
-    """"camera" or "station"."""
+    """"camera", "station" or "target"."""
     name: str
     quantity: str
     value: tuple[float, ...]
@@ -45,13 +51,26 @@ class Prior:
         object.__setattr__(self, "value", tuple(float(v) for v in self.value))
         object.__setattr__(self, "sigma", tuple(float(s) for s in self.sigma))
         here = f"prior on {self.quantity!r} of {self.name!r}"
-        if self.owner not in ("camera", "station"):
-            raise InputError(f"{here}: its owner must be 'camera' or 'station', not {self.owner!r}")
+        if self.owner not in PRIOR_OWNERS:
+            raise InputError(f"{here}: its owner must be one of {', '.join(PRIOR_OWNERS)}, not {self.owner!r}")
         size = {"position_m": 3, "principal_point": 2}.get(self.quantity, 1)
         if len(self.value) != size or len(self.sigma) != size:
             raise InputError(f"{here}: give {size} numbers and {size} sigmas")
-        if not np.all(np.isfinite((*self.value, *self.sigma))) or min(self.sigma) <= 0.0:
+        finite = np.all(np.isfinite(self.value)) and (self.is_open or np.all(np.isfinite(self.sigma)))
+        if not finite or not min(self.sigma) > 0.0:
             raise InputError(f"{here}: finite numbers and a sigma above 0")
+        if self.owner == "target" and not self.value[0] > 0.0:
+            raise InputError(f"{here}: a length is above 0 m, not {self.value[0]:g}")
+
+    @property
+    def is_open(self) -> bool:
+        """Whether a target's dimension is not known at all."""
+        return self.owner == "target" and self.sigma == (np.inf,)
+
+    @property
+    def dimension(self) -> str:
+        """The "target/dimension" that it is about; nothing where it is about a camera or a station."""
+        return f"{self.name}/{self.quantity}" if self.owner == "target" else ""
 
 
 TYPES = {"view": np.int32, "feature": np.int32, "pixels": np.float64, "sigma_px": np.float64, "side": np.int8}
@@ -68,6 +87,8 @@ class Columns:
 
     def __post_init__(self) -> None:
         for name, values in vars(self).items():
+            if isinstance(values, np.memmap):  # which stays in its file
+                continue
             column = np.array(values, dtype=TYPES[name])
             column.setflags(write=False)
             object.__setattr__(self, name, column)
@@ -90,6 +111,7 @@ class Curves(Columns):
     side: Codes
 
 
+_BLOCK = 1 << 20  # rows at once: what is made of them stays small beside very many
 _NOBODY, _NOWHERE = np.empty(0, np.int32), np.empty((0, 2))
 NO_POINTS = Points(_NOBODY, _NOBODY, _NOWHERE, np.empty(0))
 NO_CURVES = Curves(_NOBODY, _NOBODY, _NOWHERE, np.empty(0), np.empty(0, np.int8))
@@ -99,6 +121,54 @@ C = TypeVar("C")
 def taken(columns: C, rows: Indices | Indices32 | Mask) -> C:
     """Points, curves, or columns of another kind, at these rows only: their numbers, or True for each that stays."""
     return type(columns)(**{name: column[rows] for name, column in vars(columns).items()})
+
+
+class FileRows(NamedTuple):
+    """Rows of a column in a file, which are read without becoming part of the process's memory for good."""
+
+    path: str
+    offset: int
+    dtype: str
+    shape: tuple[int, ...]
+
+    def read(self) -> AnyArray:
+        """The rows.
+
+        Raises:
+            InputError: the file is not there, or ends too early.
+        """
+        size = math.prod(self.shape)
+        try:
+            with Path(self.path).open("rb") as file:
+                values = np.fromfile(file, self.dtype, size, offset=self.offset)
+        except OSError as error:
+            raise InputError(f"{self.path}: cannot be read: {error.strerror}") from None
+        if values.size != size:
+            raise InputError(f"{self.path}: it ends before its observations do: write it again")
+        return values.reshape(self.shape)
+
+
+def rows_of(column: AnyArray, start: int, stop: int) -> AnyArray | FileRows:
+    """Some rows of a column, where they are."""
+    rows = column[start:stop]
+    if not isinstance(column, np.memmap):
+        return rows
+    offset = int(column.offset) + start * int(column.strides[0])
+    return FileRows(str(column.filename), offset, column.dtype.str, rows.shape)
+
+
+def read_rows(rows: AnyArray | FileRows) -> AnyArray:
+    """The rows, in memory."""
+    return rows.read() if isinstance(rows, FileRows) else rows
+
+
+def in_blocks(columns: C) -> Iterator[tuple[int, C]]:
+    """The columns block by block, each in memory, with the number of its first row: at least one."""
+    arrays = vars(columns)
+    total = len(next(iter(arrays.values())))
+    for first in range(0, max(total, 1), _BLOCK):
+        stop = min(first + _BLOCK, total)
+        yield first, type(columns)(**{name: read_rows(rows_of(array, first, stop)) for name, array in arrays.items()})
 
 
 def view_label(number: int, views: Sequence[View]) -> str:

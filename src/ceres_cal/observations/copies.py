@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ceres_cal.base.arrays import Indices, Mask
-from ceres_cal.observations.columns import Columns, Curves, Points, View
+from ceres_cal.observations.columns import Columns, Curves, Points, View, in_blocks
 
 Hashes = NDArray[np.uint64]
 
@@ -40,6 +40,11 @@ class Copies:
     points: Indices
     curves: Indices
 
+    @property
+    def are_there(self) -> bool:
+        """Whether there is any."""
+        return any(len(source) and source.strides[0] and np.any(source >= 0) for source in (self.points, self.curves))
+
     @cached_property
     def originals(self) -> tuple[Mask, Mask]:
         """(N,) of points and (M,) of curve observations: what counts."""
@@ -47,6 +52,8 @@ class Copies:
 
     def words(self, views: Sequence[View], columns: tuple[Columns, Columns]) -> Iterator[str]:
         """What was counted once: a line for copied frames, and one for rows that are there twice in theirs."""
+        if not self.are_there:
+            return
         rows: Counter[tuple[str, str]] = Counter()
         for column, source in zip(columns, (self.points, self.curves), strict=True):
             copied = source >= 0
@@ -69,15 +76,39 @@ def find_copies(views: Sequence[View], points: Points, curves: Curves) -> Copies
     themselves are compared.
     """
     columns: tuple[Columns, Columns] = (points, curves)
+    place = _numbered((view.station, view.target, view.placement is None) for view in views)
+    if not any(_may_repeat(column, place) for column in columns):
+        none = [np.broadcast_to(np.int64(-1), len(column)) for column in columns]
+        return Copies(none[0], none[1])
     sources = tuple(np.full(len(column), -1, dtype=np.int64) for column in columns)
     hashes = [_row_hashes(column) for column in columns]
-    if any(np.any(own[1:] == own[:-1]) for own in map(np.sort, hashes)):
-        place = _numbered((view.station, view.target, view.placement is None) for view in views)
-        frame = _numbered((view.frame, number) for view, number in zip(views, place, strict=True))
-        for column, own, source in zip(columns, hashes, sources, strict=True):
-            _mark_rows(column, own, frame, source)
-        _mark_views(columns, hashes, place, sources)
+    frame = _numbered((view.frame, number) for view, number in zip(views, place, strict=True))
+    for column, own, source in zip(columns, hashes, sources, strict=True):
+        _mark_rows(column, own, frame, source)
+    _mark_views(columns, hashes, place, sources)
     return Copies(*sources)
+
+
+def _may_repeat(column: Columns, place: Indices) -> bool:
+    """Whether rows near one another agree or, of very many, whole views."""
+    of_views = np.zeros(len(place), dtype=np.uint64)
+    for _, block in in_blocks(column):
+        hashes = _row_hashes(block)
+        np.add.at(of_views, *_by_view(block, hashes))
+        hashes.sort()
+        if np.any(hashes[1:] == hashes[:-1]):
+            return True
+    with_rows = np.flatnonzero(of_views)
+    of_views = np.sort(of_views[with_rows] + place[with_rows].astype(np.uint64) * _FRAME)
+    return bool(np.any(of_views[1:] == of_views[:-1]))
+
+
+def _by_view(column: Columns, hashes: Hashes) -> tuple[Indices, Hashes]:
+    """Views, and the sum of their rows' hashes."""
+    if not len(hashes):
+        return np.empty(0, dtype=np.int64), hashes
+    starts = np.flatnonzero(np.diff(column.view, prepend=-1))
+    return column.view[starts].astype(np.int64), np.add.reduceat(hashes, starts)
 
 
 def _row_hashes(column: Columns) -> Hashes:

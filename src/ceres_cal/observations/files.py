@@ -1,4 +1,4 @@
-"""Observations in JSON and NPZ files (docs/files.md): every number comes back exactly."""
+"""Observations in JSON and NPZ files and in folders of columns (docs/files.md): every number comes back exactly."""
 
 from __future__ import annotations
 
@@ -30,6 +30,7 @@ from ceres_cal.base.files import (
 from ceres_cal.observations.columns import (
     NO_CURVES,
     NO_POINTS,
+    PRIOR_OWNERS,
     TYPES,
     Columns,
     Curves,
@@ -39,15 +40,17 @@ from ceres_cal.observations.columns import (
     choices,
     view_label,
 )
+from ceres_cal.observations.folders import ENDING, HEADER, read_folder, write_folder
 from ceres_cal.scene.targets import SIDES, Target, targets_from_specs
 
 FORMAT, VERSION = "ceres-cal/observations", 1
-_COLUMNS = {"header": Column(np.uint8, ("bytes",))} | {
+_NUMBERS = {
     f"{kind}_{name}": Column(dtype, (kind, 2) if name == "pixels" else (kind,))
     for kind in ("points", "curves")
     for name, dtype in TYPES.items()
     if (kind, name) != ("points", "side")
 }
+_COLUMNS = {"header": Column(np.uint8, ("bytes",))} | _NUMBERS
 _SIDE_NAMES = {value: name for name, value in SIDES.items()}
 
 
@@ -138,6 +141,9 @@ class ObservationsFile(msgspec.Struct, forbid_unknown_fields=True, kw_only=True)
 
 def read_content(path: Path) -> Content:
     """See `Observations.load`."""
+    if path.suffix == ENDING or path.is_dir():
+        plain = parse_json(read_bytes(path / HEADER), str(path / HEADER))
+        return _of_columns(plain, read_folder(path, _NUMBERS), str(path))
     content = read_bytes(path)
     return _from_npz(content, str(path)) if path.suffix == ".npz" else _from_json(content, str(path))
 
@@ -148,8 +154,12 @@ def write_content(content: Content, path: Path) -> None:
         write_bytes(path, _to_npz(content))
     elif path.suffix == ".json":
         write_bytes(path, _to_json(content))
+    elif path.suffix == ENDING:
+        write_folder(path, header_of(content), {"points": content.points, "curves": content.curves})
     else:
-        raise InputError(f"{path}: observations are written as .json or .npz: give one of these endings")
+        raise InputError(
+            f"{path}: observations are written as .json or .npz, or as a folder .columns: give one of these endings"
+        )
 
 
 def header_of(content: Content) -> ObservationsFile:
@@ -166,9 +176,13 @@ def header_of(content: Content) -> ObservationsFile:
 
 
 def prior_to_json(prior: Prior) -> dict[str, Any]:
-    """A prior as the files have it: `{"station": "a", "height_m": 4.02, "sigma_m": 0.01}`."""
+    """A prior as the files have it: `{"station": "a", "height_m": 4.02, "sigma_m": 0.01}`; null: nothing is known."""
     value, sigma = (v[0] if len(v) == 1 else list(v) for v in (prior.value, prior.sigma))
-    return {prior.owner: prior.name, prior.quantity: value, "sigma_m" if prior.owner == "station" else "sigma": sigma}
+    return {prior.owner: prior.name, prior.quantity: value, _sigma_of(prior.owner): None if prior.is_open else sigma}
+
+
+def _sigma_of(owner: str) -> str:
+    return "sigma" if owner == "camera" else "sigma_m"
 
 
 def prior_from_json(entry: Mapping[str, Any], where: str) -> Prior:
@@ -178,13 +192,14 @@ def prior_from_json(entry: Mapping[str, Any], where: str) -> Prior:
         InputError: naming `where`, when the entry does not name one owner, one quantity and one sigma.
     """
     rest = dict(entry)
-    owners = [key for key in ("camera", "station") if key in rest]
+    owners = [key for key in PRIOR_OWNERS if key in rest]
     if len(owners) != 1:
-        raise InputError(f'{where}: a prior names one "camera" or one "station"')
-    name = rest.pop(owners[0])
-    sigma_key = "sigma_m" if owners[0] == "station" else "sigma"
-    sigma = rest.pop(sigma_key, None)
-    if sigma is None or len(rest) != 1:
+        raise InputError(f'{where}: a prior names one "camera" or one "station", or one "target"')
+    name, sigma_key = rest.pop(owners[0]), _sigma_of(owners[0])
+    sigma = rest.pop(sigma_key, msgspec.UNSET)
+    if sigma is None and owners[0] == "target":
+        sigma = np.inf
+    if sigma in (None, msgspec.UNSET) or len(rest) != 1:
         raise InputError(f'{where}: a prior of a {owners[0]} has one quantity and "{sigma_key}", not {sorted(entry)}')
     ((quantity, value),) = rest.items()
     size = {"position_m": 3, "principal_point": 2}.get(quantity, 1)
@@ -331,8 +346,12 @@ def _to_npz(content: Content) -> bytes:
 
 def _from_npz(packed: bytes, where: str) -> Content:
     arrays = read_npz(packed, _COLUMNS, where)
-    plain = check_header(parse_json(arrays.pop("header").tobytes(), where), where, FORMAT, VERSION)
-    content = convert(plain, ObservationsFile, where).content()
+    return _of_columns(parse_json(arrays.pop("header").tobytes(), where), arrays, where)
+
+
+def _of_columns(header: Any, arrays: Mapping[str, AnyArray], where: str) -> Content:
+    """What a header and columns say."""
+    content = convert(check_header(header, where, FORMAT, VERSION), ObservationsFile, where).content()
     points, curves = (
         {name.removeprefix(kind): array for name, array in arrays.items() if name.startswith(kind)}
         for kind in ("points_", "curves_")

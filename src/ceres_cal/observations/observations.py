@@ -16,10 +16,10 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ceres_cal.base.arrays import Mask
+from ceres_cal.base.arrays import AnyArray, Indices, Mask
 from ceres_cal.base.errors import InputError, naming
 from ceres_cal.observations.bounds import odd_sizes, stray_pixels
-from ceres_cal.observations.columns import Columns, Curves, Points, Prior, View, choices, taken, view_label
+from ceres_cal.observations.columns import Columns, Curves, Points, Prior, View, choices, in_blocks, taken, view_label
 from ceres_cal.observations.copies import Copies, find_copies
 from ceres_cal.observations.files import Content, header_of, read_content, write_content
 from ceres_cal.observations.from_points import gathered
@@ -51,9 +51,16 @@ class Observations(Content):
 
     def __post_init__(self) -> None:
         self._check_names()
-        self._check_columns("point", self.points)
-        self._check_columns("curve", self.curves)
-        seen = {self.views[i].camera for column in (self.points, self.curves) for i in np.unique(column.view)}
+        for kind, column in (("point", self.points), ("curve", self.curves)):
+            count = len(column.view)
+            if column.pixels.shape != (count, 2) or any(len(array) != count for array in vars(column).values()):
+                raise InputError(f"the columns of the {kind} observations differ in length: write them again")
+            last = 0
+            for first, block in in_blocks(column):
+                self._check_columns(kind, block, first, last)
+                last = int(block.view[-1]) if len(block) else 0
+        shown = np.flatnonzero(np.diff(self.ends[0]) + np.diff(self.ends[1]))
+        seen = {self.views[i].camera for i in shown.tolist()}
         for name in self.cameras:
             if name not in seen:
                 raise InputError(f"camera {name!r} has no observation: add views of it or remove the camera")
@@ -90,7 +97,7 @@ class Observations(Content):
 
     @classmethod
     def load(cls, path: str | Path) -> Observations:
-        """Read `.json` or `.npz` (docs/files.md).
+        """Read `.json`, `.npz`, or a folder `.columns`, whose columns stay in their files (docs/files.md).
 
         Raises:
             InputError: one line that names the file, the view and the feature; also for pixels outside their images.
@@ -101,7 +108,7 @@ class Observations(Content):
             return observations
 
     def save(self, path: str | Path) -> None:
-        """Write `.json` or, for large sets, `.npz`; every number comes back exactly."""
+        """Write `.json`, for large sets `.npz`, beyond memory a folder `.columns`; every number comes back exactly."""
         write_content(self, Path(path))
 
     @cached_property
@@ -110,9 +117,23 @@ class Observations(Content):
         header = msgspec.structs.replace(header_of(self), notes=msgspec.UNSET)
         content = hashlib.sha256(msgspec.json.encode(header))
         for column in (self.points, self.curves):
-            for array in vars(column).values():
-                content.update(np.ascontiguousarray(array).data)
+            for name in vars(column):  # the whole of a column before the next
+                for _, block in in_blocks(_Alone(getattr(column, name))):
+                    content.update(np.ascontiguousarray(block.values).data)
         return content.hexdigest()
+
+    @cached_property
+    def ends(self) -> tuple[Indices, Indices]:
+        """(V + 1,) where the points of each view begin, and where its curve observations do."""
+        count = len(self.views)
+        points, curves = (
+            sum(
+                (np.bincount(block.values, minlength=count) for _, block in in_blocks(_Alone(column.view))),
+                start=np.zeros(count, np.int64),
+            )
+            for column in (self.points, self.curves)
+        )
+        return np.concatenate([[0], np.cumsum(points)]), np.concatenate([[0], np.cumsum(curves)])
 
     # ---- reading ------------------------------------------------------------------------------------------------
 
@@ -153,9 +174,17 @@ class Observations(Content):
 
     # ---- parts --------------------------------------------------------------------------------------------------
 
-    def part(self, points: Mask, curves: Mask) -> Observations:
-        """The same views with some of the observations."""
+    def part(self, points: Mask | Indices, curves: Mask | Indices) -> Observations:
+        """The same views with some of the observations: their numbers, or True for each that stays."""
         return replace(self, points=taken(self.points, points), curves=taken(self.curves, curves))
+
+    def with_targets(self, targets: Mapping[str, Target]) -> Observations:
+        """The same observations of targets that are drawn otherwise; their digest stays."""
+        if all(targets[name] == target for name, target in self.targets.items()):
+            return self
+        drawn = replace(self, targets=dict(targets))
+        vars(drawn)["digest"] = self.digest
+        return drawn
 
     def of_station(self, name: str) -> Observations:
         """One station's views with all their observations, without priors."""
@@ -192,17 +221,15 @@ class Observations(Content):
                     "give each rigid thing a placement of its own"
                 )
 
-    def _check_columns(self, kind: str, column: Columns) -> None:
-        count = len(column.view)
-        if column.pixels.shape != (count, 2) or any(len(array) != count for array in vars(column).values()):
-            raise InputError(f"the columns of the {kind} observations differ in length: write them again")
-        if count == 0:
+    def _check_columns(self, kind: str, column: Columns, first: int, last: int) -> None:
+        """Of a block that begins with row `first`, behind one of view `last`."""
+        if not len(column):
             return
         if np.any(wrong := (column.view < 0) | (column.view >= len(self.views))):
             raise InputError(
                 f"a {kind} observation names view {column.view[np.argmax(wrong)]}, but there are {len(self.views)}"
             )
-        if np.any(np.diff(column.view) < 0):
+        if column.view[0] < last or np.any(np.diff(column.view) < 0):
             raise InputError(f"the {kind} observations are not in the order of their views: sort the columns by view")
         targets = [self.targets[view.target] for view in self.views]
         known = np.array([len(target.points if kind == "point" else target.curves) for target in targets])
@@ -213,9 +240,9 @@ class Observations(Content):
                 f"{here}: {kind} feature number {column.feature[row]} is unknown in target {target!r}, "
                 f"which has {known[column.view[row]]}"
             )
-        self._check_numbers(kind, column)
+        self._check_numbers(kind, column, first)
 
-    def _check_numbers(self, kind: str, column: Columns) -> None:
+    def _check_numbers(self, kind: str, column: Columns, first: int) -> None:
         sigma = np.where(column.sigma_px > 0.0, column.sigma_px, np.inf)
         side = column.side if isinstance(column, Curves) else np.zeros(1, np.int8)
         for what, bad in (
@@ -226,7 +253,9 @@ class Observations(Content):
             if np.any(bad):
                 row = int(np.argmax(bad))
                 here = view_label(column.view[row], self.views)
-                raise InputError(f"{here}, {kind} {self.feature_name(kind, row)!r}: {what}: correct or remove it")
+                raise InputError(
+                    f"{here}, {kind} {self.feature_name(kind, first + row)!r}: {what}: correct or remove it"
+                )
 
     def require_inside(self) -> tuple[str, ...]:
         """A line for each camera of which a few observations lie outside its image.
@@ -241,10 +270,18 @@ class Observations(Content):
         return stray_pixels(self)
 
     def require_owner(self, prior: Prior) -> None:
-        """Raise InputError where a prior names a camera or station that is not there."""
-        names: Iterable[str] = self.cameras if prior.owner == "camera" else self.stations
+        """Raise InputError where a prior names a camera, a station or a target that is not there."""
+        every: dict[str, Iterable[str]] = {"camera": self.cameras, "station": self.stations, "target": self.targets}
+        names = every[prior.owner]
         if prior.name not in names:
             raise InputError(f"a prior names {prior.owner} {prior.name!r}, which is not there: {choices(names)}")
+
+
+@dataclass(frozen=True, eq=False)
+class _Alone:
+    """A single column."""
+
+    values: AnyArray
 
 
 def combine(parts: Sequence[Observations]) -> Observations:

@@ -25,6 +25,7 @@ from numpy.typing import ArrayLike
 
 from ceres_cal.base.arrays import AnyArray, Array, Indices, Indices32, Mask
 from ceres_cal.observations import Columns, Observations
+from ceres_cal.observations.files import Content
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.curves import nearest_to_rays
 
@@ -186,6 +187,13 @@ class Sights(Sequence["Sights"]):
         numbers = np.flatnonzero(point_sizes + curve_sizes)
         return self._rows(numbers, p, c, point_sizes[numbers], curve_sizes[numbers])
 
+    def renumbered(self, points: Indices, curves: Indices) -> Sights:
+        """The sights of some of the observations, by ascending row, as rows of these alone."""
+        p, c = (np.full(int(rows.max(initial=-1)) + 1, -1) for rows in (self.point_rows, self.curve_rows))
+        p[points], c[curves] = np.arange(len(points)), np.arange(len(curves))
+        own = self.used(p >= 0, c >= 0)
+        return replace(own, point_rows=p[own.point_rows], curve_rows=c[own.curve_rows])
+
     @property
     def by_kind(self) -> tuple[Sights, Sights]:
         """The same sights with their points alone, and with their curve observations alone."""
@@ -240,6 +248,12 @@ def gather_sights(observations: Observations, *, predicted: bool = False) -> Sig
     Args:
         predicted: that they were never measured: without noise frames of a static camera look like copies.
     """
+    every = sights_of(observations)
+    return every if predicted else every.used(*observations.copies.originals)
+
+
+def sights_of(observations: Content) -> Sights:
+    """The sights of all observations; a sight without any is left out."""
     keys = [SightKey(view.camera, view.station, view.placement) for view in observations.views]
     order = {key: number for number, key in enumerate(dict.fromkeys(keys))}
     sight_of_view = np.array([order[key] for key in keys], dtype=np.int64)
@@ -278,8 +292,7 @@ def gather_sights(observations: Observations, *, predicted: bool = False) -> Sig
         np.concatenate([np.tile(t.is_arc, 3) for t in targets]),
     )
     filled = np.flatnonzero(np.diff(point_bounds) + np.diff(curve_bounds))
-    every = every if len(filled) == len(every) else every.take(filled)
-    return every if predicted else every.used(*observations.copies.originals)
+    return every if len(filled) == len(every) else every.take(filled)
 
 
 def _grouped(columns: Columns, sight_of_view: Indices, count: int) -> tuple[Indices | slice, Indices]:

@@ -19,7 +19,7 @@ from ceres_cal.detect.lines import Lines
 from ceres_cal.model.equations import whole_structure, write_equations
 from ceres_cal.model.parameters import intrinsic_names
 from ceres_cal.model.residuals import residuals
-from ceres_cal.model.structure import dimension_slopes
+from ceres_cal.model.structure import dimension_slopes, dimensions_of
 from ceres_cal.observations import Prior
 from ceres_cal.photographs.refit import observations_of, problem_of
 from ceres_cal.scene.camera import Camera
@@ -120,12 +120,10 @@ def as_built(lines: Lines, camera: Camera, target: Target, priors: tuple[Prior, 
     bent = model.freed(columns[:, there])  # lines that no offset straightens: wavy tape, another lens
     left = float(model.left_over @ model.left_over) - bent.decrease
     noise = max(1.0, left / max(model.spare - bent.root.shape[1], 1))
-    names, moves = dimension_slopes(structure, seen.targets)
+    names = tuple(dimensions_of(seen.targets))
+    drawn_m, moves = dimension_slopes(structure.names, seen.targets, names)
     owner = np.array([_curve_of(structure.names[row]) for row in there])
-    shape = _Shape(
-        normal / noise, slope / noise, owner, moves[there], names, np.array(list(target.dimensions.values()))
-    )
-    return shape.explained()
+    return _Shape(normal / noise, slope / noise, owner, moves[there], names, drawn_m).explained()
 
 
 def _curve_of(name: str) -> str:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 
@@ -13,10 +14,13 @@ from ceres_cal.detect.courses import predict
 from ceres_cal.detect.lines import search as search_along
 from ceres_cal.detect.registration import nearness_to
 from ceres_cal.detect.strokes import drawn, find_strokes
+from ceres_cal.model.structure import redrawn
+from ceres_cal.observations import Prior
 from ceres_cal.photographs.grid import Grid, grid_of, offsets_of
 from ceres_cal.photographs.matching import FloorLines, Match, StrokeMap, divergence, lines_seen, match
 from ceres_cal.photographs.upright import Upright, find_upright
 from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.curves import curve_points
 from ceres_cal.scene.lens import Radial
 from ceres_cal.scene.symmetry import turns_of
 from ceres_cal.scene.targets import Target
@@ -32,6 +36,9 @@ _MOST, _MOST_ALIKE = 4, 60
 # Where a candidate's lines are sought: px apart, and to either side as a share of half the image's diagonal; and how
 # bright, of the usual brightest, is paint. So many of any lines would be found there by chance.
 _SPACING_PX, _REACH, _CLEAR, _FEWEST, _BY_CHANCE = 8.0, 0.025, 0.4, 12, 0.3
+# Share of a length that is not known by which it is drawn longer and shorter, too: a match is nearly as good up to half
+# of that beside it.
+_LENGTH_STEP = 0.06
 _SAME_PLACE, _SAME_TURN = 0.08, 0.1  # in heights, rad
 
 
@@ -41,12 +48,14 @@ class FieldSearch:
 
     Attributes:
         turns: of the target that put its painted curves onto themselves; the first is none.
+        others: the target drawn with other lengths, where some are not known.
     """
 
     grey: Array32
     stroke_map: StrokeMap
     grid: Grid
     turns: tuple[Pose, ...]
+    others: tuple[Grid, ...] = ()
 
     @property
     def target(self) -> Target:
@@ -58,30 +67,59 @@ class FieldSearch:
         return self.grid.curves
 
 
-def prepare_search(grey: Array32, target: Target, curves: Collection[str]) -> FieldSearch:
+def prepare_search(
+    grey: Array32, target: Target, curves: Collection[str], lengths: Sequence[Prior] = ()
+) -> FieldSearch:
     """The strokes of a photograph, beside what they are to be taken for.
+
+    Args:
+        lengths: what is known of dimensions of the target that may be others.
 
     Raises:
         InputError: the target has too few straight lines.
     """
-    grid = grid_of(target, curves)
+    grid, *others = (grid_of(drawn, curves) for drawn in _drawings(target, curves, lengths))
     size = (int(grey.shape[1]), int(grey.shape[0]))
     strokes = find_strokes(grey)
     stroke_map = StrokeMap(strokes, nearness_to(drawn(strokes, size)), size, 0.5 * (np.array(size) - 1.0))
-    return FieldSearch(grey, stroke_map, grid, tuple(turns_of(target, curves)))
+    return FieldSearch(grey, stroke_map, grid, tuple(turns_of(target, curves)), tuple(others))
 
 
-def candidates(search: FieldSearch) -> list[Camera]:
-    """Cameras that may have taken it, the best first, each once for all turns of the target."""
+def _drawings(target: Target, curves: Collection[str], lengths: Sequence[Prior]) -> Iterator[Target]:
+    """The target, and drawn with those two of the lengths by which most paint moves in steps to either side."""
+    yield target
+    moved: dict[float, str] = {}
+    for prior in lengths:
+        if prior.sigma[0] > 0.5 * _LENGTH_STEP * prior.value[0]:
+            other = redrawn(target, {prior.quantity: (1.0 + _LENGTH_STEP) * prior.value[0]})
+            ways = [curve_points(one.curves[name], 0, 20) for name in curves for one in (target, other)]
+            paint = sum(
+                float(np.mean(np.linalg.norm(here - there, axis=1))) * target.curves[name].length_m
+                for name, here, there in zip(curves, ways[::2], ways[1::2], strict=True)
+            )
+            moved[paint] = prior.quantity
+    names = [moved[paint] for paint in sorted(moved, reverse=True)[:2]]
+    for steps in product((0.0, -_LENGTH_STEP, _LENGTH_STEP), repeat=len(names)):
+        if any(steps):
+            yield redrawn(target, {n: (1.0 + s) * target.dimensions[n] for n, s in zip(names, steps, strict=True)})
+
+
+def candidates(search: FieldSearch) -> list[tuple[Camera, Grid]]:
+    """Cameras that may have taken it, the best first, each once for all turns of the target; and how it was drawn."""
     scored: list[tuple[float, Camera]] = []
+    drawn: dict[int, Grid] = {}
     for upright in find_upright(search.stroke_map.ends, search.stroke_map.strokes.length_px, _UPRIGHTS):
         optics = _optics(upright, search.stroke_map)
-        matches = match(upright, search.stroke_map, search.grid, lines_seen(upright, search.stroke_map))
-        scored += [(one.score, _posed(optics, one)) for one in matches]
+        seen = lines_seen(upright, search.stroke_map)
+        for grid in (search.grid, *search.others):
+            found = [(one.score, _posed(optics, one)) for one in match(upright, search.stroke_map, grid, seen)]
+            drawn |= {id(camera): grid for _, camera in found}
+            scored += found
         if scored and max(score for score, _ in scored) > _SURE:
             break
     distinct = _distinct(sorted(scored, key=lambda one: -one[0]), search.turns, _COMPARABLE)
-    return sorted(distinct, key=lambda camera: -_on_lines(search, camera))[:_MOST]
+    every = [(camera, drawn[id(camera)]) for camera in distinct]
+    return sorted(every, key=lambda one: -_on_lines(replace(search, grid=one[1]), one[0]))[:_MOST]
 
 
 def _on_lines(search: FieldSearch, camera: Camera) -> float:

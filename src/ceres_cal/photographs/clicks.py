@@ -69,9 +69,12 @@ def clicks_from_json(data: Mapping[str, Any], where: str) -> Clicks:
 
 
 def starts_from_clicks(
-    clicks: Clicks, target: Target, image_size: tuple[int, int]
+    clicks: Clicks, target: Target, image_size: tuple[int, int], lengths: tuple[Prior, ...] = ()
 ) -> tuple[list[Camera], FreeIntrinsics]:
     """Posed cameras of several lenses that the clicks may belong to, and what is free to be told by the photograph.
+
+    Args:
+        lengths: what is known of dimensions of the target that are free, too.
 
     Raises:
         InputError: a point that the target does not have, or points of which three lie on a line.
@@ -97,17 +100,22 @@ def starts_from_clicks(
             raise InputError("the points to start from go round the wrong way, as if seen from below: check names")
         cameras.append(Camera(image_size, phi, (float(middle[0]), float(middle[1])), lens, 1.0, pose))
     phi = float(np.median([camera.phi for camera in cameras]))
-    return cameras, unknown_optics(image_size, phi, PointHints(index, pixels, np.full(len(index), SIGMA_PX)))
+    hints = PointHints(index, pixels, np.full(len(index), SIGMA_PX))
+    return cameras, unknown_optics(image_size, phi, hints, lengths)
 
 
-def unknown_optics(image_size: tuple[int, int], phi: float, hints: PointHints | None) -> FreeIntrinsics:
-    """What a photograph may tell of a camera of which nothing is known but, roughly, its phi and where points are."""
+def unknown_optics(
+    image_size: tuple[int, int], phi: float, hints: PointHints | None, lengths: tuple[Prior, ...] = ()
+) -> FreeIntrinsics:
+    """What a photograph may tell of a camera of which nothing is known but, roughly, its phi and where points are; and
+    of lengths of the target.
+    """
     middle = 0.5 * (np.array(image_size) - 1.0)
     priors = (
         Prior("camera", CAMERA, "phi", (phi,), (0.5 * phi,)),
         Prior("camera", CAMERA, "principal_point", tuple(middle), (0.04 * image_size[0],) * 2),
     )
-    return FreeIntrinsics(_FREED, priors, hints)
+    return FreeIntrinsics(_FREED, (*priors, *lengths), hints)
 
 
 def _phi(homography: Array, half_px: float) -> float:

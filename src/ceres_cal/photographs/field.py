@@ -15,15 +15,18 @@ from ceres_cal.base.words import frame_of
 from ceres_cal.detect.crossings import find_crossings
 from ceres_cal.detect.images import filled, read_grey
 from ceres_cal.detect.lines import Lines
-from ceres_cal.observations import NO_POINTS, Curves, Observations, Points, View, combine
+from ceres_cal.observations import NO_POINTS, Curves, Observations, Points, Prior, View, combine
 from ceres_cal.photographs.clicks import Clicks, starts_from_clicks
 from ceres_cal.photographs.follow import Followed, FreeIntrinsics, follow
 from ceres_cal.photographs.judgement import why_missed
 from ceres_cal.photographs.search import Auto, SearchResult, search
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.targets import Target
+from ceres_cal.solve.dimensions import drawn_as_stated
 
 TARGET_NAME = "field"
+# Of a length, the standard deviation under which lines are followed: what a few lines leave open does not run off.
+_ABOUT = 0.15
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +56,7 @@ class FieldOptions:
         edges: both edges of the paint instead of its middle.
         left_out: (height, width) pixels that show nothing of the field: hall, walls, people.
         keep_start: nothing farther from the start than 12 px is looked at.
+        lengths: what is known of dimensions of the target (named "field") that are to be told by the photographs.
         refused: called with the path of each image that does not show the field, and what was seen there instead.
     """
 
@@ -62,6 +66,7 @@ class FieldOptions:
     edges: bool = False
     left_out: Mask | None = None
     keep_start: bool = False
+    lengths: tuple[Prior, ...] = ()
     refused: Callable[[Path, SearchResult], None] | None = None
 
 
@@ -93,12 +98,12 @@ def detect_field(
     """
     options = options or FieldOptions()
     painted = _painted(target, curves)
-    paths = [Path(path) for path in images]
+    paths, drawn = [Path(path) for path in images], drawn_as_stated({TARGET_NAME: target}, options.lengths)[TARGET_NAME]
     results: dict[str, SearchResult] = {}
     last: Followed | None = None
     for number, path in enumerate(paths, start=1):
         grey = _without(read_grey(path).astype(np.float32), options.left_out, path)
-        result = _looked_for(grey, target, painted, start if last is None else last, (path, options.keep_start))
+        result = _looked_for(grey, drawn, painted, start if last is None else last, (path, options))
         results[str(path)] = result
         if result.followed is None and options.refused is not None:
             options.refused(path, result)
@@ -111,7 +116,18 @@ def detect_field(
         raise NothingShownError(f"no field in any of {len(paths)} images; {missed[0][0]}: {missed[0][1]}", missed)
     parts = [_observations(frame_of(path), one, target, options) for path, one in followed.items()]
     searched = {path: result for path, result in results.items() if result.followed is not None and result.ways}
-    return FieldDetections(combine(parts), followed, missed, searched)
+    lengths = tuple(_found(prior, next(iter(followed.values()))) for prior in options.lengths)
+    return FieldDetections(replace(combine(parts), priors=lengths), followed, missed, searched)
+
+
+def _found(prior: Prior, followed: Followed) -> Prior:
+    """What is known of a length; where nothing is, a calibration starts from what was found."""
+    return replace(prior, value=(followed.target.dimensions[prior.quantity],)) if prior.is_open else prior
+
+
+def _tracked(lengths: tuple[Prior, ...]) -> tuple[Prior, ...]:
+    """The same as tight as lines are followed under: a field is about as large as it is said to be."""
+    return tuple(replace(one, sigma=(min(one.sigma[0], _ABOUT * one.value[0]),)) for one in lengths)
 
 
 def _painted(target: Target, curves: Collection[str] | None) -> tuple[str, ...]:
@@ -139,30 +155,37 @@ def _looked_for(
     target: Target,
     painted: tuple[str, ...],
     start: Camera | Clicks | Auto | Followed,
-    where: tuple[Path, bool],
+    where: tuple[Path, FieldOptions],
 ) -> SearchResult:
     """The field from where the last image showed it, or from the start that was given, or from none.
 
     Args:
-        where: the image's path, and whether the start is to be kept to.
+        where: the image's path, and what observations are to be.
     """
-    path, keep = where
+    path, options = where
+    lengths = _tracked(options.lengths)
     if isinstance(start, Auto):
         with naming(path):
-            return search(grey, target, painted, start)
-    starts, free = _starts(start, target, (int(grey.shape[1]), int(grey.shape[0])), path)
-    followed = follow(grey, target, starts, painted, replace(free, keep=keep))
+            return search(grey, target, painted, replace(start, lengths=lengths))
+    target = start.target if isinstance(start, Followed) else target
+    starts, free = _starts(start, target, (int(grey.shape[1]), int(grey.shape[0])), (path, lengths))
+    followed = follow(grey, target, starts, painted, replace(free, keep=options.keep_start))
     if followed.holds and not followed.built.is_other:
         return SearchResult(followed)
     return SearchResult(None, why_missed(followed, target, started=True), seen=followed)
 
 
 def _starts(
-    start: Camera | Clicks | Followed, target: Target, size: tuple[int, int], path: Path
+    start: Camera | Clicks | Followed, target: Target, size: tuple[int, int], given: tuple[Path, tuple[Prior, ...]]
 ) -> tuple[list[Camera], FreeIntrinsics]:
-    """The cameras to start from: the last image's, or the one given, or those that the clicks may belong to."""
+    """The cameras to start from: the last image's, or the one given, or those that the clicks may belong to.
+
+    Args:
+        given: the image's path, and what is known of lengths.
+    """
+    path, lengths = given
     if isinstance(start, Clicks):
-        return starts_from_clicks(start, target, size)
+        return starts_from_clicks(start, target, size, lengths)
     camera = start.camera if isinstance(start, Followed) else start
     if camera.image_size != size:
         raise InputError(
@@ -174,7 +197,7 @@ def _starts(
                 "start from a calibration of this camera"
             )
         )
-    return [camera], FreeIntrinsics()
+    return [camera], FreeIntrinsics(priors=lengths)
 
 
 def _observations(frame: str, followed: Followed, target: Target, options: FieldOptions) -> Observations:
@@ -182,7 +205,7 @@ def _observations(frame: str, followed: Followed, target: Target, options: Field
     camera, lines = followed.camera, followed.lines
     points, used = NO_POINTS, np.zeros(len(lines.found), dtype=bool)
     if options.points:
-        met = find_crossings(target, camera, lines)
+        met = find_crossings(followed.target, camera, lines)
         points, used = Points(np.zeros(len(met.feature), np.int32), met.feature, met.pixels, met.sigma_px), met.used
     return Observations(
         {TARGET_NAME: target},

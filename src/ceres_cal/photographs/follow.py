@@ -17,7 +17,7 @@ from ceres_cal.detect.registration import nearness, shifted
 from ceres_cal.model.parameters import Options, intrinsic_names
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.photographs.as_built import AS_DRAWN, AsBuilt, as_built
-from ceres_cal.photographs.refit import PointHints, observations_of, refit_camera
+from ceres_cal.photographs.refit import TARGET, PointHints, observations_of, refit_camera
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import LENSES
 from ceres_cal.scene.targets import Target
@@ -44,10 +44,11 @@ _AT_REST_PX = 0.02
 
 @dataclass(frozen=True, eq=False)
 class FreeIntrinsics:
-    """What of the camera a photograph may change besides the pose.
+    """What of the camera, and of the target, a photograph may change besides the pose.
 
     Attributes:
-        names: of the free intrinsics, in the order in which they are freed. priors: that hold them.
+        names: of the free intrinsics, in the order in which they are freed. priors: that hold them, and dimensions of
+            the target, which are free because of that.
         hints: points that somebody showed, which hold the camera while lines are far off.
         keep: whether the starts are known to be near: nothing far off is looked at.
     """
@@ -63,12 +64,14 @@ class Followed:
     """A field's lines as they were followed.
 
     Attributes:
-        camera: the posed camera that predicts them. lines: what was measured there, but for curves that lie aside.
+        camera: the posed camera that predicts them. target: as its dimensions were found.
+        lines: what was measured there, but for curves that lie aside.
         moved_px: how far the last refit moved the prediction; at rest below 0.02.
         built: how the curves lie, where the photograph had to tell the lens, too.
     """
 
     camera: Camera
+    target: Target
     lines: Lines
     moved_px: float
     built: AsBuilt = AS_DRAWN
@@ -128,7 +131,7 @@ def approach(grey: Array32, target: Target, camera: Camera, curves: Collection[s
 def refine(grey: Array32, target: Target, camera: Camera, curves: Collection[str], free: FreeIntrinsics) -> Followed:
     """From a camera that is right but for its lens: the kind that suits best, without curves that lie aside."""
     tracker = _Tracker(grey, target, curves, free)
-    return tracker.refined(Followed(camera, tracker.measured(camera), np.inf))
+    return tracker.refined(Followed(camera, target, tracker.measured(camera), np.inf))
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,52 +181,56 @@ class _Tracker:
         refitted = []
         for places in shifted(wide, near, camera.image_size, FAR_PX, _CANDIDATES):
             moved = observations_of(self.target, camera.image_size, wide.curve, places, np.full(len(wide), sigma_px))
-            refitted.append(refit_camera(camera, moved) or camera)
+            there = refit_camera(camera, moved)
+            refitted.append(camera if there is None else there[0])
         return refitted
 
     def close_in(self, camera: Camera, reaches_px: Sequence[float]) -> Followed:
         """Search ever nearer, freeing one intrinsic after the other; then measure and refit until at rest."""
+        tracker = self
         for number, reach in enumerate(reaches_px):
             names = self.free.names[: max(0, 2 * number - 1)]
-            camera = self._search_step(camera, names, reach) or camera
-        return self.at_rest(camera, self.free.names)
+            tracker, camera = tracker._search_step(camera, names, reach) or (tracker, camera)
+        return tracker.at_rest(camera, self.free.names)
 
     def at_rest(self, camera: Camera, names: tuple[str, ...]) -> Followed:
         """Measured and refitted, with these intrinsics free, until nothing moves any more."""
-        lines, moved = self.measured(camera), np.inf
+        tracker, lines, moved = self, self.measured(camera), np.inf
         for _ in range(_ROUNDS):
             if np.count_nonzero(lines.found) < _FEWEST:
                 break
-            refitted = refit_camera(camera, self._observed(lines, camera), names, self.free.priors)
+            refitted = tracker._refitted(camera, tracker._observed(lines, camera), names)
             if refitted is None:
                 break
-            moved = _moved_px(camera, refitted, lines.course.pixels)
-            camera, lines = refitted, self.measured(refitted)
+            before, (tracker, there) = camera, refitted
+            moved = _moved_px(before, there, lines.course.pixels)
+            camera, lines = there, tracker.measured(there)
             if moved < _AT_REST_PX:
                 break
-        return Followed(camera, lines, moved)
+        return Followed(camera, tracker.target, lines, moved)
 
     def refined(self, followed: Followed) -> Followed:
         """The same, predicted with the lens that suits the curves best, without those that lie aside."""
         followed = self.without_aside(followed)
         if followed.built.is_other:
             return followed
-        left = replace(self, curves=[name for name in self.curves if name not in followed.built.aside_m])
+        curves = [name for name in self.curves if name not in followed.built.aside_m]
+        left = replace(self, curves=curves, target=followed.target)
         return self.without_aside(left.with_best_lens(followed))
 
     def without_aside(self, followed: Followed) -> Followed:
         """The same without the curves that lie aside: none of them draws the camera to where others look aside."""
         free = tuple(name for name in intrinsic_names(followed.camera.lens) if name != "aspect")
-        left, built = self, AS_DRAWN
+        whole, built = replace(self, target=followed.target), AS_DRAWN
+        left = whole
         for _ in range(_ROUNDS):
-            known, built = (
-                built,
-                as_built(self.measured(followed.camera), followed.camera, self.target, self.free.priors),
-            )
+            known, lines = built, whole.measured(followed.camera)
+            built = as_built(lines, followed.camera, whole.target, self.free.priors)
             if built.is_other or built.aside_m.keys() == known.aside_m.keys():
                 break
-            left = replace(self, curves=[name for name in self.curves if name not in built.aside_m])
+            left = replace(whole, curves=[name for name in self.curves if name not in built.aside_m])
             followed = left.at_rest(followed.camera, free)
+            whole, left = (replace(one, target=followed.target) for one in (whole, left))
         return replace(followed, built=built, lines=left.measured(followed.camera))
 
     def with_best_lens(self, followed: Followed) -> Followed:
@@ -232,23 +239,33 @@ class _Tracker:
         A polynomial that is a pixel off bends what crossings are extrapolated along.
         """
         lines, fits = followed.lines, []
+        known = tuple(prior for prior in self.free.priors if prior.dimension)
         observations = self._observed(lines, followed.camera)
         for kind, lens in LENSES.items():
             if lens.set_at_start:
                 continue  # a few lines do not tell a lens without a formula
             try:
-                calibration = calibrate(observations, Options(lens=kind, powers=(lens.trial_powers or ((),))[-1]))
+                powers = (lens.trial_powers or ((),))[-1]
+                calibration = calibrate(observations, Options(lens=kind, powers=powers, priors=known))
             except CalibrationError:
                 continue
             fits.append((calibration.fit.curve_scale * len(lines.found) / calibration.fit.curves, calibration))
         if not fits:
             return followed
-        camera = min(fits, key=lambda fit: fit[0])[1].station()
-        lines = self.measured(camera)
-        refined = Followed(camera, lines, _moved_px(followed.camera, camera, lines.course.pixels))
+        best = min(fits, key=lambda fit: fit[0])[1]
+        camera, target = best.station(), best.targets[TARGET]
+        lines = replace(self, target=target).measured(camera)
+        refined = Followed(camera, target, lines, _moved_px(followed.camera, camera, lines.course.pixels))
         return refined if refined.holds and refined.share > followed.share - 0.02 else followed
 
-    def _search_step(self, camera: Camera, names: tuple[str, ...], reach_px: float) -> Camera | None:
+    def _refitted(
+        self, camera: Camera, observations: Observations, names: tuple[str, ...]
+    ) -> tuple[_Tracker, Camera] | None:
+        """The camera refitted with these intrinsics free, and the tracker of the target as it is then."""
+        refitted = refit_camera(camera, observations, names, self.free.priors)
+        return None if refitted is None else (replace(self, target=refitted[1]), refitted[0])
+
+    def _search_step(self, camera: Camera, names: tuple[str, ...], reach_px: float) -> tuple[_Tracker, Camera] | None:
         """The camera refitted to what is brightest along the normals; None where too little is."""
         course = self._predicted(camera, 2.0)
         if len(course) < _FEWEST:
@@ -262,7 +279,7 @@ class _Tracker:
         sigma = np.full(len(course), max(0.1 * reach_px, 0.5))
         hints = self.free.hints if reach_px > 10.0 else None
         observations = observations_of(self.target, camera.image_size, course.curve, places, sigma, hints)
-        return refit_camera(camera, observations, names, self.free.priors)
+        return self._refitted(camera, observations, names)
 
     def _predicted(self, camera: Camera, margin_px: float = 0.0) -> Course:
         return predict(self.target, camera, self.curves, _ROUGH_SPACING_PX, margin_px)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from ceres_cal.detect.courses import predict
 from ceres_cal.photographs.candidates import FieldSearch
 from ceres_cal.photographs.follow import LEAST_SHARE, Followed
-from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.targets import Target
 from ceres_cal.start.initialise import PHI_RANGE
 
@@ -42,7 +43,8 @@ def why_missed(followed: Followed, target: Target, *, started: bool) -> str:
         started: whether somebody said where to start.
     """
     if followed.built.is_other:
-        return "; ".join(followed.built.words())
+        help_ = ": correct the target, or have them found (--estimate)" if followed.built.dimensions else ""
+        return "; ".join(followed.built.words()) + help_
     if followed.share >= LEAST_SHARE:
         names = ", ".join(target.curve_names[number] for number in followed.absent)
         return f"there is no {names} where they should be: say which lines are not painted, or check the dimensions"
@@ -61,8 +63,7 @@ def objection(search: FieldSearch, followed: Followed) -> str:
     phi = followed.camera.phi / search.stroke_map.unit_px
     if -followed.camera.cam_from_world.rotation[2, 2] < _LEAST_UPRIGHT or not PHI_RANGE[0] < phi < PHI_RANGE[1]:
         return "its lines were not found in any view from above: start from corners"
-    share = explained(search, followed.camera)
-    of_all = explained(search, followed.camera, everywhere=True)
+    share, of_all = explained(search, followed), explained(search, followed, everywhere=True)
     if share < _EXPLAINED or of_all < (_OF_ALL if len(names) >= _MANY_CURVES else _EXPLAINED):
         share = min(share, of_all)
         return (
@@ -72,24 +73,24 @@ def objection(search: FieldSearch, followed: Followed) -> str:
     return ""
 
 
-def likelihood(search: FieldSearch, camera: Camera) -> float:
-    """How much likelier the target is where a camera puts it than lines laid anywhere: see `StrokeMap.likelihood`."""
-    course = predict(search.target, camera, search.curves, _COURSE_PX)
+def likelihood(search: FieldSearch, followed: Followed) -> float:
+    """How much likelier the target is where it was followed than lines laid anywhere: see `StrokeMap.likelihood`."""
+    course = predict(followed.target, followed.camera, search.curves, _COURSE_PX)
     near = search.stroke_map.near.at(*course.pixels.T)
     return float(search.stroke_map.likelihood(np.array(_COURSE_PX * np.sum(near)), np.array(_COURSE_PX * len(course))))
 
 
-def explained(search: FieldSearch, camera: Camera, *, everywhere: bool = False) -> float:
+def explained(search: FieldSearch, followed: Followed, *, everywhere: bool = False) -> float:
     """Of the strokes inside the target's outline, or everywhere, that could be its lines, the share that lies on them.
 
     Those could be that run along its lines or across, and are as strong as the ones on it: cables, seams, shadows and
     stripes of sun that run otherwise, or are fainter, say nothing against it.
     """
-    strokes = search.stroke_map.strokes
-    course = predict(search.target, camera, search.curves, _COURSE_PX)
+    strokes, camera, target = search.stroke_map.strokes, followed.camera, followed.target
+    course = predict(target, camera, search.curves, _COURSE_PX)
     ends = np.stack([camera.locate(strokes.ends[:, end]) @ search.grid.turn for end in (0, 1)])
     middles, along = ends.mean(axis=0), np.abs(ends[1] - ends[0])
-    places = search.grid.outline
+    places = replace(search.grid, target=target).outline
     margin = _RIM * np.ptp(places, axis=0)
     with np.errstate(invalid="ignore"):
         inside = np.all((middles > places.min(axis=0) - margin) & (middles < places.max(axis=0) + margin), axis=1)

@@ -10,7 +10,7 @@ from ceres_cal.base.arrays import Array, Indices32
 from ceres_cal.base.errors import CalibrationError
 from ceres_cal.model.parameters import Estimate, Layout, Options, Station, intrinsic_names
 from ceres_cal.model.priors import stated_prior
-from ceres_cal.model.structure import make_structure
+from ceres_cal.model.structure import make_structure, redrawn
 from ceres_cal.observations import NO_POINTS, Curves, Observations, Points, Prior, View
 from ceres_cal.observations.sights import gather_sights
 from ceres_cal.scene.camera import Camera
@@ -56,13 +56,13 @@ def problem_of(
     camera: Camera, observations: Observations, free: tuple[str, ...], priors: tuple[Prior, ...]
 ) -> tuple[Problem, Estimate]:
     """What `refit_camera` solves, and where from."""
-    names = intrinsic_names(camera.lens)
+    names, solved = intrinsic_names(camera.lens), tuple(prior.dimension for prior in priors if prior.dimension)
     freed = np.array(sorted(names.index(name) for name in free), dtype=np.int64)
     estimate = Estimate(
         {CAMERA: camera.at(camera.cam_from_world)},
         {STATION: Station(CAMERA, camera.cam_from_world)},
         {},
-        make_structure(observations.targets, {}),
+        make_structure(observations.targets, {}, solved),
     )
     layout = Layout({CAMERA: freed}, frozenset({STATION}), frozenset())
     known = tuple(stated_prior(prior, camera.lens) for prior in priors)
@@ -72,11 +72,12 @@ def problem_of(
 
 def refit_camera(
     camera: Camera, observations: Observations, free: tuple[str, ...] = (), priors: tuple[Prior, ...] = ()
-) -> Camera | None:
-    """The posed camera that one view's observations tell, from one that is near; None where they tell none.
+) -> tuple[Camera, Target] | None:
+    """The posed camera that one view's observations tell, from one that is near, and the target; None where they tell
+    none.
 
     Args:
-        free: names of the intrinsics that are free too. priors: on them.
+        free: names of the intrinsics that are free too. priors: on them, and on dimensions that are solved for.
     """
     problem, estimate = problem_of(camera, observations, free, priors)
     try:
@@ -86,4 +87,8 @@ def refit_camera(
         return None
     finite = np.all(np.isfinite(refitted.position))
     usable = not solution.failed and not refitted.folds and finite and refitted.position[2] > 0.0
-    return refitted if usable else None
+    found = solution.estimate.structure.dimensions
+    lengths = {name.partition("/")[2]: length for name, length in found.items()}
+    if not usable or not all(length > 0.0 for length in lengths.values()):
+        return None
+    return refitted, redrawn(observations.targets[TARGET], lengths)

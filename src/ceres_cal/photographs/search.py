@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array32
 from ceres_cal.base.errors import InputError
+from ceres_cal.observations import Prior
 from ceres_cal.photographs.candidates import FieldSearch, alike, candidates, prepare_search
 from ceres_cal.photographs.clicks import SIGMA_PX, unknown_optics
 from ceres_cal.photographs.facing import (
@@ -20,6 +21,7 @@ from ceres_cal.photographs.facing import (
     side_of,
 )
 from ceres_cal.photographs.follow import Followed, FreeIntrinsics, approach, refine
+from ceres_cal.photographs.grid import grid_of
 from ceres_cal.photographs.judgement import detected_curves, explained, likelihood, objection, same_labels
 from ceres_cal.photographs.refit import PointHints
 from ceres_cal.scene.camera import Camera, in_image
@@ -44,10 +46,12 @@ class Auto:
     Attributes:
         facing: which way round it is, where it looks alike turned.
         before: or the station's camera before it was moved; the way that it is turned least is taken.
+        lengths: what is known of dimensions of the target that are to be told by the photograph.
     """
 
     facing: tuple[Facing, ...] = ()
     before: Camera | None = None
+    lengths: tuple[Prior, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,27 +85,28 @@ def search(grey: Array32, target: Target, curves: Collection[str], auto: Auto) -
             too few straight lines; or nothing that `auto.facing` names.
     """
     require_sides(auto.facing, target, curves)
-    problem = prepare_search(grey, target, curves)
+    problem = prepare_search(grey, target, curves, auto.lengths)
     good: list[Followed] = []
     seen: Followed | None = None
     reason = _NO_LINES
-    for camera in candidates(problem):
-        followed = _followed(problem, _turned(problem, auto, camera))
+    for camera, grid in candidates(problem):
+        followed = _followed(replace(problem, grid=grid), auto, _turned(problem, auto, camera))
         against = objection(problem, followed)
         if not against:
             good.append(followed)
         elif seen is None or followed.share > seen.share:
             seen, reason = followed, against
-        if good and explained(problem, good[-1].camera) > _SURE:
+        if good and explained(problem, good[-1]) > _SURE:
             break
     if not good:
         return SearchResult(None, reason, seen=seen)
-    best = max(good, key=lambda one: likelihood(problem, one.camera))
+    best = max(good, key=lambda one: likelihood(problem, one))
+    problem = replace(problem, grid=grid_of(best.target, curves))
     similar = alike(problem, best.camera, detected_curves(problem, best))
-    others = [_followed(problem, _turned(problem, auto, camera)) for camera in similar]
+    others = [_followed(problem, auto, _turned(problem, auto, camera)) for camera in similar]
     distinct = [best]
     for other in (*good, *(one for one in others if not objection(problem, one))):
-        as_good = likelihood(problem, other.camera) >= _AS_GOOD * likelihood(problem, best.camera)
+        as_good = likelihood(problem, other) >= _AS_GOOD * likelihood(problem, best)
         if as_good and not any(same_labels(problem, other, one) for one in distinct):
             distinct.append(other)
     return _one_way(problem, auto, distinct)
@@ -114,16 +119,17 @@ def _turned(problem: FieldSearch, auto: Auto, camera: Camera) -> Camera:
     return ways[agreeing[0]] if agreeing else camera
 
 
-def _followed(problem: FieldSearch, camera: Camera) -> Followed:
+def _followed(problem: FieldSearch, auto: Auto, camera: Camera) -> Followed:
     """The target's lines from a camera that is about right, held by the points that it puts into the picture."""
-    return approach(problem.grey, problem.target, camera, problem.curves, _free(problem, camera))
+    free = _free(problem.target, auto, camera)
+    return approach(problem.grey, problem.target, camera, problem.curves, free)
 
 
-def _free(problem: FieldSearch, camera: Camera) -> FreeIntrinsics:
-    pixels = camera.project(problem.target.point_array)
+def _free(target: Target, auto: Auto, camera: Camera) -> FreeIntrinsics:
+    pixels = camera.project(target.point_array)
     rows = np.flatnonzero(in_image(pixels, camera.image_size))
     hints = PointHints(rows.astype(np.int32), pixels[rows], np.full(len(rows), SIGMA_PX))
-    return unknown_optics(camera.image_size, camera.phi, hints)
+    return unknown_optics(camera.image_size, camera.phi, hints, auto.lengths)
 
 
 # ---- which way round ------------------------------------------------------------------------------------------------
@@ -134,8 +140,9 @@ def _one_way(problem: FieldSearch, auto: Auto, distinct: Sequence[Followed]) -> 
     target, curves = problem.target, problem.curves
     ways = [one.camera.at(one.camera.cam_from_world @ turn) for one in distinct for turn in problem.turns]
     agreeing = _consistent(problem, auto, ways)
-    camera = ways[agreeing[0]] if agreeing else ways[0]
-    followed = refine(problem.grey, target, camera, curves, _free(problem, camera))
+    number = agreeing[0] if agreeing else 0
+    camera, drawn = ways[number], distinct[number // len(problem.turns)].target
+    followed = refine(problem.grey, drawn, camera, curves, _free(drawn, auto, camera))
     if against := objection(problem, followed):
         return SearchResult(None, against, seen=followed)
     if not agreeing:

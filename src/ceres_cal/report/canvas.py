@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,9 +21,13 @@ if TYPE_CHECKING:
 
 POINT, CURVE, OUTLIER = "#0072b2", "#009e73", "#d55e00"  # Okabe and Ito's, apart for colour-blind readers too
 INK, QUIET, PAINT, FAINT = "#1f2933", "#5b6770", "#b3bcc4", "#e8ecef"
-RAMP = ("#f1f6fa", "#d5e5f1", "#b0d0e6", "#82b4d6", "#5494c0", "#2f72a4", "#185383")
-"""From little to much: lightness alone tells it, in grey print too."""
-DIVERGING = ("#a84a00", "#e8a06b", "#ffffff", "#86b9da", "#004f80")
+DIVERGING = ("#a84a00", "#c47039", "#dc9a6d", "#f0cbb0", "#fdfdfd", "#c0dbee", "#8bbadb", "#4a8ebb", "#004f80")
+_THEMED = {
+    **dict(zip((INK, QUIET, PAINT, FAINT, "#ffffff"), ("ink", "quiet", "paint", "grid", "page"), strict=True)),
+    **dict(zip((POINT, CURVE, OUTLIER), ("point", "curve", "outlier"), strict=True)),
+    **{color: f"diverging-{number}" for number, color in enumerate(DIVERGING)},
+}
+"""Colours that the page may have otherwise, in a dark window, and what its style sheet calls them."""
 
 NARROW_IN, WIDE_IN = 3.65, 7.5
 """A picture in one column, which is what a phone shows, and one across both."""
@@ -74,6 +78,33 @@ class Drawing:
     height: float
 
 
+@dataclass(frozen=True)
+class Hover:
+    """What is said beside the pointer, by the nearest of places that lie evenly over the axes.
+
+    Attributes:
+        x, y: where the first and the last place are, in units of the axes, and how many there are.
+        values: of each place, row by row; "" where nothing is said.
+        text: of a place, with {x}, {y} and {value} in it. names: of columns and of rows, instead of their numbers.
+    """
+
+    x: tuple[float, float, int]
+    y: tuple[float, float, int]
+    values: tuple[str, ...]
+    text: str
+    names: tuple[tuple[str, ...], tuple[str, ...]] = ((), ())
+
+    @classmethod
+    def of(cls, x: Array, y: Array, values: Iterable[str], text: str) -> Hover:
+        """Of values over a grid x (X,), y (Y,) with even steps, row by row."""
+        across, down = ((float(axis[0]), float(axis[-1]), len(axis)) for axis in (x, y))
+        return cls(across, down, tuple(values), text)
+
+    def named(self, columns: Sequence[str], rows: Sequence[str] = ("",)) -> Hover:
+        """With names of the columns and rows in place of numbers."""
+        return replace(self, names=(tuple(columns), tuple(rows)))
+
+
 def to_svg(drawing: Drawing, width_in: float, name: str, *, whole_file: bool = False) -> str:
     """An <svg> element to stand in a page, or the text of a file of its own.
 
@@ -90,25 +121,38 @@ def to_svg(drawing: Drawing, width_in: float, name: str, *, whole_file: bool = F
         engine = figure.get_layout_engine()
         assert engine is not None
         engine.set(w_pad=0.03, h_pad=0.03)  # type: ignore[call-arg]
-        drawing.draw(figure.add_subplot(), width_in)
+        axes = figure.add_subplot()
+        drawing.draw(axes, width_in)
         stream = io.StringIO()
         write: Any = FigureCanvasSVG(figure).print_svg
         write(stream, metadata={"Date": None, "Creator": None})
+        where = _place_of(axes)
     text = stream.getvalue()
     element = text[text.index("<svg") :]
-    return element if whole_file else _for_page(element)
+    return element if whole_file else _for_page(element).replace("<svg", f'<svg data-axes="{where}"', 1)
+
+
+def _place_of(axes: Axes) -> str:
+    """Left, top, right and bottom of the axes as shares of the picture, and the numbers that are there."""
+    box, (left, right), (bottom, top) = axes.get_position(), axes.get_xlim(), axes.get_ylim()
+    return " ".join(f"{v:.6g}" for v in (box.x0, 1.0 - box.y1, box.x1, 1.0 - box.y0, left, top, right, bottom))
 
 
 def _for_page(text: str) -> str:
-    """A file's <svg> without what a page does not need."""
+    """A file's <svg> without what a page does not need, in the page's colours."""
     text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.S)
     text = re.sub(r' (?:width|height)="[\d.]+pt"', "", text)  # as wide as its place
     named = set(re.findall(r'(?:href="|url\()#([^")]+)', text))
     text = re.sub(r' id="([^"]+)"', lambda match: match[0] if match[1] in named else "", text)
     text = re.sub(r' xmlns(?::xlink)?="[^"]*"| version="1.1"', "", text)  # HTML knows them
     text = re.sub(r' d="[^"]+"', lambda match: re.sub(r"(\.\d\d)\d+", r"\1", match[0]), text)  # a hundredth of a point
+    text = re.sub(r"#[0-9a-f]{6}\b", lambda match: _themed(match[0]), text)
     text = text.replace("xlink:href", "href")
     return re.sub(r"\n\s*", "\n", text).strip()
+
+
+def _themed(color: str) -> str:
+    return f"var(--{_THEMED[color]},{color})" if color in _THEMED else color
 
 
 # ---- many things in one path ----------------------------------------------------------------------------------------
@@ -131,13 +175,6 @@ def crosses(axes: Axes, places: Array, color: str, size: float, **how: Any) -> N
     for slope in (1.0, -1.0):
         reach = 0.5 * size * np.array([1.0, slope])
         strokes(axes, places - reach, places + reach, color, 0.9, **how)
-
-
-def ramp(colors: tuple[str, ...]) -> Any:
-    """A colour map through these colours."""
-    from matplotlib.colors import LinearSegmentedColormap
-
-    return LinearSegmentedColormap.from_list("ramp", list(colors))
 
 
 def key(axes: Axes, columns: int = 4) -> None:

@@ -234,6 +234,11 @@ def _headline(quality: Quality, every: tuple[Reach, ...], reasons: str) -> tuple
     return level, f"{'This calibration can be trusted' if level == 'good' else 'Use it with care'}: {promised}."
 
 
+def promises(quality: Quality) -> bool:
+    """Whether the headline states any accuracy: where it does not, no number of mm is shown as good."""
+    return judge_quality(quality).level != "no" and not _doubt(quality)
+
+
 def _doubt(quality: Quality) -> str:
     """What keeps a headline from promising anything; "" where nothing does."""
     if disputed(quality):

@@ -1,4 +1,4 @@
-"""Maps over the drawn field, in mm: the standard deviation of a located point, or where two calibrations differ."""
+"""Maps over the field and over the image: how far off a located point may be, or where two calibrations differ."""
 
 from __future__ import annotations
 
@@ -9,15 +9,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ceres_cal.base.arrays import Array
-from ceres_cal.base.words import metres, mm, sentence, short
+from ceres_cal.base.words import mm, sentence, short
 from ceres_cal.calibration import Calibration
 from ceres_cal.moves import StationComparison
 from ceres_cal.report import canvas
-from ceres_cal.report.canvas import INK, OUTLIER, QUIET, RAMP, Drawing
+from ceres_cal.report.canvas import INK, OUTLIER, QUIET, Drawing, Hover
+from ceres_cal.report.grounds import worst_radius
 from ceres_cal.report.material import Material, image_border, paint_of
 from ceres_cal.report.page import Figure, Table
+from ceres_cal.report.scale import COLORS, MM, ON_COLOR, PX, Scale, spoken
 from ceres_cal.scene.heights import at_height
-from ceres_cal.uncertainty import FieldMap
+from ceres_cal.uncertainty import FieldMap, image_grid
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -27,38 +29,43 @@ _SERIES = (
     (1.0, 1.5, 2.0, 3.0, 5.0, 7.0),
     (1.0, 1.2, 1.5, 1.8, 2.2, 2.7, 3.3, 3.9, 4.7, 5.6, 6.8, 8.2),
 )
-"""Rounder steps first; the finer ones where the others would leave too few colours."""
+"""Rounder steps first; the finer ones where the others would leave too few lines."""
 _FEWEST_STEPS = 6
 _TABLE_COLUMNS, _TABLE_ROWS = 7, 6
+_DOT, _DOT_ALPHA = 1.1, 0.45
+_MOST_LINES = 4
+_LABEL = "95 % within, mm"
 
 
 @dataclass(frozen=True, eq=False)
 class MapDrawing:
-    """What is drawn of a map.
+    """What is drawn of a map over the field.
 
     Attributes:
         x_m (X,), y_m (Y,), values (Y, X): mm, NaN where nothing is shown, infinite where nothing can be said.
-        levels: (L,) steps of colour, mm. label: of the scale of colours.
+        label: of the scale of colours.
         paint: (S, 2) m each, what lies in the world. border: (B, 2) m, of the image. camera: (3,) m.
-        worst_m: the place that is ringed, where there is one.
+        worst_m: the place that is ringed, where there is one. observed: (N, 2) m, where observations lie.
     """
 
     x_m: Array
     y_m: Array
     values: Array
-    levels: Array
     label: str
     paint: Sequence[Array]
     border: Array
     camera: Array
     worst_m: tuple[float, float] | None = None
+    observed: Array | None = None
 
     def draw(self, axes: Axes, width_in: float) -> None:
         """The map with the field's lines, the border of the image, and the camera on top."""
-        self._fill(axes)
+        fill(axes, MM, (self.x_m, self.y_m), self.values)
         for line in self.paint:
             axes.plot(*line.T, color="white", linewidth=1.8, alpha=0.8)
             axes.plot(*line.T, color=QUIET, linewidth=0.6)
+        if self.observed is not None:
+            canvas.dots(axes, self.observed, ON_COLOR, _DOT, alpha=_DOT_ALPHA)
         axes.plot(*self.border.T, color=QUIET, linewidth=0.8, dashes=(3, 2))
         axes.plot(*self.camera[:2], "^", color=INK, markersize=4, markeredgecolor="white", markeredgewidth=0.6)
         if self.worst_m is not None:
@@ -67,6 +74,7 @@ class MapDrawing:
         axes.set(xlim=(self.x_m[0] - margin, self.x_m[-1] + margin), aspect="equal", xlabel="x, m", ylabel="y, m")
         axes.set(ylim=(self.y_m[0] - margin, self.y_m[-1] + margin))
         axes.grid(visible=False)
+        MM.bar(axes, self.label)
 
     @property
     def drawing(self) -> Drawing:
@@ -74,39 +82,21 @@ class MapDrawing:
         shape = float(np.ptp(self.y_m) / np.ptp(self.x_m))
         return Drawing(self.draw, min(max(shape * 0.9 + 0.2, 0.4), 1.4))
 
-    def _fill(self, axes: Axes) -> None:
-        from matplotlib.colors import BoundaryNorm
 
-        colors = canvas.ramp(RAMP)
-        norm = BoundaryNorm(self.levels, colors.N)
-        unknown = np.isinf(self.values)
-        if unknown.any():
-            unsure = unknown.astype(float)
-            axes.contourf(self.x_m, self.y_m, unsure, [0.5, 1.5], colors=["#fcede4"], hatches=["////"])
-        known = np.where(unknown, np.nan, self.values)
-        if np.isfinite(known).any():
-            axes.contourf(self.x_m, self.y_m, known, self.levels, cmap=colors, norm=norm)
-            axes.contour(self.x_m, self.y_m, known, self.levels[1:-1], colors="white", linewidths=0.5)
-        self._bar(axes, colors, norm)
-
-    def _bar(self, axes: Axes, colors: object, norm: object) -> None:
-        from matplotlib.cm import ScalarMappable
-
-        figure = axes.get_figure()
-        assert figure is not None
-        scale = ScalarMappable(norm, colors)  # type: ignore[arg-type]
-        bar = figure.colorbar(
-            scale, ax=axes, orientation="horizontal", ticks=self.levels, aspect=45, shrink=0.9, pad=0.02,
-            spacing="uniform",
-        )  # fmt: skip
-        bar.ax.set_xticklabels([short(level) for level in self.levels.tolist()])
-        bar.set_label(self.label)
-        bar.ax.tick_params(length=0)
-        bar.outline.set_visible(False)
+def fill(axes: Axes, scale: Scale, grid: tuple[Array, Array], values: Array) -> None:
+    """The colours of a map (Y, X) over x and y, and lines of equal amounts with what they are."""
+    scale.fill(axes, *grid, values)
+    known = np.where(np.isinf(values), np.nan, values)
+    if np.isfinite(known).any():
+        levels = levels_of(known)
+        few = levels[1 :: -(-len(levels) // _MOST_LINES)]
+        lines = axes.contour(*grid, known, few, colors=ON_COLOR, linewidths=0.4)
+        for text in axes.clabel(lines, fmt=short, fontsize=6.5, colors=ON_COLOR):
+            text.set_bbox({"facecolor": COLORS[0], "edgecolor": "none", "pad": 0.6, "alpha": 0.75})
 
 
 def levels_of(*maps: Array) -> Array:
-    """Steps of colour, mm: round numbers around everything that the maps (Y, X) show, at least three."""
+    """Lines of equal amounts: round numbers around everything that the maps (Y, X) show, at least three."""
     values = np.concatenate([one[np.isfinite(one)] for one in maps])
     if not len(values):
         return np.array([1.0, 2.0, 5.0])
@@ -121,57 +111,160 @@ def levels_of(*maps: Array) -> Array:
     return levels
 
 
-# ---- the standard deviation of a located point ----------------------------------------------------------------------
+# ---- how far off a located point may be -----------------------------------------------------------------------------
 
 
 def map_figure(material: Material, station: str, number: int) -> Figure:
-    """One map of one station; the colours are the same on both of its heights."""
-    maps = material.maps[station]
-    one, drawn = maps[number], material.drawn_maps[station][number]
+    """One map of one station over the field, at one of its heights."""
+    one, drawn = material.maps[station][number], material.drawn_maps[station][number]
+    posed = material.calibration.stations[station]
     map_drawing = MapDrawing(
         drawn.x_m,
         drawn.y_m,
-        drawn.sd_mm,
-        levels_of(*(each.sd_mm for each in (*maps, *material.drawn_maps[station]))),
-        "standard deviation of a located point, mm",
+        drawn.radius_95_mm,
+        _LABEL,
         [line[:, :2] for line in paint_of(material.fields)],
-        image_border(material.calibration.stations[station], one.height_m),
-        material.calibration.stations[station].position,
-        one.worst_place_m if np.isfinite(one.worst_mm) else None,
+        image_border(posed, one.height_m),
+        posed.position,
+        _worst_place(one) if np.isfinite(worst_radius(one)) else None,
+        _within(posed.locate(material.observed(station)), one) if one.height_m == 0.0 else None,
     )
     where = sentence(at_height(one.height_m)) + ("" if one.height_m == 0.0 else ", robot height")
     return Figure(
         f"map-{list(material.maps).index(station)}-{number}",
-        where + (f", {station}" if len(material.maps) > 1 else ""),
-        f"{_reading(one)}. Dashed: the border of the image, white beyond it. Triangle: the camera.",
+        where + _named(material, station),
+        f"{_reading(one)}. Dashed: the border of the image, open beyond it. Triangle: the camera."
+        + (" Dots: observations." if one.height_m == 0.0 else ""),
         map_drawing.drawing,
         _grid_table(one),
+        hover=Hover.of(one.x_m, one.y_m, spoken(one.radius_95_mm), "x {x} m, y {y} m: 95 % within {value} mm"),
     )
 
 
+def _named(material: Material, station: str) -> str:
+    return f", {station}" if len(material.maps) > 1 else ""
+
+
+def _worst_place(one: FieldMap) -> tuple[float, float]:
+    row, column = np.unravel_index(np.nanargmax(one.radius_95_mm), one.radius_95_mm.shape)
+    return float(one.x_m[column]), float(one.y_m[row])
+
+
+def _within(places: Array, one: FieldMap) -> Array:
+    """Those that the map shows."""
+    low, high = (one.x_m[0], one.y_m[0]), (one.x_m[-1], one.y_m[-1])
+    with np.errstate(invalid="ignore"):
+        return np.asarray(places[np.all((places >= low) & (places <= high), axis=1)])
+
+
 def _reading(one: FieldMap) -> str:
-    if np.isnan(one.worst_mm):
+    radius = worst_radius(one)
+    if np.isnan(radius):
         return "The image shows no place of the field"
-    if np.isinf(one.worst_mm):
+    if np.isinf(radius):
         return "Hatched: the observations cannot tell how far off a located point is"
-    worst = f"{mm(one.worst_mm)} at worst (ring, {metres(one.worst_place_m)})"
-    return f"Darker is worse: {mm(one.mean_mm)} in the mean, {worst}"
+    return f"Darker is worse: 95 % of the points located at the worst place (ring) are within {mm(radius)}"
 
 
 def _grid_table(one: FieldMap) -> Table:
     columns, rows = evenly(len(one.x_m), _TABLE_COLUMNS), evenly(len(one.y_m), _TABLE_ROWS)[::-1]
     return Table(
-        ("mm at y \\ x", *(f"{one.x_m[c]:.1f} m" for c in columns)),
-        tuple(
-            (f"{one.y_m[r]:.1f} m", *("∞" if np.isinf(sd) else short(sd) for sd in one.sd_mm[r, columns].tolist()))
-            for r in rows
-        ),
+        ("95 % within, mm, at y \\ x", *(f"{one.x_m[c]:.1f} m" for c in columns)),
+        tuple((f"{one.y_m[r]:.1f} m", *cells(one.radius_95_mm[r, columns])) for r in rows),
     )
+
+
+def cells(values: Array) -> tuple[str, ...]:
+    """A row of a map's table."""
+    return tuple("∞" if np.isinf(value) else short(value) for value in values.tolist())
 
 
 def evenly(count: int, most: int) -> list[int]:
     """At most so many of `count` numbers from 0 on, that lie evenly, both ends among them."""
     return [int(number) for number in np.unique(np.linspace(0, count - 1, most).round())]
+
+
+# ---- over the image -------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class _OverImage:
+    """What is drawn over one image: radii (Y, X) at x (X,), y (Y,) px, observations (N, 2) px, and the scale."""
+
+    image_size: tuple[int, int]
+    x: Array
+    y: Array
+    radii: Array
+    observed: Array
+    scale: Scale
+
+    def draw(self, axes: Axes, width_in: float) -> None:
+        """The map with the observations on top."""
+        width, height = self.image_size
+        fill(axes, self.scale, (self.x, self.y), self.radii)
+        canvas.dots(axes, self.observed, ON_COLOR, _DOT, alpha=_DOT_ALPHA)
+        axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), aspect="equal", xlabel="px")
+        axes.grid(visible=False)
+        self.scale.bar(axes, f"95 % within, {self.scale.unit}")
+
+    def figure(self, name: str, title: str, what: str) -> Figure:
+        """With how much of the image was observed."""
+        columns, rows = evenly(len(self.x), _TABLE_COLUMNS), evenly(len(self.y), _TABLE_ROWS)
+        width, height = self.image_size
+        unit = self.scale.unit
+        return Figure(
+            name,
+            title,
+            f"{what} Dots: observations, in {_covered(self.observed, self.image_size)} of 192 parts of the image; "
+            "where there are none, the model of the lens speaks alone.",
+            Drawing(self.draw, 0.92 * height / width + 0.2),
+            Table(
+                (f"95 % within, {unit}, at y \\ x", *(f"{self.x[c]:.0f} px" for c in columns)),
+                tuple((f"{self.y[r]:.0f} px", *cells(self.radii[r, columns])) for r in rows),
+            ),
+            hover=Hover.of(self.x, self.y, spoken(self.radii), f"pixel {{x}}, {{y}}: 95 % within {{value}} {unit}"),
+        )
+
+
+def _covered(pixels: Array, image_size: tuple[int, int]) -> int:
+    """How many of 16 x 12 parts of an image have an observation in them."""
+    parts = np.floor((pixels + 0.5) / image_size * (16, 12)).astype(int)
+    return len(np.unique(parts, axis=0))
+
+
+def image_figure(material: Material, station: str) -> Figure:
+    """The map of one station on the floor, over its image instead of the field."""
+    posed = material.calibration.stations[station]
+    x, y = image_grid(posed.image_size)
+    pixels = np.column_stack([part.ravel() for part in np.meshgrid(x, y)])
+    radii = np.full(len(pixels), np.nan)
+    shown = np.isfinite(posed.locate(pixels)).all(axis=1)
+    assert material.uncertainty is not None
+    radii[shown] = 1e3 * material.uncertainty.located(pixels[shown], 0.0, station).radius_95_m
+    drawn = _OverImage(posed.image_size, x, y, radii.reshape(len(y), len(x)), material.observed(station), MM)
+    return drawn.figure(
+        f"image-{list(material.maps).index(station)}",
+        f"On the floor, over the image{_named(material, station)}",
+        "The same, where the camera sees it.",
+    )
+
+
+def lens_image_figure(material: Material, name: str) -> Figure:
+    """How well a camera that has no place over a field knows its own image, px."""
+    assert material.uncertainty is not None
+    known = material.uncertainty.map_px(name)
+    stations = [s for s, owner in material.observations.stations.items() if owner == name]
+    observed = np.concatenate([material.observed(station) for station in stations])
+    drawn = _OverImage(
+        material.calibration.cameras[name].image_size, known.x_px, known.y_px, known.radius_95_px, observed, PX
+    )
+    several = len(material.observations.cameras) > 1
+    return drawn.figure(
+        f"image-{list(material.observations.cameras).index(name)}",
+        "Over the image" + (f", {name}" if several else ""),
+        "How far off in the picture a direction may be that this lens gives, when the camera is turned as well as can "
+        "be. Darker is worse.",
+    )
 
 
 # ---- where two calibrations differ ----------------------------------------------------------------------------------
@@ -186,7 +279,6 @@ def comparison_svg(comparison: StationComparison, before: Calibration) -> str:
         comparison.x_m,
         comparison.y_m,
         comparison.errors_mm,
-        levels_of(comparison.errors_mm),
         f"{comparison.station}, {where}: difference, mm ({comparison.mean_mm:.2f} on average)",
         [line[:, :2] for line in paint_of(fields)],
         image_border(camera, comparison.height_m),

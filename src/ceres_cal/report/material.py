@@ -27,6 +27,7 @@ _CURVE_PIECES = 95
 _FINER = 2  # than the maps' own grid, where that is quick
 _BORDER_STEPS = 60
 _MOST_SEAMS = 6
+_MOST_DOTS = 2000  # observations drawn into one map
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,6 +110,13 @@ class Material(Quality):
         """(N,) bool: rows of the residual table that a camera observed."""
         owners = np.array([view["camera"] == camera for view in self.diagnosis.table.views])
         return np.asarray(owners[self.diagnosis.table.view])
+
+    def observed(self, station: str) -> Array:
+        """(N, 2) px: where observations of a station lie that took part, evenly thinned where they are many."""
+        table = self.diagnosis.table
+        seen = np.array([view["station"] == station for view in table.views])
+        pixels = table.pixel[seen[table.view] & table.inlier]
+        return np.asarray(pixels[:: -(-len(pixels) // _MOST_DOTS) or 1])
 
 
 def paint_of(targets: Iterable[Target]) -> Iterator[Array]:

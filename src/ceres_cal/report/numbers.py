@@ -6,7 +6,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from ceres_cal.base.transforms import euler_from_rotation
+from ceres_cal.base.arrays import Array
+from ceres_cal.base.transforms import euler_from_rotation, rotation_exp
 from ceres_cal.base.words import DASH, at_precision, bounds_text, fixed, grouped, mm, powered, sentence, short
 from ceres_cal.calibration import LensChoice
 from ceres_cal.model.parameters import anchored_stations
@@ -20,6 +21,8 @@ from ceres_cal.uncertainty import Verdict
 
 _HEAD = ("", "value", "± sd", "by the model alone", "95 % bounds", "verdict")
 _MOST_OFFSETS = 40
+_ANGLES = ("alpha, the paper's", "beta, the paper's", "gamma, the paper's", "tilt from straight down")
+_TURN = 1e-6  # rad
 _Row = tuple[str, ...]
 
 
@@ -97,12 +100,14 @@ def _width(sd: float, unit: str, plain: bool) -> str:
 
 
 def bounds(verdict: Verdict, unit: str = "") -> str:
-    """What 95 % bounds leave, as finely as they lie apart."""
-    width = verdict.high - verdict.low
-    if verdict.key.unit.startswith("px^") or not np.isfinite(width) or verdict.low == 0.0:
-        return bounds_text(verdict.low, verdict.high, unit, ".4g")
-    places = int(np.clip(2 - np.floor(np.log10(max(width, 1e-12))), 0, 9))
-    return bounds_text(verdict.low, verdict.high, unit, f".{places}f")
+    """What 95 % bounds leave, as finely as the value is given."""
+    if np.isfinite([verdict.low, verdict.high, verdict.sd]).all() and verdict.low != 0.0:
+        low, high = (at_precision(bound, verdict.sd) for bound in (verdict.low, verdict.high))
+        if ("e" in low) != ("e" in high):  # as many places, without powers
+            places = 1 - int(np.floor(np.log10(verdict.sd)))
+            low, high = (f"{bound:.{places}f}" for bound in (verdict.low, verdict.high))
+        return f"{low} to {high}{f' {unit}' if unit else ''}"
+    return bounds_text(verdict.low, verdict.high, unit, ".4g")
 
 
 def _station(material: Material, name: str) -> Table:
@@ -117,25 +122,62 @@ def _station(material: Material, name: str) -> Table:
              material.verdicts.get(("station", name, quantity)))
         for quantity, value in zip(("x", "y", "height"), camera.position, strict=True)
     ]  # fmt: skip
-    angles = np.degrees(euler_from_rotation(camera.cam_from_world.rotation))
-    for word, angle in zip(("alpha", "beta", "gamma"), angles.tolist(), strict=True):
-        rows.append((f"{word}, the paper's", f"{angle:.4f}°", "", "", "", ""))
-    rows.append(("tilt from straight down", f"{camera.tilt_deg:.3f}°", "", "", "", ""))
-    for axis in "xyz":
-        verdict = material.verdicts.get(("station", name, f"turn_{axis}"))
-        if verdict is not None:
-            sd = float(np.degrees(verdict.sd))
-            limits = f"± {short(0.5 * float(np.degrees(verdict.high - verdict.low)))}°"
-            sds = (f"{short(one)}°" if np.isfinite(one) else "unknown" for one in (sd, sd / verdict.factor))
-            rows.append((f"turn about the camera's {axis}", "", *sds, limits, verdict.verdict))
+    rows += _angles(material, name, camera)
     return Table(_HEAD, tuple(rows), caption, stacked=True)
+
+
+def _angles(material: Material, name: str, camera: Camera) -> Iterator[_Row]:
+    """The paper's angles and the tilt, with what turns about the camera's axes leave of them."""
+    every = (material.verdicts.get(("station", name, f"turn_{axis}")) for axis in "xyz")
+    turns = [verdict for verdict in every if verdict is not None]
+    rotation = camera.cam_from_world.rotation
+    posterior = material.calibration.posterior
+    if len(turns) == 3 and posterior is not None:
+        at = [posterior.column("station", name, f"turn_{axis}") for axis in "xyz"]
+        sd = np.array([(turn.sd, turn.sd / turn.factor) for turn in turns])
+        widths = _angle_sds(rotation, posterior.covariance[np.ix_(at, at)], sd)
+    else:
+        widths = np.full((len(_ANGLES), 2), np.nan)
+    reach = 0.0 if posterior is None else posterior.half_width
+    for word, angle, (width, alone) in zip(_ANGLES, _angles_deg(rotation), widths.tolist(), strict=True):
+        shown = f"{at_precision(float(angle), width)}°"
+        if np.isfinite(width):
+            yield word, shown, f"{short(width)}°", f"{short(alone)}°", f"± {short(reach * width)}°", ""
+        else:
+            yield word, shown, *(("", "", "", "not free") if np.isnan(width) else ("unknown", "", "", ""))
+
+
+def _angle_sds(rotation: Array, covariance: Array, sd: Array) -> Array:
+    """(4, n) degrees: of the angles, by the correlation of the three turns and each column of their sd (3, n) rad."""
+    own = np.sqrt(np.diagonal(covariance))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        correlation = covariance / own[:, None] / own
+    slopes = np.stack(
+        [(_angles_deg(rotation_exp(_TURN * axis) @ rotation) - _angles_deg(rotation)) / _TURN for axis in np.eye(3)], 1
+    )
+    slopes = (slopes + 180.0 / _TURN) % (360.0 / _TURN) - 180.0 / _TURN  # a turn past 180 degrees is a small one
+    spread = np.stack([np.einsum("ai,ij,aj->a", slopes * s, correlation, slopes * s) for s in sd.T], 1)
+    return np.where(np.isfinite(spread), np.sqrt(np.maximum(spread, 0.0)), np.inf)
+
+
+def _angles_deg(rotation: Array) -> Array:
+    """(4,) alpha, beta, gamma and the tilt."""
+    tilt = np.arctan2(np.hypot(*rotation[2, :2]), -rotation[2, 2])
+    return np.degrees([*euler_from_rotation(rotation), tilt])
 
 
 def _as_built(material: Material) -> Iterator[Piece]:
     structure = material.calibration.estimate.structure
-    if not len(structure.names):
+    lengths = [(name, *name.partition("/")[::2], length) for name, length in structure.dimensions.items()]
+    solved = tuple(
+        _row(name, length, "m", material.verdicts.get(("dimension", target, one)))
+        for name, target, one, length in lengths
+    )
+    if solved:
+        yield Table(_HEAD, solved, "Dimensions that were solved for", stacked=True)
+    if not structure.own:
         return
-    order = np.argsort(-np.abs(structure.values), kind="stable")[:_MOST_OFFSETS]
+    order = np.argsort(-np.abs(structure.values[: structure.own]), kind="stable")[:_MOST_OFFSETS]
     rows = []
     for i in order:
         target, _, feature = structure.names[i].partition("/")
@@ -143,7 +185,7 @@ def _as_built(material: Material) -> Iterator[Piece]:
         sd = 1e3 * verdict.sd if verdict is not None else np.nan
         rows.append((structure.names[i], f"{1e3 * structure.values[i]:+.2f} mm", f"{short(sd)} mm",
                      f"{short(1e3 * float(structure.sigma_m[i]))} mm"))  # fmt: skip
-    rest = len(structure.names) - len(order)
+    rest = structure.own - len(order)
     yield from (Text(f"{sentence(words)}.") for words in words_of(material.calibration.as_built))
     yield Table(("", "off its drawing", "± sd", "tolerance"), tuple(rows), "Targets as built", stacked=True)
     if rest:

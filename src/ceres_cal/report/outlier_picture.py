@@ -33,7 +33,10 @@ def outliers(material: Material) -> Figure | None:
         places = np.arange(len(named))
         axes.barh(places, [number for _, number in named], height=0.62, color=OUTLIER)
         for place, (name, number) in enumerate(named):
-            axes.text(number, place, f" {number} of {totals[name]}", va="center", fontsize=6.5, color=INK)
+            text = f"{number} of {totals[name]}"
+            axes.annotate(
+                text, (number, place), (3, 0), textcoords="offset points", va="center", fontsize=6.5, color=INK
+            )
         names = [_short_name(name, several) for name, _ in named]
         axes.set_yticks(places, names, fontsize=6.5)
         axes.tick_params(axis="y", length=0)

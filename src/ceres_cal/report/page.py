@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import json
 from base64 import b64encode
 from collections.abc import Sequence
 from dataclasses import dataclass
+from hashlib import sha256
 from html import escape
 from importlib.resources import files
 from typing import Protocol
+from urllib.parse import quote
 
 from ceres_cal.base.words import grouped
-from ceres_cal.report.canvas import NARROW_IN, WIDE_IN, Drawing, to_svg
+from ceres_cal.report.canvas import NARROW_IN, WIDE_IN, Drawing, Hover, to_svg
 
-_MOST_ROWS = 200  # of a table
 _SHORT = 14  # letters that stay on one line
 
 
@@ -50,16 +52,17 @@ class BulletList:
 class Table:
     """Columns under their heads; the first column names its row.
 
-    Of more than 200 rows the first are shown, and how many there are. `stacked`: on a phone each row becomes a card.
+    Of more than `most` rows the first are shown, and how many there are. `stacked`: on a phone each row becomes a card.
     """
 
     head: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
     caption: str = ""
     stacked: bool = False
+    most: int = 200
 
     def html(self) -> str:
-        shown = self.rows[:_MOST_ROWS]
+        shown = self.rows[: self.most]
         head = "".join(f'<th scope="col">{escape(name)}</th>' for name in self.head)
         body = "".join(self._row(row) for row in shown)
         caption = f"<caption>{escape(self.caption)}</caption>" if self.caption else ""
@@ -80,7 +83,8 @@ class Table:
 class Figure:
     """A picture with a title, a sentence that says how to read it, and the table behind it.
 
-    A wide one is drawn twice, for a wide and for a narrow window.
+    A wide one is drawn twice, for a wide and for a narrow window. `hover` is what is said beside the pointer; whoever
+    has none finds it in the table.
     """
 
     name: str
@@ -90,9 +94,12 @@ class Figure:
     table: Table
     wide: bool = False
     narrow_drawing: Drawing | None = None
+    hover: Hover | None = None
 
     def html(self) -> str:
         label = f'role="img" aria-label="{escape(self.title)}"'
+        if self.hover is not None:
+            label += f' data-hover="{escape(json.dumps(vars(self.hover), separators=(",", ":"), ensure_ascii=False))}"'
         narrow = to_svg(self.narrow_drawing or self.drawing, NARROW_IN, f"{self.name}-narrow")
         if self.wide:
             wide = to_svg(self.drawing, WIDE_IN, f"{self.name}-wide")
@@ -139,6 +146,18 @@ class Gallery:
 
 
 @dataclass(frozen=True)
+class Folded:
+    """Pieces that are there when somebody asks for them."""
+
+    title: str
+    pieces: tuple[Piece, ...]
+
+    def html(self) -> str:
+        body = "".join(piece.html() for piece in self.pieces)
+        return f'<details class="folded"><summary>{escape(self.title)}</summary>{body}</details>'
+
+
+@dataclass(frozen=True)
 class Tile:
     """One large number: what it is, the number, its unit, and what to know about it."""
 
@@ -168,19 +187,19 @@ class Tiles:
 
 @dataclass(frozen=True)
 class Card:
-    """One finding: a sentence, what to do, and small facts."""
+    """One finding: a sentence, what to do where that is known, small facts, and a file beside the page to look at."""
 
     level: str
     sentence: str
     advice: str
     facts: tuple[str, ...]
+    link: str = ""
 
     def html(self) -> str:
         facts = "".join(f"<li>{escape(fact)}</li>" for fact in self.facts)
-        return (
-            f"<article{_class('card', self.level)}><h3>{escape(self.sentence)}</h3>"
-            f'<p>{escape(self.advice)}</p><ul class="facts">{facts}</ul></article>'
-        )
+        title = f'<a href="{quote(self.link)}">{escape(self.sentence)}</a>' if self.link else escape(self.sentence)
+        advice = f"<p>{escape(self.advice)}</p>" if self.advice else ""
+        return f'<article{_class("card", self.level)}><h3>{title}</h3>{advice}<ul class="facts">{facts}</ul></article>'
 
 
 @dataclass(frozen=True)
@@ -202,17 +221,22 @@ def _class(*names: str) -> str:
     return f' class="{known}"' if known else ""
 
 
-def page(title: str, about: str, chapters: Sequence[Chapter], foot: str) -> str:
-    """The whole page, which needs nothing from elsewhere."""
-    style = files("ceres_cal.report").joinpath("style.css").read_text(encoding="utf-8")
+def page(title: str, about: str, chapters: Sequence[Chapter], foot: str, kind: str = "Calibration report") -> str:
+    """The whole page, which needs nothing from elsewhere, and in which no script but its own runs."""
+    style, script = (
+        files("ceres_cal.report").joinpath(name).read_text(encoding="utf-8") for name in ("style.css", "hover.js")
+    )
+    own = b64encode(sha256(script.encode()).digest()).decode("ascii")
     links = "".join(f'<a href="#{c.name}">{escape(c.title)}</a>' for c in chapters[1:])
     head, *rest = (chapter.html() for chapter in chapters)
     return (
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         "<meta http-equiv=\"Content-Security-Policy\" content=\"default-src 'none'; style-src 'unsafe-inline'; "
-        'img-src data:">\n<link rel="icon" href="data:,">\n'
+        f"script-src 'sha256-{own}'; img-src data:\">\n"
+        '<meta name="color-scheme" content="light dark">\n<link rel="icon" href="data:,">\n'
         f"<title>{escape(title)}</title>\n<style>\n{style}</style>\n</head>\n<body>\n"
-        f"<header><p>Calibration report</p><h1>{escape(title)}</h1><p>{escape(about)}</p></header>\n<main>\n"
-        f"{head}\n<nav>{links}</nav>\n{chr(10).join(rest)}\n</main>\n<footer>{escape(foot)}</footer>\n</body>\n</html>\n"
+        f"<header><p>{escape(kind)}</p><h1>{escape(title)}</h1><p>{escape(about)}</p></header>\n<main>\n"
+        f"{head}\n<nav>{links}</nav>\n{chr(10).join(rest)}\n</main>\n<footer>{escape(foot)}</footer>\n"
+        f"<script>{script}</script>\n</body>\n</html>\n"
     )

@@ -32,6 +32,7 @@ class Seam:
 
 def quality_of(calibration: Calibration, observations: Observations, diagnosis: Diagnosis | None = None) -> Quality:
     """A calibration diagnosed on its own observations, on a sample of very many; not where nothing was minimised."""
+    observations = calibration.drawn_alike(observations)
     if not calibration.rounds:
         return Quality(calibration, observations, diagnosis)
     try:

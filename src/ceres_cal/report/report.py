@@ -12,12 +12,13 @@ from ceres_cal.calibration import Calibration
 from ceres_cal.diagnostics import Choice, Diagnosis, diagnose
 from ceres_cal.observations import Observations
 from ceres_cal.report.findings import findings
+from ceres_cal.report.grounds import promises
 from ceres_cal.report.lens_picture import distortion
-from ceres_cal.report.maps import map_figure
+from ceres_cal.report.maps import image_figure, lens_image_figure, map_figure
 from ceres_cal.report.material import ClosedForm, FramePhotographs, Material
 from ceres_cal.report.numbers import numbers
 from ceres_cal.report.outlier_picture import outliers
-from ceres_cal.report.page import Chapter, Figure, Gallery, Text, page
+from ceres_cal.report.page import Chapter, Figure, Folded, Gallery, Piece, Text, page
 from ceres_cal.report.residual_pictures import against_radius, by_frame, vectors
 from ceres_cal.report.solve_pictures import against_closed_form, convergence, correlation
 from ceres_cal.report.verdict import verdict_chapter
@@ -27,9 +28,11 @@ MOST_CAMERAS = 8
 """Cameras, and stations, that have pictures of their own; the others are in the tables alone."""
 
 _OF_MAPS = (
-    "Standard deviation of a point that is located, in mm, over the field as drawn: what the calibration itself is "
-    "unsure of. The noise of the pixel that is asked about comes on top; model error is not in it."
+    "How far off a located point may be, by what the calibration itself is unsure of: 95 % are within the mm shown. "
+    "Blue is good, amber wants care, brown is not to be used, in every report alike. The noise of the pixel that is "
+    "asked about comes on top; model error is not in it."
 )
+_NO_PROMISE = "The verdict above promises no accuracy: these maps hold only if what it doubts is set right."
 
 
 def make_report(
@@ -96,11 +99,30 @@ def _pictures(material: Material) -> Iterator[Chapter]:
         pictures += [against_radius(material, name), distortion(material, name)]
     pictures += [picture for picture in (by_frame(material), outliers(material)) if picture is not None]
     yield Chapter("residuals", "Residuals and the lens", (*_left_out(cameras), Gallery(tuple(pictures))))
-    if material.maps:
-        stations = list(material.maps)
-        maps = [map_figure(material, name, number) for name in stations[:MOST_CAMERAS] for number in (0, 1)]
-        yield Chapter("maps", "How well places are told", (Text(_OF_MAPS), *_left_out(stations), Gallery(tuple(maps))))
+    places = tuple(_places(material))
+    if places:
+        yield Chapter("maps", "How well places are told", places)
     yield _solve(material)
+
+
+def _places(material: Material) -> Iterator[Piece]:
+    """Maps over the image beside those over the field; of cameras without a place over one, over the image alone."""
+    if material.uncertainty is None:
+        return
+    stations = list(material.maps)
+    pictures = []
+    for name in stations[:MOST_CAMERAS]:
+        pictures += [map_figure(material, name, 0), image_figure(material, name), map_figure(material, name, 1)]
+    owners = {material.observations.stations[name] for name in stations}
+    without = [name for name in material.observations.cameras if name not in owners]
+    pictures += [lens_image_figure(material, name) for name in without[:MOST_CAMERAS]]
+    if stations:
+        yield Text(_OF_MAPS)
+    if not promises(material):
+        yield Text(_NO_PROMISE, "warning")
+    yield from _left_out(stations)
+    yield from _left_out(without)
+    yield Gallery(tuple(pictures))
 
 
 def _left_out(names: list[str]) -> tuple[Text, ...]:
@@ -115,7 +137,8 @@ def _solve(material: Material) -> Chapter:
         figures.insert(1, against_closed_form(material, closed))
     texts = () if isinstance(closed, ClosedForm) else (Text(f"No closed form to compare with: {closed}.", "note"),)
     gallery = Gallery(tuple(figure for figure in figures if figure is not None))
-    return Chapter("solve", "The solve", (gallery, *texts))
+    folded = Folded("Convergence, the closed form, and what may be wrong together", (gallery, *texts))
+    return Chapter("solve", "The solve", (folded,))
 
 
 def _about(material: Material) -> str:

@@ -14,9 +14,10 @@ from ceres_cal.base.words import fixed, grouped, short
 from ceres_cal.diagnostics import ResidualTable, Summary
 from ceres_cal.diagnostics.summaries import RadiusTrend
 from ceres_cal.report import canvas
-from ceres_cal.report.canvas import CURVE, INK, OUTLIER, PAINT, POINT, QUIET, Drawing
+from ceres_cal.report.canvas import CURVE, INK, OUTLIER, PAINT, POINT, QUIET, Drawing, Hover
 from ceres_cal.report.material import Material, paint_of
 from ceres_cal.report.page import Figure, Table
+from ceres_cal.report.scale import spoken
 from ceres_cal.scene.camera import Camera
 
 if TYPE_CHECKING:
@@ -61,7 +62,7 @@ def vectors(material: Material, name: str) -> Figure:
         f"vectors-{_number_of(material, name)}",
         f"Residual vectors over the image{_owner_suffix(material, name)}",
         f"Each stroke leads from an observation to where the model puts it, {field.enlarged} times enlarged; of a line "
-        "or arc it is the shortest way to the curve. Strokes that point anyhow are noise. Dark: means of regions that "
+        "or arc it is the shortest way to the curve. Strokes that point anyhow are noise. Thick: means of regions that "
         f"noise cannot explain ({len(means.places)} of {means.regions}); where they grow or turn together, the model "
         f"is wrong.{_thinned(len(field.inliers) + len(field.outliers), len(inliers) + len(outliers))}",
         Drawing(field.draw, 0.93 * shape + 0.07),
@@ -294,6 +295,7 @@ def by_frame(material: Material) -> Figure:
             ("frame", "points", "rms px", "curves", "rms px", "out"),
             tuple(_summary_row(frames, i, frames.names[i]) for i in range(len(frames.names))),
         ),
+        hover=Hover.of(number, np.zeros(1), spoken(frames.rms_sigma), "{x}: {value} sigma").named(frames.names),
     )
 
 

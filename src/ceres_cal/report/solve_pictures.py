@@ -12,7 +12,7 @@ from ceres_cal.base.words import counted, fixed, short
 from ceres_cal.calibration import Calibration
 from ceres_cal.model.keys import Key
 from ceres_cal.report import canvas
-from ceres_cal.report.canvas import DIVERGING, OUTLIER, PAINT, POINT, Drawing
+from ceres_cal.report.canvas import DIVERGING, OUTLIER, PAINT, POINT, Drawing, Hover
 from ceres_cal.report.material import ClosedForm, Material
 from ceres_cal.report.page import Figure, Table
 
@@ -48,12 +48,21 @@ def correlation(material: Material) -> Figure | None:
         + (f" {counted(rest, 'further number')} not drawn." if rest else ""),
         Drawing(lambda axes, _: _draw_matrix(axes, matrix, labels), 0.86),
         _pairs(matrix, labels),
+        hover=Hover.of(
+            places := np.arange(0.5, len(labels)),
+            places,
+            [f"{value:+.3f}" if np.isfinite(value) else "unknown" for value in matrix.ravel().tolist()],
+            "{x}, {y}: {value}",
+        ).named(labels, labels),
     )
 
 
 def _draw_matrix(axes: Axes, matrix: Array, labels: Sequence[str]) -> None:
+    from matplotlib.colors import ListedColormap
+
+    colors = ListedColormap(list(DIVERGING))
     axes.set_facecolor(PAINT)
-    drawn = axes.pcolormesh(matrix, vmin=-1.0, vmax=1.0, cmap=canvas.ramp(DIVERGING), edgecolor="white", linewidth=0.8)
+    drawn = axes.pcolormesh(matrix, vmin=-1.0, vmax=1.0, cmap=colors, edgecolor="white", linewidth=0.8)
     size = 6.5 if len(labels) <= 14 else 6.0
     places = np.arange(len(labels)) + 0.5
     axes.set_xticks(places, labels, rotation=60, ha="right", rotation_mode="anchor", fontsize=size)
@@ -72,7 +81,7 @@ def label(key: Key, others: Sequence[Key]) -> str:
     """A number's name, with its owner where several have one of that name."""
     same = {other.owner for other in others if (other.kind, other.quantity) == (key.kind, key.quantity)}
     name = key.quantity.replace("_", " ")
-    whole = f"{name} {key.owner}" if len(same) > 1 or key.kind in ("placement", "structure") else name
+    whole = f"{name} {key.owner}" if len(same) > 1 or key.kind in ("placement", "structure", "dimension") else name
     return whole if len(whole) <= 22 else f"{whole[:21]}…"
 
 

@@ -3,11 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
 from ceres_cal.base.words import counted, fixed, metres, mm, sentence, short
-from ceres_cal.report.grounds import CARE_MM, GOOD_MM, focal, judge_quality, level_of, level_of_verdict, worst_radius
+from ceres_cal.report.grounds import (
+    CARE_MM,
+    GOOD_MM,
+    focal,
+    judge_quality,
+    level_of,
+    level_of_verdict,
+    promises,
+    worst,
+    worst_radius,
+)
 from ceres_cal.report.material import Material
 from ceres_cal.report.numbers import bounds
 from ceres_cal.report.page import BulletList, Chapter, Piece, Text, Tile, Tiles
@@ -24,7 +35,10 @@ _MEANING = (
 def verdict_chapter(material: Material) -> Chapter:
     """The chapter, its level the colour of the page's first box."""
     judged = judge_quality(material)
-    pieces: list[Piece] = [Tiles(tuple(_tiles(material))), BulletList(judged.reasons)]
+    tiles = tuple(_tiles(material))
+    if not promises(material):  # the verdict's colour, not that of a number nobody vouches for
+        tiles = tuple(replace(tile, level=worst(judged.level, tile.level)) if tile.level else tile for tile in tiles)
+    pieces: list[Piece] = [Tiles(tiles), BulletList(judged.reasons)]
     if material.maps:
         pieces.append(Text(_MEANING, "note"))
     return Chapter("verdict", judged.headline, tuple(pieces), judged.level)

@@ -53,7 +53,8 @@ def solve_as_built(
         start = replace(end.solution.estimate, structure=stated)
         end = solve_robustly(_taking_part(held, observations, explanations), observations, start, is_near=True)
         tolerances = {**options.tolerances, **tolerances_of(every)}
-        structure = make_structure(observations.targets, tolerances).carrying(whole)
+        structure = make_structure(observations.targets, tolerances, options.dimensions)
+        structure = structure.carrying(whole, end.solution.estimate.structure)
         now, whole = estimate_as_built(problem, observations, _freed(end, problem, structure))
     end, explanations = compete(held, observations, end, solver)
     explanations = tuple(replace(one, other=replace(one.other, structure=structure)) for one in explanations)

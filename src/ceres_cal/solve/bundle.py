@@ -131,6 +131,9 @@ def _assemble(run: Run, problem: Problem, estimate: Estimate) -> _Assembly:
             for part in parts:
                 sight_cost = SightCost(run, part, problem, estimate)
                 assembly.costs.append((sight_cost, blocks.of(key, sight_cost.slots)))
+    if problem.elsewhere is not None:
+        more = problem.elsewhere.cost(run, problem, estimate)
+        assembly.costs.append((more, [blocks.owned_by(*owner) for owner in more.owners]))
     for prior in problem.priors_at(estimate):
         prior_cost = PriorCost(run, prior, estimate, layout)
         assembly.costs.append((prior_cost, [blocks.owned_by(*owner) for owner in prior_cost.owners]))
@@ -275,9 +278,9 @@ def _rests(history: Sequence[float]) -> bool:
 def _require_enough(problem: Problem, estimate: Estimate) -> None:
     unknowns = problem.layout.size + len(estimate.structure.values)
     known = unknowns - problem.unknowns(estimate)
-    if problem.sights.equations + known < unknowns:
+    if problem.equations + known < unknowns:
         raise DegenerateError(
-            f"{problem.sights.equations + known} measured numbers (two a point, one a curve observation or prior) "
+            f"{problem.equations + known} measured numbers (two a point, one a curve observation or prior) "
             f"cannot determine {unknowns} unknowns: add observations, or fix some of the unknowns"
         )
 

@@ -22,6 +22,7 @@ from ceres_cal.observations import Observations
 from ceres_cal.solve.bundle import with_placements_at_best
 from ceres_cal.solve.explanation import DOUBTFUL, Explanation
 from ceres_cal.solve.linear_model import LinearModel, equation_weights, make_linear_model
+from ceres_cal.solve.looked_at import Asked, asked, excess, inliers_of, mostly_rejected, rows_looked_at
 from ceres_cal.solve.offsets import Offsets, measure_offsets
 from ceres_cal.solve.problem import Problem
 from ceres_cal.solve.robust import RobustSolution
@@ -30,19 +31,14 @@ from ceres_cal.solve.wholes import FEWEST, Wholes, wholes_of
 # Log odds, by the linear model, from which on a whole is looked at by a solve without it: one in thirty sound scenes is
 # above -9, errors that agree along lines over 2 m reach -3, a line 1.2 px aside is above -7.
 _SUSPECT = -9.0
-# Share of a whole's observations in use below which it is looked at in any case: its other rows are good by chance.
-_LEFT = 0.5
-_MOST_VIEWS, _MOST_WHOLE_VIEWS = 8, 24  # whose features, or which, are looked at together: at the cube of the number
-_MOST_OTHERS = 16  # views besides, which tell the lens
-_MOST_ROWS = 40  # of a whole in one view
 # Standard deviations by which a view's mean square must stand out, beyond the largest of so many by noise, for views to
 # be looked at: boards whose drawing is 3 % too short in one of ten do by 2 to 4, 10 % by 17.
 _STANDS_OUT = 2.5
 _MOST_WRONG = 4  # wholes
 
 
-Solver = Callable[[Problem], RobustSolution]
-"""Solves a problem of some of the observations, from a start that the others had no part in."""
+Solver = Callable[[Problem, Asked], RobustSolution]
+"""Solves a problem of some of the observations that are asked, from a start that the others had no part in."""
 
 
 def compete(
@@ -53,20 +49,21 @@ def compete(
     Args:
         problem: of all the observations. end: of its rounds.
     """
-    competition = _Competition(problem, observations, solver)
-    explanations: list[Explanation] = []
-    while competition.has_any and len(explanations) < _MOST_WRONG:
-        trials = list(competition.trials(end))
-        if not trials:
-            break
-        best = _best(trials)
-        if best.log_odds < -DOUBTFUL:
-            break
-        explanations += best.explanations
-        if best.log_odds < 0.0:
-            break
-        end, competition.taking_part = best.end, competition.taking_part & ~best.rows
-    if not competition.taking_part.all():
+    every = Asked(problem, observations, end, list(wholes_of(observations, problem.sights)))
+    if not every.kinds:
+        return end, ()
+    some = asked(every)
+    trials, explanations = _Competition(some, solver).decided(), list[Explanation]()
+    taking_part = np.ones(len(observations.points) + len(observations.curves), dtype=bool)
+    for trial in trials:
+        wholes = every.kinds[some.kinds.index(trial.suspects.wholes)]
+        own = [wholes.among(np.array([number])) & taking_part for number in trial.suspects.numbers]
+        explanations += [replace(one, rows=rows) for one, rows in zip(trial.explanations, own, strict=True)]
+        if trial.log_odds >= 0.0:
+            taking_part &= ~np.any(own, axis=0)
+            end = trial.end
+    if not taking_part.all():
+        end = end if some is every else solver(every.without(~taking_part), every)
         end = replace(end, residuals=residuals(observations, problem.sights, end.solution.estimate))
     return end, tuple(explanations)
 
@@ -81,13 +78,14 @@ class _Suspects:
 
 @dataclass(frozen=True, eq=False)
 class _Trial:
-    """What a solve without some wholes says of them.
+    """What a solve without the suspects says of them.
 
     Attributes:
         end: of that solve. rows: (N + M,) theirs. log_odds: the least of theirs. explanations: of each.
         next: the whole that does not belong either, where one is suspected.
     """
 
+    suspects: _Suspects
     end: RobustSolution
     rows: Mask
     log_odds: float
@@ -95,8 +93,10 @@ class _Trial:
     next: int | None
 
 
-def _best(trials: Sequence[_Trial]) -> _Trial:
+def _best(trials: Sequence[_Trial]) -> _Trial | None:
     """The most probable one, or the largest that is sure and takes all of that along."""
+    if not trials:
+        return None
     best = max(trials, key=lambda trial: trial.log_odds)
     wider = [one for one in trials if one.log_odds > DOUBTFUL and not np.any(best.rows & ~one.rows)]
     return max(wider, key=lambda one: int(np.count_nonzero(one.rows)), default=best)
@@ -105,17 +105,23 @@ def _best(trials: Sequence[_Trial]) -> _Trial:
 class _Competition:
     """What is asked of all suspects. taking_part: (N + M,) the observations that none of them took along."""
 
-    def __init__(self, problem: Problem, observations: Observations, solver: Solver) -> None:
-        self._problem, self._observations, self._solver = problem, observations, solver
-        self._kinds = list(wholes_of(observations, problem.sights))
-        self._view = np.concatenate([observations.points.view, observations.curves.view])
+    def __init__(self, some: Asked, solver: Solver) -> None:
+        self._some, self._solver = some, solver
         self._tried: set[tuple[int, ...]] = set()
-        self.taking_part = np.ones(len(observations.points) + len(observations.curves), dtype=bool)
+        self._taking_part = np.ones(len(some.observations.points) + len(some.observations.curves), dtype=bool)
 
-    @property
-    def has_any(self) -> bool:
-        """Whether there is any whole."""
-        return bool(self._kinds)
+    def decided(self) -> list[_Trial]:
+        """The trials of wholes that do not belong, one after the other; the last one may be in doubt."""
+        end, decided = self._some.end, list[_Trial]()
+        while sum(len(one.explanations) for one in decided) < _MOST_WRONG:
+            best = _best(list(self.trials(end)))
+            if best is None or best.log_odds < -DOUBTFUL:
+                break
+            decided.append(best)
+            if best.log_odds < 0.0:
+                break
+            end, self._taking_part = best.end, self._taking_part & ~best.rows
+        return decided
 
     def trials(self, end: RobustSolution) -> Iterator[_Trial]:
         """What solves without the suspects say; also without one more, where a second one may hide the first."""
@@ -131,7 +137,7 @@ class _Competition:
 
     def suspects(self, end: RobustSolution) -> Iterator[_Suspects]:
         """Wholes without which the rest may be better explained."""
-        for wholes in self._kinds:
+        for wholes in self._some.kinds:
             for numbers in (*self._mostly_rejected(end, wholes), *self._by_offsets(end, wholes)):
                 rows = tuple(np.flatnonzero(wholes.among(np.array(numbers))).tolist())
                 if rows not in self._tried:
@@ -140,16 +146,15 @@ class _Competition:
 
     def _mostly_rejected(self, end: RobustSolution, wholes: Wholes) -> Iterator[tuple[int, ...]]:
         """The one with most outliers, where most of its observations are."""
-        counts, used = wholes.count(self.taking_part), wholes.count(_inliers(end) & self.taking_part)
-        rejected = np.where((counts > FEWEST) & (used < _LEFT * counts), counts - used, 0)
+        rejected = mostly_rejected(wholes, end, self._taking_part)
         if np.any(rejected):
             yield (int(np.argmax(rejected)),)
 
     def _by_offsets(self, end: RobustSolution, wholes: Wholes) -> Iterator[tuple[int, ...]]:
         """Those that the offsets speak against: single ones, and the pair of most evidence."""
         if not wholes.of_features:
-            excess = self._excess(end, wholes)
-            if np.max(excess) < _STANDS_OUT + np.sqrt(2.0 * np.log(max(int(np.count_nonzero(excess)), 1))):
+            above = excess(self._some.observations, wholes, end, self._taking_part)
+            if np.max(above) < _STANDS_OUT + np.sqrt(2.0 * np.log(max(int(np.count_nonzero(above)), 1))):
                 return
         chosen, offsets = self._offsets(end, wholes, ())
         if offsets is None:
@@ -172,14 +177,14 @@ class _Competition:
         without = self._without(wholes, numbers)
         if without is None:
             return None
-        there = residuals(self._observations, self._problem.sights, without.solution.estimate)
+        there = residuals(self._some.observations, self._some.problem.sights, without.solution.estimate)
         chosen, offsets = self._offsets(replace(without, residuals=there), wholes, numbers)
         if offsets is None:
             return None
         lengths, explanations = np.concatenate(there.lengths), []
         for number in numbers:
             odds, rival = _odds(offsets, chosen, number, numbers)
-            own = wholes.among(np.array([number])) & self.taking_part
+            own = wholes.among(np.array([number])) & self._taking_part
             other = (end if odds > 0.0 else without).solution.estimate
             instead = "it belongs"
             if rival is not None and abs(odds) < DOUBTFUL:
@@ -188,21 +193,20 @@ class _Competition:
                 other = other if rivals is None or odds < 0.0 else rivals.solution.estimate
             aside_px = float(np.nanmedian(lengths[own]))
             explanations.append(Explanation(wholes.name(number), own, aside_px, odds, instead, other))
-        rows = wholes.among(np.array(numbers)) & self.taking_part
+        rows = wholes.among(np.array(numbers)) & self._taking_part
         least = min(one.log_odds for one in explanations)
-        return _Trial(without, rows, least, tuple(explanations), _next(offsets, chosen, numbers))
+        return _Trial(suspects, without, rows, least, tuple(explanations), _next(offsets, chosen, numbers))
 
     def _without(self, wholes: Wholes, numbers: tuple[int, ...]) -> RobustSolution | None:
         """The end of a solve without some wholes; None where the others determine nothing."""
+        gone = wholes.among(np.array(numbers))
         try:
-            gone = wholes.among(np.array(numbers))
-            others = self._problem.used(*self._split(self.taking_part & ~gone))
-            end = self._solver(replace(others, layout=others.layout.of(others.sights.keys)))
+            end = self._solver(self._some.without(gone | ~self._taking_part), self._some)
         except CalibrationError:
             return None
         if wholes.of_features:
             return end
-        alone = self._problem.used(*self._split(gone)).weighted(replace(end.problem.weighting, loss="cauchy"))
+        alone = self._some.of_rows(gone).weighted(replace(end.problem.weighting, loss="cauchy"))
         estimate = with_placements_at_best(alone, end.solution.estimate)
         return replace(end, solution=replace(end.solution, estimate=estimate))
 
@@ -211,88 +215,31 @@ class _Competition:
 
         None where some of these lie here and there: they are no whole.
         """
-        recalled = wholes.among(np.array(back, dtype=np.int64)) & self.taking_part
-        rows = self._rows(end, wholes, recalled)
-        sights = self._problem.sights.used(*self._split(rows))
+        recalled = wholes.among(np.array(back, dtype=np.int64)) & self._taking_part
+        observations, problem = self._some.observations, self._some.problem
+        rows = rows_looked_at(observations, wholes, end, self._taking_part, recalled)
+        sights = self._some.of_rows(rows).sights
         if not len(sights):
             return np.empty(0, dtype=np.int64), None
-        equations = write_equations(self._observations, sights, end.solution.estimate, end.residuals)
-        inliers, weighting = end.inliers, end.inliers.weighting(self._problem.options)
+        equations = write_equations(observations, sights, end.solution.estimate, end.residuals)
+        inliers, weighting = end.inliers, end.inliers.weighting(problem.options)
         taking_part = inliers.points, inliers.curves
-        weights = equation_weights(self._observations, weighting, equations, end.residuals, taking_part)
+        weights = equation_weights(observations, weighting, equations, end.residuals, taking_part)
         here = recalled[equations.observation]
         weights = replace(weights, used=weights.used | here, robust=np.where(here, 1.0, weights.robust))
-        model = make_linear_model(self._problem, end.solution.estimate, equations, weights)
-        chosen = np.flatnonzero(wholes.count(rows & (_inliers(end) | recalled)) >= FEWEST)
+        model = make_linear_model(problem, end.solution.estimate, equations, weights)
+        chosen = np.flatnonzero(wholes.count(rows & (inliers_of(end) | recalled)) >= FEWEST)
         columns, group = wholes.modes(equations, chosen)
         agreeing = model.used.copy()
         for number in back:
             own = np.flatnonzero(group == np.searchsorted(chosen, number))
-            agree = _agreeing(model, columns, own, self._problem.options.reject_sigma)
+            agree = _agreeing(model, columns, own, problem.options.reject_sigma)
             if number not in chosen or 2 * np.count_nonzero(agree) < max(len(own), 2 * FEWEST):
                 return chosen, None
             agreeing[own] = agree
         if back:
-            model = make_linear_model(self._problem, end.solution.estimate, equations, replace(weights, used=agreeing))
+            model = make_linear_model(problem, end.solution.estimate, equations, replace(weights, used=agreeing))
         return chosen, measure_offsets(model, columns, group) if len(chosen) > 1 else None
-
-    def _rows(self, end: RobustSolution, wholes: Wholes, recalled: Mask) -> Mask:
-        """(N + M,) the rows that are looked at: of some views, of each whole some."""
-        taking_part = self.taking_part & (_inliers(end) | recalled)
-        shows_some = np.bincount(self._view[taking_part & (wholes.of >= 0)], minlength=len(self._observations.views))
-        largest = self._largest(end) if wholes.of_features else self._excess(end, wholes)[self._owner(wholes)]
-        most = _MOST_VIEWS if wholes.of_features else _MOST_WHOLE_VIEWS
-        with_some, others = np.flatnonzero(shows_some), np.flatnonzero(shows_some == 0)
-        chosen = np.zeros(len(shows_some), dtype=bool)
-        chosen[np.unique(self._view[recalled])[:most]] = True
-        chosen[with_some[np.argsort(-largest[with_some], kind="stable")][: most // 2]] = True
-        chosen[with_some[:: max(1, 2 * len(with_some) // most)]] = True
-        chosen[others[:: max(1, len(others) // _MOST_OTHERS)]] = True
-        rows = np.flatnonzero(taking_part & chosen[self._view])
-        taking_part[:] = False
-        taking_part[_thinned(rows, wholes.of[rows] * len(shows_some) + self._view[rows], wholes.of[rows] >= 0)] = True
-        return taking_part
-
-    def _excess(self, end: RobustSolution, wholes: Wholes) -> Array:
-        """(size + 1,) by how many standard deviations the mean square residual of each view or placement is above the
-        median one.
-        """
-        lengths = np.concatenate([end.inliers.point_sigmas, end.inliers.curve_sigmas])
-        points, size = len(end.inliers.points), wholes.size + 1
-        of = np.where(_inliers(end) & self.taking_part, wholes.of, -1)
-        of[of < 0] = wholes.size
-        spare = 2.0 * np.bincount(of[:points], minlength=size) + np.bincount(of[points:], minlength=size)
-        square = np.bincount(of, lengths**2, minlength=size)
-        spare[-1] = square[-1] = 0.0  # of what is in none
-        square, there = square / np.maximum(spare, 1.0), spare > 0.0
-        middle = float(np.median(square[there])) if np.any(there) else 1.0
-        return np.asarray((square / max(middle, 1e-12) - 1.0) / np.sqrt(2.0 / np.maximum(spare, 1.0)) * there)
-
-    def _owner(self, wholes: Wholes) -> Indices:
-        """(V,) number of the whole that each view is of; the last for none."""
-        owner = np.full(len(self._observations.views), wholes.size)
-        owner[self._view[wholes.of >= 0]] = wholes.of[wholes.of >= 0]
-        return owner
-
-    def _largest(self, end: RobustSolution) -> Array:
-        """(V,) the largest mean offset of a curve in each view, in standard deviations where errors are independent."""
-        single, curves, largest = self._kinds[0], self._observations.curves, np.zeros(len(self._observations.views))
-        own = single.of[len(self._observations.points) :]
-        sigmas = end.residuals.curves / (end.inliers.curve_scale * curves.sigma_px)
-        inside = np.where(end.inliers.curves & np.isfinite(sigmas), sigmas, 0.0)
-        mean = np.abs(np.bincount(own, inside)) / np.sqrt(np.maximum(np.bincount(own, end.inliers.curves), 1.0))
-        np.maximum.at(largest, curves.view, mean[own])
-        return largest
-
-    def _split(self, rows: Mask) -> tuple[Mask, Mask]:
-        """(N,) of points and (M,) of curve observations."""
-        count = len(self._observations.points)
-        return np.asarray(rows[:count]), np.asarray(rows[count:])
-
-
-def _inliers(end: RobustSolution) -> Mask:
-    """(N + M,) the observations that take part."""
-    return np.concatenate([end.inliers.points, end.inliers.curves])
 
 
 def _odds(offsets: Offsets, chosen: Indices, number: int, wrong: tuple[int, ...]) -> tuple[float, int | None]:
@@ -314,15 +261,6 @@ def _next(offsets: Offsets, chosen: Indices, wrong: tuple[int, ...]) -> int | No
     each = offsets.log_evidence_with_each(at)
     best = int(np.argmax(each))
     return int(chosen[best]) if each[best] > offsets.log_evidence(at) else None
-
-
-def _thinned(rows: Indices, key: Indices, of_whole: Mask) -> Indices:
-    """Of rows with the same key some, evenly, where they are of a whole."""
-    order = np.argsort(key, kind="stable")
-    _, starts, count = np.unique(key[order], return_index=True, return_counts=True)
-    place, size = np.arange(len(order)) - np.repeat(starts, count), np.repeat(count, count)
-    most = np.where(of_whole[order], np.minimum(size, _MOST_ROWS), size)
-    return np.asarray(rows[order[(place * most) // size != ((place - 1) * most) // size]])
 
 
 def _agreeing(model: LinearModel, columns: Array, rows: Indices, reject_sigma: float) -> Mask:

@@ -18,6 +18,7 @@ from ceres_cal.model.structure import Structure
 from ceres_cal.observations.sights import SightKey, Sights
 from ceres_cal.solve.problem import Problem, Weighting
 
+_STRUCTURE = 3  # slot
 ROWS_WORTH_A_THREAD = 20_000
 NORMAL_NS = 60.0
 """That an observation's share of the normal equations takes."""
@@ -47,9 +48,9 @@ class SightCost(pyceres.CostFunction):
         super().__init__()
         self._run, self._sight, self._structure = run, sight, estimate.structure
         key, layout, weighting = sight.key, problem.layout, problem.weighting
-        free, count = layout.free[key.camera], len(estimate.structure.values)
+        free, count, offsets = layout.free[key.camera], len(self._structure.values), len(self._structure.offsets)
         feet = starting_feet(sight, estimate, problem.feet)
-        self._optics, self._unknowns = camera_optics(estimate.cameras[key.camera]), kernels.Unknowns(free, count)
+        self._optics, self._unknowns = camera_optics(estimate.cameras[key.camera]), kernels.Unknowns(free, offsets)
         self._points = point_columns(sight, estimate.structure, weighting.point_scale)
         self._curves = curve_columns(sight, estimate.structure, feet, weighting.curve_scale)
         self._loss = kernel_loss(weighting)
@@ -60,7 +61,7 @@ class SightCost(pyceres.CostFunction):
         is_free = (len(free) > 0, key.station in layout.stations, key.placement in layout.placements, count > 0)
         self.slots = [slot for slot in range(4) if is_free[slot]]
         self._known: tuple[Array, Array, list[Array]] | None = None
-        self.set_num_residuals(len(free) + count + 7)
+        self.set_num_residuals(len(free) + offsets + 7)
         self.set_parameter_block_sizes([sizes[slot] for slot in self.slots])
 
     def Evaluate(self, parameters: Sequence[Array], residuals: Array, jacobians: Sequence[Array] | None) -> bool:
@@ -79,18 +80,33 @@ class SightCost(pyceres.CostFunction):
             jacobian[:] = known
         return True
 
+    def block(self, parameters: Sequence[Array]) -> Array | None:
+        """(N, K + 1) the Jacobians side by side and the residuals, None where an observation cannot be projected."""
+        known = self._evaluated(kernels.NOTHING, parameters)
+        if known is None:
+            return None
+        return np.column_stack([*(each.reshape(self.num_residuals(), -1) for each in known[2]), known[1]])
+
+    @property
+    def feet(self) -> Array:
+        """(M,) where the last evaluation left the feet."""
+        return self._curves.feet
+
     def _evaluated(self, at: Array, parameters: Sequence[Array]) -> tuple[Array, Array, list[Array]] | None:
         """(place, residuals, flat Jacobians), or None where an observation cannot be projected from there."""
         numbers, jacobians = [kernels.NOTHING, *self._poses, kernels.NOTHING], [kernels.NOTHING] * 4
-        rows = self.num_residuals()
+        rows, mixing = self.num_residuals(), self._structure.mixing
         for place, slot in enumerate(self.slots):
-            numbers[slot], jacobians[slot] = parameters[place], np.empty(rows * len(parameters[place]))
+            size = self._unknowns.structure if slot == _STRUCTURE else len(parameters[place])
+            numbers[slot], jacobians[slot] = parameters[place], np.empty(rows * size)
         residuals = np.empty(rows)
         points, curves = as_built(self._points, self._curves, self._sight, self._structure.with_values(numbers[3]))
         answered = kernels.evaluate_block(
             self._optics, self._unknowns, points, curves, self._loss, kernels.Blocks(*numbers), residuals,
             kernels.Blocks(*jacobians),
         )  # fmt: skip
+        if mixing is not None:
+            jacobians[_STRUCTURE] = (jacobians[_STRUCTURE].reshape(rows, -1) @ mixing).reshape(-1)
         return (at, residuals, [jacobians[slot] for slot in self.slots]) if answered else None
 
 
@@ -138,16 +154,19 @@ class EliminatedCost(pyceres.CostFunction):
         super().__init__()
         self.camera, weighting = sights.keys[0].camera, problem.weighting
         self._run, self._sights, self._structure = run, sights, estimate.structure
-        free, count = problem.layout.free[self.camera], len(estimate.structure.values)
+        free, count = problem.layout.free[self.camera], len(self._structure.values)
         feet = starting_feet(sights, estimate, problem.feet)
-        self._optics, self._unknowns = camera_optics(estimate.cameras[self.camera]), kernels.Unknowns(free, count)
+        self._optics = camera_optics(estimate.cameras[self.camera])
+        self._unknowns = kernels.Unknowns(free, len(self._structure.offsets))
         self._points = point_columns(sights, estimate.structure, weighting.point_scale)
         self._curves = curve_columns(sights, estimate.structure, feet, weighting.curve_scale)
         self._loss = kernel_loss(weighting)
         sizes = (len(free), count)
         self._size = sum(sizes)
         start = np.concatenate([self._optics.intrinsics[free], estimate.structure.values])
-        poses, gains = estimate.pose_stack(sights.keys), np.zeros((len(sights), 6, self._size))
+        # The kernels speak of offsets alone; (size + 1, size + 1) but for that.
+        self._chain, lead = self._structure.chain(len(free), 1), len(free) + self._unknowns.structure
+        poses, gains = estimate.pose_stack(sights.keys), np.zeros((len(sights), 6, lead))
         # Every step starts from the poses of the last accepted one: a rejected step may have led them astray.
         self._accepted = _Evaluation(start, kernels.NOTHING, kernels.NOTHING, poses, gains)
         self._known: _Evaluation | None = None
@@ -202,7 +221,8 @@ class EliminatedCost(pyceres.CostFunction):
         optics = self._optics._replace(intrinsics=intrinsics)
         built = self._structure.with_values(at[len(free) :])
         points, curves = as_built(self._points, self._curves, self._sights, built)
-        change, size = at - self._accepted.at, self._size + 1
+        change, size, chain = at - self._accepted.at, self._accepted.gains.shape[2] + 1, self._chain
+        change = change if chain is None else chain[:-1, :-1] @ change
         poses, gains, costs = self._accepted.poses.copy(), self._accepted.gains.copy(), np.empty(len(self._sights))
 
         def part(first: int, last: int) -> Array:
@@ -212,7 +232,8 @@ class EliminatedCost(pyceres.CostFunction):
             )
             return sweep.reduced
 
-        return kernels.Sweep(poses, gains, costs, np.sum(run_parts(part, self._parts), axis=0))
+        reduced = np.sum(run_parts(part, self._parts), axis=0)
+        return kernels.Sweep(poses, gains, costs, reduced if chain is None else chain.T @ reduced @ chain)
 
     def from_poses(self, poses: Array, tolerance: float) -> tuple[Array, Array]:
         """Costs (S,) and poses (S, 3, 4) that the search for each placement ends with when it starts from `poses`,

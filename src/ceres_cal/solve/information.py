@@ -6,7 +6,7 @@ added up over what is shared, in the coordinates of `model.keys`.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property, reduce
 from operator import add
@@ -97,6 +97,17 @@ def information(problem: Problem, estimate: Estimate) -> ReducedInformation:
     return _Sums(problem, estimate).result()
 
 
+def normals_of(sight: Sights, problem: Problem, estimate: Estimate) -> dict[int, Array]:
+    """Normal equations (K, K) of a single sight by kind: of points (0) and of curves (1), where there are any. K is
+    [free intrinsics in the units of the files | structure | left perturbation of the pose: turn, shift].
+
+    Raises:
+        SolutionError: an observation cannot be projected.
+    """
+    kinds = enumerate(sight.by_kind)
+    return {kind: _Normals(own, problem, estimate).of(0, 1)[0] for kind, own in kinds if own.equations}
+
+
 class _Sums:
     """The sums of one pass over the sights."""
 
@@ -104,7 +115,7 @@ class _Sums:
         self._problem, self._estimate = problem, estimate
         self._keys = free_keys(estimate, problem.layout, problem.private)
         self._columns = {owner: np.array(at, dtype=np.int64) for owner, at in columns_by_owner(self._keys).items()}
-        structure = [column for column, key in enumerate(self._keys) if key.kind == "structure"]
+        structure = [column for column, key in enumerate(self._keys) if key.is_structure]
         self._structure = np.array(structure, dtype=np.int64)
         size = len(self._keys)
         self._matrices, self._leverages = np.zeros((2, size, size)), np.zeros(2)  # of points, of curves
@@ -121,6 +132,9 @@ class _Sums:
             sight = sights[int(number)]
             for pose, normals in self._normals(sight):
                 self._add(sight.key, pose[0], {kind: normal[0] for kind, normal in normals.items()})
+        if self._problem.elsewhere is not None:
+            for key, kinds in self._problem.elsewhere.normals(self._problem, self._estimate).items():
+                self._add(key, self._estimate.pose_stack([key])[0], kinds)
         points, curves = (Information(self._keys, 0.5 * (matrix + matrix.T)) for matrix in self._matrices)
         priors = [prior.information for prior in self._problem.priors_at(self._estimate)]
         known = reduce(add, priors, Information.nothing(self._keys))
@@ -191,7 +205,7 @@ class _Sums:
             self._matrices[kind][np.ix_(lead, lead)] += reduced
             self._leverages[kind] += float(np.sum(normal[:, -6:, -6:] * covariance))
 
-    def _add(self, key: SightKey, pose: Array, normals: dict[int, Array]) -> None:
+    def _add(self, key: SightKey, pose: Array, normals: Mapping[int, Array]) -> None:
         """What a sight that nothing is eliminated from says, added to the sums."""
         world, lead = self._estimate.stations[key.station].cam_from_world, len(next(iter(normals.values()))) - 6
         at = [self._owned("camera", key.camera), self._structure]
@@ -222,12 +236,13 @@ class _Normals:
     def __init__(self, sights: Sights, problem: Problem, estimate: Estimate) -> None:
         camera = estimate.cameras[sights.keys[0].camera]
         free, structure, weighting = problem.layout.free[sights.keys[0].camera], estimate.structure, problem.weighting
-        self._size = len(free) + len(structure.values) + 6
-        units = np.ones(self._size)
+        offsets = len(structure.offsets)
+        units = np.ones(len(free) + offsets + 6)
         units[: len(free)] = intrinsics_scales(camera)[free]
+        self._size, self._chain = len(units), structure.chain(len(free), 6)
         self._arguments = (
             camera_optics(camera),
-            kernels.Unknowns(free, len(structure.values)),
+            kernels.Unknowns(free, offsets),
             point_columns(sights, structure, weighting.point_scale),
             curve_columns(sights, structure, starting_feet(sights, estimate, problem.feet), weighting.curve_scale),
             kernel_loss(weighting),
@@ -244,4 +259,4 @@ class _Normals:
         normals = np.empty((last - first, self._size, self._size))
         if not kernels.sight_normals(first, last, *self._arguments, normals):
             raise SolutionError("an observation cannot be projected where the solve ended: no uncertainty can be given")
-        return normals
+        return normals if self._chain is None else self._chain.T @ normals @ self._chain

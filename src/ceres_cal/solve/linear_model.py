@@ -313,7 +313,7 @@ def shared_columns(equations: Equations, estimate: Estimate, keys: Sequence[Key]
             columns[here, own] = equations.pose[here] @ from_station(pose, world)[0]
         if own := owned.get(("placement", str(key.placement)), []):
             columns[here, own] = equations.pose[here] @ from_placement(pose, world)[0]
-    structure = [column for column, key in enumerate(keys) if key.kind == "structure"]
+    structure = [column for column, key in enumerate(keys) if key.is_structure]
     if structure:
         columns[:, structure] = equations.structure_columns(estimate.structure)
     return columns

@@ -6,14 +6,16 @@ Residuals are taken in units of their stated sigma; the noise scale is the facto
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Mask
+from ceres_cal.base.arrays import Array, Indices, Mask
 from ceres_cal.model.parameters import Options
 from ceres_cal.model.residuals import Residuals
 from ceres_cal.observations import Observations
+from ceres_cal.observations.files import Content
 from ceres_cal.observations.sights import Sights
 from ceres_cal.solve.problem import Weighting
 
@@ -90,6 +92,32 @@ class Inliers:
             and abs(self.curve_scale - other.curve_scale) <= relative * other.curve_scale
         )
 
+    @classmethod
+    def at(
+        cls,
+        points: Array,
+        curves: Array,
+        redundancy: Redundancy,
+        options: Options,
+        usual: tuple[float, float] | None = None,
+    ) -> Inliers:
+        """See `judge`; of lengths of points (N,) and of curves (M,) in their stated sigmas."""
+        noise = noise_of(EachLength(points), EachLength(curves), redundancy, options, usual)
+        return cls.by_noise(points, curves, noise)
+
+    @classmethod
+    def by_noise(cls, points: Array, curves: Array, noise: Noise) -> Inliers:
+        """Of these lengths at a noise."""
+        p, c = noise.bounds
+        scales, relative = (noise.points, noise.curves), (points / noise.points, curves / noise.curves)
+        return cls(points <= p, curves <= c, *scales, *relative, noise.degrees_of_freedom)
+
+    def of_rows(self, points: Indices, curves: Indices) -> Inliers:
+        """Those of some of the observations, as if there were no others."""
+        sigmas = self.point_sigmas[points], self.curve_sigmas[curves]
+        both = Inliers(self.points[points], self.curves[curves], self.point_scale, self.curve_scale, *sigmas)
+        return replace(both, degrees_of_freedom=self.degrees_of_freedom)
+
     def weighting(self, options: Options) -> Weighting:
         """Of the observations at these noise scales."""
         return Weighting(self.point_scale, self.curve_scale, options.loss, options.loss_scale)
@@ -99,7 +127,7 @@ class Inliers:
         return self.point_scale < share * other.point_scale or self.curve_scale < share * other.curve_scale
 
 
-def relative_lengths(observations: Observations, residuals: Residuals) -> tuple[Array, Array]:
+def relative_lengths(observations: Content, residuals: Residuals) -> tuple[Array, Array]:
     """Lengths of the residuals of points and of curves in their stated sigmas; infinite where there is none."""
     points, curves = residuals.lengths
     points, curves = points / observations.points.sigma_px, curves / observations.curves.sigma_px
@@ -116,11 +144,14 @@ def visible_from(observations: Observations, residuals: Residuals) -> Inliers:
 
 
 def _median_scale(lengths: Array, median_of_one: float) -> float:
-    if not len(lengths):
-        return 1.0
+    return max(_middle(lengths) / median_of_one, _LEAST_SCALE_PX) if len(lengths) else 1.0
+
+
+def _middle(lengths: Array) -> float:
+    """The median, of some of very many."""
     some = lengths[:: max(1, len(lengths) // _ENOUGH)]  # its median is that of all within two hundredths
     middle = len(some) // 2
-    return max(float(np.partition(some, middle)[middle]) / median_of_one, _LEAST_SCALE_PX)
+    return float(np.partition(some, middle)[middle]) if len(some) else 0.0
 
 
 def judge(
@@ -139,13 +170,51 @@ def judge(
         options: how far off an outlier is, and whether the stated sigmas hold (scale 1).
         usual: scales of points and curves seen before; they count as much as a few spare equations do.
     """
-    points, curves = relative_lengths(observations, residuals)
+    return Inliers.at(*relative_lengths(observations, residuals), redundancy, options, usual)
+
+
+class Noise(NamedTuple):
+    """Noise scales of points and of curves, the length in them from which on an observation is an outlier, and the
+    spare equations that they rest on; infinite where they are the stated ones.
+    """
+
+    points: float
+    curves: float
+    reject_sigma: float
+    degrees_of_freedom: float
+
+    @property
+    def bounds(self) -> tuple[float, float]:
+        """Lengths in stated sigmas from which on points and curve observations are outliers."""
+        return self.points * self.reject_sigma, self.curves * self.reject_sigma
+
+
+class Lengths(Protocol):
+    """Lengths of residuals in their stated sigmas, or what was added up of them: of all that can be shown."""
+
+    @property
+    def count(self) -> int:
+        """How many there are."""
+
+    def middle(self) -> float:
+        """Their median; 0 of none."""
+
+    def within(self, bound: float) -> Spread:
+        """Of those that are no longer."""
+
+
+def noise_of(
+    points: Lengths,
+    curves: Lengths,
+    redundancy: Redundancy,
+    options: Options,
+    usual: tuple[float, float] | None = None,
+) -> Noise:
+    """The noise that lengths show; see `judge`."""
     if options.noise_scale == "stated":
-        inside = points <= options.reject_sigma, curves <= options.reject_sigma
-        return Inliers(*inside, 1.0, 1.0, points, curves)
+        return Noise(1.0, 1.0, options.reject_sigma, np.inf)
     floor = usual or (0.0, 0.0)
-    finite = np.count_nonzero(np.isfinite(points)), np.count_nonzero(np.isfinite(curves))
-    spare_of_all = 2.0 * redundancy.points * finite[0] + redundancy.curves * finite[1]
+    spare_of_all = 2.0 * redundancy.points * points.count + redundancy.curves * curves.count
     reject_sigma = _as_rare(options.reject_sigma, spare_of_all + (USUAL_EQUATIONS if usual else 0.0))
     point_spread = _spread(points, _RAYLEIGH_MEDIAN, reject_sigma, floor[0], 2.0 * redundancy.points)
     curve_spread = _spread(curves, _NORMAL_MEDIAN, reject_sigma, floor[1], redundancy.curves)
@@ -161,7 +230,7 @@ def judge(
         )
         if degrees < _LEAST_SPARE:
             p, c, degrees = 1.0, 1.0, np.inf
-    return Inliers(points <= reject_sigma * p, curves <= reject_sigma * c, p, c, points / p, curves / c, degrees)
+    return Noise(p, c, reject_sigma, degrees)
 
 
 def _as_rare(sigmas: float, degrees: float) -> float:
@@ -175,13 +244,13 @@ def _as_rare(sigmas: float, degrees: float) -> float:
 
 
 @dataclass(frozen=True)
-class _Spread:
+class Spread:
     """Number and sum of squares of the lengths within the rejection bound."""
 
     count: int
     squares: float
 
-    def scale(self, spare: float, other: _Spread, other_spare: float) -> float:
+    def scale(self, spare: float, other: Spread, other_spare: float) -> float:
         """Their scale, when they bring so many spare equations: that of the other kind counts as much as a few."""
         borrowed = min(_BORROWED, max(other_spare, 0.0))
         variance = borrowed * other.squares / max(other_spare, 1.0)
@@ -192,25 +261,41 @@ class _Spread:
         return float(np.sqrt((self.squares + USUAL_EQUATIONS * usual**2) / (max(spare, 0.0) + USUAL_EQUATIONS)))
 
 
-def _spread(lengths: Array, median_of_one: float, reject_sigma: float, least: float, degrees: float) -> _Spread:
+class EachLength:
+    """Lengths one by one; infinite ones are of what cannot be shown."""
+
+    def __init__(self, lengths: Array) -> None:
+        finite = np.isfinite(lengths)
+        self._seen = lengths if finite.all() else lengths[finite]
+
+    @property
+    def count(self) -> int:
+        """How many there are."""
+        return len(self._seen)
+
+    def middle(self) -> float:
+        """Their median; 0 of none."""
+        return _middle(self._seen)
+
+    def within(self, bound: float) -> Spread:
+        """Of those that are no longer."""
+        inside = self._seen[self._seen <= bound]
+        return Spread(len(inside), float(inside @ inside))
+
+
+def _spread(lengths: Lengths, median_of_one: float, reject_sigma: float, least: float, degrees: float) -> Spread:
     """Of the lengths that the scale they have keeps.
 
     Args:
         least: a scale that theirs is no smaller than. degrees: spare equations of each.
     """
-    finite = np.isfinite(lengths)
-    seen = lengths if finite.all() else lengths[finite]
-    spread = _within(seen, reject_sigma * max(_median_scale(seen, median_of_one), least))
+    first = max(lengths.middle() / median_of_one, _LEAST_SCALE_PX) if lengths.count else 1.0
+    spread = lengths.within(reject_sigma * max(first, least))
     for _ in range(_MOST_WIDER):
         if degrees <= 0.0 or not spread.count:
             break
-        wider = _within(seen, reject_sigma * float(np.sqrt(spread.squares / (degrees * spread.count))))
+        wider = lengths.within(reject_sigma * float(np.sqrt(spread.squares / (degrees * spread.count))))
         if not spread.count < wider.count <= (1.0 + _TAIL) * spread.count:
             break
         spread = wider
     return spread
-
-
-def _within(lengths: Array, bound: float) -> _Spread:
-    inside = lengths[lengths <= bound]
-    return _Spread(len(inside), float(inside @ inside))

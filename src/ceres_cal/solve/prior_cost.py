@@ -105,7 +105,7 @@ def _parts(
             # Without turns among its numbers any rotation will do.
             rotation = prior.rotations.get(owner, estimate.stations[owner].cam_from_world.rotation)
             parts.append(((kind, owner), _Station(columns, rows, rotation)))
-    structure = [column for column, key in enumerate(prior.keys) if key.kind == "structure"]
+    structure = [column for column, key in enumerate(prior.keys) if key.is_structure]
     if structure:
         names = estimate.structure.names
         slots = [names.index(prior.keys[column].structure_name) for column in structure]

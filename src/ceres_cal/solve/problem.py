@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from ceres_cal.model.keys import Key
 from ceres_cal.model.parameters import Estimate, Layout, Options
 from ceres_cal.model.priors import GaussianPrior
 from ceres_cal.model.quantities import free_keys, intrinsic_keys
-from ceres_cal.observations.sights import Sights
+from ceres_cal.observations.sights import SightKey, Sights
 
 _CONVEX = ("trivial", "huber", "soft_l1")
 
@@ -44,6 +45,20 @@ class Weighting:
         return self.loss in _CONVEX
 
 
+class Elsewhere(Protocol):
+    """Observations of the world that are not at hand: they answer with sums."""
+
+    @property
+    def equations(self) -> int:
+        """How many measured numbers they are."""
+
+    def cost(self, run: Any, problem: Problem, estimate: Estimate) -> Any:
+        """What Ceres sees of them: its `owners` say by kind and name which numbers it depends on."""
+
+    def normals(self, problem: Problem, estimate: Estimate) -> Mapping[SightKey, Mapping[int, Array]]:
+        """Their normal equations by sight and kind, see `solve.information`."""
+
+
 @dataclass(frozen=True, eq=False)
 class Problem:
     """What is minimised, over what, under what was known before.
@@ -51,6 +66,7 @@ class Problem:
     Attributes:
         sights: the observations that take part. layout: the numbers that are free.
         priors: all that is known beforehand; of numbers that are held they say nothing.
+        elsewhere: more observations of the world, which are not at hand.
         smoothness: camera -> standard deviations (px) of its lens's `roughness`; its loose ones where it is not named.
         weighting: of the observations. options: iterations and threads.
         feet: (M,) where on its track each curve observation's foot is sought first (see `residuals`), by row.
@@ -63,6 +79,7 @@ class Problem:
     options: Options = field(default_factory=Options)
     feet: Array | None = None
     smoothness: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    elsewhere: Elsewhere | None = None
 
     @cached_property
     def private(self) -> frozenset[str | None]:
@@ -94,6 +111,11 @@ class Problem:
                     whole = GaussianPrior(Information(own, form.matrix / sigma**2), np.zeros(len(own)))
                     yield whole.given(free)
 
+    @property
+    def equations(self) -> int:
+        """Measured numbers: two of each point, one of each curve observation."""
+        return self.sights.equations + (self.elsewhere.equations if self.elsewhere else 0)
+
     def unknowns(self, estimate: Estimate) -> int:
         """Number of free numbers that use up observations: what is known beforehand does not."""
         known = sum(len(prior.information.root) for prior in self.priors_at(estimate) if not prior.is_usual)
@@ -106,6 +128,11 @@ class Problem:
     def used(self, points: Mask, curves: Mask) -> Problem:
         """The problem of these rows of the observations alone."""
         return replace(self, sights=self.sights.used(points, curves))
+
+    def of_rows(self, points: Indices, curves: Indices) -> Problem:
+        """The problem of some of the observations, in their order, as if there were no others."""
+        sights = self.sights.renumbered(points, curves)
+        return replace(self, sights=sights, layout=self.layout.of(sights.keys))
 
     def of_sights(self, numbers: Indices) -> Problem:
         """The problem of some of the sights: no placement that they do not show is free."""

@@ -75,7 +75,8 @@ def estimate_as_built(
         problem: of all the observations. end: of its rounds.
     """
     structure, tolerances = whole_structure(observations.targets), problem.options.tolerances
-    stated = make_structure(observations.targets, tolerances).carrying(end.solution.estimate.structure)
+    dimensions = problem.options.dimensions
+    stated = make_structure(observations.targets, tolerances, dimensions).carrying(end.solution.estimate.structure)
     as_stated = structure.carrying(stated)
     kinds = {of: n for of, n in numbers_by_kind(structure, observations.targets).items() if of[0] not in tolerances}
     if len(end.problem.sights) < 2 or not kinds:
@@ -132,7 +133,8 @@ class _Columns:
         estimate = end.solution.estimate
         equations = equations_of(observations, sights, estimate, end.residuals)
         weights = _weights(observations, end, equations)
-        before = estimate.structure.values * [name not in stated.names for name in estimate.structure.names]
+        stated_alone = stated.carrying(estimate.structure)
+        before = estimate.structure.offsets - estimate.structure.carrying(stated_alone).offsets
         solved = np.append(before, 0.0)[equations.slots(estimate.structure)]
         equations = replace(equations, residual=equations.residual - np.sum(equations.built * solved, axis=1))
         slots, scale = equations.slots(structure), weights.inverse_sigma * weights.used

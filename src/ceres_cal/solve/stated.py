@@ -83,7 +83,7 @@ class Statement:
         if self.kind == "earlier":
             return "the earlier calibration"
         names = " and ".join(key.quantity for key in self.keys)
-        return f"the {_STATED[self.kind]} {names} of {self.keys[0].kind} {self.keys[0].owner!r}"
+        return f"the {_STATED[self.kind]} {names} of {self.keys[0].whose}"
 
     def left_out(self, problem: Problem, estimate: Estimate) -> Problem:
         """The problem without it."""
@@ -167,7 +167,7 @@ def contradicted(statement: Statement, test: Test, alone: bool, rivals: Sequence
             in its place.
     """
     key, who = test.key, "the observations alone say" if alone else "everything else says"
-    about = f"{_STATED[statement.kind]} {key.quantity} of {key.kind} {key.owner!r}, {number_text(*test.stated, key)}"
+    about = f"{_STATED[statement.kind]} {key.quantity} of {key.whose}, {number_text(*test.stated, key)}"
     apart = f"{who} {number_text(*test.seen, key)}, {two_digits(test.sigmas)} sigmas apart"
     if statement.kind == "usual":
         words = f"the {about}: {apart}: is the picture a part of another? What is usual was left out"
@@ -186,7 +186,7 @@ def contradicting(statements: Sequence[Statement]) -> Iterator[tuple[Key, Confli
             sigmas = abs(one[0] - other[0]) / float(np.hypot(one[1], other[1]))
             if log_chi2_tail(sigmas**2, 1.0) <= np.log(LEVEL):
                 words = (
-                    f"two priors contradict each other: {key.quantity} of {key.kind} {key.owner!r} is stated as "
+                    f"two priors contradict each other: {key.quantity} of {key.whose} is stated as "
                     f"{number_text(*one, key)} and as {number_text(*other, key)}, {two_digits(sigmas)} sigmas apart: "
                     "correct or remove one"
                 )

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices, Mask
+from ceres_cal.base.arrays import Array, Indices, Indices32, Mask
 from ceres_cal.model.equations import Equations
 from ceres_cal.observations import Columns, Observations, View
 from ceres_cal.observations.sights import Sights
@@ -31,7 +31,7 @@ class Wholes:
     """
 
     observations: Observations
-    of: Indices
+    of: Indices32
     size: int
     frames: Indices
     of_features: bool = True
@@ -136,7 +136,7 @@ def wholes_of(observations: Observations, sights: Sights) -> Iterator[Wholes]:
     owner[(owner < len(views)) & (frames == 0)] = -1
     if len(np.unique(owner[owner >= 0])) >= FEWEST_VIEWS:
         of = owner[np.concatenate([observations.points.view, observations.curves.view])]
-        yield Wholes(observations, of, len(views) + len(placed), frames, of_features=False)
+        yield Wholes(observations, of.astype(np.int32), len(views) + len(placed), frames, of_features=False)
 
 
 def _wholes(observations: Observations, owner: Indices, frames: Indices) -> Wholes:
@@ -149,4 +149,6 @@ def _wholes(observations: Observations, owner: Indices, frames: Indices) -> Whol
     takes_part = (owner[view] >= 0) & (is_curve | (frames[view] > 1))
     names = int(feature.max(initial=0)) + 1
     number = (owner[view] * 2 + is_curve) * names + feature
-    return Wholes(observations, np.where(takes_part, number, -1), (int(owner.max()) + 1) * 2 * names, frames)
+    return Wholes(
+        observations, np.where(takes_part, number, -1).astype(np.int32), (int(owner.max()) + 1) * 2 * names, frames
+    )

@@ -57,7 +57,7 @@ def initialise(observations: Observations, sights: Sights, options: Options) -> 
     """
     cameras, phi_from, numbers, poses = posed_sights(observations, sights, options)
     stations, placements = chained_poses(observations, sights, numbers, poses)
-    structure = make_structure(observations.targets, options.tolerances)
+    structure = make_structure(observations.targets, options.tolerances, options.dimensions)
     return Start(Estimate(cameras, stations, placements, structure), phi_from)
 
 
@@ -113,7 +113,7 @@ def edge_over(camera: Camera, reach_px: float) -> float:
 def _concerns(prior: Prior, camera: str, sights: Sights) -> bool:
     if prior.owner == "camera":
         return prior.name == camera
-    return any(key.station == prior.name for key in sights.keys)
+    return prior.owner == "station" and any(key.station == prior.name for key in sights.keys)
 
 
 def _poses_at(homographies: Homographies, phi: float) -> Array:

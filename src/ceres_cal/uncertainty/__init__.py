@@ -3,6 +3,7 @@
 from ceres_cal.uncertainty.assess import assess
 from ceres_cal.uncertainty.dependence import Dependence, Scatter, measure_scatter
 from ceres_cal.uncertainty.files import PosteriorFile, information_from, lower_triangle
+from ceres_cal.uncertainty.image import ImageMap, image_grid
 from ceres_cal.uncertainty.maps import FieldMap, PointSpread
 from ceres_cal.uncertainty.posterior import Posterior, make_posterior
 from ceres_cal.uncertainty.profile import PhiProfile
@@ -14,6 +15,7 @@ __all__ = [
     "Dependence",
     "Disagreement",
     "FieldMap",
+    "ImageMap",
     "PhiProfile",
     "PointSpread",
     "Posterior",
@@ -24,6 +26,7 @@ __all__ = [
     "WeakDirection",
     "assess",
     "disagreement",
+    "image_grid",
     "information_from",
     "lower_triangle",
     "make_posterior",

@@ -23,7 +23,7 @@ from ceres_cal.uncertainty.bent import weak_axes
 from ceres_cal.uncertainty.posterior import Posterior
 from ceres_cal.uncertainty.profile import FARTHER
 
-_STEP = 1e-5  # of each number's natural size: the differences are good to 1e-9 of the slope
+STEP = 1e-5  # of each number's natural size: the differences are good to 1e-9 of the slope
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +71,7 @@ def locate_slopes(estimate: Estimate, keys: Sequence[Key], station: str, pixels:
         return np.asarray(distance * (change[:, :2] - slant * change[:, 2:]))
 
     slopes = np.zeros((len(pixels), 2, len(keys)))
-    for k, (key, size) in enumerate(zip(keys, _STEP * natural_sizes(estimate, keys), strict=True)):
+    for k, (key, size) in enumerate(zip(keys, STEP * natural_sizes(estimate, keys), strict=True)):
         if key[:2] == ("station", station):
             axis = STATION_QUANTITIES.index(key.quantity)
             if axis == 2:

@@ -15,6 +15,7 @@ from ceres_cal.base.errors import InputError
 from ceres_cal.base.words import two_digits
 from ceres_cal.model.parameters import Estimate
 from ceres_cal.scene.targets import Target
+from ceres_cal.uncertainty.image import ImageMap, image_map
 from ceres_cal.uncertainty.maps import FieldMap, Grid, PointSpread, field_map, spread_of_points
 from ceres_cal.uncertainty.posterior import Posterior
 from ceres_cal.uncertainty.rig import RigPair, rig_pairs
@@ -120,6 +121,18 @@ class Uncertainty:
         """
         name = self.estimate.station_name(station)
         return field_map(self.estimate, self.posterior, name, self._grid(height_m, x_m, y_m))
+
+    def map_px(self, camera: str | None = None) -> ImageMap:
+        """How well a camera knows its image, px, whatever its pose.
+
+        Raises:
+            InputError: no such camera, or none named where there are several.
+        """
+        if camera is None:
+            (camera, *others) = self.estimate.cameras
+            if others:
+                raise InputError(f"which camera? One of {', '.join(self.estimate.cameras)}")
+        return image_map(self.estimate, self.posterior, camera)
 
     def seam_sd_mm(
         self,

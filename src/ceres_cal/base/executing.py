@@ -1,0 +1,54 @@
+"""The same work over many items, here or over any `concurrent.futures.Executor`: the same numbers, whatever it is."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Executor, ProcessPoolExecutor
+from contextlib import contextmanager
+from typing import Any, TypeVar
+
+from ceres_cal.base.errors import InputError
+from ceres_cal.base.threads import share_cores
+
+_T = TypeVar("_T")
+
+
+def each(function: Callable[..., _T], *items: Iterable[Any], executor: Executor | None = None) -> Iterator[_T]:
+    """What a function makes of the items, in their order; one after the other where there is no executor.
+
+    Of processes the function and its arguments have to be picklable: no lambda, nothing defined inside a function.
+    """
+    if executor is None:
+        return map(function, *items)
+    futures = [executor.submit(function, *arguments) for arguments in zip(*items, strict=True)]
+    return (future.result() for future in futures)
+
+
+@contextmanager
+def processes(jobs: int) -> Iterator[Executor | None]:
+    """So many processes that share the cores among them; None for one: then the work is done here. 0 is one a core.
+
+    Whatever ends it early (Ctrl-C, SIGTERM, an error) ends the processes, too.
+
+    Raises:
+        InputError: fewer than 0.
+    """
+    if jobs < 0:
+        raise InputError(f"{jobs} jobs at a time: give 1 or more, or 0 for one a core")
+    jobs = jobs or os.cpu_count() or 1
+    if jobs == 1:
+        yield None
+        return
+    fresh = multiprocessing.get_context("spawn")  # a fork has its parent's locks, and none of the threads
+    before = set(multiprocessing.active_children())
+    pool = ProcessPoolExecutor(jobs, fresh, share_cores, (jobs,))
+    try:
+        yield pool
+    except BaseException:
+        for child in set(multiprocessing.active_children()) - before:
+            child.terminate()  # what waits fails with them; to cancel it besides makes Python 3.11 complain
+        raise
+    finally:
+        pool.shutdown()

@@ -1,0 +1,107 @@
+"""What came out of a solve, as a calibration that is not assessed yet."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ceres_cal.base.arrays import Array, Indices
+from ceres_cal.calibration.calibration import Calibration
+from ceres_cal.calibration.origin import COPY, Fit, Rejected
+from ceres_cal.model.parameters import Layout
+from ceres_cal.observations import Observations
+from ceres_cal.solve import Problem, RobustSolution
+from ceres_cal.solve.bulk import Settled
+from ceres_cal.solve.explanation import Explanation
+
+
+def came_out(
+    phi_from: Mapping[str, str],
+    observations: Observations,
+    problem: Problem,
+    end: RobustSolution,
+    explanations: Sequence[Explanation] = (),
+) -> Calibration:
+    """What came out, not assessed."""
+    out = [np.flatnonzero(~mask) for mask in (end.inliers.points, end.inliers.curves)]
+    far = end.inliers.point_sigmas[out[0]], end.inliers.curve_sigmas[out[1]]
+    return Calibration(
+        end.solution.estimate,
+        observations.targets,
+        _fit(end, problem.layout),
+        _rejected(observations, out, far, explanations),
+        end.solution.termination,
+        end.solution.converged,
+        end.rounds,
+        end.solution.history,
+        phi_from,
+        observations.warnings,
+        problem.options,
+        observations.digest,
+    )
+
+
+def of_all(calibration: Calibration, settled: Settled) -> Calibration:
+    """What came out of all observations, where a part of them decided."""
+    observations, used, scales = settled.observations, settled.used, calibration.fit.scales
+    points, curves = used.sums
+    sigmas = [own / scale for own, scale in zip(used.sigmas, scales, strict=True)]
+    mean = [np.sqrt(sums[1:] / max(sums[0], 1.0)) for sums in (points, curves)]
+    return replace(
+        calibration,
+        fit=replace(
+            calibration.fit,
+            points=int(points[0]),
+            curves=int(curves[0]),
+            points_rms_px=float(mean[0][0]),
+            curves_rms_px=float(mean[1][0]),
+            point_sigma_px=float(mean[0][1]),
+            curve_sigma_px=float(mean[1][1]),
+        ),
+        rejected=_rejected(observations, used.rows, sigmas, settled.explanations),
+        warnings=observations.warnings,
+    )
+
+
+def _fit(end: RobustSolution, layout: Layout) -> Fit:
+    points, curves = end.residuals.lengths
+    used = points[end.inliers.points], curves[end.inliers.curves]
+    sigmas = end.problem.sights.sigma_px, end.problem.sights.curve_sigma_px
+    return Fit(
+        len(used[0]),
+        len(used[1]),
+        _rms(used[0]),
+        _rms(used[1]),
+        end.inliers.point_scale,
+        end.inliers.curve_scale,
+        layout.size,
+        _rms(sigmas[0]),
+        _rms(sigmas[1]),
+    )
+
+
+def _rms(values: Array) -> float:
+    """Root mean square; 0 of nothing."""
+    return float(np.sqrt(values @ values / max(len(values), 1)))
+
+
+def _rejected(
+    observations: Observations, rows: Sequence[Indices], sigmas: Sequence[Array], explanations: Sequence[Explanation]
+) -> tuple[Rejected, ...]:
+    """The rows of points and of curve observations that did not take part, and how far off they are."""
+    wholes = [one for one in explanations if one.is_taken]
+    entries, views, copies = [], observations.views, observations.copies
+    for kind, out, far, column, copy_of, first in (
+        ("point", rows[0], sigmas[0], observations.points, copies.points, 0),
+        ("curve", rows[1], sigmas[1], observations.curves, copies.curves, len(observations.points)),
+    ):
+        for row, sigma in zip(out.tolist(), far.tolist(), strict=True):
+            reason = f"{sigma:.1f} sigma off" if np.isfinite(sigma) else "cannot be seen from there"
+            reason = next((one.words for one in wholes if one.rows[first + row]), reason)
+            if copy_of[row] >= 0:
+                reason = f"{COPY} of frame {views[copy_of[row]].frame!r}"
+            frame = views[column.view[row]].frame
+            entries.append(Rejected(kind, row, frame, observations.feature_name(kind, row), reason))
+    return tuple(entries)

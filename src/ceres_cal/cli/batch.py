@@ -1,0 +1,207 @@
+"""`ceres-cal batch`: many calibrations, checks and refits over processes, each by its own command."""
+
+from __future__ import annotations
+
+import glob
+import math
+import shlex
+import sys
+from argparse import ArgumentParser, Namespace
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ceres_cal.base.errors import InputError
+from ceres_cal.base.words import plural
+from ceres_cal.cli.arguments import add_jobs, add_quiet
+from ceres_cal.cli.calibrate import COMMANDS as CALIBRATE
+from ceres_cal.cli.check import COMMANDS as CHECK
+from ceres_cal.cli.command import Answer, Command
+from ceres_cal.cli.outputs import section
+from ceres_cal.cli.refit import COMMANDS as REFIT
+
+if TYPE_CHECKING:
+    from ceres_cal.batch import Job, Outcome
+
+_COMMANDS: Mapping[str, Command] = {command.name: command for command in (*CALIBRATE, *CHECK, *REFIT)}
+_READ = ("observations", "calibration", "inputs", "images")  # arguments that name files
+_OWN = {"-o", "--output", "--report", "--json"}
+_SUMMARY = "summary.html"
+_EXIT_CODES = {"failed": 3, "no": 1}
+_MOST_REASONS = 4
+
+
+def _add_arguments(parser: ArgumentParser) -> None:
+    add = parser.add_argument
+    add(
+        "plan",
+        type=Path,
+        metavar="PLAN",
+        help="a table (.jsonl, .csv, .toml) with name, command (calibrate, check or refit) and arguments of each job, "
+        "files named from its folder; or a folder: each file of observations in it is calibrated, those of a folder "
+        "inside it together",
+    )
+    add(
+        "-o",
+        "--output",
+        type=Path,
+        required=True,
+        metavar="DIR",
+        help=f"folder for results.jsonl, what jobs write, and {_SUMMARY}; made if missing. Jobs with a result there, "
+        "and unchanged inputs, are not done again",
+    )
+    add("--options", default="", metavar="'...'", help="arguments that every calibrate job gets besides")
+    add_jobs(parser, "jobs", 0)
+    add("--reports", action="store_true", help="a report of each calibrate and refit, too")
+    add_quiet(parser)
+
+
+def _run(args: Namespace) -> Answer:
+    from ceres_cal.base.executing import processes
+    from ceres_cal.base.files import make_folder, write_bytes
+    from ceres_cal.batch import run_jobs
+    from ceres_cal.batch.page import summary_page
+
+    jobs = plan_jobs(args.plan, args.output, args.options, reports=args.reports)
+    make_folder(args.output)
+    outcomes, again = [], 0
+    with processes(args.jobs if len(jobs) > 1 else 1) as executor:
+        for outcome, is_old in run_jobs(jobs, work, args.output, executor):
+            outcomes.append(outcome)
+            again += is_old
+            if not (args.quiet or args.json):
+                print(_line(outcome, len(outcomes), len(jobs), is_old), file=sys.stdout, flush=True)
+    pages = {job.name: file.name for job in jobs for file in job.outputs if file.suffix == ".html" and file.exists()}
+    title = args.plan.resolve().name
+    write_bytes(args.output / _SUMMARY, summary_page(title, outcomes, pages).encode())
+    worst = min(outcomes, key=lambda one: one.order).level
+    return Answer(_data(args, outcomes, again), lambda: _text(args, outcomes, again), _EXIT_CODES.get(worst, 0))
+
+
+COMMANDS = (
+    Command(
+        "batch",
+        "many calibrations, checks and refits, resumable, with one page that ranks them",
+        _add_arguments,
+        _run,
+        (
+            "plan.toml -o results/ --jobs 4",
+            "rooms/ -o results/ --options '--lens auto --prior height_m=4.02:20mm' --reports",
+        ),
+    ),
+)
+
+
+# ---- jobs -----------------------------------------------------------------------------------------------------------
+
+
+def plan_jobs(plan: Path, to: Path, options: str = "", *, reports: bool = False) -> list[Job]:
+    """The jobs of a plan, with all that `work` needs; what they write goes into the folder `to`.
+
+    Args:
+        options: that every calibrate job gets besides. reports: whether calibrate and refit write one.
+
+    Raises:
+        InputError: the plan cannot be read, or a row is wrong usage of its command; it says which.
+    """
+    from ceres_cal.batch import read_plan
+
+    base = plan if plan.is_dir() else plan.parent
+    jobs = []
+    for row in read_plan(plan):
+        more = shlex.split(options) if row.command == "calibrate" else []
+        try:
+            jobs.append(_job(row.name, row.command, [*row.arguments, *more], base, to, reports))
+        except InputError as error:
+            raise InputError(f"{plan}, job {row.name!r}: {error}") from None
+    return jobs
+
+
+def _job(name: str, command: str, arguments: Sequence[str], base: Path, to: Path, reports: bool) -> Job:
+    from ceres_cal.batch import Job
+
+    if command not in _COMMANDS:
+        raise InputError(f"there is no command {command!r} for a batch: {', '.join(_COMMANDS)}")
+    if not _OWN.isdisjoint(argument.partition("=")[0] for argument in arguments):
+        raise InputError(f"leave out {', '.join(sorted(_OWN))}: what jobs write goes into the folder of the batch")
+    outputs = () if command == "check" else (to / f"{name}.json", *([to / f"{name}.html"] if reports else []))
+    parsed = _COMMANDS[command].parse([*arguments, *_written(outputs)])
+    named = [str(one) for what in _READ for one in _every(getattr(parsed, what, None))]
+    placed = tuple(str(base / one) if one in named else one for one in arguments)
+    return Job(name, command, placed, tuple(file for one in named for file in _files(base / one)), outputs)
+
+
+def _every(value: Any) -> list[Any]:
+    return [] if value is None else list(value) if isinstance(value, list) else [value]
+
+
+def _written(outputs: Sequence[Path]) -> Iterator[str]:
+    """The options for what a job writes: a calibration and, where there is one, a report."""
+    for option, file in zip(("-o", "--report"), outputs, strict=False):
+        yield from (option, str(file))
+
+
+def _files(path: Path) -> list[Path]:
+    """A file or folder, or what a pattern stands for; what is missing is the job's to say."""
+    return [path] if path.exists() else [Path(one) for one in sorted(glob.glob(str(path)))] or [path]  # noqa: PTH207
+
+
+def work(job: Job) -> Outcome:
+    """Do one job, by its command.
+
+    Raises:
+        CalibrationError: as the command has it.
+    """
+    command = _COMMANDS[job.command]
+    data = command.run(command.parse([*job.arguments, *_written(job.outputs), "--quiet"])).data
+    return _of_check(job, data) if job.command == "check" else _of_calibration(job, data)
+
+
+def _of_calibration(job: Job, data: Mapping[str, Any]) -> Outcome:
+    import numpy as np
+
+    from ceres_cal.batch import Outcome
+
+    verdict, known = data["verdict"], data["uncertainty"] or {"maps": {}}
+    radii = [float(np.nanmax(one["radius_95_mm"], initial=0.0)) for maps in known["maps"].values() for one in maps]
+    finite = [radius for radius in radii if np.isfinite(radius)]
+    reasons = [one["text"] for level in ("no", "care") for one in verdict["reasons"] if one["level"] == level]
+    worst = max(finite) if finite else None
+    return Outcome(job.name, job.command, verdict["level"], verdict["headline"], tuple(reasons[:_MOST_REASONS]), worst)
+
+
+def _of_check(job: Job, data: Mapping[str, Any]) -> Outcome:
+    from ceres_cal.batch import Outcome
+
+    stations = data["stations"]
+    said = [f"{name} {one['words']}" for name, one in stations.items() if not one["holds"]]
+    moved = [one["moved_mm"] for one in stations.values() if math.isfinite(one["moved_mm"])]
+    line = said[0] if said else f"{', '.join(stations)}: as calibrated"
+    level, worst = "good" if data["holds"] else "no", max(moved) if moved else None
+    return Outcome(job.name, job.command, level, line, tuple(said[1:][:_MOST_REASONS]), worst)
+
+
+# ---- what is said ---------------------------------------------------------------------------------------------------
+
+
+def _line(outcome: Outcome, number: int, total: int, is_old: bool) -> str:
+    width = len(str(total))
+    before = " (from before)" if is_old else ""
+    return f"{outcome.level:10}{number:{width}} of {total}  {outcome.job}: {outcome.line}{before}"
+
+
+def _data(args: Namespace, outcomes: Sequence[Outcome], again: int) -> dict[str, Any]:
+    ranked = sorted(outcomes, key=lambda one: one.order)
+    return {"jobs": [asdict(one) for one in ranked], "from_before": again, "output": str(args.output / _SUMMARY)}
+
+
+def _text(args: Namespace, outcomes: Sequence[Outcome], again: int) -> str:
+    count = Counter(one.level for one in outcomes)
+    levels = ", ".join(f"{count[level]} {level}" for level in ("good", "care", "no", "failed") if count[level])
+    before = f"; {again} from before" if again else ""
+    return "\n".join(
+        [section("jobs", [f"{plural(len(outcomes), 'job')}: {levels}{before}"]),
+         section("written", [str(args.output / _SUMMARY)])]
+    )  # fmt: skip

@@ -1,0 +1,193 @@
+"""One picture of what stands still, from several of a camera that does: robots and people are elsewhere in each.
+
+A picture that is blurred, or that was taken after the camera was moved, is left out: its gradients tell by how far it
+lies aside of a reference (Lucas and Kanade, IJCAI 1981), in one robust linear fit with an affine motion, a gain and an
+offset.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from ceres_cal.base.arrays import Array, Array32, Image
+from ceres_cal.base.errors import InputError
+from ceres_cal.base.files import most_bytes
+
+MOST_PICTURES = 25
+"""That one is made of: of video frames and photographs, evenly."""
+# How far a picture may lie aside, px.
+_MOVED_PX = 0.2
+# Share of the usual sharpness below which a picture is blurred. Noise is smoothed away before.
+_BLURRED = 0.5
+_SMOOTH_PX = 1.5
+_BLOCKS, _OF_BLOCK, _FEWEST = 8, 120, 30  # to a side; pixels that count of each, and so that it does
+_CLEAR = 4.0  # times the median gradient, which is noise and texture
+_ALIKE = 0.6  # correlation of a block that shows the same; most must, as people hide some
+_ROUNDS, _BEND = 8, 2.0  # of the fit, and of what agrees; standard deviations from which on a level counts less
+_BAND, _EVERY = 64, 31  # rows worked on at once; pixels apart that tell the noise
+_NEAR = 3.0  # times the noise
+
+
+@dataclass(frozen=True, eq=False)
+class Merged:
+    """One picture of several.
+
+    Attributes:
+        picture: (height, width) grey levels, 0 to `white`. used: names of those that took part. left_out: name and
+            reason of the others.
+    """
+
+    picture: Array32
+    white: int
+    used: tuple[str, ...]
+    left_out: tuple[tuple[str, str], ...]
+
+
+def merged(pictures: Iterable[tuple[str, Image]]) -> Merged:
+    """What the pictures show that stands still: each pixel's median, made finer by the mean of what is near it.
+
+    They are read one by one and kept in grey; of a camera that was moved in between those count that most agree with.
+
+    Args:
+        pictures: with their names, as (height, width) or (height, width, 3); MOST_PICTURES at most.
+
+    Raises:
+        InputError: there is none, no two show the same, they differ in size or depth, or are too many to be held at
+            once.
+    """
+    names, greys = _read(pictures)
+    sharpness = np.array([_sharpness(grey) for grey in greys])
+    left_out = {n: "blurred" for n, one in enumerate(sharpness) if one < _BLURRED * np.median(sharpness)}
+    sharp = [n for n in range(len(names)) if n not in left_out]
+    half = (len(sharp) + 1) // 2  # the camera may have been moved half way
+    chosen = _agreeing(greys, sharp, sharp)
+    if len(chosen) < half:
+        chosen = max((chosen, *(_agreeing(greys, sharp, some) for some in (sharp[:half], sharp[half:]))), key=len)
+    if len(chosen) < min(len(sharp), 2):
+        raise InputError(
+            f"no two of {len(names)} pictures show the same: one is made of those of a camera that stands still, give "
+            "them one by one"
+        )
+    left_out |= {n: "the camera had moved" for n in sharp if n not in chosen}
+    return Merged(
+        _middle([greys[n] for n in chosen]),
+        int(np.iinfo(greys[0].dtype).max),
+        tuple(names[n] for n in chosen),
+        tuple((names[n], left_out[n]) for n in sorted(left_out)),
+    )
+
+
+def _agreeing(greys: Sequence[Image], every: Sequence[int], some: Sequence[int]) -> list[int]:
+    """Those of the pictures that lie where what some of them show together does."""
+    kept = list(some)
+    for _ in range(_ROUNDS):
+        reference = _Reference.of(_middle([greys[n] for n in kept]))
+        same = [n for n in every if reference.moved_px(greys[n]) < _MOVED_PX]
+        if same == kept or not same:
+            break
+        kept = same
+    return same
+
+
+def _read(pictures: Iterable[tuple[str, Image]]) -> tuple[list[str], list[Image]]:
+    names: list[str] = []
+    greys: list[Image] = []
+    for name, picture in pictures:
+        grey = picture if picture.ndim == 2 else np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY))
+        if greys and (grey.shape != greys[0].shape or grey.dtype != greys[0].dtype):
+            size, first = (f"{one.shape[1]} x {one.shape[0]} px of {one.dtype}" for one in (grey, greys[0]))
+            raise InputError(f"{name}: {size}, but {names[0]} has {first}: give pictures of one camera")
+        if (len(greys) + 1) * grey.nbytes > most_bytes():
+            raise InputError(
+                f"{name}: more than {len(greys)} pictures of {grey.shape[1]} x {grey.shape[0]} px are too many to be "
+                "held at once: give fewer"
+            )
+        names.append(name)
+        greys.append(grey)
+    if not greys:
+        raise InputError("there is no picture to be seen: give some")
+    return names, greys
+
+
+def _smooth(grey: Image | Array32) -> Array32:
+    return np.asarray(cv2.GaussianBlur(grey.astype(np.float32), (0, 0), _SMOOTH_PX))
+
+
+def _sharpness(grey: Image) -> float:
+    return float(np.mean(np.asarray(cv2.Laplacian(_smooth(grey), cv2.CV_32F)) ** 2))
+
+
+@dataclass(frozen=True, eq=False)
+class _Reference:
+    """A picture at its clearest pixels.
+
+    Attributes:
+        pixels: (N,) their numbers. block: (N,) which part of the picture each is in. grey: (N,) its level, smoothed.
+        columns: (N, 8) by how much a level changes with a motion (x, y, and both by x and y), a gain and an offset.
+        reach: (2,) half the picture's size, the unit of x and y.
+    """
+
+    pixels: Array
+    block: Array
+    grey: Array
+    columns: Array
+
+    @classmethod
+    def of(cls, grey: Array32) -> _Reference:
+        soft = _smooth(grey)
+        dx, dy = (np.asarray(cv2.Sobel(soft, cv2.CV_32F, *order, scale=0.125)) for order in ((1, 0), (0, 1)))
+        steep = np.hypot(dx, dy)
+        height, width = soft.shape
+        row, column = np.divmod(np.arange(soft.size), width)
+        block = (row * _BLOCKS // height) * _BLOCKS + column * _BLOCKS // width
+        clear = np.flatnonzero(steep.ravel() > _CLEAR * float(np.median(steep)))
+        order = clear[np.lexsort((-steep.ravel()[clear], block[clear]))]
+        place = np.arange(len(order)) - np.searchsorted(block[order], block[order])
+        chosen = order[place < _OF_BLOCK]
+        x, y = 2.0 * column[chosen] / width - 1.0, 2.0 * row[chosen] / height - 1.0
+        gx, gy, level = (one.ravel()[chosen].astype(float) for one in (dx, dy, soft))
+        columns = np.column_stack([gx, gy, gx * x, gx * y, gy * x, gy * y, level, np.ones(len(chosen))])
+        return cls(chosen, block[chosen], level, columns)
+
+    def moved_px(self, grey: Image) -> float:
+        """How far another picture lies aside, root mean square; infinity where it shows something else."""
+        seen = _smooth(grey).ravel()[self.pixels].astype(float)
+        alike = self._alike(seen)
+        if 2 * sum(alike.values()) <= len(alike):
+            return np.inf
+        rows = np.isin(self.block, [block for block, same in alike.items() if same])
+        columns, seen, weight = self.columns[rows], seen[rows], np.ones(np.count_nonzero(rows))
+        for _ in range(_ROUNDS):
+            wide = columns * weight[:, None]
+            fit = np.linalg.lstsq(wide.T @ wide, wide.T @ (seen * weight), rcond=None)[0]
+            left = np.abs(seen - columns @ fit)
+            weight = np.minimum(1.0, _BEND * 1.4826 * max(float(np.median(left)), 1e-3) / np.maximum(left, 1e-12))
+        moves = fit[:6] / max(abs(float(fit[6])), 1e-3)
+        return float(np.sqrt(moves[:2] @ moves[:2] + moves[2:] @ moves[2:] / 3.0))
+
+    def _alike(self, seen: Array) -> dict[int, bool]:
+        """Whether each part of the picture that shows anything shows the same."""
+        return {
+            int(number): bool(np.corrcoef(self.grey[own], seen[own])[0, 1] > _ALIKE)
+            for number, own in ((number, self.block == number) for number in np.unique(self.block))
+            if np.count_nonzero(own) >= _FEWEST and np.ptp(seen[own]) > 0.0
+        }
+
+
+def _middle(greys: Sequence[Image]) -> Array32:
+    """Each pixel's median, made finer: the mean of the levels that are near it, (height, width)."""
+    some = np.stack([grey.ravel()[::_EVERY] for grey in greys]).astype(np.float32)
+    noise = 1.4826 * float(np.median(np.abs(some - np.median(some, axis=0))))
+    picture = np.empty(greys[0].shape, dtype=np.float32)
+    for row in range(0, len(picture), _BAND):
+        band = np.stack([grey[row : row + _BAND] for grey in greys]).astype(np.float32)
+        median = np.median(band, axis=0)
+        near = np.abs(band - median) <= max(_NEAR * noise, 1.0)
+        count = np.count_nonzero(near, axis=0)
+        mean = np.sum(band, axis=0, where=near) / np.maximum(count, 1)
+        picture[row : row + _BAND] = np.where(count > 0, mean, median)  # of two that differ there is no level near
+    return picture

@@ -1,0 +1,71 @@
+"""The scales of colour, the same in every report: blue is good, amber wants care, brown is not to be used.
+
+Lightness falls all the way, so that grey print and colour-blind readers have the same order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ceres_cal.base.arrays import Array
+from ceres_cal.base.words import short
+from ceres_cal.report.grounds import CARE_MM, GOOD_MM
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+COLORS = ("#eef5fa", "#d9e8f3", "#bfd8ea", "#a3c6e0", "#86b2d4", "#6a9dc7", "#4f88b8", "#a05c08", "#7e3f06", "#5e1c0a")
+ON_COLOR = "#26303a"
+"""What is drawn upon them, in a dark window too."""
+_UNKNOWN = "#fcede4"
+_ENDLESS = 1e300
+
+
+@dataclass(frozen=True)
+class Scale:
+    """Where one colour of `COLORS` ends and the next begins, in a unit."""
+
+    borders: tuple[float, ...]
+    unit: str
+
+    def fill(self, axes: Axes, x: Array, y: Array, values: Array) -> None:
+        """Values (Y, X) over a grid: NaN stays open, infinity is hatched."""
+        unknown = np.isinf(values)
+        if unknown.any():
+            axes.contourf(x, y, unknown.astype(float), [0.5, 1.5], colors=[_UNKNOWN], hatches=["////"])
+        known = np.where(unknown, np.nan, values)
+        if np.isfinite(known).any():
+            axes.contourf(x, y, known, [0.0, *self.borders, _ENDLESS], colors=COLORS)
+
+    def bar(self, axes: Axes, label: str) -> None:
+        """The whole scale beneath the axes, whatever of it the picture needs."""
+        from matplotlib.cm import ScalarMappable
+        from matplotlib.colors import BoundaryNorm, ListedColormap
+
+        figure = axes.get_figure()
+        assert figure is not None
+        steps = range(len(COLORS) + 1)
+        every = ScalarMappable(BoundaryNorm(list(steps), len(COLORS)), ListedColormap(list(COLORS)))
+        bar = figure.colorbar(
+            every, ax=axes, orientation="horizontal", ticks=steps[1:-1], aspect=45, shrink=0.9, pad=0.02,
+            drawedges=True,
+        )  # fmt: skip
+        bar.ax.set_xticklabels([f"{border:g}" for border in self.borders])
+        bar.set_label(label)
+        bar.ax.tick_params(length=0)
+        bar.outline.set_visible(False)
+        bar.dividers.set(color="#ffffff", linewidth=0.7)
+
+
+MM = Scale((0.1, 0.2, 0.5, 1.0, 2.0, 5.0, GOOD_MM, 20.0, CARE_MM), "mm")
+PX = Scale((0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0), "px")
+"""Of what a lens shows, of which no verdict speaks: amber is more than a detected corner or line is off by."""
+
+
+def spoken(values: Sequence[float] | Array) -> tuple[str, ...]:
+    """Each value with two digits: "" of NaN, "unknown" of infinity."""
+    return tuple("" if np.isnan(value) else short(float(value)) for value in np.ravel(values))

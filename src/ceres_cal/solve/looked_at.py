@@ -1,0 +1,186 @@
+"""Which observations are looked at where it is asked whether some do not belong, as a whole.
+
+The answer rests on a few rows of a few views: of those that stand out, and of others, evenly. So of very many
+observations a part is asked, with all rows of the views that stand out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ceres_cal.base.arrays import AnyArray, Array, Indices, Mask
+from ceres_cal.observations import Observations
+from ceres_cal.observations.thinning import column_of
+from ceres_cal.solve.problem import Problem
+from ceres_cal.solve.robust import RobustSolution
+from ceres_cal.solve.wholes import FEWEST, Wholes
+
+_MOST_VIEWS, _MOST_WHOLE_VIEWS = 8, 24  # whose features, or which, are looked at together: at the cube of the number
+_MOST_OTHERS = 16  # views besides, which tell the lens
+_MOST_ROWS = 40  # of a whole in one view
+# Share of a whole's observations in use below which it is looked at in any case: its other rows are good by chance.
+_LEFT = 0.5
+_MOST_REJECTED = 4  # such wholes of a kind, whose views are asked
+# Observations that are asked, and views of them: what the free numbers take up is projected out of the few rows that
+# are looked at, so a solve has but to end in the right valley.
+_MOST_ASKED, _FEWEST_ASKED = 200_000, 200
+
+
+@dataclass(frozen=True, eq=False)
+class Asked:
+    """The observations that are asked, with their problem and its end.
+
+    Attributes:
+        kinds: of wholes, numbered as among all of them.
+    """
+
+    problem: Problem
+    observations: Observations
+    end: RobustSolution
+    kinds: Sequence[Wholes]
+
+    def of_rows(self, rows: Mask) -> Problem:
+        """The problem of these (n + m,)."""
+        points = len(self.observations.points)
+        return self.problem.used(rows[:points], rows[points:])
+
+    def without(self, rows: Mask) -> Problem:
+        """The problem of the others: no placement that they do not show is free."""
+        others = self.of_rows(~rows)
+        return replace(others, layout=others.layout.of(others.sights.keys))
+
+
+def asked(every: Asked) -> Asked:
+    """All observations, or of very many some: of views that stand out, and of others evenly."""
+    observations, sights = every.observations, every.problem.sights
+    if len(sights.point_rows) + len(sights.curve_rows) <= _MOST_ASKED:
+        return every
+    points = len(observations.points)
+    there = np.zeros(points + len(observations.curves), dtype=bool)
+    there[sights.point_rows] = there[points + sights.curve_rows] = True
+    view = column_of(observations, "view")
+    chosen = _some_views(np.bincount(view[there], minlength=len(observations.views)))
+    for wholes in every.kinds:
+        gone = mostly_rejected(wholes, every.end, there)
+        worst = np.argsort(-gone, kind="stable")[: min(_MOST_REJECTED, np.count_nonzero(gone))]
+        chosen |= views_looked_at(observations, wholes, every.end, there, wholes.among(worst) & there)
+    there &= chosen[view]
+    rows = np.flatnonzero(there)[:: max(1, int(np.count_nonzero(there)) // (2 * _MOST_ASKED))]
+    return _part(every, rows, int(np.searchsorted(rows, points)))
+
+
+def _some_views(counts: Indices) -> Mask:
+    """(V,) some of the views that show anything, evenly: as many as hold what is asked, and no fewer than a few."""
+    shown = np.flatnonzero(counts)
+    most = min(max(_FEWEST_ASKED, len(shown) * _MOST_ASKED // int(counts.sum())), len(shown))
+    chosen = np.zeros(len(counts), dtype=bool)
+    chosen[shown[np.linspace(0, len(shown) - 1, most).astype(np.int64)]] = True
+    return chosen
+
+
+def _part(every: Asked, rows: Indices, split: int) -> Asked:
+    """Some rows (n + m,) of all, the first of them points, as if there were no others."""
+    p, c = rows[:split], rows[split:] - len(every.observations.points)
+    observations, problem = every.observations.part(p, c), every.problem.of_rows(p, c)
+    there, inliers = every.end.residuals.of_rows(p, c), every.end.inliers.of_rows(p, c)
+    weighting = every.end.problem.weighting
+    used = replace(problem.used(inliers.points, inliers.curves), weighting=weighting, feet=there.feet)
+    end = replace(every.end, problem=used, inliers=inliers, residuals=there)
+    kinds = [replace(wholes, observations=observations, of=wholes.of[rows]) for wholes in every.kinds]
+    return Asked(problem, observations, end, kinds)
+
+
+# ---- what is looked at ----------------------------------------------------------------------------------------------
+
+
+def rows_looked_at(
+    observations: Observations, wholes: Wholes, end: RobustSolution, taking_part: Mask, recalled: Mask
+) -> Mask:
+    """(N + M,) of some views, and of each whole in them some.
+
+    Args:
+        taking_part: (N + M,) all that may be. recalled: (N + M,) what is looked at whether or not it is an inlier.
+    """
+    inside, view = taking_part & (inliers_of(end) | recalled), column_of(observations, "view")
+    rows = np.flatnonzero(inside & views_looked_at(observations, wholes, end, inside, recalled)[view])
+    inside[:] = False
+    key = wholes.of[rows].astype(np.int64) * len(observations.views) + view[rows]
+    inside[_thinned(rows, key, wholes.of[rows] >= 0)] = True
+    return inside
+
+
+def views_looked_at(
+    observations: Observations, wholes: Wholes, end: RobustSolution, taking_part: Mask, recalled: Mask
+) -> Mask:
+    """(V,) those with what is recalled, those that stand out, some of the others, and some without any whole."""
+    view = column_of(observations, "view")
+    shows_some = np.bincount(view[taking_part & (wholes.of >= 0)], minlength=len(observations.views))
+    if wholes.of_features:
+        largest, most = _largest(observations, end), _MOST_VIEWS
+    else:
+        largest, most = excess(observations, wholes, end, taking_part)[_owner(wholes, view)], _MOST_WHOLE_VIEWS
+    with_some, others = np.flatnonzero(shows_some), np.flatnonzero(shows_some == 0)
+    chosen = np.zeros(len(shows_some), dtype=bool)
+    chosen[np.unique(view[recalled])[:most]] = True
+    chosen[with_some[np.argsort(-largest[with_some], kind="stable")][: most // 2]] = True
+    chosen[with_some[:: max(1, 2 * len(with_some) // most)]] = True
+    chosen[others[:: max(1, len(others) // _MOST_OTHERS)]] = True
+    return chosen
+
+
+def inliers_of(end: RobustSolution) -> Mask:
+    """(N + M,) the observations that take part."""
+    return np.concatenate([end.inliers.points, end.inliers.curves])
+
+
+def mostly_rejected(wholes: Wholes, end: RobustSolution, taking_part: Mask) -> Indices:
+    """(size,) how many observations of each whole are outliers, where most of them are; else 0."""
+    counts, used = wholes.count(taking_part), wholes.count(inliers_of(end) & taking_part)
+    return np.where((counts > FEWEST) & (used < _LEFT * counts), counts - used, 0)
+
+
+def excess(observations: Observations, wholes: Wholes, end: RobustSolution, taking_part: Mask) -> Array:
+    """(size + 1,) by how many standard deviations the mean square residual of each view or placement is above the
+    median one.
+    """
+    lengths = np.concatenate([end.inliers.point_sigmas, end.inliers.curve_sigmas])
+    points, size = len(observations.points), wholes.size + 1
+    of = np.where(inliers_of(end) & taking_part, wholes.of, -1)
+    of[of < 0] = wholes.size
+    spare = 2.0 * np.bincount(of[:points], minlength=size) + np.bincount(of[points:], minlength=size)
+    square = np.bincount(of, lengths**2, minlength=size)
+    spare[-1] = square[-1] = 0.0  # of what is in none
+    square, there = square / np.maximum(spare, 1.0), spare > 0.0
+    middle = float(np.median(square[there])) if np.any(there) else 1.0
+    return np.asarray((square / max(middle, 1e-12) - 1.0) / np.sqrt(2.0 / np.maximum(spare, 1.0)) * there)
+
+
+def _owner(wholes: Wholes, view: AnyArray) -> Indices:
+    """(V,) number of the whole that each view is of; the last for none."""
+    owner = np.full(len(wholes.frames), wholes.size)
+    owner[view[wholes.of >= 0]] = wholes.of[wholes.of >= 0]
+    return owner
+
+
+def _largest(observations: Observations, end: RobustSolution) -> Array:
+    """(V,) the largest mean offset of a curve in each view, in standard deviations where errors are independent."""
+    curves, names = observations.curves, int(observations.curves.feature.max(initial=0)) + 1
+    own = curves.view * names + curves.feature
+    sigmas = end.residuals.curves / (end.inliers.curve_scale * curves.sigma_px)
+    inside = np.where(end.inliers.curves & np.isfinite(sigmas), sigmas, 0.0)
+    size = len(observations.views) * names
+    count = np.bincount(own, end.inliers.curves, minlength=size)
+    mean = np.abs(np.bincount(own, inside, minlength=size)) / np.sqrt(np.maximum(count, 1.0))
+    return np.asarray(mean.reshape(-1, names).max(axis=1))
+
+
+def _thinned(rows: Indices, key: Indices, of_whole: Mask) -> Indices:
+    """Of rows with the same key some, evenly, where they are of a whole."""
+    order = np.argsort(key, kind="stable")
+    _, starts, count = np.unique(key[order], return_index=True, return_counts=True)
+    place, size = np.arange(len(order)) - np.repeat(starts, count), np.repeat(count, count)
+    most = np.where(of_whole[order], np.minimum(size, _MOST_ROWS), size)
+    return np.asarray(rows[order[(place * most) // size != ((place - 1) * most) // size]])

@@ -1,0 +1,373 @@
+"""Very many observations of the world in shares, each of which answers with sums.
+
+A share is some of the rows, in memory or in files, and is asked where it is: by this process, or by a worker that has
+it. What it answers does not grow with its rows: a compressed block (design, section 6), normal equations, a histogram
+of residuals. It keeps nothing that an answer depends on but its rows, so one that is lost is made again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ceres_cal.base.arrays import AnyArray, Array, Indices, Indices32, Mask
+from ceres_cal.model.parameters import Estimate, Layout
+from ceres_cal.model.residuals import Residuals, residuals
+from ceres_cal.observations import Observations
+from ceres_cal.observations.columns import Curves, FileRows, Points, View, read_rows, rows_of
+from ceres_cal.observations.files import Content
+from ceres_cal.observations.sights import SightKey, Sights, sights_of
+from ceres_cal.scene.targets import Target
+from ceres_cal.solve.costs import Run, SightCost
+from ceres_cal.solve.information import normals_of
+from ceres_cal.solve.noise import Spread, relative_lengths
+from ceres_cal.solve.problem import Problem, Weighting
+
+# Of the bounds of outliers: longer residuals are remembered, so that bounds may move.
+_FAR = 0.5
+_ROWS = 1 << 20  # of a share: what is made of them for an answer takes some 100 MB
+# Bins of a histogram of lengths in stated sigmas, to 2e7: from which on one is, and how much wider than the last.
+_LEAST, _WIDTH, _BINS = 1e-6, 0.00375, 8192
+
+
+class Asked(NamedTuple):
+    """What a share needs to know of a problem to answer.
+
+    Attributes:
+        estimate, layout, weighting: of the problem. judged_at: where residuals say which rows take part, and its name.
+        bounds: of points and of curve observations, the lengths in stated sigmas from which on they do not.
+    """
+
+    estimate: Estimate
+    layout: Layout
+    weighting: Weighting
+    judged_at: tuple[str, Estimate]
+    bounds: tuple[float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class Histogram:
+    """Lengths by their size: (B,) how many, and (B,) the sum of their squares."""
+
+    counts: Indices
+    squares: Array
+
+    @classmethod
+    def of(cls, lengths: Array) -> Histogram:
+        """Of those that are finite."""
+        seen = lengths[np.isfinite(lengths)]
+        bins = _bin_of(seen)
+        squares = np.asarray(np.bincount(bins, seen**2, minlength=_BINS), dtype=float)
+        return cls(np.bincount(bins, minlength=_BINS), squares)
+
+    def __add__(self, other: Histogram) -> Histogram:
+        return Histogram(self.counts + other.counts, self.squares + other.squares)
+
+    @property
+    def count(self) -> int:
+        """How many there are."""
+        return int(self.counts.sum())
+
+    def middle(self) -> float:
+        """Their median; 0 of none."""
+        total = np.cumsum(self.counts)
+        middle = np.searchsorted(total, total[-1] // 2 + 1)
+        return float(_LEAST * np.exp((middle + 0.5) * _WIDTH)) if total[-1] else 0.0
+
+    def within(self, bound: float) -> Spread:
+        """Of those that are no longer, to the width of a bin."""
+        last = int(_bin_of(np.array([bound]))[0])
+        return Spread(int(self.counts[:last].sum()), float(self.squares[:last].sum()))
+
+
+def _bin_of(lengths: Array) -> Indices32:
+    """Number of the bin of each."""
+    with np.errstate(divide="ignore"):
+        place = (np.log(lengths) - np.log(_LEAST)) / _WIDTH
+    return np.asarray(np.clip(place, 0.0, _BINS - 1.0), dtype=np.int32)
+
+
+@dataclass(frozen=True, eq=False)
+class Looked:
+    """What residuals are like.
+
+    Attributes:
+        points, curves: their lengths in stated sigmas.
+        view: (n,) numbers of the views. equations, squares: (n,) of what lies within the bounds in each, how many and
+            their squared lengths. beyond: (n,) how many do not.
+    """
+
+    points: Histogram
+    curves: Histogram
+    view: Indices
+    equations: Indices
+    squares: Array
+    beyond: Indices
+
+    def __add__(self, other: Looked) -> Looked:
+        each = zip(list(vars(self).values())[2:], list(vars(other).values())[2:], strict=True)
+        return Looked(self.points + other.points, self.curves + other.curves, *map(np.concatenate, each))
+
+
+@dataclass(frozen=True, eq=False)
+class Blocks:
+    """Compressed blocks (K + 1, K + 1) by sight, the residual last; None where an observation cannot be projected."""
+
+    of: Mapping[SightKey, Array] | None
+
+    def __add__(self, other: Blocks) -> Blocks:
+        if self.of is None or other.of is None:
+            return Blocks(None)
+        both = {**self.of, **other.of}
+        for key in self.of.keys() & other.of.keys():
+            both[key] = compressed(np.vstack([self.of[key], other.of[key]]))
+        return Blocks(both)
+
+
+@dataclass(frozen=True, eq=False)
+class Normals:
+    """Normal equations by sight and by kind, see `solve.information`."""
+
+    of: Mapping[SightKey, Mapping[int, Array]]
+
+    def __add__(self, other: Normals) -> Normals:
+        both = {key: dict(kinds) for key, kinds in self.of.items()}
+        for key, kinds in other.of.items():
+            own = both.setdefault(key, {})
+            for kind, matrix in kinds.items():
+                own[kind] = own[kind] + matrix if kind in own else matrix
+        return Normals(both)
+
+
+@dataclass(frozen=True, eq=False)
+class Used:
+    """The rows that take part, and those that do not.
+
+    Attributes:
+        sums: (2, 3) of points and of curve observations that take part: how many, squared lengths and sigmas, px.
+        rows, sigmas: of those that do not, points and curve observations: numbers, and lengths in stated sigmas.
+    """
+
+    sums: Array
+    rows: tuple[Indices, Indices]
+    sigmas: tuple[Array, Array]
+
+    def __add__(self, other: Used) -> Used:
+        rows, sigmas = (
+            tuple(np.concatenate(pair) for pair in zip(mine, theirs, strict=True))
+            for mine, theirs in ((self.rows, other.rows), (self.sigmas, other.sigmas))
+        )
+        return Used(self.sums + other.sums, (rows[0], rows[1]), (sigmas[0], sigmas[1]))
+
+
+def compressed(rows: Array) -> Array:
+    """(K + 1, K + 1) upper triangle with the same products as rows (N, K + 1)."""
+    size = rows.shape[1]
+    triangle = np.linalg.qr(np.vstack([rows, np.zeros((max(size - len(rows), 0), size))]), mode="r")
+    return np.asarray(triangle)
+
+
+@dataclass(frozen=True, eq=False)
+class _Judged:
+    """What decides which rows take part at a place.
+
+    Attributes:
+        name: of the place. bounds: that were asked for. far: rows of points and of curve observations beyond a share of
+            them, and their lengths in stated sigmas. sums: (2, 3) of the others, see `Used`.
+    """
+
+    name: str
+    bounds: tuple[float, float]
+    far: Sequence[tuple[Indices, Array]]
+    sums: Array
+
+    def will_do(self, asked: Asked) -> bool:
+        """Whether other bounds in the same place need nothing else."""
+        return self.name == asked.judged_at[0] and all(
+            now >= _FAR * then for now, then in zip(asked.bounds, self.bounds, strict=True)
+        )
+
+    def taking_part(self, content: Content, asked: Asked) -> tuple[Mask, Mask]:
+        """(n,) of points and (m,) of curve observations."""
+        points, curves = np.ones(len(content.points), dtype=bool), np.ones(len(content.curves), dtype=bool)
+        for mask, bound, (rows, lengths) in zip((points, curves), asked.bounds, self.far, strict=True):
+            mask[rows[~(lengths <= bound)]] = False
+        return points, curves
+
+
+def _sums(lengths_px: Array, sigma_px: Array) -> tuple[float, float, float]:
+    """How many there are, and the sums of squares."""
+    return float(len(lengths_px)), float(lengths_px @ lengths_px), float(sigma_px @ sigma_px)
+
+
+# ---- a share --------------------------------------------------------------------------------------------------------
+
+
+@dataclass(eq=False)
+class Share:
+    """Consecutive rows of points and of curve observations.
+
+    Attributes:
+        targets: of all. views: that it shows, the first of them with the number `first_view`. first_rows: of points and
+            of curve observations. points, curves: columns by name. left_out: (n,) of points, (m,) of curve
+            observations: True for what does not count; None where all of them do.
+    """
+
+    targets: Mapping[str, Target]
+    views: tuple[View, ...]
+    first_view: int
+    first_rows: tuple[int, int]
+    points: Mapping[str, AnyArray | FileRows]
+    curves: Mapping[str, AnyArray | FileRows]
+    left_out: tuple[Mask, Mask] | None = None
+
+    def __post_init__(self) -> None:
+        self._feet: NDArray[np.float32] | None = None  # where the search for the next ones starts, and no more
+        self._judged: _Judged | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**vars(self), "_feet": None, "_judged": None}
+
+    def _content(self) -> Content:
+        points, curves = (
+            {name: read_rows(column) for name, column in columns.items()} for columns in (self.points, self.curves)
+        )
+        for columns in (points, curves):
+            columns["view"] = columns["view"] - np.int32(self.first_view)
+        return Content(self.targets, {}, self.views, Points(**points), Curves(**curves))
+
+    def _loaded(self) -> tuple[Content, Sights]:
+        """What it holds, and the sights of the world in it."""
+        content = self._content()
+        sights = sights_of(content)
+        sights = sights.take(sights.numbers(placements=(None,)))
+        return content, sights if self.left_out is None else sights.used(*(~mask for mask in self.left_out))
+
+    def _residuals(self, content: Content, sights: Sights, estimate: Estimate) -> Residuals:
+        feet = None if self._feet is None else self._feet.astype(float)
+        there = residuals(content, sights, estimate, feet)
+        self._feet = there.feet.astype(np.float32)
+        return there
+
+    def _lengths(self, content: Content, sights: Sights, asked: Asked) -> tuple[Array, Array]:
+        """(n,) and (m,) lengths of the residuals where the rows are judged, in stated sigmas; what decides which take
+        part is remembered.
+        """
+        there = self._residuals(content, sights, asked.judged_at[1])
+        lengths, sums, far = relative_lengths(content, there), [], []
+        columns = content.points, content.curves
+        for column, px, own, bound in zip(columns, there.lengths, lengths, asked.bounds, strict=True):
+            rows = np.flatnonzero(~(own <= _FAR * bound))
+            far.append((rows, own[rows]))
+            sums.append(_sums(np.delete(px, rows), np.delete(column.sigma_px, rows)))
+        self._judged = _Judged(asked.judged_at[0], asked.bounds, far, np.array(sums))
+        return lengths
+
+    def _judged_by(self, content: Content, sights: Sights, asked: Asked) -> _Judged:
+        """What decides which rows take part, from before where that will do."""
+        known = self._judged
+        if known is None or not known.will_do(asked):
+            self._lengths(content, sights, asked)
+        assert self._judged is not None
+        return self._judged
+
+    # ---- answers ----------------------------------------------------------------------------------------------------
+
+    def looked(self, asked: Asked) -> Looked:
+        """What the residuals are like where the rows are judged."""
+        content, sights = self._loaded()
+        points, curves = self._lengths(content, sights, asked)
+        there, (p, c) = _rows_in(content, sights), asked.bounds
+        view = np.concatenate([content.points.view, content.curves.view])
+        inside = np.concatenate([points <= p, curves <= c])
+        relative = np.concatenate([points / asked.weighting.point_scale, curves / asked.weighting.curve_scale])[inside]
+        count, size = np.where(np.arange(len(view)) < len(points), 2, 1), len(self.views)
+        return Looked(
+            Histogram.of(points),
+            Histogram.of(curves),
+            self.first_view + np.arange(size),
+            np.bincount(view[inside], count[inside], size),
+            np.asarray(np.bincount(view[inside], relative**2, size), dtype=float),
+            np.bincount(view[there & ~inside], minlength=size),
+        )
+
+    def blocks(self, asked: Asked, numbers: Mapping[tuple[str, str], Array]) -> Blocks:
+        """Compressed blocks at some numbers, by kind and name of what owns them."""
+        answers: dict[SightKey, Array] = {}
+        for sight, problem in self._problems(asked):
+            cost = SightCost(Run(), sight, problem, asked.estimate)
+            rows = cost.block([numbers[owner] for owner in owners_of(sight.key, cost.slots)])
+            if rows is None:
+                return Blocks(None)
+            if self._feet is not None:
+                self._feet[sight.curve_rows] = cost.feet
+            answers[sight.key] = compressed(rows)
+        return Blocks(answers)
+
+    def normals(self, asked: Asked) -> Normals:
+        """Normal equations of the rows that take part, at the estimate."""
+        return Normals(
+            {sight.key: normals_of(sight, problem, asked.estimate) for sight, problem in self._problems(asked)}
+        )
+
+    def used(self, asked: Asked) -> Used:
+        """Which rows take part, and how far off the others are."""
+        content, sights = self._loaded()
+        judged = self._judged_by(content, sights, asked)
+        world = np.split(_rows_in(content, sights_of(content)), [len(content.points)])
+        sums, rows, sigmas = judged.sums.copy(), [], []
+        for kind, column in enumerate((content.points, content.curves)):
+            far, lengths = judged.far[kind]
+            inside, sigma_px = lengths <= asked.bounds[kind], column.sigma_px[far]
+            sums[kind] += _sums((lengths * sigma_px)[inside], sigma_px[inside])
+            out = ~inside & world[kind][far]
+            rows.append(self.first_rows[kind] + far[out])
+            sigmas.append(lengths[out])
+        return Used(sums, (rows[0], rows[1]), (sigmas[0], sigmas[1]))
+
+    def _problems(self, asked: Asked) -> Iterator[tuple[Sights, Problem]]:
+        """Each sight with the rows that take part, and its problem."""
+        content, sights = self._loaded()
+        part = sights.used(*self._judged_by(content, sights, asked).taking_part(content, asked))
+        feet = None if self._feet is None else self._feet.astype(float)
+        problem = Problem(part, asked.layout, (), asked.weighting, feet=feet)
+        return ((sight, problem) for sight in part)
+
+
+def _rows_in(content: Content, sights: Sights) -> Mask:
+    """(n + m,) the rows that the sights of the world show."""
+    rows = np.zeros(len(content.points) + len(content.curves), dtype=bool)
+    world = sights.take(sights.numbers(placements=(None,)))
+    rows[world.point_rows] = rows[len(content.points) + world.curve_rows] = True
+    return rows
+
+
+def owners_of(key: SightKey, slots: Sequence[int]) -> list[tuple[str, str]]:
+    """What owns the numbers that a sight of the world depends on: its camera (0), station (1), structure (3)."""
+    every = {0: ("camera", key.camera), 1: ("station", key.station), 3: ("structure", "")}
+    return [every[slot] for slot in slots]
+
+
+def cut(observations: Observations, left_out: tuple[Mask, Mask] | None = None) -> Iterator[Share]:
+    """The observations of targets that lie in the world, in shares of whole views."""
+    points, curves = observations.points, observations.curves
+    for first, last in _ranges(observations):
+        (p, q), (c, d) = ((int(ends[first]), int(ends[last])) for ends in observations.ends)
+        own = [
+            {name: rows_of(array, start, stop) for name, array in vars(column).items()}
+            for column, start, stop in ((points, p, q), (curves, c, d))
+        ]
+        out = None if left_out is None else (left_out[0][p:q], left_out[1][c:d])
+        yield Share(observations.targets, observations.views[first:last], first, (p, c), own[0], own[1], out)
+
+
+def _ranges(observations: Observations) -> list[tuple[int, int]]:
+    """First view and the one after the last of each share."""
+    before = observations.ends[0] + observations.ends[1]
+    stops = np.searchsorted(before, np.arange(_ROWS, int(before[-1]), _ROWS))
+    return list(pairwise(dict.fromkeys([0, *stops.tolist(), len(observations.views)])))

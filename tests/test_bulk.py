@@ -1,0 +1,106 @@
+"""Very many observations of the world: a part decides, all of them are solved for, in shares."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+import pytest
+from scenes import RADIAL, two_cameras
+from test_competing import NOISE, half_field, moved_aside, wholes
+
+from ceres_cal.calibrating import calibrate
+from ceres_cal.calibration import Calibration
+from ceres_cal.model.quantities import difference
+from ceres_cal.observations import Observations
+from ceres_cal.simulate import Disturbance, simulate
+from ceres_cal.solve import Progress, bulk, shares
+
+OUTLIERS = Disturbance(points_sigma_px=0.3, curves_sigma_px=0.3, outliers=0.05)
+
+
+class Calibrated(Protocol):
+    def __call__(
+        self, observations: Observations, progress: Callable[[Progress], None] | None = None
+    ) -> Calibration: ...
+
+
+@pytest.fixture
+def in_shares(monkeypatch: pytest.MonkeyPatch) -> Calibrated:
+    """A calibration of few observations as of very many: a dozen shares, a part of a quarter."""
+
+    def calibrated(observations: Observations, progress: Callable[[Progress], None] | None = None) -> Calibration:
+        with monkeypatch.context() as patch:
+            patch.setattr(bulk, "MANY", 100)
+            patch.setattr(bulk, "_PART", 2_000)
+            patch.setattr(bulk, "_FEWEST_VIEWS", 16)
+            patch.setattr(bulk, "_STANDING_OUT", 2)
+            patch.setattr(shares, "_ROWS", 500)
+            return calibrate(observations, RADIAL, progress)
+
+    return calibrated
+
+
+def rejected(calibration: Calibration) -> list[tuple[str, int]]:
+    return [(entry.kind, entry.row) for entry in calibration.rejected]
+
+
+def assert_same(one: Calibration, other: Calibration) -> None:
+    """To what the loops leave, which end where noise scales change by less than a hundredth."""
+    posterior = other.uncertainty.posterior
+    steps = difference(one.estimate, other.estimate, posterior.keys) / posterior.sd
+    assert np.max(np.abs(steps)) < 0.03  # 0.014 measured
+    assert rejected(one) == rejected(other)
+    for name, value in vars(other.fit).items():
+        assert getattr(one.fit, name) == pytest.approx(value, rel=2e-3), name
+
+
+def test_all_take_part_though_a_part_decides(in_shares: Calibrated) -> None:
+    observations = simulate(half_field(32), OUTLIERS, 4).observations
+    of_shares = in_shares(observations)
+    assert len(of_shares.rejected) > 100
+    of_all = calibrate(observations, RADIAL)
+    assert_same(of_shares, of_all)
+    assert of_shares.digest == observations.digest
+    sds = of_shares.uncertainty.posterior.sd / of_all.uncertainty.posterior.sd
+    np.testing.assert_allclose(sds, 1.0, rtol=0.1)  # 0.02 measured: scatter is looked at in other views
+
+
+@pytest.mark.parametrize("frame", [None, "0017"])
+def test_whole_that_does_not_belong_is_taken_out_of_all(frame: str | None, in_shares: Calibrated) -> None:
+    observations = moved_aside(simulate(half_field(32), NOISE, 4).observations, "HalfwayLine", 4.0, frame)
+    of_shares, of_all = in_shares(observations), calibrate(observations, RADIAL)
+    where = "all 32 frames" if frame is None else f"frame {frame!r}"
+    assert wholes(of_shares) == {f"the whole of line 'HalfwayLine' in {where}"}
+    assert_same(of_shares, of_all)
+
+
+def test_boards_beside_the_world_stay_at_hand(in_shares: Calibrated) -> None:
+    observations = simulate(two_cameras("radial-2-3"), OUTLIERS, 4).observations
+    assert_same(in_shares(observations), calibrate(observations, RADIAL))
+
+
+def test_from_files_the_answer_is_the_same_to_the_last_bit(in_shares: Calibrated, tmp_path: Path) -> None:
+    observations = simulate(half_field(32), OUTLIERS, 4).observations
+    observations.save(tmp_path / "day.columns")
+    stored, at_hand = in_shares(Observations.load(tmp_path / "day.columns")), in_shares(observations)
+    assert stored.estimate.stations["overhead"] == at_hand.estimate.stations["overhead"]
+    assert stored.cameras["overhead"].phi == at_hand.cameras["overhead"].phi
+    assert stored.fit == at_hand.fit
+    assert stored.rejected == at_hand.rejected
+
+
+def test_what_the_caller_raises_ends_it(in_shares: Calibrated) -> None:
+    observations = simulate(half_field(32), NOISE, 4).observations
+    seen: list[Progress] = []
+    in_shares(observations, seen.append)
+
+    def late(_: Progress) -> None:
+        seen.pop()
+        if not seen:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        in_shares(observations, late)

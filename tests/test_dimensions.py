@@ -1,0 +1,183 @@
+"""Dimensions of a field that are not known: solved for with the camera, named where nothing measures them."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from ceres_cal.base.arrays import Image
+from ceres_cal.base.errors import DegenerateError, InputError
+from ceres_cal.calibrating import calibrate
+from ceres_cal.calibration import Calibration
+from ceres_cal.cli import main
+from ceres_cal.cli.estimate import parse_estimates
+from ceres_cal.diagnostics import diagnose
+from ceres_cal.model.parameters import Options
+from ceres_cal.model.structure import Tolerance
+from ceres_cal.moves import check, refit
+from ceres_cal.observations import Observations, Prior
+from ceres_cal.photographs.candidates import candidates, prepare_search
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.lens import Radial
+from ceres_cal.scene.targets import checkerboard, ssl_field
+from ceres_cal.simulate import (
+    Disturbance,
+    Photography,
+    Scene,
+    Station,
+    board_scene,
+    field_scene,
+    join,
+    overhead_pose,
+    simulate,
+)
+from ceres_cal.simulate.photograph import photograph
+
+FIELD = ssl_field("B")
+TRUE = {"field_length_m": 8.28, "field_width_m": 5.52}
+BOTH = tuple(f"field/{name}" for name in TRUE)
+EVERY = tuple(f"field/{n}" for n in FIELD.dimensions if n not in ("goal_width_m", "line_thickness_m"))
+CAMERA = Camera((780, 580), 350.0, (392.0, 287.0), Radial((-5.2e-5, 6.1e-7)))
+HEIGHT = Prior("station", "s", "height_m", (5.0,), (0.01,))
+
+
+def scene() -> Scene:
+    station = Station("a", overhead_pose(0.2, -0.15, 5.0, 9.0, -6.0))
+    return field_scene(ssl_field("B", **TRUE), {"a": CAMERA}, {"s": station}, spacing_m=0.1)
+
+
+def seen(what: Scene, seed: int = 1) -> Observations:
+    """Observations of the odd field, said to be of division B's."""
+    observations = simulate(what, Disturbance(0.1, 0.1), seed).observations
+    return replace(observations, targets={**observations.targets, "field": FIELD})
+
+
+@cache
+def solved() -> tuple[Observations, Calibration]:
+    observations = seen(scene())
+    return observations, calibrate(observations, Options(lens="radial", dimensions=BOTH))
+
+
+def test_a_field_of_odd_size_from_its_circle() -> None:
+    _, calibration = solved()
+    target = calibration.targets["field"]
+    for name, true in TRUE.items():
+        known = calibration.uncertainty.verdict("dimension", "field", name)
+        assert known.low < true < known.high and known.sd < 0.005 and known.verdict == "known"  # 2 and 3 mm
+        assert target.dimensions[name] == known.value == calibration.estimate.structure.dimensions[f"field/{name}"]
+    assert not calibration.outliers and calibration.fit.curve_scale < 1.2
+    assert np.allclose(calibration.estimate.structure.offsets, 0.0)  # it is drawn as it is
+    corner = calibration.station().project(np.array([target.points["TopLeftCorner"]]))
+    there = scene().camera_at("s").project(np.array([ssl_field("B", **TRUE).points["TopLeftCorner"]]))
+    assert np.linalg.norm(corner - there) < 0.2  # 0.1 px
+
+
+def test_what_comes_after_takes_the_field_as_it_was_found(tmp_path: Path) -> None:
+    observations, calibration = solved()
+    calibration.save(tmp_path / "c.json")
+    again = Calibration.load(tmp_path / "c.json")
+    assert again.targets == calibration.targets and again.options == calibration.options
+    assert not diagnose(again, observations).findings
+    new = seen(scene(), 2)
+    assert check(again, new).holds
+    moved = refit(again, new)
+    known, before = (one.uncertainty.verdict("dimension", "field", "field_length_m") for one in (moved, again))
+    assert known.sd < before.sd and abs(known.value - 8.28) < 3.0 * known.sd
+
+
+def test_nothing_of_size_is_known() -> None:
+    observations, _ = solved()
+    with pytest.raises(DegenerateError, match=r"nothing says how large target 'field' is.* measure one of them "):
+        calibrate(observations, Options(lens="radial", dimensions=EVERY))
+    for known in (HEIGHT, Prior("target", "field", "field_length_m", (8.28,), (0.005,))):
+        calibration = calibrate(observations, Options(lens="radial", dimensions=EVERY, priors=(known,)))
+        radius = calibration.uncertainty.verdict("dimension", "field", "center_circle_radius_m")
+        assert radius.low < 0.5 < radius.high and radius.sd < 0.02  # 12 mm by the height, 1 mm by the length
+
+
+def test_a_dimension_that_nothing_shows_and_one_that_is_contradicted() -> None:
+    observations, _ = solved()
+    marks = [name for name in FIELD.point_names if "Mark" not in name]
+    kept = np.isin(observations.points.feature, [FIELD.point_names.index(name) for name in marks])
+    without = observations.part(kept, np.ones(len(observations.curves), dtype=bool))
+    with pytest.raises(DegenerateError, match="depends on goal_center_to_penalty_mark_m of target 'field'"):
+        calibrate(without, Options(lens="radial", dimensions=(*BOTH, "field/goal_center_to_penalty_mark_m")))
+    for name, words in (("line_thickness_m", "no line or point lies elsewhere"), ("depth", "there is no dimension")):
+        with pytest.raises(InputError, match=words):
+            calibrate(observations, Options(lens="radial", dimensions=(f"field/{name}",)))
+    wrong = Prior("target", "field", "field_length_m", (8.6,), (0.005,))
+    calibration = calibrate(observations, Options(lens="radial", dimensions=BOTH, priors=(wrong,)))
+    assert any("the stated field_length_m of target 'field'" in words for words in calibration.warnings)
+
+
+def test_beside_tolerances_and_boards() -> None:
+    boards = board_scene(checkerboard(9, 6, 0.1), {"a": CAMERA}, {"s": scene().stations["s"]}, count=6, seed=3)
+    observations = seen(join(scene(), boards))
+    options = Options(lens="radial", dimensions=BOTH, tolerances={"field": Tolerance(0.003, 0.003)})
+    calibration = calibrate(observations, options)
+    structure = calibration.estimate.structure
+    assert structure.own == 65 == len(structure.offsets) and len(structure.values) == 67
+    known = calibration.uncertainty.verdict("dimension", "field", "field_length_m")
+    assert known.low < 8.28 < known.high and 0.002 < known.sd < 0.02  # 5 mm: its lines may lie aside
+
+
+def test_what_is_typed() -> None:
+    length, width, circle = parse_estimates(["length,width=5.5", "circle=500mm:1mm"], {"field": FIELD})
+    assert length == Prior("target", "field", "field_length_m", (9.0,), (np.inf,)) and length.is_open
+    assert width.value == (5.5,) and width.is_open and circle.dimension == "field/center_circle_radius_m"
+    assert circle.sigma == (0.001,)
+    for text, words in (
+        ("penalty", "may be penalty_area_depth_m or penalty_area_width_m"),
+        ("height", "'height' is no dimension: there are field_length_m"),
+        ("length,length", "given twice"),
+        ("length=long", "is not a number"),
+        ("length=9:0", "sigma above 0"),
+        ("length=-9", "above 0"),
+    ):
+        with pytest.raises(InputError, match=words):
+            parse_estimates([text], {"field": FIELD})
+
+
+@cache
+def picture() -> Image:
+    photography = Photography(robots=3, carpet_texture=0.05)
+    return photograph(replace(scene(), photography=photography), "s", "0001", seed=1).image
+
+
+def test_without_a_start_the_field_is_sought_in_several_sizes() -> None:
+    grey, drawn = cv2.cvtColor(picture(), cv2.COLOR_BGR2GRAY).astype(np.float32), ssl_field("B", field_width_m=6.4)
+    width = Prior("target", "field", "field_width_m", (6.4,), (0.9,))
+    search = prepare_search(grey, drawn, drawn.curve_names, (width,))
+    assert len(search.others) == 2
+    camera, grid = candidates(search)[0]
+    assert grid is search.others[0]  # 6 % narrower: 9 to 6.0 m, as is 8.28 to 5.52
+    away = [(camera.cam_from_world @ turn).position[:2] - scene().camera_at("s").position[:2] for turn in search.turns]
+    assert min(np.linalg.norm(away, axis=1)) < 0.3
+
+
+def test_from_a_photograph(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path, observed, out = (str(tmp_path / name) for name in ("odd.png", "field.json", "calibration.json"))
+    cv2.imwrite(path, picture())
+    target, camera = ssl_field("B", **TRUE), scene().camera_at("s")
+    names = [f"{side}{end}Corner" for side in ("Top", "Bottom") for end in ("Left", "Right")]
+    clicked = np.round(camera.project(np.array([target.points[name] for name in names]))).astype(int)
+    corners = [word for name, (x, y) in zip(names, clicked, strict=True) for word in ("--corner", f"{name}={x},{y}")]
+    asked = ["detect", "field", path, "--target", "ssl-b", *corners, "-o", observed]
+    assert main(asked) == 2 and "--estimate" in capsys.readouterr().err  # says what would help
+    assert main([*asked, "--estimate", "length,width"]) == 0
+    priors = json.loads(Path(observed).read_text())["priors"]
+    assert [prior["sigma_m"] for prior in priors] == [None, None]
+    capsys.readouterr()
+    assert main(["calibrate", observed, "-o", out, "--lens", "radial", "--report", str(tmp_path / "report.html")]) == 0
+    printed = capsys.readouterr().out
+    assert "lengths   field_length_m" in printed and "(field, solved for)" in printed
+    dimensions = Calibration.load(out).targets["field"].dimensions
+    for name, true in TRUE.items():
+        assert abs(dimensions[name] - true) < 0.003  # 0.5 mm
+    assert "Dimensions that were solved for" in (tmp_path / "report.html").read_text()
