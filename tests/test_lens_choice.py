@@ -15,11 +15,12 @@ from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
 from ceres_cal.cli import main
 from ceres_cal.diagnostics import choose
-from ceres_cal.lens_choice import PAPER, decide, label_of
+from ceres_cal.lens_choice import PAPER, candidates, decide, label_of
 from ceres_cal.model.equations import write_equations
 from ceres_cal.model.parameters import AUTO, Options
 from ceres_cal.model.residuals import residuals
 from ceres_cal.observations import Observations
+from ceres_cal.scene.lens import KannalaBrandt
 from ceres_cal.simulate import Disturbance, simulate
 from ceres_cal.solve.left_out import GroupNormals, group_normals
 from ceres_cal.solve.linear_model import LinearModel, equation_weights, make_linear_model
@@ -69,6 +70,38 @@ def test_the_simplest_wins_among_equals_and_the_papers_before_it() -> None:
     same = np.full(12, 10.0)
     assert decide(["brown k1 k2", "kannala-brandt k1"], [2, 1], [same, same])[1] == 1
     assert decide(["kannala-brandt k1", PAPER], [1, 2], [same, same])[1] == 1
+
+
+def test_what_everybody_knows_comes_first_among_equals_of_one_size() -> None:
+    same, a_little_worse = np.full(12, 10.0), np.full(12, 10.0) + 0.5 * np.cos(np.arange(12))
+    assert decide(["radial 3,5", "brown k1 k2"], [2, 2], [same, a_little_worse])[1] == 1
+
+
+def test_decentring_comes_after_two_coefficients_along_the_radius() -> None:
+    labels = [label_of(one) for one in candidates(Options(lens="brown"))]
+    assert labels == ["brown k1", "brown k1 k2 p1 p2", "brown k1 k2 p1 p2 k3"]
+
+
+def test_a_decentred_fisheye_is_recognised() -> None:
+    scene = scenes.MIXES["boards"]("kannala-brandt")
+    lens = KannalaBrandt((-0.012, 0.004, 0.0, 0.0, 4e-3, -3e-3), ("tangential",))
+    scene = replace(scene, cameras={name: replace(one, lens=lens) for name, one in scene.cameras.items()})
+    calibration = calibrate(simulate(scene, _NOISE, 2).observations)
+    assert calibration.options.lens == "kannala-brandt" and calibration.options.terms == ("tangential",)
+    assert label_of(calibration.options).endswith("p1 p2")
+
+
+def test_a_lens_that_no_formula_has_is_seen_in_what_all_others_leave() -> None:
+    scene = scenes.MIXES["boards"]("brown")
+    cameras = {name: scenes.camera("spline") for name in scene.cameras}
+    noise = Disturbance(points_sigma_px=0.1)
+    choice = calibrate(simulate(replace(scene, cameras=cameras), noise, 1).observations).lens_choice
+    assert choice is not None and choice.chosen == "spline 2,3"
+    first, second, *_ = (one.rms_px for one in choice.tried)
+    assert first and second and second > 1.8 * first  # 2.3 times, and four standard errors, in each of four runs
+    seen = _seen("radial-2-3", "boards")
+    plain = calibrate(seen).lens_choice  # where nothing is left behind it is not looked at
+    assert plain is not None and not [one for one in plain.tried if one.label.startswith("spline")]
 
 
 def _normals(observations: Observations, calibration: Calibration) -> tuple[GroupNormals, LinearModel]:

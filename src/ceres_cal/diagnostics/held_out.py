@@ -22,7 +22,7 @@ from ceres_cal.base.transforms import Pose
 from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
 from ceres_cal.diagnostics.table import error_mm
-from ceres_cal.lens_choice import any_lens, candidates, coefficients_of, decide, label_of, size_of
+from ceres_cal.lens_choice import any_lens, candidates, coefficients_of, decide, label_of, size_of, surprise
 from ceres_cal.model.equations import write_equations
 from ceres_cal.model.parameters import Estimate, Layout, Options
 from ceres_cal.model.residuals import residuals
@@ -199,7 +199,9 @@ def _attempt(observations: Observations, options: Options) -> Calibration | str:
 def _decide(tried: Sequence[HeldOut], options: Sequence[Options]) -> tuple[int, int]:
     """Indices of the best candidate and of the simplest that is as good, on the frames that all predict."""
     common = np.all([one.frame_counts > 0 for one in tried if not one.failed], axis=0)
-    squares = [None if one.failed else one.frame_squares[common] for one in tried]
+    known = [None if one.failed else (one.frame_squares[common], one.frame_counts[common]) for one in tried]
+    noise = min((float(s.sum() / n.sum()) for s, n in filter(None, known)), default=0.0) or 1.0  # of the best
+    squares = [None if one is None else surprise(one[0] / noise, one[1]) for one in known]
     return decide([one.label for one in tried], list(map(size_of, options)), squares)
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from ceres_cal.kernels.arguments import CurveColumns, Loss, Optics, PointColumns, Sweep, Unknowns
 from ceres_cal.kernels.block import rotation
-from ceres_cal.kernels.jit import jit
+from ceres_cal.kernels.jit import borrowing, jit
 from ceres_cal.kernels.lenses import prepared
 from ceres_cal.kernels.sight import normal_equations, order_of_rows, working_space
 
@@ -48,17 +48,48 @@ def _solve_pose(normal: Any, count: int, damping: float, lower: Any, gain: Any) 
                 lower[k, k] = 0.0 if held else 1.0 / np.sqrt(total)
             else:
                 lower[i, k] = total * lower[k, k]
-    for column in range(count + 1):
-        for k in range(6):
-            total = normal[count + k, column] if column < count else normal[count + 6, count + k]
-            for j in range(k):
-                total -= lower[k, j] * gain[j, column]
-            gain[k, column] = total * lower[k, k]
-        for k in range(5, -1, -1):
-            total = gain[k, column]
-            for j in range(k + 1, 6):
-                total -= lower[j, k] * gain[j, column]
-            gain[k, column] = total * lower[k, k]
+    for k in range(6):
+        own, known = gain[k, :count], normal[count + k, :count]
+        for column in range(count):
+            own[column] = known[column]
+        gain[k, count] = normal[count + 6, count + k]
+        for j in range(k):
+            _less(count + 1, lower[k, j], gain[j], gain[k])
+        _scaled(count + 1, lower[k, k], gain[k])
+    for k in range(5, -1, -1):
+        for j in range(k + 1, 6):
+            _less(count + 1, lower[j, k], gain[j], gain[k])
+        _scaled(count + 1, lower[k, k], gain[k])
+
+
+@borrowing
+def _less(n: int, factor: float, row: Any, own: Any) -> None:
+    """own -= factor times row."""
+    for i in range(n):
+        own[i] -= factor * row[i]
+
+
+@borrowing
+def _scaled(n: int, factor: float, own: Any) -> None:
+    """own *= factor."""
+    for i in range(n):
+        own[i] *= factor
+
+
+@borrowing
+def _add_complement(count: int, normal: Any, gain: Any, reduced: Any) -> None:
+    """reduced += A_cc - A_cp A_pp^-1 A_pc, lower triangle, the residual's row last."""
+    p = normal[count : count + 6]
+    for i in range(count + 1):
+        own, row = reduced[i], normal[count + 6 if i == count else i]
+        a, b, c, d, e, f = gain[0, i], gain[1, i], gain[2, i], gain[3, i], gain[4, i], gain[5, i]
+        for j in range(min(i + 1, count)):
+            own[j] += row[j] - (a * p[0, j] + b * p[1, j] + c * p[2, j] + d * p[3, j] + e * p[4, j] + f * p[5, j])
+    last = normal[count + 6]
+    left = last[count + 6]
+    for k in range(6):
+        left -= gain[k, count] * last[count + k]
+    reduced[count, count] += left
 
 
 @jit
@@ -117,11 +148,5 @@ def eliminate_placements(
                 step[k] = -gain[k, count] if promise <= 1e-2 * cost else 0.0
         _move(pose, step, turned, poses[v])
         gains[v] = gain[:, :count]
-        for i in range(count + 1):
-            at = count + 6 if i == count else i
-            for j in range(i + 1):
-                value = normal[at, count + 6 if j == count else j]
-                for k in range(6):
-                    value -= gain[k, i] * (normal[count + 6, count + k] if j == count else normal[count + k, j])
-                reduced[i, j] += value
+        _add_complement(count, normal, gain, reduced)
         costs[v] = cost - max(promise, 0.0)

@@ -2,7 +2,7 @@
 
 from ceres_cal.lens_choice.choice import Chosen, choose_lens
 from ceres_cal.lens_choice.forms import PAPER, any_lens, candidates, coefficients_of, label_of, papers, size_of
-from ceres_cal.lens_choice.rule import decide
+from ceres_cal.lens_choice.rule import decide, surprise
 
 __all__ = [
     "PAPER",
@@ -15,4 +15,5 @@ __all__ = [
     "label_of",
     "papers",
     "size_of",
+    "surprise",
 ]

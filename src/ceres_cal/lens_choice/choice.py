@@ -18,6 +18,7 @@ from ceres_cal.base.transforms import Poses
 from ceres_cal.calibration import LensChoice, TriedLens
 from ceres_cal.lens_choice.forms import PAPER, papers
 from ceres_cal.lens_choice.kinds import Candidate, compared_kinds
+from ceres_cal.lens_choice.last_resort import last_resort
 from ceres_cal.lens_choice.rule import AS_GOOD, AS_GOOD_BESIDE_LENGTHS, decide, standard_errors
 from ceres_cal.model.parameters import Options
 from ceres_cal.observations import Observations
@@ -50,16 +51,18 @@ def choose_lens(observations: Observations, options: Options, start: Start) -> C
     """
     as_good = AS_GOOD_BESIDE_LENGTHS if options.dimensions else AS_GOOD
     try:
-        kinds, share = compared_kinds(observations, options, start.estimate)
+        seen, kinds, share = compared_kinds(observations, options, start.estimate)
         tried, best, chosen = _compare([one for kind in kinds for one in kind.candidates(first=True)], as_good)
         if chosen.form.label != PAPER:
             others = [one for longest in tried if longest.may_win(best) for one in longest.of.candidates(first=False)]
             tried, _, chosen = _compare([*tried, *others], as_good)
+        more = list(last_resort(seen, chosen))
+        tried, chosen = [*tried, *more], next((one for one in more if one.clearly_beats(chosen)), chosen)
     except CalibrationError:
         return Chosen(papers(options), start, LensChoice(PAPER, (TriedLens(PAPER, 2),), 0, 0.0))
     there = chosen.estimate
     placements = Poses.of(start.estimate.placements).updated(list(there.placements), Poses.of(there.placements).stack)
-    near = replace(start, estimate=replace(there, placements=placements), is_near=True)
+    near = replace(start, estimate=replace(there, placements=placements), is_near=not chosen.form.blank.roughness)
     return Chosen(chosen.form.of(options), near, _choice(tried, chosen, share))
 
 

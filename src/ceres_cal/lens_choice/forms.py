@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
 
 from ceres_cal.model.parameters import AUTO, OF_PIXELS, PAPERS_POWERS, Options
-from ceres_cal.scene.lens import LENSES, make_lens
+from ceres_cal.scene.lens import LENSES, Lens, make_lens
 
 PAPER = "radial 2,3"
 """The lens that wins ties."""
 _ANY_PHI = 100.0
+_BEFORE = 2  # coefficients along the radius come before decentring, which is smaller: as OpenCV has them
 _PROJECTION = 2  # coefficients that a projection of its own is worth
 
 
@@ -36,12 +38,18 @@ def candidates(options: Options) -> list[Options]:
             powers = [options.powers]
         return [replace(options, powers=one) for one in powers]
     by_order = [name for _, name in sorted(zip(lens.orders, lens.names, strict=True)) if name not in options.fixed]
-    names = [name for name in by_order if name not in lens.decentring]
-    also = tuple(name for name in by_order if name in lens.decentring and name not in options.held)
-    shorter = [replace(options, coefficients=(*names[: count + 1], *also)) for count in range(len(names))]
+    names = [name for name in by_order if name not in _tangential(lens)]
+    also = tuple(name for name in by_order if name in _tangential(lens) and name not in options.held)
+    counts = range(1, len(names) + 1)
+    shorter = [replace(options, coefficients=(*names[:n], *(also if n >= _BEFORE else ()))) for n in counts]
     if all(label_of(one) != label_of(options) for one in shorter):
         shorter.append(options)
     return shorter
+
+
+def _tangential(lens: Lens | type[Lens]) -> tuple[str, ...]:
+    """Names of its coefficients that displace tangentially, which it has or may have."""
+    return lens.decentring or lens.more_terms.get("tangential", ())
 
 
 def label_of(options: Options) -> str:
@@ -65,30 +73,39 @@ def size_of(options: Options) -> int:
     return coefficients_of(options) + (0 if is_pinhole else _PROJECTION)
 
 
+def is_usual(label: str) -> bool:
+    """Whether a lens of that label is one that people know: all but the paper's with other powers, or ssl-vision's."""
+    return not label.startswith("radial ") or label in (PAPER, "radial 3")
+
+
 @dataclass(frozen=True)
 class Form:
     """A lens to be tried: see `Options`.
 
     Attributes:
         names: of the coefficients that are free. label: how it is called. size: see `size_of`.
+        blank: with every coefficient 0.
     """
 
     lens: str
     powers: tuple[int, ...]
     coefficients: tuple[str, ...] | None
+    terms: tuple[str, ...]
     names: tuple[str, ...]
     label: str
     size: int
+    blank: Lens
 
     @classmethod
     def among(cls, options: Options) -> Form:
         """The lens of some options."""
         names = tuple(name for name in options.blank_lens.names if name not in options.held)
-        return cls(options.lens, options.powers, options.coefficients, names, label_of(options), size_of(options))
+        chosen = options.lens, options.powers, options.coefficients, options.terms
+        return cls(*chosen, names, label_of(options), size_of(options), options.blank_lens)
 
     def of(self, options: Options) -> Options:
         """The options with this lens."""
-        return replace(options, lens=self.lens, powers=self.powers, coefficients=self.coefficients)
+        return replace(options, lens=self.lens, powers=self.powers, coefficients=self.coefficients, terms=self.terms)
 
 
 @cache
@@ -98,8 +115,19 @@ def forms_of(kind: str) -> tuple[Form, ...]:
     """
     lens = LENSES[kind]
     powers = tuple(sorted({power for trial in lens.trial_powers for power in trial}))
-    longest = Options(lens=kind, powers=powers)
-    bare = tuple(name for name in longest.blank_lens.names if name not in lens.decentring)
-    starts = [longest, *([replace(longest, coefficients=bare)] if lens.decentring else [])]
-    every = [Form.among(one) for start in starts for one in candidates(start)]
-    return tuple(sorted(every, key=lambda one: -len(one.names)))
+    terms = tuple(term for term, names in lens.more_terms.items() if names == _tangential(lens))
+    longest, plain = Options(lens=kind, powers=powers, terms=terms), Options(lens=kind, powers=powers)
+    bare = tuple(name for name in plain.blank_lens.names if name not in _tangential(lens))
+    starts = [longest, *([replace(plain, coefficients=bare)] if _tangential(lens) else [])]
+    every = {(form := Form.among(one)).label: form for start in starts for one in candidates(start)}
+    return tuple(sorted(every.values(), key=lambda one: -len(one.names)))
+
+
+def kinds() -> Iterator[tuple[Form, ...]]:
+    """The lenses of each kind that has a formula: one without has no shorter ones."""
+    return (forms_of(kind) for kind, lens in LENSES.items() if not lens.set_at_start)
+
+
+def without_formula() -> Iterator[tuple[Form, ...]]:
+    """The lenses of all other kinds."""
+    return ((Form.among(Options(lens=kind)),) for kind, lens in LENSES.items() if lens.set_at_start)

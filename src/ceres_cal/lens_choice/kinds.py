@@ -11,21 +11,20 @@ import numpy as np
 from ceres_cal.base.arrays import Array, Indices, Mask
 from ceres_cal.base.errors import CalibrationError, DegenerateError
 from ceres_cal.base.transforms import Poses
-from ceres_cal.lens_choice.forms import PAPER, Form, forms_of
-from ceres_cal.lens_choice.rule import AS_GOOD, standard_errors
+from ceres_cal.lens_choice.forms import PAPER, Form, kinds
+from ceres_cal.lens_choice.rule import AS_GOOD, CLEARLY, standard_errors, surprise
 from ceres_cal.model.equations import Equations, write_equations
 from ceres_cal.model.parameters import Estimate, Options, make_layout
 from ceres_cal.model.priors import gather_priors
 from ceres_cal.model.quantities import moved, values_of
-from ceres_cal.model.residuals import residuals
+from ceres_cal.model.residuals import Residuals, residuals
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights, gather_sights
 from ceres_cal.observations.thinning import thinned
-from ceres_cal.scene.lens import LENSES
 from ceres_cal.solve import Problem, RobustSolution, solve, solve_robustly
 from ceres_cal.solve.left_out import GroupNormals, group_normals
 from ceres_cal.solve.linear_model import equation_weights
-from ceres_cal.start.initialise import LensProfile
+from ceres_cal.start.initialise import LensProfile, edge_over
 
 _LEAST_ROWS, _SHARE, _FEWEST_FRAMES = 1_000, 0.025, 24  # of the observations, how many take part
 _FEWEST_GROUPS = 8  # with fewer nothing tells lenses apart
@@ -36,6 +35,7 @@ _QUIETER = 0.7
 _MOST_ROUNDS = 8
 _SOUND_PX = 1.0  # noise beyond which a first solve may have ended in a wrong valley: others are tried from nothing
 _PRECISION = 1e-2  # relative change of the cost from which on normal equations say where the least is
+_MOST_STEPS = 10  # a kind that takes more is no lens for these observations
 _FEWEST_PLACEMENTS = 5  # with fewer the features of each are held out one by one
 
 
@@ -74,7 +74,7 @@ class Kind:
         held = [key for key in self.normals.keys if key.kind == "camera" and key.quantity in lens]
         squares, step = self.normals.held_out(dict(zip(held, -values_of(self.estimate, held), strict=True)))
         rms_px = self.sigma_px * float(np.sqrt(squares.sum() / self.normals.counts.sum()))
-        return Candidate(form, self, _surprise(squares, self.normals.counts), rms_px, step)
+        return Candidate(form, self, surprise(squares, self.normals.counts), rms_px, step)
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,6 +99,12 @@ class Candidate:
             return False
         return self.squares is None or best.squares is None or standard_errors(self.squares, best.squares) <= AS_GOOD
 
+    def clearly_beats(self, other: Candidate) -> bool:
+        """Whether it predicts so much better that a lens which few programs know is worth it."""
+        if self.squares is None or other.squares is None or self.fault:
+            return False
+        return standard_errors(other.squares, self.squares) > AS_GOOD and self.rms_px < CLEARLY * other.rms_px
+
     @cached_property
     def estimate(self) -> Estimate:
         """Near its best.
@@ -107,7 +113,7 @@ class Candidate:
             InputError: there is no camera there.
         """
         there = moved(self.of.estimate, self.of.normals.keys if self.of.normals else (), self.step)
-        blank = self.form.of(Options()).blank_lens
+        blank = self.form.blank
         cameras = {}
         for name, camera in there.cameras.items():
             values = camera.lens.coefficients
@@ -129,37 +135,29 @@ class Candidate:
         return ""
 
 
-def _surprise(squares: Array, counts: Array) -> Array:
-    """(G,) squares that grow by their logarithm where a group is off by more than the noise: a line that lies aside, or
-    a feature whose label is wrong, must not decide.
-    """
-    return np.asarray(counts * np.log1p(squares / counts))
-
-
-def compared_kinds(observations: Observations, options: Options, start: Estimate) -> tuple[list[Kind], float]:
-    """Each kind near its best, over the same observations and at the noise of the one that explains the most; and their
-    share of all.
+def compared_kinds(observations: Observations, options: Options, start: Estimate) -> tuple[Seen, list[Kind], float]:
+    """The observations that take part, each kind near its best over them, at the noise of the one that explains the
+    most, and their share of all.
 
     Raises:
         CalibrationError: too little to tell lenses apart, or no calibration.
     """
-    formulas = [kind for kind, lens in LENSES.items() if not lens.set_at_start]  # one without has no shorter ones
-    kinds = sorted(map(forms_of, formulas), key=lambda forms: forms[0].lens != _WIDEST)
+    every = sorted(kinds(), key=lambda forms: forms[0].lens != _WIDEST)
     total = len(observations.points) + len(observations.curves)
     few = thinned(observations, max(_LEAST_ROWS, int(_SHARE * total)), _FEWEST_FRAMES)
     sights = gather_sights(few)
     _require_groups(sights)
     names = list(dict.fromkeys(key.placement for key in sights.keys if key.placement is not None))
     start = replace(start, placements=Poses.stacked(names, Poses.of(start.placements).of_names(names)))
-    tried = kinds
+    tried = every
     while True:
         end, used = _solved(few, options, sights, start, tried)
-        seen = _Seen(few, end, options)
-        compared = [seen.kind(forms, is_solved=forms is used) for forms in kinds]
+        seen = Seen(few, end, options)
+        compared = [seen.kind(forms, is_solved=forms is used) for forms in every]
         best = min(compared, key=lambda one: one.least)
         least = next(one.least for one in compared if one.forms is used)
         if len(tried) == 1 or best.least > _QUIETER * least:
-            return compared, (len(few.points) + len(few.curves)) / total
+            return seen, compared, (len(few.points) + len(few.curves)) / total
         tried = [best.forms]
 
 
@@ -177,8 +175,8 @@ def _solved(
     for forms, most_rounds in [(kinds[0], 1), *((forms, _MOST_ROUNDS) for forms in kinds)]:
         own = forms[0].of(options)
         try:
-            near = _seen_through(start, own, _profiles(start, sights))
-            problem = _problem(observations, sights, own, near)
+            near = seen_through(start, own, _profiles(start, sights))
+            problem = problem_of(observations, sights, own, near)
             end = solve_robustly(problem, observations, near, most_rounds=most_rounds)
         except CalibrationError as error:
             failure = error
@@ -198,7 +196,8 @@ def _noise_px(end: RobustSolution) -> float:
     return float(np.exp(np.mean(np.log(np.concatenate(sigmas)))))
 
 
-def _problem(observations: Observations, sights: Sights, options: Options, estimate: Estimate) -> Problem:
+def problem_of(observations: Observations, sights: Sights, options: Options, estimate: Estimate) -> Problem:
+    """What is minimised, before anything was weighed."""
     priors = gather_priors(observations, options, estimate.structure)
     return Problem(sights, make_layout(observations, options), priors, options=options)
 
@@ -211,17 +210,19 @@ def _profiles(estimate: Estimate, sights: Sights) -> dict[str, LensProfile]:
     }
 
 
-def _seen_through(estimate: Estimate, options: Options, profiles: Mapping[str, LensProfile]) -> Estimate:
+def seen_through(estimate: Estimate, options: Options, profiles: Mapping[str, LensProfile]) -> Estimate:
     """The estimate with the lens of the options, as near to its own as it comes."""
     cameras = dict(estimate.cameras)
     for name, profile in profiles.items():
-        lens = profile.nearest(options.blank_lens, cameras[name].phi, options.held)
+        phi, edge = cameras[name].phi, edge_over(cameras[name], profile.reach_px)
+        blank = options.blank_lens.spanning(float(profile.angles[-1]), phi, edge)
+        lens = profile.nearest(blank, phi, options.held)
         cameras[name] = replace(cameras[name], lens=lens)
     return replace(estimate, cameras=cameras)
 
 
 @dataclass(frozen=True, eq=False)
-class _Seen:
+class Seen:
     """The inliers of a solve."""
 
     observations: Observations
@@ -238,27 +239,53 @@ class _Seen:
 
     def kind(self, forms: tuple[Form, ...], *, is_solved: bool) -> Kind:
         """A kind near its best, and the normal equations of each group there; `is_solved`: the one that was solved."""
-        options = forms[0].of(self.options)
-        estimate = _seen_through(self.end.solution.estimate, options, self._profiles)
+        options = replace(forms[0].of(self.options), max_iterations=_MOST_STEPS)
+        estimate = self.end.solution.estimate
         try:
-            problem = _problem(self.observations, self.sights, options, estimate)
-            problem = problem.weighted(self.end.problem.weighting)
+            problem = self._problem(options, estimate)
             if not is_solved:
-                estimate = solve(problem, estimate, precision=_PRECISION).estimate
-            normals, sigma_px = self._normals(problem, estimate)
+                estimate = seen_through(estimate, options, self._profiles)
+                self._shown(estimate)
+                estimate = solve(problem, estimate, precision=_PRECISION, is_near=False).estimate
+            return self._near_best(forms, problem, estimate)
         except CalibrationError as error:
             return Kind(forms, estimate, failed=str(error))
+
+    def solved(self, forms: tuple[Form, ...], near: Estimate) -> Kind:
+        """A kind whose roughness the data tell, by all rounds of a robust solve from an estimate with another lens."""
+        options = forms[0].of(self.options)
+        estimate = seen_through(near, options, _profiles(near, self.sights))
+        try:
+            problem = problem_of(self.observations, gather_sights(self.observations), options, estimate)
+            end = solve_robustly(problem, self.observations, estimate, most_rounds=_MOST_ROUNDS)
+            estimate = end.solution.estimate
+            problem = replace(self._problem(options, estimate), smoothness=end.problem.smoothness)
+            return self._near_best(forms, problem, estimate)
+        except CalibrationError as error:
+            return Kind(forms, estimate, failed=str(error))
+
+    def _problem(self, options: Options, estimate: Estimate) -> Problem:
+        """All inliers weigh the same with every kind: what one of them misses must not weigh less with it."""
+        problem = problem_of(self.observations, self.sights, options, estimate)
+        return problem.weighted(replace(self.end.problem.weighting, loss="trivial"))
+
+    def _near_best(self, forms: tuple[Form, ...], problem: Problem, estimate: Estimate) -> Kind:
+        normals, sigma_px = self._normals(problem, estimate, self._shown(estimate))
         reach_px = {name: profile.reach_px for name, profile in self._profiles.items()}
         return Kind(forms, estimate, normals, sigma_px, reach_px)
 
-    def _normals(self, problem: Problem, estimate: Estimate) -> tuple[GroupNormals, float]:
-        """The normal equations of each group, and the sigma of a typical observation, px."""
-        there = residuals(self.observations, self.sights, estimate)
-        points, curves = there.lengths
-        if not np.isfinite([*points[self.sights.point_rows], *curves[self.sights.curve_rows]]).all():
+    def _shown(self, estimate: Estimate) -> Residuals:
+        """The residuals there; DegenerateError where something is not seen."""
+        there = residuals(self.observations, self.sights, estimate, self.end.residuals.feet)
+        known = np.isfinite(there.points[self.sights.point_rows]), np.isfinite(there.curves[self.sights.curve_rows])
+        if not (known[0].all() and known[1].all()):
             raise DegenerateError("cannot show all that another lens shows")
+        return there
+
+    def _normals(self, problem: Problem, estimate: Estimate, there: Residuals) -> tuple[GroupNormals, float]:
+        """The normal equations of each group, and the sigma of a typical observation, px."""
         equations = write_equations(self.observations, self.sights, estimate, there)
-        weights = equation_weights(self.observations, problem.weighting, equations, there).within_sigma
+        weights = equation_weights(self.observations, problem.weighting, equations, there)
         normals = group_normals(problem, estimate, equations, weights, _groups(equations, problem))
         return normals, 1.0 / float(np.mean(weights.inverse_sigma))
 

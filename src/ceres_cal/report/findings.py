@@ -14,7 +14,7 @@ from ceres_cal.report.page import Card, Chapter, Piece, Table, Text
 
 _MOST_CARDS = 8
 
-CHOSEN_BY = "the simplest within 1.5 standard errors of the least error; radial 2,3 wins ties"
+CHOSEN_BY = "the simplest within 1.75 standard errors of the least error; radial 2,3 wins ties"
 
 
 def findings(material: Material) -> Chapter:

@@ -99,10 +99,15 @@ def _start_camera(blank: Camera, sights: Sights, options: Options, priors: Seque
     r = _RADII * sights.reach_px
     w = profile.lift(np.column_stack([r, np.zeros_like(r)]))[:, 2]
     seen = LensProfile(r, np.arctan2(r, phi * w))
-    beyond = _MARGIN * max(1.0, blank.corner_radius / sights.reach_px)
-    lens = seen.nearest(blank.lens.spanning(float(seen.angles[-1]), phi, beyond), phi, options.held)
+    spanning = blank.lens.spanning(float(seen.angles[-1]), phi, edge_over(blank, sights.reach_px))
+    lens = seen.nearest(spanning, phi, options.held)
     camera = replace(blank, phi=phi, lens=lens)
     return _CameraStart(camera, phi_from, homographies.sights, _poses_at(homographies, phi))
+
+
+def edge_over(camera: Camera, reach_px: float) -> float:
+    """How many times as far out as its observations reach a camera's lens is asked about."""
+    return _MARGIN * max(1.0, camera.corner_radius / reach_px)
 
 
 def _concerns(prior: Prior, camera: str, sights: Sights) -> bool:

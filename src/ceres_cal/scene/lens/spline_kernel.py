@@ -110,8 +110,11 @@ def differentiate(n: int, intrinsics: Any, unit: float, state: Any, image: Any, 
         for a in range(DEGREE + 1):
             if j + a >= 2:
                 row = HEAD + (j * (DEGREE + 1) + a) * (DEGREE + 1)
-                value, slope = _polynomial(state, row, t)
-                value += INTERVALS * slope * max(radius - 1.0, 0.0)
+                value = state[row + DEGREE]
+                for d in range(DEGREE - 1, -1, -1):
+                    value = value * t + state[row + d]
+                if radius > 1.0:
+                    value += INTERVALS * (radius - 1.0) * _polynomial(state, row, t)[1]
                 jacobian[3 + j + a, 0, i], jacobian[3 + j + a, 1, i] = value * x, value * y
     for k in range(int(state[1])):
         row = HEAD + TABLE + INTERVALS * (DEGREE + 1) + 5 * k
