@@ -385,7 +385,9 @@ def test_two_coefficients_are_too_few_for_the_wide_camera_and_three_enough(gopro
     by_label = {one.label: one for one in choice.candidates}
     short, enough = by_label["brown k1 k2"], by_label["brown k1 k2 k3"]
     best = choice.candidates[choice.chosen]
-    assert best.label == "kannala-brandt k1 k2 p1 p2"  # 0.442 px of 0.492 without decentring, 0.596 with three of brown's
+    assert (
+        best.label == "kannala-brandt k1 k2 p1 p2"
+    )  # 0.442 px of 0.492 without decentring, 0.596 with three of brown's
     assert best.rms_px < 0.8 * enough.rms_px
     assert short.fit_rms_px == pytest.approx(1.36, abs=0.1) and enough.fit_rms_px == pytest.approx(0.57, abs=0.1)
     assert enough.rms_px < 0.5 * short.rms_px

@@ -15,7 +15,9 @@ from ceres_cal.lens_choice.forms import PAPER, is_usual
 AS_GOOD = 1.5
 
 
-def decide(labels: Sequence[str], sizes: Sequence[int], squares: Sequence[Array | None]) -> tuple[int, int]:
+def decide(
+    labels: Sequence[str], sizes: Sequence[int], squares: Sequence[Array | None], refuted: Sequence[bool] = ()
+) -> tuple[int, int]:
     """Indices of the best lens and of the simplest that is as good; the paper's comes before all others.
 
     As good is what exceeds the least error by no more than 1.5 standard errors of their difference, group by group (the
@@ -23,6 +25,7 @@ def decide(labels: Sequence[str], sizes: Sequence[int], squares: Sequence[Array 
 
     Args:
         sizes: see `forms.size_of`. squares: (G,) squared errors by group of each lens; None where there is no answer.
+        refuted: lenses that a longer one refutes, which are not as good whatever few groups say.
 
     Raises:
         DegenerateError: no lens has one.
@@ -33,7 +36,8 @@ def decide(labels: Sequence[str], sizes: Sequence[int], squares: Sequence[Array 
     totals = {i: float(one.sum()) for i, one in known.items()}
     best = min(totals, key=totals.__getitem__)
     order = sorted(totals, key=lambda i: (labels[i] != PAPER, sizes[i], not is_usual(labels[i]), totals[i]))
-    return best, next(i for i in order if standard_errors(known[i], known[best]) <= AS_GOOD)
+    as_good = (i for i in order if standard_errors(known[i], known[best]) <= AS_GOOD)
+    return best, next((i for i in as_good if not any(refuted[i : i + 1])), best)
 
 
 def standard_errors(squares: Array, others: Array) -> float:
