@@ -70,7 +70,8 @@ def _compare(tried: list[Candidate], as_good: float) -> tuple[list[Candidate], C
     """The lenses, the best and the one that is chosen: one that folds where it must not gives no answer."""
     labels, sizes = [one.form.label for one in tried], [one.form.size for one in tried]
     while True:
-        best, chosen = decide(labels, sizes, [one.squares for one in tried], as_good)
+        refuted = [any(other.refutes(one) for other in tried if other.squares is not None) for one in tried]
+        best, chosen = decide(labels, sizes, [one.squares for one in tried], as_good, refuted)
         faults = {number: fault for number in (best, chosen) if (fault := tried[number].fault)}
         if not faults:
             return tried, tried[best], tried[chosen]

@@ -10,6 +10,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask
 from ceres_cal.base.errors import CalibrationError, DegenerateError
+from ceres_cal.base.tails import upper_tail
 from ceres_cal.base.transforms import Poses
 from ceres_cal.lens_choice.forms import PAPER, Form, kinds
 from ceres_cal.lens_choice.rule import AS_GOOD, CLEARLY, standard_errors, surprise
@@ -36,7 +37,9 @@ _MOST_ROUNDS = 8
 _SOUND_PX = 1.0  # noise beyond which a first solve may have ended in a wrong valley: others are tried from nothing
 _PRECISION = 1e-2  # relative change of the cost from which on normal equations say where the least is
 _MOST_STEPS = 10  # a kind that takes more is no lens for these observations
-_FEWEST_PLACEMENTS = 5  # with fewer the features of each are held out one by one
+# Probability of what a lens leaves more than a longer one, under which it is no lens for these observations.
+_REFUTED = 1e-3
+_FEWEST_PLACEMENTS = 8  # with fewer the features of each are held out one by one
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +77,17 @@ class Kind:
         held = [key for key in self.normals.keys if key.kind == "camera" and key.quantity in lens]
         squares, step = self.normals.held_out(dict(zip(held, -values_of(self.estimate, held), strict=True)))
         rms_px = self.sigma_px * float(np.sqrt(squares.sum() / self.normals.counts.sum()))
-        return Candidate(form, self, surprise(squares, self.normals.counts), rms_px, step)
+        least = self.normals.squares_at(step)
+        return Candidate(form, self, surprise(squares, self.normals.counts), rms_px, step, least)
+
+    @cached_property
+    def scatter(self) -> float:
+        """Mean of the variances of its coefficients as groups scatter, over those by the noise alone; at least 1."""
+        if self.normals is None:
+            return 1.0
+        names = set(self.forms[0].names)
+        own = [i for i, key in enumerate(self.normals.keys) if key.kind == "camera" and key.quantity in names]
+        return max(1.0, self.normals.scatter_of(np.array(own)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +96,7 @@ class Candidate:
 
     Attributes:
         squares: (G,) of each group, in standard deviations; None where it gives no answer, and `failed` says why.
-        rms_px: of all. step: from the kind's estimate to where this lens is at its best.
+        rms_px: of all. step: from the kind's estimate to where this lens is at its best. least: all squares there.
     """
 
     form: Form
@@ -91,7 +104,13 @@ class Candidate:
     squares: Array | None = None
     rms_px: float = np.nan
     step: Array = field(default_factory=lambda: np.empty(0))
+    least: float = np.nan
     failed: str = ""
+
+    def refutes(self, other: Candidate) -> bool:
+        """Whether the other lens, which has fewer numbers, leaves more than it may by chance."""
+        more = self.form.size - other.form.size
+        return more > 0 and upper_tail((other.least - self.least) / self.of.scatter, more) < _REFUTED
 
     def may_win(self, best: Candidate) -> bool:
         """Whether it is the longest of a kind whose shorter ones may be as good as the best."""

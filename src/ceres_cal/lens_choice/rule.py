@@ -21,7 +21,11 @@ AS_GOOD_BESIDE_LENGTHS = 0.5
 
 
 def decide(
-    labels: Sequence[str], sizes: Sequence[int], squares: Sequence[Array | None], as_good: float = AS_GOOD
+    labels: Sequence[str],
+    sizes: Sequence[int],
+    squares: Sequence[Array | None],
+    as_good: float = AS_GOOD,
+    refuted: Sequence[bool] = (),
 ) -> tuple[int, int]:
     """Indices of the best lens and of the simplest that is as good; the paper's comes before all others.
 
@@ -30,7 +34,8 @@ def decide(
 
     Args:
         sizes: see `forms.size_of`. squares: (G,) squared errors by group of each lens; None where there is no answer.
-        as_good: in place of those 1.5.
+        as_good: in place of those 1.75.
+        refuted: lenses that a longer one refutes, which are not as good whatever few groups say.
 
     Raises:
         DegenerateError: no lens has one.
@@ -41,7 +46,8 @@ def decide(
     totals = {i: float(one.sum()) for i, one in known.items()}
     best = min(totals, key=totals.__getitem__)
     order = sorted(totals, key=lambda i: (labels[i] != PAPER, sizes[i], not is_usual(labels[i]), totals[i]))
-    return best, next(i for i in order if standard_errors(known[i], known[best]) <= as_good)
+    near = (i for i in order if standard_errors(known[i], known[best]) <= as_good)
+    return best, next((i for i in near if not any(refuted[i : i + 1])), best)
 
 
 def surprise(squares: Array, counts: Array) -> Array:

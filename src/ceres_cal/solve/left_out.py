@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -46,9 +47,21 @@ class GroupNormals:
     @property
     def least(self) -> float:
         """The least squares, everything free."""
-        whole, slope = self.normal.sum(axis=0) + self.known, self.gradient.sum(axis=0) + self.known_gradient
-        left = inverse_root(whole, self.sizes, SINGULAR).T @ slope
-        return float(self.squares.sum() - left @ left)
+        return self.squares_at(self._least_step)
+
+    def squares_at(self, step: Array) -> float:
+        """All squares, so far from where the numbers stand, to second order."""
+        return float(self.squares.sum() + 2.0 * (self._slope @ step) + step @ self._whole @ step)
+
+    def scatter_of(self, numbers: Indices) -> float:
+        """Mean of the variances of some of the numbers as groups scatter, over those by the noise alone.
+
+        The delete-one jackknife (Efron and Stein, Annals of Statistics 9, 1981), which overshoots where groups are few.
+        """
+        axes = np.linalg.qr(self._root[numbers].T)[0]
+        gradient = (self.gradient + self.normal @ self._least_step) @ self._root
+        without = self._left_out(self._root, gradient)[1] @ axes
+        return float((len(without) - 1.0) * np.mean(np.var(without, axis=0)))
 
     def held_out(self, held: Mapping[Key, float]) -> tuple[Array, Array]:
         """(G,) squared errors of each group predicted from all others, and the step (K,) to where the least squares
@@ -56,18 +69,37 @@ class GroupNormals:
         """
         free = np.array([i for i, key in enumerate(self.keys) if key not in held], dtype=np.int64)
         step = np.array([held.get(key, 0.0) for key in self.keys])
-        whole = self.normal.sum(axis=0) + self.known
-        slope = self.gradient.sum(axis=0) + self.known_gradient + whole @ step
-        root = inverse_root(whole[np.ix_(free, free)], self.sizes[free], SINGULAR)
-        step[free] -= root @ (root.T @ slope[free])
+        root = np.zeros((len(self.keys), len(free)))
+        root[free] = inverse_root(self._whole[np.ix_(free, free)], self.sizes[free], SINGULAR)
+        step -= root @ (root.T @ (self._slope + self._whole @ step))
         moved = self.normal @ step
         squares = self.squares + 2.0 * (self.gradient @ step) + moved @ step
-        gradient = (self.gradient + moved)[:, free] @ root
-        own = root.T @ self.normal[:, free[:, None], free] @ root
-        rest = (1.0 + _RIDGE) * np.eye(root.shape[1]) - own
-        without = np.linalg.solve(rest, gradient[:, :, None])
-        squares += np.sum((2.0 * gradient[:, :, None] + own @ without) * without, axis=(1, 2))
+        gradient = (self.gradient + moved) @ root
+        own, without = self._left_out(root, gradient)
+        squares += np.einsum("gk,gk->g", 2.0 * gradient + np.einsum("gkl,gl->gk", own, without), without)
         return squares, step
+
+    def _left_out(self, root: Array, gradient: Array) -> tuple[Array, Array]:
+        """Each group's share (G, R, R) of the information, and where the others are without it (G, R), along a root."""
+        own = root.T @ self.normal @ root
+        rest = (1.0 + _RIDGE) * np.eye(root.shape[1]) - own
+        return np.asarray(own), np.asarray(np.linalg.solve(rest, gradient[:, :, None])[:, :, 0])
+
+    @cached_property
+    def _whole(self) -> Array:
+        return np.asarray(self.normal.sum(axis=0) + self.known)
+
+    @cached_property
+    def _slope(self) -> Array:
+        return np.asarray(self.gradient.sum(axis=0) + self.known_gradient)
+
+    @cached_property
+    def _root(self) -> Array:
+        return inverse_root(self._whole, self.sizes, SINGULAR)
+
+    @cached_property
+    def _least_step(self) -> Array:
+        return np.asarray(-self._root @ (self._root.T @ self._slope))
 
 
 def group_normals(
