@@ -143,7 +143,8 @@ def _run(args: Namespace) -> Answer:
         from ceres_cal.calibrating import calibrate
         from ceres_cal.report.quality import quality_of
 
-        calibration = calibrate(observations, options, _solve_progress(bar), client=client)
+        workers = {} if client is None else {"client": client}
+        calibration = calibrate(observations, options, _solve_progress(bar), **workers)
     page = report_page(args, calibration, observations, photographs)
     quality = quality_of(calibration, observations)
     write_results(args, calibration.save, page)
