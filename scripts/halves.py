@@ -128,15 +128,16 @@ class Agreement:
 
 
 def agreement(first: Calibration, second: Calibration, pixels: Array) -> Agreement:
-    """Of the only camera of two calibrations from different observations; projections at pixels (N, 2). Of two lenses,
-    the intrinsics that both have.
+    """Of the only camera of two calibrations from different observations; projections at pixels (N, 2). Of lenses
+    of two kinds the intrinsics do not mean the same: NaN.
     """
     posteriors = [one.uncertainty.posterior for one in (first, second)]
     keys = [key for key in posteriors[0].keys if key.kind == "camera" and key in posteriors[1].keys]
     sizes = natural_sizes(first.estimate, keys)
     step = (values_of(first.estimate, keys) - values_of(second.estimate, keys)) / sizes
     spread = sum(_covariance(posterior, keys) for posterior in posteriors) / sizes[:, None] / sizes
-    mahalanobis = float(step @ np.linalg.solve(spread, step)) / len(keys)
+    alike = len({type(one.estimate.cameras[keys[0].owner].lens) for one in (first, second)}) == 1
+    mahalanobis = float(step @ np.linalg.solve(spread, step)) / len(keys) if alike else np.nan
     cameras = [one.estimate.cameras[keys[0].owner].at(Pose.identity()) for one in (first, second)]
     rays = cameras[0].rays(pixels)
     pixels, rays = pixels[np.isfinite(rays[:, 0])], rays[np.isfinite(rays[:, 0])]
@@ -223,7 +224,7 @@ def _rows(
     views = " and ".join(str(len(half.shown_views)) for half in pairs[0])
     note = f"{len(found)} splits into {views} views" + (f", {failed} without a calibration" if failed else "")
     for what in ("intrinsics", "projections"):
-        squares = np.array([getattr(one, what) for one in found])
+        squares = np.array([value for one in found if np.isfinite(value := getattr(one, what))])
         value = float(np.sqrt(np.mean(squares)))
         error = float(np.std(squares, ddof=1) / np.sqrt(len(squares)) / (2.0 * value))
         yield Row(name, f"{what}: difference over stated, rms", value, error, *limits, note)

@@ -17,12 +17,14 @@ from ceres_cal.base.errors import CalibrationError
 from ceres_cal.base.transforms import Poses
 from ceres_cal.calibration import LensChoice, TriedLens
 from ceres_cal.lens_choice.forms import PAPER, papers
-from ceres_cal.lens_choice.kinds import Candidate, compared_kinds
+from ceres_cal.lens_choice.kinds import Candidate, Seen, compared_kinds
 from ceres_cal.lens_choice.last_resort import last_resort
 from ceres_cal.lens_choice.rule import AS_GOOD, AS_GOOD_BESIDE_LENGTHS, decide, standard_errors
 from ceres_cal.model.parameters import Options
 from ceres_cal.observations import Observations
 from ceres_cal.start.initialise import Start
+
+_BROKEN = "solved for, it leaves more than the equations of a longer lens had it"
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,10 +54,10 @@ def choose_lens(observations: Observations, options: Options, start: Start) -> C
     as_good = AS_GOOD_BESIDE_LENGTHS if options.dimensions else AS_GOOD
     try:
         seen, kinds, share = compared_kinds(observations, options, start.estimate)
-        tried, best, chosen = _compare([one for kind in kinds for one in kind.candidates(first=True)], as_good)
+        tried, best, chosen = _compare([one for kind in kinds for one in kind.candidates(first=True)], as_good, seen)
         if chosen.form.label != PAPER:
             others = [one for longest in tried if longest.may_win(best) for one in longest.of.candidates(first=False)]
-            tried, _, chosen = _compare([*tried, *others], as_good)
+            tried, _, chosen = _compare([*tried, *others], as_good, seen)
         more = list(last_resort(seen, chosen))
         tried, chosen = [*tried, *more], next((one for one in more if one.clearly_beats(chosen)), chosen)
     except CalibrationError:
@@ -66,13 +68,17 @@ def choose_lens(observations: Observations, options: Options, start: Start) -> C
     return Chosen(chosen.form.of(options), near, _choice(tried, chosen, share))
 
 
-def _compare(tried: list[Candidate], as_good: float) -> tuple[list[Candidate], Candidate, Candidate]:
-    """The lenses, the best and the one that is chosen: one that folds where it must not gives no answer."""
+def _compare(tried: list[Candidate], as_good: float, seen: Seen) -> tuple[list[Candidate], Candidate, Candidate]:
+    """The lenses, the best and the one that is chosen: one that folds where it must not gives no answer, nor does one
+    that leaves more than was promised.
+    """
     labels, sizes = [one.form.label for one in tried], [one.form.size for one in tried]
     while True:
         refuted = [any(other.refutes(one) for other in tried if other.squares is not None) for one in tried]
         best, chosen = decide(labels, sizes, [one.squares for one in tried], as_good, refuted)
         faults = {number: fault for number in (best, chosen) if (fault := tried[number].fault)}
+        if not faults and not seen.keeps(tried[chosen]):
+            faults = {chosen: _BROKEN}
         if not faults:
             return tried, tried[best], tried[chosen]
         tried = [replace(one, squares=None, failed=faults[n]) if n in faults else one for n, one in enumerate(tried)]

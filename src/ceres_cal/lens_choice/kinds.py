@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -37,6 +38,7 @@ _MOST_ROUNDS = 8
 _SOUND_PX = 1.0  # noise beyond which a first solve may have ended in a wrong valley: others are tried from nothing
 _PRECISION = 1e-2  # relative change of the cost from which on normal equations say where the least is
 _MOST_STEPS = 10  # a kind that takes more is no lens for these observations
+_KEPT = 1.5  # times the squares that normal equations promise: what leaves more is not the lens that was compared
 # Probability of what a lens leaves more than a longer one, under which it is no lens for these observations.
 _REFUTED = 1e-3
 _FEWEST_PLACEMENTS = 8  # with fewer the features of each are held out one by one
@@ -282,6 +284,32 @@ class Seen:
             return self._near_best(forms, problem, estimate)
         except CalibrationError as error:
             return Kind(forms, estimate, failed=str(error))
+
+    @property
+    def splits_placements(self) -> bool:
+        """Whether placements are too few to be held out whole."""
+        return any(key.placement for key in self.sights.keys) and not _placed(self.sights).any()
+
+    def in_sigmas(self, estimate: Estimate) -> tuple[Array, Array]:
+        """(N, 2), (M,) residuals of points and curve observations, in standard deviations.
+
+        Raises:
+            DegenerateError: something is not seen.
+        """
+        there, sights, scales = self._shown(estimate), self.sights, self.end.problem.weighting.scales
+        points = there.points[sights.point_rows] / (scales[0] * sights.sigma_px[:, None])
+        return points, there.curves[sights.curve_rows] / (scales[1] * sights.curve_sigma_px)
+
+    def keeps(self, candidate: Candidate) -> bool:
+        """Whether a lens leaves no more than the normal equations of a longer one promised, at once or when solved."""
+        with suppress(CalibrationError):
+            points, curves = self.in_sigmas(candidate.estimate)
+            if np.sum(points**2) + curves @ curves <= _KEPT * candidate.least:
+                return True
+            options = replace(candidate.form.of(self.options), max_iterations=_MOST_STEPS)
+            problem = self._problem(options, candidate.estimate)
+            return 2.0 * solve(problem, candidate.estimate, precision=_PRECISION).cost <= _KEPT * candidate.least
+        return False
 
     def _problem(self, options: Options, estimate: Estimate) -> Problem:
         """All inliers weigh the same with every kind: what one of them misses must not weigh less with it."""

@@ -13,7 +13,6 @@ import numpy as np
 from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.lens_choice.forms import without_formula
 from ceres_cal.lens_choice.kinds import Candidate, Kind, Seen
-from ceres_cal.model.residuals import residuals
 
 # Between cells over within them, from which on residuals go together: in white noise it is 1.0 by 0.17. From half to
 # double it decides which observations are asked, seldom what is chosen.
@@ -22,21 +21,22 @@ _IN_A_CELL, _MOST_CELLS = 8, 8  # observations on average; cells along the image
 
 
 def last_resort(seen: Seen, chosen: Candidate) -> Iterator[Candidate]:
-    """The lenses without a formula, where even the longest lens of the chosen kind leaves what goes together."""
-    if _between_cells(seen, chosen.of) > _TOGETHER:
+    """The lenses without a formula, where even the longest lens of the chosen kind leaves what goes together.
+
+    Not of so few placements that their features are held out one by one: what goes together within each would be
+    predicted, too.
+    """
+    if not seen.splits_placements and _between_cells(seen, chosen.of) > _TOGETHER:
         for forms in without_formula():
             yield from seen.solved(forms, chosen.of.estimate).candidates(first=True)
 
 
 def _between_cells(seen: Seen, kind: Kind) -> float:
     """Mean square of residuals between cells over that within them; the x and y of points and each curve apart."""
-    sights, there = seen.sights, residuals(seen.observations, seen.sights, kind.estimate)
-    points = there.points[sights.point_rows] / sights.sigma_px[:, None]
-    curves = there.curves[sights.curve_rows] / sights.curve_sigma_px
-    scales = seen.end.problem.weighting.scales
+    sights, (points, curves) = seen.sights, seen.in_sigmas(kind.estimate)
     cells = [_cells(seen, sights.point_bounds, sights.pixels), _cells(seen, sights.curve_bounds, sights.curve_pixels)]
     apart = [cells[0] * 2, cells[0] * 2 + 1, (cells[1] * len(sights.tracks) + sights.track_index) * -1 - 1]
-    left = np.concatenate([points[:, 0] / scales[0], points[:, 1] / scales[0], curves / scales[1]])
+    left = np.concatenate([points[:, 0], points[:, 1], curves])
     cell = np.unique(np.concatenate(apart), return_inverse=True)[1]
     counts = np.bincount(cell)
     between = np.bincount(cell, left) ** 2 / counts
