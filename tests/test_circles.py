@@ -107,7 +107,7 @@ def test_as_typed(say: Say, tmp_path: Path) -> None:
     spec = json.dumps({**PLAIN.spec, "columns": 3, "rows": 3, "spacing_m": 0.012, "diameter_m": 0.006})
     assert say("targets", "print", spec, "-o", sheet).code == 0 and sheet.read_bytes().startswith(b"%PDF")
     assert ".pdf" in refused(say("targets", "print", spec, "-o", tmp_path / "board.png"))
-    assert "no JSON" in refused(say("targets", "print", "{", "-o", sheet))
+    assert "not valid JSON" in refused(say("targets", "print", "{", "-o", sheet))
     write(tmp_path / "a.png", photograph(seen(PLAIN, 0.3)[0]))
     detect = ("detect", "board", tmp_path / "a.png", "--columns", 7, "--rows", 5, "-o", tmp_path / "o.json")
     said = say(*detect, "--circles", 0.03, "--diameter", 0.02, "--quiet")

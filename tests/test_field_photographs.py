@@ -259,7 +259,7 @@ def test_command(tmp_path: Path, shot: script.Shot, capsys: pytest.CaptureFixtur
         (("--start", other, "--target", "ssl-b"), 'must be "ceres-cal/corners"'),
         (("--corner", "A=1", "--target", "ssl-b"), "write NAME=X,Y"),
         ((*clicked, *clicked[:2], "--target", "ssl-b"), "is given twice"),
-        ((*clicked, "--target", "ssl-c"), "neither ssl-a nor ssl-b, nor a file"),
+        ((*clicked, "--target", "ssl-c"), ", nor a file"),
         ((*clicked, "--target", "ssl-b", "--not-painted", "Nowhere"), "is not one of the target's"),
     ):
         assert main([*detect, *arguments]) == 2

@@ -27,7 +27,7 @@ class ViewPlan:
         station: where they are taken.
         target: what they show.
         placement: where the target is; None: it lies in the world.
-        points: names of the points looked for; None: all that the target has.
+        points: names of the points looked for; None: all that the target has, crossings of its curves apart.
         curves: names of the curves looked for; None: all that the target has.
         spacing_m: distance along a curve from one curve observation to the next.
         side: which part of the paint is observed: "centre", "left" or "right".

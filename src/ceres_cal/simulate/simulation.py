@@ -12,6 +12,7 @@ from ceres_cal.observations import Curves, Observations, Points, View
 from ceres_cal.scene.camera import Camera, in_image
 from ceres_cal.scene.curves import SIDES, along_curve, distance_to_curve
 from ceres_cal.scene.targets import Target
+from ceres_cal.scene.targets.crossings import is_crossing
 from ceres_cal.simulate.scene import Disturbance, Scene, ViewPlan
 
 CLEAN, OUTLIER, WRONG_LABEL = 0, 1, 2
@@ -126,7 +127,8 @@ def _chosen(names: tuple[str, ...] | None, known: tuple[str, ...]) -> Indices32:
 
 def _points_in_view(scene: Scene, plan: ViewPlan, camera: Camera) -> _InView:
     target = scene.targets[plan.target]
-    chosen = _chosen(plan.points, target.point_names)
+    named = tuple(name for name in target.point_names if not is_crossing(name))
+    chosen = _chosen(named if plan.points is None else plan.points, target.point_names)
     rows, pixels = _project_seen(scene, plan, camera, target.point_array[chosen])
     return _InView(chosen[rows], pixels, len(target.points), camera.image_size)
 

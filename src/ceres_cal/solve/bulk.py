@@ -33,6 +33,8 @@ MANY = 2_000_000
 """Observations of the world from which on a part decides, and the rest answers with sums."""
 # Observations of the part, and views of it at least.
 _PART, _FEWEST_VIEWS = 300_000, 200
+# Relative change of the cost at which a solve of all ends: sums in another order end elsewhere by its root.
+_TO_THE_LAST = 1e-17
 _STANDING_OUT = 12  # views besides, of the largest residuals and of most outliers each
 _MOST_ROUNDS = 8
 _AT_REST = 1e-2  # relative change of a noise scale that is no change, as in `robust`
@@ -256,7 +258,7 @@ class _Rounds:
         noise = self._noise(Redundancy.by_count(sum(self._seen.looked.equations), unknowns))
         while rounds < _MOST_ROUNDS:
             problem = self._judged(noise)
-            solution, rounds = solve(problem, self._seen.estimate, self._progress), rounds + 1
+            solution, rounds = solve(problem, self._seen.estimate, self._progress, precision=_TO_THE_LAST), rounds + 1
             inside = self._seen.inside(noise)
             self._seen = self._look(solution.estimate, noise.bounds, problem.weighting)
             redundancy = Redundancy.by_count(problem.equations, unknowns)

@@ -69,8 +69,9 @@ class GroupNormals:
         """
         free = np.array([i for i, key in enumerate(self.keys) if key not in held], dtype=np.int64)
         step = np.array([held.get(key, 0.0) for key in self.keys])
-        root = np.zeros((len(self.keys), len(free)))
-        root[free] = inverse_root(self._whole[np.ix_(free, free)], self.sizes[free], SINGULAR)
+        of_free = inverse_root(self._whole[np.ix_(free, free)], self.sizes[free], SINGULAR)
+        root = np.zeros((len(self.keys), of_free.shape[1]))
+        root[free] = of_free
         step -= root @ (root.T @ (self._slope + self._whole @ step))
         moved = self.normal @ step
         squares = self.squares + 2.0 * (self.gradient @ step) + moved @ step

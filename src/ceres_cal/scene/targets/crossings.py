@@ -28,6 +28,11 @@ def crossings(curves: Mapping[str, Curve]) -> dict[str, Place]:
     return {names[0]: place for names, place in _named(curves)}
 
 
+def is_crossing(name: str) -> bool:
+    """Whether a point is there only because two curves cross, by its name."""
+    return "*" in name
+
+
 def with_crossings(points: Mapping[str, Place], curves: Mapping[str, Curve]) -> dict[str, Place]:
     """The points, then the crossings at which there is none of them yet."""
     every, places = dict(points), np.array(list(points.values())).reshape(-1, 3)
