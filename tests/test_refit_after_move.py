@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 import refit_after_move
+import week
 from moves import MOVED, NOISE, seen
 
 from ceres_cal.calibration import Calibration
@@ -93,6 +94,15 @@ def test_a_folder_is_watched(place: Path) -> None:
         process.send_signal(signal.SIGINT)
         assert process.wait(120) in (0, -signal.SIGINT)
     assert [event["event"] for event in events[:2]] == ["suspected", "refitted"]
+
+
+def test_a_week_in_fast_motion(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """A move, a folder that is away and a full disk, each with files that are damaged beside good ones."""
+    for name, value in (("HEAP", 10), ("KINDS", 3), ("MOVE_EVERY", 30), ("AWAY_EVERY", 20), ("FULL_EVERY", 40)):
+        monkeypatch.setattr(week, name, value)
+    assert week.main(["--files", "60", "--seed", "1", "--json"]) == 0
+    figures = {row["figure"]: row["value"] for row in json.loads(capsys.readouterr().out)}
+    assert figures["files that were lost"] == 0 and "refits that are not one of 1 moves" in figures
 
 
 def test_a_killed_refit_leaves_a_whole_calibration(place: Path) -> None:
