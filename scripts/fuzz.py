@@ -3,8 +3,8 @@
 Files of a small corpus, made of what the package ships, are mutated: bytes, numbers and names of JSON, columns of
 archives, headers of images. A reader must refuse in one line that names the file, or accept; what is accepted must
 survive being written and read again. Counted as failures: other exceptions, warnings, over 10 s of processor time or
-60 s on the wall, over 1 GiB, deaths of the process, and what does not come back. Exits with 1 when there is one; --keep
-keeps the files that did it.
+60 s on the wall, over 1 GiB more than before, deaths of the process, and what does not come back. Exits with 1 when
+there is one; --keep keeps the files that did it.
 """
 
 from __future__ import annotations
@@ -269,7 +269,7 @@ def work(folder: Path, names: Sequence[str], seed: int, goal: Goal, keep: Path |
     trace = (folder / TRACE).open("w")
     for number in (signal.SIGALRM, signal.SIGPROF):
         faulthandler.register(number, trace, all_threads=True, chain=True)
-    rng = np.random.default_rng(seed)
+    rng, before_mb = np.random.default_rng(seed), _peak_mb()  # a fork begins with what its parent has
     contents = {name: (folder / name).read_bytes() for name in names}
     place = Path(tempfile.mkdtemp(dir=folder))
     shutil.copytree(folder / "colmap", place / "colmap")
@@ -285,7 +285,7 @@ def work(folder: Path, names: Sequence[str], seed: int, goal: Goal, keep: Path |
         seconds = time.process_time() - begin
         signal.setitimer(signal.ITIMER_PROF, 0.0)
         signal.alarm(0)
-        peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+        peak_mb = _peak_mb() - before_mb
         what = "slow" if seconds > LONGEST_S else "memory" if peak_mb > MOST_MB else what
         if what in FAILURES:
             put_aside(path, keep, what, name)
@@ -293,6 +293,10 @@ def work(folder: Path, names: Sequence[str], seed: int, goal: Goal, keep: Path |
         answers.send((name, what, words, seconds, peak_mb))
         if what == "memory":  # whose peak would be that of all that follow
             return
+
+
+def _peak_mb() -> float:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
 def fuzz(folder: Path, goal: Goal, seed: int, keep: Path | None, names: Sequence[str] = ()) -> Counter[tuple[str, str]]:
@@ -320,7 +324,9 @@ def fuzz(folder: Path, goal: Goal, seed: int, keep: Path | None, names: Sequence
                 name = ""
         except EOFError:
             worker.join()
-        if worker.exitcode and name:
+        if worker.exitcode and not name:
+            raise SystemExit(f"a worker ended with exit code {worker.exitcode} before it read anything")
+        if worker.exitcode:
             counts[name, "died"] += 1
             where = (folder / TRACE).read_text()
             print(f"{name}: died: exit code {worker.exitcode}\n{where}", end="", flush=True)
