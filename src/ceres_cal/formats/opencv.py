@@ -211,7 +211,7 @@ def _matrix(node: Any) -> Array | None:
     rows, cols = (_real(node, (name,)) or 0.0 for name in ("rows", "cols"))
     try:
         fits = rows > 0.0 and cols > 0.0 and rows * cols == node.getNode("data").size()
-        return np.asarray(node.mat()) if fits else None
+        return np.asarray(node.mat(), dtype=float) if fits else None
     except cv2.error:
         return None
 

@@ -86,7 +86,7 @@ def as_before(entry: Mapping[str, Any], before: Mapping[str, Any] | None) -> dic
 
 def reader_traps(entry: Mapping[str, Any]) -> list[str]:
     """What those who read an entry make of it."""
-    if entry["distortion"] < 0.0:
+    if float(entry["distortion"]) < 0.0:
         return [
             "its distortion is negative: ssl-vision locates with it but draws, and states its own RMSE, without "
             "(its issue 148); vision-processor takes either sign"

@@ -57,7 +57,7 @@ def _named(curves: Mapping[str, Curve]) -> Iterator[tuple[tuple[str, str], Place
     """Both names of each crossing, and where it is."""
     if len(curves) > MOST_CURVES:
         return
-    every = list(curves.items())
+    every = [(name, curve) for name, curve in curves.items() if 0.0 < curve.length_m < np.inf]
     boxes = np.array([_box(curve) for _, curve in every]).reshape(-1, 2, 3)
     for number, (one, curve) in enumerate(every):
         apart = np.any(
