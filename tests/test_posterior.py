@@ -27,7 +27,8 @@ from ceres_cal.observations.sights import gather_sights
 from ceres_cal.simulate import Disturbance, simulate
 from ceres_cal.solve import Problem, Weighting, information, solve
 from ceres_cal.solve.bundle import _Blocks
-from ceres_cal.solve.costs import Run, SightCost
+from ceres_cal.solve.cached_cost import Run
+from ceres_cal.solve.costs import SightCost
 from ceres_cal.solve.prior_cost import PriorCost
 from ceres_cal.uncertainty import make_posterior
 

@@ -45,7 +45,7 @@ from ceres_cal.scene.lens import Radial
 from ceres_cal.scene.targets import ssl_field
 from ceres_cal.simulate import field_scene, overhead_pose, simulate
 from ceres_cal.solve.bundle import _Blocks
-from ceres_cal.solve.costs import Run
+from ceres_cal.solve.cached_cost import Run
 from ceres_cal.solve.prior_cost import PriorCost
 
 FAR = overhead_pose(-2.3, -1.9, 3.9, tilt_y_deg=-25.0, yaw_deg=90.0)

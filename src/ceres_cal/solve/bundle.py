@@ -16,7 +16,8 @@ from ceres_cal.base.threads import at_most, available
 from ceres_cal.base.transforms import Pose, Poses
 from ceres_cal.model.parameters import Estimate, Layout, Station, intrinsics_vector, with_intrinsics
 from ceres_cal.observations.sights import SightKey, Sights
-from ceres_cal.solve.costs import ROWS_WORTH_A_THREAD, EliminatedCost, Run, SightCost
+from ceres_cal.solve.cached_cost import Run
+from ceres_cal.solve.costs import ROWS_WORTH_A_THREAD, EliminatedCost, SightCost
 from ceres_cal.solve.prior_cost import PriorCost
 from ceres_cal.solve.problem import Problem, Weighting
 

@@ -1,13 +1,12 @@
-"""The cost functions of the observations that Ceres calls: compressed sights, eliminated placements."""
+"""Cost functions of the observations: compressed sights, eliminated placements."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
-import pyceres
 
 from ceres_cal import kernels
 from ceres_cal.base.arrays import Array
@@ -16,6 +15,7 @@ from ceres_cal.model.parameters import Estimate
 from ceres_cal.model.residuals import camera_optics, curve_columns, point_columns, starting_feet
 from ceres_cal.model.structure import Structure
 from ceres_cal.observations.sights import SightKey, Sights
+from ceres_cal.solve.cached_cost import Answer, CachedCost, Run
 from ceres_cal.solve.problem import Problem, Weighting
 
 _STRUCTURE = 3  # slot
@@ -28,15 +28,7 @@ _LARGE, _LIFT = 64, 1e-12  # numbers from which on LAPACK is faster; share of th
 _LEFT_TO_THE_COMPLEMENT = 1e-2
 
 
-@dataclass(eq=False)
-class Run:
-    """What the callbacks of one solve share: the first exception in any of them (Ctrl-C too) ends the solve."""
-
-    failure: BaseException | None = None
-    history: list[float] = field(default_factory=list)
-
-
-class SightCost(pyceres.CostFunction):
+class SightCost(CachedCost):
     """The compressed block of one sight (design, section 6).
 
     Attributes:
@@ -45,8 +37,8 @@ class SightCost(pyceres.CostFunction):
     """
 
     def __init__(self, run: Run, sight: Sights, problem: Problem, estimate: Estimate) -> None:
-        super().__init__()
-        self._run, self._sight, self._structure = run, sight, estimate.structure
+        super().__init__(run)
+        self._sight, self._structure = sight, estimate.structure
         key, layout, weighting = sight.key, problem.layout, problem.weighting
         free, count, offsets = layout.free[key.camera], len(self._structure.values), len(self._structure.offsets)
         feet = starting_feet(sight, estimate, problem.feet)
@@ -60,40 +52,22 @@ class SightCost(pyceres.CostFunction):
         sizes = (len(free), 6, 6, count)
         is_free = (len(free) > 0, key.station in layout.stations, key.placement in layout.placements, count > 0)
         self.slots = [slot for slot in range(4) if is_free[slot]]
-        self._known: tuple[Array, Array, list[Array]] | None = None
         self.set_num_residuals(len(free) + offsets + 7)
         self.set_parameter_block_sizes([sizes[slot] for slot in self.slots])
-
-    def Evaluate(self, parameters: Sequence[Array], residuals: Array, jacobians: Sequence[Array] | None) -> bool:
-        try:
-            at = np.concatenate(parameters)
-            # Ceres asks for the cost of a step first, then for the Jacobian in the same place: once is enough.
-            if self._known is None or not np.array_equal(self._known[0], at):
-                self._known = self._evaluated(at, parameters)
-        except BaseException as error:  # an exception must not travel through C++: the solve ends, then it is raised
-            self._run.failure = self._run.failure or error
-            return False
-        if self._known is None:
-            return False
-        residuals[:] = self._known[1]
-        for jacobian, known in zip(jacobians or (), self._known[2], strict=False):
-            jacobian[:] = known
-        return True
 
     def block(self, parameters: Sequence[Array]) -> Array | None:
         """(N, K + 1) the Jacobians side by side and the residuals, None where an observation cannot be projected."""
         known = self._evaluated(kernels.NOTHING, parameters)
         if known is None:
             return None
-        return np.column_stack([*(each.reshape(self.num_residuals(), -1) for each in known[2]), known[1]])
+        return np.column_stack([*(each.reshape(self.num_residuals(), -1) for each in known.jacobians), known.residuals])
 
     @property
     def feet(self) -> Array:
         """(M,) where the last evaluation left the feet."""
         return self._curves.feet
 
-    def _evaluated(self, at: Array, parameters: Sequence[Array]) -> tuple[Array, Array, list[Array]] | None:
-        """(place, residuals, flat Jacobians), or None where an observation cannot be projected from there."""
+    def _evaluated(self, at: Array, parameters: Sequence[Array]) -> Answer | None:
         numbers, jacobians = [kernels.NOTHING, *self._poses, kernels.NOTHING], [kernels.NOTHING] * 4
         rows, mixing = self.num_residuals(), self._structure.mixing
         for place, slot in enumerate(self.slots):
@@ -107,7 +81,7 @@ class SightCost(pyceres.CostFunction):
         )  # fmt: skip
         if mixing is not None:
             jacobians[_STRUCTURE] = (jacobians[_STRUCTURE].reshape(rows, -1) @ mixing).reshape(-1)
-        return (at, residuals, [jacobians[slot] for slot in self.slots]) if answered else None
+        return Answer(at, residuals, [jacobians[slot] for slot in self.slots]) if answered else None
 
 
 def _factor(normal: Array, upper: Array) -> None:
@@ -147,13 +121,13 @@ class _Evaluation:
     gains: Array
 
 
-class EliminatedCost(pyceres.CostFunction):
+class EliminatedCost(CachedCost):
     """All sights of one camera whose placements no other station sees, over its free intrinsics and the structure."""
 
     def __init__(self, run: Run, sights: Sights, problem: Problem, estimate: Estimate) -> None:
-        super().__init__()
+        super().__init__(run)
         self.camera, weighting = sights.keys[0].camera, problem.weighting
-        self._run, self._sights, self._structure = run, sights, estimate.structure
+        self._sights, self._structure = sights, estimate.structure
         free, count = problem.layout.free[self.camera], len(self._structure.values)
         feet = starting_feet(sights, estimate, problem.feet)
         self._optics = camera_optics(estimate.cameras[self.camera])
@@ -169,34 +143,24 @@ class EliminatedCost(pyceres.CostFunction):
         poses, gains = estimate.pose_stack(sights.keys), np.zeros((len(sights), 6, lead))
         # Every step starts from the poses of the last accepted one: a rejected step may have led them astray.
         self._accepted = _Evaluation(start, kernels.NOTHING, kernels.NOTHING, poses, gains)
-        self._known: _Evaluation | None = None
+        self._last = self._accepted
         self._parts = parts_of(len(sights), len(sights.points) + len(sights.curve_pixels), NORMAL_NS)
         self.slots = [slot for slot, size in zip((0, 3), sizes, strict=True) if size]
         self.set_num_residuals(self._size + 1)
         self.set_parameter_block_sizes([size for size in sizes if size])
 
-    def Evaluate(self, parameters: Sequence[Array], residuals: Array, jacobians: Sequence[Array] | None) -> bool:
-        try:
-            at = np.concatenate(parameters)
-            # Ceres asks for the cost of a step first, then for the Jacobian in the same place: once is enough.
-            if self._known is None or not np.array_equal(self._known.at, at):
-                self._known = self._evaluated(at, _LEFT_TO_THE_COMPLEMENT)
-        except BaseException as error:  # an exception must not travel through C++: the solve ends, then it is raised
-            self._run.failure = self._run.failure or error
-            return False
-        if self._known is None:
-            return False
-        residuals[:] = self._known.residuals
-        first = 0
-        for jacobian in jacobians or ():
-            size = len(jacobian) // (self._size + 1)
-            jacobian[:] = self._known.jacobian[:, first : first + size].reshape(-1)
-            first += size
-        if jacobians is not None:  # asked for where a step was accepted, and nowhere else
-            self._accepted = self._known
-        return True
+    def _evaluated(self, at: Array, parameters: Sequence[Array]) -> Answer | None:
+        last = self._eliminated(at, _LEFT_TO_THE_COMPLEMENT)
+        if last is None:
+            return None
+        self._last = last
+        sizes = np.cumsum(self.parameter_block_sizes()[:-1])
+        return Answer(at, last.residuals, [part.reshape(-1) for part in np.split(last.jacobian, sizes, axis=1)])
 
-    def _evaluated(self, at: Array, tolerance: float) -> _Evaluation | None:
+    def _accept(self) -> None:
+        self._accepted = self._last
+
+    def _eliminated(self, at: Array, tolerance: float) -> _Evaluation | None:
         """The cost in a place, or None where an observation cannot be projected from there."""
         upper = np.empty((self._size + 1, self._size + 1))
         for newton in (True, False):
@@ -248,5 +212,5 @@ class EliminatedCost(pyceres.CostFunction):
         at = np.concatenate([kernels.NOTHING, *parameters])
         # At rest they have come to rest as well; elsewhere, or where Ceres had nothing to move, they are sought.
         if not len(self._accepted.residuals) or not np.array_equal(self._accepted.at, at):
-            self._accepted = self._evaluated(at, 1e-14) or self._accepted
+            self._accepted = self._eliminated(at, 1e-14) or self._accepted
         return self._sights.keys, self._accepted.poses

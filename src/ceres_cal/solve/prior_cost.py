@@ -6,14 +6,13 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-import pyceres
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.transforms import Pose, left_jacobian, rotation_exp, rotation_log, skew
 from ceres_cal.model.keys import STATION_QUANTITIES, columns_by_owner
 from ceres_cal.model.parameters import Estimate, Layout, intrinsic_names, intrinsics_scales
 from ceres_cal.model.priors import GaussianPrior
-from ceres_cal.solve.costs import Run
+from ceres_cal.solve.cached_cost import Answer, CachedCost, Run
 
 
 class _Linear(NamedTuple):
@@ -59,7 +58,7 @@ class _Station(NamedTuple):
         return slopes[self.rows]
 
 
-class PriorCost(pyceres.CostFunction):
+class PriorCost(CachedCost):
     """root (x - mean), in standard deviations, of a prior on free numbers alone.
 
     Attributes:
@@ -67,25 +66,19 @@ class PriorCost(pyceres.CostFunction):
     """
 
     def __init__(self, run: Run, prior: GaussianPrior, estimate: Estimate, layout: Layout) -> None:
-        super().__init__()
-        self._run, self._root, self._mean = run, prior.information.root, prior.mean
+        super().__init__(run)
+        self._root, self._mean = prior.information.root, prior.mean
         parts = dict(_parts(prior, estimate, layout))
         self._parts, self.owners = list(parts.values()), list(parts)
         self.set_num_residuals(len(self._root))
         self.set_parameter_block_sizes([part.size for part in self._parts])
 
-    def Evaluate(self, parameters: Sequence[Array], residuals: Array, jacobians: Sequence[Array] | None) -> bool:
-        try:
-            off = -self._mean
-            for part, block in zip(self._parts, parameters, strict=True):
-                off[part.columns] += part.values(block)
-            residuals[:] = self._root @ off
-            for jacobian, part, block in zip(jacobians or (), self._parts, parameters, strict=False):
-                jacobian[:] = (self._root[:, part.columns] @ part.slopes(block)).reshape(-1)
-        except BaseException as error:  # an exception must not travel through C++: the solve ends, then it is raised
-            self._run.failure = self._run.failure or error
-            return False
-        return True
+    def _evaluated(self, at: Array, parameters: Sequence[Array]) -> Answer:
+        off, blocks = -self._mean, list(zip(self._parts, parameters, strict=True))
+        for part, block in blocks:
+            off[part.columns] += part.values(block)
+        slopes = [(self._root[:, part.columns] @ part.slopes(block)).reshape(-1) for part, block in blocks]
+        return Answer(at, self._root @ off, slopes)
 
 
 def _parts(

@@ -6,13 +6,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import pyceres
 
 from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.transforms import Poses
 from ceres_cal.model.parameters import Estimate
 from ceres_cal.observations.sights import SightKey
-from ceres_cal.solve.costs import Run
+from ceres_cal.solve.cached_cost import Answer, CachedCost, Run
 from ceres_cal.solve.engines import Engine
 from ceres_cal.solve.problem import Problem
 from ceres_cal.solve.shares import Asked, Share, owners_of
@@ -41,7 +40,7 @@ class Judged:
         return self.engine.ask(Share.normals, self.asked(problem, estimate)).of
 
 
-class SharedCost(pyceres.CostFunction):
+class SharedCost(CachedCost):
     """The compressed blocks of all sights of the shares: a round trip for each place that Ceres looks at.
 
     Attributes:
@@ -49,8 +48,8 @@ class SharedCost(pyceres.CostFunction):
     """
 
     def __init__(self, run: Run, judged: Judged, problem: Problem, estimate: Estimate) -> None:
-        super().__init__()
-        self._run, self._judged, self._asked = run, judged, judged.asked(problem, estimate)
+        super().__init__(run)
+        self._judged, self._asked = judged, judged.asked(problem, estimate)
         layout, sizes = problem.layout, dict[tuple[str, str], int]()
         self._of: dict[SightKey, list[tuple[str, str]]] = {}
         for key in judged.keys:
@@ -66,30 +65,12 @@ class SharedCost(pyceres.CostFunction):
         self.owners = list(sizes)
         ends = np.cumsum([0, *sizes.values()])
         self._columns = {owner: np.arange(*ends[n : n + 2]) for n, owner in enumerate(sizes)}
-        self._known: tuple[Array, Array, Array] | None = None
         rows = sum(1 + sum(sizes[owner] for owner in own) for own in self._of.values())
         self._shape = rows, int(ends[-1])
         self.set_num_residuals(rows)
         self.set_parameter_block_sizes(list(sizes.values()))
 
-    def Evaluate(self, parameters: Sequence[Array], residuals: Array, jacobians: Sequence[Array] | None) -> bool:
-        try:
-            at = np.concatenate(parameters)
-            # Ceres asks for the cost of a step first, then for the Jacobian in the same place: once is enough.
-            if self._known is None or not np.array_equal(self._known[0], at):
-                self._known = self._evaluated(at)
-        except BaseException as error:  # an exception must not travel through C++: the solve ends, then it is raised
-            self._run.failure = self._run.failure or error
-            return False
-        if self._known is None:
-            return False
-        residuals[:] = self._known[1]
-        for jacobian, owner in zip(jacobians or (), self.owners, strict=False):
-            jacobian[:] = self._known[2][:, self._columns[owner]].ravel()
-        return True
-
-    def _evaluated(self, at: Array) -> tuple[Array, Array, Array] | None:
-        """(place, residuals, Jacobian), or None where an observation cannot be projected from there."""
+    def _evaluated(self, at: Array, parameters: Sequence[Array]) -> Answer | None:
         numbers = {owner: at[columns] for owner, columns in self._columns.items()}
         blocks = self._judged.engine.ask(Share.blocks, self._asked, numbers).of
         if blocks is None:
@@ -98,7 +79,7 @@ class SharedCost(pyceres.CostFunction):
         for key, block in blocks.items():
             columns, rows = self._columns_of(key), slice(row, row + len(block))
             jacobian[rows, columns], residuals[rows], row = block[:, :-1], block[:, -1], row + len(block)
-        return at, residuals, jacobian
+        return Answer(at, residuals, [jacobian[:, columns].reshape(-1) for columns in self._columns.values()])
 
     def _columns_of(self, key: SightKey) -> Indices:
         """Columns of the numbers that a sight depends on."""

@@ -23,7 +23,8 @@ from ceres_cal.observations.columns import Curves, FileRows, Points, View, read_
 from ceres_cal.observations.files import Content
 from ceres_cal.observations.sights import SightKey, Sights, sights_of
 from ceres_cal.scene.targets import Target
-from ceres_cal.solve.costs import Run, SightCost
+from ceres_cal.solve.cached_cost import Run
+from ceres_cal.solve.costs import SightCost
 from ceres_cal.solve.information import normals_of
 from ceres_cal.solve.noise import Spread, relative_lengths
 from ceres_cal.solve.problem import Problem, Weighting
