@@ -115,6 +115,7 @@ def test_the_simplest_wins_among_equals_and_the_papers_before_it() -> None:
 def test_what_everybody_knows_comes_first_among_equals_of_one_size() -> None:
     same, a_little_worse = np.full(12, 10.0), np.full(12, 10.0) + 0.5 * np.cos(np.arange(12))
     assert decide(["radial 3,5", "brown k1 k2"], [2, 2], [same, a_little_worse])[1] == 1
+    assert decide(["radial 3,5", "brown k1 k2"], [2, 2], [same, a_little_worse + 0.3])[1] == 0  # 3 % are none
 
 
 def test_decentring_comes_after_two_coefficients_along_the_radius() -> None:
