@@ -325,12 +325,15 @@ SCALE = {
     "size": ("line points", "d"),
     "workers": ("workers", "d"),
     "seconds": ("seconds", ".1f"),
+    "processor": ("of a processor", ".1f"),
+    "longest": ("one after the other", ".1f"),
     "open_seconds": ("opened in", ".1f"),
     "peak_mib": ("peak MiB", ".0f"),
     "worker_mib": ("of a worker", ".0f"),
     "iterations": ("iterations", "d"),
     "iteration_seconds": ("s each", ".3f"),
     "iteration_bytes": ("bytes each", "d"),
+    "overhead_ms": ("overhead ms", ".1f"),
     "focal_error_px": ("focal error px", "+.3f"),
 }
 PIXELS_TOLD = {"lens": ("lens", ""), "locate": ("locate s", ".3f"), "project": ("project s", ".3f")}

@@ -25,6 +25,7 @@ from ceres_cal.observations.folders import HEADER
 FOLDER = "CERES_CAL_BENCHMARK"  # the environment's name of where the observations are
 _FRAMES = 2000  # written at once
 _WARM_UP = 20_000
+_ASKED = 50  # times, for what asking takes
 
 
 def write_field(path: Path, line_points: int) -> None:
@@ -66,17 +67,20 @@ def stored_growth(line_points: int, workers: int) -> dict[str, Any]:
     calibrate(field_observations(_WARM_UP), options)
     with ExitStack() as stack:
         client = stack.enter_context(_cluster(workers)) if workers else None
-        start = time.perf_counter()
+        before, start = _processor(client), time.perf_counter()
         observations = Observations.load(os.environ[FOLDER])
         opened = time.perf_counter()
         trips = _watched(stack)
         calibration = calibrate(observations, options, client=client)
         seconds = time.perf_counter() - start
+        processor = [now - then for now, then in zip(_processor(client), before, strict=True)]
         peaks = client.run(resource.getrusage, resource.RUSAGE_SELF).values() if client else ()
         return {
             "size": line_points,
             "workers": workers,
             "seconds": seconds,
+            "processor": sum(processor),
+            "longest": processor[0] + max(processor[1:], default=0.0),
             "open_seconds": opened - start,
             "focal_error_px": calibration.cameras["overhead"].phi - 600.0,
             "phi": calibration.cameras["overhead"].phi,
@@ -85,14 +89,38 @@ def stored_growth(line_points: int, workers: int) -> dict[str, Any]:
             "iterations": len(trips),
             "iteration_seconds": float(np.median([seconds for seconds, _ in trips])),
             "iteration_bytes": max(size for _, size in trips),
+            "overhead_ms": 1e3 * _overhead_s(client, observations) if client else None,
         }
+
+
+def _processor(client: Any) -> list[float]:
+    """Processor seconds of this process, and of each worker."""
+    return [time.process_time(), *(client.run(time.process_time).values() if client else ())]
+
+
+def _overhead_s(client: Any, observations: Observations) -> float:
+    """What it takes to ask the workers and hear their answers, without the work: the median."""
+    from ceres_cal.solve.engines import OnWorkers
+    from ceres_cal.solve.shares import cut
+
+    engine, seconds = OnWorkers(client, list(cut(observations))), []
+    for _ in range(_ASKED):
+        start = time.perf_counter()
+        engine.ask(_nothing)
+        seconds.append(time.perf_counter() - start)
+    engine.close()
+    return float(np.median(seconds))
+
+
+def _nothing(_: Any) -> int:
+    return 0
 
 
 def _cluster(workers: int) -> Any:
     """A client of so many worker processes on this machine."""
     from distributed import Client, LocalCluster
 
-    return Client(LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address=None, memory_limit=0))
+    return Client(LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address=":0", memory_limit=0))
 
 
 def _watched(stack: ExitStack) -> list[tuple[float, int]]:
