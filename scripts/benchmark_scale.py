@@ -6,7 +6,7 @@ import os
 import pickle
 import resource
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -14,9 +14,10 @@ from typing import Any
 
 import msgspec
 import numpy as np
-from benchmark_peers import peak_mib
-from benchmark_problems import field_observations
+from benchmark_peers import Corners, peak_mib
+from benchmark_problems import corner_observations, field_observations, wide_lens
 
+from ceres_cal.base.arrays import Array
 from ceres_cal.observations import Observations
 from ceres_cal.observations.columns import View
 from ceres_cal.observations.files import header_of
@@ -25,6 +26,7 @@ from ceres_cal.observations.folders import HEADER
 FOLDER = "CERES_CAL_BENCHMARK"  # the environment's name of where the observations are
 _FRAMES = 2000  # written at once
 _WARM_UP = 20_000
+_TIMES = 10  # the fewest frames between two times of more
 _ASKED = 50  # times, for what asking takes
 
 
@@ -114,6 +116,44 @@ def _overhead_s(client: Any, observations: Observations) -> float:
 
 def _nothing(_: Any) -> int:
     return 0
+
+
+def frames_in_turns(sizes: Sequence[int], turns: int) -> list[dict[str, Any]]:
+    """What a frame of a board before a wide lens takes, and how many times what one of the fewest takes, in turns.
+
+    Each size stands between two times of the fewest: a processor's pace changes by half within a minute.
+    """
+    from ceres_cal.calibrating import calibrate
+    from ceres_cal.model.parameters import Options
+
+    options, few = Options(lens="brown", free_aspect=True), wide_lens(min(sizes)).corners
+
+    def spent(corners: Corners, times: int = 1) -> Array:
+        each = []
+        for _ in range(times):
+            observations = corner_observations(corners)
+            before = time.process_time(), time.perf_counter()
+            calibrate(observations, options)
+            each.append((time.process_time() - before[0], time.perf_counter() - before[1]))
+        return np.asarray(np.mean(each, axis=0) / corners.frames)
+
+    spent(few, 3)
+    rows = []
+    for frames in sizes:
+        corners, times = wide_lens(frames).corners, int(np.clip(frames // min(sizes), 1, _TIMES))
+        spent(corners)
+        own, ratios, before = [], [], spent(few, times)
+        for _ in range(turns):
+            own.append(spent(corners))
+            after = spent(few, times)
+            ratios.append(own[-1] / (0.5 * (before + after)))
+            before = after
+        (processor, wall), (times_processor, times_wall) = np.median(own, axis=0), np.median(ratios, axis=0)
+        rows.append({
+            "frames": frames, "processor_us": 1e6 * processor, "wall_us": 1e6 * wall,
+            "times_processor": times_processor, "times_wall": times_wall,
+        })  # fmt: skip
+    return rows
 
 
 def _cluster(workers: int) -> Any:
