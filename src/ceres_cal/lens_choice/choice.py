@@ -9,11 +9,12 @@ predict the others no better: a criterion that counts observations would take th
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ceres_cal.base.errors import CalibrationError
+from ceres_cal.base.errors import CalibrationError, DegenerateError
 from ceres_cal.base.transforms import Poses
 from ceres_cal.calibration import LensChoice, TriedLens
 from ceres_cal.lens_choice.forms import PAPER, papers
@@ -54,8 +55,11 @@ def choose_lens(observations: Observations, options: Options, start: Start) -> C
     as_good = AS_GOOD_BESIDE_LENGTHS if options.dimensions else AS_GOOD
     try:
         seen, kinds, share = compared_kinds(observations, options, start.estimate)
-        tried, best, chosen = _compare([one for kind in kinds for one in kind.candidates(first=True)], as_good, seen)
-        if chosen.form.label != PAPER:
+        tried = [one for kind in kinds for one in kind.candidates(first=True)]
+        best = chosen = None
+        with suppress(DegenerateError):  # all of these fold, which shorter ones need not
+            tried, best, chosen = _compare(tried, as_good, seen)
+        if chosen is None or chosen.form.label != PAPER:
             others = [one for longest in tried if longest.may_win(best) for one in longest.of.candidates(first=False)]
             tried, _, chosen = _compare([*tried, *others], as_good, seen)
         more = list(last_resort(seen, chosen))
