@@ -17,10 +17,12 @@ import numpy as np
 from ceres_cal.base.errors import CalibrationError, DegenerateError
 from ceres_cal.base.transforms import Poses
 from ceres_cal.calibration import LensChoice, TriedLens
+from ceres_cal.lens_choice.comparing import compared_kinds
 from ceres_cal.lens_choice.forms import PAPER, papers
-from ceres_cal.lens_choice.kinds import Candidate, Seen, compared_kinds
+from ceres_cal.lens_choice.kinds import Candidate
 from ceres_cal.lens_choice.last_resort import last_resort
 from ceres_cal.lens_choice.rule import AS_GOOD, AS_GOOD_BESIDE_LENGTHS, decide, standard_errors
+from ceres_cal.lens_choice.seen import Seen
 from ceres_cal.model.parameters import Options
 from ceres_cal.observations import Observations
 from ceres_cal.start.initialise import Start
