@@ -22,7 +22,7 @@ from ceres_cal.lens_choice.forms import PAPER, papers
 from ceres_cal.lens_choice.kinds import Candidate
 from ceres_cal.lens_choice.last_resort import last_resort
 from ceres_cal.lens_choice.rule import AS_GOOD, AS_GOOD_BESIDE_LENGTHS, decide, standard_errors
-from ceres_cal.lens_choice.seen import Seen
+from ceres_cal.lens_choice.seen import FewGroupsError, Seen
 from ceres_cal.model.parameters import Options
 from ceres_cal.observations import Observations
 from ceres_cal.start.initialise import Start
@@ -66,8 +66,9 @@ def choose_lens(observations: Observations, options: Options, start: Start) -> C
             tried, _, chosen = _compare([*tried, *others], as_good, seen)
         more = list(last_resort(seen, chosen))
         tried, chosen = [*tried, *more], next((one for one in more if one.clearly_beats(chosen)), chosen)
-    except CalibrationError:
-        return Chosen(papers(options), start, LensChoice(PAPER, (TriedLens(PAPER, 2),), 0, 0.0))
+    except CalibrationError as error:
+        failed = "" if isinstance(error, FewGroupsError) else str(error)
+        return Chosen(papers(options), start, LensChoice(PAPER, (TriedLens(PAPER, 2, failed=failed),), 0, 0.0))
     there = chosen.estimate
     placements = Poses.of(start.estimate.placements).updated(list(there.placements), Poses.of(there.placements).stack)
     near = replace(start, estimate=replace(there, placements=placements), is_near=not chosen.form.blank.roughness)

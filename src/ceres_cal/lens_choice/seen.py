@@ -32,6 +32,10 @@ _KEPT = 1.5  # times the squares that normal equations promise: what leaves more
 _FEWEST_PLACEMENTS = 8  # with fewer the features of each are held out one by one
 
 
+class FewGroupsError(DegenerateError):
+    """There is too little to hold out: nothing tells lenses apart."""
+
+
 def problem_of(observations: Observations, sights: Sights, options: Options, estimate: Estimate) -> Problem:
     """What is minimised, before anything was weighed."""
     priors = gather_priors(observations, options, estimate.structure)
@@ -159,13 +163,13 @@ def _placed(sights: Sights) -> Mask:
 
 
 def require_groups(sights: Sights) -> None:
-    """Raise DegenerateError where there is too little to hold out."""
+    """Raise FewGroupsError where there is too little to hold out."""
     placed = _placed(sights)
     count = int(np.count_nonzero(placed))
     for own in (sights[int(number)] for number in np.flatnonzero(~placed)):
         count += len(np.unique(own.point_index)) + len(np.unique(own.track_index))
     if count < _FEWEST_GROUPS:
-        raise DegenerateError("too few views or features to tell lenses apart")
+        raise FewGroupsError("too few views or features to tell lenses apart")
 
 
 def _groups(equations: Equations, problem: Problem) -> tuple[Indices, frozenset[str | None]]:
