@@ -76,7 +76,7 @@ DECIDING: tuple[Constant, ...] = (
     *_of("calibrating", "_SAYS_LESS", "calibrate"),
     *_of("lens_choice.rule", "AS_GOOD ALIKE CLEARLY", "lens"),
     *_of("lens_choice.comparing", "_QUIETER _SOUND_PX", "lens"),
-    *_of("lens_choice.kinds", "_REFUTED", "lens"),
+    *_of("lens_choice.kinds", "_REFUTED _UNSEEN_GROUPS", "lens"),
     *_of("lens_choice.seen", "_KEPT", "lens"),
     *_of("lens_choice.last_resort", "_TOGETHER", "lens"),
     *_of("calibration.caveats", "_RESTING", "calibrate"),
