@@ -175,12 +175,12 @@ class Bulk:
 
     def look(
         self, engine: Engine, estimate: Estimate, weighting: Weighting, bounds: tuple[float, float],
-        feet_at: tuple[str, Estimate] | None = None,
+        along: tuple[tuple[str, Estimate], ...] = (),
     ) -> tuple[str, Looked]:  # fmt: skip
-        """What residuals are like at an estimate, which is given a name; feet are sought from there, or from others."""
+        """What residuals are like at an estimate, which is given a name. along: where feet were sought before."""
         here = uuid4().hex, of_world(estimate)
         blank = Layout({}, frozenset(), frozenset())
-        return here[0], engine.ask(Share.looked, Asked(here[1], blank, weighting, here, bounds, feet_at or here))
+        return here[0], engine.ask(Share.looked, Asked(here[1], blank, weighting, here, bounds, (*along, here)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,12 +224,12 @@ class _Rounds:
         masks = np.zeros(len(self._few.points), dtype=bool), np.zeros(len(self._few.curves), dtype=bool)
         masks[0][self._core.point_rows] = masks[1][self._core.curve_rows] = True
         self._placed, self._before = masks, end
-        self._feet_at: tuple[str, Estimate] | None = None
+        self._along: tuple[tuple[str, Estimate], ...] = ()
         self._seen = self._look(end.solution.estimate, _bounds(end), end.problem.weighting)
 
     def _look(self, estimate: Estimate, bounds: tuple[float, float], weighting: Weighting) -> _Seen:
-        name, looked = self._bulk.look(self._engine, estimate, weighting, bounds, self._feet_at)
-        self._feet_at = self._feet_at or (name, of_world(estimate))
+        name, looked = self._bulk.look(self._engine, estimate, weighting, bounds, self._along)
+        self._along = (*self._along, (name, of_world(estimate)))
         self._there = residuals(self._few, self._problem.sights, estimate)
         points, curves = relative_lengths(self._few, self._there)
         if self._part.gone is not None:
@@ -243,9 +243,8 @@ class _Rounds:
         points, curves = noise.bounds
         inside = seen.lengths[0] <= points, seen.lengths[1] <= curves
         equations = 2 * seen.looked.points.within(points).count + seen.looked.curves.within(curves).count
-        assert self._feet_at is not None
         judged_at = seen.name, of_world(seen.estimate)
-        judged = Judged(self._engine, self._bulk.keys, equations, judged_at, noise.bounds, self._feet_at)
+        judged = Judged(self._engine, self._bulk.keys, equations, judged_at, noise.bounds, self._along)
         weighting = Weighting(noise.points, noise.curves, options.loss, options.loss_scale)
         return replace(
             self._problem,

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ceres_cal.base.arrays import AnyArray, Array, Indices, Indices32, Mask
 from ceres_cal.model.parameters import Estimate, Layout
-from ceres_cal.model.residuals import Residuals, residuals
+from ceres_cal.model.residuals import residuals
 from ceres_cal.observations import Observations
 from ceres_cal.observations.columns import Curves, FileRows, Points, View, read_rows, rows_of
 from ceres_cal.observations.files import Content
@@ -42,7 +42,7 @@ class Asked(NamedTuple):
     Attributes:
         estimate, layout, weighting: of the problem. judged_at: where residuals say which rows take part, and its name.
         bounds: of points and of curve observations, the lengths in stated sigmas from which on they do not.
-        feet_at: where the feet are from which every search for others starts, and its name.
+        feet_along: places, by name, at each of which feet were sought from those before: from the last, all others are.
     """
 
     estimate: Estimate
@@ -50,7 +50,7 @@ class Asked(NamedTuple):
     weighting: Weighting
     judged_at: tuple[str, Estimate]
     bounds: tuple[float, float]
-    feet_at: tuple[str, Estimate]
+    feet_along: tuple[tuple[str, Estimate], ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -253,24 +253,21 @@ class Share:
 
     def _feet_of(self, content: Content, sights: Sights, asked: Asked) -> Array:
         """(m,) where the search for feet starts, known from before or found again: no answer depends on which."""
-        name, estimate = asked.feet_at
-        if self._feet is None or self._feet[0] != name:
-            self._keep_feet(name, residuals(content, sights, estimate))
-        assert self._feet is not None
-        return self._feet[1].astype(float)
-
-    def _keep_feet(self, name: str, there: Residuals) -> None:
-        self._feet = name, there.feet.astype(np.float32)
+        names = [name for name, _ in asked.feet_along]
+        known = self._feet if self._feet is not None and self._feet[0] in names else None
+        feet = None if known is None else known[1].astype(float)
+        for name, estimate in asked.feet_along[names.index(known[0]) + 1 if known else 0 :]:
+            kept = residuals(content, sights, estimate, feet).feet.astype(np.float32)
+            self._feet, feet = (name, kept), kept.astype(float)
+        assert feet is not None
+        return feet
 
     def _lengths(self, content: Content, sights: Sights, asked: Asked) -> tuple[Array, Array]:
         """(n,) and (m,) lengths of the residuals where the rows are judged, in stated sigmas; what decides which take
         part is remembered.
         """
         name, estimate = asked.judged_at
-        at_feet = name == asked.feet_at[0]
-        there = residuals(content, sights, estimate, None if at_feet else self._feet_of(content, sights, asked))
-        if at_feet:
-            self._keep_feet(name, there)
+        there = residuals(content, sights, estimate, self._feet_of(content, sights, asked))
         lengths, sums, far = relative_lengths(content, there), [], []
         columns = content.points, content.curves
         for column, px, own, bound in zip(columns, there.lengths, lengths, asked.bounds, strict=True):
