@@ -72,7 +72,7 @@ def stored_growth(line_points: int, workers: int) -> dict[str, Any]:
         before, start = _processor(client), time.perf_counter()
         observations = Observations.load(os.environ[FOLDER])
         opened = time.perf_counter()
-        trips = _watched(stack)
+        trips = _watched(stack, client)
         calibration = calibrate(observations, options, client=client)
         seconds = time.perf_counter() - start
         processor = [now - then for now, then in zip(_processor(client), before, strict=True)]
@@ -90,7 +90,7 @@ def stored_growth(line_points: int, workers: int) -> dict[str, Any]:
             "worker_mib": max((one.ru_maxrss / 1024.0 for one in peaks), default=None),
             "iterations": len(trips),
             "iteration_seconds": float(np.median([seconds for seconds, _ in trips])),
-            "iteration_bytes": max(size for _, size in trips),
+            "iteration_bytes": max(size for _, size in trips) if client else None,
             "overhead_ms": 1e3 * _overhead_s(client, observations) if client else None,
         }
 
@@ -163,12 +163,22 @@ def _cluster(workers: int) -> Any:
     return Client(LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address=":0", memory_limit=0))
 
 
-def _watched(stack: ExitStack) -> list[tuple[float, int]]:
-    """Seconds of each evaluation from now on, and the bytes that go to a worker and back for it."""
+def _watched(stack: ExitStack, client: Any) -> list[tuple[float, int]]:
+    """Seconds of each evaluation from now on, and the bytes that go to a worker and back for it, the most of any."""
     from ceres_cal.solve import engines
     from ceres_cal.solve.shares import Share
 
     trips: list[tuple[float, int]] = []
+    sent = [0]
+
+    def run(function: Any, *given: Any, **named: Any) -> Any:
+        replies = type(client).run(client, function, *given, **named)
+        sent[0] = len(pickle.dumps(given)) + max(len(pickle.dumps(reply)) for reply in replies.values())
+        return replies
+
+    if client is not None:
+        client.run = run
+        stack.callback(delattr, client, "run")
     for engine in (engines.InProcess, engines.OnWorkers):
         whole: Callable[..., Any] = engine.ask
 
@@ -176,8 +186,7 @@ def _watched(stack: ExitStack) -> list[tuple[float, int]]:
             start = time.perf_counter()
             told = whole(self, answer, *request)
             if answer is Share.blocks:
-                size = len(pickle.dumps(request)) + len(pickle.dumps(told))
-                trips.append((time.perf_counter() - start, size))
+                trips.append((time.perf_counter() - start, sent[0]))
             return told
 
         engine.ask = ask  # type: ignore[method-assign]

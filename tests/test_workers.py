@@ -36,13 +36,20 @@ def in_shares(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture(scope="module")
-def client() -> Iterator[Any]:
+def cluster_client() -> Iterator[Any]:
     """Of two workers, in processes of their own."""
     with (
         distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0") as cluster,
         distributed.Client(cluster) as client,
     ):
         yield client
+
+
+@pytest.fixture
+def client(cluster_client: Any) -> Any:
+    """With both workers, where a test before has killed some."""
+    cluster_client.wait_for_workers(2, timeout=60)
+    return cluster_client
 
 
 @pytest.fixture(scope="module")

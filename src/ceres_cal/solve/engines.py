@@ -102,12 +102,9 @@ class OnWorkers:
 
     def _found(self) -> dict[str, list[int]]:
         """Numbers of the groups that each worker keeps, once all are kept."""
-        from distributed import wait
-
-        wait(self._kept)
         for one in self._kept:
-            if one.status == "error":
-                raise _in_words(one.exception())
+            if (error := one.exception()) is not None:
+                raise _in_words(error)
         places: dict[str, list[int]] = {}
         held = self._client.who_has(self._kept)
         for number, one in enumerate(self._kept):
