@@ -269,7 +269,9 @@ class _Rounds:
             before, noise = noise, self._noise(redundancy)
             if _alike(noise, before) and _same_rows(self._seen.inside(noise), inside):
                 break
-        reduced = information(problem, solution.estimate)
+        assert isinstance(problem.elsewhere, Judged)
+        here = replace(problem.elsewhere, feet_along=self._along)  # else shares would seek those of before again
+        reduced = information(replace(problem, elsewhere=here), solution.estimate)
         counts = self._seen.inside(noise)
         points, curves = (
             1.0 - own / max(n, 1) for own, n in zip(reduced.leverages, (2 * counts[0], counts[1]), strict=True)
