@@ -22,6 +22,7 @@ class Terminated(KeyboardInterrupt):
 def as_a_program() -> None:
     """Take SIGTERM like Ctrl-C, print whatever a name holds, and let nobody but us write on standard error."""
     signal.signal(signal.SIGTERM, _terminate)
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # to begin threads that are not used (base.threads) takes time
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
