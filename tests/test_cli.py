@@ -246,6 +246,13 @@ def test_a_shell_completes(say: Say, tmp_path: Path, words: list[str], completed
     assert set(done.stdout.split()) == completed, done.stderr
 
 
+def test_what_is_to_be_done_at_the_end_is_done() -> None:
+    """Though the process does not take Python apart: what others registered, and what stands in the streams."""
+    code = "import atexit; from ceres_cal.cli import main; atexit.register(print, 'last'); main(); print('never')"
+    run = subprocess.run([sys.executable, "-c", code, "calibrate"], capture_output=True, text=True, check=False)
+    assert (run.returncode, run.stdout) == (2, "last\n") and "required: OBS" in run.stderr
+
+
 def test_help_and_wrong_usage_bring_in_nothing_heavy() -> None:
     code = (
         "import sys; from ceres_cal.cli import main\n"

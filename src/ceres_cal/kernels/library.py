@@ -45,7 +45,8 @@ def library_path() -> Path:
     """Where the library of these sources lies: scripts/carry_kernels.py."""
     sources = digest([*_HERE.glob("*.py"), *_HERE.parent.glob("scene/lens/*.py")])
     baseline = BASELINES.get(platform.machine(), ("none",))[0]
-    return _HERE / "carried" / f"{sources}-{sys.implementation.cache_tag}-{baseline}.so"
+    python = f"{sys.implementation.cache_tag}{sys.abiflags}"  # how its objects lie in memory
+    return _HERE / "carried" / f"{sources}-{python}-{baseline}.so"
 
 
 @cache
