@@ -21,7 +21,7 @@ from ceres_cal.kernels.library import library_path
 
 ROOT = Path(__file__).parents[1]
 SAMPLE = ROOT / "data" / "ssl_field" / "observations.json"
-WHEEL_MB = 25.0  # 1.2
+WHEEL_MB = 25.0  # 1.1
 FIRST_S = 10.0  # 1.5 on two busy cores; compiling takes 45
 _OURS = ("PYTHONPATH", "NUMBA_CACHE_DIR", "XDG_CACHE_HOME")
 BARE = {name: value for name, value in os.environ.items() if name not in _OURS}
