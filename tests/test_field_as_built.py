@@ -12,10 +12,12 @@ from ceres_cal.cli import main
 from ceres_cal.detect.courses import predict
 from ceres_cal.detect.images import filled
 from ceres_cal.detect.lines import Lines, measure
-from ceres_cal.detect.strokes import find_strokes
+from ceres_cal.detect.registration import nearness_to
+from ceres_cal.detect.strokes import Strokes, drawn, find_strokes
 from ceres_cal.photographs import Auto, Clicks, FieldOptions, detect_field
 from ceres_cal.photographs.as_built import AsBuilt, as_built
 from ceres_cal.photographs.clicks import unknown_optics
+from ceres_cal.photographs.matching import StrokeMap
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Radial
 from ceres_cal.scene.targets import Segment, Target, custom, ssl_field
@@ -163,6 +165,22 @@ def test_strokes_are_of_thin_lines_in_sun_and_of_dashes() -> None:
     solid, dashes = (length[np.abs(middles[:, 1] - y) < 2.0].sum() for y in (99.5, 299.5))
     assert solid > 300.0 and dashes > 200.0
     assert solid + dashes > 0.7 * length.sum()
+
+
+def test_worn_lines_are_covered_by_their_dashes() -> None:
+    course = predict(FIELD, CAMERA, FIELD.curve_names, 2.0)
+    way = 7.0 * np.column_stack([course.normals[:, 1], -course.normals[:, 0]])
+    middles = np.arange(6, len(course), 13)  # dashes of 14 px, 12 px apart
+    ends = np.stack([course.pixels[middles] - way[middles], course.pixels[middles] + way[middles]], axis=1)
+    strokes = Strokes(ends, np.ones(len(ends)))
+    near = nearness_to(drawn(strokes, CAMERA.image_size))
+    shown = StrokeMap(strokes, near, CAMERA.image_size, 0.5 * (np.array(CAMERA.image_size) - 1.0))
+    outer = ("TopTouchLine", "BottomTouchLine", "LeftGoalLine", "RightGoalLine")
+    likelihoods = [  # of the field, and of another one that shares its outer lines and has half as much elsewhere
+        float(shown.likelihood(2.0 * np.array(near.at(*one.pixels.T).sum()), np.array(times * 2.0 * len(one))))
+        for one, times in ((course, 1.0), (predict(FIELD, CAMERA, outer, 2.0), 1.5))
+    ]
+    assert likelihoods[0] > 1.5 * likelihoods[1]  # 0.82 and 0.28; with the length of the dashes alone 0.42 and 0.47
 
 
 def test_auto_takes_no_other_target(path: Path) -> None:
