@@ -6,11 +6,12 @@ import cv2
 import numpy as np
 import photograph_shots as script
 import pytest
+from photographs_disturbed import AUTO, taken
 
 from ceres_cal.base.errors import NothingShownError
 from ceres_cal.cli import main
 from ceres_cal.detect.courses import predict
-from ceres_cal.detect.images import filled
+from ceres_cal.detect.images import filled, light
 from ceres_cal.detect.lines import Lines, measure
 from ceres_cal.detect.registration import nearness_to
 from ceres_cal.detect.strokes import Strokes, drawn, find_strokes
@@ -18,6 +19,7 @@ from ceres_cal.photographs import Auto, Clicks, FieldOptions, detect_field
 from ceres_cal.photographs.as_built import AsBuilt, as_built
 from ceres_cal.photographs.clicks import unknown_optics
 from ceres_cal.photographs.matching import StrokeMap
+from ceres_cal.photographs.search import search
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Radial
 from ceres_cal.scene.targets import Segment, Target, custom, ssl_field
@@ -181,6 +183,26 @@ def test_worn_lines_are_covered_by_their_dashes() -> None:
         for one, times in ((course, 1.0), (predict(FIELD, CAMERA, outer, 2.0), 1.5))
     ]
     assert likelihoods[0] > 1.5 * likelihoods[1]  # 0.82 and 0.28; with the length of the dashes alone 0.42 and 0.47
+
+
+def test_wide_lines_are_one_stroke_each_and_a_picture_border_is_none() -> None:
+    grey = np.full((300, 400), 30.0, np.float32)
+    grey[:, 196:206] = 200.0  # 10 px wide
+    grey[:, 300:302] = 200.0
+    grey[:2] = 120.0
+    strokes = find_strokes(cv2.GaussianBlur(grey, (0, 0), 1.0))
+    middles, length = strokes.ends.mean(axis=1), strokes.length_px
+    wide, thin = (np.abs(middles[:, 0] - x) < 1.0 for x in (200.5, 300.5))
+    assert np.all(wide | thin)
+    assert all(200.0 < length[some].sum() < 310.0 for some in (wide, thin))
+
+
+def test_a_part_that_a_field_may_lack_is_said_to_be_missing() -> None:
+    shot = taken("plain", 0, ssl_field("B", center_circle=False))
+    followed = search(light(shot.image), FIELD, FIELD.curve_names, AUTO).followed
+    assert followed is not None and followed.lacking == ("CenterCircle",)
+    away = followed.camera.locate(shot.camera.project(FIELD.point_array)) - FIELD.point_array[:, :2]
+    assert np.max(np.linalg.norm(away, axis=1)) < 0.05
 
 
 def test_auto_takes_no_other_target(path: Path) -> None:

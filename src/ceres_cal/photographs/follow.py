@@ -17,6 +17,7 @@ from ceres_cal.detect.registration import nearness, shifted
 from ceres_cal.model.parameters import Options, intrinsic_names
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.photographs.as_built import AS_DRAWN, AsBuilt, as_built
+from ceres_cal.photographs.painted import painted_curves
 from ceres_cal.photographs.refit import TARGET, PointHints, observations_of, refit_camera
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import LENSES
@@ -67,13 +68,14 @@ class Followed:
 
     Attributes:
         camera: the posed camera that predicts them. target: as its dimensions were found.
-        lines: what was measured there, but for curves that lie aside.
+        curves: names of those that were followed. lines: what was measured of them, but for curves that lie aside.
         moved_px: how far the last refit moved the prediction; at rest below 0.02.
         built: how the curves lie, where the photograph had to tell the lens, too.
     """
 
     camera: Camera
     target: Target
+    curves: tuple[str, ...]
     lines: Lines
     moved_px: float
     built: AsBuilt = AS_DRAWN
@@ -90,6 +92,13 @@ class Followed:
         numbers, places = np.unique(curve, return_counts=True)
         counts = np.array([np.count_nonzero(found[curve == number]) for number in numbers])
         return tuple(int(number) for number in numbers[counts < _ABSENT * places])
+
+    @property
+    def lacking(self) -> tuple[str, ...]:
+        """Names of the curves in view that this field does not have, of those that it need not have."""
+        lacking = [name for part in self.target.optional if not set(part) & set(self.curves) for name in part]
+        in_view = predict(self.target, self.camera, lacking, SPACING_PX, SPACING_PX).curve
+        return tuple(self.target.curve_names[number] for number in np.unique(in_view))
 
     @property
     def holds(self) -> bool:
@@ -134,7 +143,7 @@ def approach(grey: Array32, target: Target, camera: Camera, curves: Collection[s
 def refine(grey: Array32, target: Target, camera: Camera, curves: Collection[str], free: FreeIntrinsics) -> Followed:
     """From a camera that is right but for its lens: the kind that suits best, without curves that lie aside."""
     tracker = _Tracker(grey, target, curves, free)
-    return tracker.refined(Followed(camera, target, tracker.measured(camera), np.inf))
+    return tracker.refined(Followed(camera, target, tuple(curves), tracker.measured(camera), np.inf))
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,7 +203,8 @@ class _Tracker:
         for number, reach in enumerate(reaches_px):
             names = self.free.names[: max(0, 2 * number - 1)]
             tracker, camera = tracker._search_step(camera, names, reach) or (tracker, camera)
-        return tracker.at_rest(camera, self.free.names)
+        curves = painted_curves(self.grey, self.target, camera, self.curves)
+        return replace(tracker, curves=curves).at_rest(camera, self.free.names)
 
     def at_rest(self, camera: Camera, names: tuple[str, ...]) -> Followed:
         """Measured and refitted, with these intrinsics free, until nothing moves any more."""
@@ -210,30 +220,30 @@ class _Tracker:
             camera, lines = there, tracker.measured(there)
             if moved < _AT_REST_PX:
                 break
-        return Followed(camera, tracker.target, lines, moved)
+        return Followed(camera, tracker.target, tuple(self.curves), lines, moved)
 
     def refined(self, followed: Followed) -> Followed:
         """The same, predicted with the lens that suits the curves best, without those that lie aside."""
         followed = self.without_aside(followed)
         if followed.built.is_other:
             return followed
-        curves = [name for name in self.curves if name not in followed.built.aside_m]
+        curves = [name for name in followed.curves if name not in followed.built.aside_m]
         left = replace(self, curves=curves, target=followed.target)
-        return self.without_aside(left.with_best_lens(followed))
+        return self.without_aside(replace(left.with_best_lens(followed), curves=followed.curves))
 
     def without_aside(self, followed: Followed) -> Followed:
         """The same without the curves that lie aside: none of them draws the camera to where others look aside."""
         free = tuple(name for name in intrinsic_names(followed.camera.lens) if name != "aspect")
-        whole, built = replace(self, target=followed.target), AS_DRAWN
+        whole, built = replace(self, curves=followed.curves, target=followed.target), AS_DRAWN
         left = whole
         for _ in range(_ROUNDS):
             known, built = built, whole.as_built(followed, free)
             if built.is_other or built.aside_m.keys() == known.aside_m.keys():
                 break
-            left = replace(whole, curves=[name for name in self.curves if name not in built.aside_m])
+            left = replace(whole, curves=[name for name in whole.curves if name not in built.aside_m])
             followed = left.at_rest(followed.camera, free)
             whole, left = (replace(one, target=followed.target) for one in (whole, left))
-        return replace(followed, built=built, lines=left.measured(followed.camera))
+        return replace(followed, curves=tuple(whole.curves), built=built, lines=left.measured(followed.camera))
 
     def as_built(self, followed: Followed, free: tuple[str, ...]) -> AsBuilt:
         """How all curves lie.
@@ -276,7 +286,9 @@ class _Tracker:
         best = min(fits, key=lambda fit: fit[0])[1]
         camera, target = best.station(), best.targets[TARGET]
         lines = replace(self, target=target).measured(camera)
-        refined = Followed(camera, target, lines, _moved_px(followed.camera, camera, lines.course.pixels))
+        refined = Followed(
+            camera, target, tuple(self.curves), lines, _moved_px(followed.camera, camera, lines.course.pixels)
+        )
         return refined if refined.holds and refined.share > followed.share - _LESS else followed
 
     def _refitted(

@@ -7,9 +7,10 @@ from dataclasses import replace
 import numpy as np
 
 from ceres_cal.detect.courses import predict
-from ceres_cal.photographs.candidates import BY_CHANCE, FieldSearch
+from ceres_cal.photographs.candidates import FieldSearch
 from ceres_cal.photographs.follow import LEAST_SHARE, Followed
 from ceres_cal.photographs.matching import divergence
+from ceres_cal.photographs.painted import BY_CHANCE
 from ceres_cal.scene.targets import Target
 from ceres_cal.start.initialise import PHI_RANGE
 

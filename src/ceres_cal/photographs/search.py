@@ -109,7 +109,7 @@ def search(grey: Array32, target: Target, curves: Collection[str], auto: Auto) -
     if not good:
         return SearchResult(None, reason, seen=seen)
     best = max(good, key=likelihood)
-    problem = replace(problem, grid=grid_of(best.target, curves))
+    problem = replace(problem, grid=grid_of(best.target, best.curves))
     similar = alike(problem, best.camera, detected_curves(problem, best))
     others = [_followed(problem, auto, _turned(problem, auto, camera)) for camera in similar]
     distinct = [best]
