@@ -190,7 +190,7 @@ def test_wide_lines_are_one_stroke_each_and_a_picture_border_is_none() -> None:
     grey[:, 196:206] = 200.0  # 10 px wide
     grey[:, 300:302] = 200.0
     grey[:2] = 120.0
-    strokes = find_strokes(cv2.GaussianBlur(grey, (0, 0), 1.0))
+    strokes = find_strokes(np.asarray(cv2.GaussianBlur(grey, (0, 0), 1.0), np.float32))
     middles, length = strokes.ends.mean(axis=1), strokes.length_px
     wide, thin = (np.abs(middles[:, 0] - x) < 1.0 for x in (200.5, 300.5))
     assert np.all(wide | thin)

@@ -18,7 +18,8 @@ from ceres_cal.detect.lines import Lines
 from ceres_cal.model.dimensions import features_of
 from ceres_cal.observations import NO_POINTS, Curves, Observations, Points, Prior, View, combine
 from ceres_cal.photographs.clicks import Clicks, starts_from_clicks
-from ceres_cal.photographs.follow import Followed, FreeIntrinsics, follow
+from ceres_cal.photographs.follow import FreeIntrinsics, follow
+from ceres_cal.photographs.followed import Followed
 from ceres_cal.photographs.judgement import why_missed
 from ceres_cal.photographs.search import Auto, SearchResult, SeveralWaysError, search
 from ceres_cal.scene.camera import Camera

@@ -20,7 +20,8 @@ from ceres_cal.photographs.facing import (
     require_sides,
     side_of,
 )
-from ceres_cal.photographs.follow import Followed, FreeIntrinsics, approach, refine
+from ceres_cal.photographs.follow import FreeIntrinsics, approach, refine
+from ceres_cal.photographs.followed import Followed
 from ceres_cal.photographs.grid import grid_of
 from ceres_cal.photographs.judgement import detected_curves, explained, likelihood, objection, same_labels
 from ceres_cal.photographs.refit import PointHints
@@ -109,7 +110,7 @@ def search(grey: Array32, target: Target, curves: Collection[str], auto: Auto) -
     if not good:
         return SearchResult(None, reason, seen=seen)
     best = max(good, key=likelihood)
-    problem = replace(problem, grid=grid_of(best.target, best.curves))
+    problem = replace(problem, grid=grid_of(best.target, curves))
     similar = alike(problem, best.camera, detected_curves(problem, best))
     others = [_followed(problem, auto, _turned(problem, auto, camera)) for camera in similar]
     distinct = [best]
