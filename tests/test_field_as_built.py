@@ -1,5 +1,6 @@
 """How lines lie beside their drawing, and dimensions that are others: told apart, named, refused."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -9,16 +10,21 @@ import pytest
 from photographs_disturbed import AUTO, taken
 
 from ceres_cal.base.errors import NothingShownError
+from ceres_cal.calibrating import calibrate
+from ceres_cal.calibration import Calibration
 from ceres_cal.cli import main
 from ceres_cal.detect.courses import predict
 from ceres_cal.detect.images import filled, light
 from ceres_cal.detect.lines import Lines, measure
 from ceres_cal.detect.registration import nearness_to
 from ceres_cal.detect.strokes import Strokes, drawn, find_strokes
+from ceres_cal.model.parameters import Options
+from ceres_cal.observations import Observations, Prior
 from ceres_cal.photographs import Auto, Clicks, FieldOptions, detect_field
 from ceres_cal.photographs.as_built import AsBuilt, as_built
 from ceres_cal.photographs.clicks import unknown_optics
 from ceres_cal.photographs.matching import StrokeMap
+from ceres_cal.photographs.refit import observations_of
 from ceres_cal.photographs.search import search
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Radial
@@ -71,6 +77,32 @@ def test_lines_that_lie_aside_are_named_and_measured() -> None:
     for name, aside in true.items():
         assert abs(built.aside_m[name] - aside) < 0.004  # 0.002 m
     assert any(words.startswith("BottomTouchLine lies ") for words in built.words())
+
+
+def test_a_line_that_lies_aside_is_straight_nevertheless(tmp_path: Path) -> None:
+    painted = moved({"BottomTouchLine": (0.0, -0.03), "RightGoalLine": (0.03, 0.0), "HalfwayLine": (-0.02, 0.0)})
+    course = predict(painted, CAMERA, painted.curve_names, 8.0, 8.0)
+    places = course.pixels + np.random.default_rng(4).normal(0.0, 0.1, (len(course), 1)) * course.normals
+    seen = observations_of(FIELD, CAMERA.image_size, course.curve, places, np.full(len(course), 0.1))
+    aside = ("BottomTouchLine", "RightGoalLine", "HalfwayLine")
+    left = np.flatnonzero(~np.isin(course.curve, [FIELD.curve_index[name] for name in aside]))
+    pixels, sds = CAMERA.project(FIELD.point_array), []
+    for some in (
+        seen.part(np.empty(0, dtype=np.int64), left),
+        replace(seen, priors=tuple(Prior.of_offset("field", name, 0.04) for name in aside)),
+    ):
+        some.save(tmp_path / "seen.json")
+        calibration = calibrate(Observations.load(tmp_path / "seen.json"), Options(lens="radial", powers=(2, 3)))
+        calibration.save(tmp_path / "calibration.json")
+        calibration = Calibration.load(tmp_path / "calibration.json")
+        off = calibration.station().locate(pixels) - FIELD.point_array[:, :2]
+        sd = calibration.uncertainty.located(pixels).sd_m
+        sds.append(float(np.sqrt(np.mean(sd**2))))
+        assert np.sqrt(np.mean(off**2)) < 2.0 * sds[-1]
+    assert sds[1] < 0.9 * sds[0]  # 0.78
+    offsets = dict(zip(calibration.estimate.structure.names, calibration.estimate.structure.values, strict=True))
+    for name, offset in zip(aside, (-0.03, -0.03, 0.02), strict=True):
+        assert offsets[f"field/{name}"] == pytest.approx(offset, abs=0.003)
 
 
 @pytest.mark.parametrize("share", [0.92, 0.95, 0.97])

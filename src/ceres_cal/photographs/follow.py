@@ -205,7 +205,12 @@ class _Tracker:
             left = replace(whole, curves=[name for name in whole.curves if name not in built.aside_m])
             followed = left.at_rest(followed.camera, free)
             whole, left = (replace(one, target=followed.target) for one in (whole, left))
-        return replace(followed, curves=tuple(self.curves), built=built, lines=left.measured(followed.camera))
+        lines, beside = left.measured(followed.camera), None
+        if built.aside_m:
+            every = whole.measured(followed.camera)
+            aside = [followed.target.curve_index[name] for name in built.aside_m]
+            beside = every.take(np.isin(every.course.curve, aside))
+        return replace(followed, curves=tuple(self.curves), built=built, lines=lines, beside=beside)
 
     def as_built(self, followed: Followed, free: tuple[str, ...]) -> AsBuilt:
         """How all curves lie.

@@ -27,6 +27,7 @@ class Followed:
         camera: the posed camera that predicts them. target: as its dimensions were found.
         curves: names of those that were followed. missing: of those that the target may lack, and this field does.
         lines: what was measured there, but for curves that lie aside.
+        beside: the same of the curves that lie aside.
         moved_px: how far the last refit moved the prediction; at rest below 0.02.
         built: how the curves lie, where the photograph had to tell the lens, too.
     """
@@ -38,6 +39,7 @@ class Followed:
     lines: Lines
     moved_px: float
     built: AsBuilt = AS_DRAWN
+    beside: Lines | None = None
 
     @cached_property
     def places(self) -> int:
