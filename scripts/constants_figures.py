@@ -16,6 +16,7 @@ from accuracy_bound import attempts, efficiency
 from accuracy_scenes import CLEAN_NOISE, GROSS_NOISE, PROBLEMS, small_boards, tilted
 from diagnostic_scenes import CLEAN, FAULTS
 from false_alarms import diagnosed
+from lens_choice import LENSES, SCENES, choices
 from moves import (
     ALARMS,
     CAMERA,
@@ -433,8 +434,18 @@ def from_clicks(runs: int, folder: Path) -> Figures:
     return {f"clicks followed of {runs}": right}
 
 
+def lenses(runs: int, _: Path) -> Figures:
+    """Of the lens that the data ask for."""
+    return {
+        f"{name}, {scene}: recognised of {runs}": choices(scene, name, runs)[name]
+        for scene in SCENES
+        for name in LENSES
+    }
+
+
 FIGURES: Mapping[str, Callable[[int, Path], Figures]] = {
     "calibrate": calibrations,
+    "lens": lenses,
     "verdicts": verdicts,
     "advice": advice,
     "diagnose": diagnoses,

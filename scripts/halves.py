@@ -38,7 +38,7 @@ from ceres_cal.uncertainty import Posterior
 
 LEAST, MOST = 0.85, 1.25
 _CONTROL = 0.9, 1.1
-_NO_CURVES = Curves(np.empty(0, np.int32), np.empty(0, np.int32), np.empty((0, 2)), np.empty(0), np.empty(0, np.int8))
+NO_CURVES = Curves(np.empty(0, np.int32), np.empty(0, np.int32), np.empty((0, 2)), np.empty(0), np.empty(0, np.int8))
 _GRID = 12  # places along the longer side of the image
 _STEP = 1e-5  # of each number's natural size
 
@@ -68,7 +68,7 @@ def _ov_plane() -> Observations:
     views = tuple(View(f"{n:02d}", "camera", "camera", "board", f"{n:02d}") for n in range(int(view.max()) + 1))
     points = Points(view.astype(np.int32), (22 * row + column)[point], pixels, np.ones(count))
     board_target, sizes = {"board": checkerboard(22, 22, pitch_m)}, {"camera": (int(size[0]), int(size[1]))}
-    return Observations(board_target, sizes, views, points, _NO_CURVES)
+    return Observations(board_target, sizes, views, points, NO_CURVES)
 
 
 _ORDINARY = Options(lens="radial")
@@ -141,18 +141,23 @@ def agreement(first: Calibration, second: Calibration, pixels: Array) -> Agreeme
     cameras = [one.estimate.cameras[keys[0].owner].at(Pose.identity()) for one in (first, second)]
     rays = cameras[0].rays(pixels)
     pixels, rays = pixels[np.isfinite(rays[:, 0])], rays[np.isfinite(rays[:, 0])]
-    turned = np.linalg.qr(_turn_slopes(cameras[0], rays))[0]
+    turned = turn_basis(cameras[0], rays)
     off = (cameras[1].project(rays) - pixels).ravel()
     off -= turned @ (turned.T @ off)
-    stated = np.zeros(len(off))
-    for one, camera, posterior in zip((first, second), cameras, posteriors, strict=True):
-        own = [key for key in posterior.keys if key.kind == "camera"]
-        slopes = _projection_slopes(
-            camera, rays, [key.quantity for key in own], _STEP * natural_sizes(one.estimate, own)
-        )
-        slopes -= turned @ (turned.T @ slopes)
-        stated += np.einsum("ni,ij,nj->n", slopes, _covariance(posterior, own), slopes)
-    return Agreement(mahalanobis, float(np.mean(_pairs(off**2) / _pairs(stated))))
+    stated = [stated_squares(*each, rays, turned) for each in zip((first, second), cameras, strict=True)]
+    return Agreement(mahalanobis, float(np.mean(pairs(off**2) / pairs(np.sum(stated, axis=0)))))
+
+
+def stated_squares(calibration: Calibration, camera: Camera, rays: Array, turned: Array) -> Array:
+    """(2 N,) variance, px^2, of where rays (N, 3) are seen as the calibration of the camera states it, all turns of a
+    basis (2 N, 3) taken out.
+    """
+    posterior = calibration.uncertainty.posterior
+    own = [key for key in posterior.keys if key.kind == "camera"]
+    steps = _STEP * natural_sizes(calibration.estimate, own)
+    slopes = _projection_slopes(camera, rays, [key.quantity for key in own], steps)
+    slopes -= turned @ (turned.T @ slopes)
+    return np.asarray(np.einsum("ni,ij,nj->n", slopes, _covariance(posterior, own), slopes))
 
 
 def _covariance(posterior: Posterior, keys: Sequence[Key]) -> Array:
@@ -160,7 +165,7 @@ def _covariance(posterior: Posterior, keys: Sequence[Key]) -> Array:
     return np.asarray(posterior.covariance[np.ix_(at, at)])
 
 
-def _pairs(values: Array) -> Array:
+def pairs(values: Array) -> Array:
     """(N,) sums over x and y of (2 N,)."""
     return np.asarray(values.reshape(-1, 2).sum(axis=1))
 
@@ -185,12 +190,12 @@ def _projection_slopes(camera: Camera, rays: Array, quantities: Sequence[str], s
     return np.column_stack(columns)
 
 
-def _turn_slopes(camera: Camera, rays: Array) -> Array:
-    """(2 N, 3) px per radian that the camera turns."""
+def turn_basis(camera: Camera, rays: Array) -> Array:
+    """(2 N, 3) orthonormal basis of how the places at which rays (N, 3) are seen move when the camera turns."""
     ahead, behind = (
         [camera.project(rays + sign * _STEP * rays @ skew(axis)) for axis in np.eye(3)] for sign in (1, -1)
     )
-    return np.column_stack([(a - b).ravel() / (2.0 * _STEP) for a, b in zip(ahead, behind, strict=True)])
+    return np.asarray(np.linalg.qr(np.column_stack([(a - b).ravel() for a, b in zip(ahead, behind, strict=True)]))[0])
 
 
 # ---- the command ----------------------------------------------------------------------------------------------------

@@ -55,14 +55,21 @@ def _both(camera: Camera, seed: int) -> Scene:
 SCENES: Mapping[str, Callable[[Camera, int], Scene]] = {"boards": _boards, "field": _field, "both": _both}
 
 
+def choices(scene: str, name: str, runs: int) -> Counter[str]:
+    """How often which lens is chosen where it is the one of that name."""
+    phi, lens = LENSES[name]
+    chosen: Counter[str] = Counter()
+    for seed in range(runs):
+        seen = simulate(SCENES[scene](Camera((1280, 960), phi, (651.3, 468.9), lens), seed), _NOISE, seed)
+        choice = calibrate(seen.observations, Options()).lens_choice
+        chosen[choice.chosen if choice else ""] += 1
+    return chosen
+
+
 def rows(scene: str, runs: int) -> Iterator[Row]:
     """How often each lens is recognised, and what is chosen."""
-    for name, (phi, lens) in LENSES.items():
-        chosen: Counter[str] = Counter()
-        for seed in range(runs):
-            seen = simulate(SCENES[scene](Camera((1280, 960), phi, (651.3, 468.9), lens), seed), _NOISE, seed)
-            choice = calibrate(seen.observations, Options()).lens_choice
-            chosen[choice.chosen if choice else ""] += 1
+    for name in LENSES:
+        chosen = choices(scene, name, runs)
         note = ", ".join(f"{label} {count}" for label, count in chosen.most_common(3))
         least = 0.95 if name == PAPER else 0.0
         yield Row(scene, f"{name}: recognised", chosen[name] / runs, least=least, note=note)

@@ -40,6 +40,15 @@ def test_alarms_are_as_rare_as_stated_whatever_the_observations_are_like(kind: K
     assert np.median(found) > 0.25  # of one half: no one is unlucky, and the test allows for that
 
 
+@pytest.mark.parametrize("seed", [16, 45, 323])
+def test_what_is_seen_along_correlated_edges_is_no_movement(seed: int) -> None:
+    """Probabilities of 5e-151, 3e-9 and 5e-53, and 2.4 m for one of them, while what a prior brought had been taken off
+    what everything together says: where edges go together that leaves less than nothing.
+    """
+    found = checked(KINDS[3], seed % 40, seed)
+    assert found.holds and found.probability > 0.1  # 0.54, 0.51 and 0.49
+
+
 def test_small_moves_are_found() -> None:
     for seed in range(5):
         assert not checked(KINDS[0], seed, seed, SMALL_TILT).holds

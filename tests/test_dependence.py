@@ -10,11 +10,15 @@ import pytest
 from accuracy_scenes import CLEAN_NOISE, RADIAL, SSL_PROBLEMS, boards
 from coverage import CASES, cover, share
 from dependent_errors import Errors, along_lines, warped
+from hypothesis import given
+from hypothesis import strategies as st
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.tails import NORMAL_95, student_95
 from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
+from ceres_cal.model.information import Information
+from ceres_cal.model.keys import Key
 from ceres_cal.model.parameters import Options
 from ceres_cal.model.residuals import residuals
 from ceres_cal.moves import refit
@@ -24,6 +28,7 @@ from ceres_cal.simulate import Disturbance, simulate
 from ceres_cal.start.initialise import initialise
 from ceres_cal.uncertainty.between import _averaged, _expected
 from ceres_cal.uncertainty.correlation import _freedom_of_mixture
+from ceres_cal.uncertainty.dependence import Dependence, Scatter
 from ceres_cal.uncertainty.likelihood import likelihoods
 from ceres_cal.uncertainty.sample import _shown
 from ceres_cal.uncertainty.strands import Family, Strand, decay
@@ -273,6 +278,23 @@ def test_the_likelihood_is_that_of_the_whole_covariance() -> None:
 def _split(family: Family, values: Array) -> list[Array]:
     """Values of the rows, strand by strand."""
     return np.split(values, np.cumsum([len(strand.rows) for strand in family.strands])[:-1])
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(0, 5))
+def test_what_observations_say_alone_is_what_their_scores_leave(seed: int, seen: int) -> None:
+    """A^T C^-1 A, whatever the prior says and however little the observations do; less than nothing it never is."""
+    rng = np.random.default_rng(seed)
+    half, prior = rng.standard_normal((seen, 5)), rng.standard_normal((5, 5)) * 10.0 ** rng.uniform(-2, 2)
+    root = np.linalg.inv(np.linalg.cholesky(half.T @ half + prior.T @ prior + 1e-9 * np.eye(5))).T
+    spread = (spread := rng.standard_normal((seen, seen))) @ spread.T + 0.1 * np.eye(seen)
+    keys = tuple(Key("camera", "camera", f"k{n}", "") for n in range(5))
+    alone, everything = (Information(keys, np.asarray(m)) for m in (half.T @ half, np.linalg.inv(root @ root.T)))
+    whole = np.eye(5) + root.T @ half.T @ (spread - np.eye(seen)) @ half @ root
+    scatter = Scatter(root, whole, Dependence())
+    found = scatter.widened_alone(alone, everything).matrix
+    expected = half.T @ np.linalg.inv(spread) @ half
+    assert np.allclose(found, expected, rtol=1e-5, atol=1e-6 * np.abs(alone.matrix).max(initial=1.0))
+    assert np.linalg.eigvalsh(found).min() > -1e-9 * max(1.0, np.abs(found).max())
 
 
 def test_the_spread_of_scores_is_that_over_all_pairs_of_views() -> None:

@@ -16,6 +16,7 @@ _MENDED = {
     ("few line points", "kannala-brandt", 2297): "6.1 sd, 3.4 radii: another minimum; 0, 0.7",
     ("few line points", "kannala-brandt", 1673): "5.6 radii: the map bends; 0.9, 0.6",
     ("few points", "kannala-brandt", 760): "3.9 radii: the map bends; 0, 0.1",
+    ("few points", "kannala-brandt", 40): "divided by 0: without the prior nothing says anything of a number; 1.5, 0.5",
 }
 
 

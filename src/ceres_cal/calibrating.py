@@ -140,7 +140,8 @@ def _chosen(observations: Observations, options: Options, watched: Watched) -> C
     except CalibrationError as error:  # of all observations, not of those that took part in the choice
         chosen = chosen.without(str(error), papers(options), start)
         calibration = _of_lens(start, observations, sights, chosen.options, watched)
-    return replace(calibration, lens_choice=chosen.choice)
+    caveats = filter(None, [chosen.choice.caveat])
+    return replace(calibration, lens_choice=chosen.choice, warnings=(*calibration.warnings, *caveats))
 
 
 def _part(bulk: Bulk, options: Options) -> Part:

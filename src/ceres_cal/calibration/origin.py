@@ -28,6 +28,17 @@ class Rejected:
         return self.reason.startswith("the whole of ")
 
 
+_TOO_FEW = "the observations are too few to compare lenses by"
+_NOT_THE_BEST = (
+    "the lens that predicts best makes no calibration of all observations; {}, which was taken, predicts {:.1f} "
+    "standard errors worse, and its map may be off by more than is stated: name another lens (--lens)"
+)
+_NOT_CHOSEN = (
+    "no lens could be chosen ({}), and {} was taken: what is stated holds only if the camera has it: name its lens "
+    "(--lens)"
+)
+
+
 @dataclass(frozen=True)
 class TriedLens:
     """A lens that was compared with others.
@@ -64,7 +75,7 @@ class LensChoice:
     def words(self) -> str:
         """In a line."""
         if not self.groups:
-            return f"{self.chosen}, the paper's: the observations are too few to compare lenses by"
+            return f"{self.chosen}, the paper's: {self.tried[0].failed or _TOO_FEW}"
         others = [one for one in self.tried if one.worse is not None and one.label != self.chosen]
         if not others or self.tried[0].rms_px is None:
             return f"{self.chosen}, the only one that can be calibrated"
@@ -73,6 +84,14 @@ class LensChoice:
             f"{self.chosen} of {len(self.tried)}: predicts {self.groups} held-out parts to {self.tried[0].rms_px:.4f} "
             f"px; next {over} (standard errors by which they predict worse)"
         )
+
+    @property
+    def caveat(self) -> str:
+        """What speaks against the lens that was taken, "" where nothing does."""
+        taken = self.tried[0]
+        if taken.worse:
+            return _NOT_THE_BEST.format(taken.label, taken.worse)
+        return _NOT_CHOSEN.format(taken.failed, taken.label) if taken.failed else ""
 
 
 @dataclass(frozen=True)

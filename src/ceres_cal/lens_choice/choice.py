@@ -9,17 +9,20 @@ predict the others no better: a criterion that counts observations would take th
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ceres_cal.base.errors import CalibrationError
+from ceres_cal.base.errors import CalibrationError, DegenerateError
 from ceres_cal.base.transforms import Poses
 from ceres_cal.calibration import LensChoice, TriedLens
+from ceres_cal.lens_choice.comparing import compared_kinds
 from ceres_cal.lens_choice.forms import PAPER, papers
-from ceres_cal.lens_choice.kinds import Candidate, Seen, compared_kinds
+from ceres_cal.lens_choice.kinds import Candidate
 from ceres_cal.lens_choice.last_resort import last_resort
 from ceres_cal.lens_choice.rule import AS_GOOD, AS_GOOD_BESIDE_LENGTHS, decide, standard_errors
+from ceres_cal.lens_choice.seen import FewGroupsError, Seen
 from ceres_cal.model.parameters import Options
 from ceres_cal.observations import Observations
 from ceres_cal.start.initialise import Start
@@ -54,14 +57,18 @@ def choose_lens(observations: Observations, options: Options, start: Start) -> C
     as_good = AS_GOOD_BESIDE_LENGTHS if options.dimensions else AS_GOOD
     try:
         seen, kinds, share = compared_kinds(observations, options, start.estimate)
-        tried, best, chosen = _compare([one for kind in kinds for one in kind.candidates(first=True)], as_good, seen)
-        if chosen.form.label != PAPER:
+        tried = [one for kind in kinds for one in kind.candidates(first=True)]
+        best = chosen = None
+        with suppress(DegenerateError):  # all of these fold, which shorter ones need not
+            tried, best, chosen = _compare(tried, as_good, seen)
+        if chosen is None or chosen.form.label != PAPER:
             others = [one for longest in tried if longest.may_win(best) for one in longest.of.candidates(first=False)]
             tried, _, chosen = _compare([*tried, *others], as_good, seen)
         more = list(last_resort(seen, chosen))
         tried, chosen = [*tried, *more], next((one for one in more if one.clearly_beats(chosen)), chosen)
-    except CalibrationError:
-        return Chosen(papers(options), start, LensChoice(PAPER, (TriedLens(PAPER, 2),), 0, 0.0))
+    except CalibrationError as error:
+        failed = "" if isinstance(error, FewGroupsError) else str(error)
+        return Chosen(papers(options), start, LensChoice(PAPER, (TriedLens(PAPER, 2, failed=failed),), 0, 0.0))
     there = chosen.estimate
     placements = Poses.of(start.estimate.placements).updated(list(there.placements), Poses.of(there.placements).stack)
     near = replace(start, estimate=replace(there, placements=placements), is_near=not chosen.form.blank.roughness)

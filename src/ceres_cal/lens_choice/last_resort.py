@@ -12,7 +12,8 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.lens_choice.forms import without_formula
-from ceres_cal.lens_choice.kinds import Candidate, Kind, Seen
+from ceres_cal.lens_choice.kinds import Candidate, Kind
+from ceres_cal.lens_choice.seen import Seen
 
 # Between cells over within them, from which on residuals go together: in white noise it is 1.0 by 0.17. From half to
 # double it decides which observations are asked, seldom what is chosen.

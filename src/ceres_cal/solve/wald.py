@@ -94,6 +94,9 @@ def _slopes(problem: Problem, observations: Observations, estimate: Estimate, re
     points, curves = points * weights[: len(points), None], curves * weights[len(points) :]
     slopes = []
     for number, stated in enumerate(np.diagonal(rest.matrix)):
+        if not stated > 0.0:  # the rest says nothing of it
+            slopes.append(0.0)
+            continue
         step = np.zeros(len(rest.keys))
         step[number] = _STEP / np.sqrt(stated)
         above, below = (standardised(moved(estimate, rest.keys, sign * step)) for sign in (1.0, -1.0))

@@ -22,6 +22,7 @@ from ceres_cal.uncertainty.between import FEWEST_GROUPS, Between, compare_groups
 from ceres_cal.uncertainty.correlation import Correlation, correlated
 from ceres_cal.uncertainty.sample import Sample, take_sample
 
+_DETERMINED = 1e-12  # share of the largest variance of a score: what is below is rounding
 _LIKELY = 0.5  # probability from which on a cause is named
 _OVER = {"points": "errors go together between a target's points", "curves": "errors go together along lines"}
 
@@ -77,6 +78,21 @@ class Scatter:
         back = self.root.T @ information.matrix
         change = back.T @ (np.linalg.inv(self.matrix) - np.eye(len(self.matrix))) @ back
         return Information(information.keys, information.matrix + 0.5 * (change + change.T))
+
+    def widened_alone(self, seen: Information, information: Information) -> Information:
+        """What the observations say without any prior, as they scatter.
+
+        A^T C^-1 A with A what they say by the model and C the covariance of their score: what is left of the whole
+        without its priors need not be positive, where errors that go together weigh as much as a prior does.
+
+        Args:
+            seen: A. information: of everything, priors and all.
+        """
+        back, own = self.root.T @ information.matrix, self.root.T @ seen.matrix @ self.root
+        values, vectors = np.linalg.eigh(own + self.matrix - np.eye(len(own)))
+        determined = values > _DETERMINED * values[-1]
+        half = (vectors[:, determined] / np.sqrt(values[determined])).T @ own @ back
+        return Information(seen.keys, half.T @ half)
 
 
 def measure_scatter(
