@@ -62,11 +62,6 @@ class SightCost(CachedCost):
             return None
         return np.column_stack([*(each.reshape(self.num_residuals(), -1) for each in known.jacobians), known.residuals])
 
-    @property
-    def feet(self) -> Array:
-        """(M,) where the last evaluation left the feet."""
-        return self._curves.feet
-
     def _evaluated(self, at: Array, parameters: Sequence[Array]) -> Answer | None:
         numbers, jacobians = [kernels.NOTHING, *self._poses, kernels.NOTHING], [kernels.NOTHING] * 4
         rows, mixing = self.num_residuals(), self._structure.mixing
