@@ -123,9 +123,11 @@ DECIDING: tuple[Constant, ...] = (
     *_of("detect.partly", "_MISFIT _AS_STRONG _CLEAR", "boards"),
     *_of("detect.rings", "_FEWEST_RAYS _LEAST_CONTRAST _NOISY _FAR _MOST_MISFIT", "rings"),
     *_of("photographs.clicks", "SIGMA_PX _SQUARE", "clicks"),
-    *_of("photographs.follow", "LEAST_SHARE _SURE_SHARE _ABSENT _MOST_ABSENT", "lines", "auto"),
+    *_of("photographs.follow", "_SURE_SHARE", "lines", "auto"),
+    *_of("photographs.followed", "LEAST_SHARE _ABSENT _MOST_ABSENT", "lines", "auto"),
     *_of("photographs.facing", "_FACES _AS_WELL _NEARER_DEG", "auto"),
-    *_of("photographs.candidates", "_SURE _COMPARABLE _ALIKE _CLEAR BY_CHANCE", "auto"),
+    *_of("photographs.candidates", "_SURE _COMPARABLE _ALIKE", "auto"),
+    *_of("photographs.painted", "_CLEAR BY_CHANCE", "auto"),
     *_of("photographs.grid", "_SHORT", "auto"),
     *_of("photographs.as_built", "_OTHER_FIELD _SURELY _FARTHEST_M", "lines", "auto"),
     *_of("photographs.judgement", "_NEAR_PX _EXPLAINED _OF_ALL _FEWEST_PLACES _FEWEST_CURVES", "auto"),
@@ -199,9 +201,13 @@ def _measure(figures: str, folder: Path, runs: int, setting: Sequence[str] | Non
     """In the process that `measured` starts: set the constant, then measure; the last line printed is the answer."""
     from constants_figures import FIGURES  # with it, everything that copies constants
 
+    from ceres_cal.kernels import library
+
     if setting is not None:
         constant = next(one for one in DECIDING if str(one) == setting[0])
         value: Any = json.loads(setting[1])
+        if constant.module.startswith("kernels"):  # what came with the package has its own
+            vars(library)["library_path"] = Path
         constant.set(tuple(value) if isinstance(value, list) else value)
     print(json.dumps(FIGURES[figures](runs, folder)))
     return 0

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import sys
-import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations
@@ -13,12 +12,10 @@ from typing import Any
 
 import numpy as np
 from cases import Row
+from photograph_outcomes import MOVED_MM, STATED, USUAL_MM, Outcome, outcome
 
 from ceres_cal.base.arrays import Array
-from ceres_cal.base.errors import CalibrationError, InputError
-from ceres_cal.calibrating import calibrate
-from ceres_cal.model.parameters import Options
-from ceres_cal.photographs import Auto, Clicks, Facing, detect_field
+from ceres_cal.photographs import Auto, Clicks, Facing
 from ceres_cal.scene.targets import targets_by_name
 
 CLICK_PX = 8.0
@@ -26,8 +23,7 @@ CORNERS = (
     *("TopLeftCorner", "BottomLeftCorner", "TopRightCorner", "BottomRightCorner"),
     *("BottomHalfwayCrossing", "TopHalfwayCrossing"),
 )
-ALLOWED_MM = {"combo": 3.0, "camera": 3.0}  # by kind; else as small pictures allow
-USUAL_MM, STATED = 1.5, 1.6
+ALLOWED_MM = {"combo": MOVED_MM, "camera": MOVED_MM}  # by kind
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,18 +73,6 @@ def _spread(corners: dict[str, list[float]], names: Sequence[str]) -> float:
     return float(np.min(np.abs(areas)))
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """What came of one: mean and median error of the map, mm, errors over stated standard deviations, and seconds."""
-
-    seconds: float
-    mean_mm: float = np.nan
-    median_mm: float = np.nan
-    over_stated: float = np.nan
-    lens: str = ""
-    why: str = ""
-
-
 def known_photographs(folder: Path) -> list[Known]:
     """Those of a folder that have a truth beside them."""
     known = []
@@ -98,30 +82,13 @@ def known_photographs(folder: Path) -> list[Known]:
     return known
 
 
-def outcome(shown: Known, start: Auto | Clicks, lens: str = "auto") -> Outcome:
-    """Detect, calibrate, and compare with the truth; the seconds are those of the detection."""
-    began = time.perf_counter()
-    try:
-        found = detect_field([shown.path], targets_by_name()[shown.truth["asked_as"]], start)
-        seconds = time.perf_counter() - began
-        calibration = calibrate(found.observations, Options(lens=lens))
-    except (CalibrationError, InputError) as refusal:
-        return Outcome(time.perf_counter() - began, why=str(refusal))
-    pixels, places = shown.floor()
-    camera = calibration.station()
-    error = np.linalg.norm(camera.locate(pixels) - places, axis=1)
-    stated = calibration.uncertainty.located(pixels).sd_m
-    ratio = float(np.sqrt(np.mean(error**2) / np.mean(stated**2)))
-    mean, median = 1e3 * float(np.mean(error)), 1e3 * float(np.median(error))
-    return Outcome(seconds, mean, median, ratio, calibration.options.lens)
-
-
 def shared_rows(folder: Path) -> Iterator[Row]:
     """Every photograph without a start and from four rough clicks; other fields must be refused."""
     for shown in known_photographs(folder):
         side = Facing(*shown.truth["facing"].split("="))
         for how, start in (("auto", Auto((side,))), ("clicks", shown.clicks())):
-            yield from _rows(shown, how, outcome(shown, start))
+            target = targets_by_name()[shown.truth["asked_as"]]
+            yield from _rows(shown, how, outcome(shown.path, target, start, shown.floor()))
 
 
 def _rows(shown: Known, how: str, came: Outcome) -> Iterator[Row]:

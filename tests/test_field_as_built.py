@@ -1,21 +1,31 @@
 """How lines lie beside their drawing, and dimensions that are others: told apart, named, refused."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import photograph_shots as script
 import pytest
+from photographs_disturbed import AUTO, taken
 
 from ceres_cal.base.errors import NothingShownError
+from ceres_cal.calibrating import calibrate
+from ceres_cal.calibration import Calibration
 from ceres_cal.cli import main
 from ceres_cal.detect.courses import predict
-from ceres_cal.detect.images import filled
+from ceres_cal.detect.images import filled, light
 from ceres_cal.detect.lines import Lines, measure
-from ceres_cal.detect.strokes import find_strokes
+from ceres_cal.detect.registration import nearness_to
+from ceres_cal.detect.strokes import Strokes, drawn, find_strokes
+from ceres_cal.model.parameters import Options
+from ceres_cal.observations import Observations, Prior
 from ceres_cal.photographs import Auto, Clicks, FieldOptions, detect_field
 from ceres_cal.photographs.as_built import AsBuilt, as_built
 from ceres_cal.photographs.clicks import unknown_optics
+from ceres_cal.photographs.matching import StrokeMap
+from ceres_cal.photographs.refit import observations_of
+from ceres_cal.photographs.search import search
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Radial
 from ceres_cal.scene.targets import Segment, Target, custom, ssl_field
@@ -67,6 +77,32 @@ def test_lines_that_lie_aside_are_named_and_measured() -> None:
     for name, aside in true.items():
         assert abs(built.aside_m[name] - aside) < 0.004  # 0.002 m
     assert any(words.startswith("BottomTouchLine lies ") for words in built.words())
+
+
+def test_a_line_that_lies_aside_is_straight_nevertheless(tmp_path: Path) -> None:
+    painted = moved({"BottomTouchLine": (0.0, -0.03), "RightGoalLine": (0.03, 0.0), "HalfwayLine": (-0.02, 0.0)})
+    course = predict(painted, CAMERA, painted.curve_names, 8.0, 8.0)
+    places = course.pixels + np.random.default_rng(4).normal(0.0, 0.1, (len(course), 1)) * course.normals
+    seen = observations_of(FIELD, CAMERA.image_size, course.curve, places, np.full(len(course), 0.1))
+    aside = ("BottomTouchLine", "RightGoalLine", "HalfwayLine")
+    left = np.flatnonzero(~np.isin(course.curve, [FIELD.curve_index[name] for name in aside]))
+    pixels, sds = CAMERA.project(FIELD.point_array), []
+    for some in (
+        seen.part(np.empty(0, dtype=np.int64), left),
+        replace(seen, priors=tuple(Prior.of_offset("field", name, 0.04) for name in aside)),
+    ):
+        some.save(tmp_path / "seen.json")
+        calibration = calibrate(Observations.load(tmp_path / "seen.json"), Options(lens="radial", powers=(2, 3)))
+        calibration.save(tmp_path / "calibration.json")
+        calibration = Calibration.load(tmp_path / "calibration.json")
+        off = calibration.station().locate(pixels) - FIELD.point_array[:, :2]
+        sd = calibration.uncertainty.located(pixels).sd_m
+        sds.append(float(np.sqrt(np.mean(sd**2))))
+        assert np.sqrt(np.mean(off**2)) < 2.0 * sds[-1]
+    assert sds[1] < 0.9 * sds[0]  # 0.78
+    offsets = dict(zip(calibration.estimate.structure.names, calibration.estimate.structure.values, strict=True))
+    for name, offset in zip(aside, (-0.03, -0.03, 0.02), strict=True):
+        assert offsets[f"field/{name}"] == pytest.approx(offset, abs=0.003)
 
 
 @pytest.mark.parametrize("share", [0.92, 0.95, 0.97])
@@ -163,6 +199,42 @@ def test_strokes_are_of_thin_lines_in_sun_and_of_dashes() -> None:
     solid, dashes = (length[np.abs(middles[:, 1] - y) < 2.0].sum() for y in (99.5, 299.5))
     assert solid > 300.0 and dashes > 200.0
     assert solid + dashes > 0.7 * length.sum()
+
+
+def test_worn_lines_are_covered_by_their_dashes() -> None:
+    course = predict(FIELD, CAMERA, FIELD.curve_names, 2.0)
+    way = 7.0 * np.column_stack([course.normals[:, 1], -course.normals[:, 0]])
+    middles = np.arange(6, len(course), 13)  # dashes of 14 px, 12 px apart
+    ends = np.stack([course.pixels[middles] - way[middles], course.pixels[middles] + way[middles]], axis=1)
+    strokes = Strokes(ends, np.ones(len(ends)))
+    near = nearness_to(drawn(strokes, CAMERA.image_size))
+    shown = StrokeMap(strokes, near, CAMERA.image_size, 0.5 * (np.array(CAMERA.image_size) - 1.0))
+    outer = ("TopTouchLine", "BottomTouchLine", "LeftGoalLine", "RightGoalLine")
+    likelihoods = [  # of the field, and of another one that shares its outer lines and has half as much elsewhere
+        float(shown.likelihood(2.0 * np.array(near.at(*one.pixels.T).sum()), np.array(times * 2.0 * len(one))))
+        for one, times in ((course, 1.0), (predict(FIELD, CAMERA, outer, 2.0), 1.5))
+    ]
+    assert likelihoods[0] > 1.5 * likelihoods[1]  # 0.82 and 0.28; with the length of the dashes alone 0.42 and 0.47
+
+
+def test_wide_lines_are_one_stroke_each_and_a_picture_border_is_none() -> None:
+    grey = np.full((300, 400), 30.0, np.float32)
+    grey[:, 196:206] = 200.0  # 10 px wide
+    grey[:, 300:302] = 200.0
+    grey[:2] = 120.0
+    strokes = find_strokes(np.asarray(cv2.GaussianBlur(grey, (0, 0), 1.0), np.float32))
+    middles, length = strokes.ends.mean(axis=1), strokes.length_px
+    wide, thin = (np.abs(middles[:, 0] - x) < 1.0 for x in (200.5, 300.5))
+    assert np.all(wide | thin)
+    assert all(200.0 < length[some].sum() < 310.0 for some in (wide, thin))
+
+
+def test_a_part_that_a_field_may_lack_is_said_to_be_missing() -> None:
+    shot = taken("plain", 0, ssl_field("B", center_circle=False))
+    followed = search(light(shot.image), FIELD, FIELD.curve_names, AUTO).followed
+    assert followed is not None and followed.lacking == ("CenterCircle",)
+    away = followed.camera.locate(shot.camera.project(FIELD.point_array)) - FIELD.point_array[:, :2]
+    assert np.max(np.linalg.norm(away, axis=1)) < 0.05
 
 
 def test_auto_takes_no_other_target(path: Path) -> None:

@@ -295,6 +295,7 @@ def _image_data(path: str, detections: FieldDetections) -> dict[str, Any]:
         "blur_px": lines.blur_px,
         "width_factor": lines.stretch,
         "not_as_drawn": list(detections.found[path].built.words()),
+        "lacking": list(detections.found[path].lacking),
     }
     if path in detections.searched:
         searched = detections.searched[path]
@@ -321,6 +322,7 @@ def _text(data: dict[str, Any]) -> str:
         f"{one['image']}: found without a start, {_ways(one['searched'])}" for one in data["found"] if "searched" in one
     ]
     lines += [f"{one['image']}: {words}" for one in data["found"] for words in one["not_as_drawn"]]
+    lines += [f"{one['image']}: no {', '.join(one['lacking'])} to be seen" for one in data["found"] if one["lacking"]]
     lines += [f"{one['image']}: {one['reason']}" for one in data["missed"]]
     return "\n".join([*lines, f"written to {data['output']}"])
 

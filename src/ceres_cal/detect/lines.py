@@ -6,7 +6,7 @@ does not look like paint of that width, or does not go on as its neighbours do, 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -85,6 +85,11 @@ class Lines:
     def pixels(self) -> Array:
         """(N, 2) the paint's middle, NaN where it was not found."""
         return np.asarray(self.course.pixels + self.offset_px[:, None] * self.course.normals)
+
+    def take(self, rows: Mask) -> Lines:
+        """These places only."""
+        columns = {name: getattr(self, name)[rows] for name in ("found", "offset_px", "sigma_px", "contrast")}
+        return replace(self, course=self.course.take(rows), **columns)
 
     def edge(self, side: int) -> Array:
         """(N, 2) the paint's left (side 1) or right (-1) edge, NaN where it was not found.

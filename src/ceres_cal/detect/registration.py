@@ -29,6 +29,11 @@ class Nearness:
     plane: Array32
     reduced: int = _REDUCED
 
+    @property
+    def length_px(self) -> float:
+        """The length of the lines, with what is near to their ends."""
+        return float(np.sum(self.plane) * self.reduced**2 / (np.sqrt(2.0 * np.pi) * _NEAR_PX))
+
     def score(self, pixels: Array) -> float:
         """Mean nearness of places (N, 2) px; those outside the image count as far off."""
         return float(np.mean(self.at(pixels[:, 0], pixels[:, 1])))

@@ -27,6 +27,11 @@ _NOISE = 5.0
 _NEARBY_PX, _NOISE_NEARBY = 41, 3.0
 # Of the response, that at twice the scale: 0.125 of a thin line, more of stripes of sun and walls.
 _WIDEST = 0.45
+# Width in which a stroke found at another scale is the same one; times as bright a coarser one must be, whose place and
+# direction are known less well.
+_BESIDE_PX, _COARSER = 11, 1.4
+# Of the picture, where nothing is seen of a ridge's other side.
+_BORDER_PX = 3
 # Between pieces of one stroke; of a stroke's length, what is paint: worn lines are dashes.
 _GAP_PX, _DENSE = 3, 0.5
 
@@ -40,6 +45,10 @@ class Strokes:
 
     def __len__(self) -> int:
         return len(self.ends)
+
+    def take(self, rows: Mask) -> Strokes:
+        """These only."""
+        return Strokes(self.ends[rows], self.strength[rows])
 
     @property
     def length_px(self) -> Array:
@@ -55,7 +64,7 @@ def drawn(strokes: Strokes, image_size: tuple[int, int]) -> Mask:
 
 
 def find_strokes(grey: Array32) -> Strokes:
-    """Every stroke of a photograph, of paint up to some 12 px wide."""
+    """Every stroke of a photograph, of paint up to some 12 px wide, each at the scale at which it is brightest."""
     by_scale = []
     for scale in _SCALES:
         plane = (
@@ -63,7 +72,23 @@ def find_strokes(grey: Array32) -> Strokes:
         )
         strokes = _strokes(_ridge_points(np.asarray(plane, np.float32)))
         by_scale.append(Strokes((strokes.ends + 0.5) * scale - 0.5, strokes.strength))
-    return by_scale[0] if np.sum(by_scale[0].length_px) > 0.7 * np.sum(by_scale[1].length_px) else by_scale[1]
+    size = (int(grey.shape[1]), int(grey.shape[0]))
+    fine, coarse = by_scale
+    fine = fine.take(_COARSER * fine.strength >= _strength_beside(fine, coarse, size))
+    coarse = coarse.take(coarse.strength > _COARSER * _strength_beside(coarse, fine, size))
+    return Strokes(*(np.concatenate([getattr(one, name) for one in (fine, coarse)]) for name in ("ends", "strength")))
+
+
+def _strength_beside(strokes: Strokes, other: Strokes, image_size: tuple[int, int]) -> Array:
+    """(N,) how bright a ridge of the other scale lies along each stroke, 0 where there is none."""
+    plane = np.zeros(image_size[::-1], np.float32)
+    for row in np.argsort(other.strength):
+        a, b = np.round(other.ends[row]).astype(int).tolist()
+        cv2.line(plane, a, b, float(other.strength[row]), _BESIDE_PX)
+    share = np.linspace(0.0, 1.0, 5)[:, None, None]
+    places = np.round((1.0 - share) * strokes.ends[:, 0] + share * strokes.ends[:, 1]).astype(int)
+    x, y = (np.clip(places[..., axis], 0, image_size[axis] - 1) for axis in (0, 1))
+    return np.asarray(np.median(plane[y, x], axis=0), float)
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +111,9 @@ def _ridge_points(grey: Array32) -> _Ridge:
     nearby = cv2.boxFilter(np.minimum(strength, _NOISE * max(usual, 1e-3)), cv2.CV_32F, size, normalize=True)
     nearby = cv2.boxFilter(np.minimum(strength, 2.0 * _NOISE * nearby), cv2.CV_32F, size, normalize=True)
     limit = np.maximum(_NOISE_NEARBY * nearby, max(_NOISE * usual, 1e-3))
-    rows, columns = np.nonzero((strength > limit) & (wider < _WIDEST * strength))
+    ridge = (strength > limit) & (wider < _WIDEST * strength)
+    ridge[:_BORDER_PX] = ridge[-_BORDER_PX:] = ridge[:, :_BORDER_PX] = ridge[:, -_BORDER_PX:] = False
+    rows, columns = np.nonzero(ridge)
     a, b, c = xx[rows, columns], xy[rows, columns], bend[rows, columns]
     angle = 0.5 * np.arctan2(2.0 * b, a - yy[rows, columns]) + 0.5 * np.pi  # of the direction that bends most downwards
     nx, ny = np.cos(angle), np.sin(angle)

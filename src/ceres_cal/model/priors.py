@@ -101,7 +101,7 @@ def gather_priors(
     stated = []
     for prior in dict.fromkeys((*observations.priors, *options.priors)):  # what is said twice counts once
         observations.require_owner(prior)
-        if not prior.is_open:
+        if not (prior.is_open or prior.curve):  # which are among the tolerances
             stated.append(stated_prior(prior, lenses.get(prior.name, options.blank_lens)))
     if carried:
         return (carried, *stated, *tolerances(structure, carried.keys))

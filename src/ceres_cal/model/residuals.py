@@ -72,11 +72,8 @@ class Residuals:
 def camera_optics(camera: Camera) -> kernels.Optics:
     """A camera's optics as the kernels take them."""
     lens = camera.lens
-    prepare, distort, differentiate = kernels.lens_functions(lens.prepare, lens.distort_chunk, lens.differentiate_chunk)
     return kernels.Optics(
-        prepare.address,
-        distort.address,
-        differentiate.address,
+        *kernels.lens_functions(lens.prepare, lens.distort_chunk, lens.differentiate_chunk),
         intrinsics_vector(camera),
         unit_px(camera),
         lens.state,

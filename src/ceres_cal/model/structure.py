@@ -36,15 +36,17 @@ class Tolerance:
         lines_m: of the offset of each segment, and of each arc's centre and radius.
         points_m: of each point's x and y.
         warp_m: of a board's bow along each side, at its middle.
+        curve_m: name of a curve -> the same as lines_m, of that one in place of it.
     """
 
     lines_m: float = 0.0
     points_m: float = 0.0
     warp_m: float = 0.0
+    curve_m: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if not (np.isfinite(value) and value >= 0.0):
+        for name, value in ({**vars(self), **self.curve_m}).items():
+            if name != "curve_m" and not (np.isfinite(value) and value >= 0.0):
                 raise InputError(f"tolerance {name} must be a number of metres from 0 on, not {value}")
 
 
@@ -242,7 +244,8 @@ def _tolerated(name: str, target: Target, tolerances: Mapping[str, Tolerance]) -
     """Everything of a target that may be offset, and its tolerance, in the order of the solver's numbers."""
     tolerance = tolerances.get(name, Tolerance())
     for curve_name, curve in target.curves.items():
-        yield from ((f"{name}/{curve_name}{part}", tolerance.lines_m) for part in _parts_of(curve))
+        sigma_m = tolerance.curve_m.get(curve_name, tolerance.lines_m)
+        yield from ((f"{name}/{curve_name}{part}", sigma_m) for part in _parts_of(curve))
     if tolerance.warp_m > 0.0 and not target.bows:
         raise InputError(
             f"a warp is for checkerboards and boards like them: target {name!r}, of kind {target.kind!r}, does not bow"

@@ -25,6 +25,7 @@ class View:
     placement: str | None = None
 
 
+_OFFSET = ".offset_m"
 PRIOR_OWNERS = ("camera", "station", "target")
 
 
@@ -34,7 +35,8 @@ class Prior:
 
     Quantities of a station: height_m, position_m (m). Of a camera: phi, principal_point (px), aspect, and the lens's
     coefficients by name in the units of the files. Of a target: its dimensions (m), which are solved for then; a sigma
-    that is infinite says that the value is only where to start from.
+    that is infinite says that the value is only where to start from. And CURVE.offset_m, of a curve that lies
+    beside its drawing: about 0, it is solved for, too.
 
     Raises:
         InputError: on construction: an unknown owner, numbers that are not finite, a sigma that is not above 0.
@@ -59,7 +61,9 @@ class Prior:
         finite = np.all(np.isfinite(self.value)) and (self.is_open or np.all(np.isfinite(self.sigma)))
         if not finite or not min(self.sigma) > 0.0:
             raise InputError(f"{here}: finite numbers and a sigma above 0")
-        if self.owner == "target" and not self.value[0] > 0.0:
+        if self.curve and (self.value != (0.0,) or self.is_open):
+            raise InputError(f"{here}: an offset is about 0 m, and its sigma finite")
+        if self.dimension and not self.value[0] > 0.0:
             raise InputError(f"{here}: a length is above 0 m, not {self.value[0]:g}")
 
     @property
@@ -69,8 +73,18 @@ class Prior:
 
     @property
     def dimension(self) -> str:
-        """The "target/dimension" that it is about; nothing where it is about a camera or a station."""
-        return f"{self.name}/{self.quantity}" if self.owner == "target" else ""
+        """The "target/dimension" that it is about; nothing where it is about something else."""
+        return f"{self.name}/{self.quantity}" if self.owner == "target" and not self.curve else ""
+
+    @property
+    def curve(self) -> str:
+        """The target's curve whose offset it is about; nothing where it is about something else."""
+        return self.quantity.removesuffix(_OFFSET) if self.owner == "target" and self.quantity.endswith(_OFFSET) else ""
+
+    @classmethod
+    def of_offset(cls, target: str, curve: str, sigma_m: float) -> Prior:
+        """What is known of a curve that lies beside its drawing."""
+        return cls("target", target, f"{curve}{_OFFSET}", (0.0,), (sigma_m,))
 
 
 TYPES = {"view": np.int32, "feature": np.int32, "pixels": np.float64, "sigma_px": np.float64, "side": np.int8}

@@ -282,11 +282,13 @@ class Observations(Content):
         return stray_pixels(self)
 
     def require_owner(self, prior: Prior) -> None:
-        """Raise InputError where a prior names a camera, a station or a target that is not there."""
+        """Raise InputError where a prior names a camera, a station, a target or a curve that is not there."""
         every: dict[str, Iterable[str]] = {"camera": self.cameras, "station": self.stations, "target": self.targets}
         names = every[prior.owner]
         if prior.name not in names:
             raise InputError(f"a prior names {prior.owner} {prior.name!r}, which is not there: {choices(names)}")
+        if prior.curve and prior.curve not in self.targets[prior.name].curves:
+            raise InputError(f"a prior names a curve {prior.curve!r}, which target {prior.name!r} does not have")
 
 
 @dataclass(frozen=True, eq=False)

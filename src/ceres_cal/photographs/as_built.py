@@ -27,7 +27,7 @@ from ceres_cal.scene.targets import Target
 from ceres_cal.solve.linear_model import Weights, make_linear_model
 
 _SCATTER_M = np.array([0.0005, 0.001, 0.002, 0.004, 0.008])  # of paint about its drawing
-_ASIDE_M, _OTHER = 0.04, 0.1  # of a curve that lies aside; of a dimension that is another one, as a share of it
+ASIDE_M, _OTHER = 0.04, 0.1  # of a curve that lies aside; of a dimension that is another one, as a share of it
 _LOG_ODDS = np.log(0.1 / 0.9)  # that a curve lies aside, or a dimension is another one
 _BEAM, _MOST = 24, 9
 # Of a dimension, another field; what a tape measure, a strange lens and a floor that is not flat make of one is less.
@@ -165,7 +165,7 @@ class _Shape:
         """The set of curves and dimensions of most evidence."""
         curves = list(dict.fromkeys(self.owner.tolist()))
         moving = [int(d) for d in np.flatnonzero(np.any(self.moves != 0.0, axis=0))]
-        roots = [_ASIDE_M * np.eye(len(self.owner))[:, self.owner == name] for name in curves]
+        roots = [ASIDE_M * np.eye(len(self.owner))[:, self.owner == name] for name in curves]
         roots += [_OTHER * self.lengths[d] * self.moves[:, d : d + 1] for d in moving]
         chosen, scatter_m = self._searched(roots)
         mean, sd = self._amounts(np.hstack([np.empty((len(self.owner), 0)), *(roots[n] for n in chosen)]), scatter_m)
@@ -176,8 +176,8 @@ class _Shape:
             at += size
             worst = int(np.argmax(np.abs(values)))
             if number < len(curves):
-                aside[curves[number]] = _ASIDE_M * float(values[worst])
-                sds[curves[number]] = _ASIDE_M * float(own[worst])
+                aside[curves[number]] = ASIDE_M * float(values[worst])
+                sds[curves[number]] = ASIDE_M * float(own[worst])
                 continue
             d = moving[number - len(curves)]
             name = self.names[d].partition("/")[2]

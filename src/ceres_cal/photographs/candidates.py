@@ -10,14 +10,13 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array32
 from ceres_cal.base.transforms import Pose, rotation_log
-from ceres_cal.detect.courses import predict
-from ceres_cal.detect.lines import search as search_along
 from ceres_cal.detect.registration import nearness_to
 from ceres_cal.detect.strokes import drawn, find_strokes
 from ceres_cal.model.dimensions import redrawn
 from ceres_cal.observations import Prior
 from ceres_cal.photographs.grid import Grid, grid_of, offsets_of
-from ceres_cal.photographs.matching import FloorLines, Match, StrokeMap, divergence, lines_seen, match
+from ceres_cal.photographs.matching import FloorLines, Match, StrokeMap, lines_seen, match
+from ceres_cal.photographs.painted import likelihood_of_place
 from ceres_cal.photographs.upright import Upright, find_upright
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.curves import curve_points
@@ -33,10 +32,6 @@ _POWERS = (2, 3, 4, 5)
 # Of the best match's score: another's, and that of another way to take the picture. Nothing changes from 0.6 to 0.86.
 _COMPARABLE, _ALIKE = 0.3, 0.9
 _MOST, _MOST_ALIKE = 4, 60
-# Where a candidate's lines are sought: px apart, and to either side as a share of half the image's diagonal; and how
-# bright, of the usual brightest, is paint. So many of any lines would be found there by chance.
-_SPACING_PX, _REACH, _CLEAR, _FEWEST = 8.0, 0.035, 0.4, 12
-BY_CHANCE = 0.3  # of the places on any lines, those that lie on paint
 # Share of a length that is not known by which it is drawn longer and shorter, too: a match is nearly as good up to half
 # of that beside it.
 _LENGTH_STEP = 0.06
@@ -121,24 +116,11 @@ def candidates(search: FieldSearch) -> list[tuple[Camera, Grid]]:
             break
     distinct = _distinct(sorted(scored, key=lambda one: -one[0]), search.turns, _COMPARABLE)
     every = [(camera, drawn[id(camera)]) for camera in distinct]
-    return sorted(every, key=lambda one: -_on_lines(replace(search, grid=one[1]), one[0]))[:_MOST]
 
+    def likelihood(one: tuple[Camera, Grid]) -> float:
+        return likelihood_of_place(search.grey, one[1].target, one[0], search.curves)
 
-def _on_lines(search: FieldSearch, camera: Camera) -> float:
-    """How much likelier the target is there than elsewhere, by where its own lines are seen in the picture itself.
-
-    The log-likelihood ratio of so many places with paint, less what tells that the curves do not share one share: of a
-    target that is elsewhere some lie on paint and others do not, while wear and robots are everywhere.
-    """
-    course = predict(search.target, camera, search.curves, _SPACING_PX, _SPACING_PX)
-    if len(course) < _FEWEST:
-        return -np.inf
-    bright = search_along(search.grey, course, _REACH * search.stroke_map.unit_px)[1]
-    seen = bright > _CLEAR * float(np.quantile(bright, 0.8))
-    places = np.bincount(course.curve)
-    own = np.bincount(course.curve, seen) / np.maximum(places, 1)
-    share = max(float(np.mean(seen)), BY_CHANCE)
-    return float(np.sum(places) * divergence(share, BY_CHANCE) - np.sum(places * divergence(own, share)))
+    return sorted(every, key=likelihood, reverse=True)[:_MOST]
 
 
 def alike(search: FieldSearch, camera: Camera, detected: Collection[str]) -> list[Camera]:

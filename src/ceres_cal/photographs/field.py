@@ -17,8 +17,10 @@ from ceres_cal.detect.images import filled, read_light
 from ceres_cal.detect.lines import Lines
 from ceres_cal.model.dimensions import features_of
 from ceres_cal.observations import NO_POINTS, Curves, Observations, Points, Prior, View, combine
+from ceres_cal.photographs.as_built import ASIDE_M
 from ceres_cal.photographs.clicks import Clicks, starts_from_clicks
-from ceres_cal.photographs.follow import Followed, FreeIntrinsics, follow
+from ceres_cal.photographs.follow import FreeIntrinsics, follow
+from ceres_cal.photographs.followed import Followed
 from ceres_cal.photographs.judgement import why_missed
 from ceres_cal.photographs.search import Auto, SearchResult, SeveralWaysError, search
 from ceres_cal.scene.camera import Camera
@@ -127,7 +129,8 @@ def detect_field(
     seen |= {target.point_names[number] for number in np.unique(every.points.feature)}
     lengths = [_found(one, next(iter(followed.values()))) for one in options.lengths]
     lengths = [one for one in lengths if features_of(target, one.quantity) & seen]  # else it may stay as drawn
-    return FieldDetections(replace(every, priors=tuple(lengths)), followed, missed, searched)
+    priors = dict.fromkeys((*every.priors, *lengths))
+    return FieldDetections(replace(every, priors=tuple(priors)), followed, missed, searched)
 
 
 def _found(prior: Prior, followed: Followed) -> Prior:
@@ -216,18 +219,26 @@ def _starts(
 
 
 def _observations(frame: str, followed: Followed, target: Target, options: FieldOptions) -> Observations:
-    """One image's view: what its lines and crossings are, each pixel counted once."""
+    """One image's view: what its lines and crossings are, each pixel counted once.
+
+    Curves that lie beside their drawing are straight and round nevertheless: they tell the lens, under an offset.
+    """
     camera, lines = followed.camera, followed.lines
     points, used = NO_POINTS, np.zeros(len(lines.found), dtype=bool)
     if options.points:
         met = find_crossings(followed.target, camera, lines)
         points, used = Points(np.zeros(len(met.feature), np.int32), met.feature, met.pixels, met.sigma_px), met.used
+    curves, beside = _curves(lines, lines.found & ~used, options.edges), followed.beside
+    if beside is not None:
+        aside = _curves(beside, beside.found, options.edges)
+        curves = Curves(**{name: np.concatenate([own, getattr(aside, name)]) for name, own in vars(curves).items()})
     return Observations(
         {TARGET_NAME: target},
         {options.camera: camera.image_size},
         (View(frame, options.camera, options.station or options.camera, TARGET_NAME),),
         points,
-        _curves(lines, lines.found & ~used, options.edges),
+        curves,
+        tuple(Prior.of_offset(TARGET_NAME, name, ASIDE_M) for name in followed.built.aside_m),
     )
 
 

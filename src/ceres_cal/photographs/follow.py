@@ -17,18 +17,16 @@ from ceres_cal.detect.registration import nearness, shifted
 from ceres_cal.model.parameters import Options, intrinsic_names
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.photographs.as_built import AS_DRAWN, AsBuilt, as_built
+from ceres_cal.photographs.followed import Followed
+from ceres_cal.photographs.painted import painted_curves
 from ceres_cal.photographs.refit import TARGET, PointHints, observations_of, refit_camera
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import LENSES
 from ceres_cal.scene.targets import Target, target_from_spec
 
 FAR_PX = 130.0  # how far off the start may be
-# Of the places in view where paint must be found: robots and wear hide a third. Nothing changes from 0.33 to 0.67.
-LEAST_SHARE = 0.5
 # Share from which on no other start is tried. At half of its odds nothing changes.
 _SURE_SHARE = 0.7
-# Found of a curve, at least; places on curves without that, at most.
-_ABSENT, _MOST_ABSENT = 0.2, 0.08
 _ROUGH_SPACING_PX = 12.0
 _NEAR_REACHES_PX = (12.0, 6.0, 4.0)
 # From points that were shown: what stands farther beside a line than they are off cannot draw it away.
@@ -59,43 +57,6 @@ class FreeIntrinsics:
     priors: tuple[Prior, ...] = ()
     hints: PointHints | None = None
     keep: bool = False
-
-
-@dataclass(frozen=True, eq=False)
-class Followed:
-    """A field's lines as they were followed.
-
-    Attributes:
-        camera: the posed camera that predicts them. target: as its dimensions were found.
-        lines: what was measured there, but for curves that lie aside.
-        moved_px: how far the last refit moved the prediction; at rest below 0.02.
-        built: how the curves lie, where the photograph had to tell the lens, too.
-    """
-
-    camera: Camera
-    target: Target
-    lines: Lines
-    moved_px: float
-    built: AsBuilt = AS_DRAWN
-
-    @property
-    def share(self) -> float:
-        """Of the places in view, the share where paint was found."""
-        return self.lines.share
-
-    @property
-    def absent(self) -> tuple[int, ...]:
-        """The curves in view of which next to nothing was found."""
-        curve, found = self.lines.course.curve, self.lines.found
-        numbers, places = np.unique(curve, return_counts=True)
-        counts = np.array([np.count_nonzero(found[curve == number]) for number in numbers])
-        return tuple(int(number) for number in numbers[counts < _ABSENT * places])
-
-    @property
-    def holds(self) -> bool:
-        """Whether this is the field: paint at half of the places in view, and no line missing that weighs."""
-        missing = np.isin(self.lines.course.curve, self.absent)
-        return self.share >= LEAST_SHARE and float(np.mean(missing)) <= _MOST_ABSENT
 
 
 def follow(
@@ -133,8 +94,8 @@ def approach(grey: Array32, target: Target, camera: Camera, curves: Collection[s
 
 def refine(grey: Array32, target: Target, camera: Camera, curves: Collection[str], free: FreeIntrinsics) -> Followed:
     """From a camera that is right but for its lens: the kind that suits best, without curves that lie aside."""
-    tracker = _Tracker(grey, target, curves, free)
-    return tracker.refined(Followed(camera, target, tracker.measured(camera), np.inf))
+    tracker = _Tracker(grey, target, curves, free).of_painted(camera)
+    return tracker.refined(tracker.followed(camera, tracker.measured(camera), np.inf))
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,6 +106,16 @@ class _Tracker:
     target: Target
     curves: Collection[str]
     free: FreeIntrinsics
+    missing: tuple[str, ...] = ()
+
+    def followed(self, camera: Camera, lines: Lines, moved_px: float) -> Followed:
+        """What was measured from a camera."""
+        return Followed(camera, self.target, tuple(self.curves), self.missing, lines, moved_px)
+
+    def of_painted(self, camera: Camera) -> _Tracker:
+        """The same without what the target may lack and this camera does not see."""
+        painted = painted_curves(self.grey, self.target, camera, self.curves)
+        return replace(self, curves=painted, missing=tuple(name for name in self.curves if name not in painted))
 
     def tried(self, starts: Sequence[Camera]) -> Iterator[Followed]:
         """What is reached from each start: what is surely the field at once, then the others, the best first."""
@@ -194,7 +165,7 @@ class _Tracker:
         for number, reach in enumerate(reaches_px):
             names = self.free.names[: max(0, 2 * number - 1)]
             tracker, camera = tracker._search_step(camera, names, reach) or (tracker, camera)
-        return tracker.at_rest(camera, self.free.names)
+        return tracker.of_painted(camera).at_rest(camera, self.free.names)
 
     def at_rest(self, camera: Camera, names: tuple[str, ...]) -> Followed:
         """Measured and refitted, with these intrinsics free, until nothing moves any more."""
@@ -210,16 +181,17 @@ class _Tracker:
             camera, lines = there, tracker.measured(there)
             if moved < _AT_REST_PX:
                 break
-        return Followed(camera, tracker.target, lines, moved)
+        return tracker.followed(camera, lines, moved)
 
     def refined(self, followed: Followed) -> Followed:
         """The same, predicted with the lens that suits the curves best, without those that lie aside."""
-        followed = self.without_aside(followed)
+        whole = replace(self, curves=followed.curves, missing=followed.missing, target=followed.target)
+        followed = whole.without_aside(followed)
         if followed.built.is_other:
             return followed
-        curves = [name for name in self.curves if name not in followed.built.aside_m]
-        left = replace(self, curves=curves, target=followed.target)
-        return self.without_aside(left.with_best_lens(followed))
+        curves = [name for name in whole.curves if name not in followed.built.aside_m]
+        left = replace(whole, curves=curves, target=followed.target)
+        return whole.without_aside(left.with_best_lens(followed))
 
     def without_aside(self, followed: Followed) -> Followed:
         """The same without the curves that lie aside: none of them draws the camera to where others look aside."""
@@ -230,10 +202,15 @@ class _Tracker:
             known, built = built, whole.as_built(followed, free)
             if built.is_other or built.aside_m.keys() == known.aside_m.keys():
                 break
-            left = replace(whole, curves=[name for name in self.curves if name not in built.aside_m])
+            left = replace(whole, curves=[name for name in whole.curves if name not in built.aside_m])
             followed = left.at_rest(followed.camera, free)
             whole, left = (replace(one, target=followed.target) for one in (whole, left))
-        return replace(followed, built=built, lines=left.measured(followed.camera))
+        lines, beside = left.measured(followed.camera), None
+        if built.aside_m:
+            every = whole.measured(followed.camera)
+            aside = [followed.target.curve_index[name] for name in built.aside_m]
+            beside = every.take(np.isin(every.course.curve, aside))
+        return replace(followed, curves=tuple(self.curves), built=built, lines=lines, beside=beside)
 
     def as_built(self, followed: Followed, free: tuple[str, ...]) -> AsBuilt:
         """How all curves lie.
@@ -276,7 +253,8 @@ class _Tracker:
         best = min(fits, key=lambda fit: fit[0])[1]
         camera, target = best.station(), best.targets[TARGET]
         lines = replace(self, target=target).measured(camera)
-        refined = Followed(camera, target, lines, _moved_px(followed.camera, camera, lines.course.pixels))
+        moved = _moved_px(followed.camera, camera, lines.course.pixels)
+        refined = replace(self, target=target).followed(camera, lines, moved)
         return refined if refined.holds and refined.share > followed.share - _LESS else followed
 
     def _refitted(

@@ -7,9 +7,10 @@ from dataclasses import replace
 import numpy as np
 
 from ceres_cal.detect.courses import predict
-from ceres_cal.photographs.candidates import BY_CHANCE, FieldSearch
-from ceres_cal.photographs.follow import LEAST_SHARE, Followed
+from ceres_cal.photographs.candidates import FieldSearch
+from ceres_cal.photographs.followed import LEAST_SHARE, Followed
 from ceres_cal.photographs.matching import divergence
+from ceres_cal.photographs.painted import BY_CHANCE
 from ceres_cal.scene.targets import Target
 from ceres_cal.start.initialise import PHI_RANGE
 
@@ -79,9 +80,7 @@ def likelihood(followed: Followed) -> float:
 
     The log-likelihood ratio of so many places with paint: a grid that is moved by a line has fewer of them.
     """
-    found = followed.lines.found
-    share = float(np.mean(found)) if len(found) else 0.0
-    return float(len(found) * divergence(max(share, BY_CHANCE), BY_CHANCE))
+    return float(followed.places * divergence(max(followed.share, BY_CHANCE), BY_CHANCE))
 
 
 def explained(search: FieldSearch, followed: Followed, *, everywhere: bool = False) -> float:

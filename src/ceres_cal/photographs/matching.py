@@ -68,8 +68,8 @@ class StrokeMap:
 
     @cached_property
     def paint_px(self) -> float:
-        """The length of all strokes."""
-        return float(self.strokes.length_px.sum())
+        """The length of any lines that strokes can cover: of worn lines they cover the gaps, too."""
+        return max(self.near.length_px, 1.0)
 
     @cached_property
     def _by_chance(self) -> float:

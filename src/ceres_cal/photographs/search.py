@@ -20,7 +20,8 @@ from ceres_cal.photographs.facing import (
     require_sides,
     side_of,
 )
-from ceres_cal.photographs.follow import Followed, FreeIntrinsics, approach, refine
+from ceres_cal.photographs.follow import FreeIntrinsics, approach, refine
+from ceres_cal.photographs.followed import Followed
 from ceres_cal.photographs.grid import grid_of
 from ceres_cal.photographs.judgement import detected_curves, explained, likelihood, objection, same_labels
 from ceres_cal.photographs.refit import PointHints

@@ -6,7 +6,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import Image, Image8
 from ceres_cal.detect.strokes import find_strokes
-from ceres_cal.photographs.follow import Followed
+from ceres_cal.photographs.followed import Followed
 from ceres_cal.pictures.overlay import AFTER, BEFORE, TAKEN_OUT, Marks, draw_overlay, in_8_bit_colour
 from ceres_cal.scene.targets import Target
 

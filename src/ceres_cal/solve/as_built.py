@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -72,7 +73,7 @@ def solve_as_built(
 
 def tolerances_of(every: Sequence[AsBuilt]) -> dict[str, Tolerance]:
     """The sigmas as tolerances."""
-    sigmas: dict[str, dict[str, float]] = {}
+    sigmas: dict[str, dict[str, Any]] = {}
     for one in every:
         sigmas.setdefault(one.target, {})[f"{one.kind}_m"] = one.sigma_m
     return {target: Tolerance(**of) for target, of in sigmas.items()}

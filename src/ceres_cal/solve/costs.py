@@ -96,6 +96,13 @@ def kernel_loss(weighting: Weighting) -> kernels.Loss:
     return kernels.Loss(kernels.LOSS_CODES[weighting.loss], weighting.loss_scale)
 
 
+def robust_weights(weighting: Weighting, squared: Array) -> Array:
+    """(N,) the weight rho' that each squared residual has in the solve."""
+    weights = np.empty(len(squared))
+    kernels.loss_weights(kernel_loss(weighting), squared, weights)
+    return weights
+
+
 def as_built(
     points: kernels.PointColumns, curves: kernels.CurveColumns, sights: Sights, structure: Structure
 ) -> tuple[kernels.PointColumns, kernels.CurveColumns]:

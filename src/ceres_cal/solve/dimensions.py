@@ -10,6 +10,7 @@ import numpy as np
 from ceres_cal.base.errors import DegenerateError
 from ceres_cal.model.dimensions import redrawn
 from ceres_cal.model.parameters import Estimate, Options
+from ceres_cal.model.structure import Tolerance
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.scene.targets import Target
 from ceres_cal.solve.information import information
@@ -21,11 +22,19 @@ _UNMEASURED = 0.3
 
 
 def free_dimensions(observations: Observations, options: Options) -> tuple[Observations, Options]:
-    """The observations of targets drawn with the lengths that are stated of them, and options that name those."""
+    """The observations of targets drawn with the lengths that are stated of them, and options that name those, and the
+    tolerances of curves that lie beside their drawing.
+    """
     priors = (*observations.priors, *options.priors)
     names = dict.fromkeys((*options.dimensions, *(prior.dimension for prior in priors if prior.dimension)))
     drawn = observations.with_targets(drawn_as_stated(observations.targets, priors))
-    return drawn, replace(options, dimensions=tuple(names))
+    tolerances = dict(options.tolerances)
+    for prior in priors:
+        if prior.curve:
+            known = tolerances.get(prior.name, Tolerance())
+            sigma_m = max(prior.sigma[0], known.lines_m)
+            tolerances[prior.name] = replace(known, curve_m={**known.curve_m, prior.curve: sigma_m})
+    return drawn, replace(options, dimensions=tuple(names), tolerances=tolerances)
 
 
 def drawn_as_stated(targets: Mapping[str, Target], priors: Sequence[Prior]) -> dict[str, Target]:

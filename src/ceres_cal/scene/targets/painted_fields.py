@@ -82,6 +82,7 @@ class Template(msgspec.Struct, forbid_unknown_fields=True):
     Attributes:
         source: the rules: document, edition, clause, and what is from memory of them. measured: to which edges.
         dimensions, parts: name -> value, or the value of each variant. lengths: name -> expression, in order.
+        optional: parts that a field may lack without being another one.
     """
 
     kind: str
@@ -93,6 +94,7 @@ class Template(msgspec.Struct, forbid_unknown_fields=True):
     segments: dict[str, _Segment]
     variants: _Variants | None = None
     parts: dict[str, bool | dict[str, bool]] = {}
+    optional: tuple[str, ...] = ()
     lengths: dict[str, Expression] = {}
     arcs: dict[str, _Arc] = {}
     points: dict[str, _Point] = {}
@@ -116,7 +118,7 @@ class Template(msgspec.Struct, forbid_unknown_fields=True):
         try:
             for name, expression in self.lengths.items():
                 names[name] = _value(expression, names)
-            shapes = _painted({**self.segments, **self.arcs}, parts)
+            shapes = list(_painted({**self.segments, **self.arcs}, parts))
             curves = {name: shape.curve(names, mirror) for name, mirror, shape in shapes}
             points = {name: _place(one.at, names, mirror) for name, mirror, one in _painted(self.points, parts)}
         except (ValueError, ZeroDivisionError, OverflowError):
@@ -130,6 +132,9 @@ class Template(msgspec.Struct, forbid_unknown_fields=True):
             curves,
             mistaken_for=self._others(variant, switched),
             dimensions=dimensions,
+            optional=tuple(
+                tuple(name for name, _, shape in shapes if part in shape.parts) for part in self.optional if parts[part]
+            ),
         )
 
     def _require_known(self, variant: str | None, given: Mapping[str, float | bool]) -> None:

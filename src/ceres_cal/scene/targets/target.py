@@ -55,6 +55,7 @@ class Target:
         mistaken_for: in words -> spec of another target that has features of the same names.
         dimensions: the lengths, m, that its spec gives or implies, by their names there; with another value in the
             spec its features lie elsewhere.
+        optional: names of curves that go together and that a field may lack without being another one.
     """
 
     spec: Mapping[str, Any]
@@ -66,6 +67,7 @@ class Target:
     paper: Paper | None = None
     mistaken_for: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     dimensions: Mapping[str, float] = field(default_factory=dict)
+    optional: tuple[tuple[str, ...], ...] = ()
 
     def __eq__(self, other: object) -> bool:
         return (

@@ -1,0 +1,68 @@
+"""How well a target's own lines are seen where a camera puts them, and which of those it may lack are not there."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+
+import numpy as np
+
+from ceres_cal.base.arrays import Array, Array32
+from ceres_cal.detect.courses import predict
+from ceres_cal.detect.lines import search
+from ceres_cal.photographs.matching import divergence
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.targets import Target
+
+# Where lines are sought: px apart, and to either side as a share of half the image's diagonal; and how bright, of the
+# usual brightest, is paint. So many of any lines would be found there by chance.
+_SPACING_PX, _REACH, _CLEAR, _FEWEST = 8.0, 0.035, 0.4, 12
+BY_CHANCE = 0.3  # of the places on any lines, those that lie on paint
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """Of each of the target's C curves: places in view, and those of them that have paint nearby."""
+
+    places: Array
+    bright: Array
+
+    def lacks(self, target: Target, part: Collection[str]) -> bool:
+        """Whether these curves are in view and nothing is seen of them but by chance."""
+        rows = [target.curve_index[name] for name in part]
+        return bool(np.sum(self.bright[rows]) < BY_CHANCE * np.sum(self.places[rows]))
+
+
+def _seen(grey: Array32, target: Target, camera: Camera, curves: Collection[str]) -> _Seen:
+    course = predict(target, camera, curves, _SPACING_PX, _SPACING_PX)
+    count = len(target.curves)
+    if len(course) < _FEWEST:
+        return _Seen(np.zeros(count), np.zeros(count))
+    light = search(grey, course, 0.5 * _REACH * float(np.hypot(*camera.image_size)))[1]
+    bright = light > _CLEAR * float(np.quantile(light, 0.8))
+    return _Seen(*(np.bincount(course.curve, one, count).astype(float) for one in (np.ones(len(course)), bright)))
+
+
+def painted_curves(grey: Array32, target: Target, camera: Camera, curves: Collection[str]) -> tuple[str, ...]:
+    """These curves without the optional parts of the target that are not in the picture, where the camera sees them."""
+    seen = _seen(grey, target, camera, curves)
+    lacking = {name for part in target.optional if seen.lacks(target, part) for name in part}
+    return tuple(name for name in curves if name not in lacking)
+
+
+def likelihood_of_place(grey: Array32, target: Target, camera: Camera, curves: Collection[str]) -> float:
+    """How much likelier the target is there than elsewhere, by where its own lines are seen in the picture itself.
+
+    The log-likelihood ratio of so many places with paint, less what tells that the curves do not share one share: of a
+    target that is elsewhere some lie on paint and others do not, while wear and robots are everywhere. Optional parts
+    that are not seen say nothing.
+    """
+    seen = _seen(grey, target, camera, curves)
+    painted = np.ones(len(target.curves), dtype=bool)
+    for part in target.optional:
+        painted[[target.curve_index[name] for name in part]] &= not seen.lacks(target, part)
+    places, bright = seen.places[painted], seen.bright[painted]
+    if not np.sum(places):
+        return -np.inf
+    own, share = bright / np.maximum(places, 1.0), max(float(np.sum(bright) / np.sum(places)), BY_CHANCE)
+    return float(np.sum(places) * divergence(share, BY_CHANCE) - np.sum(places * divergence(own, share)))
