@@ -37,7 +37,7 @@ from benchmark_problems import (
     wide_lens,
 )
 from benchmark_process import process_rows
-from benchmark_scale import FOLDER, stored_growth, write_field
+from benchmark_scale import FOLDER, frames_in_turns, stored_growth, write_field
 
 from ceres_cal.scene.heights import ROBOT_TOP_M
 from ceres_cal.scene.lens import KannalaBrandt
@@ -325,13 +325,25 @@ SCALE = {
     "size": ("line points", "d"),
     "workers": ("workers", "d"),
     "seconds": ("seconds", ".1f"),
+    "processor": ("of a processor", ".1f"),
+    "longest": ("caller and busiest", ".1f"),
+    "times_seconds": ("times one's seconds", ".2f"),
+    "times_longest": ("busiest", ".2f"),
     "open_seconds": ("opened in", ".1f"),
     "peak_mib": ("peak MiB", ".0f"),
     "worker_mib": ("of a worker", ".0f"),
     "iterations": ("iterations", "d"),
     "iteration_seconds": ("s each", ".3f"),
     "iteration_bytes": ("bytes each", "d"),
+    "overhead_ms": ("overhead ms", ".1f"),
     "focal_error_px": ("focal error px", "+.3f"),
+}
+FRAMES = {
+    "frames": ("frames", "d"),
+    "processor_us": ("us of a processor", ".1f"),
+    "wall_us": ("us", ".1f"),
+    "times_processor": ("times the fewest's, processor", ".3f"),
+    "times_wall": ("wall", ".3f"),
 }
 PIXELS_TOLD = {"lens": ("lens", ""), "locate": ("locate s", ".3f"), "project": ("project s", ".3f")}
 
@@ -426,18 +438,22 @@ def measure(chosen: argparse.Namespace) -> dict[str, Any]:
 
 def measure_scale(chosen: argparse.Namespace) -> dict[str, Any]:
     """Line points in files, in one process and with Dask's workers; frames; and how they grow."""
-    rows = []
+    rows: list[dict[str, Any]] = []
     for count in chosen.scale:
         with tempfile.TemporaryDirectory() as folder:
             os.environ[FOLDER] = str(Path(folder) / "field.columns")
             write_field(Path(os.environ[FOLDER]), count)
             for workers in chosen.workers:
-                rows.append(alone("stored", count, workers))
+                row = alone("stored", count, workers)
+                one = next((other for other in rows if other["size"] == count and other["workers"] == 1), row)
+                row |= {f"times_{what}": row[what] / one[what] for what in ("seconds", "longest") if workers}
+                rows.append(row)
                 print_table("line points in files", SCALE, rows[-1:])
     for workers in chosen.workers:
         print_growth(f"with {workers} workers", [row for row in rows if row["workers"] == workers])
-    frames = [frames_growth(count, chosen.repeat) for count in chosen.growth]
-    print_growth("growth with the frames", frames)
+    frames = frames_in_turns(chosen.scale_frames, chosen.repeat)
+    title = f"a frame's time, in turns with {min(chosen.scale_frames)} frames; median of {chosen.repeat} turns"
+    print_table(title, FRAMES, frames)
     return {"environment": environment(), "stored": rows, "frames": frames}
 
 
@@ -500,8 +516,9 @@ def main(arguments: Sequence[str]) -> int:
         type=numbers,
         nargs="?",
         const="1e7,1e8",
-        help="line points in files, and --growth; no more: %(const)s",
+        help="line points in files, and --scale-frames; no more: %(const)s",
     )
+    parser.add_argument("--scale-frames", type=numbers, default="1e3,1e4,1e5", help="in --scale: %(default)s")
     parser.add_argument("--workers", type=numbers, default="0,1,2", help="of Dask in --scale, 0 is none: %(default)s")
     parser.add_argument("--process", action="store_true", help="whole processes in turns, and no more")
     parser.add_argument("--alone", nargs=3, help=argparse.SUPPRESS)

@@ -6,7 +6,7 @@ import os
 import pickle
 import resource
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -14,9 +14,10 @@ from typing import Any
 
 import msgspec
 import numpy as np
-from benchmark_peers import peak_mib
-from benchmark_problems import field_observations
+from benchmark_peers import Corners, peak_mib
+from benchmark_problems import corner_observations, field_observations, wide_lens
 
+from ceres_cal.base.arrays import Array
 from ceres_cal.observations import Observations
 from ceres_cal.observations.columns import View
 from ceres_cal.observations.files import header_of
@@ -25,6 +26,8 @@ from ceres_cal.observations.folders import HEADER
 FOLDER = "CERES_CAL_BENCHMARK"  # the environment's name of where the observations are
 _FRAMES = 2000  # written at once
 _WARM_UP = 20_000
+_TIMES = 10  # the fewest frames between two times of more
+_ASKED = 50  # times, for what asking takes
 
 
 def write_field(path: Path, line_points: int) -> None:
@@ -66,17 +69,20 @@ def stored_growth(line_points: int, workers: int) -> dict[str, Any]:
     calibrate(field_observations(_WARM_UP), options)
     with ExitStack() as stack:
         client = stack.enter_context(_cluster(workers)) if workers else None
-        start = time.perf_counter()
+        before, start = _processor(client), time.perf_counter()
         observations = Observations.load(os.environ[FOLDER])
         opened = time.perf_counter()
         trips = _watched(stack)
         calibration = calibrate(observations, options, client=client)
         seconds = time.perf_counter() - start
+        processor = [now - then for now, then in zip(_processor(client), before, strict=True)]
         peaks = client.run(resource.getrusage, resource.RUSAGE_SELF).values() if client else ()
         return {
             "size": line_points,
             "workers": workers,
             "seconds": seconds,
+            "processor": sum(processor),
+            "longest": processor[0] + max(processor[1:], default=0.0),
             "open_seconds": opened - start,
             "focal_error_px": calibration.cameras["overhead"].phi - 600.0,
             "phi": calibration.cameras["overhead"].phi,
@@ -85,14 +91,76 @@ def stored_growth(line_points: int, workers: int) -> dict[str, Any]:
             "iterations": len(trips),
             "iteration_seconds": float(np.median([seconds for seconds, _ in trips])),
             "iteration_bytes": max(size for _, size in trips),
+            "overhead_ms": 1e3 * _overhead_s(client, observations) if client else None,
         }
+
+
+def _processor(client: Any) -> list[float]:
+    """Processor seconds of this process, and of each worker."""
+    return [time.process_time(), *(client.run(time.process_time).values() if client else ())]
+
+
+def _overhead_s(client: Any, observations: Observations) -> float:
+    """What it takes to ask the workers and hear their answers, without the work: the median."""
+    from ceres_cal.solve.engines import OnWorkers
+    from ceres_cal.solve.shares import cut
+
+    engine, seconds = OnWorkers(client, list(cut(observations))), []
+    for _ in range(_ASKED):
+        start = time.perf_counter()
+        engine.ask(_nothing)
+        seconds.append(time.perf_counter() - start)
+    engine.close()
+    return float(np.median(seconds))
+
+
+def _nothing(_: Any) -> int:
+    return 0
+
+
+def frames_in_turns(sizes: Sequence[int], turns: int) -> list[dict[str, Any]]:
+    """What a frame of a board before a wide lens takes, and how many times what one of the fewest takes, in turns.
+
+    Each size stands between two times of the fewest: a processor's pace changes by half within a minute.
+    """
+    from ceres_cal.calibrating import calibrate
+    from ceres_cal.model.parameters import Options
+
+    options, few = Options(lens="brown", free_aspect=True), wide_lens(min(sizes)).corners
+
+    def spent(corners: Corners, times: int = 1) -> Array:
+        each = []
+        for _ in range(times):
+            observations = corner_observations(corners)
+            before = time.process_time(), time.perf_counter()
+            calibrate(observations, options)
+            each.append((time.process_time() - before[0], time.perf_counter() - before[1]))
+        return np.asarray(np.mean(each, axis=0) / corners.frames)
+
+    spent(few, 3)
+    rows = []
+    for frames in sizes:
+        corners, times = wide_lens(frames).corners, int(np.clip(frames // min(sizes), 1, _TIMES))
+        spent(corners)
+        own, ratios, before = [], [], spent(few, times)
+        for _ in range(turns):
+            own.append(spent(corners))
+            after = spent(few, times)
+            ratios.append(own[-1] / (0.5 * (before + after)))
+            before = after
+        (processor, wall), (times_processor, times_wall) = np.median(own, axis=0), np.median(ratios, axis=0)
+        rows.append({
+            "frames": frames, "processor_us": 1e6 * processor, "wall_us": 1e6 * wall,
+            "times_processor": times_processor, "times_wall": times_wall,
+        })  # fmt: skip
+    return rows
 
 
 def _cluster(workers: int) -> Any:
     """A client of so many worker processes on this machine."""
     from distributed import Client, LocalCluster
 
-    return Client(LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address=None, memory_limit=0))
+    return Client(LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address=":0", memory_limit=0))
 
 
 def _watched(stack: ExitStack) -> list[tuple[float, int]]:

@@ -1,53 +1,37 @@
 """Compile the kernels that the package carries along: python scripts/carry_kernels.py [--help]
 
-For a baseline that every machine of the last ten years has, into src/ceres_cal/kernels/carried, from where wheels take
-them; what is there already, of the same sources, is not made again. Which kernels: those that the commands below call.
-A kernel that is not among them is compiled where it is used.
+For a baseline that every machine of the last ten years has, into a shared library in src/ceres_cal/kernels/carried,
+from where wheels take it; what is there already, of the same sources, is not made again. Without a C++ compiler, which
+links it, or on a machine without a baseline, they are compiled where they are used.
 """
 
 from __future__ import annotations
 
 import argparse
+import logging
 import os
 import platform
 import shutil
 import subprocess
 import sys
 import tempfile
-from contextlib import redirect_stdout
-from io import StringIO
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-SAMPLE, MOVED = (ROOT / "data" / name / "observations.json" for name in ("ssl_field", "ssl_field_moved"))
-
-
-def commands(folder: Path) -> list[list[str]]:
-    """As they are typed."""
-    from ceres_cal.scene.lens import LENSES
-
-    sample = ["calibrate", str(SAMPLE), "--quiet"]
-    found = [[*sample, "--output", str(folder / "sample.json")]]
-    found += [[*sample, "--lens", lens, "--free-aspect"] for lens in LENSES]
-    found += [[*sample, "--closed-form-only"], ["calibrate", str(MOVED), "--quiet"]]
-    found += [["diagnose", str(folder / "sample.json"), str(SAMPLE)]]
-    found += [["refit", str(folder / "sample.json"), str(MOVED), "--output", str(folder / "moved.json")]]
-    found += [["check", str(folder / "sample.json"), str(MOVED)], ["advise", str(folder / "sample.json")]]
-    return found
 
 
 def compile_all() -> int:
-    """Run the commands in this process, which compiles what they call; a command that says no has called it too."""
-    from ceres_cal.cli import main
+    """All that is called from outside of the kernels, and what lenses do for them."""
+    from ceres_cal.kernels import KERNELS
+    from ceres_cal.kernels.library import library_path
+    from ceres_cal.kernels.linking import link
+    from ceres_cal.scene.lens import LENSES
 
-    with tempfile.TemporaryDirectory() as folder:
-        every = commands(Path(folder))
-        for number, command in enumerate(every, 1):
-            print(f"\rcompiling the kernels: {number} of {len(every)}", end="", file=sys.stderr, flush=True)
-            with redirect_stdout(StringIO()):
-                code = main(command)
-            if code not in (0, 1):
-                print(f"  (code {code}: {' '.join(command[:4])})", file=sys.stderr)
+    logging.getLogger("ceres_cal").setLevel(logging.ERROR)  # the bar says that it takes time
+    lenses = {(lens.prepare, lens.distort_chunk, lens.differentiate_chunk) for lens in LENSES.values()}
+    steps = len(KERNELS) + len(lenses)
+    for done, _ in enumerate(link(library_path(), list(KERNELS), sorted(lenses, key=str)), 1):
+        print(f"\rcompiling the kernels: {done} of {steps}", end="", file=sys.stderr, flush=True)
     print(file=sys.stderr)
     return 0
 
@@ -55,29 +39,24 @@ def compile_all() -> int:
 def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n")[1])
     parser.add_argument("--here", action="store_true", help=argparse.SUPPRESS)
-    sys.path.insert(0, str(ROOT / "src"))
+    sys.path[0] = str(ROOT / "src")  # numba would take scripts here for what it may import
     if parser.parse_args().here:
         return compile_all()
-    from ceres_cal.kernels.store import BASELINES, CARRIED_FOLDER, digest
+    from ceres_cal.kernels.library import BASELINES, library_path
+    from ceres_cal.kernels.linking import compiler
 
-    stamp = CARRIED_FOLDER / "sources"  # the lenses' own kernels lie elsewhere than the folder is named after
-    package = ROOT / "src" / "ceres_cal"
-    sources = digest([*package.glob("kernels/*.py"), *package.glob("scene/lens/*.py")])
-
-    if platform.machine() not in BASELINES:
-        print(f"no baseline for {platform.machine()}: kernels are compiled where they are used", file=sys.stderr)
+    if library_path().is_file():
         return 0
-    if stamp.is_file() and stamp.read_text() == sources:
+    if platform.machine() not in BASELINES or compiler() is None:
+        what = "C++ compiler" if compiler() is None else f"baseline for {platform.machine()}"
+        print(f"no {what}: kernels are compiled where they are used", file=sys.stderr)
         return 0
     name, features = BASELINES[platform.machine()]
-    shutil.rmtree(CARRIED_FOLDER.parent, ignore_errors=True)  # or its kernels would be taken instead of compiled
+    shutil.rmtree(library_path().parent, ignore_errors=True)  # what older sources made
     with tempfile.TemporaryDirectory() as cache:
         baseline = {"NUMBA_CPU_NAME": name, "NUMBA_CPU_FEATURES": ",".join(f"+{one}" for one in features)}
         environment = {**os.environ, **baseline, "NUMBA_CACHE_DIR": cache}
         subprocess.run([sys.executable, __file__, "--here"], env=environment, check=True)
-        (compiled,) = Path(cache).glob(f"ceres-cal/*/{name}-*")
-        shutil.copytree(compiled, CARRIED_FOLDER)
-        stamp.write_text(sources)
     return 0
 
 

@@ -201,9 +201,13 @@ def _measure(figures: str, folder: Path, runs: int, setting: Sequence[str] | Non
     """In the process that `measured` starts: set the constant, then measure; the last line printed is the answer."""
     from constants_figures import FIGURES  # with it, everything that copies constants
 
+    from ceres_cal.kernels import library
+
     if setting is not None:
         constant = next(one for one in DECIDING if str(one) == setting[0])
         value: Any = json.loads(setting[1])
+        if constant.module.startswith("kernels"):  # what came with the package has its own
+            vars(library)["library_path"] = Path
         constant.set(tuple(value) if isinstance(value, list) else value)
     print(json.dumps(FIGURES[figures](runs, folder)))
     return 0

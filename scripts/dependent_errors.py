@@ -1,4 +1,4 @@
-"""Errors that go together, to be put onto simulated observations: for `coverage.py`."""
+"""Errors that go together, to be put onto simulated observations: for `intervals.py`."""
 
 from __future__ import annotations
 

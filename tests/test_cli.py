@@ -11,6 +11,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
+from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,11 +23,13 @@ from accuracy_scenes import CLEAN_NOISE, tilted
 from scenes import RADIAL
 
 import ceres_cal.calibrating
+from ceres_cal import cli
 from ceres_cal.base.errors import InputError
 from ceres_cal.calibration import Calibration
-from ceres_cal.cli import COMMANDS, main
+from ceres_cal.cli import commands, main
 from ceres_cal.cli.arguments import length, parse_length
 from ceres_cal.cli.colour import coloured, in_colour
+from ceres_cal.cli.commands import COMMANDS
 from ceres_cal.cli.progress import ProgressBar
 from ceres_cal.detect.boards import CORNER_FITS
 from ceres_cal.model.parameters import LOSSES, Options
@@ -92,6 +95,11 @@ def test_help_lists_every_command(say: Say) -> None:
     said = say("--help")
     assert said.code == 0 and said.err == ""
     assert all(f"  {name:14}  {command.summary}\n" in said.out for name, command in COMMANDS.items())
+    modules = [import_module(f"ceres_cal.cli.{one.stem}") for one in Path(cli.__file__).parent.glob("[!_]*.py")]
+    written = [
+        command.name for module in modules for command in getattr(module, "COMMANDS", ()) if module is not commands
+    ]
+    assert set(COMMANDS) == {*written} and len(written) == len(COMMANDS)
     assert set(COMMANDS) == {
         "run",
         "detect board",
@@ -236,6 +244,13 @@ def test_a_shell_completes(say: Say, tmp_path: Path, words: list[str], completed
         capture_output=True, text=True, check=True,
     )  # fmt: skip
     assert set(done.stdout.split()) == completed, done.stderr
+
+
+def test_what_is_to_be_done_at_the_end_is_done() -> None:
+    """Though the process does not take Python apart: what others registered, and what stands in the streams."""
+    code = "import atexit; from ceres_cal.cli import main; atexit.register(print, 'last'); main(); print('never')"
+    run = subprocess.run([sys.executable, "-c", code, "calibrate"], capture_output=True, text=True, check=False)
+    assert (run.returncode, run.stdout) == (2, "last\n") and "required: OBS" in run.stderr
 
 
 def test_help_and_wrong_usage_bring_in_nothing_heavy() -> None:

@@ -77,9 +77,9 @@ def test_what_a_longer_lens_refutes_is_not_as_good() -> None:
     """With few groups hardly any difference is outside of its own scatter, however large it is."""
     plain, better_once = np.full(6, 10.0), np.array([1.0, *[10.0] * 5])
     labels, counts = [PAPER, "brown k1 k2 p1 p2"], [2, 4]
-    assert decide(labels, counts, [plain, better_once], refuted=[True, False]) == (1, 1)
-    assert decide(labels, counts, [plain, better_once], refuted=[False, False]) == (1, 0)
-    assert decide(labels, counts, [better_once, plain], refuted=[True, False]) == (0, 1)
+    assert decide(labels, counts, [plain, better_once], is_refuted=(True, False).__getitem__) == (1, 1)
+    assert decide(labels, counts, [plain, better_once], is_refuted=(False, False).__getitem__) == (1, 0)
+    assert decide(labels, counts, [better_once, plain], is_refuted=(True, False).__getitem__) == (0, 1)
 
 
 def test_decentring_is_seen_in_a_few_views(sony_boards: BoardDetections) -> None:

@@ -10,7 +10,8 @@ import pytest
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.calibration import Calibration
-from ceres_cal.cli import COMMANDS, main
+from ceres_cal.cli import main
+from ceres_cal.cli.commands import COMMANDS
 from ceres_cal.cli.run import _short
 from ceres_cal.detect.video import sharpest_frames
 

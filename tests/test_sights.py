@@ -117,6 +117,23 @@ def test_only_the_rows_that_are_used() -> None:
     assert_true_to(observations, used)
 
 
+@pytest.mark.parametrize("run", [1, 10**6])
+def test_rows_move_alike_one_by_one_and_in_runs(run: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ceres_cal.observations.sights._RUN", run)
+    sights, rng = gather_sights(seen()), np.random.default_rng(1)
+    points, curves = rng.random(len(sights.point_rows)) > 0.2, rng.random(len(sights.curve_rows)) > 0.2
+    points[[0, -1]] = curves[[0, -1]] = False
+    used = sights.used(points, curves)
+    for name in ("point_rows", "point_index", "points", "pixels", "sigma_px"):
+        np.testing.assert_array_equal(getattr(used, name), getattr(sights, name)[points[sights.point_rows]])
+    for name in ("curve_rows", "track_index", "curve_pixels", "curve_sigma_px"):
+        np.testing.assert_array_equal(getattr(used, name), getattr(sights, name)[curves[sights.curve_rows]])
+    for number, key in enumerate(used.keys):
+        before, after = sights[sights.keys.index(key)], used[number]
+        np.testing.assert_array_equal(after.point_rows, before.point_rows[points[before.point_rows]])
+        np.testing.assert_array_equal(after.curve_rows, before.curve_rows[curves[before.curve_rows]])
+
+
 def test_sights_of_which_nothing_is_left_are_left_out() -> None:
     observations = seen()
     sights = gather_sights(observations)

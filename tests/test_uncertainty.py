@@ -1,6 +1,6 @@
 """Verdicts, profile bounds, maps in mm and seams, against what was built in and against brute force.
 
-`scripts/coverage.py` has the full samples; here are small ones.
+`scripts/intervals.py` has the full samples; here are small ones.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from accuracy_bound import bound, make_trial
 from accuracy_scenes import CLEAN_NOISE, FIELD, painted_by_two_cameras, tilted, two_cameras
-from coverage import CASES, cover, share
+from intervals import CASES, cover, share
 from scenes import RADIAL, SCENES
 
 from ceres_cal.base.arrays import Array
@@ -205,8 +205,8 @@ def test_bounds_in_words(low: float, high: float, words: str) -> None:
 
 @pytest.mark.parametrize("name", ["tilt 25 deg", "tilt 3 deg", "tilt 1 deg", "tilt 1 deg, height", "boards"])
 def test_intervals_hold_what_they_say(name: str) -> None:
-    """Four standard errors around 0.95; scripts/coverage.py has 500 runs of each, 0.943 to 0.964 measured. (25 degrees:
-    0.98 in these 60, 0.955 in 150; where nearly all hold a sample's own error is too small.)
+    """Four standard errors around 0.95; scripts/intervals.py has 500 runs of each, 0.943 to 0.964 measured. (25
+    degrees: 0.98 in these 60, 0.955 in 150; where nearly all hold a sample's own error is too small.)
     """
     found = cover(CASES[name], range(RUNS))
     assert found.failed == 0

@@ -11,7 +11,6 @@ import json
 import math
 import os
 import re
-import secrets
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -232,7 +231,7 @@ def _beside(target: Path) -> Iterator[tuple[int, Path]]:
         if entry.name.startswith(start) and entry.name.endswith(end):
             _remove_stale(target.parent / entry.name)
     while True:
-        beside = target.parent / f"{start}{secrets.token_hex(6)}{end}"
+        beside = target.parent / f"{start}{os.urandom(6).hex()}{end}"
         handle = os.open(beside, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
         with suppress(OSError):  # where a file system knows no locks
             fcntl.flock(handle, fcntl.LOCK_EX)

@@ -51,6 +51,11 @@ def known_inverses(information: Array, limits: Array) -> Array:
     return np.asarray(half @ np.swapaxes(half, -1, -2))
 
 
+def are_known(information: Array, limits: Array) -> bool:
+    """Whether nothing is unknown in any of many matrices (S, n, n), at a glance; False where it takes a closer look."""
+    return _regular_inverses(_scaled(information, limits)[1]) is not None
+
+
 def _regular_inverses(scaled: Array) -> Array | None:
     """Their plain inverses, ten times as fast, where no direction of any of them comes near to being unknown."""
     try:

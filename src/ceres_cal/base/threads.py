@@ -5,14 +5,16 @@ from __future__ import annotations
 import os
 import signal
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import cache
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np  # noqa: F401 its BLAS is what the controller looks for
 from threadpoolctl import ThreadpoolController
+
+if TYPE_CHECKING:
+    from concurrent.futures import Future, ThreadPoolExecutor
 
 _WORTH_US = 180.0  # of work in a part; below it a thread costs more than it brings
 _LATER_US = 100.0  # that another thread begins after this one
@@ -24,6 +26,8 @@ _T = TypeVar("_T")
 @cache
 def _pool() -> ThreadPoolExecutor:
     """For the parts that the caller's own thread does not take."""
+    from concurrent.futures import ThreadPoolExecutor
+
     return ThreadPoolExecutor(thread_name_prefix="ceres_cal")
 
 

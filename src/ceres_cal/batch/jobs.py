@@ -6,13 +6,13 @@ import json
 from collections.abc import Iterable
 from dataclasses import dataclass
 from hashlib import sha256
-from importlib.metadata import version
 from pathlib import Path
 
 import msgspec
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import convert, read_bytes
+from ceres_cal.base.version import __version__
 from ceres_cal.base.written import note
 
 RESULTS = "results.jsonl"
@@ -42,7 +42,7 @@ class Job:
         Raises:
             InputError: an input cannot be read.
         """
-        told = [version("ceres-cal"), self.command, *self.arguments]
+        told = [__version__, self.command, *self.arguments]
         digests = (sha256(read_bytes(file)).hexdigest() for file in _files(self.inputs))
         return sha256(json.dumps([told, list(digests)]).encode()).hexdigest()
 

@@ -211,6 +211,10 @@ class Calibration:
 
     def to_file(self) -> CalibrationFile:
         """The calibration as its file has it."""
+        return self._file
+
+    @cached_property
+    def _file(self) -> CalibrationFile:
         estimate = self.estimate
         return CalibrationFile(
             format=FORMAT,

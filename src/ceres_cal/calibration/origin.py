@@ -4,9 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
-from importlib.metadata import PackageNotFoundError, version
 
+import numpy as np
+
+from ceres_cal.base.version import __version__
+from ceres_cal.kernels import numba_version
 from ceres_cal.model.priors import GaussianPrior
+from ceres_cal.solve import solver_version
 
 COPY = "a copy"
 """How the reason begins of an observation that repeats another one, and was not taken out for its residual."""
@@ -165,10 +169,4 @@ class Refitted:
 @cache
 def package_versions() -> dict[str, str]:
     """Versions of what the numbers depend on."""
-    versions = {}
-    for name in ("ceres-cal", "pyceres", "numpy", "numba"):
-        try:
-            versions[name] = version(name)
-        except PackageNotFoundError:
-            versions[name] = "not installed"
-    return versions
+    return {"ceres-cal": __version__, "pyceres": solver_version, "numpy": np.__version__, "numba": numba_version()}

@@ -1,11 +1,11 @@
 """The commands: `ceres-cal COMMAND ...` (design, section 11).
 
-Only argparse is imported here and at the top of the commands' modules, so that help and wrong usage answer at once.
+Only argparse is imported here and at the top of the commands' modules, so that help and wrong usage answer at once; and
+of these only the one whose command is typed.
 """
 
 from __future__ import annotations
 
-import json
 import os
 import sys
 from collections.abc import Sequence
@@ -15,37 +15,10 @@ from ceres_cal.base.errors import CalibrationError, InputError, SolutionError
 from ceres_cal.base.words import first_of
 from ceres_cal.base.written import noting
 from ceres_cal.cli import colour
-from ceres_cal.cli.advise import COMMANDS as ADVISE
-from ceres_cal.cli.audit import COMMANDS as AUDIT
-from ceres_cal.cli.batch import COMMANDS as BATCH
-from ceres_cal.cli.calibrate import COMMANDS as CALIBRATE
-from ceres_cal.cli.check import COMMANDS as CHECK
 from ceres_cal.cli.command import Command, print_answer
-from ceres_cal.cli.compare import COMMANDS as COMPARE
-from ceres_cal.cli.completion import completion
-from ceres_cal.cli.detect import COMMANDS as DETECT_BOARD
-from ceres_cal.cli.detect_field import COMMANDS as DETECT_FIELD
-from ceres_cal.cli.detect_rings import COMMANDS as DETECT_RINGS
-from ceres_cal.cli.diagnose import COMMANDS as DIAGNOSE
-from ceres_cal.cli.export import COMMANDS as EXPORT
-from ceres_cal.cli.foreign import COMMANDS as FOREIGN
-from ceres_cal.cli.join import COMMANDS as JOIN
-from ceres_cal.cli.locate import COMMANDS as LOCATE
+from ceres_cal.cli.commands import COMMANDS
 from ceres_cal.cli.program import TERMINATED, Terminated, as_a_program, ended
-from ceres_cal.cli.refit import COMMANDS as REFIT
-from ceres_cal.cli.run import COMMANDS as RUN
-from ceres_cal.cli.score import COMMANDS as SCORE
-from ceres_cal.cli.simulate import COMMANDS as SIMULATE
-from ceres_cal.cli.targets import COMMANDS as TARGETS
-from ceres_cal.cli.undistort import COMMANDS as UNDISTORT
 
-_GROUPS = (
-    RUN,
-    *(DETECT_BOARD, DETECT_RINGS, DETECT_FIELD),
-    *(JOIN, CALIBRATE, DIAGNOSE, ADVISE, REFIT, CHECK, SCORE, COMPARE, AUDIT, BATCH),
-    *(LOCATE, UNDISTORT, EXPORT, FOREIGN, SIMULATE, TARGETS, (completion(lambda: COMMANDS),)),
-)
-COMMANDS: dict[str, Command] = {command.name: command for group in _GROUPS for command in group}
 _BEGINNINGS = {"", *(name.partition(" ")[0] for name in COMMANDS if " " in name)}
 _MOST_LETTERS = 200  # of an error that nobody wrote for people
 _INTERRUPTED, _PIPE_CLOSED = 130, 141  # what a shell reports of a program that SIGINT or SIGPIPE ended
@@ -105,6 +78,8 @@ def _fail(message: str, exit_code: int, as_json: bool) -> int:
     said = f"ceres-cal: {line}"
     print(colour.error(said) if colour.in_colour(sys.stderr) else said, file=sys.stderr)
     if as_json:
+        import json
+
         with suppress(OSError):
             print(json.dumps({"error": line, "exit_code": exit_code}), flush=True)
     return exit_code

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from argparse import ArgumentParser, Namespace
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.cli.command import Answer, Command, Parser
@@ -21,19 +21,15 @@ def _add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("shell", choices=_SHELLS, help="whose; what is printed goes into a file that it reads")
 
 
-def completion(every: Callable[[], Mapping[str, Command]]) -> Command:
-    """The command, of all commands there are."""
+def _run(args: Namespace) -> Answer:
+    try:
+        import shtab
+    except ImportError:
+        raise InputError("completion needs shtab: pip install 'ceres-cal[completion]'") from None
+    from ceres_cal.cli import commands
 
-    def run(args: Namespace) -> Answer:
-        try:
-            import shtab
-        except ImportError:
-            raise InputError("completion needs shtab: pip install 'ceres-cal[completion]'") from None
-        script = shtab.complete(whole_parser(every()), shell=args.shell)
-        return Answer({"shell": args.shell, "script": script}, lambda: script)
-
-    summary = "what a shell needs to complete commands, options and files"
-    return Command("completion", summary, _add_arguments, run, _EXAMPLES)
+    script = shtab.complete(whole_parser(commands.COMMANDS), shell=args.shell)
+    return Answer({"shell": args.shell, "script": script}, lambda: script)
 
 
 def whole_parser(commands: Mapping[str, Command]) -> ArgumentParser:
@@ -52,3 +48,10 @@ def whole_parser(commands: Mapping[str, Command]) -> ArgumentParser:
             if action.nargs != 0 and action.choices is None and not isinstance(action, argparse._SubParsersAction):
                 action.complete = _FILE  # type: ignore[attr-defined]
     return root
+
+
+COMMANDS = (
+    Command(
+        "completion", "what a shell needs to complete commands, options and files", _add_arguments, _run, _EXAMPLES
+    ),
+)

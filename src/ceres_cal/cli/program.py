@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import atexit
 import io
 import os
 import signal
 import sys
+from contextlib import suppress
 from types import FrameType
 from typing import NoReturn
 
@@ -20,6 +22,7 @@ class Terminated(KeyboardInterrupt):
 def as_a_program() -> None:
     """Take SIGTERM like Ctrl-C, print whatever a name holds, and let nobody but us write on standard error."""
     signal.signal(signal.SIGTERM, _terminate)
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # to begin threads that are not used (base.threads) takes time
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
@@ -43,10 +46,15 @@ def _silence_libraries() -> None:
 
 
 def ended(exit_code: int) -> int:
-    """The same code; the process ends here where native work that nobody waits for would hold it."""
+    """The process ends here, after all that was to be done at its end; Python would take its objects apart one by one,
+    which takes as long as many a solve, and wait for native work that was left to itself.
+    """
+    if os.environ.get("CERES_CAL_DEBUG"):  # a profiler wants its say
+        return exit_code
     native = sys.modules.get("ceres_cal.base.native")
-    if native is not None and native.is_busy():
-        for stream in (sys.stdout, sys.stderr):
+    if native is None or not native.is_busy():
+        atexit._run_exitfuncs()
+    for stream in (sys.stdout, sys.stderr):
+        with suppress(AttributeError, OSError, ValueError):  # there is none, nobody reads, it is closed
             stream.flush()
-        os._exit(exit_code)
-    return exit_code
+    os._exit(exit_code)

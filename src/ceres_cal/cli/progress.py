@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 import sys
 import time
 from argparse import Namespace
@@ -60,6 +59,8 @@ class ProgressBar:
         if self._silent or now < self._due:
             return
         if self._terminal:
+            import shutil
+
             bar = f"{_bar(done, total)} {note}" if total else note
             self._write(_CLEAR + bar[: shutil.get_terminal_size().columns - 1])
         else:

@@ -8,7 +8,7 @@ import numpy as np
 
 from ceres_cal.kernels.block import cholesky, substitute
 from ceres_cal.kernels.jit import jit
-from ceres_cal.kernels.planes import least_direction, normalise
+from ceres_cal.kernels.planes import least_direction, median, normalise
 
 
 @jit
@@ -112,17 +112,24 @@ def alignment_errors(bounds: Any, x: Any, p: Any, h12: Any, h3: Any, profile: An
 
 
 @jit
-def usual_by_radius(errors: Any, radius: Any) -> Any:
-    """(N,) the median error at each point's distance from the centre: profiles fit worst where lenses bend most."""
+def usual_by_radius(errors: Any, radius: Any, usual: Any) -> None:
+    """The median error at each point's distance from the centre, to `usual` (N,): profiles fit worst where lenses bend
+    most.
+    """
     rings = min(max(len(errors) // 200, 1), 16)  # few points in a ring, and its outliers would be the usual there
     farthest = 0.0
     for r in radius:
         farthest = max(farthest, r)
-    ring, usual = np.empty(len(errors), np.int64), np.empty(len(errors))
+    ring, inside = np.empty(len(errors), np.int64), np.empty(len(errors))
     for i in range(len(errors)):
         ring[i] = min(int(radius[i] * rings / (farthest + 1e-300)), rings - 1)
     for number in range(rings):
-        inside = np.flatnonzero(ring == number)
-        if len(inside) > 0:
-            usual[inside] = max(np.median(errors[inside]), 1e-12)
-    return usual
+        count = 0
+        for i in range(len(errors)):
+            if ring[i] == number:
+                inside[count] = errors[i]
+                count += 1
+        middle = max(median(inside[:count]), 1e-12) if count > 0 else 0.0
+        for i in range(len(errors)):
+            if ring[i] == number:
+                usual[i] = middle

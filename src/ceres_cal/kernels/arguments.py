@@ -13,7 +13,7 @@ class Optics(NamedTuple):
     """A camera's optics.
 
     Attributes:
-        prepare, distort, differentiate: addresses of the lens's compiled functions, see `lenses.lens_functions`.
+        prepare, distort, differentiate: addresses of the lens's compiled functions, see `library.lens_functions`.
         intrinsics: phi, aspect, cx, cy, scaled coefficients, skew. unit: half the image diagonal, px.
         state: what the lens is chosen by, and room for what it derives from its intrinsics, see `lenses.prepared`.
         work_rows: how many numbers per observation the lens keeps for its derivatives.
@@ -106,3 +106,7 @@ class Sweep(NamedTuple):
 
 NOTHING = np.empty(0)
 """A block that is held."""
+
+LOSS_CODES = {"trivial": 0, "huber": 1, "soft_l1": 2, "cauchy": 3, "tukey": 4}
+
+ROUNDING = 1e-9  # of a cost

@@ -10,12 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from ceres_cal.kernels.arguments import Blocks, CurveColumns, Loss, Optics, PointColumns, Unknowns
+from ceres_cal.kernels.arguments import ROUNDING, Blocks, CurveColumns, Loss, Optics, PointColumns, Unknowns
 from ceres_cal.kernels.jit import jit
 from ceres_cal.kernels.lenses import prepared
 from ceres_cal.kernels.sight import normal_equations, order_of_rows, working_space
-
-ROUNDING = 1e-9  # of a cost
 
 
 @jit

@@ -10,13 +10,16 @@ from ceres_cal.kernels.jit import jit
 
 
 @jit
-def grouped_scatter(values: Any, bounds: Any) -> Any:
-    """Mean of (v - mean)(v - mean)^T over values[bounds[g]:bounds[g + 1]] for every group g: (groups, k, k)."""
-    groups, size = len(bounds) - 1, values.shape[1]
-    scatter, mean = np.zeros((groups, size, size)), np.empty(size)
-    for g in range(groups):
+def grouped_scatter(values: Any, bounds: Any, scatter: Any) -> None:
+    """Mean of (v - mean)(v - mean)^T over values[bounds[g]:bounds[g + 1]] for every group g, to `scatter`, (groups, k,
+    k).
+    """
+    size = values.shape[1]
+    mean = np.empty(size)
+    for g in range(len(bounds) - 1):
         count = bounds[g + 1] - bounds[g]
         mean[:] = 0.0
+        scatter[g] = 0.0
         for n in range(bounds[g], bounds[g + 1]):
             for i in range(size):
                 mean[i] += values[n, i]
@@ -29,4 +32,3 @@ def grouped_scatter(values: Any, bounds: Any) -> Any:
             for j in range(i + 1):
                 scatter[g, i, j] /= count
                 scatter[g, j, i] = scatter[g, i, j]
-    return scatter

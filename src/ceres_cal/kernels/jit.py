@@ -11,16 +11,17 @@ from typing import Any
 from numba import njit
 from numba.core.ccallback import CFunc
 
-from ceres_cal.kernels.store import KernelStore, digest
+from ceres_cal.kernels.sources import digest
+from ceres_cal.kernels.store import KernelStore
 
 _NJIT: Any = njit  # no stub knows `_nrt`: whether references are counted
 
-_OPTIONS: dict[str, Any] = {"error_model": "numpy", "fastmath": {"reassoc", "contract", "nsz"}}
+OPTIONS: dict[str, Any] = {"error_model": "numpy", "fastmath": {"reassoc", "contract", "nsz"}}
 
 
 def jit(function: Callable[..., Any], counted: bool = True) -> Callable[..., Any]:
     """Compile without the GIL; reassoc and contract let sums be vectorised, NaN and infinity keep their meaning."""
-    compiled: Callable[..., Any] = _kept(_NJIT(nogil=True, _nrt=counted, **_OPTIONS)(function), function, set())
+    compiled: Callable[..., Any] = _kept(_NJIT(nogil=True, _nrt=counted, **OPTIONS)(function), function, set())
     return compiled
 
 
@@ -37,9 +38,9 @@ def compile_callback(function: Callable[..., Any], signature: Any) -> Any:
     Its arrays are its callers': it makes none.
     """
     files: set[Path] = set()
-    whole = _with_callees(function, files)
+    whole = with_callees(function, files)
     taken = signature.args, signature.return_type
-    callback: Any = CFunc(whole, taken, locals={}, options={"_nrt": False, **_OPTIONS})
+    callback: Any = CFunc(whole, taken, locals={}, options={"_nrt": False, **OPTIONS})
     _kept(callback, whole, files).compile()
     return callback
 
@@ -52,12 +53,12 @@ def _kept(compiled: Any, function: Callable[..., Any], files: set[Path]) -> Any:
     return compiled
 
 
-def _with_callees(function: Any, files: set[Path]) -> FunctionType:
+def with_callees(function: Any, files: set[Path]) -> FunctionType:
     """The function with compiled ones in place of the plain functions that it names; `files` are where they all are."""
     files.add(Path(inspect.getfile(function)))
     known = function.__globals__
     plain = {name: known[name] for name in function.__code__.co_names if isinstance(known.get(name), FunctionType)}
-    compiled = {name: _NJIT(_nrt=False, **_OPTIONS)(_with_callees(one, files)) for name, one in plain.items()}
+    compiled = {name: _NJIT(_nrt=False, **OPTIONS)(with_callees(one, files)) for name, one in plain.items()}
     whole = FunctionType(function.__code__, {**known, **compiled}, function.__name__, None, function.__closure__)
     whole.__qualname__ = function.__qualname__
     return whole

@@ -18,24 +18,24 @@ from ceres_cal.kernels.arguments import Optics
 from ceres_cal.kernels.jit import borrowing, compile_callback, jit
 
 _Numbers, _Rows, _Jacobian = types.float64[::1], types.float64[:, ::1], types.float64[:, :, ::1]
-_OF_PREPARE = types.void(_Numbers, types.float64, _Numbers)
-_OF_DISTORT = types.boolean(types.int64, _Numbers, types.float64, _Numbers, _Rows, _Rows, _Rows)
-_OF_DIFFERENTIATE = types.void(types.int64, _Numbers, types.float64, _Numbers, _Rows, _Rows, _Jacobian)
+SIGNATURES = (
+    types.void(_Numbers, types.float64, _Numbers),
+    types.boolean(types.int64, _Numbers, types.float64, _Numbers, _Rows, _Rows, _Rows),
+    types.void(types.int64, _Numbers, types.float64, _Numbers, _Rows, _Rows, _Jacobian),
+)
+"""Of a lens's own functions: prepare, distort, differentiate."""
 
 
 _CODE: Any = cgutils.__dict__["ir"]  # llvmlite, which has no stubs
 
 
 @cache
-def lens_functions(
+def compiled_functions(
     prepare: Callable[..., None], distort: Callable[..., bool], differentiate: Callable[..., None]
 ) -> tuple[Any, Any, Any]:
-    """A lens's own functions compiled; `address` of each is what `Optics` takes. See `scene.lens.Lens`."""
-    return (
-        compile_callback(prepare, _OF_PREPARE),
-        compile_callback(distort, _OF_DISTORT),
-        compile_callback(differentiate, _OF_DIFFERENTIATE),
-    )
+    """A lens's own functions compiled."""
+    first, second, third = map(compile_callback, (prepare, distort, differentiate), SIGNATURES)
+    return first, second, third
 
 
 def _calls(expected: Any) -> Any:
@@ -57,7 +57,7 @@ def _calls(expected: Any) -> Any:
     return call
 
 
-_call_prepare, _call_distort, _call_differentiate = map(_calls, (_OF_PREPARE, _OF_DISTORT, _OF_DIFFERENTIATE))
+_call_prepare, _call_distort, _call_differentiate = map(_calls, SIGNATURES)
 
 
 @jit

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from ceres_cal.kernels.arguments import Loss
+from ceres_cal.kernels.arguments import LOSS_CODES, Loss
 from ceres_cal.kernels.jit import jit
 
-LOSS_CODES = {"trivial": 0, "huber": 1, "soft_l1": 2, "cauchy": 3, "tukey": 4}
-
-_TRIVIAL, _HUBER, _SOFT_L1, _CAUCHY = 0, 1, 2, 3
+_TRIVIAL, _HUBER, _SOFT_L1, _CAUCHY = (LOSS_CODES[name] for name in ("trivial", "huber", "soft_l1", "cauchy"))
 _STRAIGHT = 0.1  # in place of 0, where a loss has no curvature left
 
 

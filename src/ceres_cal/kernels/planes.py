@@ -15,6 +15,34 @@ _WRONG = 8.0
 
 
 @jit
+def median(values: Any) -> float:
+    """Of numbers; NumPy's own, as numba has it, needs more of numba than its runtime. By Hoare's selection."""
+    kept, half = values.copy(), len(values) // 2
+    low, high = 0, len(kept) - 1
+    while low < high:
+        pivot, i, j = kept[half], low, high
+        while i <= j:
+            while kept[i] < pivot:
+                i += 1
+            while pivot < kept[j]:
+                j -= 1
+            if i <= j:
+                kept[i], kept[j] = kept[j], kept[i]
+                i += 1
+                j -= 1
+        if j < half:
+            low = i
+        if half < i:
+            high = j
+    below = kept[half]
+    if len(kept) % 2 == 0:
+        below = kept[0]
+        for i in range(1, half):
+            below = max(below, kept[i])
+    return 0.5 * (below + kept[half])
+
+
+@jit
 def normalise(plane: Any, x: Any, lift: Any) -> None:
     """x (2, n): the points with their centroid at 0 and unit spread; `lift` (3): centroid and 1 / spread."""
     n = len(plane)
@@ -106,7 +134,9 @@ def plane_homographies(
         bounds: (S + 1,) where each sight begins. plane: (N, 2) m. offsets: (N, 2) px. unit: px.
         profile: c_k of w = 1 + sum c_k r^2k, which makes q = (p, w); p and r are offsets and their lengths over `unit`.
     """
-    most = np.max(np.diff(bounds))
+    most = 0
+    for g in range(len(bounds) - 1):
+        most = max(most, bounds[g + 1] - bounds[g])
     x, weights, columns, lifted = np.empty((2, most)), np.empty(most), np.empty((7, most)), np.empty((most, 3))
     normal, upper, h, lift = np.empty((9, 9)), np.empty((9, 9)), np.empty(9), np.empty(3)
     for g in range(len(bounds) - 1):
@@ -123,8 +153,11 @@ def plane_homographies(
             _moments(x, q, weights, columns, normal)
             least_direction(normal, upper, h)
             _errors(x, q, h, e, weights)
-            usual = np.median(e)
-            if np.max(e) <= _WRONG * usual:
+            usual = median(e)
+            worst = 0.0
+            for i in range(n):
+                worst = max(worst, e[i])
+            if worst <= _WRONG * usual:
                 break
             for i in range(n):
                 weights[i] /= 1.0 + (e[i] / (1.5 * usual + 1e-12)) ** 2

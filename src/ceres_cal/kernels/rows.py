@@ -92,9 +92,7 @@ def _add_built(pose: Any, directions: Any, row: Any) -> None:
 
 
 @jit
-def loss_weights(loss: Loss, squared: Any) -> Any:
-    """rho' at each squared residual, (N,): the weight an observation has in the solve."""
-    weights = np.empty(len(squared))
+def loss_weights(loss: Loss, squared: Any, weights: Any) -> None:
+    """rho' at each squared residual, to `weights` (N,): what an observation has in the solve."""
     for i in range(len(squared)):
         weights[i] = robust_loss(loss, squared[i])[1]
-    return weights

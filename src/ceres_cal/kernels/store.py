@@ -1,9 +1,8 @@
-"""Where the machine code of the kernels is kept, and how it comes back.
+"""Where the machine code of kernels that are compiled here is kept, and how it comes back.
 
-numba's own cache looks at the file of the compiled function alone, not at the files it calls into; it sets all of the
-compiler up before it reads anything, and it knows a file by where it lies. Here a kernel's file is named after
-everything that its code depends on, all the kernels' sources among it, so that it can be carried from one machine to
-another; and nothing of the compiler is loaded before there is something to compile.
+numba's own cache looks at the file of the compiled function alone, not at the files it calls into, and it sets all of
+the compiler up before it reads anything. Here a kernel's file is named after everything that its code depends on, all
+the kernels' sources among it; and nothing of the compiler is loaded before there is something to compile.
 """
 
 from __future__ import annotations
@@ -12,10 +11,9 @@ import fcntl
 import hashlib
 import os
 import pickle
-import platform
 import sys
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from contextlib import suppress
 from functools import cache
 from io import BytesIO
@@ -31,22 +29,13 @@ from numba.core.environment import Environment, _rebuild_env, lookup_environment
 from numba.core.runtime import nrt
 from numba.core.serialize import dumps
 
+from ceres_cal.kernels.sources import digest
+
 _HERE = Path(__file__).parent
 _LONGEST_S = 600
 _LIBRARY: Any = JITCodeLibrary  # no stub knows what it inherits
 _LLVM: Any = llvm
 _CONFIG: Any = numba.config  # numba makes its settings at import
-
-# What the kernels that come with the package are compiled for, by machine: ten years of processors have these features.
-BASELINES = {"x86_64": ("x86-64-v3", ("avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt", "movbe"))}
-
-
-def digest(paths: Iterable[Path]) -> str:
-    """Of the contents of files."""
-    sources = hashlib.sha256()
-    for path in sorted(paths):
-        sources.update(path.read_bytes())
-    return sources.hexdigest()[:16]
 
 
 def _release() -> str:
@@ -63,17 +52,6 @@ def _cache_folder() -> Path:
 
 
 CACHE_FOLDER = _cache_folder()
-CARRIED_FOLDER = _HERE / "carried" / f"{_RELEASE}-{BASELINES.get(platform.machine(), ('none',))[0]}"
-"""Machine code that comes with the package: see scripts/carry_kernels.py."""
-
-
-@cache
-def _carried() -> Path | None:
-    """The folder of the machine code that came with the package, where it is this version's and runs here."""
-    if not CARRIED_FOLDER.is_dir():
-        return None
-    features = _LLVM.get_host_cpu_features()
-    return CARRIED_FOLDER if all(features.get(feature) for feature in BASELINES[platform.machine()][1]) else None
 
 
 @cache
@@ -104,8 +82,7 @@ class KernelStore:
     def load_overload(self, signature: Any, target: Any) -> Any:
         """The compiled function; None, with the lock taken, where it must be compiled."""
         name, own = self._file_name(signature), _own_folder(target.codegen())
-        carried = _carried()
-        loaded = (carried and _loaded(carried / name, target)) or _loaded(own / name, target)
+        loaded = _loaded(own / name, target)
         if loaded is None:
             self.lock()
             loaded = _loaded(own / name, target)
@@ -162,7 +139,7 @@ def _say_that_it_takes_time() -> None:
     """One line on standard error in a process that compiles, unless the caller has logging do otherwise."""
     import logging
 
-    some = _carried() or next(CACHE_FOLDER.rglob("*.nbc"), None)
+    some = next(CACHE_FOLDER.rglob("*.nbc"), None)
     how_long = "some seconds each" if some else "one or two minutes in all"
     logging.getLogger("ceres_cal").warning("ceres-cal: compiling kernels for this machine, once: %s", how_long)
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -81,14 +82,18 @@ def _compare(tried: list[Candidate], as_good: float, seen: Seen) -> tuple[list[C
     """
     labels, sizes = [one.form.label for one in tried], [one.form.size for one in tried]
     while True:
-        refuted = [any(other.refutes(one) for other in tried if other.squares is not None) for one in tried]
-        best, chosen = decide(labels, sizes, [one.squares for one in tried], as_good, refuted)
+        is_refuted = partial(_is_refuted, tried)
+        best, chosen = decide(labels, sizes, [one.squares for one in tried], as_good, is_refuted)
         faults = {number: fault for number in (best, chosen) if (fault := tried[number].fault)}
         if not faults and not seen.keeps(tried[chosen]):
             faults = {chosen: _BROKEN}
         if not faults:
             return tried, tried[best], tried[chosen]
         tried = [replace(one, squares=None, failed=faults[n]) if n in faults else one for n, one in enumerate(tried)]
+
+
+def _is_refuted(tried: Sequence[Candidate], number: int) -> bool:
+    return any(other.refutes(tried[number]) for other in tried if other.squares is not None)
 
 
 def _choice(tried: Sequence[Candidate], chosen: Candidate, share: float) -> LensChoice:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -28,7 +28,7 @@ def decide(
     sizes: Sequence[int],
     squares: Sequence[Array | None],
     as_good: float = AS_GOOD,
-    refuted: Sequence[bool] = (),
+    is_refuted: Callable[[int], bool] = lambda _: False,
 ) -> tuple[int, int]:
     """Indices of the best lens and of the simplest that is as good; the paper's comes before all others.
 
@@ -38,7 +38,7 @@ def decide(
     Args:
         sizes: see `forms.size_of`. squares: (G,) squared errors by group of each lens; None where there is no answer.
         as_good: in place of those 1.75.
-        refuted: lenses that a longer one refutes, which are not as good whatever few groups say.
+        is_refuted: whether a longer lens refutes one, which then is not as good whatever few groups say.
 
     Raises:
         DegenerateError: no lens has one.
@@ -52,7 +52,7 @@ def decide(
     familiar = {i: is_usual(labels[i]) and totals[i] <= ALIKE * least[sizes[i]] for i in totals}
     order = sorted(totals, key=lambda i: (labels[i] != PAPER, sizes[i], not familiar[i], totals[i]))
     near = (i for i in order if standard_errors(known[i], known[best]) <= as_good)
-    return best, next((i for i in near if not any(refuted[i : i + 1])), best)
+    return best, next((i for i in near if not is_refuted(i)), best)
 
 
 def surprise(squares: Array, counts: Array) -> Array:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -38,8 +38,8 @@ class Residuals:
     @cached_property
     def lengths(self) -> tuple[Array, Array]:
         """Lengths of the residuals of points (N,) and of curves (M,), px."""
-        x, y = self.points.T
-        return np.sqrt(x * x + y * y), np.abs(self.curves)
+        points = np.abs(np.ascontiguousarray(self.points).view(complex)[:, 0])  # in one pass
+        return points, np.abs(self.curves)
 
     def of_rows(self, points: Indices, curves: Indices) -> Residuals:
         """Those of some of the observations, as if there were no others."""
@@ -72,11 +72,8 @@ class Residuals:
 def camera_optics(camera: Camera) -> kernels.Optics:
     """A camera's optics as the kernels take them."""
     lens = camera.lens
-    prepare, distort, differentiate = kernels.lens_functions(lens.prepare, lens.distort_chunk, lens.differentiate_chunk)
     return kernels.Optics(
-        prepare.address,
-        distort.address,
-        differentiate.address,
+        *kernels.lens_functions(lens.prepare, lens.distort_chunk, lens.differentiate_chunk),
         intrinsics_vector(camera),
         unit_px(camera),
         lens.state,
@@ -84,20 +81,22 @@ def camera_optics(camera: Camera) -> kernels.Optics:
     )
 
 
-def point_columns(sights: Sights, structure: Structure, noise_scale: float = 1.0) -> kernels.PointColumns:
-    """The point observations of some sights as the kernels take them."""
+def point_columns(sights: Sights, structure: Structure, noise_scale: float | None = None) -> kernels.PointColumns:
+    """The point observations of some sights as the kernels take them; without a noise scale they have no weights."""
     moved = sights.point_index if len(structure.values) else sights.point_index[:0]
     return kernels.PointColumns(
         sights.point_bounds,
         structure.points(sights),
         sights.pixels,
-        1.0 / (noise_scale * sights.sigma_px),
+        _weights(sights.sigma_px, noise_scale),
         structure.point_slots[moved],
         structure.bends[moved],
     )
 
 
-def curve_columns(sights: Sights, structure: Structure, feet: Array, noise_scale: float = 1.0) -> kernels.CurveColumns:
+def curve_columns(
+    sights: Sights, structure: Structure, feet: Array, noise_scale: float | None = None
+) -> kernels.CurveColumns:
     """The curve observations of some sights as the kernels take them, which move the feet (M of the sights,)."""
     return kernels.CurveColumns(
         sights.curve_bounds,
@@ -105,10 +104,17 @@ def curve_columns(sights: Sights, structure: Structure, feet: Array, noise_scale
         sights.is_arc,
         sights.track_index,
         sights.curve_pixels,
-        1.0 / (noise_scale * sights.curve_sigma_px),
+        _weights(sights.curve_sigma_px, noise_scale),
         feet,
         structure.track_slots,
     )
+
+
+def _weights(sigma_px: Array, noise_scale: float | None) -> Array:
+    if noise_scale is None:
+        return kernels.NOTHING
+    weights = noise_scale * sigma_px
+    return np.reciprocal(weights, out=weights)
 
 
 def residuals(observations: Content, sights: Sights, estimate: Estimate, feet: Array | None = None) -> Residuals:
@@ -118,8 +124,18 @@ def residuals(observations: Content, sights: Sights, estimate: Estimate, feet: A
         feet: (M,) where on its track the search for each curve observation's foot starts, such as those of earlier
             residuals; without them it starts where the ray passes nearest.
     """
-    points = np.full((len(observations.points), 2), np.nan)
-    curves, ends = np.full(len(observations.curves), np.nan), np.full(len(observations.curves), np.nan)
+    return _residuals(len(observations.points), len(observations.curves), sights, estimate, feet)
+
+
+def residuals_alone(sights: Sights, estimate: Estimate, feet: Array | None = None) -> Residuals:
+    """Residuals of the sights' own observations, in their order, as if there were no others."""
+    n, m = len(sights.point_rows), len(sights.curve_rows)
+    own = replace(sights, point_rows=np.arange(n), curve_rows=np.arange(m))
+    return _residuals(n, m, own, estimate, None if feet is None else feet[sights.curve_rows])
+
+
+def _residuals(n: int, m: int, sights: Sights, estimate: Estimate, feet: Array | None) -> Residuals:
+    points, curves, ends = np.full((n, 2), np.nan), np.full(m, np.nan), np.full(m, np.nan)
     poses = estimate.pose_stack(sights.keys)
     for name in sights.cameras:
         numbers = sights.numbers(camera=name)

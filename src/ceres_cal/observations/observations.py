@@ -9,6 +9,7 @@ import hashlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,8 @@ from ceres_cal.observations.copies import Copies, find_copies
 from ceres_cal.observations.files import Content, header_of, read_content, write_content
 from ceres_cal.observations.from_points import gathered
 from ceres_cal.scene.targets import Target
+
+_NAMES = attrgetter("camera", "station", "target", "placement")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -207,19 +210,28 @@ class Observations(Content):
                 raise InputError(f"camera {name!r}: image_size must be two positive whole numbers, not {size}")
         owner: dict[str, str] = {}
         placed: dict[str, str] = {}
-        for number, view in enumerate(self.views):
-            here = view_label(number, self.views)
-            if view.camera not in self.cameras:
-                raise InputError(f"{here} names camera {view.camera!r}, which is not there: {choices(self.cameras)}")
-            if view.target not in self.targets:
-                raise InputError(f"{here} names target {view.target!r}, which is not there: {choices(self.targets)}")
-            if owner.setdefault(view.station, view.camera) != view.camera:
-                raise InputError(f"{here}: station {view.station!r} belongs to camera {owner[view.station]!r} already")
-            if view.placement is not None and placed.setdefault(view.placement, view.target) != view.target:
-                raise InputError(
-                    f"{here}: placement {view.placement!r} holds target {placed[view.placement]!r} already; "
-                    "give each rigid thing a placement of its own"
-                )
+        for number, (camera, station, target, placement) in enumerate(map(_NAMES, self.views)):
+            if (
+                camera not in self.cameras
+                or target not in self.targets
+                or owner.setdefault(station, camera) != camera
+                or (placement is not None and placed.setdefault(placement, target) != target)
+            ):
+                raise InputError(self._odd_view(number, owner, placed))
+
+    def _odd_view(self, number: int, owner: Mapping[str, str], placed: Mapping[str, str]) -> str:
+        """What is wrong with a view. owner, placed: camera of each station and target of each placement before."""
+        here, view = view_label(number, self.views), self.views[number]
+        if view.camera not in self.cameras:
+            return f"{here} names camera {view.camera!r}, which is not there: {choices(self.cameras)}"
+        if view.target not in self.targets:
+            return f"{here} names target {view.target!r}, which is not there: {choices(self.targets)}"
+        if owner[view.station] != view.camera:
+            return f"{here}: station {view.station!r} belongs to camera {owner[view.station]!r} already"
+        return (
+            f"{here}: placement {view.placement!r} holds target {placed[str(view.placement)]!r} already; "
+            "give each rigid thing a placement of its own"
+        )
 
     def _check_columns(self, kind: str, column: Columns, first: int, last: int) -> None:
         """Of a block that begins with row `first`, behind one of view `last`."""

@@ -19,7 +19,7 @@ from collections.abc import Container, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from operator import itemgetter
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -31,6 +31,8 @@ from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.curves import nearest_to_rays
 
 _BLOCK = 1 << 16  # rows worked on at once: memory stays small beside the observations
+_RUN = 256  # rows between two that go, from which on those between are moved together
+_Rows: TypeAlias = "Indices | slice | list[slice]"
 
 
 class SightKey(NamedTuple):
@@ -182,9 +184,8 @@ class Sights(Sequence["Sights"]):
         """What is left of every sight when only these rows of the observations count; empty sights are left out."""
         if points.all() and curves.all():
             return self
-        p, c = np.flatnonzero(points[self.point_rows]), np.flatnonzero(curves[self.curve_rows])
-        point_sizes = np.diff(np.searchsorted(p, self.point_bounds))
-        curve_sizes = np.diff(np.searchsorted(c, self.curve_bounds))
+        p, point_sizes = _left(points[self.point_rows], self.point_bounds)
+        c, curve_sizes = _left(curves[self.curve_rows], self.curve_bounds)
         numbers = np.flatnonzero(point_sizes + curve_sizes)
         return self._rows(numbers, p, c, point_sizes[numbers], curve_sizes[numbers])
 
@@ -204,9 +205,7 @@ class Sights(Sequence["Sights"]):
             self._rows(every, slice(0, 0), slice(None), nothing, np.diff(self.curve_bounds)),
         )
 
-    def _rows(
-        self, numbers: Indices, p: Indices | slice, c: Indices | slice, point_sizes: Indices, curve_sizes: Indices
-    ) -> Sights:
+    def _rows(self, numbers: Indices, p: _Rows, c: _Rows, point_sizes: Indices, curve_sizes: Indices) -> Sights:
         every = len(numbers) == len(self) and np.array_equal(numbers, np.arange(len(self)))
         chosen = () if every else numbers.tolist()
         return Sights(
@@ -228,9 +227,20 @@ class Sights(Sequence["Sights"]):
         )
 
 
-def _at(values: AnyArray, rows: Indices | slice) -> AnyArray:
-    """values[rows]; `take` is several times as fast where a row holds more than one number."""
+def _at(values: AnyArray, rows: _Rows) -> AnyArray:
+    """values[rows]; `take` is several times as fast where a row holds more than one number, and runs of rows again."""
+    if isinstance(rows, list):
+        return np.concatenate([values[run] for run in rows])
     return values[rows] if isinstance(rows, slice) else values.take(rows, axis=0)
+
+
+def _left(stays: Mask, bounds: Indices) -> tuple[_Rows, Indices]:
+    """The rows that stay, as runs where few go, and how many of each sight do."""
+    gone = np.flatnonzero(~stays)
+    sizes = np.diff(bounds) - np.diff(np.searchsorted(gone, bounds))
+    if len(gone) * _RUN > len(stays):
+        return np.flatnonzero(stays), sizes
+    return list(map(slice, [0, *(gone + 1).tolist()], [*gone.tolist(), len(stays)])), sizes
 
 
 def bounds_of(sizes: ArrayLike) -> Indices:

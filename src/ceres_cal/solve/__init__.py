@@ -8,7 +8,7 @@ and its placement; each prior is one small block. What Ceres minimises is the sa
 from ceres_cal.base.native import kept_signals
 
 with kept_signals():
-    import pyceres  # noqa: F401
+    from pyceres import __version__ as solver_version
 
 from ceres_cal.solve.as_built import words_of
 from ceres_cal.solve.bundle import Progress, Solution, placement_costs, solve, with_placements_at_best
@@ -35,6 +35,7 @@ __all__ = [
     "placement_costs",
     "solve",
     "solve_robustly",
+    "solver_version",
     "with_placements_at_best",
     "words_of",
 ]

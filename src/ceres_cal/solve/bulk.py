@@ -174,12 +174,13 @@ class Bulk:
         return (points, curves) if self._left_out is None else (points | self._left_out[0], curves | self._left_out[1])
 
     def look(
-        self, engine: Engine, estimate: Estimate, weighting: Weighting, bounds: tuple[float, float]
-    ) -> tuple[str, Looked]:
-        """What residuals are like at an estimate, which is given a name."""
-        name, there = uuid4().hex, of_world(estimate)
+        self, engine: Engine, estimate: Estimate, weighting: Weighting, bounds: tuple[float, float],
+        along: tuple[tuple[str, Estimate], ...] = (),
+    ) -> tuple[str, Looked]:  # fmt: skip
+        """What residuals are like at an estimate, which is given a name. along: where feet were sought before."""
+        here = uuid4().hex, of_world(estimate)
         blank = Layout({}, frozenset(), frozenset())
-        return name, engine.ask(Share.looked, Asked(there, blank, weighting, (name, there), bounds))
+        return here[0], engine.ask(Share.looked, Asked(here[1], blank, weighting, here, bounds, (*along, here)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -223,10 +224,12 @@ class _Rounds:
         masks = np.zeros(len(self._few.points), dtype=bool), np.zeros(len(self._few.curves), dtype=bool)
         masks[0][self._core.point_rows] = masks[1][self._core.curve_rows] = True
         self._placed, self._before = masks, end
+        self._along: tuple[tuple[str, Estimate], ...] = ()
         self._seen = self._look(end.solution.estimate, _bounds(end), end.problem.weighting)
 
     def _look(self, estimate: Estimate, bounds: tuple[float, float], weighting: Weighting) -> _Seen:
-        name, looked = self._bulk.look(self._engine, estimate, weighting, bounds)
+        name, looked = self._bulk.look(self._engine, estimate, weighting, bounds, self._along)
+        self._along = (*self._along, (name, of_world(estimate)))
         self._there = residuals(self._few, self._problem.sights, estimate)
         points, curves = relative_lengths(self._few, self._there)
         if self._part.gone is not None:
@@ -240,7 +243,8 @@ class _Rounds:
         points, curves = noise.bounds
         inside = seen.lengths[0] <= points, seen.lengths[1] <= curves
         equations = 2 * seen.looked.points.within(points).count + seen.looked.curves.within(curves).count
-        judged = Judged(self._engine, self._bulk.keys, equations, (seen.name, of_world(seen.estimate)), noise.bounds)
+        judged_at = seen.name, of_world(seen.estimate)
+        judged = Judged(self._engine, self._bulk.keys, equations, judged_at, noise.bounds, self._along)
         weighting = Weighting(noise.points, noise.curves, options.loss, options.loss_scale)
         return replace(
             self._problem,

@@ -62,11 +62,6 @@ class SightCost(CachedCost):
             return None
         return np.column_stack([*(each.reshape(self.num_residuals(), -1) for each in known.jacobians), known.residuals])
 
-    @property
-    def feet(self) -> Array:
-        """(M,) where the last evaluation left the feet."""
-        return self._curves.feet
-
     def _evaluated(self, at: Array, parameters: Sequence[Array]) -> Answer | None:
         numbers, jacobians = [kernels.NOTHING, *self._poses, kernels.NOTHING], [kernels.NOTHING] * 4
         rows, mixing = self.num_residuals(), self._structure.mixing
@@ -99,6 +94,13 @@ def _factor(normal: Array, upper: Array) -> None:
 def kernel_loss(weighting: Weighting) -> kernels.Loss:
     """The loss as the kernels take it."""
     return kernels.Loss(kernels.LOSS_CODES[weighting.loss], weighting.loss_scale)
+
+
+def robust_weights(weighting: Weighting, squared: Array) -> Array:
+    """(N,) the weight rho' that each squared residual has in the solve."""
+    weights = np.empty(len(squared))
+    kernels.loss_weights(kernel_loss(weighting), squared, weights)
+    return weights
 
 
 def as_built(

@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import errno
+import time
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import reduce
 from operator import add
 from typing import Any, Protocol, TypeVar
 
-from ceres_cal.base.errors import SolutionError
+from ceres_cal.base.errors import CalibrationError, InputError, SolutionError
 from ceres_cal.base.threads import at_most, available, single_threaded_blas
 from ceres_cal.solve.shares import Share
 
 _A = TypeVar("_A")
 _RETRIES = 3  # of what a worker that was lost had to do
+_GROUPS = 16  # workers up to which sums are the same to the last bit; what is sent for each answer grows with it
+_PAUSE_S = 0.05  # before what a lost worker had is asked again, four times as long each time
+_NO_ROOM = "a worker's disk is full: make room, or start it with another --local-directory"
+_NO_MEMORY = "a worker ran out of memory: give it more, or start more workers"
+_LOST = "workers were lost again and again: have they enough memory?"
 
 
 class Engine(Protocol):
@@ -27,32 +34,42 @@ class Engine(Protocol):
 
 
 class InProcess:
-    """Shares that this process asks, a thread each."""
+    """Shares that this process asks, a thread for each group."""
 
     def __init__(self, shares: Sequence[Share]) -> None:
-        self._shares = shares
+        self._groups = _groups_of(shares)
 
     def ask(self, answer: Callable[..., _A], *request: Any) -> _A:
         """The sum of answer(share, *request) over all shares."""
-        return asked_of(self._shares, answer, request, available())
+        return reduce(add, asked_of(self._groups, answer, request, available()))
 
     def close(self) -> None:
         """Let the shares go."""
-        self._shares = ()
+        self._groups = []
 
 
-def asked_of(shares: Sequence[Share], answer: Callable[..., _A], request: Sequence[Any], threads: int) -> _A:
-    """The sum of answer(share, *request) over some shares, by so many threads."""
+def _groups_of(shares: Sequence[Share], workers: int = 1) -> list[Sequence[Share]]:
+    """Consecutive shares that are added up by themselves, where they are: the same ones for any number of workers up
+    to so many, and so are all sums, to the last bit.
+    """
+    count = min(len(shares), max(_GROUPS, workers))
+    return [shares[len(shares) * n // count : len(shares) * (n + 1) // count] for n in range(count)]
 
-    def one(share: Share) -> _A:
+
+def asked_of(
+    groups: Sequence[Sequence[Share]], answer: Callable[..., _A], request: Sequence[Any], threads: int
+) -> list[_A]:
+    """The sum of answer(share, *request) over the shares of each group, by so many threads."""
+
+    def one(group: Sequence[Share]) -> _A:
         with at_most(1):
-            return answer(share, *request)
+            return reduce(add, (answer(share, *request) for share in group))
 
     if threads == 1:
-        return reduce(add, map(one, shares))
+        return list(map(one, groups))
     with ThreadPoolExecutor(threads) as pool:
         try:
-            return reduce(add, pool.map(one, shares))
+            return list(pool.map(one, groups))
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise
@@ -61,8 +78,10 @@ def asked_of(shares: Sequence[Share], answer: Callable[..., _A], request: Sequen
 class OnWorkers:
     """Shares that the workers of a `distributed.Client` keep, one after the other each; one that is lost is made again.
 
+    They are kept by tasks, which Dask does again elsewhere, and asked past its scheduler, which takes ten milliseconds.
+
     Raises:
-        SolutionError: when asked: a worker ran out of memory or was lost again and again.
+        SolutionError: a worker ran out of memory or disk, or was lost again and again; it is named.
     """
 
     def __init__(self, client: Any, shares: Sequence[Share]) -> None:
@@ -70,35 +89,55 @@ class OnWorkers:
         workers = sorted(client.scheduler_info(n_workers=-1)["workers"])
         if not workers:
             raise SolutionError("the scheduler has no workers: start some with `dask worker ADDRESS`")
-        workers = workers[: len(shares)]
-        count = len(workers)
-        # In tasks, not scattered: what a lost worker had is made again from them.
+        groups = _groups_of(shares, len(workers))
+        count = min(len(workers), len(groups))
         self._kept = [
-            client.submit(_kept, shares[len(shares) * n // count : len(shares) * (n + 1) // count], workers=[worker],
-                          allow_other_workers=True, pure=False, retries=_RETRIES)
-            for n, worker in enumerate(workers)
+            client.submit(_kept, group, workers=[workers[n * count // len(groups)]], allow_other_workers=True,
+                          pure=False, retries=_RETRIES)
+            for n, group in enumerate(groups)
         ]  # fmt: skip
-        self._workers = workers
+        self._places = self._found()
+        # From now on anywhere: a task that is to be done by a worker that is gone waits for ever.
+        client.sync(client.scheduler.set_restrictions, worker={one.key: None for one in self._kept})
+
+    def _found(self) -> dict[str, list[int]]:
+        """Numbers of the groups that each worker keeps, once all are kept."""
+        from distributed import wait
+
+        wait(self._kept)
+        for one in self._kept:
+            if one.status == "error":
+                raise _in_words(one.exception())
+        places: dict[str, list[int]] = {}
+        held = self._client.who_has(self._kept)
+        for number, one in enumerate(self._kept):
+            for worker in held.get(one.key, ())[:1]:
+                places.setdefault(worker, []).append(number)
+        return places
 
     def ask(self, answer: Callable[..., _A], *request: Any) -> _A:
         """The sum of answer(share, *request) over all shares."""
-        asked = [
-            self._client.submit(_answered, kept, answer, request, workers=[worker], allow_other_workers=True,
-                                pure=False, retries=_RETRIES)
-            for kept, worker in zip(self._kept, self._workers, strict=True)
-        ]  # fmt: skip
-        try:
-            answers: list[_A] = self._client.gather(asked)
-            return reduce(add, answers)
-        except MemoryError:
-            raise SolutionError("a worker ran out of memory: give it more, or start more workers") from None
-        except Exception as error:
-            if type(error).__name__ not in ("KilledWorker", "FutureCancelledError", "CancelledError"):
-                raise
-            raise SolutionError("workers were lost again and again: have they enough memory?") from None
-        finally:
-            for one in asked:
-                one.release()
+        answers: dict[int, _A] = {}
+        for again in range(_RETRIES + 1):
+            if again:
+                time.sleep(_PAUSE_S * 4**again)
+                self._places = self._found()
+            asked = {
+                worker: {n: self._kept[n].key for n in numbers if n not in answers}
+                for worker, numbers in self._places.items()
+            }
+            workers = [worker for worker, keys in asked.items() if keys]
+            replies = self._client.run(_answered, asked, answer, request, workers=workers, on_error="return")
+            for worker, reply in replies.items():
+                if isinstance(reply, dict):
+                    answers |= reply
+                elif not isinstance(reply, (OSError, KeyError)):  # else the worker or what it kept is lost
+                    raise _in_words(reply)
+                else:
+                    last = worker
+            if len(answers) == len(self._kept):
+                return reduce(add, (answers[number] for number in range(len(self._kept))))
+        raise SolutionError(f"{_LOST} ({last})")
 
     def close(self) -> None:
         """Let the shares go."""
@@ -106,12 +145,41 @@ class OnWorkers:
             one.release()
 
 
-def _kept(shares: Sequence[Share]) -> Sequence[Share]:
+def _kept(group: Sequence[Share]) -> Sequence[Share]:
     """What a worker keeps."""
-    return shares
+    return group
 
 
-def _answered(shares: Sequence[Share], answer: Callable[..., _A], request: Sequence[Any]) -> _A:
-    """The sum of what a worker's shares answer."""
-    with single_threaded_blas():
-        return asked_of(shares, answer, request, 1)
+async def _answered(
+    asked: Mapping[str, Mapping[int, str]], answer: Callable[..., _A], request: Sequence[Any], dask_worker: Any
+) -> dict[int, _A] | CalibrationError:
+    """What the groups answer that are asked of this worker, by number; what stops it, and where."""
+    keys = asked[dask_worker.address]
+    groups = [dask_worker.data[key] for key in keys.values()]
+
+    def all_of_them() -> list[_A]:
+        with single_threaded_blas():
+            return asked_of(groups, answer, request, 1)
+
+    here = dask_worker.address
+    try:
+        answers = await dask_worker.loop.run_in_executor(dask_worker.executor, all_of_them)
+    except MemoryError:
+        return SolutionError(f"{_NO_MEMORY} ({here})")
+    except InputError as error:  # of a file
+        return InputError(f"{error} (worker {here})")
+    except OSError as error:
+        full = error.errno in (errno.ENOSPC, errno.EDQUOT)
+        where, what = error.filename or dask_worker.local_directory, _NO_ROOM if full else error.strerror
+        return SolutionError(f"{where}: {what} (worker {here})")
+    return dict(zip(keys, answers, strict=True))
+
+
+def _in_words(error: BaseException) -> BaseException:
+    """What a worker raised, in one line where that is known."""
+    if isinstance(error, MemoryError):
+        return SolutionError(_NO_MEMORY)
+    if type(error).__name__ in ("KilledWorker", "FutureCancelledError", "CancelledError"):
+        last = getattr(getattr(error, "last_worker", None), "address", "")
+        return SolutionError(_LOST + f" ({last})" * bool(last))
+    return error

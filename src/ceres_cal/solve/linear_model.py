@@ -14,7 +14,6 @@ from functools import cached_property
 
 import numpy as np
 
-from ceres_cal import kernels
 from ceres_cal.base.arrays import Array, Indices, Mask
 from ceres_cal.model.equations import Equations, of_observations
 from ceres_cal.model.keys import Key, columns_by_owner
@@ -23,6 +22,7 @@ from ceres_cal.model.quantities import free_keys, from_placement, from_station
 from ceres_cal.model.residuals import Residuals
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import ranges
+from ceres_cal.solve.costs import robust_weights
 from ceres_cal.solve.problem import Problem, Weighting
 
 LEAST_LEFT = 1e-7
@@ -233,9 +233,8 @@ def equation_weights(
     at, scale = equations.observation, np.where(equations.is_curve, weighting.curve_scale, weighting.point_scale)
     sigma = scale * of_observations(at, observations.points.sigma_px, observations.curves.sigma_px)
     squared = (of_observations(at, *there.lengths) / sigma) ** 2
-    loss = kernels.Loss(kernels.LOSS_CODES[weighting.loss], weighting.loss_scale)
     used = np.ones(len(at), dtype=bool) if taking_part is None else of_observations(at, *taking_part)
-    return Weights(1.0 / sigma, used, kernels.loss_weights(loss, squared))
+    return Weights(1.0 / sigma, used, robust_weights(weighting, squared))
 
 
 def make_linear_model(problem: Problem, estimate: Estimate, equations: Equations, weights: Weights) -> LinearModel:

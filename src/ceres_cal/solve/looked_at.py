@@ -148,8 +148,7 @@ def excess(observations: Observations, wholes: Wholes, end: RobustSolution, taki
     """
     lengths = np.concatenate([end.inliers.point_sigmas, end.inliers.curve_sigmas])
     points, size = len(observations.points), wholes.size + 1
-    of = np.where(inliers_of(end) & taking_part, wholes.of, -1)
-    of[of < 0] = wholes.size
+    of = np.where(inliers_of(end) & taking_part & (wholes.of >= 0), wholes.of, np.int64(wholes.size))
     spare = 2.0 * np.bincount(of[:points], minlength=size) + np.bincount(of[points:], minlength=size)
     square = np.bincount(of, lengths**2, minlength=size)
     spare[-1] = square[-1] = 0.0  # of what is in none

@@ -38,6 +38,7 @@ _MOST_WIDER = 5
 SAME = 4e-3
 _ENOUGH = 5_000
 _LEAST_SCALE_PX = 1e-4  # no image is measured better than that
+_BLOCK = 1 << 16  # lengths at once: what is made of them stays where the processor is quick
 _RAYLEIGH_MEDIAN = 1.177410022515474  # of the length of a two-dimensional standard normal
 _NORMAL_MEDIAN = 0.674489750196082  # of the absolute value of a standard normal
 
@@ -98,6 +99,10 @@ class Inliers:
             and abs(self.curve_scale - other.curve_scale) <= relative * other.curve_scale
         )
 
+    def same_rows(self, other: Inliers) -> bool:
+        """Whether the same observations take part."""
+        return np.array_equal(self.points, other.points) and np.array_equal(self.curves, other.curves)
+
     def with_rows_of(self, other: Inliers) -> Inliers:
         """The same with the rows that others have."""
         return replace(self, points=other.points, curves=other.curves)
@@ -132,29 +137,35 @@ class Inliers:
         """Of the observations at these noise scales."""
         return Weighting(self.point_scale, self.curve_scale, options.loss, options.loss_scale)
 
-    def much_below(self, other: Inliers, share: float) -> bool:
-        """Whether a scale fell to less than a share of what it was."""
-        return self.point_scale < share * other.point_scale or self.curve_scale < share * other.curve_scale
+    @property
+    def scales(self) -> tuple[float, float]:
+        """Of points and of curves."""
+        return self.point_scale, self.curve_scale
 
 
 def relative_lengths(observations: Content, residuals: Residuals) -> tuple[Array, Array]:
     """Lengths of the residuals of points and of curves in their stated sigmas; infinite where there is none."""
     points, curves = residuals.lengths
     points, curves = points / observations.points.sigma_px, curves / observations.curves.sigma_px
-    return np.where(np.isfinite(points), points, np.inf), np.where(np.isfinite(curves), curves, np.inf)
+    return np.fmin(points, np.inf, out=points), np.fmin(curves, np.inf, out=curves)  # NaN is infinite
 
 
 def visible_from(observations: Observations, residuals: Residuals) -> Inliers:
     """Everything that a start can show, at the scale of its median residual: what the first solve works with."""
     points, curves = relative_lengths(observations, residuals)
-    shown_points, shown_curves = np.isfinite(points), np.isfinite(curves)
-    p = _median_scale(points[shown_points], _RAYLEIGH_MEDIAN)
-    c = _median_scale(curves[shown_curves], _NORMAL_MEDIAN)
-    return Inliers(shown_points, shown_curves, p, c, points / p, curves / c)
+    p, c = median_scales(points, curves)
+    return Inliers(np.isfinite(points), np.isfinite(curves), p, c, points / p, curves / c)
 
 
-def _median_scale(lengths: Array, median_of_one: float) -> float:
-    return max(_middle(lengths) / median_of_one, _LEAST_SCALE_PX) if len(lengths) else 1.0
+def median_scales(points: Array, curves: Array) -> tuple[float, float]:
+    """Noise scales by the medians of lengths of points and of curves in their stated sigmas."""
+    both = (EachLength(points), _RAYLEIGH_MEDIAN), (EachLength(curves), _NORMAL_MEDIAN)
+    p, c = (_median_scale(lengths, median_of_one) for lengths, median_of_one in both)
+    return p, c
+
+
+def _median_scale(lengths: Lengths, median_of_one: float) -> float:
+    return max(lengths.middle() / median_of_one, _LEAST_SCALE_PX) if lengths.count else 1.0
 
 
 def _middle(lengths: Array) -> float:
@@ -289,8 +300,12 @@ class EachLength:
 
     def within(self, bound: float) -> Spread:
         """Of those that are no longer."""
-        inside = self._seen[self._seen <= bound]
-        return Spread(len(inside), float(inside @ inside))
+        count, squares = 0, 0.0
+        for first in range(0, len(self._seen), _BLOCK):
+            block = self._seen[first : first + _BLOCK]
+            inside = block[block <= bound]
+            count, squares = count + len(inside), squares + float(inside @ inside)
+        return Spread(count, squares)
 
 
 def _spread(lengths: Lengths, median_of_one: float, reject_sigma: float, least: float, degrees: float) -> Spread:
@@ -299,7 +314,7 @@ def _spread(lengths: Lengths, median_of_one: float, reject_sigma: float, least: 
     Args:
         least: a scale that theirs is no smaller than. degrees: spare equations of each.
     """
-    first = max(lengths.middle() / median_of_one, _LEAST_SCALE_PX) if lengths.count else 1.0
+    first = _median_scale(lengths, median_of_one)
     spread = lengths.within(reject_sigma * max(first, least))
     for _ in range(_MOST_WIDER):
         if degrees <= 0.0 or not spread.count:

@@ -10,14 +10,14 @@ import numpy as np
 from ceres_cal.base.arrays import Indices
 from ceres_cal.base.errors import DegenerateError
 from ceres_cal.model.parameters import Estimate
-from ceres_cal.model.residuals import Residuals, residuals
+from ceres_cal.model.residuals import Residuals, residuals, residuals_alone
 from ceres_cal.observations import Observations
-from ceres_cal.observations.sights import SightKey
+from ceres_cal.observations.sights import SightKey, Sights
 from ceres_cal.solve.bundle import Progress, Solution, solve, with_placements_at_best
 from ceres_cal.solve.information import ReducedInformation, information
 from ceres_cal.solve.lost import with_lost_boards_posed
 from ceres_cal.solve.mirrored import without_mirrored_poses
-from ceres_cal.solve.noise import Inliers, Redundancy, judge, visible_from
+from ceres_cal.solve.noise import Inliers, Redundancy, judge, median_scales, visible_from
 from ceres_cal.solve.problem import Problem, Weighting
 from ceres_cal.solve.smoothness import with_smoothness
 
@@ -96,8 +96,6 @@ def solve_robustly(
     before: Inliers | None = None
     while state.rounds < most_rounds:
         at_rest = before is not None and state.inliers.same_as(before, rounds.no_change)
-        if at_rest and before is not None:
-            state = rounds.with_rows_of(state, before)
         if not at_rest and before is not None:
             undecided = frozenset(state.problem.sights.keys)  # another lens had decided about mirrored poses
         if at_rest or before is None:
@@ -115,7 +113,7 @@ def solve_robustly(
 def judge_at(problem: Problem, observations: Observations, estimate: Estimate) -> RobustSolution:
     """Noise and outliers by the leverages at an estimate, where nothing is solved."""
     rounds = _Rounds(problem, observations, None, None)
-    return rounds.by_leverages(rounds.at(estimate))[0]
+    return rounds.by_leverages(rounds.at(estimate))
 
 
 class _Rounds:
@@ -131,7 +129,8 @@ class _Rounds:
         self._problem, self._observations, self._usual, self._progress = problem, observations, usual, progress
         self._redundancy: Redundancy | None = None
         self._moving = 0.0
-        self._visible: Inliers
+        self._scales = (1.0, 1.0)  # of points and of curves that the last rough solve was weighted by
+        self._last: tuple[Inliers, Sights] | None = None
         self.no_change = _AT_REST if usual is None else _AT_REST_AGAIN
 
     def first(self, estimate: Estimate) -> RobustSolution:
@@ -142,7 +141,8 @@ class _Rounds:
     def at(self, estimate: Estimate) -> RobustSolution:
         """An estimate as it is, judged."""
         there = residuals(self._observations, self._problem.sights, estimate)
-        return self._weighted(Solution(estimate, np.nan, False, "", ()), there, 0)
+        solution = Solution(estimate, np.nan, False, "", ())
+        return self._with(self._judge(solution, there), solution, there, 0)
 
     def posed(self, estimate: Estimate) -> RobustSolution:
         """A start near the minimum, its private placements at their best."""
@@ -152,14 +152,14 @@ class _Rounds:
         problem = replace(self._problem.used(visible.points, visible.curves), weighting=weighting, feet=there.feet)
         estimate = with_placements_at_best(problem, estimate)
         state = self._judged(Solution(estimate, np.nan, False, "", ()), there, 0)
-        self._visible = visible_from(self._observations, state.residuals)
+        self._scales = visible_from(self._observations, state.residuals).scales
         return state
 
     def refined(self, state: RobustSolution) -> RobustSolution:
         """Further rough solves, each at the scale of the residuals that the one before left, while that falls."""
         for _ in range(_MOST_REFINED):
             visible = visible_from(self._observations, state.residuals)
-            if not visible.much_below(self._visible, _MUCH_LESS):
+            if not _much_below(visible.scales, self._scales):
                 break
             state = self._rough(state.solution.estimate, state.residuals, visible, state.rounds + 1)
         # Of one kind of observations without priors the leverages add up to the count.
@@ -167,11 +167,11 @@ class _Rounds:
         if self._problem.smoothness:  # which tells as much, of fewer sights
             return state
         mixed = stated or all(kind.equations for kind in self._problem.sights.by_kind)
-        return self.by_leverages(state)[0] if mixed and len(state.problem.sights) else state
+        return self.by_leverages(state) if mixed and len(state.problem.sights) else state
 
     def _rough(self, estimate: Estimate, there: Residuals, visible: Inliers, rounds: int) -> RobustSolution:
         """A solve of few placements, which the others follow, that gross errors do not decide."""
-        self._visible = visible
+        self._scales = visible.scales
         # A line painted aside is an outlier to a redescending loss, but not to its tolerance.
         loss = "huber" if len(estimate.structure.values) else "cauchy"
         weighting = Weighting(visible.point_scale, visible.curve_scale, loss, loss_scale=1.0)
@@ -186,16 +186,32 @@ class _Rounds:
             self._problem = replace(self._problem, smoothness=end.problem.smoothness)
             solution = end.solution
         else:
-            solution = solve(few, estimate, self._progress, precision=_ROUGH, is_near=False)
+            solution = self._of_few(few, estimate, len(few.sights) < len(problem.sights))
         if len(few.sights) < len(problem.sights):
             solution = replace(solution, estimate=with_placements_at_best(problem, solution.estimate))
         return self._judged(solution, there, rounds)
 
+    def _of_few(self, few: Problem, estimate: Estimate, others_follow: bool) -> Solution:
+        """A rough solve; where others follow, which takes time, again at the scale that it left while that falls."""
+        solution = solve(few, estimate, self._progress, precision=_ROUGH, is_near=False)
+        for _ in range(_MOST_REFINED if others_follow else 0):
+            points, curves = residuals_alone(few.sights, solution.estimate, few.feet).lengths
+            scales = median_scales(points / few.sights.sigma_px, curves / few.sights.curve_sigma_px)
+            if not _much_below(scales, self._scales):
+                break
+            self._scales = scales
+            few = few.weighted(replace(few.weighting, point_scale=scales[0], curve_scale=scales[1]))
+            estimate, *_ = without_mirrored_poses(few, solution.estimate, frozenset(few.sights.keys))
+            solution = solve(few, estimate, self._progress, precision=_ROUGH, is_near=False)
+        return solution
+
     def next(self, state: RobustSolution) -> RobustSolution:
-        """One more solve, from where the last one ended, of what was judged to be inliers."""
+        """One more solve, from where the last one ended, of what was judged to be inliers; with the same rows where
+        others are as good.
+        """
         precision = _AS_SMOOTH if state.problem.options.blank_lens.roughness else _TO_THE_END
         solution = solve(state.problem, state.solution.estimate, self._progress, precision=precision)
-        return self._judged(solution, state.residuals, state.rounds + 1)
+        return self._judged(solution, state.residuals, state.rounds + 1, state.inliers)
 
     def mended(
         self, state: RobustSolution, undecided: frozenset[SightKey]
@@ -211,45 +227,57 @@ class _Rounds:
             state = self._judged(replace(state.solution, estimate=estimate), state.residuals, state.rounds)
         return state, lost + turned, undecided
 
-    def with_rows_of(self, state: RobustSolution, before: Inliers) -> RobustSolution:
-        """The state with the rows that it was solved with, where others are as good."""
-        inliers = state.inliers.with_rows_of(before)
-        used = self._problem.used(inliers.points, inliers.curves)
-        return replace(state, inliers=inliers, problem=replace(state.problem, sights=used.sights))
-
     def with_leverages(self, state: RobustSolution) -> RobustSolution:
         """The state with what its problem says there, where the noise is judged no other by the leverages, and nothing
         moves by how smooth lenses are; else judged by them, for another round.
         """
-        anew, reduced = self.by_leverages(state)
-        if self._moving > _STILL or not anew.inliers.same_as(state.inliers, self.no_change):
-            return anew
+        anew, reduced = self._anew(state)
+        if self._moving > _STILL or not anew.same_as(state.inliers, self.no_change):
+            return self._with(anew, state.solution, state.residuals, state.rounds)
         problem = replace(state.problem, smoothness=self._problem.smoothness)
-        inliers = replace(state.inliers, degrees_of_freedom=anew.inliers.degrees_of_freedom)
+        inliers = replace(state.inliers, degrees_of_freedom=anew.degrees_of_freedom)
         return replace(state, problem=problem, inliers=inliers, reduced=reduced)
 
-    def by_leverages(self, state: RobustSolution) -> tuple[RobustSolution, ReducedInformation]:
-        """The state judged by the leverages there, and what they were taken from."""
+    def by_leverages(self, state: RobustSolution) -> RobustSolution:
+        """The state judged by the leverages there."""
+        return self._with(self._anew(state)[0], state.solution, state.residuals, state.rounds)
+
+    def _anew(self, state: RobustSolution) -> tuple[Inliers, ReducedInformation]:
+        """Noise and inliers by the leverages there, and what they were taken from."""
         reduced = information(state.problem, state.solution.estimate)
         self._problem, reduced, self._moving = with_smoothness(self._problem, state.solution.estimate, reduced)
         self._redundancy = Redundancy.by_leverage(state.problem.sights, reduced.leverages)
-        return self._weighted(state.solution, state.residuals, state.rounds), reduced
+        return self._judge(state.solution, state.residuals), reduced
 
-    def _judged(self, solution: Solution, before: Residuals, rounds: int) -> RobustSolution:
-        """Noise and inliers where a solve ended, and the problem that they make."""
+    def _judged(
+        self, solution: Solution, before: Residuals, rounds: int, inliers: Inliers | None = None
+    ) -> RobustSolution:
+        """Where a solve, of these inliers, ended, and the problem that the inliers there make."""
         there = residuals(self._observations, self._problem.sights, solution.estimate, before.feet)
-        return self._weighted(solution, there, rounds)
+        anew = self._judge(solution, there)
+        if inliers is not None and anew.same_as(inliers, self.no_change):
+            anew = anew.with_rows_of(inliers)
+        return self._with(anew, solution, there, rounds)
 
-    def _weighted(self, solution: Solution, there: Residuals, rounds: int) -> RobustSolution:
-        """The same from the residuals there."""
-        options = self._problem.options
+    def _judge(self, solution: Solution, there: Residuals) -> Inliers:
         redundancy = self._redundancy or Redundancy.by_count(
             self._problem.sights.equations, self._problem.unknowns(solution.estimate)
         )
-        inliers = judge(self._observations, there, redundancy, options, self._usual)
-        used = self._problem.used(inliers.points, inliers.curves)
-        problem = replace(used, weighting=inliers.weighting(options), feet=there.feet)
+        return judge(self._observations, there, redundancy, self._problem.options, self._usual)
+
+    def _with(self, inliers: Inliers, solution: Solution, there: Residuals, rounds: int) -> RobustSolution:
+        """The state with the problem that the inliers make; rows are not moved where the last ones were the same."""
+        last = self._last
+        if last is None or not inliers.same_rows(last[0]):
+            self._last = last = inliers, self._problem.sights.used(inliers.points, inliers.curves)
+        weighting = inliers.weighting(self._problem.options)
+        problem = replace(self._problem, sights=last[1], weighting=weighting, feet=there.feet)
         return RobustSolution(problem, solution, inliers, there, rounds)
+
+
+def _much_below(scales: tuple[float, float], before: tuple[float, float]) -> bool:
+    """Whether the scale of points or that of curves fell to a small share of what it was."""
+    return any(now < _MUCH_LESS * then for now, then in zip(scales, before, strict=True))
 
 
 def _evenly(problem: Problem) -> Indices:

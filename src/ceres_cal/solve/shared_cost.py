@@ -26,10 +26,13 @@ class Judged:
     equations: int
     judged_at: tuple[str, Estimate]
     bounds: tuple[float, float]
+    feet_along: tuple[tuple[str, Estimate], ...]
 
     def asked(self, problem: Problem, estimate: Estimate) -> Asked:
         """What the shares are asked about a problem at an estimate."""
-        return Asked(of_world(estimate), problem.layout, problem.weighting, self.judged_at, self.bounds)
+        return Asked(
+            of_world(estimate), problem.layout, problem.weighting, self.judged_at, self.bounds, self.feet_along
+        )
 
     def cost(self, run: Run, problem: Problem, estimate: Estimate) -> SharedCost:
         """What Ceres sees of them."""

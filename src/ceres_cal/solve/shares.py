@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ceres_cal.base.arrays import AnyArray, Array, Indices, Indices32, Mask
 from ceres_cal.model.parameters import Estimate, Layout
-from ceres_cal.model.residuals import Residuals, residuals
+from ceres_cal.model.residuals import residuals
 from ceres_cal.observations import Observations
 from ceres_cal.observations.columns import Curves, FileRows, Points, View, read_rows, rows_of
 from ceres_cal.observations.files import Content
@@ -42,6 +42,7 @@ class Asked(NamedTuple):
     Attributes:
         estimate, layout, weighting: of the problem. judged_at: where residuals say which rows take part, and its name.
         bounds: of points and of curve observations, the lengths in stated sigmas from which on they do not.
+        feet_along: places, by name, at each of which feet were sought from those before: from the last, all others are.
     """
 
     estimate: Estimate
@@ -49,6 +50,7 @@ class Asked(NamedTuple):
     weighting: Weighting
     judged_at: tuple[str, Estimate]
     bounds: tuple[float, float]
+    feet_along: tuple[tuple[str, Estimate], ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -228,7 +230,7 @@ class Share:
     left_out: tuple[Mask, Mask] | None = None
 
     def __post_init__(self) -> None:
-        self._feet: NDArray[np.float32] | None = None  # where the search for the next ones starts, and no more
+        self._feet: tuple[str, NDArray[np.float32]] | None = None  # and the name of where they are
         self._judged: _Judged | None = None
 
     def __getstate__(self) -> dict[str, Any]:
@@ -249,24 +251,30 @@ class Share:
         sights = sights.take(sights.numbers(placements=(None,)))
         return content, sights if self.left_out is None else sights.used(*(~mask for mask in self.left_out))
 
-    def _residuals(self, content: Content, sights: Sights, estimate: Estimate) -> Residuals:
-        feet = None if self._feet is None else self._feet.astype(float)
-        there = residuals(content, sights, estimate, feet)
-        self._feet = there.feet.astype(np.float32)
-        return there
+    def _feet_of(self, content: Content, sights: Sights, asked: Asked) -> Array:
+        """(m,) where the search for feet starts, known from before or found again: no answer depends on which."""
+        names = [name for name, _ in asked.feet_along]
+        known = self._feet if self._feet is not None and self._feet[0] in names else None
+        feet = None if known is None else known[1].astype(float)
+        for name, estimate in asked.feet_along[names.index(known[0]) + 1 if known else 0 :]:
+            kept = residuals(content, sights, estimate, feet).feet.astype(np.float32)
+            self._feet, feet = (name, kept), kept.astype(float)
+        assert feet is not None
+        return feet
 
     def _lengths(self, content: Content, sights: Sights, asked: Asked) -> tuple[Array, Array]:
         """(n,) and (m,) lengths of the residuals where the rows are judged, in stated sigmas; what decides which take
         part is remembered.
         """
-        there = self._residuals(content, sights, asked.judged_at[1])
+        name, estimate = asked.judged_at
+        there = residuals(content, sights, estimate, self._feet_of(content, sights, asked))
         lengths, sums, far = relative_lengths(content, there), [], []
         columns = content.points, content.curves
         for column, px, own, bound in zip(columns, there.lengths, lengths, asked.bounds, strict=True):
             rows = np.flatnonzero(~(own <= _FAR * bound))
             far.append((rows, own[rows]))
             sums.append(_sums(np.delete(px, rows), np.delete(column.sigma_px, rows)))
-        self._judged = _Judged(asked.judged_at[0], asked.bounds, far, np.array(sums))
+        self._judged = _Judged(name, asked.bounds, far, np.array(sums))
         return lengths
 
     def _judged_by(self, content: Content, sights: Sights, asked: Asked) -> _Judged:
@@ -305,8 +313,6 @@ class Share:
             rows = cost.block([numbers[owner] for owner in owners_of(sight.key, cost.slots)])
             if rows is None:
                 return Blocks(None)
-            if self._feet is not None:
-                self._feet[sight.curve_rows] = cost.feet
             answers[sight.key] = compressed(rows)
         return Blocks(answers)
 
@@ -335,7 +341,7 @@ class Share:
         """Each sight with the rows that take part, and its problem."""
         content, sights = self._loaded()
         part = sights.used(*self._judged_by(content, sights, asked).taking_part(content, asked))
-        feet = None if self._feet is None else self._feet.astype(float)
+        feet = self._feet_of(content, sights, asked)
         problem = Problem(part, asked.layout, (), asked.weighting, feet=feet)
         return ((sight, problem) for sight in part)
 

@@ -14,7 +14,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ceres_cal import kernels
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.tails import log_f_tail
 from ceres_cal.model.information import Information
@@ -22,6 +21,7 @@ from ceres_cal.model.parameters import Estimate
 from ceres_cal.model.quantities import moved, values_of
 from ceres_cal.model.residuals import residuals
 from ceres_cal.observations import Observations
+from ceres_cal.solve.costs import robust_weights
 from ceres_cal.solve.information import information
 from ceres_cal.solve.problem import Problem
 from ceres_cal.solve.robust import RobustSolution
@@ -89,8 +89,7 @@ def _slopes(problem: Problem, observations: Observations, estimate: Estimate, re
         return np.nan_to_num(seen.points / sigmas[0]), np.nan_to_num(seen.curves / sigmas[1])
 
     points, curves = standardised(estimate)
-    loss = kernels.Loss(kernels.LOSS_CODES[weighting.loss], weighting.loss_scale)
-    weights = kernels.loss_weights(loss, np.concatenate([np.sum(points**2, axis=1), curves**2]))
+    weights = robust_weights(weighting, np.concatenate([np.sum(points**2, axis=1), curves**2]))
     points, curves = points * weights[: len(points), None], curves * weights[len(points) :]
     slopes = []
     for number, stated in enumerate(np.diagonal(rest.matrix)):

@@ -195,14 +195,14 @@ def radial_alignment(data: PlaneData, unit_px: float, terms: int, rounds: int) -
     x, lifts = np.empty((2, len(p))), np.empty((sights, 3))
     normalised_planes(data.bounds, data.plane, x, lifts)
     h12, shares, errors = np.empty((sights, 6)), np.empty((sights, 3, terms + 1)), np.empty(len(p))
-    weights = np.ones(len(p))
+    usual, weights = np.empty(len(p)), np.ones(len(p))
     for _ in range(rounds):
         reduced = np.zeros((terms + 1, terms + 1))
         align_sights(data.bounds, x, p, weights, h12, shares, reduced)
         c = np.linalg.lstsq(reduced[:terms, :terms], reduced[:terms, terms], rcond=1e-10)[0]
         h3 = shares[:, :, terms] - shares[:, :, :terms] @ c
         alignment_errors(data.bounds, x, p, h12, h3, c, errors)
-        usual = usual_by_radius(errors, radius)
+        usual_by_radius(errors, radius, usual)
         weights = 1.0 / (1.0 + (errors / (1.5 * usual)) ** 2)
     homographies = np.concatenate([h12.reshape(-1, 2, 3) * unit_px, h3[:, None, :]], axis=1) @ _restored(lifts)
     return RadialAlignment(

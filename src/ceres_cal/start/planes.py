@@ -154,10 +154,17 @@ def profile_and_homographies(sights: Sights, unit: float) -> tuple[RadialProfile
     return profile, Homographies(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
 
+def _scatter(values: Array, bounds: Indices) -> Array:
+    """See `kernels.grouped_scatter`."""
+    scatter = np.empty((len(bounds) - 1, values.shape[1], values.shape[1]))
+    grouped_scatter(values, bounds, scatter)
+    return scatter
+
+
 def _of_boards(numbers: Indices, board: Sights, data: PlaneData, profile: RadialProfile) -> Homographies:
     """The homographies of sights of points that send the plane to more than a point or a line."""
     matrices = _homographies_of_boards(board, data, profile)
-    sizes = np.sqrt(np.trace(grouped_scatter(data.offsets, data.bounds), axis1=1, axis2=2))
+    sizes = np.sqrt(np.trace(_scatter(data.offsets, data.bounds), axis1=1, axis2=2))
     heights = board.points[board.point_bounds[:-1], 2]
     b = matrices[:, :, :2]
     m = np.swapaxes(b, 1, 2) @ b
@@ -170,7 +177,7 @@ def _flat_sights_of_points(sights: Sights) -> tuple[Indices, Sights]:
     few = (np.diff(sights.point_bounds) >= 6) & (np.diff(sights.curve_bounds) == 0)
     candidates = np.flatnonzero(few)
     board = sights.take(candidates)
-    scatter = grouped_scatter(board.points, board.point_bounds)
+    scatter = _scatter(board.points, board.point_bounds)
     xx, xy, yy = scatter[:, 0, 0], scatter[:, 0, 1], scatter[:, 1, 1]
     flat = np.flatnonzero((scatter[:, 2, 2] < 1e-18) & (xx * yy - xy**2 > 1e-12 * (xx + yy) ** 2))
     return candidates[flat], board.take(flat)

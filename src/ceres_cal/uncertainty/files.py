@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache
 
 import msgspec
 import numpy as np
 
+from ceres_cal.base.arrays import Indices
 from ceres_cal.base.errors import InputError
 from ceres_cal.model.information import Information
 from ceres_cal.model.keys import Key, pose_keys
@@ -111,7 +113,13 @@ class PosteriorFile(msgspec.Struct, forbid_unknown_fields=True):
 
 def lower_triangle(information: Information) -> list[float]:
     """Row by row, the diagonal included."""
-    return list(information.matrix[np.tril_indices(len(information.keys))].tolist())
+    return list(information.matrix[_lower_triangle(len(information.keys))].tolist())
+
+
+@cache
+def _lower_triangle(size: int) -> tuple[Indices, Indices]:
+    rows, columns = np.tril_indices(size)
+    return rows, columns
 
 
 def information_from(triangle: Sequence[float], keys: Sequence[Key], where: str) -> Information:

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from ceres_cal.base.arrays import Array
+from ceres_cal.base.spread import are_known
 from ceres_cal.base.words import two_digits
-from ceres_cal.model.keys import PLACEMENT_QUANTITIES, Key
+from ceres_cal.model.keys import PLACEMENT_QUANTITIES, Key, sigma_limits
 from ceres_cal.model.parameters import Estimate
 from ceres_cal.model.quantities import natural_sizes, values_of
 from ceres_cal.uncertainty.posterior import Posterior
@@ -93,7 +94,10 @@ def _word(key: Key, relative: float) -> str:
 
 def unknown_placements(posterior: Posterior) -> dict[str, tuple[str, ...]]:
     """Placements of which some number is not known at all, and which: the roll of a ring sheet about its axis."""
-    unknown = {}
+    unknown: dict[str, tuple[str, ...]] = {}
+    every = list(posterior.placements.values())
+    if every and are_known(np.array([one.matrix for one in every]), sigma_limits(every[0].keys)):
+        return unknown
     for name in posterior.placements:
         lost = np.isinf(posterior.placement(name).sd)
         if lost.any():

@@ -1,4 +1,4 @@
-"""Whether stated uncertainty is honest, over many simulated calibrations: python scripts/coverage.py [--help]
+"""Whether stated uncertainty is honest, over many simulated calibrations: python scripts/intervals.py [--help]
 
 For each problem: how often the stated 95 % intervals of the parameters, and of points located at 0 and 150 mm, contain
 the truth, over all of them (93 to 97 % asked) and for the parameter that does worst (91 % asked); and how often the
