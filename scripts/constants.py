@@ -117,7 +117,7 @@ DECIDING: tuple[Constant, ...] = (
     *_of("moves.refitting", "_NATS_ALIKE _UNIQUE", "refit"),
     *_of("moves.explain", "_HALF _FEW _RARE _NOISIER _TOO_NOISY _SUPPORTED _FAR_M _NEAR_M _NEAR_RAD", "refit"),
     *_of("detect.lines", "_LEAST_CLARITY _LEAST_CONTRAST _OF_NEARBY _NOISY _WANDERING _FAR", "lines"),
-    *_of("detect.strokes", "_LEAST_PX _STRAIGHT_PX _NOISE _NOISE_NEARBY _WIDEST", "auto"),
+    *_of("detect.strokes", "_LEAST_PX _STRAIGHT_PX _NOISE _NOISE_NEARBY _WIDEST _COARSER", "auto"),
     *_of("detect.saddles", "_LOST _FAINT", "boards"),
     *_of("detect.boards", "_MOST_PX _UNEVEN", "boards"),
     *_of("detect.partly", "_MISFIT _AS_STRONG _CLEAR", "boards"),
