@@ -150,6 +150,11 @@ def valley(camera: str, problem: Problem, estimate: Estimate, inflation: float =
         )
     down = list(_walk(camera, problem, first, -1, inflation))
     up = list(_walk(camera, problem, first, +1, inflation))
+    if not (down or up):
+        raise SolutionError(
+            f"camera {camera!r}: no other phi beside {phi:.1f} px can be solved for, so nothing says how far it is "
+            "known: check labels and dimensions, add observations, or a prior on height_m or phi"
+        )
     return (*down[::-1], first, *up)
 
 
