@@ -1,4 +1,4 @@
-"""Lenses that are none of the package's own, before boards: python scripts/other_lenses.py [--help]
+"""Lenses by their own formulas, which the package need not have, before boards: python scripts/other_lenses.py [--help]
 
 Each lens is a formula of this script; 6, 12 and 25 views of a board, tilted by up to 40 degrees, fill its picture, with
 0.2 px of noise. Calibrated by defaults, so that the lens is chosen by the data: how far from where the truth has them
