@@ -146,3 +146,22 @@ def _kept_by(client: Any) -> int:
             break
         time.sleep(0.1)
     return kept
+
+
+def test_workers_that_keep_nothing_are_lost_in_words(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nobody is there to be asked, and nobody to be named."""
+
+    class Nobody:
+        scheduler = None
+
+        def __getattr__(self, name: str) -> Callable[..., Any]:
+            answers = {"scheduler_info": {"workers": ["a"]}, "submit": self, "who_has": {}, "run": {}}
+            return lambda *_, **__: answers.get(name)
+
+        key = "a"
+
+    monkeypatch.setattr(Nobody, "scheduler", Nobody())
+    monkeypatch.setattr(engines, "_PAUSE_S", 0.0)
+    share: Any = "a share"
+    with pytest.raises(SolutionError, match=r"lost again and again: have they enough memory\?$"):
+        engines.OnWorkers(Nobody(), [share]).ask(lambda _: None)

@@ -267,7 +267,7 @@ def _tolerances(specs: list[str]) -> dict[str, Tolerance]:
     """The tolerances of `--tolerance` arguments: TARGET.lines_m|points_m|warp_m=SIGMA."""
     from ceres_cal.model.structure import Tolerance
 
-    given: dict[str, dict[str, float]] = {}
+    given: dict[str, dict[str, Any]] = {}
     names = ("lines_m", "points_m", "warp_m")
     for spec in specs:
         left, equals, value = spec.rpartition("=")
@@ -275,7 +275,4 @@ def _tolerances(specs: list[str]) -> dict[str, Tolerance]:
         if not (equals and dot) or what not in names:
             raise InputError(f"--tolerance {spec!r}: write TARGET.{'|'.join(names)}=SIGMA, such as field.lines_m=0.01")
         given.setdefault(target, {})[what] = parse_length(value, f"--tolerance {spec!r}")
-    return {
-        target: Tolerance(of.get("lines_m", 0.0), of.get("points_m", 0.0), of.get("warp_m", 0.0))
-        for target, of in given.items()
-    }
+    return {target: Tolerance(**sigmas) for target, sigmas in given.items()}

@@ -55,7 +55,10 @@ class CachedCost(pyceres.CostFunction):
         return True
 
     def _evaluated(self, at: Array, parameters: Sequence[Array]) -> Answer | None:
-        """The answer in a place, whole and by blocks; None where an observation cannot be projected from there."""
+        """The answer in a place, whole and by blocks; None where an observation cannot be projected from there.
+
+        For every cost function to say: pyceres' own class has a metaclass that none with abstract methods can join.
+        """
         raise NotImplementedError
 
     def _accept(self) -> None:

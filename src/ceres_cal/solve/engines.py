@@ -20,7 +20,6 @@ _GROUPS = 16  # workers up to which sums are the same to the last bit; what is s
 _PAUSE_S = 0.05  # before what a lost worker had is asked again, four times as long each time
 _NO_ROOM = "a worker's disk is full: make room, or start it with another --local-directory"
 _NO_MEMORY = "a worker ran out of memory: give it more, or start more workers"
-_LOST = "workers were lost again and again: have they enough memory?"
 
 
 class Engine(Protocol):
@@ -115,6 +114,7 @@ class OnWorkers:
     def ask(self, answer: Callable[..., _A], *request: Any) -> _A:
         """The sum of answer(share, *request) over all shares."""
         answers: dict[int, _A] = {}
+        last = ""
         for again in range(_RETRIES + 1):
             if again:
                 time.sleep(_PAUSE_S * 4**again)
@@ -134,7 +134,7 @@ class OnWorkers:
                     last = worker
             if len(answers) == len(self._kept):
                 return reduce(add, (answers[number] for number in range(len(self._kept))))
-        raise SolutionError(f"{_LOST} ({last})")
+        raise _lost(last)
 
     def close(self) -> None:
         """Let the shares go."""
@@ -178,5 +178,9 @@ def _in_words(error: BaseException) -> BaseException:
         return SolutionError(_NO_MEMORY)
     if type(error).__name__ in ("KilledWorker", "FutureCancelledError", "CancelledError"):
         last = getattr(getattr(error, "last_worker", None), "address", "")
-        return SolutionError(_LOST + f" ({last})" * bool(last))
+        return _lost(last)
     return error
+
+
+def _lost(last: str) -> SolutionError:
+    return SolutionError("workers were lost again and again: have they enough memory?" + f" ({last})" * bool(last))
