@@ -13,6 +13,7 @@ from ceres_cal.base.errors import NothingShownError
 from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
 from ceres_cal.cli import main
+from ceres_cal.cli.detect_field import _data
 from ceres_cal.detect.courses import predict
 from ceres_cal.detect.images import filled, light
 from ceres_cal.detect.lines import Lines, measure
@@ -20,7 +21,7 @@ from ceres_cal.detect.registration import nearness_to
 from ceres_cal.detect.strokes import Strokes, drawn, find_strokes
 from ceres_cal.model.parameters import Options
 from ceres_cal.observations import Observations, Prior
-from ceres_cal.photographs import Auto, Clicks, FieldOptions, detect_field
+from ceres_cal.photographs import Auto, Clicks, FieldDetections, FieldOptions, detect_field
 from ceres_cal.photographs.as_built import AsBuilt, as_built
 from ceres_cal.photographs.clicks import unknown_optics
 from ceres_cal.photographs.matching import StrokeMap
@@ -103,6 +104,14 @@ def test_a_line_that_lies_aside_is_straight_nevertheless(tmp_path: Path) -> None
     offsets = dict(zip(calibration.estimate.structure.names, calibration.estimate.structure.values, strict=True))
     for name, offset in zip(aside, (-0.03, -0.03, 0.02), strict=True):
         assert offsets[f"field/{name}"] == pytest.approx(offset, abs=0.003)
+
+
+def test_an_offset_is_no_length() -> None:
+    """What is printed as a length to solve for is one; an offset is said to lie beside its drawing."""
+    seen = observations_of(FIELD, CAMERA.image_size, np.zeros(1, int), np.full((1, 2), 99.0), np.ones(1))
+    priors = (Prior.of_offset("field", "HalfwayLine", 0.04), Prior("target", "field", "field_width_m", (5.9,), (0.1,)))
+    detections = FieldDetections(replace(seen, priors=priors), {}, (), {})
+    assert _data(detections, Path("field.json"))["lengths_m"] == {"field_width_m": 5.9}
 
 
 @pytest.mark.parametrize("share", [0.92, 0.95, 0.97])

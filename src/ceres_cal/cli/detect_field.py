@@ -278,7 +278,7 @@ def _data(detections: FieldDetections, output: Path) -> dict[str, Any]:
         "output": str(output),
         "points": len(detections.observations.points),
         "curves": len(detections.observations.curves),
-        "lengths_m": {prior.quantity: prior.value[0] for prior in detections.observations.priors},
+        "lengths_m": {prior.quantity: prior.value[0] for prior in detections.observations.priors if prior.dimension},
         "found": [_image_data(path, detections) for path in detections.found],
         "missed": missed_data(detections.missed),
     }
