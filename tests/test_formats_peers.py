@@ -199,6 +199,8 @@ def test_import_export_import_changes_nothing(
         ("a.yaml", "camera_model: [", "not valid YAML"),
         ("a.yaml", "cam1: {camera_model: pinhole}", "its cameras must be cam0, cam1"),
         ("a.yaml", "cam0: {camera_model: round, intrinsics: [1]}", "'round' with distortion 'none' is unknown"),
+        ("a.yaml", "cam0: {camera_model: [1, 2]}", r"'.1, 2.' with distortion 'none' is unknown"),
+        ("a.yaml", "cam0: {camera_model: pinhole}\n7: 1", "not a YAML file of names and values"),
         ("a.yaml", "cam0: {camera_model: pinhole, intrinsics: [1, 2]}", r"cam0.intrinsics must be 4 finite numbers"),
         ("a.yaml", "distortion_model: plumb_bob\ncols: 3", "image_width and image_height must be whole numbers"),
         ("a.yaml", "image_width: 9\nimage_height: 9\ndistortion_model: x\ncols: 1", "it has no camera_matrix with"),

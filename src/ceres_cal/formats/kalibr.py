@@ -75,7 +75,7 @@ def _pose(entry: Mapping[str, Any], key: str) -> Pose:
 
 
 def _camera(entry: Mapping[str, Any], key: str, pose: Pose | None) -> ForeignCamera:
-    model, bent = entry.get("camera_model"), entry.get("distortion_model", "none")
+    model, bent = str(entry.get("camera_model")), str(entry.get("distortion_model", "none"))
     if model not in _PROJECTIONS or bent not in _DISTORTIONS:
         raise InputError(f"{key}: {model!r} with distortion {bent!r} is unknown: one of {', '.join(_PROJECTIONS)} with "
                          f"{', '.join(_DISTORTIONS)}")  # fmt: skip

@@ -33,7 +33,7 @@ def read_yaml(text: str) -> dict[str, Any]:
         size = _size(data, {})
     except (yaml.YAMLError, ValueError, TypeError, OverflowError, RecursionError) as error:
         raise InputError(f"not valid YAML (cut short?): {' '.join(str(error).split())}") from None
-    if not isinstance(data, dict):
+    if not (isinstance(data, dict) and all(isinstance(name, str) for name in data)):
         raise InputError("not a YAML file of names and values")
     if math.isinf(size):
         raise InputError("something in its YAML holds itself: correct that")
