@@ -17,6 +17,7 @@ _MENDED = {
     ("few line points", "kannala-brandt", 1673): "5.6 radii: the map bends; 0.9, 0.6",
     ("few points", "kannala-brandt", 760): "3.9 radii: the map bends; 0, 0.1",
     ("few points", "kannala-brandt", 40): "divided by 0: without the prior nothing says anything of a number; 1.5, 0.5",
+    ("points and few line points", "brown", 1978): "7.6 sd, 4.2 radii: another minimum costs less; 1.4, 0.5",
     ("few line points", "radial", 1609): "a traceback: beside its phi nothing can be solved for; refused",
 }
 

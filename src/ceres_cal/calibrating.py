@@ -31,6 +31,7 @@ from ceres_cal.solve import (
     Solution,
     find_conflicts,
     information,
+    least_of_few,
     solve_robustly,
 )
 from ceres_cal.solve.as_built import solve_as_built, tolerances_of
@@ -50,6 +51,8 @@ from ceres_cal.uncertainty import Posterior, Scatter, assess, measure_scatter
 # Share of the standard deviation of usual principal points: observations that say as much need nothing usual. Half and
 # double leave ordinary fields and boards, whose share is under a tenth, as they are.
 _SAYS_LESS = 0.5
+# Share of what the normal equations say that another minimum costs at most: the same one, not quite reached, costs all.
+_OTHER = 0.25
 # Share of a dimension by which it may come out another than drawn without a second solve from there, whose start and
 # outliers are those of the right drawing; and how many there may be.
 _REDRAWN, _MOST_DRAWINGS = 0.005, 4
@@ -268,6 +271,7 @@ def solved_from(
     as_built: tuple[AsBuilt, ...] = ()
     if again is None and problem.options.as_built == "estimate":
         end, problem, explanations, as_built = solve_as_built(problem, observations, end, explanations, solved)
+    end, others = least_of_few(problem, observations, end) if again is None else (end, ())
     require_fits(end, problem)
     require_possible(observations, problem.sights, end.solution.estimate, end.residuals)
     posterior, conflicts, settled = None, Conflicts(), None
@@ -281,6 +285,7 @@ def solved_from(
     if assessed:
         end, posterior = _assess(end, observations, problem, again)
         posterior = _with_doubts(posterior.in_doubt(conflicts.keys, conflicts.shifts), end, explanations)
+        posterior = _with_others(posterior, end, others)
         warnings = (*warnings, *(one.words for one in conflicts.every), *unknown_phi(end, posterior))
         warnings = (*warnings, *resting_phi(end, problem))
     if digest is not None:
@@ -323,6 +328,17 @@ def _assess(
 
     assessed, posterior = assess(known, estimate, reduced, end.inliers.degrees_of_freedom, scatter_at)
     return (end if assessed is estimate else end.moved_to(assessed, observations, problem)), posterior
+
+
+def _with_others(posterior: Posterior, end: RobustSolution, others: Sequence[Solution]) -> Posterior:
+    """The posterior that holds other minima, too, as far as they cost no more than its intervals reach."""
+    known, shifts = (posterior.by_model or posterior.information).matrix, []
+    for one in others:
+        shift = difference(one.estimate, end.solution.estimate, posterior.keys)
+        # In the same minimum it would cost what the normal equations say.
+        if 2.0 * one.cost < min(posterior.half_width**2, _OTHER * float(shift @ known @ shift)):
+            shifts.append(shift)
+    return posterior.in_doubt(posterior.keys, shifts)
 
 
 def _start_of(others: Problem, some: Asked, start: Start, again: Again | None) -> Estimate:

@@ -1,0 +1,57 @@
+"""Other minima of few observations: where a solve ends that begins at another phi.
+
+A floor seen by few points and lines may be explained from two places, by two lenses; a start cannot tell which of the
+minima is the least, nor that there are two.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import replace
+
+from ceres_cal.base.errors import CalibrationError
+from ceres_cal.model.parameters import Estimate
+from ceres_cal.observations import Observations
+from ceres_cal.solve.bundle import Solution, solve
+from ceres_cal.solve.problem import Problem
+from ceres_cal.solve.robust import RobustSolution
+
+_FEW = 300  # equations from which on one minimum was seen: the cases mended had under 200
+_FACTORS = 0.7, 0.85, 1.15, 1.4  # on phi: the other valleys that were seen began within a sixth
+_MOST_ITERATIONS = 30  # of each: along a flat valley the solver creeps for hundreds that change nothing here
+_LOWER = 1.0  # of twice the cost: rounding is less, and what is no lower than that is as likely
+
+
+def least_of_few(
+    problem: Problem, observations: Observations, end: RobustSolution
+) -> tuple[RobustSolution, tuple[Solution, ...]]:
+    """The end of all rounds in the least minimum of its inliers that is found from there, and others, with what they
+    cost beyond it.
+
+    Args:
+        problem: of all the observations. end: of its rounds.
+    """
+    if end.problem.sights.equations >= _FEW:
+        return end, ()
+    least = solve(end.problem, end.solution.estimate)
+    others = list(_elsewhere(end.problem, least.estimate))
+    lowest = min(others, key=lambda one: one.cost, default=least)
+    if 2.0 * (least.cost - lowest.cost) > _LOWER:
+        others.append(least)
+        least = solve(end.problem, lowest.estimate)
+        end = replace(end.moved_to(least.estimate, observations, problem), reduced=None)
+    return end, tuple(replace(one, cost=one.cost - least.cost) for one in others)
+
+
+def _elsewhere(problem: Problem, estimate: Estimate) -> Iterator[Solution]:
+    """Where solves end that begin with other phis; the same minimum may come again."""
+    short = replace(problem.options, max_iterations=min(_MOST_ITERATIONS, problem.options.max_iterations))
+    for name in [name for name, numbers in problem.layout.free.items() if 0 in numbers]:
+        for factor in _FACTORS:
+            camera = estimate.cameras[name]
+            start = replace(estimate, cameras={**estimate.cameras, name: replace(camera, phi=factor * camera.phi)})
+            with suppress(CalibrationError):  # nothing is seen from there
+                solution = solve(replace(problem, options=short), start, is_near=False)
+                if not solution.failed:
+                    yield solution
