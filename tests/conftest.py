@@ -1,6 +1,7 @@
 """What several test modules share."""
 
 import fcntl
+import gc
 import os
 import pickle
 import signal
@@ -24,6 +25,16 @@ _T = TypeVar("_T")
 
 # A shell's background jobs get SIGINT ignored, and hand it on; the tests of Ctrl-C want it as it comes at a terminal.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def pytest_collection() -> None:
+    """All that is imported and collected stays: nobody needs to look through it for garbage."""
+    gc.disable()
+
+
+def pytest_collection_finish() -> None:
+    gc.freeze()
+    gc.enable()
 
 
 @pytest.fixture(scope="session")
