@@ -58,6 +58,12 @@ def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[], _T]
     return made
 
 
+@pytest.fixture
+def words_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Reports without their pictures, which take most of the time, for tests that ask what is said."""
+    monkeypatch.setattr("ceres_cal.report.page.to_svg", lambda *_: "<svg></svg>")
+
+
 @pytest.fixture(scope="session")
 def sony_boards(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> BoardDetections:
     """What is detected in BoofCV's 13 photographs."""
