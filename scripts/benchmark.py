@@ -526,6 +526,7 @@ def main(arguments: Sequence[str]) -> int:
         return 0
     if chosen.quick:
         chosen.frames, chosen.growth, chosen.points, chosen.repeat = [20], [20, 40], [1000], 1
+        chosen.warm_up = 0.0
     if chosen.scale:
         report = measure_scale(chosen)
     else:

@@ -9,6 +9,7 @@ import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 
 import cv2
@@ -96,6 +97,7 @@ def varied(seed: int) -> Photography:
     )
 
 
+@lru_cache(maxsize=8)
 def take(seed: int) -> Shot:
     """Photograph number `seed`."""
     rng = np.random.default_rng(seed)

@@ -90,11 +90,12 @@ def observed_boards(real: Path) -> BoardDetections:
     return detect_boards(sorted((real / FOLDER).glob("GOPR*.jpg")), checkerboard(COLUMNS, ROWS, 1.0))
 
 
-def straight_rows(real: Path, boards: BoardDetections, keep_scale: bool = False) -> Iterator[Row]:
+def straight_rows(real: Path, boards: BoardDetections, keep_scale: bool = False, every: int = 1) -> Iterator[Row]:
     """Of test_image.jpg and of the boards: how far corners lie off their rows and columns, ours and OpenCV's.
 
     Args:
         keep_scale: in a straight image as large as keeps the photograph's scale in the middle, not of its size.
+        every: only so manieth board.
     """
     camera = calibrate(boards.observations, THREE).station()
     straight = straighten(camera, whole=True, phi=camera.phi if keep_scale else None)
@@ -104,7 +105,7 @@ def straight_rows(real: Path, boards: BoardDetections, keep_scale: bool = False)
     case = f"straight, phi {straight.camera.phi:.0f} px"
     starts = {real / FOLDER / "test_image.jpg": clicked_grid(camera, straight)}
     points = boards.observations.points
-    for view, path in enumerate(boards.found):
+    for view, path in list(enumerate(boards.found))[::every]:
         grid = np.empty((ROWS * COLUMNS, 2))
         grid[points.feature[points.view == view]] = points.pixels[points.view == view]
         starts[Path(path)] = in_straight(camera, straight, grid).reshape(ROWS, COLUMNS, 2)

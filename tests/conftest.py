@@ -1,7 +1,13 @@
 """What several test modules share."""
 
+import fcntl
+import gc
+import os
+import pickle
 import signal
+from collections.abc import Callable
 from pathlib import Path
+from typing import TypeVar
 
 import pytest
 from hypothesis import settings
@@ -15,8 +21,20 @@ from ceres_cal.scene.targets import checkerboard
 settings.register_profile("untimed", deadline=None)  # how long an example takes is no property of it
 settings.load_profile("untimed")
 
+_T = TypeVar("_T")
+
 # A shell's background jobs get SIGINT ignored, and hand it on; the tests of Ctrl-C want it as it comes at a terminal.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def pytest_collection() -> None:
+    """All that is imported and collected stays: nobody needs to look through it for garbage."""
+    gc.disable()
+
+
+def pytest_collection_finish() -> None:
+    gc.freeze()
+    gc.enable()
 
 
 @pytest.fixture(scope="session")
@@ -28,16 +46,36 @@ def real_data() -> Path:
     return folder
 
 
+def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[], _T]) -> _T:
+    """What takes long to make: the first of the run's workers makes it, and the others read it."""
+    own = factory.getbasetemp()
+    path = (own.parent if "PYTEST_XDIST_WORKER" in os.environ else own) / name
+    with path.with_suffix(".lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not path.exists():
+            path.write_bytes(pickle.dumps(make()))
+    made: _T = pickle.loads(path.read_bytes())
+    return made
+
+
+@pytest.fixture
+def words_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Reports without their pictures, which take most of the time, for tests that ask what is said."""
+    monkeypatch.setattr("ceres_cal.report.page.to_svg", lambda *_: "<svg></svg>")
+
+
 @pytest.fixture(scope="session")
-def sony_boards(real_data: Path) -> BoardDetections:
+def sony_boards(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> BoardDetections:
     """What is detected in BoofCV's 13 photographs."""
-    return detect_boards(sorted((real_data / "boofcv_sony_chess").glob("*.jpg")), checkerboard(4, 6, 0.03))
+    images = sorted((real_data / "boofcv_sony_chess").glob("*.jpg"))
+    return made_once(tmp_path_factory, "sony", lambda: detect_boards(images, checkerboard(4, 6, 0.03)))
 
 
 @pytest.fixture(scope="session")
-def gopro_boards(real_data: Path) -> BoardDetections:
+def gopro_boards(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> BoardDetections:
     """What is detected in the 36 wide-angle photographs; the size of a square is not known."""
-    return detect_boards(sorted((real_data / "udacity_gopro_wide").glob("GOPR*.jpg")), checkerboard(8, 6, 1.0))
+    images = sorted((real_data / "udacity_gopro_wide").glob("GOPR*.jpg"))
+    return made_once(tmp_path_factory, "gopro", lambda: detect_boards(images, checkerboard(8, 6, 1.0)))
 
 
 @pytest.fixture(scope="session")

@@ -30,7 +30,7 @@ from ceres_cal.observations.sights import gather_sights
 from ceres_cal.simulate import simulate
 from ceres_cal.solve.mirrored import mirrored
 
-RUNS = 60
+RUNS = 20
 PROBLEMS = tuple(scenes.PROBLEMS)
 
 
@@ -47,7 +47,7 @@ def test_efficient_without_outliers(name: str) -> None:
     efficiency = found(name, 0.0)
     assert efficiency.failed == 0
     excess, error = efficiency.excess
-    assert error < 0.015  # 0.007 measured at most, so that 5 percent are told
+    assert error < 0.015  # 0.012 measured at most, so that 5 percent are told
     assert excess < 0.05  # 0.006 measured at most
     sigmas, parameter = efficiency.bias
     assert sigmas < 4.0, parameter  # 2.7 measured at most, of 58 numbers
@@ -134,12 +134,12 @@ def test_no_pose_of_a_small_board_is_mirrored() -> None:
 
 @pytest.mark.parametrize("name", scenes.SSL_PROBLEMS)
 def test_the_scenes_of_ssl_vision_are_solved_as_well_as_the_noise_allows(name: str) -> None:
-    rows = list(accuracy.ssl_vision_rows(name, scenes.SSL_PROBLEMS[name](), 20))
+    rows = list(accuracy.ssl_vision_rows(name, scenes.SSL_PROBLEMS[name](), 10))
     for row in rows:
         if row.what.startswith("its excess"):
-            assert row.error < 0.03  # 0.002 measured, so that 10 percent are told
+            assert row.error < 0.03  # 0.003 measured, so that 10 percent are told
         assert row.verdict in ("yes", "open", ""), row
-    # Medians of 20 seeds vary by 8 percent or so; the paper's lens is ssl-vision's worst case.
+    # Medians of 10 seeds vary by 11 percent or so; the paper's lens is ssl-vision's worst case.
     means = {row.case: row.value for row in rows if row.what.startswith("mean")}
     if "paper" in name:
         for height, (theirs, _) in zip(("0", "150"), scenes.SSL_VISION_MM[name], strict=True):
@@ -169,8 +169,8 @@ def test_lines_painted_amiss_are_found_by_six_stations(seed: int) -> None:
 
 @pytest.mark.parametrize("heights_known", [False, True])
 def test_tolerances_do_no_harm_where_two_cameras_can_tell_little(heights_known: bool) -> None:
-    errors = np.array([accuracy.floor_errors_of_two_cameras(seed, heights_known) for seed in range(5)])
-    assert np.all(errors[:, 1] <= errors[:, 0])  # 5 against 11 mm on average
+    errors = np.array([accuracy.floor_errors_of_two_cameras(seed, heights_known) for seed in range(2)])
+    assert np.all(errors[:, 1] <= errors[:, 0])  # 4 against 7 mm on average
 
 
 # ---- the script -----------------------------------------------------------------------------------------------------
@@ -178,9 +178,9 @@ def test_tolerances_do_no_harm_where_two_cameras_can_tell_little(heights_known: 
 
 def test_the_script_prints_and_writes_its_rows(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "figures.json"
-    assert accuracy.main(["--case", "as-built", "--runs", "2", "--json", str(path)]) == 0
+    assert accuracy.main(["--case", "field", "--runs", "9", "--json", str(path)]) == 0
     rows = json.loads(path.read_text(encoding="utf-8"))
     printed = capsys.readouterr().out
-    assert {row["verdict"] for row in rows} == {"yes", ""}
+    assert {row["verdict"] for row in rows} == {"yes", "open"}
     assert all(row["what"] in printed for row in rows)
-    assert all("least" not in row for row in rows)  # JSON knows no infinity
+    assert "Infinity" not in path.read_text(encoding="utf-8")  # JSON knows none

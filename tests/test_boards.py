@@ -218,9 +218,15 @@ def calibrated(detections: BoardDetections, flags: int) -> tuple[float, Array, A
         ("saddle", 0.145, 702.6),  # 0.1383 and 702.59
     ],
 )
-def test_sony_photographs(real_data: Path, corner_fit: str, most_px: float, phi: float) -> None:
-    images = sorted((real_data / "boofcv_sony_chess").glob("*.jpg"))
-    detections = detect_boards(images, checkerboard(4, 6, 0.03), corners=corner_fit)
+def test_sony_photographs(
+    real_data: Path, sony_boards: BoardDetections, corner_fit: str, most_px: float, phi: float
+) -> None:
+    detections = sony_boards
+    if corner_fit == "opencv":
+        seen: list[tuple[int, int, str]] = []
+        images, board = sorted((real_data / "boofcv_sony_chess").glob("*.jpg")), checkerboard(4, 6, 0.03)
+        detections = detect_boards(images, board, corners="opencv", progress=lambda *done: seen.append(done))
+        assert seen == [(i, 13, path.name) for i, path in enumerate(images, start=1)]
     assert len(detections.found) == 13 and not detections.missed
     assert len(detections.observations.points) == 13 * 24
     rms_px, matrix, sigma = calibrated(detections, cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K3)
@@ -232,13 +238,10 @@ def test_sony_photographs(real_data: Path, corner_fit: str, most_px: float, phi:
     assert abs(matrix[1, 1] - 698.65) < 2.0 * sigma[1]
 
 
-def test_gopro_photographs(real_data: Path) -> None:
-    images = sorted((real_data / "udacity_gopro_wide").glob("GOPR*.jpg"))
-    seen: list[tuple[int, int, str]] = []
-    detections = detect_boards(images, checkerboard(8, 6, 1.0), progress=lambda *done: seen.append(done))
-    assert len(images) == 36 and len(detections.found) == 35
+def test_gopro_photographs(gopro_boards: BoardDetections) -> None:
+    detections = gopro_boards
+    assert len(detections.found) == 35
     assert [Path(path).name for path, _ in detections.missed] == ["GOPR0055.jpg"]  # shows a part of the board only
-    assert seen == [(i, 36, path.name) for i, path in enumerate(images, start=1)]
     assert len(detections.observations.points) == 35 * 48
     rms_px, matrix, _ = calibrated(detections, cv2.CALIB_ZERO_TANGENT_DIST)
     assert rms_px < 0.53  # 0.5236; 0.5208 with saddles

@@ -347,6 +347,7 @@ def test_calibrate_tells_what_came_out(say: Say, tmp_path: Path) -> None:
     assert "warning" not in said.out and "weak" not in said.out and "seam" not in said.out
 
 
+@pytest.mark.usefixtures("words_alone")
 def test_one_verdict_on_the_screen_in_json_and_in_the_report(say: Say, tmp_path: Path) -> None:
     """Two wrong labels that were taken out do no harm: nobody is told otherwise by another command or its exit code."""
     out, page = tmp_path / "calibration.json", tmp_path / "page.html"

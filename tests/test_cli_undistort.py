@@ -165,6 +165,7 @@ def test_refusals(say: Say, folder: Path, tmp_path: Path) -> None:
 # ---- the report -----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.usefixtures("words_alone")
 def test_reports_with_photographs(say: Say, folder: Path, tmp_path: Path) -> None:
     page, images = tmp_path / "page.html", ("--images", folder / "in")
     said = say("calibrate", folder / "obs.json", "--report", page, *images, "--quiet")

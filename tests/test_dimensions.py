@@ -172,6 +172,7 @@ def test_without_a_start_the_field_is_sought_in_several_sizes() -> None:
     assert min(np.linalg.norm(away, axis=1)) < 0.3
 
 
+@pytest.mark.usefixtures("words_alone")
 def test_from_a_photograph(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path, observed, out = (str(tmp_path / name) for name in ("odd.png", "field.json", "calibration.json"))
     cv2.imwrite(path, picture())

@@ -232,6 +232,7 @@ def test_a_shorter_lens_is_the_longest_with_coefficients_at_0() -> None:
 # ---- where it is kept -----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.usefixtures("words_alone")
 def test_the_choice_is_kept_printed_and_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     _seen("kannala-brandt", "boards").save(tmp_path / "obs.json")
     arguments = ["calibrate", str(tmp_path / "obs.json"), "-o", str(tmp_path / "c.json")]

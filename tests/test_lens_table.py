@@ -215,6 +215,7 @@ def test_it_is_saved_and_loaded(calibration: Calibration, simulation: Simulation
     assert again.cameras["overhead"].lens == make_lens("division", (), {"k": -2.4e-7})
 
 
+@pytest.mark.usefixtures("words_alone")
 def test_the_command_line_offers_it(simulation: Simulation, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     simulation.observations.save(tmp_path / "observations.json")
     output = tmp_path / "calibration.json"

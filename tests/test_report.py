@@ -205,6 +205,7 @@ def test_a_frontal_view_is_trusted_on_the_floor_alone() -> None:
     assert "nan" not in re.sub(r"<svg.*?</svg>|<style.*?</style>", "", page, flags=re.S).lower().split()
 
 
+@pytest.mark.usefixtures("words_alone")
 def test_a_wrong_model_is_never_simply_trusted() -> None:
     observations = sample()[1]
     page = make_report(calibrate(observations, Options(powers=(3,))), observations)
@@ -245,6 +246,7 @@ def test_very_many_observations_are_diagnosed_by_a_sample() -> None:
     assert few is not None and few.new_data and 1000 < len(few.table) <= 5_500 < 4 * 2271
 
 
+@pytest.mark.usefixtures("words_alone")
 def test_boards_alone_tell_no_places() -> None:
     scene, disturbance = built_in_scene("boards")
     observations = simulate(scene, disturbance, seed=1).observations
@@ -255,6 +257,7 @@ def test_boards_alone_tell_no_places() -> None:
     assert '<figure id="map' not in page and "held as the world" in page
 
 
+@pytest.mark.usefixtures("words_alone")
 def test_the_closed_form_alone_is_not_to_be_used() -> None:
     observations = sample()[1]
     page = make_report(calibrate(observations, Options(lens="radial", closed_form_only=True)), observations)
@@ -279,6 +282,7 @@ def test_levels(radius: float, level: str) -> None:
 @pytest.mark.parametrize(
     "turned_deg, found", [(0.0, "good: This"), (0.05, "care: Use it"), (0.5, "no: It does not hold")]
 )
+@pytest.mark.usefixtures("words_alone")
 def test_new_data_tell_a_camera_that_was_bumped(turned_deg: float, found: str) -> None:
     calibration, _ = sample()
     scene, disturbance = built_in_scene("ssl-field")
@@ -382,6 +386,7 @@ def test_the_colours_say_the_same_in_every_report() -> None:
     assert np.all(np.diff(lightness) < -10.0)  # grey print has the same order; 14.9 measured
 
 
+@pytest.mark.usefixtures("words_alone")
 def test_no_number_is_green_under_a_verdict_that_promises_nothing() -> None:
     observations = sample()[1]
     calibration = calibrate(
@@ -418,6 +423,7 @@ def test_what_a_lens_shows_is_as_uncertain_as_lenses_scatter() -> None:
 # ---- commands -------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.usefixtures("words_alone")
 def test_commands_write_the_page(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     one, page, again = tmp_path / "one.json", tmp_path / "one.html", tmp_path / "again.html"
     assert main(["calibrate", str(SAMPLE), "-o", str(one), "--report", str(page), "--quiet"]) == 0

@@ -38,7 +38,6 @@ from ceres_cal.uncertainty.maps import locate_slopes, radius_95, visible_pixels
 from ceres_cal.uncertainty.seam import predicted
 
 ROOT = Path(__file__).resolve().parents[1]
-RUNS = 60
 
 
 @cache
@@ -203,20 +202,23 @@ def test_bounds_in_words(low: float, high: float, words: str) -> None:
 # ---- coverage, by small samples -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["tilt 25 deg", "tilt 3 deg", "tilt 1 deg", "tilt 1 deg, height", "boards"])
-def test_intervals_hold_what_they_say(name: str) -> None:
+@pytest.mark.parametrize(
+    "name, runs",
+    [("tilt 25 deg", 60), ("tilt 3 deg", 30), ("tilt 1 deg", 60), ("tilt 1 deg, height", 60), ("boards", 60)],
+)
+def test_intervals_hold_what_they_say(name: str, runs: int) -> None:
     """Four standard errors around 0.95; scripts/intervals.py has 500 runs of each, 0.943 to 0.964 measured. (25
     degrees: 0.98 in these 60, 0.955 in 150; where nearly all hold a sample's own error is too small.)
     """
-    found = cover(CASES[name], range(RUNS))
+    found, wider = cover(CASES[name], range(runs)), np.sqrt(60.0 / runs)
     assert found.failed == 0
     mean, error = share(found.parameters)
-    assert mean == pytest.approx(0.95, abs=4.0 * max(error, 0.01)) and error < 0.02
-    assert np.min(np.mean(found.parameters, axis=0)) > 0.83  # 0.95 less four standard errors
+    assert mean == pytest.approx(0.95, abs=4.0 * max(error, 0.01)) and error < 0.02 * wider
+    assert np.min(np.mean(found.parameters, axis=0)) > 0.95 - 0.12 * wider  # four standard errors
     if found.points:
-        assert share(found.points[0.0])[0] == pytest.approx(0.95, abs=0.04)
+        assert share(found.points[0.0])[0] == pytest.approx(0.95, abs=0.04 * wider)
     if found.points and np.mean(np.concatenate(found.open[0.15])) < 0.01:
-        assert share(found.points[0.15])[0] == pytest.approx(0.95, abs=0.06)
+        assert share(found.points[0.15])[0] == pytest.approx(0.95, abs=0.06 * wider)
     if found.placements:
         assert share(found.placements)[0] == pytest.approx(0.95, abs=0.04)
     assert np.mean(found.verdicts) >= 0.9  # 0.92 at 1 degree, 1.0 elsewhere

@@ -49,53 +49,54 @@ def predict(
     Args:
         camera: its cam_from_world is cam_from_target. margin_px: how far inside the image they must lie.
     """
-    parts = [
-        _places(target, camera, number, spacing_px, margin_px)
-        for number, (name, curve) in enumerate(target.curves.items())
-        if name in curves and curve.width_m > 0.0
-    ]
-    number = np.concatenate([np.empty(0, np.int32), *(np.full(len(s), i, np.int32) for i, s in parts)])
-    s = np.concatenate([np.empty(0), *(s for _, s in parts)])
+    painted = [i for i, (name, curve) in enumerate(target.curves.items()) if name in curves and curve.width_m > 0.0]
+    number, s = _places(target, camera, np.array(painted, dtype=np.int32), spacing_px, margin_px)
     course = course_at(target, camera, number, s)
     # Where the lens folds over, paint may have one edge only; and what is wider no search is meant for.
     whole = np.isfinite(course.curvature + np.sum(course.pixels + course.normals, axis=1))
     return course.take(whole & (course.width_px < _WIDEST_PX))
 
 
-def _places(target: Target, camera: Camera, number: int, spacing_px: float, margin_px: float) -> tuple[int, Array]:
-    """The curve's number and the parameters of its places."""
-    curve = target.curves[target.curve_names[number]]
-    s = np.linspace(*curve.parameter_range, _PIECES + 1)
-    pixels = camera.project(along_curve(curve, s))
+def _places(
+    target: Target, camera: Camera, curves: Indices32, spacing_px: float, margin_px: float
+) -> tuple[Indices32, Array]:
+    """Curve (N,) and parameter (N,) of the places; what is projected is projected at once, which spares most of it."""
+    low, high = np.array([curve.parameter_range for curve in target.curves.values()]).reshape(-1, 2)[curves].T
+    s = np.linspace(low, high, _PIECES + 1, axis=1)
+    pixels = _seen(target, camera, np.repeat(curves, _PIECES + 1), s.ravel()).reshape(*s.shape, 2)
     size = np.array(camera.image_size)
     with np.errstate(invalid="ignore"):
-        near = np.all((pixels > -0.5 * size) & (pixels < 1.5 * size), axis=1)
-    step = np.where(near[1:] & near[:-1], np.linalg.norm(np.diff(pixels, axis=0), axis=1), 0.0)
-    length = np.concatenate([[0.0], np.cumsum(np.nan_to_num(step))])
-    count = int(length[-1] / spacing_px)
-    if count < 1:
-        return number, np.empty(0)
-    even = (np.arange(count) + 0.5) * (length[-1] / count)
-    chosen = np.interp(even, length, s)
-    there = camera.project(along_curve(curve, chosen))
+        near = np.all((pixels > -0.5 * size) & (pixels < 1.5 * size), axis=2)
+    step = np.where(near[:, 1:] & near[:, :-1], np.linalg.norm(np.diff(pixels, axis=1), axis=2), 0.0)
+    length = np.pad(np.cumsum(np.nan_to_num(step), axis=1), ((0, 0), (1, 0)))
+    counts = (length[:, -1] / spacing_px).astype(int)
+    chosen = [
+        np.interp((np.arange(count) + 0.5) * (along[-1] / count), along, places)
+        for count, along, places in zip(counts, length, s, strict=True)
+        if count
+    ]
+    number, s = np.repeat(curves, counts), np.concatenate([np.empty(0), *chosen])
+    there = _seen(target, camera, number, s)
     with np.errstate(invalid="ignore"):
         inside = np.all((there > margin_px - 0.5) & (there < size - 0.5 - margin_px), axis=1)
-    return number, chosen[inside]
+    return number[inside], s[inside]
+
+
+def _seen(target: Target, camera: Camera, number: Indices32, s: Array) -> Array:
+    """Pixels (N, 2) of the middles of curves (N,) at parameters (N,)."""
+    return camera.project(along_track(target.tracks[0][number], target.is_arc[number], s))
 
 
 def course_at(target: Target, camera: Camera, number: Indices32, s: Array) -> Course:
     """The course through places that are given by curve (N,) and parameter (N,)."""
-    is_arc = target.is_arc[number]
     span = np.array([np.diff(curve.parameter_range)[0] for curve in target.curves.values()])[number]
-
-    def seen(side: int, step: float) -> Array:
-        return camera.project(along_track(target.tracks[side][number], is_arc, s + step * span))
-
-    before, pixels, after = seen(0, -2e-3), seen(0, 0.0), seen(0, 2e-3)
+    steps = np.array([-2e-3, 0.0, 2e-3, 0.0, 0.0])[:, None] * span
+    tracks = np.stack([target.tracks[side][number] for side in (0, 0, 0, 1, -1)]).reshape(-1, 3, 3)
+    places = along_track(tracks, np.tile(target.is_arc[number], 5), (s + steps).ravel())
+    before, pixels, after, left, right = camera.project(places).reshape(5, -1, 2)
     tangent = after - before
     length = np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-9)
     tangent = tangent / length
-    left, right = seen(1, 0.0), seen(-1, 0.0)
     normals = np.column_stack([-tangent[:, 1], tangent[:, 0]])
     normals *= np.where(np.sum((left - right) * normals, axis=1) < 0.0, -1.0, 1.0)[:, None]
     width = np.sum((left - right) * normals, axis=1)
@@ -108,14 +109,16 @@ def clear_px(target: Target, camera: Camera, course: Course, curves: Collection[
     number, s, pixels = course.curve, course.s, course.pixels
     places = along_track(target.tracks[0][number], target.is_arc[number], s)
     clear = np.full(len(places), np.inf)
+    rows, others = [np.empty(0, dtype=np.int64)], [np.empty((0, 3))]
     for other, (name, curve) in enumerate(target.curves.items()):
         own = number == other
         if not isinstance(curve, Arc):
-            for end_px in camera.project(curve_points(curve, 0, 1)):
-                clear[own] = np.fmin(clear[own], np.linalg.norm(pixels[own] - end_px, axis=1))
-        if name not in curves or curve.width_m <= 0.0:
-            continue
-        rows = np.flatnonzero(~own)
-        there = camera.project(along_curve(curve, nearest_on_curve(curve, places[rows])))
-        clear[rows] = np.fmin(clear[rows], np.linalg.norm(pixels[rows] - there, axis=1))
+            for end in curve_points(curve, 0, 1):
+                rows.append(np.flatnonzero(own))
+                others.append(np.broadcast_to(end, (len(rows[-1]), 3)))
+        if name in curves and curve.width_m > 0.0:
+            rows.append(np.flatnonzero(~own))
+            others.append(along_curve(curve, nearest_on_curve(curve, places[rows[-1]])))
+    at = np.concatenate(rows)
+    np.fmin.at(clear, at, np.linalg.norm(pixels[at] - camera.project(np.concatenate(others)), axis=1))
     return clear

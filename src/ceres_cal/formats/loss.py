@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from ceres_cal.scene.targets import Target
 
 _GRID = (122, 91)  # pixels: finer than that of the fit
+_EDGE_M = 1e-6  # places at the box's own edge are in it, whatever the last bit of their way there and back says
 _ROUNDS = 8  # of bringing a place to where another camera shows it in the same pixel
 Box = tuple[Array, Array]
 
@@ -40,7 +41,7 @@ def field_error_mm(
     for height_m in heights_m:
         true = camera.locate(pixels, height_m)
         with np.errstate(invalid="ignore"):
-            on_field = np.all((true >= low) & (true <= high), axis=1)
+            on_field = np.all((true >= low - _EDGE_M) & (true <= high + _EDGE_M), axis=1)
         off = 1e3 * np.linalg.norm(locate(pixels[on_field], height_m) - true[on_field], axis=1)
         errors[height_m] = _size(off)
     return errors
