@@ -27,6 +27,7 @@ HALF_WIDTH_PX = 3  # of a window, along the line
 SPACING_PX = 2.0 * HALF_WIDTH_PX + 2.0  # neighbouring windows share no pixels
 _BEYOND_PX = 4.5  # of a window, past the paint's border
 _SEARCH_STEP_PX = 0.5
+_TINY = 1e-9  # grey levels
 _BAND_PX = 3.0  # of background, to either side of the paint, in the search
 _SHAPE_WINDOWS = 150
 # Of blur, in standard deviations: the part of a blurred line that is brightest.
@@ -112,7 +113,8 @@ def search(
     """Where along the normals there is most likely paint: offsets (N,) px, and how much brighter it is, grey levels.
 
     Args:
-        reach_px: how far to look to either side. spare_px: of two lines alike the one nearer than by this is taken.
+        reach_px: how far to look to either side. spare_px: of two lines the one nearer than by this is taken, even
+            where the other is twice as bright.
         blur_px: standard deviation of what makes lines wider, (N,) or one.
     """
     width_px = np.maximum(course.width_px, np.maximum(_AS_WIDE * np.asarray(blur_px), 1.0))
@@ -134,9 +136,18 @@ def search(
     left, right = mean(-half - 1.0 - _BAND_PX, -half - 1.0), mean(half + 1.0, half + 1.0 + _BAND_PX)
     response = mean(-half, half) - np.maximum(left, right)
     response[:, np.abs(steps) > reach_px] = -np.inf
-    preference = response * np.exp(-0.5 * (steps / spare_px) ** 2) if spare_px > 0.0 else response
-    best = np.argmax(preference, axis=1)
+    best = np.argmax(_preferred(response, steps / spare_px) if spare_px > 0.0 else response, axis=1)
     return steps[best], response[np.arange(len(best)), best]
+
+
+def _preferred(response: Array, away: Array) -> Array:
+    """(N, S) how much a step (S,) is to be taken for the line: a peak that is near. Brighter than paint usually is no
+    more paint: a boundary line beside the field's own is wider.
+    """
+    bright, usual = np.maximum(response, 0.0), max(float(np.median(np.max(response, axis=1))), _TINY)
+    higher = np.pad(response, ((0, 0), (1, 1)), constant_values=-np.inf)
+    peak = (response >= higher[:, :-2]) & (response >= higher[:, 2:])
+    return np.asarray(peak * bright / (bright + 0.5 * usual) * np.exp(-0.5 * away**2))
 
 
 def _along_normals(grey: Array32, course: Course, steps: Array, shift_px: float) -> Array:
@@ -201,12 +212,10 @@ def _shape(windows: Windows, course: Course, bright: Array) -> tuple[Array, floa
     rows = np.flatnonzero(windows.inside)
     if not len(rows):
         return np.ones(len(course)), 1.0
-    limit = 0.5 * np.quantile(bright[rows], 0.8)
-    rows = rows[bright[rows] >= limit]
     edges = np.column_stack([-0.5 * course.width_px, 0.5 * course.width_px])
-    blur, stretch = _shape_of(windows, edges, rows, 1.0, 1.0)
+    blur, stretch = _shape_of(windows, edges, _brightest(bright, rows), 1.0, 1.0)
     sector = np.floor(angle[rows] / np.pi * _SECTORS + 0.5) % _SECTORS
-    own = [rows[sector == number] for number in range(_SECTORS)]
+    own = [_brightest(bright, rows[sector == number]) for number in np.unique(sector)]
     own = [some for some in own if len(some) >= _FEWEST_IN_SECTOR]
     if len(own) < 2:
         return np.full(len(course), blur), stretch
@@ -219,6 +228,11 @@ def _shape(windows: Windows, course: Course, bright: Array) -> tuple[Array, floa
     a, b, c = np.linalg.solve(normal, columns.T @ (count * squares))
     across = a + _doubled(angle) @ [b, c]
     return np.sqrt(np.clip(across, LEAST_BLUR_PX**2, MOST_BLUR_PX**2)), stretch
+
+
+def _brightest(bright: Array, rows: Indices) -> Indices:
+    """Of these rows, those that are surely on paint: what a moved camera smears is fainter in one direction."""
+    return rows[bright[rows] >= 0.5 * np.quantile(bright[rows], 0.8)]
 
 
 def _doubled(angle: Array) -> Array:

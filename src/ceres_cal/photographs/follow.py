@@ -188,18 +188,33 @@ class _Tracker:
         whole = replace(self, curves=followed.curves, missing=followed.missing, target=followed.target)
         followed = whole.without_aside(followed)
         if followed.built.is_other:
+            followed = self.as_drawn(followed)
+        if followed.built.is_other:
             return followed
         curves = [name for name in whole.curves if name not in followed.built.aside_m]
         left = replace(whole, curves=curves, target=followed.target)
         return whole.without_aside(left.with_best_lens(followed))
 
+    def as_drawn(self, other: Followed) -> Followed:
+        """What looks like another field, or the one that is drawn, where all of its lines are there as well.
+
+        A line around the field that was taken for its own bends the camera until areas and circle disagree. With their
+        dimensions free the camera is right: its own lines are next to where that puts them.
+        """
+        there = self.as_built(other, _free(other.camera))[1]
+        drawn = self.of_painted(there).at_rest(there, _free(there))
+        if drawn.share < _SURE_SHARE or drawn.absent:
+            return other
+        drawn = replace(self, curves=drawn.curves, missing=drawn.missing).without_aside(drawn)
+        return other if drawn.built.is_other or drawn.built.dimensions else drawn
+
     def without_aside(self, followed: Followed) -> Followed:
         """The same without the curves that lie aside: none of them draws the camera to where others look aside."""
-        free = tuple(name for name in intrinsic_names(followed.camera.lens) if name != "aspect")
+        free = _free(followed.camera)
         whole, built = replace(self, target=followed.target), AS_DRAWN
         left = whole
         for _ in range(_ROUNDS):
-            known, built = built, whole.as_built(followed, free)
+            known, built = built, whole.as_built(followed, free)[0]
             if built.is_other or built.aside_m.keys() == known.aside_m.keys():
                 break
             left = replace(whole, curves=[name for name in whole.curves if name not in built.aside_m])
@@ -212,8 +227,8 @@ class _Tracker:
             beside = every.take(np.isin(every.course.curve, aside))
         return replace(followed, curves=tuple(self.curves), built=built, lines=lines, beside=beside)
 
-    def as_built(self, followed: Followed, free: tuple[str, ...]) -> AsBuilt:
-        """How all curves lie.
+    def as_built(self, followed: Followed, free: tuple[str, ...]) -> tuple[AsBuilt, Camera]:
+        """How all curves lie, and the camera by which they do.
 
         Lines of other dimensions are several pixels from where they were looked for, and some are missed or taken for
         others; so they are looked for again, and measured, where those dimensions put them.
@@ -229,7 +244,7 @@ class _Tracker:
                 break
             lines, camera = nearer.lines, nearer.camera
             built = as_built(lines, camera, target, self.free.priors)
-        return built
+        return built, camera
 
     def with_best_lens(self, followed: Followed) -> Followed:
         """What is found when the lines are predicted with the kind of lens that suits them best.
@@ -293,6 +308,11 @@ class _Tracker:
         return observations_of(
             self.target, camera.image_size, lines.course.curve[rows], lines.pixels[rows], lines.sigma_px[rows]
         )
+
+
+def _free(camera: Camera) -> tuple[str, ...]:
+    """Names of the intrinsics that a photograph may change."""
+    return tuple(name for name in intrinsic_names(camera.lens) if name != "aspect")
 
 
 def _moved_px(camera: Camera, refitted: Camera, pixels: Array) -> float:
