@@ -75,7 +75,7 @@ def follow(
     tracker = _Tracker(grey, target, curves, free or FreeIntrinsics())
     tried = tracker.tried(starts)
     best = next(tried)
-    if not (best.holds and tracker.free.names):
+    if not (best.may_be_worn and tracker.free.names):
         return best
     best = tracker.refined(best)
     for one in islice(tried, _MOST_OTHERS):
@@ -270,7 +270,7 @@ class _Tracker:
         lines = replace(self, target=target).measured(camera)
         moved = _moved_px(followed.camera, camera, lines.course.pixels)
         refined = replace(self, target=target).followed(camera, lines, moved)
-        return refined if refined.holds and refined.share > followed.share - _LESS else followed
+        return refined if refined.may_be_worn and refined.share > followed.share - _LESS else followed
 
     def _refitted(
         self, camera: Camera, observations: Observations, names: tuple[str, ...]

@@ -21,6 +21,8 @@ _NEAR_PX = 6.0
 # Of the strokes that could be lines of the target, the share that must lie on it. On photographs with cables, seams and
 # stripes of sun it is 0.83 at least, of other fields 0.6 at most.
 _EXPLAINED = 0.75
+# The same of a field whose paint is found at fewer than half of the places; worn lines in dashes: 1.
+_EXPLAINED_IF_WORN = 0.9
 # The same, also of those beside the target, where walls and boundary lines run: 0.61 at least where it is seen whole,
 # and less where a wider boundary line shows more strokes than its lines do: then all of these must be there.
 # A corner alone may be any corner, so that fewer curves than that must explain as much of the rest of the picture.
@@ -58,7 +60,7 @@ def why_missed(followed: Followed, target: Target, *, started: bool) -> str:
 
 def objection(search: FieldSearch, followed: Followed) -> str:
     """What speaks against taking what was followed for the field, or nothing."""
-    if not followed.holds or followed.built.is_other:
+    if not is_shown(search, followed) or followed.built.is_other:
         return why_missed(followed, search.target, started=False)
     names = detected_curves(search, followed)
     if len(names) < _FEWEST_CURVES or not _in_two_directions(search, names):
@@ -75,6 +77,14 @@ def objection(search: FieldSearch, followed: Followed) -> str:
             "check the target's dimensions and which lines are painted, or start from corners"
         )
     return ""
+
+
+def is_shown(search: FieldSearch, followed: Followed) -> bool:
+    """Whether paint is found at enough places: of a worn field at fewer, where there are no strokes but its own."""
+    if followed.holds or not followed.may_be_worn:
+        return followed.holds
+    everywhere = explained(search, followed, everywhere=True)
+    return everywhere > _EXPLAINED and explained(search, followed) > _EXPLAINED_IF_WORN
 
 
 def likelihood(followed: Followed) -> float:
