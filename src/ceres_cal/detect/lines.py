@@ -175,7 +175,7 @@ def measure(grey: Array32, course: Course, reach_px: float) -> Lines:
     fits = fit_profiles(windows, stretch * edges, np.where(blur > _WIDE_BLUR_PX, _OF_WIDE, 1.0) * blur, 1.5)
     contrast = np.minimum(fits.heights[:, 0], -fits.heights[:, 1])
     offset = rough + fits.offset_px
-    found = _is_paint(course, fits, contrast)
+    found = _is_paint(course, fits, contrast, np.median(windows.values, axis=1))
     found = _goes_on(course, found, offset, fits.sigma_px)
     sigma = np.hypot(fits.sigma_px, _scatter(course, found, offset, fits.sigma_px))
     found = _goes_on(course, found, offset, sigma)
@@ -245,8 +245,11 @@ def _shape_of(windows: Windows, edges: Array, rows: Indices, blur: float, stretc
     return fit_shape(some, edges[rows], blur, stretch)
 
 
-def _is_paint(course: Course, fits: Profiles, contrast: Array) -> Mask:
-    """Where the window shows a bright line: on both sides darker, by as much as elsewhere, and nothing else in it."""
+def _is_paint(course: Course, fits: Profiles, contrast: Array, around: Array) -> Mask:
+    """Where the window shows a bright line: on both sides darker, by as much as elsewhere, and nothing else in it.
+
+    By as much as nearby, or by as large a share of the light `around` (N,): sun and shadow change paint and carpet alike.
+    """
     fitted = np.isfinite(fits.offset_px)
     if not np.any(fitted):
         return fitted
@@ -255,8 +258,11 @@ def _is_paint(course: Course, fits: Profiles, contrast: Array) -> Mask:
         return clear
     usual = float(np.median(contrast[clear]))
     clear &= contrast > _LEAST_CONTRAST * usual
-    nearby = _medians(np.where(clear, contrast, np.nan), course.curve)
-    clear &= (contrast > _OF_NEARBY[0] * nearby) & (contrast < _OF_NEARBY[1] * nearby)
+    alike = np.zeros(len(clear), dtype=bool)
+    for height in (contrast, contrast / np.maximum(around, 1.0)):
+        nearby = _medians(np.where(clear, height, np.nan), course.curve)
+        alike |= (height > _OF_NEARBY[0] * nearby) & (height < _OF_NEARBY[1] * nearby)
+    clear &= alike
     return np.asarray(clear & (fits.noise < _NOISY * np.median(fits.noise[clear])))
 
 

@@ -106,8 +106,8 @@ def candidates(search: FieldSearch) -> list[tuple[Camera, Grid]]:
     """Cameras that may have taken it, the best first, each once for all turns of the target; and how it was drawn."""
     scored: list[tuple[float, Camera]] = []
     drawn: dict[int, Grid] = {}
-    strokes = search.stroke_map.strokes
-    for upright in find_upright(search.stroke_map.ends, strokes.length_px, _UPRIGHTS, search.grid.least_share):
+    ends, weights = search.stroke_map.ends, search.stroke_map.weights
+    for upright in find_upright(ends, weights, _UPRIGHTS, search.grid.least_share):
         optics = _optics(upright, search.stroke_map)
         seen = lines_seen(upright, search.stroke_map)
         for grid in (search.grid, *search.others):

@@ -19,9 +19,9 @@ from ceres_cal.base.arrays import Array
 from ceres_cal.base.transforms import rotation_exp
 from ceres_cal.start.initialise import USUAL_PHI, USUAL_PHI_FACTOR
 
-BENDS = (0.05, -0.05, -0.15, -0.25, -0.35, -0.45)
+BENDS = (0.05, -0.05, -0.15, -0.25, -0.35, -0.45, -0.6, -0.8)
 PHIS = (0.8, 1.15, 1.6)
-_USUAL_BEND, _BEND_SIGMA = -0.15, 0.2
+_USUAL_BEND, _BEND_SIGMA = -0.15, 0.35
 # rad: a standard deviation of the tilts that cameras over fields have. Nothing changes from 0.33 to 0.67.
 _USUAL_TILT = 0.5
 # Of all strokes, at one standard deviation: it decides only where strokes do not. Nothing changes from half to
