@@ -123,7 +123,7 @@ DECIDING: tuple[Constant, ...] = (
     *_of("detect.partly", "_MISFIT _AS_STRONG _CLEAR", "boards"),
     *_of("detect.rings", "_FEWEST_RAYS _LEAST_CONTRAST _NOISY _FAR _MOST_MISFIT", "rings"),
     *_of("photographs.clicks", "SIGMA_PX _SQUARE", "clicks"),
-    *_of("photographs.follow", "_SURE_SHARE", "lines", "auto"),
+    *_of("photographs.follow", "SURE_SHARE", "lines", "auto"),
     *_of("photographs.followed", "LEAST_SHARE _ABSENT _MOST_ABSENT", "lines", "auto"),
     *_of("photographs.facing", "_FACES _AS_WELL _NEARER_DEG", "auto"),
     *_of("photographs.candidates", "_SURE _COMPARABLE _ALIKE", "auto"),

@@ -26,7 +26,7 @@ from ceres_cal.scene.targets import Target, target_from_spec
 
 FAR_PX = 130.0  # how far off the start may be
 # Share from which on no other start is tried. At half of its odds nothing changes.
-_SURE_SHARE = 0.7
+SURE_SHARE = 0.7
 _ROUGH_SPACING_PX = 12.0
 _NEAR_REACHES_PX = (12.0, 6.0, 4.0)
 # From points that were shown: what stands farther beside a line than they are off cannot draw it away.
@@ -92,6 +92,11 @@ def approach(grey: Array32, target: Target, camera: Camera, curves: Collection[s
     return next(_Tracker(grey, target, curves, free).tried([camera]))
 
 
+def as_drawn(grey: Array32, target: Target, other: Followed, curves: Collection[str], free: FreeIntrinsics) -> Followed:
+    """What looks like another field, or the one that is drawn, where that is next to it, too."""
+    return _Tracker(grey, target, curves, free).as_drawn(other)
+
+
 def refine(grey: Array32, target: Target, camera: Camera, curves: Collection[str], free: FreeIntrinsics) -> Followed:
     """From a camera that is right but for its lens: the kind that suits best, without curves that lie aside."""
     tracker = _Tracker(grey, target, curves, free).of_painted(camera)
@@ -121,7 +126,7 @@ class _Tracker:
         """What is reached from each start: what is surely the field at once, then the others, the best first."""
         left: list[Followed] = []
         for one in self._reached(starts):
-            if one.holds and one.share >= _SURE_SHARE:
+            if one.holds and one.share >= SURE_SHARE:
                 yield one
             else:
                 left.append(one)
@@ -203,7 +208,7 @@ class _Tracker:
         """
         there = self.as_built(other, _free(other.camera))[1]
         drawn = self.of_painted(there).at_rest(there, _free(there))
-        if drawn.share < _SURE_SHARE or drawn.absent:
+        if drawn.share < SURE_SHARE or not drawn.holds:
             return other
         drawn = replace(self, curves=drawn.curves, missing=drawn.missing).without_aside(drawn)
         return other if drawn.built.is_other or drawn.built.dimensions else drawn
