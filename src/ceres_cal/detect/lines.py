@@ -22,6 +22,7 @@ from ceres_cal.detect.profiles import (
     fit_profiles,
     fit_shape,
 )
+from ceres_cal.detect.sampling import drawn_aside
 
 HALF_WIDTH_PX = 3  # of a window, along the line
 SPACING_PX = 2.0 * HALF_WIDTH_PX + 2.0  # neighbouring windows share no pixels
@@ -177,7 +178,9 @@ def measure(grey: Array32, course: Course, reach_px: float) -> Lines:
     offset = rough + fits.offset_px
     found = _is_paint(course, fits, contrast, np.median(windows.values, axis=1))
     found = _goes_on(course, found, offset, fits.sigma_px)
-    sigma = np.hypot(fits.sigma_px, _scatter(course, found, offset, fits.sigma_px))
+    aside, remains = drawn_aside(course, offset, _threes(course, found), HALF_WIDTH_PX)
+    offset, sigma = offset - aside, np.hypot(fits.sigma_px, remains)
+    sigma = np.hypot(sigma, _scatter(_threes(course, found), offset, sigma))
     found = _goes_on(course, found, offset, sigma)
     return Lines(
         course,
@@ -295,21 +298,23 @@ def _goes_on(course: Course, found: Mask, offset: Array, sigma: Array) -> Mask:
     return np.asarray(found & near & ~alone)
 
 
-def _scatter(course: Course, found: Mask, offset: Array, sigma: Array) -> float:
+def _threes(course: Course, found: Mask) -> Indices:
+    """(M, 3) places on a curve, each `_APART` from the next, that were all found."""
+    first = np.arange(max(len(found) - 2 * _APART, 0))
+    three = first[:, None] + (0, _APART, 2 * _APART)
+    same = course.curve[three[:, 0]] == course.curve[three[:, 2]]
+    return np.asarray(three[same & np.all(found[three], axis=1)])
+
+
+def _scatter(three: Indices, offset: Array, sigma: Array) -> float:
     """The standard deviation, px, that besides sigma makes what the offsets of three places on a curve tell of their
     scatter.
 
     Carpet, wear, compression and the sampling of lines thinner than a pixel are not white noise, which is all that a
     window knows; and what a window in good light knows best suffers from them no less.
     """
-    before, after = slice(None, -2 * _APART), slice(2 * _APART, None)
-    middle = np.flatnonzero(
-        found[before] & found[_APART:-_APART] & found[after] & (course.curve[before] == course.curve[after])
-    )
-    middle += _APART
-    if len(middle) < 20:
+    if len(three) < 20:
         return 0.0
-    three = middle[:, None] + (-_APART, 0, _APART)
     change, weight = np.abs(offset[three] @ (1.0, -2.0, 1.0)), np.array([1.0, 4.0, 1.0])
     more = _SCATTER_PX[:, None]
     usual = np.median(change / np.sqrt(sigma[three] ** 2 @ weight + np.sum(weight) * more**2), axis=1)

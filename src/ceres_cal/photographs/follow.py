@@ -92,9 +92,11 @@ def approach(grey: Array32, target: Target, camera: Camera, curves: Collection[s
     return next(_Tracker(grey, target, curves, free).tried([camera]))
 
 
-def as_drawn(grey: Array32, target: Target, other: Followed, curves: Collection[str], free: FreeIntrinsics) -> Followed:
-    """What looks like another field, or the one that is drawn, where that is next to it, too."""
-    return _Tracker(grey, target, curves, free).as_drawn(other)
+def look_again(grey: Array32, target: Target, seen: Followed, curves: Collection[str], free: FreeIntrinsics) -> Followed:
+    """What nearly is the field, with the kind of lens that suits best, or as drawn next to where it was seen."""
+    tracker = _Tracker(grey, target, curves, free)
+    refined = tracker.refined(seen)
+    return refined if refined.holds and not refined.built.is_other else tracker.as_drawn(seen)
 
 
 def refine(grey: Array32, target: Target, camera: Camera, curves: Collection[str], free: FreeIntrinsics) -> Followed:

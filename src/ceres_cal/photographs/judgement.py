@@ -80,9 +80,13 @@ def objection(search: FieldSearch, followed: Followed) -> str:
 
 
 def is_shown(search: FieldSearch, followed: Followed) -> bool:
-    """Whether paint is found at enough places: of a worn field at fewer, where there are no strokes but its own."""
+    """Whether paint is found at enough places: of a worn field at fewer, where there are no strokes but its own, and on
+    more than half of its curves: a few cables lie on some of any field's.
+    """
     if followed.holds or not followed.may_be_worn:
         return followed.holds
+    if 2 * len(detected_curves(search, followed)) <= len(search.curves):
+        return False
     everywhere = explained(search, followed, everywhere=True)
     return everywhere > _EXPLAINED and explained(search, followed) > _EXPLAINED_IF_WORN
 

@@ -20,7 +20,7 @@ from ceres_cal.photographs.facing import (
     require_sides,
     side_of,
 )
-from ceres_cal.photographs.follow import SURE_SHARE, FreeIntrinsics, approach, as_drawn, refine
+from ceres_cal.photographs.follow import SURE_SHARE, FreeIntrinsics, approach, look_again, refine
 from ceres_cal.photographs.followed import Followed
 from ceres_cal.photographs.grid import grid_of
 from ceres_cal.photographs.judgement import detected_curves, explained, likelihood, objection, same_labels
@@ -104,7 +104,7 @@ def search(grey: Array32, target: Target, curves: Collection[str], auto: Auto) -
         against = objection(problem, followed)
         if against and followed.share >= SURE_SHARE:
             free = _free(own.target, auto, followed.camera)
-            followed = as_drawn(problem.grey, own.target, followed, problem.curves, free)
+            followed = look_again(problem.grey, own.target, followed, problem.curves, free)
             against = objection(problem, followed)
         if not against:
             good.append(followed)
