@@ -148,7 +148,8 @@ def _preferred(response: Array, away: Array) -> Array:
     bright, usual = np.maximum(response, 0.0), max(float(np.median(np.max(response, axis=1))), _TINY)
     higher = np.pad(response, ((0, 0), (1, 1)), constant_values=-np.inf)
     peak = (response >= higher[:, :-2]) & (response >= higher[:, 2:])
-    return np.asarray(peak * bright / (bright + 0.5 * usual) * np.exp(-0.5 * away**2))
+    preferred = peak * bright / (bright + 0.5 * usual) * np.exp(-0.5 * away**2)
+    return np.where(np.isfinite(response), preferred, -np.inf)
 
 
 def _along_normals(grey: Array32, course: Course, steps: Array, shift_px: float) -> Array:
@@ -178,7 +179,7 @@ def measure(grey: Array32, course: Course, reach_px: float) -> Lines:
     offset = rough + fits.offset_px
     found = _is_paint(course, fits, contrast, np.median(windows.values, axis=1))
     found = _goes_on(course, found, offset, fits.sigma_px)
-    aside, remains = drawn_aside(course, offset, _threes(course, found), HALF_WIDTH_PX)
+    aside, remains = drawn_aside(course, np.where(found, offset, np.nan), _threes(course, found), HALF_WIDTH_PX)
     offset, sigma = offset - aside, np.hypot(fits.sigma_px, remains)
     sigma = np.hypot(sigma, _scatter(_threes(course, found), offset, sigma))
     found = _goes_on(course, found, offset, sigma)
@@ -251,7 +252,7 @@ def _shape_of(windows: Windows, edges: Array, rows: Indices, blur: float, stretc
 def _is_paint(course: Course, fits: Profiles, contrast: Array, around: Array) -> Mask:
     """Where the window shows a bright line: on both sides darker, by as much as elsewhere, and nothing else in it.
 
-    By as much as nearby, or by as large a share of the light `around` (N,): sun and shadow change paint and carpet alike.
+    By as much as nearby, or by as large a share of the light `around` (N,): sun changes paint and carpet alike.
     """
     fitted = np.isfinite(fits.offset_px)
     if not np.any(fitted):

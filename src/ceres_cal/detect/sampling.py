@@ -1,8 +1,8 @@
 """By how much a sensor's pixels draw lines aside that are thinner than they are, which a picture tells by itself.
 
 A line that lies on the middle of a row of pixels, or between two rows, is drawn there. Elsewhere a sharp lens and a
-colour sensor, of whose pixels most colours are filled in, draw it up to 0.12 px towards one of them, by where it lies in
-the pixel. Along a line that is nearly level or upright that changes slowly, so that many places err together; nearer
+colour sensor, of whose pixels most colours are filled in, draw it up to 0.12 px towards one of them, by where it lies
+in the pixel. Along a line that is nearly level or upright that changes slowly, so that many places err together; nearer
 and farther ones tell it all the same, since lines are straight or round and what is drawn of them waves.
 """
 
@@ -10,12 +10,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices
+from ceres_cal.base.arrays import Array, Indices, Indices32
 from ceres_cal.detect.courses import Course
 
 _HARMONICS = (1.0, 2.0)
 _PRIOR_PX = 0.1  # standard deviation of the error's amplitude, beforehand
-_REMAINS = 0.3  # of the error, what is left once it is taken off
+_REMAINS = 0.2  # of the error, what is left once it is taken off
+_AROUND = 10  # places to either side, of which the mean tells where in its pixel a line lies
 _ROUNDS, _FEWEST = 5, 20
 _LEAST_PX = 1e-4
 _ROBUST = 2.0  # of the usual residual: Cauchy's scale
@@ -26,18 +27,29 @@ def drawn_aside(course: Course, offset_px: Array, threes: Indices, half_width_px
     """(N,) px along the normals by which lines are drawn beside themselves, and its standard deviation (N,).
 
     Args:
-        offset_px: (N,) where along the normals they were measured. threes: (M, 3) places that follow each other on a
-            curve, all of them measured. half_width_px: of the windows, along the curve.
+        offset_px: (N,) where along the normals they were measured, NaN where they were not. threes: (M, 3) places that
+            follow each other on a curve, all of them measured. half_width_px: of the windows, along the curve.
     """
-    aside = np.zeros(len(course))
+    aside: Array = np.zeros(len(course))
     if len(threes) < _FEWEST:
         return aside, aside
     bends = offset_px[threes] @ _CURVATURE
     for _ in range(_ROUNDS):  # where in the pixel a line lies is where it is drawn but for that
-        turns = _turns(course, offset_px - aside, half_width_px)
+        turns = _turns(course, _smooth(course.curve, offset_px - aside), half_width_px)
         amplitude = _amplitudes(np.einsum("mtk,t->mk", turns.imag[threes], _CURVATURE), bends)
         aside = np.nan_to_num(turns.imag @ amplitude)
     return aside, _REMAINS * np.nan_to_num(np.abs(turns) @ np.abs(amplitude))
+
+
+def _smooth(curve: Indices32, offset_px: Array) -> Array:
+    """(N,) the mean of the places around on the same curve: one place's own error would explain itself."""
+    measured, box = np.isfinite(offset_px), np.ones(2 * _AROUND + 1)
+    smooth = np.zeros(len(curve))
+    for number in np.unique(curve):
+        rows = np.flatnonzero(curve == number)
+        total, count = (np.convolve(one[rows], box)[_AROUND:-_AROUND] for one in (np.nan_to_num(offset_px), measured))
+        smooth[rows] = total / np.maximum(count, 1.0)
+    return smooth
 
 
 def _amplitudes(columns: Array, bends: Array) -> Array:

@@ -92,7 +92,9 @@ def approach(grey: Array32, target: Target, camera: Camera, curves: Collection[s
     return next(_Tracker(grey, target, curves, free).tried([camera]))
 
 
-def look_again(grey: Array32, target: Target, seen: Followed, curves: Collection[str], free: FreeIntrinsics) -> Followed:
+def look_again(
+    grey: Array32, target: Target, seen: Followed, curves: Collection[str], free: FreeIntrinsics
+) -> Followed:
     """What nearly is the field, with the kind of lens that suits best, or as drawn next to where it was seen."""
     tracker = _Tracker(grey, target, curves, free)
     refined = tracker.refined(seen)
