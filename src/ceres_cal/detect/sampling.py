@@ -54,13 +54,13 @@ def _smooth(curve: Indices32, offset_px: Array) -> Array:
 
 def _amplitudes(columns: Array, bends: Array) -> Array:
     """(K,) of what, times columns (M, K), explains the bends (M,) but for a few."""
-    amplitude = np.zeros(columns.shape[1])
+    amplitude: Array = np.zeros(columns.shape[1])
     for _ in range(_ROUNDS):
         left = bends - columns @ amplitude
         usual = max(float(np.median(np.abs(left))) / 0.6745, _LEAST_PX)
         weighted = columns / (1.0 + (left / (_ROBUST * usual)) ** 2)[:, None]
         normal = weighted.T @ columns + (usual / _PRIOR_PX) ** 2 * np.eye(len(amplitude))
-        amplitude = np.linalg.solve(normal, weighted.T @ bends)
+        amplitude = np.asarray(np.linalg.solve(normal, weighted.T @ bends), dtype=float)
     return np.asarray(amplitude)
 
 
