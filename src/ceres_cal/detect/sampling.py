@@ -15,7 +15,7 @@ from ceres_cal.detect.courses import Course
 
 _HARMONICS = (1.0, 2.0)
 _PRIOR_PX = 0.1  # standard deviation of the error's amplitude, beforehand
-_REMAINS = 0.2  # of the error, what is left once it is taken off
+_REMAINS = 0.15  # of the error, what is left once it is taken off
 _AROUND = 10  # places to either side, of which the mean tells where in its pixel a line lies
 _ROUNDS, _FEWEST = 5, 20
 _LEAST_PX = 1e-4
@@ -25,6 +25,8 @@ _CURVATURE = np.array([1.0, -2.0, 1.0])
 
 def drawn_aside(course: Course, offset_px: Array, threes: Indices, half_width_px: int) -> tuple[Array, Array]:
     """(N,) px along the normals by which lines are drawn beside themselves, and its standard deviation (N,).
+
+    That is as large as a line's middle needs whose places all err alike, since they are taken to err each by itself.
 
     Args:
         offset_px: (N,) where along the normals they were measured, NaN where they were not. threes: (M, 3) places that
@@ -38,7 +40,17 @@ def drawn_aside(course: Course, offset_px: Array, threes: Indices, half_width_px
         turns = _turns(course, _smooth(course.curve, offset_px - aside), half_width_px)
         amplitude = _amplitudes(np.einsum("mtk,t->mk", turns.imag[threes], _CURVATURE), bends)
         aside = np.nan_to_num(turns.imag @ amplitude)
-    return aside, _REMAINS * np.nan_to_num(np.abs(turns) @ np.abs(amplitude))
+    remains = _REMAINS * np.abs(amplitude) * np.nan_to_num(np.abs(turns) * np.sqrt(_alike(course, offset_px, turns)))
+    return aside, np.linalg.norm(remains, axis=1)
+
+
+def _alike(course: Course, offset_px: Array, turns: Array) -> Array:
+    """(N, 4) how many places of its curve err as a place does: few where the line wanders through the pixels."""
+    measured, alike = np.isfinite(offset_px), np.ones(turns.shape)
+    for number in np.unique(course.curve):
+        own = course.curve == number
+        alike[own] = np.maximum(np.abs(np.sum(turns[own & measured], axis=0)), 1.0)
+    return alike
 
 
 def _smooth(curve: Indices32, offset_px: Array) -> Array:
