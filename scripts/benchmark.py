@@ -25,7 +25,7 @@ from statistics import median
 from typing import Any
 
 import numpy as np
-from benchmark_peers import PEERS, WARM_UP_FRAMES, Answer, Corners, peak_mib, solve_warm
+from benchmark_peers import PEERS, WARM_UP_FRAMES, Answer, Corners, peak_mib, reset_peak, solve_warm
 from benchmark_problems import (
     HEIGHT_M,
     OVERHEAD,
@@ -37,7 +37,7 @@ from benchmark_problems import (
     wide_lens,
 )
 from benchmark_process import process_rows
-from benchmark_scale import FOLDER, frames_in_turns, stored_growth, write_field
+from benchmark_scale import FOLDER, folder_for, frames_in_turns, stored_growth, write_field
 
 from ceres_cal.scene.heights import ROBOT_TOP_M
 from ceres_cal.scene.lens import KannalaBrandt
@@ -223,13 +223,6 @@ def field_growth(line_points: int, repeat: int) -> dict[str, Any]:
     }
 
 
-def reset_peak() -> None:
-    """Let the peak memory count from here, where the system can (Linux)."""
-    switch = Path("/proc/self/clear_refs")
-    if switch.exists():
-        switch.write_text("5", encoding="ascii")
-
-
 TASKS: dict[str, Callable[[int, int], Any]] = {
     "first": first_call,
     "corners": corners_memory,
@@ -334,7 +327,7 @@ SCALE = {
     "worker_mib": ("of a worker", ".0f"),
     "iterations": ("iterations", "d"),
     "iteration_seconds": ("s each", ".3f"),
-    "iteration_bytes": ("bytes each", "d"),
+    "iteration_bytes": ("bytes a worker", "d"),
     "overhead_ms": ("overhead ms", ".1f"),
     "focal_error_px": ("focal error px", "+.3f"),
 }
@@ -344,6 +337,7 @@ FRAMES = {
     "wall_us": ("us", ".1f"),
     "times_processor": ("times the fewest's, processor", ".3f"),
     "times_wall": ("wall", ".3f"),
+    "peak_mib": ("peak MiB", ".0f"),
 }
 PIXELS_TOLD = {"lens": ("lens", ""), "locate": ("locate s", ".3f"), "project": ("project s", ".3f")}
 
@@ -440,9 +434,9 @@ def measure_scale(chosen: argparse.Namespace) -> dict[str, Any]:
     """Line points in files, in one process and with Dask's workers; frames; and how they grow."""
     rows: list[dict[str, Any]] = []
     for count in chosen.scale:
-        with tempfile.TemporaryDirectory() as folder:
-            os.environ[FOLDER] = str(Path(folder) / "field.columns")
-            write_field(Path(os.environ[FOLDER]), count)
+        with folder_for(count) as folder:
+            os.environ[FOLDER] = str(folder / "field.columns")
+            write_field(folder / "field.columns", count)
             for workers in chosen.workers:
                 row = alone("stored", count, workers)
                 one = next((other for other in rows if other["size"] == count and other["workers"] == 1), row)
@@ -454,6 +448,9 @@ def measure_scale(chosen: argparse.Namespace) -> dict[str, Any]:
     frames = frames_in_turns(chosen.scale_frames, chosen.repeat)
     title = f"a frame's time, in turns with {min(chosen.scale_frames)} frames; median of {chosen.repeat} turns"
     print_table(title, FRAMES, frames)
+    total = [{"size": row["frames"], "seconds": row["frames"] * row["processor_us"]} for row in frames]
+    if (slope := exponent(total)) is not None:
+        print(f"  processor seconds grow as the number to the power {slope:.3f} (last {LAST_DECADES:.0f} decades)")
     return {"environment": environment(), "stored": rows, "frames": frames}
 
 

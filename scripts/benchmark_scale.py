@@ -4,23 +4,25 @@ from __future__ import annotations
 
 import os
 import pickle
-import resource
+import shutil
+import signal
+import sys
+import tempfile
 import time
-from collections.abc import Callable, Sequence
-from contextlib import ExitStack
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
-from benchmark_peers import Corners, peak_mib
+from benchmark_peers import Corners, peak_mib, reset_peak
 from benchmark_problems import corner_observations, field_observations, wide_lens
 
 from ceres_cal.base.arrays import Array
-from ceres_cal.observations import Observations
-from ceres_cal.observations.columns import View
-from ceres_cal.observations.files import header_of
+from ceres_cal.observations import NO_CURVES, Observations
+from ceres_cal.observations.columns import NO_POINTS, View
+from ceres_cal.observations.files import Content, header_of
 from ceres_cal.observations.folders import HEADER
 
 FOLDER = "CERES_CAL_BENCHMARK"  # the environment's name of where the observations are
@@ -28,6 +30,21 @@ _FRAMES = 2000  # written at once
 _WARM_UP = 20_000
 _TIMES = 10  # the fewest frames between two times of more
 _ASKED = 50  # times, for what asking takes
+_BYTES = 40  # of disk for a line point, and what else a frame has
+
+
+@contextmanager
+def folder_for(line_points: int) -> Iterator[Path]:
+    """A folder with room for so many, which is gone at the end, SIGTERM's too."""
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
+    free = shutil.disk_usage(tempfile.gettempdir()).free
+    if free < _BYTES * line_points:
+        where, needed = tempfile.gettempdir(), _BYTES * line_points / 2**30
+        sys.exit(
+            f"{where}: {needed:.1f} GiB are needed, {free / 2**30:.1f} are free: set TMPDIR to where there is room"
+        )
+    with tempfile.TemporaryDirectory() as folder:
+        yield Path(folder)
 
 
 def write_field(path: Path, line_points: int) -> None:
@@ -38,7 +55,9 @@ def write_field(path: Path, line_points: int) -> None:
     counts = {"points": frames * int(np.count_nonzero(one.points.view == 0)), "curves": line_points}
     views = tuple(View(str(frame), "overhead", "overhead", "field") for frame in range(frames))
     path.mkdir()
-    (path / HEADER).write_bytes(msgspec.json.encode(header_of(replace(one, points=one.points, views=views))))
+    (path / HEADER).write_bytes(
+        msgspec.json.encode(header_of(Content(one.targets, one.cameras, views, NO_POINTS, NO_CURVES, one.priors)))
+    )
     columns = {
         f"{kind}_{name}": np.lib.format.open_memmap(
             path / f"{kind}_{name}.npy", "w+", array.dtype, (counts[kind], *array.shape[1:])
@@ -65,18 +84,18 @@ def stored_growth(line_points: int, workers: int) -> dict[str, Any]:
     from ceres_cal.calibrating import calibrate
     from ceres_cal.model.parameters import Options
 
-    options = Options(lens="radial")
-    calibrate(field_observations(_WARM_UP), options)
+    _warm_up()
     with ExitStack() as stack:
         client = stack.enter_context(_cluster(workers)) if workers else None
+        if client is not None:
+            client.run(_warm_up)
         before, start = _processor(client), time.perf_counter()
         observations = Observations.load(os.environ[FOLDER])
         opened = time.perf_counter()
         trips = _watched(stack, client)
-        calibration = calibrate(observations, options, client=client)
+        calibration = calibrate(observations, Options(lens="radial"), client=client)
         seconds = time.perf_counter() - start
         processor = [now - then for now, then in zip(_processor(client), before, strict=True)]
-        peaks = client.run(resource.getrusage, resource.RUSAGE_SELF).values() if client else ()
         return {
             "size": line_points,
             "workers": workers,
@@ -87,12 +106,20 @@ def stored_growth(line_points: int, workers: int) -> dict[str, Any]:
             "focal_error_px": calibration.cameras["overhead"].phi - 600.0,
             "phi": calibration.cameras["overhead"].phi,
             "peak_mib": peak_mib(),
-            "worker_mib": max((one.ru_maxrss / 1024.0 for one in peaks), default=None),
+            "worker_mib": max(client.run(peak_mib).values()) if client else None,
             "iterations": len(trips),
-            "iteration_seconds": float(np.median([seconds for seconds, _ in trips])),
+            "iteration_seconds": float(np.median([seconds for seconds, _ in trips])) if trips else None,
             "iteration_bytes": max(size for _, size in trips) if client else None,
             "overhead_ms": 1e3 * _overhead_s(client, observations) if client else None,
         }
+
+
+def _warm_up() -> None:
+    """What a process does once: imports, compiled kernels."""
+    from ceres_cal.calibrating import calibrate
+    from ceres_cal.model.parameters import Options
+
+    calibrate(field_observations(_WARM_UP), Options(lens="radial"))
 
 
 def _processor(client: Any) -> list[float]:
@@ -141,6 +168,7 @@ def frames_in_turns(sizes: Sequence[int], turns: int) -> list[dict[str, Any]]:
     rows = []
     for frames in sizes:
         corners, times = wide_lens(frames).corners, int(np.clip(frames // min(sizes), 1, _TIMES))
+        reset_peak()
         spent(corners)
         own, ratios, before = [], [], spent(few, times)
         for _ in range(turns):
@@ -151,16 +179,23 @@ def frames_in_turns(sizes: Sequence[int], turns: int) -> list[dict[str, Any]]:
         (processor, wall), (times_processor, times_wall) = np.median(own, axis=0), np.median(ratios, axis=0)
         rows.append({
             "frames": frames, "processor_us": 1e6 * processor, "wall_us": 1e6 * wall,
-            "times_processor": times_processor, "times_wall": times_wall,
+            "times_processor": times_processor, "times_wall": times_wall, "peak_mib": peak_mib(),
         })  # fmt: skip
     return rows
 
 
-def _cluster(workers: int) -> Any:
+@contextmanager
+def _cluster(workers: int) -> Iterator[Any]:
     """A client of so many worker processes on this machine."""
+    import dask
     from distributed import Client, LocalCluster
 
-    return Client(LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address=":0", memory_limit=0))
+    with (
+        dask.config.set(temporary_directory=str(Path(os.environ[FOLDER]).parent)),
+        LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address=":0", memory_limit=0) as cluster,
+        Client(cluster) as client,
+    ):
+        yield client
 
 
 def _watched(stack: ExitStack, client: Any) -> list[tuple[float, int]]:

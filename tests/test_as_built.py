@@ -111,7 +111,7 @@ def test_numbers_by_kind() -> None:
     structure = make_structure(targets, dict.fromkeys(targets, Tolerance(points_m=0.001, warp_m=0.001)))
     numbers = numbers_by_kind(structure, targets)
     assert {of: len(own) for of, own in numbers.items()} == {
-        ("small", "points"): 12, ("small", "warp"): 2, ("large", "points"): 24, ("large", "warp"): 2,
+        ("small", "points"): 12, ("small", "warp"): 5, ("large", "points"): 24, ("large", "warp"): 5,
     }  # fmt: skip
     assert all(structure.names[i].startswith(f"{target}/") for (target, _), own in numbers.items() for i in own)
 

@@ -1,6 +1,7 @@
 """The benchmark runs, and what it compares are answers of one quality. Nothing here is about time."""
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -30,3 +31,20 @@ def test_quick_run(tmp_path: Path) -> None:
     assert report["uncertainty_share"] > 0.0 and "standard deviations of everything add" in printed
     (field,) = report["field"]
     assert field["rms_px"] == pytest.approx(0.3, abs=0.03)  # 0.293 of 1000 line points
+
+
+def test_scale_leaves_nothing_behind(tmp_path: Path) -> None:
+    pytest.importorskip("distributed", reason="Dask is an extra: pip install 'ceres-cal[dask]'")
+    path, folder = tmp_path / "report.json", tmp_path / "folder"
+    folder.mkdir()
+    chosen = ["--scale", "4e3", "--workers", "1", "--scale-frames", "20,40", "--repeat", "1"]
+    printed = subprocess.run(
+        [sys.executable, str(SCRIPT), *chosen, "--json", str(path)],
+        capture_output=True, text=True, check=True, env={**os.environ, "TMPDIR": str(folder)},
+    ).stdout  # fmt: skip
+    report = json.loads(path.read_text(encoding="utf-8"))
+    assert not list(folder.iterdir())
+    (row,) = report["stored"]
+    assert abs(row["focal_error_px"]) < 1.0  # -0.30 measured
+    assert all(one["peak_mib"] > 10.0 for one in (row, *report["frames"])) and row["worker_mib"] > 10.0
+    assert "power" in printed and row["iteration_bytes"] < 10_000

@@ -300,7 +300,7 @@ def test_help_and_wrong_usage_bring_in_nothing_heavy() -> None:
         (("simulate", "boards", "-o", SAMPLE), "is a file: name a folder"),
         (("targets", "pitch"), "there is no target 'pitch'"),
         (("targets", "nowhere.json"), "nowhere.json: no such file"),
-        (("detect", "board", "x.png"), "required: --columns, --rows, -o/--output"),
+        (("detect", "board", "x.png"), "required: -o/--output"),
     ],
 )
 def test_wrong_usage_is_one_line(say: Say, arguments: Sequence[object], words: str, tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ from scenes import two_cameras
 from test_competing import NOISE, half_field
 
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.threads import at_most
 from ceres_cal.observations import Observations, columns
 from ceres_cal.simulate import simulate
 
@@ -79,6 +80,23 @@ def test_wrong_rows_are_named_whatever_block_they_are_in(monkeypatch: pytest.Mon
             _with_curves(sound, pixels=pixels)
     with pytest.raises(InputError, match="not in the order of their views"):
         _with_curves(sound, view=np.r_[np.full(50, 1), np.zeros(len(sound.curves) - 50)].astype(np.int32))
+
+
+def test_blocks_that_threads_look_at_say_what_one_says(monkeypatch: pytest.MonkeyPatch) -> None:
+    sound = simulate(half_field(2), NOISE, 1).observations
+    pixels, twice = sound.curves.pixels.copy(), sound.curves.pixels.copy()
+    pixels[[30, 260]], twice[271] = np.nan, twice[270]
+    copied = _with_curves(sound, pixels=twice, feature=np.full(len(twice), sound.curves.feature[0]))
+    counts, copies = [np.diff(own) for own in sound.ends], copied.copies.curves
+    monkeypatch.setattr(columns, "_BLOCK", 50)
+    monkeypatch.setattr(columns, "_ROW_NS", 1e5)
+    with at_most(4):
+        for now, then in zip(replace(sound).ends, counts, strict=True):
+            np.testing.assert_array_equal(np.diff(now), then)
+        assert np.flatnonzero(copies >= 0).tolist() == [271]
+        np.testing.assert_array_equal(replace(copied).copies.curves, copies)
+        with pytest.raises(InputError, match=f"'{sound.feature_name('curve', 30)}': its pixel is not finite"):
+            _with_curves(sound, pixels=pixels)
 
 
 def _with_curves(observations: Observations, **changed: object) -> Observations:

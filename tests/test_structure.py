@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,8 +13,9 @@ from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
+from ceres_cal.diagnostics import diagnose
 from ceres_cal.model.parameters import Options
-from ceres_cal.model.structure import EXACT, Tolerance, make_structure
+from ceres_cal.model.structure import EXACT, WARP, Tolerance, make_structure
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import gather_sights
 from ceres_cal.scene.camera import Camera
@@ -92,19 +95,43 @@ def test_painted_offsets_come_back(seed: int) -> None:
     assert not calibration.rejected
 
 
-def test_a_bent_board_is_straightened() -> None:
+@pytest.mark.parametrize("named", [False, True])
+def test_a_bent_board_is_straightened(named: bool) -> None:
+    """Bowed, twisted and wavy; a checkerboard, or a board of named points."""
     board = checkerboard(9, 6, 0.1)
+    if named:
+        board = custom({f"p{n}": place for n, place in enumerate(board.points.values())}, movable=True)
     half = 0.5 * np.ptp(board.point_array[:, :2], axis=0)
     u, v = ((board.point_array[:, :2] - half) / half).T
-    bow = 0.004 * (1.0 - u**2) - 0.002 * (1.0 - v**2)
+    bow = 0.004 * (1.0 - u**2) - 0.002 * (1.0 - v**2) + 0.003 * u * v - 0.002 * 1.5 * np.sqrt(3.0) * v * (1.0 - v**2)
     bent = custom({n: (x, y, float(z)) for (n, (x, y, _)), z in zip(board.points.items(), bow, strict=True)})
     stations = {"a": Station("a", overhead_pose(0.0, 0.0, 4.0, 0.0, 0.0, 0.0))}
     seen = simulate(board_scene(bent, {"a": CAMERA}, stations, count=12, seed=3), NOISE, 3).observations
     observations = replace(seen, targets={"board": board})
     calibration = calibrate(observations, Options(lens="radial", tolerances={"board": Tolerance(warp_m=0.01)}))
-    assert calibration.estimate.structure.names == ("board/bow.x", "board/bow.y")
-    assert calibration.estimate.structure.values == pytest.approx([0.004, -0.002], abs=3e-4)  # 1e-4
-    assert calibration.fit.points_rms_px < 0.44  # 0.41; 0.55 with a flat board
+    assert calibration.estimate.structure.names == tuple(f"board/{part}" for part in WARP)
+    assert calibration.estimate.structure.values == pytest.approx([0.004, -0.002, 0.003, 0.0, -0.002], abs=3e-4)  # 1e-4
+    assert calibration.fit.points_rms_px < 0.44  # 0.41; 0.6 with a flat board
+    findings = diagnose(calibrate(observations, Options(lens="radial")), observations).findings
+    (bent_board,) = (one for one in findings if one.kind == "board bent")
+    assert "twisted by +" in bent_board.sentence and "along y of -" in bent_board.sentence
+
+
+def test_a_warp_of_before_is_bowed_alone(tmp_path: Path) -> None:
+    """What 0.1 saved knows two bows."""
+    board = checkerboard(9, 6, 0.1)
+    stations = {"a": Station("a", overhead_pose(0.0, 0.0, 4.0, 0.0, 0.0, 0.0))}
+    observations = simulate(board_scene(board, {"a": CAMERA}, stations, count=6, seed=3), NOISE, 3).observations
+    path = tmp_path / "calibration.json"
+    calibrate(observations, Options(lens="radial", tolerances={"board": Tolerance(warp_m=0.01)})).save(path)
+    content = json.loads(path.read_text())
+    content["structure_m"] = {"board/bow.x": 0.001, "board/bow.y": 0.002}
+    path.write_text(json.dumps(content))
+    assert Calibration.load(path).estimate.structure.values.tolist() == [0.001, 0.002, 0.0, 0.0, 0.0]
+    del content["structure_m"]["board/bow.x"]
+    path.write_text(json.dumps(content))
+    with pytest.raises(InputError, match="structure_m does not fit"):
+        Calibration.load(path)
 
 
 def test_the_file_keeps_the_corrections(tmp_path: object) -> None:

@@ -361,7 +361,7 @@ WIDE_ARC = {"centre": [0, 0, 0], "radius_m": 0.1, "width_m": 0.2}
 BAD_SPECS: list[tuple[Any, str]] = [
     (
         None,
-        "unknown kind None: choose one of ssl-field, .*tape-grid, checkerboard, circle-grid, april-grid, rings, custom",
+        "unknown kind None: choose one of ssl-field, .*tape-grid, checkerboard, .*, markers, rings, custom",
     ),
     ([1, 2], "unknown kind None"),
     ({"kind": "ssl"}, "unknown kind 'ssl'"),

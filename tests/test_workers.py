@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import resource
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -68,6 +69,16 @@ def test_workers_give_the_answer_of_one_process(client: Any, observations: Obser
         assert there.rejected == here.rejected
         np.testing.assert_allclose(there.uncertainty.posterior.sd, posterior.sd, rtol=1e-9)
     assert _kept_by(client) == 0
+    assert max(client.run(_page_faults).values()) < 1_000  # 0 measured; 5160 as Dask starts its workers
+
+
+def _page_faults() -> int:
+    """Of ten arrays that are made one after the other where one has been."""
+    start = 0
+    for number in range(11):
+        np.ones(1 << 20)
+        start = start if number else resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - start
 
 
 def test_workers_killed_twice_change_no_bit(

@@ -33,12 +33,14 @@ if TYPE_CHECKING:
     from ceres_cal.report import write_report as write_report
     from ceres_cal.scene.camera import Camera as Camera
     from ceres_cal.scene.targets import Arc as Arc
+    from ceres_cal.scene.targets import Marker as Marker
     from ceres_cal.scene.targets import Segment as Segment
     from ceres_cal.scene.targets import Target as Target
     from ceres_cal.scene.targets import april_grid as april_grid
     from ceres_cal.scene.targets import checkerboard as checkerboard
     from ceres_cal.scene.targets import circle_grid as circle_grid
     from ceres_cal.scene.targets import custom as custom
+    from ceres_cal.scene.targets import markers as markers
     from ceres_cal.scene.targets import painted_field as painted_field
     from ceres_cal.scene.targets import rings as rings
     from ceres_cal.scene.targets import ssl_field as ssl_field
@@ -70,7 +72,7 @@ _HOME = {
     **dict.fromkeys(
         (
             *("Target", "Segment", "Arc", "april_grid", "checkerboard", "circle_grid", "custom", "painted_field"),
-            *("rings", "ssl_field", "tape_grid"),
+            *("Marker", "markers", "rings", "ssl_field", "tape_grid"),
         ),
         "scene.targets",
     ),

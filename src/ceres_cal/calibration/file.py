@@ -16,7 +16,7 @@ from ceres_cal.calibration.origin import Fit, LensChoice, Refitted, Rejected
 from ceres_cal.model.keys import Key
 from ceres_cal.model.parameters import Estimate, Options, Station
 from ceres_cal.model.priors import GaussianPrior
-from ceres_cal.model.structure import EXACT, make_structure
+from ceres_cal.model.structure import EXACT, WARP, make_structure
 from ceres_cal.observations import prior_from_json, prior_to_json
 from ceres_cal.scene.files import CameraFile, Matrix, PoseFile, Vector
 from ceres_cal.scene.targets import Target
@@ -25,6 +25,8 @@ from ceres_cal.uncertainty import PosteriorFile, information_from, lower_triangl
 
 FORMAT, VERSION = "ceres-cal/calibration", 1
 _ALIKE = 1e-5  # somebody who edits a file rounds
+
+_ALSO_WARPED = tuple(f"/{part}" for part in WARP[2:])
 
 
 class StationFile(PoseFile, forbid_unknown_fields=True):
@@ -154,9 +156,10 @@ class CalibrationFile(msgspec.Struct, forbid_unknown_fields=True):
             with naming(f"placement {name!r}"):
                 placements[name] = placement.pose()
         structure = make_structure(targets, options.tolerances, options.dimensions)
-        if structure.names != tuple(self.structure_m):
+        flat = {name: 0.0 for name in structure.names if name.endswith(_ALSO_WARPED)}  # which 0.1 did not have
+        if not self.structure_m.keys() <= set(structure.names) <= self.structure_m.keys() | flat.keys():
             raise InputError("structure_m does not fit the targets and the tolerances: calibrate again")
-        built = structure.with_values(np.array(list(self.structure_m.values())))
+        built = structure.with_values(np.array([(flat | self.structure_m)[name] for name in structure.names]))
         return Estimate(cameras, stations, placements, built)
 
 

@@ -12,7 +12,7 @@ from ceres_cal.cli.arguments import add_detection, add_quiet, length
 from ceres_cal.cli.command import Answer, Command
 from ceres_cal.cli.detection import detected
 from ceres_cal.cli.frames import add_frames, frames_of_videos
-from ceres_cal.cli.inputs import images_and_videos
+from ceres_cal.cli.inputs import images_and_videos, read_target
 from ceres_cal.cli.outputs import finishing, require_observations_output
 from ceres_cal.cli.photographs import missed_data, missed_text
 from ceres_cal.cli.progress import progress_bar
@@ -25,8 +25,14 @@ if TYPE_CHECKING:
 def _add_board(parser: ArgumentParser) -> None:
     add = parser.add_argument
     add("images", nargs="+", metavar="IMAGE", help="images of one camera, folders of them, or videos")
-    add("--columns", type=int, required=True, metavar="N", help="inner corners, or circles, along a row of the board")
-    add("--rows", type=int, required=True, metavar="N", help="inner corners, or circles, along a column of it")
+    add("--columns", type=int, metavar="N", help="inner corners, or circles, along a row of the board")
+    add("--rows", type=int, metavar="N", help="inner corners, or circles, along a column of it")
+    add(
+        "--target",
+        metavar="TARGET",
+        help="in place of these and of the sizes: a board, or markers of known place, spelled out "
+        "('{\"kind\": \"markers\", ...}': `ceres-cal targets`), or a JSON file with it or with a target named 'board'",
+    )
     add("--square", type=length("m"), metavar="M", help="side of a square in metres, or such as 25mm")
     add(
         "--april-grid",
@@ -72,9 +78,18 @@ def _run_board(args: Namespace) -> Answer:
     return Answer(_data(detections, args.output), lambda: _text(detections, args.output))
 
 
+_OF_A_BOARD = ("columns", "rows", "square", "april_grid", "gap", "circles", "diameter")
+
+
 def _board(args: Namespace) -> Target:
     from ceres_cal.scene.targets import april_grid, checkerboard, circle_grid
 
+    if args.target is not None:
+        if given := [f"--{name}".replace("_", "-") for name in _OF_A_BOARD if getattr(args, name) is not None]:
+            raise InputError(f"--target says what the board is: leave out {' and '.join(given)}")
+        return read_target(args.target, "board")
+    if args.columns is None or args.rows is None:
+        raise InputError("--columns N and --rows N, or --target TARGET: say what the board is")
     if sum(size is not None for size in (args.square, args.circles, args.april_grid)) != 1:
         raise InputError("--square M, --circles M or --april-grid M, by the kind of board: give one of them")
     if args.square is not None:
@@ -93,7 +108,7 @@ def _board(args: Namespace) -> Target:
 COMMANDS = (
     Command(
         "detect board",
-        "chessboards, ChArUco, AprilGrid and circle boards in images",
+        "chessboards, ChArUco, AprilGrid and circle boards, and markers, in images",
         _add_board,
         _run_board,
         (
@@ -101,6 +116,7 @@ COMMANDS = (
             "photographs/ --columns 9 --rows 6 --square 40mm --charuco DICT_4X4_50 --marker 30mm -o board.json",
             "photographs/ --columns 6 --rows 6 --april-grid 88mm --gap 0.3 -o april.json",
             "photographs/ --columns 7 --rows 5 --circles 30mm --diameter 20mm -o circles.json",
+            "0001.png --target markers.json -o floor.json",
         ),
     ),
 )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -15,7 +15,7 @@ from ceres_cal.cli.arguments import add_output, add_quiet, add_station, add_time
 from ceres_cal.cli.command import Answer, Command
 from ceres_cal.cli.detection import detected
 from ceres_cal.cli.estimate import add_estimate, parse_estimates
-from ceres_cal.cli.inputs import images_and_videos, spelled_target
+from ceres_cal.cli.inputs import images_and_videos, json_object, read_target
 from ceres_cal.cli.median import add_median, median_path, median_text, write_median
 from ceres_cal.cli.outputs import finishing, require_observations_output
 from ceres_cal.cli.photographs import missed_data
@@ -101,7 +101,7 @@ def _run(args: Namespace) -> Answer:
     from ceres_cal.photographs import FieldOptions, detect_field
 
     start = _start(args)
-    target = start.target if args.target is None else _target(args.target)
+    target = start.target if args.target is None else read_target(args.target, "field")
     if target is None:
         raise InputError("name the field with --target, such as --target ssl-b")
     not_painted = parse_names(args.not_painted)
@@ -198,7 +198,7 @@ def _start(args: Namespace) -> _Start:
     from ceres_cal.photographs.clicks import load_clicks
     from ceres_cal.photographs.known import is_painted
 
-    if _json(args.start).get("format") != FORMAT:
+    if json_object(args.start).get("format") != FORMAT:
         if args.auto:
             raise InputError(f"{args.start}: with --auto only a calibration is of use: leave out --auto, or the file")
         return _Start(load_clicks(args.start), camera, args.station or camera, None)
@@ -241,33 +241,6 @@ def _corners(specs: list[str]) -> Clicks:
             raise InputError(f"{where}: {name.strip()} is given twice")
         points[name.strip()] = (numbers[0], numbers[1])
     return Clicks(points)
-
-
-def _target(text: str) -> Target:
-    from ceres_cal.scene.targets import target_from_spec, targets_by_name
-
-    if (spelled := spelled_target(text, "--target")) is not None:
-        return spelled
-    by_name = targets_by_name()
-    if text in by_name:
-        return by_name[text]
-    if not Path(text).exists():
-        raise InputError(f"--target {text!r}: neither {' nor '.join(by_name)}, nor a file")
-    content = _json(Path(text))
-    named = content.get("targets")
-    spec = named.get("field") if isinstance(named, dict) else content
-    if not isinstance(spec, dict):
-        raise InputError(f"{text}: it holds no target named 'field'")
-    return target_from_spec(spec, text)
-
-
-def _json(path: Path) -> Mapping[str, Any]:
-    from ceres_cal.base.files import parse_json, read_bytes
-
-    content = parse_json(read_bytes(path), str(path))
-    if not isinstance(content, dict):
-        raise InputError(f"{path}: it must hold one JSON object")
-    return content
 
 
 # ---- the answer -----------------------------------------------------------------------------------------------------

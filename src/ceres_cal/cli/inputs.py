@@ -5,9 +5,9 @@ from __future__ import annotations
 import glob
 import os
 from argparse import Namespace
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from ceres_cal.base.errors import InputError
 
@@ -58,6 +58,35 @@ def spelled_target(text: str, where: str) -> Target | None:
     from ceres_cal.scene.targets import target_from_spec
 
     return target_from_spec(parse_json(text.encode(), where), where)
+
+
+def read_target(text: str, name: str) -> Target:
+    """The target of `--target`: by its name, spelled out, or in a file, alone or as one of that name among several."""
+    from ceres_cal.scene.targets import target_from_spec, targets_by_name
+
+    if (spelled := spelled_target(text, "--target")) is not None:
+        return spelled
+    by_name = targets_by_name()
+    if text in by_name:
+        return by_name[text]
+    if not Path(text).exists():
+        raise InputError(f"--target {text!r}: neither {' nor '.join(by_name)}, nor a file")
+    content = json_object(Path(text))
+    named = content.get("targets")
+    spec = named.get(name) if isinstance(named, dict) else content
+    if not isinstance(spec, dict):
+        raise InputError(f"{text}: it holds no target named {name!r}")
+    return target_from_spec(spec, text)
+
+
+def json_object(path: Path) -> Mapping[str, Any]:
+    """What a file holds; InputError where it is no JSON object."""
+    from ceres_cal.base.files import parse_json, read_bytes
+
+    content = parse_json(read_bytes(path), str(path))
+    if not isinstance(content, dict):
+        raise InputError(f"{path}: it must hold one JSON object")
+    return content
 
 
 def require_different(files: Iterable[str | Path]) -> None:

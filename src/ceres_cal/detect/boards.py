@@ -1,6 +1,6 @@
-"""Boards in image files, as observations: corners of chessboards and ChArUco boards, centres of circles.
+"""Boards in image files, as observations: corners of chessboards, ChArUco boards and markers, centres of circles.
 
-OpenCV finds the board; its sub-pixel search or `saddles` then measures every corner.
+OpenCV finds the board; its sub-pixel search, `saddles` or `markers` then measures every corner.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from ceres_cal.base.words import frame_of, printable
 from ceres_cal.detect.april_grids import measured_april_grid
 from ceres_cal.detect.circles import measured_circles
 from ceres_cal.detect.images import read_grey
+from ceres_cal.detect.markers import dictionary_of, markers_finder, measured_markers
 from ceres_cal.detect.partly import part_of_board
 from ceres_cal.detect.saddles import REACH, is_begun_dark, measure_saddles
 from ceres_cal.detect.scatter import scatter_px
@@ -29,7 +30,10 @@ CORNER_FITS = ("saddle", "opencv")
 MIN_CORNERS = 6
 TARGET_NAME = "board"
 _COUNTED = {"checkerboard": "inner corners", "circle-grid": "circles", "april-grid": "tags"}
-_HINTS = {"checkerboard": " (count the corners between squares, not the squares)", "circle-grid": "", "april-grid": ""}
+_HINTS = {
+    "checkerboard": " (count the corners between squares, not the squares)",
+    **dict.fromkeys(("circle-grid", "april-grid", "markers"), ""),
+}
 _LARGE_PX = 2e6  # larger images are searched at this size first: faster, and with less of noise and blur
 _MOST_PX = 1.6e7  # and at this size at most: on noise OpenCV takes minutes, and 50 MB for every megapixel
 _SUBPIX_HALF_WINDOW_PX = 5  # at most; a third of the spacing keeps the neighbouring corners out of it
@@ -75,13 +79,13 @@ def detect_boards(
     corners: CharucoSpec | str = "saddle",
     progress: ImageProgress | None = None,
 ) -> BoardDetections:
-    """Chessboard or ChArUco corners of one camera's images.
+    """Chessboard or ChArUco corners, or those of markers, of one camera's images.
 
     Each image is one view; its frame is the file's stem, its placement too (with as much of the folders as tells
-    equal stems apart). Corners are named so that the labelling is never mirrored: the board's x along columns, y along
-    rows and z away from the camera. Which end of a plain chessboard is "0,0" is settled where its picture says so, by
-    columns + rows being odd: then the square between "0,0" and "1,1" is dark; otherwise the board may be named as if
-    turned, which the placement takes up.
+    equal stems apart) unless the target is the world, as markers on the floor are. Corners are named so that the
+    labelling is never mirrored: a board's x along columns, y along rows and z away from the camera. Which end of a
+    plain chessboard is "0,0" is settled where its picture says so, by columns + rows being odd: then the square between
+    "0,0" and "1,1" is dark; otherwise the board may be named as if turned, which the placement takes up.
 
     `sigma_px` is one number for all images: the scatter of corners about a smooth picture of their board. What an
     unflat board and an unmodelled lens add to it is up to ten times that in real sets, and only the solve can tell.
@@ -89,7 +93,7 @@ def detect_boards(
     Args:
         images: files of any kind OpenCV reads, colour or grey, 8 or 16 bit, all of one size. A rotation noted in the
             file is ignored: intrinsics belong to the pixels as the sensor has them, not to how a viewer turns them.
-        board: a target of kind checkerboard, circle-grid or april-grid.
+        board: a target of kind checkerboard, circle-grid, april-grid or markers.
         camera: name of the camera.
         station: name of the station, that of the camera by default.
         corners: the markers, when the board has any: boards may then be partly seen. Else one of CORNER_FITS: "saddle"
@@ -105,16 +109,22 @@ def detect_boards(
         NothingShownError: no image shows the board.
     """
     paths = [Path(path) for path in images]
-    placements, find = _placement_names(paths), _finder(board, corners)
+    find = _finder(board, corners)
+    placements = _placement_names(paths) if board.movable else dict.fromkeys(paths)
     size, grids, missed = _find_all(paths, find, progress)
     if not grids:
-        what = f"{board.spec['columns']} x {board.spec['rows']} {_COUNTED[board.kind]}"
         reason = f"in any of {len(paths)} images{_HINTS[board.kind]}; {missed[0][0]}: {missed[0][1]}"
-        raise NothingShownError(f"no board of {what} {reason}", tuple(missed))
+        raise NothingShownError(f"no {_what(board)} {reason}", tuple(missed))
     views = tuple(View(frame_of(path), camera, station or camera, TARGET_NAME, placements[path]) for path in grids)
     points = _points(list(grids.values()), board)
     observations = Observations({TARGET_NAME: board}, {camera: size}, views, points, NO_CURVES)
     return BoardDetections(observations, tuple(map(str, grids)), tuple(missed))
+
+
+def _what(board: Target) -> str:
+    if board.kind == "markers":
+        return f"marker of {len(board.spec['markers'])}"
+    return f"board of {board.spec['columns']} x {board.spec['rows']} {_COUNTED[board.kind]}"
 
 
 # ---- finding --------------------------------------------------------------------------------------------------------
@@ -154,8 +164,11 @@ def _finder(board: Target, corners: CharucoSpec | str) -> Finder:
         return lambda image: measured_circles(_as_8_bit(image), board)
     if board.kind == "april-grid":
         return lambda image: _placing(measured_april_grid(image, _as_8_bit(image), board))
+    if board.kind == "markers":
+        finder = markers_finder(board)
+        return lambda image: measured_markers(image, _as_8_bit(image), board, finder)
     if board.grid is None or not board.grid.checkered:
-        known = " or ".join(map(repr, _COUNTED))
+        known = " or ".join(map(repr, _HINTS))
         raise InputError(f"target of kind {board.kind!r}: boards are detected with a target of kind {known}")
     return _corner_finder(board.grid, corners)
 
@@ -257,12 +270,9 @@ def _scales(pixels: int) -> Iterator[float]:
 
 
 def _charuco_detector(charuco: CharucoSpec, columns: int, rows: int, square_m: float) -> cv2.aruco.CharucoDetector:
-    code = getattr(cv2.aruco, charuco.dictionary, None)
-    if not charuco.dictionary.startswith("DICT_") or not isinstance(code, int):
-        raise InputError(f"unknown marker dictionary {charuco.dictionary!r}: name one of OpenCV's, such as DICT_4X4_50")
+    dictionary = dictionary_of(charuco.dictionary)
     if not 0.0 < charuco.marker_m < square_m:
         raise InputError(f"marker_m must be between 0 and the square's {square_m} m, not {charuco.marker_m}")
-    dictionary = cv2.aruco.getPredefinedDictionary(code)
     needed = (columns + 1) * (rows + 1) // 2
     if len(dictionary.bytesList) < needed:
         raise InputError(
@@ -335,9 +345,7 @@ def _placement_names(paths: Sequence[Path]) -> dict[Path, str]:
 
 
 def _points(grids: Sequence[Array], board: Target) -> Points:
-    rows, columns = grids[0].shape[:2]
-    index = {name: i for i, name in enumerate(board.point_names)}
-    features = np.array([[index[f"{c},{r}"] for c in range(columns)] for r in range(rows)], dtype=np.int32)
+    features = np.arange(len(board.points), dtype=np.int32).reshape(grids[0].shape[:2])  # as targets list them
     seen = [~np.isnan(grid[..., 0]) for grid in grids]
     count = [int(np.count_nonzero(s)) for s in seen]
     return Points(

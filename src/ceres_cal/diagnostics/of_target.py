@@ -14,7 +14,7 @@ from ceres_cal.diagnostics.diagnostic import Case, Evidence, ScoreTest, Tested, 
 from ceres_cal.diagnostics.findings import Amount, Finding, amounts
 from ceres_cal.diagnostics.scores import Family, grouped
 from ceres_cal.model.equations import whole_structure
-from ceres_cal.model.structure import Kind, numbers_by_kind
+from ceres_cal.model.structure import WARP, Kind, numbers_by_kind
 from ceres_cal.scene.targets import Arc, Segment
 from ceres_cal.solve import AsBuilt
 
@@ -164,20 +164,25 @@ class PointAside(_AsBuilt):
 
 
 class BoardBent(_AsBuilt):
-    """A board is bowed along its sides."""
+    """A board is bowed along its sides, twisted or wavy."""
 
     kind = "board bent"
     built: ClassVar = "warp"
-    places: ClassVar = slice(2, 4)
+    places: ClassVar = slice(2, 2 + len(WARP))
 
     def words(self, evidence: Evidence) -> Words:
         name = evidence.score.subject
         mm, sd = 1e3 * evidence.score.amount, 1e3 * evidence.score.sd
+        further = [
+            f"{words} {a:+.2f} ± {s:.2f} mm"
+            for words, a, s in zip(("twisted by", "waves along x of", "along y of"), mm[2:], sd[2:], strict=True)
+            if abs(a) > 2.0 * s
+        ]
         return Words(
             f"board {name} is not flat: bowed by {mm[0]:+.2f} ± {sd[0]:.2f} mm along x, {mm[1]:+.2f} ± {sd[1]:.2f} mm "
-            f"along y ({evidence.size})",
+            f"along y{''.join(f', {one}' for one in further)} ({evidence.size})",
             f"mount it on something flat, or solve for it: --tolerance {name}.warp_m=0.002",
-            amounts(("bow.x", "bow.y"), mm, sd, "mm"),
+            amounts(WARP, mm, sd, "mm"),
         )
 
 

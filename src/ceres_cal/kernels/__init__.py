@@ -4,6 +4,7 @@
 """
 
 from ceres_cal.kernels.arguments import (
+    BUILT,
     LOSS_CODES,
     NOTHING,
     ROUNDING,
@@ -44,6 +45,7 @@ KERNELS = (
 )
 
 __all__ = [
+    "BUILT",
     "KERNELS",
     "LOSS_CODES",
     "NOTHING",

@@ -28,14 +28,18 @@ class Optics(NamedTuple):
     work_rows: int
 
 
+BUILT = 7
+"""Numbers at most that move an observation on its target: of a point x, y and what a board's warp is made of."""
+
+
 class PointColumns(NamedTuple):
     """The point observations of some sights, one sight after the other.
 
     Attributes:
         bounds: (S + 1,) where each sight's rows begin. places: (N, 3) m, as built. pixels: (N, 2).
         weights: (N,) 1 / (noise scale * sigma).
-        slots: (N, 4) with bends (N, 2): the structure numbers that move each point, -1 for none; empty without
-            structure (see `structure.Structure`).
+        slots: (N, BUILT) with bends (N, BUILT - 2): the structure numbers that move each point, -1 for none; empty
+            without structure (see `structure.Structure`).
     """
 
     bounds: Any

@@ -27,11 +27,12 @@ def robust_loss(loss: Loss, squared: float) -> tuple[float, float]:
         root = np.sqrt(1.0 + squared / b)
         return 2.0 * squared / (1.0 + root), 1.0 / root  # 2 b (root - 1) without its rounding
     if code == _CAUCHY:
-        return b * np.log(1.0 + squared / b), 1.0 / (1.0 + squared / b)
+        return b * np.log1p(squared / b), 1.0 / (1.0 + squared / b)
     if squared >= b:
         return b / 3.0, 0.0
-    rest = 1.0 - squared / b
-    return b / 3.0 * (1.0 - rest * rest * rest), rest * rest
+    share = squared / b
+    rest = 1.0 - share
+    return squared * (1.0 - share + share * share / 3.0), rest * rest  # b / 3 (1 - rest^3) without its rounding
 
 
 @jit

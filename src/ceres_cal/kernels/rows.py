@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ceres_cal.kernels.arguments import CurveColumns, Loss, Optics, PointColumns
+from ceres_cal.kernels.arguments import BUILT, CurveColumns, Loss, Optics, PointColumns
 from ceres_cal.kernels.jit import borrowing, jit
 from ceres_cal.kernels.lenses import prepared
 from ceres_cal.kernels.losses import robust_loss
@@ -22,15 +22,15 @@ from ceres_cal.kernels.sight import (
 
 @jit
 def point_rows(optics: Optics, poses: Any, points: PointColumns, rows: Any) -> bool:
-    """d project(X) / d [intrinsics | 6 pose | x, y, first and second bow] into `rows` (N, 2, intrinsics + 10); False
-    where one cannot be projected.
+    """d project(X) / d [intrinsics | 6 pose | x, y, the warp's numbers] into `rows` (N, 2, intrinsics + 6 + BUILT);
+    False where one cannot be projected.
 
     Args:
         See `point_residuals`. The pose columns are left perturbations in the camera frame: (dw x R X) + dt.
     """
     optics = prepared(optics, optics.intrinsics)
     space = working_space(optics, 0)
-    jacobian, directions = space.jacobian, np.eye(4, 3)
+    jacobian, directions = space.jacobian, np.eye(BUILT, 3)
     for v in range(len(poses)):
         for start in range(points.bounds[v], points.bounds[v + 1], CHUNK):
             n = min(CHUNK, points.bounds[v + 1] - start)
@@ -38,7 +38,8 @@ def point_rows(optics: Optics, poses: Any, points: PointColumns, rows: Any) -> b
                 return False
             jacobian_rows(n, optics, space, False)
             for i in range(n):
-                directions[2, 2], directions[3, 2] = points.bends[start + i, 0], points.bends[start + i, 1]
+                for k in range(BUILT - 2):
+                    directions[2 + k, 2] = points.bends[start + i, k]
                 for c in range(2):
                     row = rows[start + i, c]
                     for k in range(len(jacobian)):
@@ -49,8 +50,8 @@ def point_rows(optics: Optics, poses: Any, points: PointColumns, rows: Any) -> b
 
 @jit
 def curve_rows(optics: Optics, poses: Any, curves: CurveColumns, rows: Any, normals: Any) -> bool:
-    """The same of the signed distance to the curve, into `rows` (M, intrinsics + 10), by the envelope theorem; the last
-    columns are of a segment's offset to the left, or of an arc's x, y and radius, and 0.
+    """The same of the signed distance to the curve, into `rows` (M, intrinsics + 6 + BUILT), by the envelope theorem;
+    the last columns are of a segment's offset to the left, or of an arc's x, y and radius, and 0.
 
     Args:
         See `curve_residuals`; s is moved to the foot. normals: (M, 2), filled with the image normal there: the foot
@@ -82,9 +83,9 @@ def curve_rows(optics: Optics, poses: Any, curves: CurveColumns, rows: Any, norm
 
 @borrowing
 def _add_built(pose: Any, directions: Any, row: Any) -> None:
-    """A row's last four columns, the target moved along each direction; the three before are the pose's translation."""
-    first = len(row) - 4
-    for a in range(4):
+    """A row's last BUILT columns, the target moved along each direction; those before are the pose's translation."""
+    first = len(row) - BUILT
+    for a in range(BUILT):
         row[first + a] = 0.0
         for j in range(3):
             for k in range(3):

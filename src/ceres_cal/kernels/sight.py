@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ceres_cal.kernels.arguments import CurveColumns, Loss, Optics, PointColumns, Unknowns
+from ceres_cal.kernels.arguments import BUILT, CurveColumns, Loss, Optics, PointColumns, Unknowns
 from ceres_cal.kernels.jit import borrowing, jit
 from ceres_cal.kernels.lenses import distort, intrinsics_rows, prepared
 from ceres_cal.kernels.losses import robust_loss
@@ -35,7 +35,7 @@ class Workspace(NamedTuple):
         work: what the lens keeps for the derivatives with respect to its own numbers.
         tangents: (3, n) dC/ds. foot (8, n): tau in px (0, 1), residual vector (2, 3), step (4), the previous s and dot
             product of residual and tau (5, 6), |tau|^2 (7).
-        directions, columns: (4, 3) and (4, 2) of one observation and its structure numbers, see `add_structure`.
+        directions, columns: (BUILT, 3), (BUILT, 2) of one observation and its structure numbers, see `add_structure`.
     """
 
     jacobian: Any
@@ -67,8 +67,8 @@ def working_space(optics: Optics, rows: int) -> Workspace:
         scratch[28:],
         scratch[17:20],
         scratch[20:28],
-        np.empty((4, 3)),
-        np.empty((4, 2)),
+        np.empty((BUILT, 3)),
+        np.empty((BUILT, 2)),
     )
 
 
@@ -237,7 +237,8 @@ def _add_points(
             directions[:] = 0.0
             directions[0, 0], directions[1, 1] = 1.0, 1.0
             for i in range(n):
-                directions[2, 2], directions[3, 2] = points.bends[start + i, 0], points.bends[start + i, 1]
+                for k in range(BUILT - 2):
+                    directions[2 + k, 2] = points.bends[start + i, k]
                 slots = points.slots[start + i]
                 add_structure(i, n, 2, slots, pose, order.places, space, normal)
     return cost

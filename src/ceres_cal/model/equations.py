@@ -37,8 +37,8 @@ class Equations:
         intrinsics: (E, K) px per solver's unit of [phi, aspect, cx, cy, coefficients, skew], 0 past a camera's own.
         pose: (E, 6) px per left perturbation of cam_from_frame. motion: (E, 3) px per metre that the point or foot
             moves in the camera frame. place: (E, 3) where it lies in its sight's frame, m.
-        built: (E, 4) px per metre of what moves it on its target: of a point x, y, first and second bow; of a segment
-            its offset to the left; of an arc x, y and radius; 0 for the rest.
+        built: (E, BUILT) px per metre of what moves it on its target: of a point x, y and what a warp is made of; of a
+            segment its offset to the left; of an arc x, y and radius; 0 for the rest.
     """
 
     sights: Sights
@@ -69,8 +69,8 @@ class Equations:
         return np.asarray(chosen[self.sight])
 
     def slots(self, structure: Structure) -> Indices:
-        """(E, 4) which of the structure's offsets are those of `built`, -1 for none."""
-        slots = np.full((len(self), 4), -1)
+        """(E, BUILT) which of the structure's offsets are those of `built`, -1 for none."""
+        slots = np.full((len(self), kernels.BUILT), -1)
         if structure.names:
             slots[~self.is_curve] = structure.point_slots[self.feature[~self.is_curve]]
             slots[self.is_curve, :3] = structure.track_slots[self.feature[self.is_curve]]
@@ -144,7 +144,7 @@ def _of_points(
     """The columns of the points of one camera's sights, of these numbers and poses."""
     optics = camera_optics(estimate.cameras[own.keys[0].camera])
     size = len(optics.intrinsics)
-    rows = np.empty((len(own.point_rows), 2, size + 10))
+    rows = np.empty((len(own.point_rows), 2, size + 6 + kernels.BUILT))
     points = point_columns(own, estimate.structure)
     bends = np.concatenate([bends_of(target) for target in observations.targets.values()])
     points = points._replace(bends=bends[own.point_index])
@@ -157,9 +157,9 @@ def _of_points(
         "direction": np.tile(np.eye(2), (len(rows), 1)),
         "pixel": np.repeat(own.pixels + there.points[own.point_rows], 2, axis=0),
         "intrinsics": rows[:, :, :size].reshape(-1, size),
-        "pose": rows[:, :, size:-4].reshape(-1, 6),
+        "pose": rows[:, :, size : size + 6].reshape(-1, 6),
         "place": np.repeat(points.places, 2, axis=0),
-        "built": rows[:, :, -4:].reshape(-1, 4),
+        "built": rows[:, :, size + 6 :].reshape(-1, kernels.BUILT),
     }
 
 
@@ -170,7 +170,7 @@ def _of_curves(
     optics = camera_optics(estimate.cameras[own.keys[0].camera])
     size = len(optics.intrinsics)
     curves = curve_columns(own, estimate.structure, there.feet[own.curve_rows])
-    rows, normals = np.empty((len(own.curve_rows), size + 10)), np.empty((len(own.curve_rows), 2))
+    rows, normals = np.empty((len(own.curve_rows), size + 6 + kernels.BUILT)), np.empty((len(own.curve_rows), 2))
     kernels.curve_rows(optics, poses, curves, rows, normals)
     distance = there.curves[own.curve_rows]
     return {
@@ -181,9 +181,9 @@ def _of_curves(
         "direction": normals,
         "pixel": own.curve_pixels + distance[:, None] * normals,
         "intrinsics": rows[:, :size],
-        "pose": rows[:, size:-4],
+        "pose": rows[:, size : size + 6],
         "place": along_track(curves.tracks[own.track_index], own.on_arc, curves.feet),
-        "built": rows[:, -4:],
+        "built": rows[:, size + 6 :],
     }
 
 

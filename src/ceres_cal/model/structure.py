@@ -1,9 +1,9 @@
 """The target as built: how far painted lines, points and boards lie from where they should, as numbers under a sigma.
 
 One vector for everything observed, shared by all frames and cameras: for each segment its offset to the left, for each
-arc its centre's x and y and its radius, for each point its x and y, for each board two bows of a parabolic warp: all in
-metres, 0 is the nominal target. Behind them come dimensions of targets that are not known, such as a field's length:
-each moves the offsets of many features at once.
+arc its centre's x and y and its radius, for each point its x and y, for each board its warp: two bows, a twist and two
+waves; all in metres, 0 is the nominal target. Behind them come dimensions of targets that are not known, such as a
+field's length: each moves the offsets of many features at once.
 """
 
 from __future__ import annotations
@@ -26,6 +26,8 @@ from ceres_cal.scene.targets import Arc, Target
 Kind = Literal["lines", "points", "warp"]
 """What a tolerance speaks of."""
 _NONE = -1
+WARP = ("bow.x", "bow.y", "twist", "wave.x", "wave.y")
+"""What the warp of a board is made of: see `bends_of`."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +37,7 @@ class Tolerance:
     Attributes:
         lines_m: of the offset of each segment, and of each arc's centre and radius.
         points_m: of each point's x and y.
-        warp_m: of a board's bow along each side, at its middle.
+        warp_m: of each of WARP, where it is largest: a board's bow along each side, its twist, a wave along each side.
         curve_m: name of a curve -> the same as lines_m, of that one in place of it.
     """
 
@@ -67,8 +69,8 @@ class Structure:
         names: (Z) "target/feature" or "target/feature.x": what each number moves; the last D are dimensions,
             "target/dimension". values: (Z,) offsets, m, and lengths of dimensions, m. sigma_m: (Z,) tolerance of each;
             infinite of a dimension, which has a prior, or none.
-        point_slots: (P, 4) which offset moves each point of all targets: x, y, first and second bow; -1 for none.
-        bends: (P, 2) how much of each bow a point gets, along +z.
+        point_slots: (P, 2 + W) which offset moves each point of all targets: x, y and each of WARP; -1 for none.
+        bends: (P, W) how much of each of them a point gets, along +z.
         track_slots: (T, 3) which offset moves each track: of a segment the offset, of an arc x, y and radius.
             These three are empty where nothing moves at all.
         slopes: (Q, D) by how much a dimension moves each of the Q offsets: the numbers' own, and those of features that
@@ -199,8 +201,8 @@ EXACT = Structure(
     (),
     np.empty(0),
     np.empty(0),
-    np.empty((0, 4), dtype=np.int32),
-    np.empty((0, 2)),
+    np.empty((0, 2 + len(WARP)), dtype=np.int32),
+    np.empty((0, len(WARP))),
     np.empty((0, 3), dtype=np.int32),
 )
 """All targets as drawn."""
@@ -250,7 +252,7 @@ def _tolerated(name: str, target: Target, tolerances: Mapping[str, Tolerance]) -
         raise InputError(
             f"a warp is for checkerboards and boards like them: target {name!r}, of kind {target.kind!r}, does not bow"
         )
-    yield from ((f"{name}/bow.{side}", tolerance.warp_m) for side in "xy")
+    yield from ((f"{name}/{part}", tolerance.warp_m) for part in WARP)
     for point_name in target.points:
         yield from ((f"{name}/{point_name}.{axis}", tolerance.points_m) for axis in "xy")
 
@@ -268,12 +270,12 @@ def _slots(targets: Mapping[str, Target], place: Mapping[str, int]) -> tuple[Ind
             slots = [place.get(f"{name}/{curve_name}{part}", _NONE) for part in _parts_of(curve)]
             curves.append(slots + [_NONE] * (3 - len(slots)))
         track_slots += curves * 3  # the paint's centre and both edges move together
-        bows = [place.get(f"{name}/bow.{side}", _NONE) for side in "xy"]
+        warp = [place.get(f"{name}/{part}", _NONE) for part in WARP]
         for point_name in target.points:
-            point_slots.append([place.get(f"{name}/{point_name}.{axis}", _NONE) for axis in "xy"] + bows)
+            point_slots.append([place.get(f"{name}/{point_name}.{axis}", _NONE) for axis in "xy"] + warp)
         bends.append(bends_of(target))
     return (
-        np.array(point_slots, dtype=np.int32).reshape(-1, 4),
+        np.array(point_slots, dtype=np.int32).reshape(-1, 2 + len(WARP)),
         np.concatenate(bends),
         np.array(track_slots, dtype=np.int32).reshape(-1, 3),
     )
@@ -299,9 +301,13 @@ def numbers_by_kind(structure: Structure, targets: Mapping[str, Target]) -> dict
 
 
 def bends_of(target: Target) -> Array:
-    """(N, 2) 1 - x^2 and 1 - y^2 over a board, x and y from -1 to 1 between its edges; 0 where it does not bow."""
+    """(N, W) of a board, x and y from -1 to 1 between its edges: 1 - x^2, 1 - y^2, x y and what is odd along a side,
+    x (1 - x^2) and y (1 - y^2) with 1 as their largest; 0 where it does not bow.
+    """
     if not target.bows or not target.points:
-        return np.zeros((len(target.points), 2))
+        return np.zeros((len(target.points), len(WARP)))
     flat = target.point_array[:, :2]
     half = 0.5 * np.ptp(flat, axis=0)
-    return np.asarray(1.0 - ((flat - flat.min(axis=0) - half) / half) ** 2)
+    across = (flat - flat.min(axis=0) - half) / half
+    bows = 1.0 - across**2
+    return np.column_stack([bows, across[:, 0] * across[:, 1], 1.5 * np.sqrt(3.0) * across * bows])

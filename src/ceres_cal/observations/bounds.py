@@ -8,7 +8,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.errors import InputError
-from ceres_cal.observations.columns import Columns, Curves, in_blocks, view_label
+from ceres_cal.observations.columns import Alone, Columns, Curves, each_block, view_label
 from ceres_cal.observations.files import Content
 
 # The image ends half a pixel beyond the centres of its outermost ones; a detector that interpolates may go one further.
@@ -50,13 +50,12 @@ def stray_pixels(content: Content) -> tuple[str, ...]:
 def _all_inside(content: Content) -> bool:
     """Whether no pixel lies outside the smallest image."""
     ends = _end(np.min(list(content.cameras.values()), axis=0))
-    return all(
-        bool(numbers.min() >= -_MARGIN_PX and numbers.max() <= end)
-        for column in (content.points, content.curves)
-        for _, block in in_blocks(column)
-        for numbers, end in zip(block.pixels.T, ends, strict=True)
-        if len(block)
-    )
+
+    def inside(_: int, block: Alone) -> bool:
+        each = zip(block.values.T, ends, strict=True)
+        return not len(block.values) or all(own.min() >= -_MARGIN_PX and own.max() <= end for own, end in each)
+
+    return all(all(each_block(inside, Alone(column.pixels))) for column in (content.points, content.curves))
 
 
 def _end(size: Sequence[int] | Array) -> Array:

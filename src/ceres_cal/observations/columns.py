@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import NamedTuple, TypeVar
 
@@ -12,6 +13,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import AnyArray, Array, Codes, Indices, Indices32, Mask
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.threads import parts_of, run_parts
 
 
 @dataclass(frozen=True)
@@ -101,7 +103,7 @@ class Columns:
 
     def __post_init__(self) -> None:
         for name, values in vars(self).items():
-            if isinstance(values, np.memmap):  # which stays in its file
+            if isinstance(values, np.memmap) or _is_kept(values, TYPES[name]):  # which stays in its file, or as it is
                 continue
             column = np.array(values, dtype=TYPES[name])
             column.setflags(write=False)
@@ -112,6 +114,13 @@ class Columns:
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({len(self)})"
+
+
+def _is_kept(values: AnyArray, dtype: type) -> bool:
+    """Whether a column is one already: of its type, by itself, and read-only."""
+    return (
+        isinstance(values, np.ndarray) and values.dtype == dtype and values.flags.owndata and not values.flags.writeable
+    )
 
 
 class Points(Columns):
@@ -129,8 +138,10 @@ _BLOCK = 1 << 20  # rows at once: what is made of them stays small beside very m
 _NOBODY, _NOWHERE = np.empty(0, np.int32), np.empty((0, 2))
 NO_POINTS = Points(_NOBODY, _NOBODY, _NOWHERE, np.empty(0))
 NO_CURVES = Curves(_NOBODY, _NOBODY, _NOWHERE, np.empty(0), np.empty(0, np.int8))
+_ROW_NS = 10.0  # of what is looked at in a block
 _MOST_RUNS = 10_000  # of rows side by side that are read one by one
 C = TypeVar("C")
+T = TypeVar("T")
 
 
 def taken(columns: C, rows: Indices | Indices32 | Mask) -> C:
@@ -172,7 +183,9 @@ class FileRows(NamedTuple):
             raise InputError(f"{self.path}: cannot be read: {error.strerror}") from None
         if values.size != size:
             raise InputError(f"{self.path}: it ends before its observations do: write it again")
-        return values.reshape(self.shape)
+        values.shape = self.shape  # not a view of it: nobody else has it
+        values.setflags(write=False)
+        return values
 
 
 def rows_of(column: AnyArray, start: int, stop: int) -> AnyArray | FileRows:
@@ -189,13 +202,37 @@ def read_rows(rows: AnyArray | FileRows) -> AnyArray:
     return rows.read() if isinstance(rows, FileRows) else rows
 
 
+@dataclass(frozen=True, eq=False)
+class Alone:
+    """A single column."""
+
+    values: AnyArray
+
+
 def in_blocks(columns: C) -> Iterator[tuple[int, C]]:
     """The columns block by block, each in memory, with the number of its first row: at least one."""
-    arrays = vars(columns)
-    total = len(next(iter(arrays.values())))
-    for first in range(0, max(total, 1), _BLOCK):
-        stop = min(first + _BLOCK, total)
-        yield first, type(columns)(**{name: read_rows(rows_of(array, first, stop)) for name, array in arrays.items()})
+    return (_block(columns, number) for number in range(_blocks(columns)))
+
+
+def each_block(function: Callable[[int, C], T], columns: C) -> list[T]:
+    """function(number of its first row, block) of every block, in their order; some of them at the same time."""
+
+    def part(first: int, last: int) -> list[T]:
+        return [function(*_block(columns, number)) for number in range(first, last)]
+
+    count = _blocks(columns)
+    parts = parts_of(count, count * _BLOCK, _ROW_NS) if count > 1 else [0, 1]
+    return list(chain.from_iterable(run_parts(part, parts)))
+
+
+def _blocks(columns: object) -> int:
+    return max(-(-len(next(iter(vars(columns).values()))) // _BLOCK), 1)
+
+
+def _block(columns: C, number: int) -> tuple[int, C]:
+    first, stop = number * _BLOCK, (number + 1) * _BLOCK
+    rows = {name: read_rows(rows_of(array, first, stop)) for name, array in vars(columns).items()}
+    return first, type(columns)(**rows)
 
 
 def view_label(number: int, views: Sequence[View]) -> str:

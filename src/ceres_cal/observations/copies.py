@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ceres_cal.base.arrays import Indices, Mask
-from ceres_cal.observations.columns import Columns, Curves, Points, View, in_blocks
+from ceres_cal.observations.columns import Columns, Curves, Points, View, each_block
 
 Hashes = NDArray[np.uint64]
 
@@ -91,24 +91,26 @@ def find_copies(views: Sequence[View], points: Points, curves: Curves) -> Copies
 
 def _may_repeat(column: Columns, place: Indices) -> bool:
     """Whether rows near one another agree or, of very many, whole views."""
-    of_views = np.zeros(len(place), dtype=np.uint64)
-    for _, block in in_blocks(column):
-        hashes = _row_hashes(block)
-        np.add.at(of_views, *_by_view(block, hashes))
-        hashes.sort()
-        if np.any(hashes[1:] == hashes[:-1]):
-            return True
+    of_views, repeat = np.zeros(len(place), dtype=np.uint64), False
+    for views, sums, some in each_block(_looked_at, column):
+        np.add.at(of_views, views, sums)
+        repeat |= some
+    if repeat:
+        return True
     with_rows = np.flatnonzero(of_views)
     of_views = np.sort(of_views[with_rows] + place[with_rows].astype(np.uint64) * _FRAME)
     return bool(np.any(of_views[1:] == of_views[:-1]))
 
 
-def _by_view(column: Columns, hashes: Hashes) -> tuple[Indices, Hashes]:
-    """Views, and the sum of their rows' hashes."""
+def _looked_at(_: int, block: Columns) -> tuple[Indices, Hashes, bool]:
+    """Views, the sum of their rows' hashes, and whether rows agree."""
+    hashes = _row_hashes(block)
     if not len(hashes):
-        return np.empty(0, dtype=np.int64), hashes
-    starts = np.flatnonzero(np.diff(column.view, prepend=-1))
-    return column.view[starts].astype(np.int64), np.add.reduceat(hashes, starts)
+        return np.empty(0, dtype=np.int64), hashes, False
+    starts = np.flatnonzero(np.diff(block.view, prepend=-1))
+    sums = np.add.reduceat(hashes, starts)
+    hashes.sort()
+    return block.view[starts].astype(np.int64), sums, bool(np.any(hashes[1:] == hashes[:-1]))
 
 
 def _row_hashes(column: Columns) -> Hashes:

@@ -142,8 +142,8 @@ class ObservationsFile(msgspec.Struct, forbid_unknown_fields=True, kw_only=True)
 def read_content(path: Path) -> Content:
     """See `Observations.load`."""
     if path.suffix == ENDING or path.is_dir():
-        plain = parse_json(read_bytes(path / HEADER), str(path / HEADER))
-        return _of_columns(plain, read_folder(path, _NUMBERS), str(path))
+        header = _decoded(read_bytes(path / HEADER), str(path / HEADER))
+        return _of_columns(header, read_folder(path, _NUMBERS))
     content = read_bytes(path)
     return _from_npz(content, str(path)) if path.suffix == ".npz" else _from_json(content, str(path))
 
@@ -218,12 +218,17 @@ def _numbers(value: Any, size: int, where: str, *, spread: bool = False) -> tupl
     return tuple(numbers)
 
 
-def _from_json(content: bytes, where: str) -> Content:
+def _decoded(content: bytes, where: str) -> ObservationsFile:
+    """The JSON of a file; InputError naming the place."""
     data = decode_json(content, ObservationsFile, where)
     if data is None:
-        plain = check_header(parse_json(content, where), where, FORMAT, VERSION)
-        data = convert(plain, ObservationsFile, where)
+        return convert(check_header(parse_json(content, where), where, FORMAT, VERSION), ObservationsFile, where)
     check_header({"format": data.format, "version": data.version}, where, FORMAT, VERSION)
+    return data
+
+
+def _from_json(content: bytes, where: str) -> Content:
+    data = _decoded(content, where)
     header = data.content()
     targets, views = header.targets, header.views
     for number, view in enumerate(views):
@@ -346,14 +351,13 @@ def _to_npz(content: Content) -> bytes:
 
 def _from_npz(packed: bytes, where: str) -> Content:
     arrays = read_npz(packed, _COLUMNS, where)
-    return _of_columns(parse_json(arrays.pop("header").tobytes(), where), arrays, where)
+    return _of_columns(_decoded(arrays.pop("header").tobytes(), where), arrays)
 
 
-def _of_columns(header: Any, arrays: Mapping[str, AnyArray], where: str) -> Content:
+def _of_columns(header: ObservationsFile, arrays: Mapping[str, AnyArray]) -> Content:
     """What a header and columns say."""
-    content = convert(check_header(header, where, FORMAT, VERSION), ObservationsFile, where).content()
     points, curves = (
         {name.removeprefix(kind): array for name, array in arrays.items() if name.startswith(kind)}
         for kind in ("points_", "curves_")
     )
-    return replace(content, points=Points(**points), curves=Curves(**curves))
+    return replace(header.content(), points=Points(**points), curves=Curves(**curves))

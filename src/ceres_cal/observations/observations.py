@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
@@ -17,10 +17,22 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ceres_cal.base.arrays import AnyArray, Indices, Mask
+from ceres_cal.base.arrays import Indices, Mask
 from ceres_cal.base.errors import InputError, naming
 from ceres_cal.observations.bounds import odd_sizes, stray_pixels
-from ceres_cal.observations.columns import Columns, Curves, Points, Prior, View, choices, in_blocks, taken, view_label
+from ceres_cal.observations.columns import (
+    Alone,
+    Columns,
+    Curves,
+    Points,
+    Prior,
+    View,
+    choices,
+    each_block,
+    in_blocks,
+    taken,
+    view_label,
+)
 from ceres_cal.observations.copies import Copies, find_copies
 from ceres_cal.observations.files import Content, header_of, read_content, write_content
 from ceres_cal.observations.from_points import gathered
@@ -58,10 +70,11 @@ class Observations(Content):
             count = len(column.view)
             if column.pixels.shape != (count, 2) or any(len(array) != count for array in vars(column).values()):
                 raise InputError(f"the columns of the {kind} observations differ in length: write them again")
-            last = 0
-            for first, block in in_blocks(column):
-                self._check_columns(kind, block, first, last)
-                last = int(block.view[-1]) if len(block) else 0
+            targets = {
+                name: target.points if kind == "point" else target.curves for name, target in self.targets.items()
+            }
+            known = np.array([len(targets[view.target]) for view in self.views])
+            each_block(partial(self._check_columns, kind, known), column)
         shown = np.flatnonzero(np.diff(self.ends[0]) + np.diff(self.ends[1]))
         seen = {self.views[i].camera for i in shown.tolist()}
         for name in self.cameras:
@@ -121,22 +134,19 @@ class Observations(Content):
         content = hashlib.sha256(msgspec.json.encode(header))
         for column in (self.points, self.curves):
             for name in vars(column):  # the whole of a column before the next
-                for _, block in in_blocks(_Alone(getattr(column, name))):
+                for _, block in in_blocks(Alone(getattr(column, name))):
                     content.update(np.ascontiguousarray(block.values).data)
         return content.hexdigest()
 
     @cached_property
     def ends(self) -> tuple[Indices, Indices]:
         """(V + 1,) where the points of each view begin, and where its curve observations do."""
-        count = len(self.views)
-        points, curves = (
-            sum(
-                (np.bincount(block.values, minlength=count) for _, block in in_blocks(_Alone(column.view))),
-                start=np.zeros(count, np.int64),
-            )
-            for column in (self.points, self.curves)
-        )
-        return np.concatenate([[0], np.cumsum(points)]), np.concatenate([[0], np.cumsum(curves)])
+        counts = np.zeros((2, len(self.views)), dtype=np.int64)
+        for own, column in zip(counts, (self.points, self.curves), strict=True):
+            for first, some in each_block(_counted, Alone(column.view)):
+                own[first : first + len(some)] += some
+        ends = np.pad(np.cumsum(counts, axis=1), ((0, 0), (1, 0)))
+        return ends[0], ends[1]
 
     # ---- reading ------------------------------------------------------------------------------------------------
 
@@ -233,18 +243,18 @@ class Observations(Content):
             "give each rigid thing a placement of its own"
         )
 
-    def _check_columns(self, kind: str, column: Columns, first: int, last: int) -> None:
-        """Of a block that begins with row `first`, behind one of view `last`."""
+    def _check_columns(self, kind: str, known: Indices, first: int, column: Columns) -> None:
+        """Of a block that begins with row `first`; known: features of each view's target."""
         if not len(column):
             return
-        if np.any(wrong := (column.view < 0) | (column.view >= len(self.views))):
+        if column.view.min() < 0 or column.view.max() >= len(self.views):
+            wrong = (column.view < 0) | (column.view >= len(self.views))
             raise InputError(
                 f"a {kind} observation names view {column.view[np.argmax(wrong)]}, but there are {len(self.views)}"
             )
-        if column.view[0] < last or np.any(np.diff(column.view) < 0):
+        whole: Columns = self.points if kind == "point" else self.curves
+        if (first and whole.view[first - 1] > column.view[0]) or np.any(column.view[1:] < column.view[:-1]):
             raise InputError(f"the {kind} observations are not in the order of their views: sort the columns by view")
-        targets = [self.targets[view.target] for view in self.views]
-        known = np.array([len(target.points if kind == "point" else target.curves) for target in targets])
         if np.any(wrong := (column.feature < 0) | (column.feature >= known[column.view])):
             row = int(np.argmax(wrong))
             here, target = view_label(column.view[row], self.views), self.views[column.view[row]].target
@@ -255,15 +265,14 @@ class Observations(Content):
         self._check_numbers(kind, column, first)
 
     def _check_numbers(self, kind: str, column: Columns, first: int) -> None:
-        sigma = np.where(column.sigma_px > 0.0, column.sigma_px, np.inf)
-        side = column.side if isinstance(column, Curves) else np.zeros(1, np.int8)
-        for what, bad in (
-            ("its pixel is not finite", ~np.all(np.isfinite(column.pixels), axis=1)),
-            ("its sigma_px must be positive and finite, 1e-12 to 1e12", ~(np.abs(np.log10(sigma)) <= 12.0)),
-            ("its side must be 0, 1 or -1", (side < -1) | (side > 1)),
+        sigma, side = column.sigma_px, column.side if isinstance(column, Curves) else np.zeros(1, np.int8)
+        for what, good in (
+            ("its pixel is not finite", np.isfinite(column.pixels)),
+            ("its sigma_px must be positive and finite, 1e-12 to 1e12", (sigma >= 1e-12) & (sigma <= 1e12)),
+            ("its side must be 0, 1 or -1", (side >= -1) & (side <= 1)),
         ):
-            if np.any(bad):
-                row = int(np.argmax(bad))
+            if not good.all():
+                row = int(np.argmin(good)) // (good.size // len(good))
                 here = view_label(column.view[row], self.views)
                 raise InputError(
                     f"{here}, {kind} {self.feature_name(kind, first + row)!r}: {what}: correct or remove it"
@@ -291,11 +300,10 @@ class Observations(Content):
             raise InputError(f"a prior names a curve {prior.curve!r}, which target {prior.name!r} does not have")
 
 
-@dataclass(frozen=True, eq=False)
-class _Alone:
-    """A single column."""
-
-    values: AnyArray
+def _counted(_: int, block: Alone) -> tuple[int, Indices]:
+    """The first view of a block in the order of its views, and how many rows it and each one behind it has."""
+    first = int(block.values[0]) if len(block.values) else 0
+    return first, np.bincount(block.values - first)
 
 
 def combine(parts: Sequence[Observations]) -> Observations:

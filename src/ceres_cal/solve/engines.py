@@ -11,6 +11,7 @@ from operator import add
 from typing import Any, Protocol, TypeVar
 
 from ceres_cal.base.errors import CalibrationError, InputError, SolutionError
+from ceres_cal.base.native import keep_freed_memory
 from ceres_cal.base.threads import at_most, available, single_threaded_blas
 from ceres_cal.solve.shares import Share
 
@@ -144,6 +145,7 @@ class OnWorkers:
 
 def _kept(group: Sequence[Share]) -> Sequence[Share]:
     """What a worker keeps."""
+    keep_freed_memory()
     return group
 
 

@@ -88,11 +88,13 @@ def _require_ahead(station: str, sight: Sights, residuals: Residuals) -> None:
 
 
 def _places_of_world(observations: Observations, sight: Sights) -> Array:
-    """(P, 3) m of what a sight shows of targets that nobody put there: its points, starts and ends of its lines."""
+    """(P, 3) m of what a sight shows of targets that nobody put there: its points, starts and ends of its lines, and
+    of its arcs the centre and a quarter.
+    """
     world = np.array([not observations.targets[view.target].movable for view in observations.views])
     points = sight.points[world[observations.points.view[sight.point_rows]]]
     tracks = sight.tracks[np.unique(sight.track_index[world[observations.curves.view[sight.curve_rows]]])]
-    return np.concatenate([points, tracks[:, 0], tracks[:, 0] + tracks[:, 1]])
+    return np.concatenate([points, *(tracks[:, 0] + along for along in (0.0, tracks[:, 1], tracks[:, 2]))])
 
 
 def _floor_m(places: Array) -> float | None:

@@ -110,10 +110,10 @@ def _some(sights: Sights, most: int) -> Sights:
 
 @dataclass(frozen=True, eq=False)
 class _Columns:
-    """Columns of the Q structure numbers over E equations, each of which has four at most.
+    """Columns of the Q structure numbers over E equations, each of which has BUILT at most.
 
     Attributes:
-        slots: (E, 4) which numbers, Q for none. values: (E, 4) of them, in standard deviations. size: Q.
+        slots: (E, BUILT) which numbers, Q for none. values: (E, BUILT) of them, in standard deviations. size: Q.
         sight: (E,) of the equation; sights: how many there are. score: (E,) robust residuals, in standard deviations.
     """
 
@@ -145,7 +145,7 @@ class _Columns:
         return cls(slots, values, size, equations.sight, len(sights), score, equations)
 
     def gathered(self, factors: Array, owner: Indices, owners: int) -> Array:
-        """(owners, Q) sums of the values times factors (E,) or (E, 4), by number and owner (E,)."""
+        """(owners, Q) sums of the values times factors (E,) or (E, BUILT), by number and owner (E,)."""
         products = self.values * (factors if factors.ndim == 2 else factors[:, None])
         key = owner[:, None] * (self.size + 1) + self.slots
         sums = np.bincount(key.ravel(), products.ravel(), minlength=owners * (self.size + 1))

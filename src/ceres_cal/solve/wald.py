@@ -18,7 +18,7 @@ from ceres_cal.base.arrays import Array
 from ceres_cal.base.tails import log_f_tail
 from ceres_cal.model.information import Information
 from ceres_cal.model.parameters import Estimate
-from ceres_cal.model.quantities import moved, values_of
+from ceres_cal.model.quantities import moved, natural_sizes, values_of
 from ceres_cal.model.residuals import residuals
 from ceres_cal.observations import Observations
 from ceres_cal.solve.costs import robust_weights
@@ -30,7 +30,9 @@ from ceres_cal.solve.stated import Statement, Test
 LARGEST_FREEDOM = 1e6
 """Degrees of freedom that count as infinitely many."""
 _LEAST_TOLD = 1e-7  # of what is known of a number, the share that others must bring to speak of it
-_STEP = 0.1  # of a standard deviation, to either side, for the slope of the cost along what is held
+# Of a standard deviation, and at most of a number's natural size, to either side, for the slope of the cost along what
+# is held.
+_STEP, _MOST_STEP = 0.1, 1e-3
 
 
 class Rest(NamedTuple):
@@ -91,13 +93,13 @@ def _slopes(problem: Problem, observations: Observations, estimate: Estimate, re
     points, curves = standardised(estimate)
     weights = robust_weights(weighting, np.concatenate([np.sum(points**2, axis=1), curves**2]))
     points, curves = points * weights[: len(points), None], curves * weights[len(points) :]
-    slopes = []
+    slopes, sizes = [], natural_sizes(estimate, rest.keys)
     for number, stated in enumerate(np.diagonal(rest.matrix)):
         if not stated > 0.0:  # the rest says nothing of it
             slopes.append(0.0)
             continue
         step = np.zeros(len(rest.keys))
-        step[number] = _STEP / np.sqrt(stated)
+        step[number] = min(_STEP / np.sqrt(stated), _MOST_STEP * sizes[number])
         above, below = (standardised(moved(estimate, rest.keys, sign * step)) for sign in (1.0, -1.0))
         change = np.sum(points * (above[0] - below[0])) + curves @ (above[1] - below[1])
         slopes.append(float(change) / (2.0 * step[number]))

@@ -21,6 +21,7 @@ from ceres_cal.observations.sights import Sights
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Lens
 from ceres_cal.start.closed_forms import orthogonality_error, poses_from_homographies
+from ceres_cal.start.few_features import pose_of_few
 from ceres_cal.start.planes import Homographies, profile_and_homographies
 
 PHI_RANGE = (0.15, 15.0)
@@ -102,7 +103,26 @@ def _start_camera(blank: Camera, sights: Sights, options: Options, priors: Seque
     spanning = blank.lens.spanning(float(seen.angles[-1]), phi, edge_over(blank, sights.reach_px))
     lens = seen.nearest(spanning, phi, options.held)
     camera = replace(blank, phi=phi, lens=lens)
-    return _CameraStart(camera, phi_from, homographies.sights, _poses_at(homographies, phi))
+    numbers, poses = homographies.sights, _poses_at(homographies, phi)
+    if phi_from != "guess":
+        more = _poses_of_few(sights, camera, numbers, priors)
+        numbers, poses = np.append(numbers, list(more)).astype(np.int64), np.concatenate([poses, *more.values()])
+    return _CameraStart(camera, phi_from, numbers, poses)
+
+
+def _poses_of_few(sights: Sights, camera: Camera, posed: Indices, priors: Sequence[Prior]) -> dict[int, Array]:
+    """Number and cam_from_world (1, 3, 4) of sights of the world that have no homography, where they determine one."""
+    poses: dict[int, Array] = {}
+    for number, key in enumerate(sights.keys):
+        if key.placement is not None or number in posed:
+            continue
+        stated = [p for p in priors if p.name == key.station and p.quantity in ("height_m", "position_m")]
+        heights, sight = [(p.value[-1], p.sigma[-1]) for p in stated], sights[number]
+        rays = tuple(camera.lens.undistort(pixels, camera.phi) for pixels in (sight.pixels, sight.curve_pixels))
+        pose = pose_of_few(sight, (rays[0], rays[1]), camera.phi, heights[0] if heights else None)
+        if pose is not None:
+            poses[number] = pose[None]
+    return poses
 
 
 def edge_over(camera: Camera, reach_px: float) -> float:

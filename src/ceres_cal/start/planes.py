@@ -137,6 +137,8 @@ def profile_and_homographies(sights: Sights, unit: float) -> tuple[RadialProfile
     for i, plane in planes.items():
         if plane.equations == 0 and len(sights[i].on_arc) and sights[i].on_arc.all():
             ring, matrices[i] = _from_rings(sights[i], unit)
+            if sights[i].key.placement is None:  # a floor, whose z points to the camera
+                matrices[i][:, 1] *= -1.0
             profile = profile or ring
     mixed = [i for i, plane in planes.items() if plane.equations >= 8]
     lined = [(planes[i].lines, planes[i].pixels) for i in mixed]
@@ -289,9 +291,10 @@ def ring_radii(sight: Sights) -> RingRadii:
 
 def _from_rings(sight: Sights, unit: float) -> tuple[RadialProfile, Array]:
     radii = ring_radii(sight)
-    profile, kappa = ring_profile(radii.measured_px, radii.ring_m, unit)
-    if len(np.unique(radii.ring_m)) < 3:
-        profile = RadialProfile((0.0, 0.0), unit)
+    if len(np.unique(radii.ring_m)) < 3:  # they tell a magnification, and nothing of the lens
+        profile, kappa = RadialProfile((0.0, 0.0), unit), float(np.mean(radii.measured_px / radii.ring_m))
+    else:
+        profile, kappa = ring_profile(radii.measured_px, radii.ring_m, unit)
     cx, cy = radii.centre
     return profile, np.array([[kappa, 0.0, cx], [0.0, kappa, cy], [0.0, 0.0, 1.0]])
 

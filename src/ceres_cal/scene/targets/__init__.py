@@ -8,6 +8,8 @@ from ceres_cal.scene.targets.april_grids import april_grid as april_grid
 from ceres_cal.scene.targets.checkerboards import checkerboard as checkerboard
 from ceres_cal.scene.targets.circle_grids import circle_grid as circle_grid
 from ceres_cal.scene.targets.custom_targets import custom as custom
+from ceres_cal.scene.targets.marker_targets import Marker as Marker
+from ceres_cal.scene.targets.marker_targets import markers as markers
 from ceres_cal.scene.targets.painted_fields import painted_field as painted_field
 from ceres_cal.scene.targets.painted_fields import ssl_field as ssl_field
 from ceres_cal.scene.targets.registry import TARGET_KINDS as TARGET_KINDS

@@ -20,12 +20,19 @@ class _Spec(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True):
     points: dict[str, tuple[float, float, float]] = {}
     segments: dict[str, Segment] = {}
     arcs: dict[str, Arc] = {}
+    movable: bool = False
 
 
 def custom(
-    points: Mapping[str, tuple[float, float, float]] | None = None, curves: Mapping[str, Curve] | None = None
+    points: Mapping[str, tuple[float, float, float]] | None = None,
+    curves: Mapping[str, Curve] | None = None,
+    *,
+    movable: bool = False,
 ) -> Target:
     """A target given in full; where its curves cross, there are points besides, such as "edge*circle".
+
+    Args:
+        movable: whether it is a board that somebody holds up, not the world. A flat one may be warped.
 
     Raises:
         InputError: no features at all, a number that is not finite, a curve without length, or paint that covers the
@@ -45,16 +52,23 @@ def custom(
             raise InputError(f"custom target: arc {name!r} must have a radius of more than half its width")
     segments = {name: curve for name, curve in curves.items() if isinstance(curve, Segment)}
     arcs = {name: curve for name, curve in curves.items() if isinstance(curve, Arc)}
-    spec = msgspec.to_builtins(_Spec("custom", points, segments, arcs))
+    spec = msgspec.to_builtins(_Spec("custom", points, segments, arcs, movable))
     curves = {**segments, **arcs}  # in the order in which a file would give them back
-    return Target(spec, with_crossings(points, curves), curves)
+    every = with_crossings(points, curves)
+    return Target(spec, every, curves, movable=movable, bows=movable and not curves and _is_flat(every))
+
+
+def _is_flat(points: Mapping[str, tuple[float, float, float]]) -> bool:
+    """Whether they lie on one level, and not on one line along x or y."""
+    x, y, z = np.ptp(np.array(list(points.values())), axis=0).tolist()
+    return bool(z == 0.0 and x > 0.0 and y > 0.0)
 
 
 def _from_spec(spec: dict[str, Any], where: str) -> Target:
     given = convert(spec, _Spec, where)
     if both := given.segments.keys() & given.arcs.keys():
         raise InputError(f"two curves are named {min(both)!r}")
-    return custom(given.points, {**given.segments, **given.arcs})
+    return custom(given.points, {**given.segments, **given.arcs}, movable=given.movable)
 
 
 def _example() -> dict[str, Target]:
@@ -65,7 +79,8 @@ def _example() -> dict[str, Target]:
 KIND = TargetKind(
     "custom",
     "anything flat or not, given in full",
-    "points (name: x, y, z), segments (from, to, width_m), arcs (centre, radius_m, from_rad, to_rad, width_m)",
+    "points (name: x, y, z), segments (from, to, width_m), arcs (centre, radius_m, from_rad, to_rad, width_m), "
+    "movable (a board that is held up, which may be warped)",
     'as named there, and points "A*B" where curves A and B cross ("A*B#1" and "A*B#2" where they do so twice)',
     _example,
     _from_spec,

@@ -6,7 +6,15 @@ from collections.abc import Mapping
 from typing import Any
 
 from ceres_cal.base.errors import InputError, naming
-from ceres_cal.scene.targets import april_grids, checkerboards, circle_grids, custom_targets, ring_sheets, tape_grids
+from ceres_cal.scene.targets import (
+    april_grids,
+    checkerboards,
+    circle_grids,
+    custom_targets,
+    marker_targets,
+    ring_sheets,
+    tape_grids,
+)
 from ceres_cal.scene.targets.painted_fields import templates
 from ceres_cal.scene.targets.target import Target, TargetKind, require_size
 
@@ -14,7 +22,7 @@ TARGET_KINDS: dict[str, TargetKind] = {
     kind.name: kind
     for kind in (
         *(template.as_kind() for template in templates().values()),
-        *(tape_grids.KIND, checkerboards.KIND, circle_grids.KIND, april_grids.KIND),
+        *(tape_grids.KIND, checkerboards.KIND, circle_grids.KIND, april_grids.KIND, marker_targets.KIND),
         *(ring_sheets.KIND, custom_targets.KIND),
     )
 }

@@ -1,0 +1,84 @@
+"""A known camera over few features: two lines and an arc, an arc and a crossing; what is seen alike from two places."""
+
+from collections.abc import Collection
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ceres_cal.base.errors import DegenerateError
+from ceres_cal.calibrating import calibrate
+from ceres_cal.calibration import Calibration
+from ceres_cal.model.parameters import Options
+from ceres_cal.observations import Observations, Prior
+from ceres_cal.observations.columns import taken
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.lens import Radial
+from ceres_cal.scene.targets import ssl_field
+from ceres_cal.simulate import Station, field_scene, overhead_pose, simulate
+
+CAMERA = Camera((1280, 960), 700.0, (640.0, 480.0), Radial((-5e-5, 6e-7)))
+KNOWN = Options(lens="radial", fixed={"phi": 700.0, "cx": 640.0, "cy": 480.0, "a2": -5e-5, "a3": 6e-7})
+HEIGHT = Prior("station", "hall", "height_m", (4.0,), (0.003,))
+PLACE = np.array([2.8, 0.5, 4.0])
+
+
+def seen(features: Collection[str], tilt_deg: float = 20.0) -> Observations:
+    """What the camera sees of some lines, arcs and crossings, with 0.3 px of noise on lines and 0.5 px on points."""
+    station = Station("overhead", overhead_pose(PLACE[0], PLACE[1], PLACE[2], tilt_x_deg=tilt_deg))
+    every = simulate(field_scene(ssl_field("B"), {"overhead": CAMERA}, {"hall": station}, spacing_m=0.1)).observations
+    field = every.targets["field"]
+    points, curves = (
+        np.array([name in features for name in names]) for names in (field.point_names, field.curve_names)
+    )
+    assert np.count_nonzero(points) + np.count_nonzero(curves) == len(features)
+    return replace(
+        every,
+        points=taken(every.points, points[every.points.feature]),
+        curves=taken(every.curves, curves[every.curves.feature]),
+    )
+
+
+def off_in_sd(calibration: Calibration) -> float:
+    """How far the camera is from where it stands, over the standard deviation of that."""
+    where, posterior = calibration.estimate.stations["hall"].cam_from_world.position, calibration.uncertainty.posterior
+    sd = [posterior.sd_of("station", "hall", quantity) for quantity in ("x", "y", "height")]
+    return float(np.linalg.norm(where - PLACE) / np.linalg.norm(sd))
+
+
+@pytest.mark.parametrize(
+    "features",
+    [
+        ("BottomTouchLine", "TopTouchLine", "CenterCircle"),
+        ("BottomTouchLine", "RightGoalLine", "CenterCircle"),
+        ("RightGoalLine", "CenterCircle", "BottomRightCorner"),
+        ("CenterCircle", "BottomRightCorner"),
+    ],
+)
+def test_lines_and_an_arc(features: tuple[str, ...]) -> None:
+    assert off_in_sd(calibrate(seen(features, 3.0), KNOWN)) < 3.0  # at most 1.9
+
+
+def test_seen_alike_from_two_places() -> None:
+    """Three points have up to four poses (Grunert); the height tells them apart."""
+    three = seen(("BottomRightCorner", "CenterMark", "RightCircleCrossing"))
+    with pytest.raises(DegenerateError, match=r"station 'hall': what it shows is seen alike from \(.*\) m and from \("):
+        calibrate(three, KNOWN)
+    assert off_in_sd(calibrate(replace(three, priors=(HEIGHT,)), KNOWN)) < 3.0  # 0.4
+
+
+def test_too_few_stay_too_few() -> None:
+    with pytest.raises(DegenerateError, match="cannot fix its pose"):
+        calibrate(seen(("BottomTouchLine", "RightGoalLine")), KNOWN)
+
+
+@pytest.mark.parametrize("tilt_deg", [3.0, 20.0])
+def test_a_circle_tells_the_height(tilt_deg: float) -> None:
+    """And nothing of the way round it: the camera is over the floor, and its x and y are not known."""
+    calibration = calibrate(seen(("CenterCircle",), tilt_deg), KNOWN)
+    position = calibration.estimate.stations["hall"].cam_from_world.position
+    assert position[2] == pytest.approx(4.0, abs=0.02)  # 0.004
+    assert np.hypot(*position[:2]) == pytest.approx(np.hypot(*PLACE[:2]), abs=0.02)
+    posterior = calibration.uncertainty.posterior
+    assert np.isinf([posterior.sd_of("station", "hall", quantity) for quantity in ("x", "y")]).all()
+    assert posterior.sd_of("station", "hall", "height") < 0.02
