@@ -37,6 +37,7 @@ _ROUGH = 1e-3  # relative change of the cost at which the first solve ends
 # The same of every further one: of a lens that is as smooth as the data say, sigmas of a tenth, that is near enough:
 # of 100 000 observations the numbers stand off by a hundredth of their standard deviations.
 _TO_THE_END, _AS_SMOOTH = 1e-14, 1e-9
+_AS_SMOOTH_OF_FEW = 1e-6  # where all of them follow
 _MOST_REFINED = 3
 # Share of the residuals' scale: a rough solve that leaves less is followed by another one at the new scale. A line that
 # is painted aside is told from noise only at a scale near the noise's own.
@@ -92,22 +93,7 @@ def solve_robustly(
     """
     rounds = _Rounds(problem, observations, usual, progress)
     state = rounds.posed(estimate) if is_near else rounds.first(estimate)
-    undecided = frozenset(state.problem.sights.keys)
-    before: Inliers | None = None
-    while state.rounds < most_rounds:
-        at_rest = before is not None and state.inliers.same_as(before, rounds.no_change)
-        if not at_rest and before is not None:
-            undecided = frozenset(state.problem.sights.keys)  # another lens had decided about mirrored poses
-        if at_rest or before is None:
-            state, changed, undecided = rounds.mended(state, undecided)
-            if before is None and not is_near:
-                state = rounds.refined(state)
-            if at_rest and not changed:
-                state = rounds.with_leverages(state)
-                if state.reduced is not None:
-                    break
-        before, state = state.inliers, rounds.next(state)
-    return state
+    return rounds.to_rest(state, most_rounds, is_near=is_near)
 
 
 def judge_at(problem: Problem, observations: Observations, estimate: Estimate) -> RobustSolution:
@@ -125,13 +111,36 @@ class _Rounds:
         observations: Observations,
         usual: tuple[float, float] | None,
         progress: Callable[[Progress], None] | None,
+        precision: float | None = None,
     ) -> None:
         self._problem, self._observations, self._usual, self._progress = problem, observations, usual, progress
         self._redundancy: Redundancy | None = None
         self._moving = 0.0
         self._scales = (1.0, 1.0)  # of points and of curves that the last rough solve was weighted by
         self._last: tuple[Inliers, Sights] | None = None
-        self.no_change = _AT_REST if usual is None else _AT_REST_AGAIN
+        self._no_change = _AT_REST if usual is None else _AT_REST_AGAIN
+        self._precision = precision or (_AS_SMOOTH if problem.options.blank_lens.roughness else _TO_THE_END)
+
+    def to_rest(
+        self, state: RobustSolution, most_rounds: int = _MOST_ROUNDS, *, is_near: bool = False
+    ) -> RobustSolution:
+        """Round after round, until nothing changes."""
+        undecided = frozenset(state.problem.sights.keys)
+        before: Inliers | None = None
+        while state.rounds < most_rounds:
+            at_rest = before is not None and state.inliers.same_as(before, self._no_change)
+            if not at_rest and before is not None:
+                undecided = frozenset(state.problem.sights.keys)  # another lens had decided about mirrored poses
+            if at_rest or before is None:
+                state, changed, undecided = self.mended(state, undecided)
+                if before is None and not is_near:
+                    state = self.refined(state)
+                if at_rest and not changed:
+                    state = self.with_leverages(state)
+                    if state.reduced is not None:
+                        break
+            before, state = state.inliers, self.next(state)
+        return state
 
     def first(self, estimate: Estimate) -> RobustSolution:
         """The rough solve from a start."""
@@ -182,7 +191,8 @@ class _Rounds:
             )
         few = problem.of_sights(_evenly(problem))
         if problem.options.blank_lens.roughness and len(few.sights) < len(problem.sights):
-            end = solve_robustly(few, self._observations, estimate, self._usual, self._progress)
+            of_few = _Rounds(few, self._observations, self._usual, self._progress, _AS_SMOOTH_OF_FEW)
+            end = of_few.to_rest(of_few.first(estimate))
             self._problem = replace(self._problem, smoothness=end.problem.smoothness)
             solution = end.solution
         else:
@@ -209,8 +219,7 @@ class _Rounds:
         """One more solve, from where the last one ended, of what was judged to be inliers; with the same rows where
         others are as good.
         """
-        precision = _AS_SMOOTH if state.problem.options.blank_lens.roughness else _TO_THE_END
-        solution = solve(state.problem, state.solution.estimate, self._progress, precision=precision)
+        solution = solve(state.problem, state.solution.estimate, self._progress, precision=self._precision)
         return self._judged(solution, state.residuals, state.rounds + 1, state.inliers)
 
     def mended(
@@ -232,7 +241,7 @@ class _Rounds:
         moves by how smooth lenses are; else judged by them, for another round.
         """
         anew, reduced = self._anew(state)
-        if self._moving > _STILL or not anew.same_as(state.inliers, self.no_change):
+        if self._moving > _STILL or not anew.same_as(state.inliers, self._no_change):
             return self._with(anew, state.solution, state.residuals, state.rounds)
         problem = replace(state.problem, smoothness=self._problem.smoothness)
         inliers = replace(state.inliers, degrees_of_freedom=anew.degrees_of_freedom)
@@ -255,7 +264,7 @@ class _Rounds:
         """Where a solve, of these inliers, ended, and the problem that the inliers there make."""
         there = residuals(self._observations, self._problem.sights, solution.estimate, before.feet)
         anew = self._judge(solution, there)
-        if inliers is not None and anew.same_as(inliers, self.no_change):
+        if inliers is not None and anew.same_as(inliers, self._no_change):
             anew = anew.with_rows_of(inliers)
         return self._with(anew, solution, there, rounds)
 

@@ -58,6 +58,12 @@ def _monomials(powers: tuple[int, ...]) -> tuple[_Monomial, ...]:
     return tuple(every)
 
 
+@cache
+def _names(powers: tuple[int, ...]) -> tuple[str, ...]:
+    across = dict.fromkeys(name for one in _monomials(powers) for name in one.names)
+    return ("rim", *(f"g{k}" for k in range(1, COUNT + 1)), *across)
+
+
 @dataclass(frozen=True)
 class Spline(Planar):
     """A quintic spline along the radius and polynomials across it.
@@ -88,8 +94,7 @@ class Spline(Planar):
 
     @property
     def names(self) -> tuple[str, ...]:
-        across = dict.fromkeys(name for one in _monomials(self.powers) for name in one.names)
-        return ("rim", *(f"g{k}" for k in range(1, COUNT + 1)), *across)
+        return _names(self.powers)
 
     @property
     def orders(self) -> tuple[int, ...]:
