@@ -8,17 +8,23 @@ import cv2
 import numpy as np
 import photograph_shots as script
 import photographs_auto as auto_script
+import photographs_disturbed as disturbed
 import pytest
 
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.transforms import Pose
 from ceres_cal.calibrating import calibrate
 from ceres_cal.cli import main
-from ceres_cal.detect.strokes import find_strokes
+from ceres_cal.detect.courses import clear_px, predict
+from ceres_cal.detect.images import light
+from ceres_cal.detect.lines import SPACING_PX, measure, window_px
+from ceres_cal.detect.strokes import Strokes, alone, find_strokes
 from ceres_cal.observations import Observations
 from ceres_cal.photographs import Auto, Facing, detect_field
 from ceres_cal.photographs.candidates import candidates, prepare_search
 from ceres_cal.photographs.facing import agreeing_with_facing, nearest_to_before, side_of
 from ceres_cal.photographs.grid import grid_of
+from ceres_cal.photographs.painted import likelihood_of_place
 from ceres_cal.photographs.search import search
 from ceres_cal.photographs.upright import find_upright
 from ceres_cal.scene.camera import Camera
@@ -253,3 +259,38 @@ def test_command(tmp_path: Path, path: Path, capsys: pytest.CaptureFixture[str])
     assert "--facing goes with --auto" in capsys.readouterr().err
     assert main([*without, "--target", "ssl-b"]) == 2
     assert "or --auto" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "kind, seed",
+    [
+        ("worn", 102),  # paint at 37 % of the places
+        ("boundary", 100),  # twice as bright as the touch line, 7 px beside it
+    ],
+)
+def test_what_disturbs_does_not_hide_the_field(kind: str, seed: int) -> None:
+    shot = disturbed.taken(kind, seed, FIELD)
+    found = search(light(shot.image), FIELD, NAMES, disturbed.AUTO).followed
+    assert found is not None
+    pixels = found.lines.pixels[found.lines.found]
+    away = np.linalg.norm(found.camera.locate(pixels) - shot.camera.locate(pixels), axis=1)
+    assert np.median(away) < 0.01  # 0.002 m at most
+
+
+def test_lines_that_motion_makes_faint_are_seen() -> None:
+    """Those across the way of the camera are a sixth as bright as those along it."""
+    shot = disturbed.taken("motion", 105, FIELD)
+    seen = likelihood_of_place(light(shot.image), FIELD, shot.camera, NAMES)
+    aside = shot.camera.at(shot.camera.cam_from_world @ Pose(np.eye(3), np.array([0.9, 0.3, 0.0])))
+    assert seen > 400.0 > 200.0 > likelihood_of_place(light(shot.image), FIELD, aside, NAMES)  # 559 and less than 100
+    course = predict(FIELD, shot.camera, NAMES, SPACING_PX, SPACING_PX)
+    course = course.take(clear_px(FIELD, shot.camera, course, NAMES) > window_px(course))
+    assert measure(light(shot.image), course, 5.0).share > 0.95  # 0.99
+
+
+def test_strokes_of_striped_floors_are_not_alone() -> None:
+    """Six stripes 20 px apart, and a line across at a distance."""
+    y = 20.0 * np.arange(6)
+    ends = np.stack([np.column_stack([np.zeros(6), y]), np.column_stack([np.full(6, 24.0), y])], axis=1)
+    strokes = Strokes(np.concatenate([ends, [[[300.0, 0.0], [300.0, 24.0]]]]), np.ones(7))
+    assert np.allclose(alone(strokes, 45.0), 1.0 / (1.0 + np.array([2, 3, 4, 4, 3, 2, 0]) ** 2))

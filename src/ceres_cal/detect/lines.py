@@ -22,11 +22,13 @@ from ceres_cal.detect.profiles import (
     fit_profiles,
     fit_shape,
 )
+from ceres_cal.detect.sampling import drawn_aside
 
 HALF_WIDTH_PX = 3  # of a window, along the line
 SPACING_PX = 2.0 * HALF_WIDTH_PX + 2.0  # neighbouring windows share no pixels
 _BEYOND_PX = 4.5  # of a window, past the paint's border
 _SEARCH_STEP_PX = 0.5
+_TINY = 1e-9  # grey levels
 _BAND_PX = 3.0  # of background, to either side of the paint, in the search
 _SHAPE_WINDOWS = 150
 # Of blur, in standard deviations: the part of a blurred line that is brightest.
@@ -112,7 +114,8 @@ def search(
     """Where along the normals there is most likely paint: offsets (N,) px, and how much brighter it is, grey levels.
 
     Args:
-        reach_px: how far to look to either side. spare_px: of two lines alike the one nearer than by this is taken.
+        reach_px: how far to look to either side. spare_px: of two lines the one nearer than by this is taken, even
+            where the other is twice as bright.
         blur_px: standard deviation of what makes lines wider, (N,) or one.
     """
     width_px = np.maximum(course.width_px, np.maximum(_AS_WIDE * np.asarray(blur_px), 1.0))
@@ -134,9 +137,19 @@ def search(
     left, right = mean(-half - 1.0 - _BAND_PX, -half - 1.0), mean(half + 1.0, half + 1.0 + _BAND_PX)
     response = mean(-half, half) - np.maximum(left, right)
     response[:, np.abs(steps) > reach_px] = -np.inf
-    preference = response * np.exp(-0.5 * (steps / spare_px) ** 2) if spare_px > 0.0 else response
-    best = np.argmax(preference, axis=1)
+    best = np.argmax(_preferred(response, steps / spare_px) if spare_px > 0.0 else response, axis=1)
     return steps[best], response[np.arange(len(best)), best]
+
+
+def _preferred(response: Array, away: Array) -> Array:
+    """(N, S) how much a step (S,) is to be taken for the line: a peak that is near. Brighter than paint usually is no
+    more paint: a boundary line beside the field's own is wider.
+    """
+    bright, usual = np.maximum(response, 0.0), max(float(np.median(np.max(response, axis=1))), _TINY)
+    higher = np.pad(response, ((0, 0), (1, 1)), constant_values=-np.inf)
+    peak = (response >= higher[:, :-2]) & (response >= higher[:, 2:])
+    preferred = peak * bright / (bright + 0.5 * usual) * np.exp(-0.5 * away**2)
+    return np.where(np.isfinite(response), preferred, -np.inf)
 
 
 def _along_normals(grey: Array32, course: Course, steps: Array, shift_px: float) -> Array:
@@ -164,9 +177,11 @@ def measure(grey: Array32, course: Course, reach_px: float) -> Lines:
     fits = fit_profiles(windows, stretch * edges, np.where(blur > _WIDE_BLUR_PX, _OF_WIDE, 1.0) * blur, 1.5)
     contrast = np.minimum(fits.heights[:, 0], -fits.heights[:, 1])
     offset = rough + fits.offset_px
-    found = _is_paint(course, fits, contrast)
+    found = _is_paint(course, fits, contrast, np.median(windows.values, axis=1))
     found = _goes_on(course, found, offset, fits.sigma_px)
-    sigma = np.hypot(fits.sigma_px, _scatter(course, found, offset, fits.sigma_px))
+    aside, remains = drawn_aside(course, np.where(found, offset, np.nan), _threes(course, found), HALF_WIDTH_PX)
+    offset, sigma = offset - aside, np.hypot(fits.sigma_px, remains)
+    sigma = np.hypot(sigma, _scatter(_threes(course, found), offset, sigma))
     found = _goes_on(course, found, offset, sigma)
     return Lines(
         course,
@@ -201,12 +216,10 @@ def _shape(windows: Windows, course: Course, bright: Array) -> tuple[Array, floa
     rows = np.flatnonzero(windows.inside)
     if not len(rows):
         return np.ones(len(course)), 1.0
-    limit = 0.5 * np.quantile(bright[rows], 0.8)
-    rows = rows[bright[rows] >= limit]
     edges = np.column_stack([-0.5 * course.width_px, 0.5 * course.width_px])
-    blur, stretch = _shape_of(windows, edges, rows, 1.0, 1.0)
+    blur, stretch = _shape_of(windows, edges, _brightest(bright, rows), 1.0, 1.0)
     sector = np.floor(angle[rows] / np.pi * _SECTORS + 0.5) % _SECTORS
-    own = [rows[sector == number] for number in range(_SECTORS)]
+    own = [_brightest(bright, rows[sector == number]) for number in np.unique(sector)]
     own = [some for some in own if len(some) >= _FEWEST_IN_SECTOR]
     if len(own) < 2:
         return np.full(len(course), blur), stretch
@@ -221,6 +234,11 @@ def _shape(windows: Windows, course: Course, bright: Array) -> tuple[Array, floa
     return np.sqrt(np.clip(across, LEAST_BLUR_PX**2, MOST_BLUR_PX**2)), stretch
 
 
+def _brightest(bright: Array, rows: Indices) -> Indices:
+    """Of these rows, those that are surely on paint: what a moved camera smears is fainter in one direction."""
+    return rows[bright[rows] >= 0.5 * np.quantile(bright[rows], 0.8)]
+
+
 def _doubled(angle: Array) -> Array:
     return np.column_stack([np.cos(2.0 * angle), np.sin(2.0 * angle)])
 
@@ -231,8 +249,11 @@ def _shape_of(windows: Windows, edges: Array, rows: Indices, blur: float, stretc
     return fit_shape(some, edges[rows], blur, stretch)
 
 
-def _is_paint(course: Course, fits: Profiles, contrast: Array) -> Mask:
-    """Where the window shows a bright line: on both sides darker, by as much as elsewhere, and nothing else in it."""
+def _is_paint(course: Course, fits: Profiles, contrast: Array, around: Array) -> Mask:
+    """Where the window shows a bright line: on both sides darker, by as much as elsewhere, and nothing else in it.
+
+    By as much as nearby, or by as large a share of the light `around` (N,): sun changes paint and carpet alike.
+    """
     fitted = np.isfinite(fits.offset_px)
     if not np.any(fitted):
         return fitted
@@ -241,8 +262,11 @@ def _is_paint(course: Course, fits: Profiles, contrast: Array) -> Mask:
         return clear
     usual = float(np.median(contrast[clear]))
     clear &= contrast > _LEAST_CONTRAST * usual
-    nearby = _medians(np.where(clear, contrast, np.nan), course.curve)
-    clear &= (contrast > _OF_NEARBY[0] * nearby) & (contrast < _OF_NEARBY[1] * nearby)
+    alike = np.zeros(len(clear), dtype=bool)
+    for height in (contrast, contrast / np.maximum(around, 1.0)):
+        nearby = _medians(np.where(clear, height, np.nan), course.curve)
+        alike |= (height > _OF_NEARBY[0] * nearby) & (height < _OF_NEARBY[1] * nearby)
+    clear &= alike
     return np.asarray(clear & (fits.noise < _NOISY * np.median(fits.noise[clear])))
 
 
@@ -275,21 +299,23 @@ def _goes_on(course: Course, found: Mask, offset: Array, sigma: Array) -> Mask:
     return np.asarray(found & near & ~alone)
 
 
-def _scatter(course: Course, found: Mask, offset: Array, sigma: Array) -> float:
+def _threes(course: Course, found: Mask) -> Indices:
+    """(M, 3) places on a curve, each `_APART` from the next, that were all found."""
+    first = np.arange(max(len(found) - 2 * _APART, 0))
+    three = first[:, None] + (0, _APART, 2 * _APART)
+    same = course.curve[three[:, 0]] == course.curve[three[:, 2]]
+    return np.asarray(three[same & np.all(found[three], axis=1)])
+
+
+def _scatter(three: Indices, offset: Array, sigma: Array) -> float:
     """The standard deviation, px, that besides sigma makes what the offsets of three places on a curve tell of their
     scatter.
 
     Carpet, wear, compression and the sampling of lines thinner than a pixel are not white noise, which is all that a
     window knows; and what a window in good light knows best suffers from them no less.
     """
-    before, after = slice(None, -2 * _APART), slice(2 * _APART, None)
-    middle = np.flatnonzero(
-        found[before] & found[_APART:-_APART] & found[after] & (course.curve[before] == course.curve[after])
-    )
-    middle += _APART
-    if len(middle) < 20:
+    if len(three) < 20:
         return 0.0
-    three = middle[:, None] + (-_APART, 0, _APART)
     change, weight = np.abs(offset[three] @ (1.0, -2.0, 1.0)), np.array([1.0, 4.0, 1.0])
     more = _SCATTER_PX[:, None]
     usual = np.median(change / np.sqrt(sigma[three] ** 2 @ weight + np.sum(weight) * more**2), axis=1)

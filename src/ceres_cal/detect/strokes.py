@@ -30,6 +30,8 @@ _WIDEST = 0.45
 # Width in which a stroke found at another scale is the same one; times as bright a coarser one must be, whose place and
 # direction are known less well: of one in blur and wear a third fewer are kept at 1.0, nothing changes from 1.25 to 2.
 _BESIDE_PX, _COARSER = 11, 1.4
+# Of strokes that run beside each other: cosine of the angle between them, and how far apart they are at least.
+_SAME_WAY, _APART_PX = 0.97, 4.0
 # Of the picture, where nothing is seen of a ridge's other side.
 _BORDER_PX = 3
 # Between pieces of one stroke; of a stroke's length, what is paint: worn lines are dashes.
@@ -54,6 +56,22 @@ class Strokes:
     def length_px(self) -> Array:
         """(N,)"""
         return np.asarray(np.linalg.norm(self.ends[:, 1] - self.ends[:, 0], axis=1))
+
+
+def alone(strokes: Strokes, reach_px: float) -> Array:
+    """(N,) how much a stroke is a line of its own: 1, less where others run beside it, as of striped floors and sun.
+
+    Args:
+        reach_px: how far to either side others count.
+    """
+    middle, along = strokes.ends.mean(axis=1), np.diff(strokes.ends, axis=1)[:, 0]
+    along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
+    between = middle[None] - middle[:, None]
+    parallel = np.abs(along @ along.T) > _SAME_WAY
+    ahead = np.abs(np.einsum("ijk,ik->ij", between, along)) < 0.5 * _TILE_PX
+    aside = np.abs(between[..., 0] * along[:, None, 1] - between[..., 1] * along[:, None, 0])
+    others = np.count_nonzero(parallel & ahead & (aside > _APART_PX) & (aside < reach_px), axis=1)
+    return np.asarray(1.0 / (1.0 + others**2))
 
 
 def drawn(strokes: Strokes, image_size: tuple[int, int]) -> Mask:

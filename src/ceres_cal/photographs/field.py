@@ -18,10 +18,11 @@ from ceres_cal.detect.lines import Lines
 from ceres_cal.model.dimensions import features_of
 from ceres_cal.observations import NO_POINTS, Curves, Observations, Points, Prior, View, combine
 from ceres_cal.photographs.as_built import ASIDE_M
+from ceres_cal.photographs.candidates import prepare_search
 from ceres_cal.photographs.clicks import Clicks, starts_from_clicks
 from ceres_cal.photographs.follow import FreeIntrinsics, follow
 from ceres_cal.photographs.followed import Followed
-from ceres_cal.photographs.judgement import why_missed
+from ceres_cal.photographs.judgement import is_shown, why_missed
 from ceres_cal.photographs.search import Auto, SearchResult, SeveralWaysError, search
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.targets import Target
@@ -188,9 +189,17 @@ def _looked_for(
     target = start.target if isinstance(start, Followed) else target
     starts, free = _starts(start, target, (int(grey.shape[1]), int(grey.shape[0])), (path, lengths))
     followed = follow(grey, target, starts, painted, replace(free, keep=options.keep_start))
-    if followed.holds and not followed.built.is_other:
+    if not followed.built.is_other and (followed.holds or _is_worn(grey, followed)):
         return SearchResult(followed)
     return SearchResult(None, why_missed(followed, target, started=True), seen=followed)
+
+
+def _is_worn(grey: Array32, followed: Followed) -> bool:
+    """Whether this is the field, its lines worn to dashes: of a target without a grid of lines it cannot be told."""
+    try:
+        return followed.may_be_worn and is_shown(prepare_search(grey, followed.target, followed.curves), followed)
+    except InputError:
+        return False
 
 
 def _starts(

@@ -26,7 +26,7 @@ from ceres_cal.scene.targets import Target, target_from_spec
 
 FAR_PX = 130.0  # how far off the start may be
 # Share from which on no other start is tried. At half of its odds nothing changes.
-_SURE_SHARE = 0.7
+SURE_SHARE = 0.7
 _ROUGH_SPACING_PX = 12.0
 _NEAR_REACHES_PX = (12.0, 6.0, 4.0)
 # From points that were shown: what stands farther beside a line than they are off cannot draw it away.
@@ -75,7 +75,7 @@ def follow(
     tracker = _Tracker(grey, target, curves, free or FreeIntrinsics())
     tried = tracker.tried(starts)
     best = next(tried)
-    if not (best.holds and tracker.free.names):
+    if not (best.may_be_worn and tracker.free.names):
         return best
     best = tracker.refined(best)
     for one in islice(tried, _MOST_OTHERS):
@@ -90,6 +90,15 @@ def follow(
 def approach(grey: Array32, target: Target, camera: Camera, curves: Collection[str], free: FreeIntrinsics) -> Followed:
     """`follow` from one start, up to where the lens remains that it started from."""
     return next(_Tracker(grey, target, curves, free).tried([camera]))
+
+
+def look_again(
+    grey: Array32, target: Target, seen: Followed, curves: Collection[str], free: FreeIntrinsics
+) -> Followed:
+    """What nearly is the field, with the kind of lens that suits best, or as drawn next to where it was seen."""
+    tracker = _Tracker(grey, target, curves, free)
+    refined = tracker.refined(seen)
+    return refined if refined.holds and not refined.built.is_other else tracker.as_drawn(seen)
 
 
 def refine(grey: Array32, target: Target, camera: Camera, curves: Collection[str], free: FreeIntrinsics) -> Followed:
@@ -121,7 +130,7 @@ class _Tracker:
         """What is reached from each start: what is surely the field at once, then the others, the best first."""
         left: list[Followed] = []
         for one in self._reached(starts):
-            if one.holds and one.share >= _SURE_SHARE:
+            if one.holds and one.share >= SURE_SHARE:
                 yield one
             else:
                 left.append(one)
@@ -188,18 +197,33 @@ class _Tracker:
         whole = replace(self, curves=followed.curves, missing=followed.missing, target=followed.target)
         followed = whole.without_aside(followed)
         if followed.built.is_other:
+            followed = self.as_drawn(followed)
+        if followed.built.is_other:
             return followed
         curves = [name for name in whole.curves if name not in followed.built.aside_m]
         left = replace(whole, curves=curves, target=followed.target)
         return whole.without_aside(left.with_best_lens(followed))
 
+    def as_drawn(self, other: Followed) -> Followed:
+        """What looks like another field, or the one that is drawn, where all of its lines are there as well.
+
+        A line around the field that was taken for its own bends the camera until areas and circle disagree. With their
+        dimensions free the camera is right: its own lines are next to where that puts them.
+        """
+        there = self.as_built(other, _free(other.camera))[1]
+        drawn = self.of_painted(there).at_rest(there, _free(there))
+        if drawn.share < SURE_SHARE or not drawn.holds:
+            return other
+        drawn = replace(self, curves=drawn.curves, missing=drawn.missing).without_aside(drawn)
+        return other if drawn.built.is_other or drawn.built.dimensions else drawn
+
     def without_aside(self, followed: Followed) -> Followed:
         """The same without the curves that lie aside: none of them draws the camera to where others look aside."""
-        free = tuple(name for name in intrinsic_names(followed.camera.lens) if name != "aspect")
+        free = _free(followed.camera)
         whole, built = replace(self, target=followed.target), AS_DRAWN
         left = whole
         for _ in range(_ROUNDS):
-            known, built = built, whole.as_built(followed, free)
+            known, built = built, whole.as_built(followed, free)[0]
             if built.is_other or built.aside_m.keys() == known.aside_m.keys():
                 break
             left = replace(whole, curves=[name for name in whole.curves if name not in built.aside_m])
@@ -212,8 +236,8 @@ class _Tracker:
             beside = every.take(np.isin(every.course.curve, aside))
         return replace(followed, curves=tuple(self.curves), built=built, lines=lines, beside=beside)
 
-    def as_built(self, followed: Followed, free: tuple[str, ...]) -> AsBuilt:
-        """How all curves lie.
+    def as_built(self, followed: Followed, free: tuple[str, ...]) -> tuple[AsBuilt, Camera]:
+        """How all curves lie, and the camera by which they do.
 
         Lines of other dimensions are several pixels from where they were looked for, and some are missed or taken for
         others; so they are looked for again, and measured, where those dimensions put them.
@@ -229,7 +253,7 @@ class _Tracker:
                 break
             lines, camera = nearer.lines, nearer.camera
             built = as_built(lines, camera, target, self.free.priors)
-        return built
+        return built, camera
 
     def with_best_lens(self, followed: Followed) -> Followed:
         """What is found when the lines are predicted with the kind of lens that suits them best.
@@ -255,7 +279,7 @@ class _Tracker:
         lines = replace(self, target=target).measured(camera)
         moved = _moved_px(followed.camera, camera, lines.course.pixels)
         refined = replace(self, target=target).followed(camera, lines, moved)
-        return refined if refined.holds and refined.share > followed.share - _LESS else followed
+        return refined if refined.may_be_worn and refined.share > followed.share - _LESS else followed
 
     def _refitted(
         self, camera: Camera, observations: Observations, names: tuple[str, ...]
@@ -293,6 +317,11 @@ class _Tracker:
         return observations_of(
             self.target, camera.image_size, lines.course.curve[rows], lines.pixels[rows], lines.sigma_px[rows]
         )
+
+
+def _free(camera: Camera) -> tuple[str, ...]:
+    """Names of the intrinsics that a photograph may change."""
+    return tuple(name for name in intrinsic_names(camera.lens) if name != "aspect")
 
 
 def _moved_px(camera: Camera, refitted: Camera, pixels: Array) -> float:

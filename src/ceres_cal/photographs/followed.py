@@ -15,6 +15,8 @@ from ceres_cal.scene.targets import Target
 
 # Of the places in view where paint must be found: robots and wear hide a third. Nothing changes from 0.33 to 0.67.
 LEAST_SHARE = 0.5
+# The same of lines that may be worn to dashes: other fields and wrong places have as much, and strokes must decide.
+_LEAST_IF_WORN = 0.3
 # Found of a curve, at least; places on curves without that, at most.
 _ABSENT, _MOST_ABSENT = 0.2, 0.08
 
@@ -73,5 +75,14 @@ class Followed:
     @property
     def holds(self) -> bool:
         """Whether this is the field: paint at half of the places in view, and no line missing that weighs."""
+        return self.share >= LEAST_SHARE and self._has_all
+
+    @property
+    def may_be_worn(self) -> bool:
+        """Whether it is at least the field if its lines are worn to dashes."""
+        return self.share >= _LEAST_IF_WORN and self._has_all
+
+    @property
+    def _has_all(self) -> bool:
         missing = np.isin(self.lines.course.curve, self.absent)
-        return self.share >= LEAST_SHARE and float(np.mean(missing)) <= _MOST_ABSENT
+        return float(np.mean(missing)) <= _MOST_ABSENT

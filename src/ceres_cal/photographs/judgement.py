@@ -21,9 +21,12 @@ _NEAR_PX = 6.0
 # Of the strokes that could be lines of the target, the share that must lie on it. On photographs with cables, seams and
 # stripes of sun it is 0.83 at least, of other fields 0.6 at most.
 _EXPLAINED = 0.75
-# The same, also of those beside the target, where walls and boundary lines run: 0.61 at least where it is seen whole;
-# a corner alone may be any corner, so that fewer curves than that must explain as much of the rest of the picture.
-_OF_ALL, _MANY_CURVES = 0.55, 6
+# The same of a field whose paint is found at fewer than half of the places; worn lines in dashes: 1.
+_EXPLAINED_IF_WORN = 0.9
+# The same, also of those beside the target, where walls and boundary lines run: 0.61 at least where it is seen whole,
+# and less where a wider boundary line shows more strokes than its lines do: then all of these must be there.
+# A corner alone may be any corner, so that fewer curves than that must explain as much of the rest of the picture.
+_OF_ALL, _OF_ALL_IF_WHOLE, _MANY_CURVES = 0.55, 0.4, 6
 # Sine of the angle between a stroke and the lines, at most: 4 degrees. Of the usual strength of strokes on the lines,
 # another line's at least.
 _PARALLEL, _AS_STRONG = 0.07, 0.5
@@ -57,7 +60,7 @@ def why_missed(followed: Followed, target: Target, *, started: bool) -> str:
 
 def objection(search: FieldSearch, followed: Followed) -> str:
     """What speaks against taking what was followed for the field, or nothing."""
-    if not followed.holds or followed.built.is_other:
+    if not is_shown(search, followed) or followed.built.is_other:
         return why_missed(followed, search.target, started=False)
     names = detected_curves(search, followed)
     if len(names) < _FEWEST_CURVES or not _in_two_directions(search, names):
@@ -66,13 +69,26 @@ def objection(search: FieldSearch, followed: Followed) -> str:
     if -followed.camera.cam_from_world.rotation[2, 2] < _LEAST_UPRIGHT or not PHI_RANGE[0] < phi < PHI_RANGE[1]:
         return "its lines were not found in any view from above: start from corners"
     share, of_all = explained(search, followed), explained(search, followed, everywhere=True)
-    if share < _EXPLAINED or of_all < (_OF_ALL if len(names) >= _MANY_CURVES else _EXPLAINED):
+    enough = (_OF_ALL if followed.absent else _OF_ALL_IF_WHOLE) if len(names) >= _MANY_CURVES else _EXPLAINED
+    if share < _EXPLAINED or of_all < enough:
         share = min(share, of_all)
         return (
             f"of the bright lines where the field would be, only {100.0 * share:.0f} % are lines of it: "
             "check the target's dimensions and which lines are painted, or start from corners"
         )
     return ""
+
+
+def is_shown(search: FieldSearch, followed: Followed) -> bool:
+    """Whether paint is found at enough places: of a worn field at fewer, where there are no strokes but its own, and on
+    more than half of its curves: a few cables lie on some of any field's.
+    """
+    if followed.holds or not followed.may_be_worn:
+        return followed.holds
+    if 2 * len(detected_curves(search, followed)) <= len(search.curves):
+        return False
+    everywhere = explained(search, followed, everywhere=True)
+    return everywhere > _EXPLAINED and explained(search, followed) > _EXPLAINED_IF_WORN
 
 
 def likelihood(followed: Followed) -> float:

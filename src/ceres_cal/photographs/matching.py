@@ -16,7 +16,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.detect.registration import Nearness
-from ceres_cal.detect.strokes import Strokes
+from ceres_cal.detect.strokes import Strokes, alone
 from ceres_cal.photographs.grid import Grid, Places, places_along
 from ceres_cal.photographs.upright import Upright
 
@@ -34,6 +34,7 @@ _KEPT = 800
 _TELLS_PX = 40.0  # of a line, as much as one place on it tells
 # Of the places on the target: a camera nearer than that sees too little of it.
 _LEAST_IN_VIEW = 0.03
+_CROWDED = 0.12  # half diagonals within which lines of a target hardly ever run beside each other
 _BLOCK = 2000
 _QUARTERS = np.array([[[c, -s, 0], [s, c, 0], [0, 0, 1]] for c, s in ((1, 0), (0, 1), (-1, 0), (0, -1))], dtype=float)
 
@@ -65,6 +66,11 @@ class StrokeMap:
     def ends(self) -> Array:
         """(N, 2, 2) the strokes' ends from the centre, in half image diagonals."""
         return np.asarray((self.strokes.ends - self.centre) / self.unit_px)
+
+    @cached_property
+    def weights(self) -> Array:
+        """(N,) px of each stroke, as far as it may be a line."""
+        return self.strokes.length_px * alone(self.strokes, _CROWDED * self.unit_px)
 
     @cached_property
     def paint_px(self) -> float:
@@ -114,7 +120,7 @@ class FloorLines:
 
 def lines_seen(upright: Upright, stroke_map: StrokeMap) -> FloorLines:
     """The lines on which most strokes lie."""
-    ends, weights = stroke_map.ends, stroke_map.strokes.length_px
+    ends, weights = stroke_map.ends, stroke_map.weights
     floor = np.stack([upright.floor(ends[:, 0]), upright.floor(ends[:, 1])], axis=1)
     on_floor = np.all(np.isfinite(floor), axis=(1, 2))
     floor, weights = floor[on_floor], weights[on_floor]

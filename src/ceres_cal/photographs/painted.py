@@ -8,16 +8,19 @@ from dataclasses import dataclass
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Array32
-from ceres_cal.detect.courses import predict
+from ceres_cal.detect.courses import Course, predict
 from ceres_cal.detect.lines import search
 from ceres_cal.photographs.matching import divergence
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.targets import Target
 
-# Where lines are sought: px apart, and to either side as a share of half the image's diagonal; and how bright, of the
-# usual brightest, is paint. So many of any lines would be found there by chance.
-_SPACING_PX, _REACH, _CLEAR, _FEWEST = 8.0, 0.035, 0.4, 12
-BY_CHANCE = 0.3  # of the places on any lines, those that lie on paint
+# Where lines are sought: px apart, and to either side as a share of half the image's diagonal.
+_SPACING_PX, _REACH, _FEWEST = 8.0, 0.035, 12
+BY_CHANCE = 0.3  # of the places on any lines, those that look like paint: what is brighter than the others does
+_ANYWHERE = 400  # places of lines laid anywhere, by which that brightness is known
+_R3 = 1.2207440846057596 ** -np.arange(1.0, 4.0)
+# Of the places on lines, at most, where lines that are not painted look like paint: 0.3 by chance, 0.8 of worn ones.
+_LACKS = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,9 +31,9 @@ class _Seen:
     bright: Array
 
     def lacks(self, target: Target, part: Collection[str]) -> bool:
-        """Whether these curves are in view and nothing is seen of them but by chance."""
+        """Whether these curves are in view and hardly more is seen of them than by chance."""
         rows = [target.curve_index[name] for name in part]
-        return bool(np.sum(self.bright[rows]) < BY_CHANCE * np.sum(self.places[rows]))
+        return bool(np.sum(self.bright[rows]) < _LACKS * np.sum(self.places[rows]))
 
 
 def _seen(grey: Array32, target: Target, camera: Camera, curves: Collection[str]) -> _Seen:
@@ -38,9 +41,20 @@ def _seen(grey: Array32, target: Target, camera: Camera, curves: Collection[str]
     count = len(target.curves)
     if len(course) < _FEWEST:
         return _Seen(np.zeros(count), np.zeros(count))
-    light = search(grey, course, 0.5 * _REACH * float(np.hypot(*camera.image_size)))[1]
-    bright = light > _CLEAR * float(np.quantile(light, 0.8))
+    reach_px = 0.5 * _REACH * float(np.hypot(*camera.image_size))
+    anywhere = _laid_anywhere(camera.image_size, float(np.median(course.width_px)))
+    by_chance = float(np.quantile(search(grey, anywhere, reach_px)[1], 1.0 - BY_CHANCE))
+    bright = search(grey, course, reach_px)[1] > by_chance
     return _Seen(*(np.bincount(course.curve, one, count).astype(float) for one in (np.ones(len(course)), bright)))
+
+
+def _laid_anywhere(image_size: tuple[int, int], width_px: float) -> Course:
+    """Places of lines all over an image, in all directions: a low-discrepancy sequence (Roberts 2018, R3)."""
+    x, y, turn = np.mod(np.outer(_R3, np.arange(1.0, _ANYWHERE + 1.0)), 1.0)
+    pixels = np.column_stack([x, y]) * (np.array(image_size) - 1.0)
+    normals = np.column_stack([np.cos(np.pi * turn), np.sin(np.pi * turn)])
+    none = np.zeros(_ANYWHERE)
+    return Course(none.astype(np.int32), none, pixels, normals, none, np.full(_ANYWHERE, width_px))
 
 
 def painted_curves(grey: Array32, target: Target, camera: Camera, curves: Collection[str]) -> tuple[str, ...]:

@@ -20,7 +20,7 @@ from ceres_cal.photographs.facing import (
     require_sides,
     side_of,
 )
-from ceres_cal.photographs.follow import FreeIntrinsics, approach, refine
+from ceres_cal.photographs.follow import SURE_SHARE, FreeIntrinsics, approach, look_again, refine
 from ceres_cal.photographs.followed import Followed
 from ceres_cal.photographs.grid import grid_of
 from ceres_cal.photographs.judgement import detected_curves, explained, likelihood, objection, same_labels
@@ -99,8 +99,13 @@ def search(grey: Array32, target: Target, curves: Collection[str], auto: Auto) -
     seen: Followed | None = None
     reason = _NO_LINES
     for camera, grid in candidates(problem):
-        followed = _followed(replace(problem, grid=grid), auto, _turned(problem, auto, camera))
+        own = replace(problem, grid=grid)
+        followed = _followed(own, auto, _turned(problem, auto, camera))
         against = objection(problem, followed)
+        if against and followed.share >= SURE_SHARE:
+            free = _free(own.target, auto, followed.camera)
+            followed = look_again(problem.grey, own.target, followed, problem.curves, free)
+            against = objection(problem, followed)
         if not against:
             good.append(followed)
         elif seen is None or followed.share > seen.share:

@@ -19,9 +19,10 @@ from ceres_cal.base.arrays import Array
 from ceres_cal.base.transforms import rotation_exp
 from ceres_cal.start.initialise import USUAL_PHI, USUAL_PHI_FACTOR
 
-BENDS = (0.05, -0.05, -0.15, -0.25, -0.35, -0.45)
+BENDS = (0.05, -0.05, -0.15, -0.25, -0.35, -0.45, -0.6, -0.75)
+_MOST_BENT = -0.75  # a floor that is seen farther out than that lies behind the camera
 PHIS = (0.8, 1.15, 1.6)
-_USUAL_BEND, _BEND_SIGMA = -0.15, 0.2
+_USUAL_BEND, _BEND_SIGMA = -0.15, 0.35
 # rad: a standard deviation of the tilts that cameras over fields have. Nothing changes from 0.33 to 0.67.
 _USUAL_TILT = 0.5
 # Of all strokes, at one standard deviation: it decides only where strokes do not. Nothing changes from half to
@@ -139,7 +140,7 @@ def _penalty(optics: Upright) -> float:
 def _moved(one: Upright, step: Array) -> Upright:
     return replace(
         one,
-        bend=one.bend + step[3],
+        bend=max(one.bend + float(step[3]), _MOST_BENT),
         phi=one.phi * float(np.exp(step[4])),
         rotation=one.rotation @ rotation_exp(step[:3]),
     )

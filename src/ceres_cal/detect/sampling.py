@@ -1,0 +1,91 @@
+"""By how much a sensor's pixels draw lines aside that are thinner than they are, which a picture tells by itself.
+
+A line that lies on the middle of a row of pixels, or between two rows, is drawn there. Elsewhere a sharp lens and a
+colour sensor, of whose pixels most colours are filled in, draw it up to 0.12 px towards one of them, by where it lies
+in the pixel. Along a line that is nearly level or upright that changes slowly, so that many places err together; nearer
+and farther ones tell it all the same, since lines are straight or round and what is drawn of them waves.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ceres_cal.base.arrays import Array, Indices, Indices32
+from ceres_cal.detect.courses import Course
+
+_HARMONICS = (1.0, 2.0)
+_PRIOR_PX = 0.1  # standard deviation of the error's amplitude, beforehand
+_REMAINS = 0.15  # of the error, what is left once it is taken off
+_AROUND = 10  # places to either side, of which the mean tells where in its pixel a line lies
+_ROUNDS, _FEWEST = 5, 20
+_LEAST_PX = 1e-4
+_ROBUST = 2.0  # of the usual residual: Cauchy's scale
+_CURVATURE = np.array([1.0, -2.0, 1.0])
+
+
+def drawn_aside(course: Course, offset_px: Array, threes: Indices, half_width_px: int) -> tuple[Array, Array]:
+    """(N,) px along the normals by which lines are drawn beside themselves, and its standard deviation (N,).
+
+    That is as large as a line's middle needs whose places all err alike, since they are taken to err each by itself.
+
+    Args:
+        offset_px: (N,) where along the normals they were measured, NaN where they were not. threes: (M, 3) places that
+            follow each other on a curve, all of them measured. half_width_px: of the windows, along the curve.
+    """
+    aside: Array = np.zeros(len(course))
+    if len(threes) < _FEWEST:
+        return aside, aside
+    bends = offset_px[threes] @ _CURVATURE
+    for _ in range(_ROUNDS):  # where in the pixel a line lies is where it is drawn but for that
+        turns = _turns(course, _smooth(course.curve, offset_px - aside), half_width_px)
+        amplitude = _amplitudes(np.einsum("mtk,t->mk", turns.imag[threes], _CURVATURE), bends)
+        aside = np.nan_to_num(turns.imag @ amplitude)
+    remains = _REMAINS * np.abs(amplitude) * np.nan_to_num(np.abs(turns) * np.sqrt(_alike(course, offset_px, turns)))
+    return aside, np.linalg.norm(remains, axis=1)
+
+
+def _alike(course: Course, offset_px: Array, turns: Array) -> Array:
+    """(N, 4) how many places of its curve err as a place does: few where the line wanders through the pixels."""
+    measured, alike = np.isfinite(offset_px), np.ones(turns.shape)
+    for number in np.unique(course.curve):
+        own = course.curve == number
+        alike[own] = np.maximum(np.abs(np.sum(turns[own & measured], axis=0)), 1.0)
+    return alike
+
+
+def _smooth(curve: Indices32, offset_px: Array) -> Array:
+    """(N,) the mean of the places around on the same curve: one place's own error would explain itself."""
+    measured, box = np.isfinite(offset_px), np.ones(2 * _AROUND + 1)
+    smooth = np.zeros(len(curve))
+    for number in np.unique(curve):
+        rows = np.flatnonzero(curve == number)
+        total, count = (np.convolve(one[rows], box)[_AROUND:-_AROUND] for one in (np.nan_to_num(offset_px), measured))
+        smooth[rows] = total / np.maximum(count, 1.0)
+    return smooth
+
+
+def _amplitudes(columns: Array, bends: Array) -> Array:
+    """(K,) of what, times columns (M, K), explains the bends (M,) but for a few."""
+    amplitude: Array = np.zeros(columns.shape[1])
+    for _ in range(_ROUNDS):
+        left = bends - columns @ amplitude
+        usual = max(float(np.median(np.abs(left))) / 0.6745, _LEAST_PX)
+        weighted = columns / (1.0 + (left / (_ROBUST * usual)) ** 2)[:, None]
+        normal = weighted.T @ columns + (usual / _PRIOR_PX) ** 2 * np.eye(len(amplitude))
+        amplitude = np.asarray(np.linalg.solve(normal, weighted.T @ bends), dtype=float)
+    return np.asarray(amplitude)
+
+
+def _turns(course: Course, offset_px: Array, half_width_px: int) -> Array:
+    """(N, 4) complex: how far round its pixel a line is, the mean over each window, along the normal: of level lines,
+    then of upright ones.
+    """
+    places, normals = course.pixels + offset_px[:, None] * course.normals, course.normals
+    level = np.abs(normals[:, 1]) >= np.abs(normals[:, 0])
+    along, across = (np.where(level, places[:, axis], places[:, 1 - axis]) for axis in (0, 1))
+    n_along, n_across = (np.where(level, normals[:, axis], normals[:, 1 - axis]) for axis in (0, 1))
+    du = np.round(along)[:, None] + np.arange(-half_width_px, half_width_px + 1) - along[:, None]
+    bent = 0.5 * course.curvature[:, None] * (du / n_across[:, None]) ** 2
+    crossed = across[:, None] + (bent - du * n_along[:, None]) / n_across[:, None]
+    turns = [n_across * np.mean(np.exp(2j * np.pi * times * crossed), axis=1) for times in _HARMONICS]
+    return np.column_stack([np.where(chosen, turn, 0.0) for chosen in (level, ~level) for turn in turns])
