@@ -333,7 +333,7 @@ def _assess(
 def _with_others(posterior: Posterior, end: RobustSolution, others: Sequence[Solution]) -> Posterior:
     """The posterior that holds other minima, too, as far as they cost no more than its intervals reach."""
     known, shifts = (posterior.by_model or posterior.information).matrix, []
-    for one in others:
+    for one in others if not posterior.profiles else ():  # a valley that is followed has its other places in it
         shift = difference(one.estimate, end.solution.estimate, posterior.keys)
         # In the same minimum it would cost what the normal equations say.
         if 2.0 * one.cost < min(posterior.half_width**2, _OTHER * float(shift @ known @ shift)):

@@ -26,13 +26,14 @@ _LOWER = 1.0  # of twice the cost: rounding is less, and what is no lower than t
 def least_of_few(
     problem: Problem, observations: Observations, end: RobustSolution
 ) -> tuple[RobustSolution, tuple[Solution, ...]]:
-    """The end of all rounds in the least minimum of its inliers that is found from there, and others, with what they
-    cost beyond it.
+    """The end of all rounds in the least minimum that is found from there, and others, with what they cost beyond it;
+    where all observations are inliers.
 
     Args:
         problem: of all the observations. end: of its rounds.
     """
-    if end.problem.sights.equations >= _FEW:
+    count = end.problem.sights.equations
+    if count >= _FEW or count < problem.sights.equations:  # what was taken out belongs to the minimum it was judged in
         return end, ()
     least = solve(end.problem, end.solution.estimate)
     others = list(_elsewhere(end.problem, least.estimate))

@@ -106,13 +106,16 @@ def _feature_modes(equations: Equations, rows: Indices) -> Array:
 
 
 def _view_modes(equations: Equations) -> Array:
-    """(E, 14) of another pose, and of a target that is stretched, sheared or warped."""
+    """(E, 11) of another pose, and of a target that is stretched, sheared or bowed.
+
+    Not twisted or wavy: with five shapes to choose from a good board of a real set came into doubt.
+    """
     rotations = equations.poses[equations.sight][:, :, :3]
     along = np.einsum("ei,eij->ej", equations.motion, rotations[:, :, :2])
     x, y = equations.place[:, :2].T
     stretch = np.column_stack([along[:, 0] * x, along[:, 1] * y, along[:, 0] * y])
-    warp = np.where(equations.is_curve[:, None], 0.0, equations.built[:, 2:])
-    return np.hstack([equations.pose, stretch, warp])
+    bows = np.where(equations.is_curve[:, None], 0.0, equations.built[:, 2:4])
+    return np.hstack([equations.pose, stretch, bows])
 
 
 def wholes_of(observations: Observations, sights: Sights) -> Iterator[Wholes]:
