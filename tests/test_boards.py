@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from ceres_cal.base.arrays import AnyArray, Array, Image8
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.transforms import Pose
-from ceres_cal.detect.boards import BoardDetections, CharucoSpec, detect_boards, right_handed
+from ceres_cal.detect.boards import BoardDetections, detect_boards, right_handed
+from ceres_cal.detect.charuco import CharucoSpec
 from ceres_cal.detect.images import read_grey
 from ceres_cal.detect.saddles import measure_saddles
 from ceres_cal.observations import Observations

@@ -64,7 +64,8 @@ def _run_board(args: Namespace) -> Answer:
     require_observations_output(args.output, [*images, *videos])
     if (args.charuco is None) != (args.marker is None):
         raise InputError("--charuco DICT and --marker M go together: give both or neither")
-    from ceres_cal.detect.boards import CharucoSpec, detect_boards
+    from ceres_cal.detect.boards import detect_boards
+    from ceres_cal.detect.charuco import CharucoSpec
 
     board = _board(args)
     corners = args.corner_fit if args.charuco is None else CharucoSpec(args.charuco, args.marker, args.legacy)

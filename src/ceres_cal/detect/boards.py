@@ -17,9 +17,10 @@ from ceres_cal.base.errors import InputError, NothingShownError
 from ceres_cal.base.progress import ImageProgress
 from ceres_cal.base.words import frame_of, printable
 from ceres_cal.detect.april_grids import measured_april_grid
+from ceres_cal.detect.charuco import CharucoSpec, charuco_detector
 from ceres_cal.detect.circles import measured_circles
 from ceres_cal.detect.images import read_grey
-from ceres_cal.detect.markers import dictionary_of, markers_finder, measured_markers
+from ceres_cal.detect.markers import markers_finder, measured_markers
 from ceres_cal.detect.partly import part_of_board
 from ceres_cal.detect.saddles import REACH, is_begun_dark, measure_saddles
 from ceres_cal.detect.scatter import scatter_px
@@ -39,21 +40,6 @@ _MOST_PX = 1.6e7  # and at this size at most: on noise OpenCV takes minutes, and
 _SUBPIX_HALF_WINDOW_PX = 5  # at most; a third of the spacing keeps the neighbouring corners out of it
 _UNEVEN = 0.45  # natural logarithm: 1.57 times; a skipped square makes 2, perspective on three squares hardly 1.3
 _SMALL_PX = 2e6  # smaller ones also at twice their size, where the squares are few pixels wide
-
-
-@dataclass(frozen=True)
-class CharucoSpec:
-    """The markers of a ChArUco board; its squares are those of the checkerboard target.
-
-    Attributes:
-        dictionary: OpenCV's name of the marker dictionary, such as "DICT_4X4_50".
-        marker_m: side of a marker. Best at most 0.8 of a square: a corner needs some white towards the markers.
-        legacy_pattern: made with OpenCV before 4.6, which began boards of an even number of rows otherwise.
-    """
-
-    dictionary: str
-    marker_m: float
-    legacy_pattern: bool = False
 
 
 @dataclass(frozen=True)
@@ -181,7 +167,7 @@ def _corner_finder(squares: Grid, corners: CharucoSpec | str) -> Finder:
         raise InputError(f"a board to be found in images needs 3 inner corners a side or more, not {columns} x {rows}")
     if isinstance(corners, str):
         return lambda image: _measured_chessboard(image, columns, rows, corners)
-    detector = _charuco_detector(corners, columns, rows, square_m)
+    detector = charuco_detector(corners, columns, rows, square_m)
     margin = 0.5 * (1.0 - corners.marker_m / square_m)  # white around a marker, in squares
     return lambda image: _measured_charuco(image, detector, columns, rows, margin)
 
@@ -267,21 +253,6 @@ def _scales(pixels: int) -> Iterator[float]:
     yield min(1.0, float(np.sqrt(_MOST_PX / pixels)))
     if pixels <= _SMALL_PX:
         yield 2.0
-
-
-def _charuco_detector(charuco: CharucoSpec, columns: int, rows: int, square_m: float) -> cv2.aruco.CharucoDetector:
-    dictionary = dictionary_of(charuco.dictionary)
-    if not 0.0 < charuco.marker_m < square_m:
-        raise InputError(f"marker_m must be between 0 and the square's {square_m} m, not {charuco.marker_m}")
-    needed = (columns + 1) * (rows + 1) // 2
-    if len(dictionary.bytesList) < needed:
-        raise InputError(
-            f"{charuco.dictionary} has {len(dictionary.bytesList)} markers, but a board of {columns + 1} x {rows + 1} "
-            f"squares needs {needed}: name the dictionary that was printed"
-        )
-    board = cv2.aruco.CharucoBoard((columns + 1, rows + 1), square_m, charuco.marker_m, dictionary)
-    board.setLegacyPattern(charuco.legacy_pattern)
-    return cv2.aruco.CharucoDetector(board)
 
 
 def _measured_charuco(
