@@ -29,6 +29,7 @@ from ceres_cal.observations import Observations, Prior, taken
 from ceres_cal.observations.sights import gather_sights
 from ceres_cal.simulate import Disturbance, simulate
 from ceres_cal.solve import Problem, Progress, Weighting, solve
+from ceres_cal.solve.bundle import _left_to_gain
 from ceres_cal.start.initialise import initialise
 
 NOISE = Disturbance(points_sigma_px=0.3, curves_sigma_px=0.3, outliers=0.03, outlier_spread_px=5.0)
@@ -310,3 +311,7 @@ def test_a_start_that_shows_nothing_fails_without_a_crash() -> None:
     lost = replace(start, stations=stations)
     found = solve(problem_of(observations, options, Weighting(), lost), lost)
     assert found.failed and not found.converged
+
+
+def test_an_exact_fit_leaves_nothing_to_gain() -> None:
+    assert _left_to_gain([3.0, 1.0, 0.0]) == 0.0

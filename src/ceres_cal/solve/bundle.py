@@ -173,7 +173,9 @@ def _left_to_gain(costs: Sequence[float]) -> float:
     if len(costs) < 3:
         return np.inf
     before, last = costs[-3] - costs[-2], costs[-2] - costs[-1]
-    return last * last / ((before - last) * costs[-1]) if before > last > 0.0 else np.inf
+    if costs[-1] <= 0.0:  # an exact fit
+        return 0.0
+    return last * last / (before - last) / costs[-1] if before > last > 0.0 else np.inf
 
 
 @contextmanager
