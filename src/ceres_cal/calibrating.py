@@ -32,6 +32,7 @@ from ceres_cal.solve import (
     find_conflicts,
     information,
     least_of_few,
+    shifts_to,
     solve_robustly,
 )
 from ceres_cal.solve.as_built import solve_as_built, tolerances_of
@@ -51,8 +52,6 @@ from ceres_cal.uncertainty import Posterior, Scatter, assess, measure_scatter
 # Share of the standard deviation of usual principal points: observations that say as much need nothing usual. Half and
 # double leave ordinary fields and boards, whose share is under a tenth, as they are.
 _SAYS_LESS = 0.5
-# Share of what the normal equations say that another minimum costs at most: the same one, not quite reached, costs all.
-_OTHER = 0.25
 # Share of a dimension by which it may come out another than drawn without a second solve from there, whose start and
 # outliers are those of the right drawing; and how many there may be.
 _REDRAWN, _MOST_DRAWINGS = 0.005, 4
@@ -285,7 +284,10 @@ def solved_from(
     if assessed:
         end, posterior = _assess(end, observations, problem, again)
         posterior = _with_doubts(posterior.in_doubt(conflicts.keys, conflicts.shifts), end, explanations)
-        posterior = _with_others(posterior, end, others)
+        if not posterior.profiles:  # a valley that is followed has its other places in it
+            known = posterior.by_model or posterior.information
+            shifts = shifts_to(others, end.solution.estimate, known, posterior.half_width)
+            posterior = posterior.in_doubt(posterior.keys, shifts)
         warnings = (*warnings, *(one.words for one in conflicts.every), *unknown_phi(end, posterior))
         warnings = (*warnings, *resting_phi(end, problem))
     if digest is not None:
@@ -328,17 +330,6 @@ def _assess(
 
     assessed, posterior = assess(known, estimate, reduced, end.inliers.degrees_of_freedom, scatter_at)
     return (end if assessed is estimate else end.moved_to(assessed, observations, problem)), posterior
-
-
-def _with_others(posterior: Posterior, end: RobustSolution, others: Sequence[Solution]) -> Posterior:
-    """The posterior that holds other minima, too, as far as they cost no more than its intervals reach."""
-    known, shifts = (posterior.by_model or posterior.information).matrix, []
-    for one in others if not posterior.profiles else ():  # a valley that is followed has its other places in it
-        shift = difference(one.estimate, end.solution.estimate, posterior.keys)
-        # In the same minimum it would cost what the normal equations say.
-        if 2.0 * one.cost < min(posterior.half_width**2, _OTHER * float(shift @ known @ shift)):
-            shifts.append(shift)
-    return posterior.in_doubt(posterior.keys, shifts)
 
 
 def _start_of(others: Problem, some: Asked, start: Start, again: Again | None) -> Estimate:

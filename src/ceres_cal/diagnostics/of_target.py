@@ -31,6 +31,8 @@ _FEWEST_AGREE = 5
 _SEVERAL = 3
 # What lies farther aside is no painting error: its label is wrong. Nothing changes from half to double.
 _FAR_M = 0.1
+# Standard deviations from which on a twist or a wave of a board is worth a word beside its bows.
+_CLEAR = 2.0
 
 
 class _AsBuilt(ScoreTest):
@@ -176,7 +178,7 @@ class BoardBent(_AsBuilt):
         further = [
             f"{words} {a:+.2f} ± {s:.2f} mm"
             for words, a, s in zip(("twisted by", "waves along x of", "along y of"), mm[2:], sd[2:], strict=True)
-            if abs(a) > 2.0 * s
+            if abs(a) > _CLEAR * s
         ]
         return Words(
             f"board {name} is not flat: bowed by {mm[0]:+.2f} ± {sd[0]:.2f} mm along x, {mm[1]:+.2f} ± {sd[1]:.2f} mm "

@@ -13,7 +13,7 @@ with kept_signals():
 from ceres_cal.solve.as_built import words_of
 from ceres_cal.solve.bundle import Progress, Solution, placement_costs, solve, with_placements_at_best
 from ceres_cal.solve.conflicts import Conflicts, find_conflicts
-from ceres_cal.solve.elsewhere import least_of_few
+from ceres_cal.solve.elsewhere import least_of_few, shifts_to
 from ceres_cal.solve.information import Eliminated, ReducedInformation, information
 from ceres_cal.solve.problem import Problem, Weighting
 from ceres_cal.solve.repeats import AsBuilt
@@ -35,6 +35,7 @@ __all__ = [
     "information",
     "least_of_few",
     "placement_costs",
+    "shifts_to",
     "solve",
     "solve_robustly",
     "solver_version",

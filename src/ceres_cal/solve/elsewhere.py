@@ -6,12 +6,15 @@ minima is the least, nor that there are two.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 
+from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import CalibrationError
+from ceres_cal.model.information import Information
 from ceres_cal.model.parameters import Estimate
+from ceres_cal.model.quantities import difference
 from ceres_cal.observations import Observations
 from ceres_cal.solve.bundle import Solution, solve
 from ceres_cal.solve.problem import Problem
@@ -20,6 +23,8 @@ from ceres_cal.solve.robust import RobustSolution
 _FEW = 300  # equations from which on one minimum was seen: the cases mended had under 200
 _FACTORS = 0.7, 0.85, 1.15, 1.4  # on phi: the other valleys that were seen began within a sixth
 _MOST_ITERATIONS = 30  # of each: along a flat valley the solver creeps for hundreds that change nothing here
+# Share of what the normal equations say that another minimum costs at most: the same one, not quite reached, costs all.
+_OTHER = 0.25
 _LOWER = 1.0  # of twice the cost: rounding is less, and what is no lower than that is as likely
 
 
@@ -43,6 +48,19 @@ def least_of_few(
         least = solve(end.problem, lowest.estimate)
         end = replace(end.moved_to(least.estimate, observations, problem), reduced=None)
     return end, tuple(replace(one, cost=one.cost - least.cost) for one in others)
+
+
+def shifts_to(
+    others: Sequence[Solution], estimate: Estimate, information: Information, half_width: float
+) -> list[Array]:
+    """(K,) from the estimate to each other minimum that costs no more than 95 % intervals reach.
+
+    Args:
+        others: with what they cost beyond the estimate. information: by the model, about the K numbers.
+        half_width: standard deviations from the middle to an end of an interval.
+    """
+    shifts = [(one, difference(one.estimate, estimate, information.keys)) for one in others]
+    return [d for one, d in shifts if 2.0 * one.cost < min(half_width**2, _OTHER * float(d @ information.matrix @ d))]
 
 
 def _elsewhere(problem: Problem, estimate: Estimate) -> Iterator[Solution]:
