@@ -191,7 +191,7 @@ def _normals(observations: Observations, calibration: Calibration) -> tuple[Grou
     there = residuals(observations, problem.sights, estimate)
     equations = write_equations(observations, problem.sights, estimate, there)
     weights = equation_weights(observations, problem.weighting, equations, there).within_sigma
-    normals = group_normals(problem, estimate, equations, weights, (equations.sight, problem.private))
+    normals = group_normals(problem, estimate, problem.sights, problem.private)
     return normals, make_linear_model(problem, estimate, equations, weights)
 
 

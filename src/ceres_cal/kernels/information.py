@@ -21,12 +21,13 @@ def sight_normals(
 
     Args:
         poses: (S, 3, 4) [R t] of cam_from_frame.
-        normals: (last - first, n, n) with n = free + structure + 6: free intrinsics, structure, left perturbation of
-            the pose, each multiplied with its one of `units` (n,); an observation has its robust weight rho'.
+        normals: (last - first, n, n) with n = free + structure + 7: free intrinsics, structure, left perturbation of
+            the pose and residual, each multiplied with its one of `units` (n,); an observation has its robust weight
+            rho'.
     """
     size = len(units)
     optics, order = prepared(optics, optics.intrinsics), order_of_rows(unknowns, len(optics.intrinsics))
-    normal, space = np.empty((size + 1, size + 1)), working_space(optics, len(order.rows))
+    normal, space = np.empty((size, size)), working_space(optics, len(order.rows))
     for v in range(first, last):
         cost = normal_equations(v, optics, poses[v], points, curves, loss, False, order, normal, space)
         if not np.isfinite(cost):

@@ -9,19 +9,17 @@ from functools import cached_property
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices, Mask
+from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.errors import CalibrationError, DegenerateError
 from ceres_cal.lens_choice.forms import Form
 from ceres_cal.lens_choice.kinds import Candidate, Kind
-from ceres_cal.model.equations import Equations, write_equations
 from ceres_cal.model.parameters import Estimate, Options, make_layout
 from ceres_cal.model.priors import gather_priors
 from ceres_cal.model.residuals import Residuals, residuals
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights, gather_sights
 from ceres_cal.solve import Problem, RobustSolution, solve, solve_robustly
-from ceres_cal.solve.left_out import GroupNormals, group_normals
-from ceres_cal.solve.linear_model import equation_weights
+from ceres_cal.solve.left_out import group_normals
 from ceres_cal.start.initialise import LensProfile, edge_over
 
 MOST_ROUNDS = 8  # of a robust solve
@@ -133,12 +131,27 @@ class Seen:
     def _problem(self, options: Options, estimate: Estimate) -> Problem:
         """All inliers weigh the same with every kind: what one of them misses must not weigh less with it."""
         problem = problem_of(self.observations, self.sights, options, estimate)
-        return problem.weighted(replace(self.end.problem.weighting, loss="trivial"))
+        return replace(
+            problem, weighting=replace(self.end.problem.weighting, loss="trivial"), feet=self.end.residuals.feet
+        )
 
     def _near_best(self, forms: tuple[Form, ...], problem: Problem, estimate: Estimate) -> Kind:
-        normals, sigma_px = self._normals(problem, estimate, self._shown(estimate))
+        whole = bool(_placed(self.sights).any())
+        normals = group_normals(problem, estimate, self._groups, problem.private if whole else frozenset())
         reach_px = {name: profile.reach_px for name, profile in self._profiles.items()}
-        return Kind(forms, estimate, normals, sigma_px, reach_px)
+        return Kind(forms, estimate, normals, self._sigma_px, reach_px)
+
+    @cached_property
+    def _groups(self) -> Sights:
+        """A sight of each group: a placement, or, of what stays where it is, a feature."""
+        return self.sights.by_feature(_placed(self.sights))
+
+    @cached_property
+    def _sigma_px(self) -> float:
+        """Of a typical observation."""
+        sights, (points, curves) = self.sights, self.end.problem.weighting.scales
+        inverse = 2.0 * np.sum(1.0 / (points * sights.sigma_px)) + np.sum(1.0 / (curves * sights.curve_sigma_px))
+        return sights.equations / float(inverse)
 
     def _shown(self, estimate: Estimate) -> Residuals:
         """The residuals there; DegenerateError where something is not seen."""
@@ -147,13 +160,6 @@ class Seen:
         if not (known[0].all() and known[1].all()):
             raise DegenerateError("cannot show all that another lens shows")
         return there
-
-    def _normals(self, problem: Problem, estimate: Estimate, there: Residuals) -> tuple[GroupNormals, float]:
-        """The normal equations of each group, and the sigma of a typical observation, px."""
-        equations = write_equations(self.observations, self.sights, estimate, there)
-        weights = equation_weights(self.observations, problem.weighting, equations, there)
-        normals = group_normals(problem, estimate, equations, weights, _groups(equations, problem))
-        return normals, 1.0 / float(np.mean(weights.inverse_sigma))
 
 
 def _placed(sights: Sights) -> Mask:
@@ -170,13 +176,3 @@ def require_groups(sights: Sights) -> None:
         count += len(np.unique(own.point_index)) + len(np.unique(own.track_index))
     if count < _FEWEST_GROUPS:
         raise FewGroupsError("too few views or features to tell lenses apart")
-
-
-def _groups(equations: Equations, problem: Problem) -> tuple[Indices, frozenset[str | None]]:
-    """(E,) number of the placement of each equation, or, of what stays where it is, of the feature; and the private
-    placements that are held out whole.
-    """
-    placed = _placed(equations.sights)
-    feature = 2 * equations.feature + equations.is_curve + 1
-    name = equations.sight * (feature.max() + 1) + np.where(placed[equations.sight], 0, feature)
-    return np.unique(name, return_inverse=True)[1], problem.private if placed.any() else frozenset()

@@ -59,20 +59,26 @@ def _distance_m(estimate: Estimate, kind: str, owner: str) -> float:
 def values_of(estimate: Estimate, keys: Sequence[Key]) -> Array:
     """(P,) the estimate's numbers in the units of the keys; 0 for a turn."""
     values = np.zeros(len(keys))
-    for column, key in enumerate(keys):
-        kind, owner, quantity, unit = key
+    for (kind, owner), columns in columns_by_owner(keys).items():
+        names = [keys[column].quantity for column in columns]
         if kind == "camera":
             camera = estimate.cameras[owner]
-            at = intrinsic_names(camera.lens).index(quantity)
-            values[column] = intrinsics_vector(camera)[at] / intrinsics_scales(camera)[at]
-        elif key.is_structure:
-            values[column] = estimate.structure.values[estimate.structure.names.index(key.structure_name)]
-        elif unit == "m":
-            if kind == "station":
-                position = estimate.stations[owner].cam_from_world.position
-            else:
-                position = estimate.placements[owner].translation
-            values[column] = position[{"x": 0, "y": 1}.get(quantity, 2)]
+            known = intrinsic_names(camera.lens)
+            every = intrinsics_vector(camera) / intrinsics_scales(camera)
+            values[columns] = every[[known.index(name) for name in names]]
+        elif keys[columns[0]].is_structure:
+            at = [estimate.structure.names.index(keys[column].structure_name) for column in columns]
+            values[columns] = estimate.structure.values[at]
+        else:
+            is_station = kind == "station"
+            position = (
+                estimate.stations[owner].cam_from_world.position
+                if is_station
+                else estimate.placements[owner].translation
+            )
+            six = [*position.tolist(), 0.0, 0.0, 0.0]
+            quantities = STATION_QUANTITIES if is_station else PLACEMENT_QUANTITIES
+            values[columns] = [six[quantities.index(name)] for name in names]
     return values
 
 

@@ -189,6 +189,18 @@ class Sights(Sequence["Sights"]):
         numbers = np.flatnonzero(point_sizes + curve_sizes)
         return self._rows(numbers, p, c, point_sizes[numbers], curve_sizes[numbers])
 
+    def by_feature(self, whole: Mask) -> Sights:
+        """Each sight as one of every feature that it shows; those (S,) that are to stay whole as they are."""
+        numbers = np.arange(len(self))
+        sight = np.concatenate([np.repeat(numbers, np.diff(b)) for b in (self.point_bounds, self.curve_bounds)])
+        feature = np.concatenate([2 * self.point_index + 1, 2 * self.track_index + 2])
+        feature[whole[sight]] = 0
+        span = 1 + int(feature.max(initial=0))
+        names, group = np.unique(sight * span + feature, return_inverse=True)
+        p, c = np.split(group, [len(self.point_rows)])
+        sizes = np.bincount(p, minlength=len(names)), np.bincount(c, minlength=len(names))
+        return self._rows(names // span, np.argsort(p, kind="stable"), np.argsort(c, kind="stable"), *sizes)
+
     def renumbered(self, points: Indices, curves: Indices) -> Sights:
         """The sights of some of the observations, by ascending row, as rows of these alone."""
         p, c = (np.full(int(rows.max(initial=-1)) + 1, -1) for rows in (self.point_rows, self.curve_rows))

@@ -18,7 +18,8 @@ def column_of(observations: Observations, name: str) -> AnyArray:
 def frames_of(observations: Observations) -> tuple[tuple[str, ...], Indices]:
     """Names of the frames that show anything, and (N + M,) the frame's number of each observation."""
     views = column_of(observations, "view")
-    names = dict.fromkeys(observations.views[int(view)].frame for view in np.unique(views))
+    filled = np.bincount(views, minlength=len(observations.views)) > 0
+    names = dict.fromkeys(view.frame for view, is_filled in zip(observations.views, filled, strict=True) if is_filled)
     order = {name: number for number, name in enumerate(names)}
     return tuple(names), np.array([order.get(view.frame, -1) for view in observations.views])[views]
 
@@ -30,7 +31,9 @@ def thinned(observations: Observations, most: int, fewest_frames: int = FEWEST_F
         return observations
     names, frame = frames_of(observations)
     count = max(min(fewest_frames, len(names)), int(len(names) * most / total))
-    chosen = np.isin(frame, np.linspace(0, len(names) - 1, count).round())
+    taken = np.zeros(len(names), dtype=bool)
+    taken[np.linspace(0, len(names) - 1, count).round().astype(int)] = True
+    chosen = taken[frame]
     step = max(1, round(np.count_nonzero(chosen) / most))
     masks = np.split(chosen, [len(observations.points)])
     for mask in masks:

@@ -6,7 +6,7 @@ added up over what is shared, in the coordinates of `model.keys`.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, reduce
 from operator import add
@@ -28,7 +28,7 @@ from ceres_cal.solve.costs import NORMAL_NS, kernel_loss
 from ceres_cal.solve.problem import Problem
 
 _ROUNDING = 1e-13  # of a sum over a sight's rows
-_BATCH = 2_000_000  # numbers of normal equations worked on at once
+_BATCH = 250_000  # numbers of normal equations worked on at once: they stay where the processor is quick
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +105,45 @@ def normals_of(sight: Sights, problem: Problem, estimate: Estimate) -> dict[int,
         SolutionError: an observation cannot be projected.
     """
     kinds = enumerate(sight.by_kind)
-    return {kind: _Normals(own, problem, estimate).of(0, 1)[0] for kind, own in kinds if own.equations}
+    return {kind: normals_with_residuals(own, problem, estimate)[0, :-1, :-1] for kind, own in kinds if own.equations}
+
+
+def normals_with_residuals(sights: Sights, problem: Problem, estimate: Estimate) -> Array:
+    """Normal equations (S, K + 1, K + 1) of one camera's sights, each by itself, as in `normals_of`; the last row is
+    that of the residuals.
+
+    Raises:
+        SolutionError: an observation cannot be projected.
+    """
+    return _Normals(sights, problem, estimate).of(0, len(sights))
+
+
+def owned_columns(keys: Sequence[Key]) -> dict[tuple[str, str], Indices]:
+    """(kind, owner) -> where its keys are, those of the structure under ("structure", "")."""
+    columns = {owner: np.array(at, dtype=np.int64) for owner, at in columns_by_owner(keys).items()}
+    structure = [column for column, key in enumerate(keys) if key.is_structure]
+    return columns | {("structure", ""): np.array(structure, dtype=np.int64)}
+
+
+def steps_of(
+    key: SightKey, pose: Array, estimate: Estimate, columns: Mapping[tuple[str, str], Indices]
+) -> tuple[Array, Indices]:
+    """What steps of the shared numbers do to those of a sight (see `normals_of`), (K, P), and which numbers they are.
+
+    Args:
+        pose: (3, 4) cam_from_frame. columns: see `owned_columns`.
+    """
+    world, nothing = estimate.stations[key.station].cam_from_world, np.empty(0, dtype=np.int64)
+    at = [columns.get(("camera", key.camera), nothing), columns["structure", ""]]
+    lead = len(at[0]) + len(at[1])
+    steps = [np.eye(lead + 6)[:, :lead]]
+    if (station := ("station", key.station)) in columns:
+        at.append(columns[station])
+        steps.append(np.vstack([np.zeros((lead, 6)), from_station(pose[None], world)[0]]))
+    if (placement := ("placement", str(key.placement))) in columns and key.placement is not None:
+        at.append(columns[placement])
+        steps.append(np.vstack([np.zeros((lead, 6)), from_placement(pose[None], world)[0]]))
+    return np.hstack(steps), np.concatenate(at)
 
 
 class _Sums:
@@ -114,9 +152,7 @@ class _Sums:
     def __init__(self, problem: Problem, estimate: Estimate) -> None:
         self._problem, self._estimate = problem, estimate
         self._keys = free_keys(estimate, problem.layout, problem.private)
-        self._columns = {owner: np.array(at, dtype=np.int64) for owner, at in columns_by_owner(self._keys).items()}
-        structure = [column for column, key in enumerate(self._keys) if key.is_structure]
-        self._structure = np.array(structure, dtype=np.int64)
+        self._columns = owned_columns(self._keys)
         size = len(self._keys)
         self._matrices, self._leverages = np.zeros((2, size, size)), np.zeros(2)  # of points, of curves
 
@@ -162,13 +198,14 @@ class _Sums:
                 first + place
                 for place in parts_of(last - first, len(sights.points) + len(sights.curve_pixels), NORMAL_NS)
             ]
-            yield poses[first:last], {k: np.concatenate(run_parts(one.of, parts)) for k, one in kernel_of.items()}
+            normals = {kind: _joined(run_parts(one.of, parts))[:, :-1, :-1] for kind, one in kernel_of.items()}
+            yield poses[first:last], normals
 
     def _eliminate(self, sights: Sights) -> Eliminated:
         """The private placements of one station; what is left of their sights is added to the sums."""
         key = sights.keys[0]
         world = self._estimate.stations[key.station].cam_from_world
-        lead = np.concatenate([self._owned("camera", key.camera), self._structure])
+        lead = np.concatenate([self._owned("camera", key.camera), self._owned("structure", "")])
         station = self._owned("station", key.station)
         stacks = []
         for poses, normals in self._normals(sights):
@@ -207,18 +244,13 @@ class _Sums:
 
     def _add(self, key: SightKey, pose: Array, normals: Mapping[int, Array]) -> None:
         """What a sight that nothing is eliminated from says, added to the sums."""
-        world, lead = self._estimate.stations[key.station].cam_from_world, len(next(iter(normals.values()))) - 6
-        at = [self._owned("camera", key.camera), self._structure]
-        chain = [np.eye(lead + 6)[:, :lead]]
-        if len(station := self._owned("station", key.station)):
-            at.append(station)
-            chain.append(np.vstack([np.zeros((lead, 6)), from_station(pose[None], world)[0]]))
-        if key.placement is not None and len(placement := self._owned("placement", key.placement)):
-            at.append(placement)
-            chain.append(np.vstack([np.zeros((lead, 6)), from_placement(pose[None], world)[0]]))
-        steps, everywhere = np.hstack(chain), np.concatenate(at)
+        steps, everywhere = steps_of(key, pose, self._estimate, self._columns)
         for kind, normal in normals.items():
             self._matrices[kind][np.ix_(everywhere, everywhere)] += steps.T @ normal @ steps
+
+
+def _joined(parts: list[Array]) -> Array:
+    return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
 
 def _limits(own: Array) -> Array:
@@ -237,9 +269,9 @@ class _Normals:
         camera = estimate.cameras[sights.keys[0].camera]
         free, structure, weighting = problem.layout.free[sights.keys[0].camera], estimate.structure, problem.weighting
         offsets = len(structure.offsets)
-        units = np.ones(len(free) + offsets + 6)
+        units = np.ones(len(free) + offsets + 7)
         units[: len(free)] = intrinsics_scales(camera)[free]
-        self._size, self._chain = len(units), structure.chain(len(free), 6)
+        self._size, self._chain = len(units), structure.chain(len(free), 7)
         self._arguments = (
             camera_optics(camera),
             kernels.Unknowns(free, offsets),
@@ -251,7 +283,7 @@ class _Normals:
         )
 
     def of(self, first: int, last: int) -> Array:
-        """(n, K, K) of the sights from one number to another.
+        """(n, K + 1, K + 1) of the sights from one number to another, the residuals' row last.
 
         Raises:
             SolutionError: an observation cannot be projected.

@@ -7,7 +7,7 @@ lens is the longer one with coefficients at 0, and needs no solve of its own.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Iterator, Mapping, Set
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -15,13 +15,15 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.spread import known_inverses
-from ceres_cal.model.equations import Equations
 from ceres_cal.model.keys import Key
 from ceres_cal.model.parameters import Estimate
 from ceres_cal.model.quantities import free_keys
-from ceres_cal.solve.linear_model import SINGULAR, Weights, inverse_root, prior_equations, shared_columns
+from ceres_cal.observations.sights import SightKey, Sights
+from ceres_cal.solve.information import normals_with_residuals, owned_columns, steps_of
+from ceres_cal.solve.linear_model import SINGULAR, inverse_root, prior_equations
 from ceres_cal.solve.problem import Problem
 
+_ROUNDING = 1e-12  # of a sum over a group's rows
 _RIDGE = 1e-3  # of everything's information: a group that tells a direction alone cannot be left out
 
 
@@ -103,43 +105,66 @@ class GroupNormals:
         return np.asarray(-self._root @ (self._root.T @ self._slope))
 
 
-def group_normals(
-    problem: Problem,
-    estimate: Estimate,
-    equations: Equations,
-    weights: Weights,
-    groups: tuple[Indices, Collection[str | None]],
-) -> GroupNormals:
+def group_normals(problem: Problem, estimate: Estimate, groups: Sights, alone: Set[str | None]) -> GroupNormals:
     """The normal equations of each group.
 
     Args:
-        groups: (E,) number of the group of each equation, and the private placements that one group alone shows: each
-            is posed from it.
+        groups: a sight is a group; several may have the same pose. alone: the private placements that one group alone
+            shows: each is posed from it.
+
+    Raises:
+        SolutionError: an observation cannot be projected.
     """
-    group, alone = groups
-    keys = tuple(free_keys(estimate, problem.layout, frozenset(alone)))
-    size = len(keys)
-    columns = np.hstack([shared_columns(equations, estimate, keys), equations.pose, equations.residual[:, None]])
-    columns *= (weights.inverse_sigma * weights.used)[:, None]
-    columns[:, -1] *= weights.robust
-    order = np.argsort(group, kind="stable")
-    first = np.concatenate([[0], 1 + np.flatnonzero(np.diff(group[order]))])
-    products = np.array([part.T @ part for part in np.split(columns[order], first[1:])])
-    sizes = np.einsum("gkk->k", products)[:size]
-    is_alone = np.array([key.placement in alone for key in equations.sights.keys])[equations.sight[order[first]]]
-    pose, rest = slice(size, size + 6), np.r_[0:size, size + 6]
-    inverse = known_inverses(products[is_alone, pose, pose], np.full(6, np.inf))
-    across = products[is_alone, pose][:, :, rest]
-    products = products[:, rest[:, None], rest]
-    products[is_alone] -= np.swapaxes(across, 1, 2) @ inverse @ across
+    keys = free_keys(estimate, problem.layout, alone)
+    columns, last = owned_columns(keys), len(keys)
+    products, sizes = np.zeros((len(groups), last + 1, last + 1)), np.zeros(last)
+    poses = estimate.pose_stack(groups.keys)
+    for numbers in _alike(groups, alone):
+        own = groups.take(numbers)
+        whole = normals_with_residuals(own, problem, estimate)
+        steps, at = steps_of(own.keys[0], poses[numbers[0]], estimate, columns)
+        if own.keys[0].placement in alone:
+            steps, at = steps[:, : len(steps) - 6], at[: len(steps) - 6]
+            whole, before = _posed(whole), whole[:, :-7, :-7]
+        else:
+            before = steps.T @ whole[:, :-1, :-1] @ steps
+        sizes[at] += np.einsum("gkk->k", before)
+        chain = np.zeros((whole.shape[1], len(at) + 1))
+        chain[:-1, :-1], chain[-1, -1], at = steps[: len(chain) - 1], 1.0, np.append(at, last)
+        products[np.ix_(numbers, at, at)] = chain.T @ whole @ chain
+    _drop_rounding(columns, sizes, products)
     rows, values = prior_equations(problem, estimate, keys)
     return GroupNormals(
         keys,
         products[:, :-1, :-1],
         products[:, :-1, -1],
         products[:, -1, -1],
-        np.diff([*first, len(group)]),
+        2 * np.diff(groups.point_bounds) + np.diff(groups.curve_bounds),
         rows.T @ rows,
         rows.T @ values,
         sizes + np.sum(rows**2, axis=0),
     )
+
+
+def _alike(groups: Sights, alone: Set[str | None]) -> Iterator[Indices]:
+    """Numbers of the groups that depend on the same numbers in the same way."""
+    every: dict[SightKey | str, list[int]] = {}
+    for number, key in enumerate(groups.keys):
+        every.setdefault(key.camera if key.placement in alone else key, []).append(number)
+    return (np.array(numbers) for numbers in every.values())
+
+
+def _drop_rounding(columns: Mapping[tuple[str, str], Indices], sizes: Array, products: Array) -> None:
+    """Take what is left of a turn that nothing tells, which is rounding of the others, out of sizes and products."""
+    for (kind, _), own in columns.items():
+        for alike in (own[:3], own[3:]) if kind in ("station", "placement") else ():
+            lost = alike[sizes[alike] <= _ROUNDING * np.max(sizes[alike])]
+            sizes[lost], products[:, lost], products[:, :, lost] = 0.0, 0.0, 0.0
+
+
+def _posed(normals: Array) -> Array:
+    """(G, K - 6, K - 6) what normal equations (G, K, K) leave where each pose is at its best."""
+    pose, rest = slice(-7, -1), np.r_[: normals.shape[1] - 7, normals.shape[1] - 1]
+    inverse = known_inverses(normals[:, pose, pose], np.full(6, np.inf))
+    across = normals[:, pose][:, :, rest]
+    return np.asarray(normals[:, rest[:, None], rest] - np.swapaxes(across, 1, 2) @ inverse @ across)

@@ -13,6 +13,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from types import MappingProxyType
 from typing import Any, ClassVar, TypeVar
 
@@ -128,7 +129,7 @@ class Lens(ABC):
     @property
     def names_of_terms(self) -> tuple[str, ...]:
         """The coefficients of the terms that it has besides."""
-        return tuple(name for term, names in self.more_terms.items() if term in self.terms for name in names)
+        return _names_of_terms(type(self), self.terms)
 
     def with_terms(self, terms: Collection[str]) -> Lens:
         """The same model with these terms besides, their coefficients 0 where it has not had them.
@@ -264,6 +265,11 @@ class Lens(ABC):
         times the offset's) with respect to each coefficient as the solver has it, and row 0, phi's, where the offset is
         not proportional to phi.
         """
+
+
+@cache
+def _names_of_terms(model: type[Lens], terms: tuple[str, ...]) -> tuple[str, ...]:
+    return tuple(name for term, names in model.more_terms.items() if term in terms for name in names)
 
 
 _L = TypeVar("_L", bound=Lens)
