@@ -33,11 +33,13 @@ _SHARE_OF_PLACEMENTS = 25
 # Of a lens that says nothing of where it was not seen; they are solved to the end, and tell how smooth it is.
 _ENOUGH_WITHOUT_FORMULA = 100
 _STILL = 0.05  # variances by which a lens that is as smooth as the data say stands off: no number is off by 0.23 sd
-_ROUGH = 1e-3  # relative change of the cost at which the first solve ends
-# The same of every further one: of a lens that is as smooth as the data say, sigmas of a tenth, that is near enough:
-# of 100 000 observations the numbers stand off by a hundredth of their standard deviations.
-_TO_THE_END, _AS_SMOOTH = 1e-14, 1e-9
-_AS_SMOOTH_OF_FEW = 1e-6  # where all of them follow
+# Relative change of the cost at which the first solve ends; of a lens without a formula less: from farther off the next
+# one, whose lens is as smooth as the data say, begins with steps in vain.
+_ROUGH, _ROUGH_WITHOUT_FORMULA = 1e-3, 1e-4
+_TO_THE_END = 1e-14  # the same of every further one
+# Of a lens that is as smooth as the data say, sigmas of a tenth, less is near enough: so many variances may be left,
+# and no number is off by 0.07 of its standard deviations.
+_LEFT_OF_SMOOTH = 5e-3
 _MOST_REFINED = 3
 # Share of the residuals' scale: a rough solve that leaves less is followed by another one at the new scale. A line that
 # is painted aside is told from noise only at a scale near the noise's own.
@@ -111,7 +113,6 @@ class _Rounds:
         observations: Observations,
         usual: tuple[float, float] | None,
         progress: Callable[[Progress], None] | None,
-        precision: float | None = None,
     ) -> None:
         self._problem, self._observations, self._usual, self._progress = problem, observations, usual, progress
         self._redundancy: Redundancy | None = None
@@ -119,7 +120,9 @@ class _Rounds:
         self._scales = (1.0, 1.0)  # of points and of curves that the last rough solve was weighted by
         self._last: tuple[Inliers, Sights] | None = None
         self._no_change = _AT_REST if usual is None else _AT_REST_AGAIN
-        self._precision = precision or (_AS_SMOOTH if problem.options.blank_lens.roughness else _TO_THE_END)
+        self._rough_end, self._end = _ROUGH, _TO_THE_END
+        if problem.options.blank_lens.roughness:
+            self._rough_end, self._end = _ROUGH_WITHOUT_FORMULA, _LEFT_OF_SMOOTH / max(problem.equations, 1)
 
     def to_rest(
         self, state: RobustSolution, most_rounds: int = _MOST_ROUNDS, *, is_near: bool = False
@@ -191,7 +194,7 @@ class _Rounds:
             )
         few = problem.of_sights(_evenly(problem))
         if problem.options.blank_lens.roughness and len(few.sights) < len(problem.sights):
-            of_few = _Rounds(few, self._observations, self._usual, self._progress, _AS_SMOOTH_OF_FEW)
+            of_few = _Rounds(few, self._observations, self._usual, self._progress)
             end = of_few.to_rest(of_few.first(estimate))
             self._problem = replace(self._problem, smoothness=end.problem.smoothness)
             solution = end.solution
@@ -203,7 +206,7 @@ class _Rounds:
 
     def _of_few(self, few: Problem, estimate: Estimate, others_follow: bool) -> Solution:
         """A rough solve; where others follow, which takes time, again at the scale that it left while that falls."""
-        solution = solve(few, estimate, self._progress, precision=_ROUGH, is_near=False)
+        solution = solve(few, estimate, self._progress, precision=self._rough_end, is_near=False)
         for _ in range(_MOST_REFINED if others_follow else 0):
             points, curves = residuals_alone(few.sights, solution.estimate, few.feet).lengths
             scales = median_scales(points / few.sights.sigma_px, curves / few.sights.curve_sigma_px)
@@ -212,14 +215,14 @@ class _Rounds:
             self._scales = scales
             few = few.weighted(replace(few.weighting, point_scale=scales[0], curve_scale=scales[1]))
             estimate, *_ = without_mirrored_poses(few, solution.estimate, frozenset(few.sights.keys))
-            solution = solve(few, estimate, self._progress, precision=_ROUGH, is_near=False)
+            solution = solve(few, estimate, self._progress, precision=self._rough_end, is_near=False)
         return solution
 
     def next(self, state: RobustSolution) -> RobustSolution:
         """One more solve, from where the last one ended, of what was judged to be inliers; with the same rows where
         others are as good.
         """
-        solution = solve(state.problem, state.solution.estimate, self._progress, precision=self._precision)
+        solution = solve(state.problem, state.solution.estimate, self._progress, precision=self._end)
         return self._judged(solution, state.residuals, state.rounds + 1, state.inliers)
 
     def mended(

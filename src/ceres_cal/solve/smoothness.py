@@ -15,7 +15,7 @@ from operator import add
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array
+from ceres_cal.base.spread import known_inverses
 from ceres_cal.model.information import Information
 from ceres_cal.model.keys import Key
 from ceres_cal.model.parameters import Estimate
@@ -71,10 +71,10 @@ def _sigmas(
     pulled = whole @ here
     sigmas = np.array(before)
     least = np.array([form.least for form in forms])
-    ranks = np.array([np.linalg.matrix_rank(form, hermitian=True) for form in every])
+    ranks = np.array([np.linalg.matrix_rank(form.matrix, hermitian=True) for form in forms])
     for _ in range(_STEPS):
         posterior = data + sum(form / sigma**2 for form, sigma in zip(every, sigmas, strict=True))
-        covariance = _inverse(posterior)
+        covariance = known_inverses(posterior, np.full(len(own), np.inf))
         values = covariance @ pulled
         known = ranks - np.array([np.sum(covariance * form) for form in every]) / sigmas**2
         sizes = np.array([values @ form @ values for form in every])
@@ -84,11 +84,3 @@ def _sigmas(
         if done:
             break
     return tuple(sigmas.tolist()), float((values - here) @ posterior @ (values - here))
-
-
-def _inverse(matrix: Array) -> Array:
-    """Of a symmetric matrix at unit diagonal."""
-    scale = 1.0 / np.sqrt(np.maximum(np.diagonal(matrix), 1e-300))
-    return np.asarray(
-        np.linalg.pinv(matrix * scale[:, None] * scale, rcond=1e-13, hermitian=True) * scale[:, None] * scale
-    )

@@ -11,7 +11,6 @@ import numpy as np
 from ceres_cal.base.arrays import Array
 from ceres_cal.scene.lens.spline_kernel import DEGREE, END, INTERVALS
 
-COUNT = INTERVALS + DEGREE - 2  # of the coefficients: value and slope at the axis are 0
 _SAMPLES = 400  # radii up to the end, between which nothing turns
 
 

@@ -12,12 +12,11 @@ import numpy as np
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.scene.lens import spline_kernel
-from ceres_cal.scene.lens.b_splines import COUNT, Growth, bending, first_fall, pieces, profile_columns
+from ceres_cal.scene.lens.b_splines import Growth, bending, first_fall, pieces, profile_columns
 from ceres_cal.scene.lens.base import LinearEquations, Roughness
 from ceres_cal.scene.lens.planar import Planar
-from ceres_cal.scene.lens.spline_kernel import DEGREE, INTERVALS, MOST, TINY, WORK_ROWS
+from ceres_cal.scene.lens.spline_kernel import CONRADY, COUNT, DEGREE, INTERVALS, MOST, TINY, WORK_ROWS
 
-_CONRADY = 3  # terms of the decentring
 _TURNS = 48  # directions, between which nothing turns
 _START_WEIGHT = 1e-4  # of the roughness of a start beside its equations
 # Standard deviations before the data have spoken, in rims: loose, so that a first solve is not held by them. Least
@@ -47,7 +46,7 @@ def _monomials(powers: tuple[int, ...]) -> tuple[_Monomial, ...]:
     """
     every = []
     for power in powers:
-        for k in range(_CONRADY if power == 2 else 0):
+        for k in range(CONRADY if power == 2 else 0):
             names = (f"p{2 * k + 2}", f"p{2 * k + 1}")
             every.append(_Monomial(names, False, k + 1, k + 1, 2.0 / 3.0))
             every.append(_Monomial(names, True, k + 2, k, 1.0 / 3.0))
@@ -240,12 +239,14 @@ class Spline(Planar):
         """See `spline_kernel`."""
         names = self.names
         rows = [
-            [4.0 + names.index(one.names[0]), float(one.turned), float(one.m), float(one.n), one.weight]
+            (4.0 + names.index(one.names[0]), float(one.m), float(one.n))
             for one in _monomials(self.powers)
+            if not one.names[0].startswith("p")
         ]
-        head = [0.0, float(len(rows)), float(max((one.m for one in _monomials(self.powers)), default=0)), 0.0]
+        conrady = 4.0 + names.index("p2") if 2 in self.powers else 0.0
+        head = [0.0, float(len(rows)), float(max(self.powers, default=0)), conrady]
         room = np.zeros(INTERVALS * (DEGREE + 1))
-        return np.concatenate([head, pieces().ravel(), room, np.array(rows).ravel()])
+        return np.concatenate([head, np.swapaxes(pieces(), 1, 2).ravel(), room, np.array(rows).ravel()])
 
     prepare = staticmethod(spline_kernel.prepare)
     distort_chunk = staticmethod(spline_kernel.distort)

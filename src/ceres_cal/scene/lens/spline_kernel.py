@@ -1,8 +1,9 @@
 """The spline lens for the solve: plain numbers and loops, which the kernels compile.
 
-The state is the limit, how many monomials and how many powers there are, and a spare; the table of the B-splines'
-pieces (see `b_splines`); the profile's polynomial on each interval; of each monomial the place of its coefficient among
-the intrinsics, whether that is conjugated, m, n and weight.
+The state is the limit, how many monomials there are and the highest power of the place in them, and where among the
+intrinsics Conrady's decentring is (0: nowhere); the table of the B-splines' pieces (see `b_splines`), coefficients by
+power, those of all pieces of an interval side by side; the profile's polynomial on each interval; of each monomial the
+place of its coefficient among the intrinsics, m and n.
 """
 
 from __future__ import annotations
@@ -12,11 +13,14 @@ from typing import Any
 import numpy as np
 
 INTERVALS, DEGREE = 8, 5
+CONRADY = 3  # terms of the decentring
+COUNT = INTERVALS + DEGREE - 2  # of the B-splines: value and slope at the axis are 0
 MOST = 9  # powers across the radius
 END = 2.0  # rims: nothing is observed farther out
 TINY = 1e-150
 HEAD = 4  # of the state
 TABLE = INTERVALS * (DEGREE + 1) ** 2
+MONOMIALS = HEAD + TABLE + INTERVALS * (DEGREE + 1)
 WORK_ROWS = 3 + 2 * (MOST + 1) + 2
 
 
@@ -27,13 +31,13 @@ def prepare(intrinsics: Any, unit: float, state: Any) -> None:
             total = 0.0
             for a in range(DEGREE + 1):
                 if j + a >= 2:
-                    total += intrinsics[5 + j + a - 2] * state[HEAD + ((j * (DEGREE + 1)) + a) * (DEGREE + 1) + d]
+                    total += intrinsics[5 + j + a - 2] * state[HEAD + (j * (DEGREE + 1) + d) * (DEGREE + 1) + a]
             state[HEAD + TABLE + j * (DEGREE + 1) + d] = total
     rim = intrinsics[4] if intrinsics[4] > 0.0 else 1.0
     state[0] = END
     for k in range(1, 8 * INTERVALS + 1):
         u = k / (8.0 * INTERVALS)
-        if rim + _piecewise(state, u)[1] <= 0.0:
+        if rim + _profile(state, u)[1] <= 0.0:
             state[0] = u
             break
 
@@ -43,35 +47,29 @@ def distort(n: int, intrinsics: Any, unit: float, state: Any, rays: Any, image: 
     limit = state[0]
     phi = intrinsics[0]
     rim = intrinsics[4] if intrinsics[4] > 0.0 else 1.0
-    most = int(state[2])
     scale = 2.0 * phi / (unit * rim)
     for i in range(n):
         x, y, z = rays[0, i], rays[1, i], rays[2, i]
         s = scale / (np.sqrt(x * x + y * y + z * z) + z)
         work[0, i], work[1, i] = s * x, s * y
         work[2, i] = np.sqrt(work[0, i] * work[0, i] + work[1, i] * work[1, i])
-        work[3, i], work[4, i] = 1.0, 0.0
-    for k in range(1, most + 1):
-        for i in range(n):
-            a, b = work[1 + 2 * k, i], work[2 + 2 * k, i]
-            work[3 + 2 * k, i] = a * work[0, i] - b * work[1, i]
-            work[4 + 2 * k, i] = a * work[1, i] + b * work[0, i]
-    for k in range(6):
-        for i in range(n):
-            image[k, i] = 0.0
+    _add_conrady(n, intrinsics, int(state[3]), work, image)
+    if state[1] > 0.0:
+        _raise_powers(n, int(state[2]), work)
     for k in range(int(state[1])):
-        row = HEAD + TABLE + INTERVALS * (DEGREE + 1) + 5 * k
-        _add_monomial(n, intrinsics, state[row : row + 5], work, image)
+        row = MONOMIALS + 3 * k
+        _add_monomial(n, intrinsics, int(state[row]), int(state[row + 1]), int(state[row + 2]), work, image)
+    for i in range(n):  # by itself: its look-up keeps the rest from SIMD registers
+        image[5, i], image[6, i] = _profile(state, work[2, i])
     good = True
     for i in range(n):
         x, y, z = rays[0, i], rays[1, i], rays[2, i]
-        u, v, radius = work[0, i], work[1, i], work[2, i]
-        value, slope = _piecewise(state, radius)
-        stretch = value / (radius + TINY)
+        u, v, radius, slope = work[0, i], work[1, i], work[2, i], image[6, i]
+        stretch = image[5, i] / (radius + TINY)
         bend = (slope - stretch) / (radius * radius + TINY)
         # Derivatives by q (rows 2, 3) and by its conjugate (rows 4, 5) become those by x and y.
-        first_x, first_y = image[2, i] + image[4, i], image[3, i] + image[5, i]
-        second_x, second_y = image[2, i] - image[4, i], image[3, i] - image[5, i]
+        first_x, first_y = image[2, i] + image[4, i], image[3, i] + image[7, i]
+        second_x, second_y = image[2, i] - image[4, i], image[3, i] - image[7, i]
         jxx, jyy = rim + stretch + bend * u * u + first_x, rim + stretch + bend * v * v + second_x
         jxy, jyx = bend * u * v - second_y, bend * u * v + first_y
         length = np.sqrt(x * x + y * y + z * z)
@@ -92,79 +90,133 @@ def distort(n: int, intrinsics: Any, unit: float, state: Any, rays: Any, image: 
 
 def differentiate(n: int, intrinsics: Any, unit: float, state: Any, image: Any, work: Any, jacobian: Any) -> None:
     """See `Lens.differentiate_chunk`."""
-    phi, aspect, last = intrinsics[0], intrinsics[1], len(intrinsics)
+    phi, aspect = intrinsics[0], intrinsics[1]
     rim = intrinsics[4] if intrinsics[4] > 0.0 else 1.0
     for i in range(n):
         jacobian[0, 0, i], jacobian[0, 1, i] = work[2 * MOST + 5, i], aspect * work[2 * MOST + 6, i]
         jacobian[4, 0, i] = unit * work[0, i] - phi * work[2 * MOST + 5, i] / rim
         jacobian[4, 1, i] = aspect * (unit * work[1, i] - phi * work[2 * MOST + 6, i] / rim)
-    for k in range(5, last):
+        outward = unit / (work[2, i] + TINY)
+        work[2 * MOST + 5, i], work[2 * MOST + 6, i] = outward * work[0, i], aspect * outward * work[1, i]
+    _weigh_pieces(n, state, work, jacobian)
+    for k in range(5, 5 + COUNT):
+        own, x, y = jacobian[k], work[2 * MOST + 5], work[2 * MOST + 6]
         for i in range(n):
-            jacobian[k, 0, i], jacobian[k, 1, i] = 0.0, 0.0
-    for i in range(n):
-        radius = work[2, i]
-        inside = min(radius, 1.0)
-        j = min(int(inside * INTERVALS), INTERVALS - 1)
-        t = inside * INTERVALS - j
-        x, y = unit * work[0, i] / (radius + TINY), aspect * unit * work[1, i] / (radius + TINY)
-        for a in range(DEGREE + 1):
-            if j + a >= 2:
-                row = HEAD + (j * (DEGREE + 1) + a) * (DEGREE + 1)
-                value = state[row + DEGREE]
-                for d in range(DEGREE - 1, -1, -1):
-                    value = value * t + state[row + d]
-                if radius > 1.0:
-                    value += INTERVALS * (radius - 1.0) * _polynomial(state, row, t)[1]
-                jacobian[3 + j + a, 0, i], jacobian[3 + j + a, 1, i] = value * x, value * y
+            value = own[0, i]
+            own[0, i], own[1, i] = value * x[i], value * y[i]
+    at = int(state[3])
+    for k in range(CONRADY if at > 0 else 0):
+        p, q = jacobian[at + 2 * k], jacobian[at + 2 * k + 1]
+        for i in range(n):
+            u, v = work[0, i], work[1, i]
+            x, y, s = u * u - v * v, 2.0 * u * v, u * u + v * v
+            size = unit / 3.0
+            for _ in range(k):
+                size *= s
+            p[0, i], p[1, i] = size * (2.0 * s + x), aspect * size * y
+            q[0, i], q[1, i] = size * y, aspect * size * (2.0 * s - x)
     for k in range(int(state[1])):
-        row = HEAD + TABLE + INTERVALS * (DEGREE + 1) + 5 * k
-        at, m, p, weight = int(state[row]), int(state[row + 2]), int(state[row + 3]), unit * state[row + 4]
-        sign = -1.0 if state[row + 1] > 0.0 else 1.0
+        row = MONOMIALS + 3 * k
+        at, m, p = int(state[row]), int(state[row + 1]), int(state[row + 2])
         for i in range(n):
             a, b, c, d = work[3 + 2 * m, i], work[4 + 2 * m, i], work[3 + 2 * p, i], work[4 + 2 * p, i]
-            x, y = weight * (a * c + b * d), weight * (b * c - a * d)
-            jacobian[at, 0, i] += x
-            jacobian[at, 1, i] += aspect * y
-            jacobian[at + 1, 0, i] -= sign * y
-            jacobian[at + 1, 1, i] += sign * aspect * x
+            x, y = unit * (a * c + b * d), unit * (b * c - a * d)
+            jacobian[at, 0, i], jacobian[at, 1, i] = x, aspect * y
+            jacobian[at + 1, 0, i], jacobian[at + 1, 1, i] = -y, aspect * x
 
 
-def _polynomial(state: Any, row: int, t: float) -> tuple[float, float]:
-    """Value and slope at t of a polynomial of the state."""
-    value, slope = state[row + DEGREE], 0.0
+def _weigh_pieces(n: int, state: Any, work: Any, jacobian: Any) -> None:
+    """The B-splines at each radius, straight on beyond the last knot, to the first of their rows' two components."""
+    for k in range(5, 5 + COUNT):
+        for i in range(n):
+            jacobian[k, 0, i] = 0.0
+    for i in range(n):
+        j, t = _place(work[2, i])
+        row = HEAD + j * (DEGREE + 1) ** 2
+        for a in range(DEGREE + 1):
+            if j + a >= 2:
+                value = state[row + DEGREE * (DEGREE + 1) + a]
+                for d in range(DEGREE - 1, -1, -1):
+                    value = value * t + state[row + d * (DEGREE + 1) + a]
+                jacobian[3 + j + a, 0, i] = value
+    for i in range(n):
+        beyond = work[2, i] - 1.0
+        if beyond > 0.0:
+            for a in range(DEGREE + 1):
+                row = HEAD + (INTERVALS - 1) * (DEGREE + 1) ** 2 + a
+                jacobian[2 + INTERVALS + a, 0, i] += INTERVALS * beyond * _polynomial(state, row, DEGREE + 1, 1.0)[1]
+
+
+def _place(u: float) -> tuple[int, float]:
+    """The interval of a radius, and how far into it that lies."""
+    inside = min(u, 1.0) * INTERVALS
+    j = min(int(inside), INTERVALS - 1)
+    return j, inside - j
+
+
+def _polynomial(state: Any, row: int, step: int, t: float) -> tuple[float, float]:
+    """Value and slope at t of a polynomial of the state, whose coefficients are so far apart."""
+    value, slope = state[row + DEGREE * step], 0.0
     for d in range(DEGREE - 1, -1, -1):
         slope = slope * t + value
-        value = value * t + state[row + d]
+        value = value * t + state[row + d * step]
     return value, slope
 
 
-def _piecewise(state: Any, u: float) -> tuple[float, float]:
+def _profile(state: Any, u: float) -> tuple[float, float]:
     """G and its slope, straight on beyond the last knot."""
-    inside = min(u, 1.0)
-    j = min(int(inside * INTERVALS), INTERVALS - 1)
-    value, slope = _polynomial(state, HEAD + TABLE + j * (DEGREE + 1), inside * INTERVALS - j)
+    j, t = _place(u)
+    value, slope = _polynomial(state, HEAD + TABLE + j * (DEGREE + 1), 1, t)
     return value + INTERVALS * slope * max(u - 1.0, 0.0), INTERVALS * slope
 
 
-def _add_monomial(n: int, intrinsics: Any, one: Any, work: Any, image: Any) -> None:
-    """c q^m conj(q)^n added to the image's rows 0 and 1, its derivatives by q and its conjugate to 2, 3 and 4, 5."""
-    at, m, p = int(one[0]), int(one[2]), int(one[3])
-    real = one[4] * intrinsics[at]
-    imaginary = one[4] * (-intrinsics[at + 1] if one[1] > 0.0 else intrinsics[at + 1])
+def _add_conrady(n: int, intrinsics: Any, at: int, work: Any, image: Any) -> None:
+    """(2 s C(s) + q^2 conj(C(s))) / 3 with s = |q|^2 and C its three terms, to the image's rows 0 and 1; its
+    derivatives by q and its conjugate to rows 2, 3 and 4, 7.
+    """
+    a0, b0, a1, b1, a2, b2 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    if at > 0:
+        a0, b0 = intrinsics[at] / 3.0, intrinsics[at + 1] / 3.0
+        a1, b1 = intrinsics[at + 2] / 3.0, intrinsics[at + 3] / 3.0
+        a2, b2 = intrinsics[at + 4] / 3.0, intrinsics[at + 5] / 3.0
+    for i in range(n):
+        u, v = work[0, i], work[1, i]
+        s, x, y = u * u + v * v, u * u - v * v, 2.0 * u * v
+        a, b = a0 + s * (a1 + s * a2), b0 + s * (b1 + s * b2)
+        da, db = a1 + 2.0 * s * a2, b1 + 2.0 * s * b2
+        image[0, i], image[1, i] = 2.0 * s * a + a * x + b * y, 2.0 * s * b + a * y - b * x
+        c, d = 2.0 * (a + s * da), 2.0 * (b + s * db)
+        image[2, i] = c * u + d * v + s * (da * u + db * v) + 2.0 * (a * u + b * v)
+        image[3, i] = d * u - c * v + s * (da * v - db * u) + 2.0 * (a * v - b * u)
+        c, d = c + da * x + db * y, d + da * y - db * x
+        image[4, i], image[7, i] = c * u - d * v, c * v + d * u
+
+
+def _raise_powers(n: int, most: int, work: Any) -> None:
+    """Powers of the place from 0 to `most`, from the work's row 3 on."""
+    for i in range(n):
+        work[3, i], work[4, i] = 1.0, 0.0
+    for k in range(1, most + 1):
+        for i in range(n):
+            a, b = work[1 + 2 * k, i], work[2 + 2 * k, i]
+            work[3 + 2 * k, i] = a * work[0, i] - b * work[1, i]
+            work[4 + 2 * k, i] = a * work[1, i] + b * work[0, i]
+
+
+def _add_monomial(n: int, intrinsics: Any, at: int, m: int, p: int, work: Any, image: Any) -> None:
+    """c q^m conj(q)^p in the same way."""
+    real, imaginary = intrinsics[at], intrinsics[at + 1]
+    before, under = max(m - 1, 0), max(p - 1, 0)
     for i in range(n):
         a, b, c, d = work[3 + 2 * m, i], work[4 + 2 * m, i], work[3 + 2 * p, i], work[4 + 2 * p, i]
         x, y = a * c + b * d, b * c - a * d
         image[0, i] += real * x - imaginary * y
         image[1, i] += real * y + imaginary * x
-    if m > 0:
-        for i in range(n):
-            a, b, c, d = work[1 + 2 * m, i], work[2 + 2 * m, i], work[3 + 2 * p, i], work[4 + 2 * p, i]
-            x, y = m * (a * c + b * d), m * (b * c - a * d)
-            image[2, i] += real * x - imaginary * y
-            image[3, i] += real * y + imaginary * x
-    if p > 0:
-        for i in range(n):
-            a, b, c, d = work[3 + 2 * m, i], work[4 + 2 * m, i], work[1 + 2 * p, i], work[2 + 2 * p, i]
-            x, y = p * (a * c + b * d), p * (b * c - a * d)
-            image[4, i] += real * x - imaginary * y
-            image[5, i] += real * y + imaginary * x
+        e, f = m * work[3 + 2 * before, i], m * work[4 + 2 * before, i]
+        x, y = e * c + f * d, f * c - e * d
+        image[2, i] += real * x - imaginary * y
+        image[3, i] += real * y + imaginary * x
+        e, f = p * work[3 + 2 * under, i], p * work[4 + 2 * under, i]
+        x, y = a * e + b * f, b * e - a * f
+        image[4, i] += real * x - imaginary * y
+        image[7, i] += real * y + imaginary * x
