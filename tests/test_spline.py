@@ -17,6 +17,7 @@ from ceres_cal.base.errors import InputError
 from ceres_cal.base.transforms import Pose
 from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
+from ceres_cal.diagnostics import diagnose
 from ceres_cal.formats import export
 from ceres_cal.model.parameters import Options
 from ceres_cal.observations import NO_CURVES, Observations, Points, View, taken
@@ -164,3 +165,17 @@ def test_a_real_fisheye_to_93_degrees(real_data: Path) -> None:
     observations = Observations(board, sizes, views, points, NO_CURVES)
     plain = Options(lens="spline", free_aspect=True, loss="trivial", reject_sigma=1e9)
     assert calibrate(observations, plain).fit.points_rms_px < 0.472  # measured 0.468
+
+
+def test_what_is_finer_than_its_knots_is_named() -> None:
+    """phi, the slope at the axis, is then 33 px off with 12 stated, though rays are right to a pixel."""
+    scene = scenes.MIXES["boards"]("spline")
+    (camera,) = scene.cameras.values()
+    plain = simulate(scene, Disturbance(points_sigma_px=0.3), 1).observations
+    offsets = camera.offsets(plain.points.pixels)
+    radius = np.linalg.norm(offsets, axis=1)
+    waves = 0.5 * (1.0 - np.cos(10.0 * np.pi * radius / radius.max()))
+    wavy = replace(plain.points, pixels=plain.points.pixels + offsets * (waves / radius)[:, None])
+    for seen, expected in ((plain, 0), (replace(plain, points=wavy), 1)):
+        found = diagnose(calibrate(seen, Options(lens="spline")), seen).findings
+        assert [one.kind for one in found].count("radius") == expected

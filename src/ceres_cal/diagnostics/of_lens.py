@@ -7,7 +7,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array
+from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.diagnostics.diagnostic import Case, Evidence, ScoreTest, Words
 from ceres_cal.diagnostics.findings import SMALL, amounts
 from ceres_cal.diagnostics.scores import Family
@@ -15,6 +15,9 @@ from ceres_cal.model.parameters import intrinsic_names, unit_px
 from ceres_cal.scene.lens import LENSES, Lens
 
 _RADIAL_BASIS = 3  # powers of the radius past those of the lens: enough for any smooth trend that one more power mends
+# Half waves over what was observed, past a lens without a formula: longer ones it follows, of shorter ones each has few
+# observations.
+_WAVES = range(5, 25)
 
 
 class Radius(ScoreTest):
@@ -24,15 +27,25 @@ class Radius(ScoreTest):
     absorbed = True
 
     def families(self, case: Case) -> Iterator[Family]:
-        columns = np.zeros((len(case.equations), _RADIAL_BASIS))
+        columns = np.zeros((len(case.equations), max(_RADIAL_BASIS, len(_WAVES))))
         for number, name in enumerate(case.cameras):
             own = case.camera == number
+            if case.estimate.cameras[name].lens.roughness:
+                columns[own, : len(_WAVES)] = _waves(case, name, own)
+                continue
             for k, power in enumerate(_missing_powers(case, name)[:_RADIAL_BASIS]):
                 columns[own, k] = _radial_column(case, name, power)[own]
         yield Family(self.kind, columns, case.camera, case.cameras)
 
     def words(self, evidence: Evidence) -> Words:
         case, name, own = evidence.case, evidence.score.subject, evidence.case.camera == evidence.score.number
+        if case.estimate.cameras[name].lens.roughness:
+            return Words(
+                f"camera {name!r}: residuals follow the radius, up to {evidence.most_px(own):.2f} px "
+                f"({evidence.size}): the lens is finer than its knots, and phi, the slope at its axis, may be off by "
+                "more than its standard deviation",
+                "rays are about as wrong as those pixels; for phi by itself look at a lens that has a formula, too",
+            )
         powers = _missing_powers(case, name)
         columns = np.column_stack([_radial_column(case, name, power) * own for power in powers])
         decreases = evidence.others.decreases(columns)
@@ -87,14 +100,25 @@ def _offsets(case: Case, camera: str) -> Array:
     return one.offsets(case.equations.pixel) / unit_px(one)
 
 
-def _radial_column(case: Case, camera: str, power: int) -> Array:
-    """(E,) px per unit of a coefficient more in the lens's polynomial, scaled to be of order one."""
-    one, equations = case.estimate.cameras[camera], case.equations
+def _outward(case: Case, camera: str) -> tuple[Array, Array]:
+    """(E,) radius of every predicted pixel, in half image diagonals, and what a px away from the centre does to it."""
     offsets = _offsets(case, camera)
     radius = np.maximum(np.linalg.norm(offsets, axis=1), 1e-12)
-    outward = np.sum(equations.direction * offsets * (1.0, one.aspect), axis=1) / radius
-    growth = one.lens.radial_change(one.offsets(equations.pixel), one.phi, unit_px(one), power)
-    return np.asarray(outward * growth)
+    along = np.sum(case.equations.direction * offsets * (1.0, case.estimate.cameras[camera].aspect), axis=1)
+    return radius, np.asarray(along / radius)
+
+
+def _radial_column(case: Case, camera: str, power: int) -> Array:
+    """(E,) px per unit of a coefficient more in the lens's polynomial, scaled to be of order one."""
+    one = case.estimate.cameras[camera]
+    growth = one.lens.radial_change(one.offsets(case.equations.pixel), one.phi, unit_px(one), power)
+    return np.asarray(_outward(case, camera)[1] * growth)
+
+
+def _waves(case: Case, camera: str, own: Mask) -> Array:
+    """(E of its own, waves) px per px of displacements along the radius that go up and down."""
+    radius, outward = (column[own, None] for column in _outward(case, camera))
+    return np.asarray(outward * np.cos(np.pi * np.array(_WAVES) * radius / np.max(radius, initial=1e-12)))
 
 
 class Decentring(ScoreTest):
