@@ -229,8 +229,10 @@ class LensProfile:
     @classmethod
     def of(cls, camera: Camera, reach_px: float) -> LensProfile:
         """A camera's up to some radius."""
-        r = _RADII * reach_px
-        rays = camera.lens.undistort(np.column_stack([r, np.zeros_like(r)]), camera.phi)
+        r, lens = _RADII * reach_px, camera.lens
+        across = {*lens.decentring, *lens.more_terms.get("tangential", ())}
+        lens = lens.with_values([0.0 if name in across else lens.coefficients[name] for name in lens.names])
+        rays = lens.undistort(np.column_stack([r, np.zeros_like(r)]), camera.phi)
         angles = np.arctan2(rays[:, 0], rays[:, 2])
         known = np.isfinite(angles)
         return cls(r[known], angles[known])

@@ -9,7 +9,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array
+from ceres_cal.base.arrays import AnyArray, Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.scene.lens import spline_kernel
 from ceres_cal.scene.lens.b_splines import Growth, bending, first_fall, pieces, profile_columns
@@ -209,11 +209,18 @@ class Spline(Planar):
         u = np.maximum(np.hypot(flat[:, 0], flat[:, 1]), TINY)
         outward = 1.0 + self._profile.bent(u)[0] / u
         answer = flat * outward[:, None]
-        q = flat[:, 0] + 1j * flat[:, 1]
+        q, conjugate = self._raised(flat[:, 0] + 1j * flat[:, 1])
         for one, c in self._across:
-            z = c * q**one.m * np.conj(q) ** one.n
+            z = c * q[one.m] * conjugate[one.n]
             answer += np.column_stack([z.real, z.imag])
         return answer
+
+    def _raised(self, q: AnyArray) -> tuple[list[AnyArray], list[AnyArray]]:
+        """Powers of complex places (N,) and of their conjugates, from 0 as far as displacements across have them."""
+        powers = [np.ones_like(q)]
+        for _ in range(max((max(one.m, one.n) for one, _ in self._across), default=0)):
+            powers.append(powers[-1] * q)
+        return powers, [np.conj(one) for one in powers]
 
     def _jacobian(self, flat: Array) -> tuple[Array, Array, Array, Array]:
         x, y = flat[:, 0], flat[:, 1]
@@ -221,13 +228,13 @@ class Spline(Planar):
         value, slope = self._profile.bent(u)
         stretch = value / u
         bend = (slope - stretch) / (u * u)
-        q = x + 1j * y
-        first, second = np.zeros_like(q), np.zeros_like(q)  # derivatives by q and by its conjugate
+        q, conjugate = self._raised(x + 1j * y)
+        first, second = np.zeros_like(q[0]), np.zeros_like(q[0])  # derivatives by q and by its conjugate
         for one, c in self._across:
             if one.m:
-                first += c * one.m * q ** (one.m - 1) * np.conj(q) ** one.n
+                first += c * one.m * q[one.m - 1] * conjugate[one.n]
             if one.n:
-                second += c * one.n * q**one.m * np.conj(q) ** (one.n - 1)
+                second += c * one.n * q[one.m] * conjugate[one.n - 1]
         both, other = first + second, first - second
         xx, yy = 1.0 + stretch + bend * x * x + both.real, 1.0 + stretch + bend * y * y + other.real
         return xx, bend * x * y - other.imag, bend * x * y + both.imag, yy
