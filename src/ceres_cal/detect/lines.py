@@ -122,14 +122,15 @@ def search(
     far = reach_px + float(np.max(width_px)) + _BAND_PX + 2.0
     steps = np.arange(-np.ceil(far / _SEARCH_STEP_PX), np.ceil(far / _SEARCH_STEP_PX) + 1.0) * _SEARCH_STEP_PX
     light = np.mean([_along_normals(grey, course, steps, shift) for shift in (-2.0, 0.0, 2.0)], axis=0)
-    total = np.cumsum(np.column_stack([np.zeros(len(light)), light]), axis=1)
+    # Between steps, not of them: a mean must lie as far to one side of its place as to the other.
+    total = np.cumsum(np.pad(0.5 * (light[:, 1:] + light[:, :-1]), ((0, 0), (1, 0))), axis=1)
 
     def mean(low: Array, high: Array) -> Array:
         """(N, S) mean light from `low` to `high` (N,) px beyond each step."""
         first, last = (np.round(edge / _SEARCH_STEP_PX).astype(int) for edge in (low, high))
         places = np.arange(len(steps))
-        a = np.clip(places + first[:, None], 0, len(steps) - 1)
-        b = np.clip(places + np.maximum(last, first + 1)[:, None], a + 1, len(steps))
+        a = np.clip(places + first[:, None], 0, len(steps) - 2)
+        b = np.clip(places + last[:, None], a + 1, len(steps) - 1)
         rows = np.arange(len(light))[:, None]
         return np.asarray((total[rows, b] - total[rows, a]) / (b - a))
 
