@@ -12,7 +12,7 @@ from ceres_cal.base.arrays import Array, Array32
 from ceres_cal.base.errors import CalibrationError
 from ceres_cal.calibrating import calibrate
 from ceres_cal.detect.courses import Course, clear_px, predict
-from ceres_cal.detect.lines import SPACING_PX, Lines, measure, search, window_px
+from ceres_cal.detect.lines import SPACING_PX, Lines, measure, search
 from ceres_cal.detect.registration import nearness, shifted
 from ceres_cal.model.parameters import Options, intrinsic_names
 from ceres_cal.observations import Observations, Prior
@@ -309,8 +309,8 @@ class _Tracker:
 
     def measured(self, camera: Camera) -> Lines:
         course = predict(self.target, camera, self.curves, SPACING_PX, SPACING_PX)
-        clear = clear_px(self.target, camera, course, self.curves) > window_px(course)
-        return measure(self.grey, course.take(clear), _LAST_REACH_PX)
+        clear = clear_px(self.target, camera, course, self.curves)
+        return measure(self.grey, course, _LAST_REACH_PX, clear)
 
     def _observed(self, lines: Lines, camera: Camera) -> Observations:
         rows = lines.found
