@@ -258,7 +258,8 @@ class _Tracker:
     def with_best_lens(self, followed: Followed) -> Followed:
         """What is found when the lines are predicted with the kind of lens that suits them best.
 
-        A polynomial that is a pixel off bends what crossings are extrapolated along.
+        A polynomial that is a pixel off bends what crossings are extrapolated along, and one that folds in the picture
+        does so where nothing was measured.
         """
         lines, fits = followed.lines, []
         known = tuple(prior for prior in self.free.priors if prior.dimension)
@@ -274,7 +275,7 @@ class _Tracker:
             fits.append((calibration.fit.curve_scale * len(lines.found) / calibration.fit.curves, calibration))
         if not fits:
             return followed
-        best = min(fits, key=lambda fit: fit[0])[1]
+        best = min(fits, key=lambda fit: (fit[1].station().folds, fit[0]))[1]
         camera, target = best.station(), best.targets[TARGET]
         lines = replace(self, target=target).measured(camera)
         moved = _moved_px(followed.camera, camera, lines.course.pixels)
