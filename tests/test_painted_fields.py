@@ -193,6 +193,22 @@ def test_a_photograph_of_another_league(tmp_path: Path, capsys: pytest.CaptureFi
     assert len(truth) >= 4
 
 
+def test_a_real_photograph_that_was_stretched(
+    real_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Its field is painted by hand, and its pixels are higher than wide."""
+    path, out = str(real_data / "vss_overhead_robocin" / "test_frame.png"), str(tmp_path / "o.json")
+    command = ["detect", "field", path, "--target", "vss-3", "--auto", "--facing", "LeftGoalLine=left", "-o", out]
+    assert main([*command, "--json"]) == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["stretched"] and 0.945 < answer["found"][0]["aspect"] < 0.97  # 0.958; circle: 185 px high, 193 wide
+    observations = Observations.load(out)
+    names = [observations.targets["field"].point_names[number] for number in observations.points.feature]
+    clicked = {"TopLeftGoalAreaCorner": (75, 148), "BottomRightGoalAreaCorner": (656, 467)}
+    away = [np.linalg.norm(observations.points.pixels[names.index(name)] - place) for name, place in clicked.items()]
+    assert max(away) < 5.0  # 1.2 px
+
+
 def _towards(seen: Camera) -> str:
     left, right = seen.project([[-0.7, 0.0, 0.0], [0.7, 0.0, 0.0]])
     return "left" if left[0] < right[0] else "right"

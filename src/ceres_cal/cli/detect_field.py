@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 _CORNER = "TopLeftCorner=102,88"
 _FACING = "LeftGoalLine=top"
+_SQUARE = 0.005  # of fy / fx: those of cameras are nearer to 1
 
 
 def _add_arguments(parser: ArgumentParser) -> None:
@@ -253,6 +254,7 @@ def _data(detections: FieldDetections, output: Path) -> dict[str, Any]:
         "curves": len(detections.observations.curves),
         "lengths_m": {prior.quantity: prior.value[0] for prior in detections.observations.priors if prior.dimension},
         "found": [_image_data(path, detections) for path in detections.found],
+        "stretched": any(_stretched(one.camera) for one in detections.found.values()),
         "missed": missed_data(detections.missed),
     }
 
@@ -270,10 +272,17 @@ def _image_data(path: str, detections: FieldDetections) -> dict[str, Any]:
         "not_as_drawn": list(detections.found[path].built.words()),
         "lacking": list(detections.found[path].lacking),
     }
+    if _stretched(camera := detections.found[path].camera):
+        data["aspect"] = camera.aspect
     if path in detections.searched:
         searched = detections.searched[path]
         data["searched"] = {"ways": searched.ways, "settled_by": searched.chosen_by or None}
     return data
+
+
+def _stretched(camera: Camera) -> bool:
+    """Whether its pixels are farther from square than those of cameras."""
+    return abs(camera.aspect - 1.0) > _SQUARE
 
 
 def _text(data: dict[str, Any]) -> str:
@@ -293,6 +302,12 @@ def _text(data: dict[str, Any]) -> str:
     ]
     lines += [
         f"{one['image']}: found without a start, {_ways(one['searched'])}" for one in data["found"] if "searched" in one
+    ]
+    lines += [
+        f"{one['image']}: its pixels are not square, fy / fx is {one['aspect']:.3f}: was the picture stretched? Give "
+        "the original, or let it be solved for (`calibrate --free-aspect`)"
+        for one in data["found"]
+        if "aspect" in one
     ]
     lines += [f"{one['image']}: {words}" for one in data["found"] for words in one["not_as_drawn"]]
     lines += [f"{one['image']}: no {', '.join(one['lacking'])} to be seen" for one in data["found"] if one["lacking"]]

@@ -70,7 +70,7 @@ def _run(args: Namespace) -> Answer:
     make_folder(args.output)
     images = _photographs(args)
     steps = [*_observed(args, images)]
-    calibrated = _calibrated(args, [step.data["output"] for step in steps if "output" in step.data])
+    calibrated = _calibrated(args, [step.data for step in steps if "output" in step.data])
     level = calibrated.data["verdict"]["level"]
     steps.append(calibrated)
     if level != "good" and args.target is not None:
@@ -150,10 +150,12 @@ def _observed(args: Namespace, images: list[Path]) -> Iterator[_Step]:
         yield _step(args, DETECT_FIELD[0], asked, most=1)
 
 
-def _calibrated(args: Namespace, observations: list[str]) -> _Step:
+def _calibrated(args: Namespace, detected: Sequence[dict[str, Any]]) -> _Step:
+    observations = [data["output"] for data in detected]
+    stretched = ["--free-aspect"] if any(data.get("stretched") for data in detected) else []
     priors = [word for prior in args.prior for word in ("--prior", prior)]
     goal = ["-o", str(args.output / "calibration.json"), "--report", str(args.output / "report.html")]
-    step = _step(args, CALIBRATE[0], [*observations, "--lens", args.lens, *priors, *goal])
+    step = _step(args, CALIBRATE[0], [*observations, "--lens", args.lens, *stretched, *priors, *goal])
     return replace(step, lines=tuple(sections_of("\n".join(step.lines), _SHOWN)))
 
 

@@ -5,8 +5,9 @@ all its views, and so what one pose projects (see `observations.sights`).
 """
 
 from ceres_cal.observations.columns import NO_CURVES, NO_POINTS, Columns, Curves, Points, Prior, View, taken
-from ceres_cal.observations.files import FORMAT, VERSION, prior_from_json, prior_to_json
+from ceres_cal.observations.files import FORMAT, VERSION
 from ceres_cal.observations.observations import Observations, combine
+from ceres_cal.observations.prior_files import prior_from_json, prior_to_json
 
 __all__ = [
     "FORMAT",

@@ -29,6 +29,8 @@ FEWEST = 4
 _STRETCHES = (1.0, 1.06, 1.14, 1.25, 1.4)  # of the image's corner by the lens
 _PHI = np.geomspace(0.5, 3.0, 40)  # in half image diagonals
 _FREED = ("a3", "phi", "a2", "cx", "cy", "a4", "a5")
+# A standard deviation of fy / fx where a picture was stretched one way.
+_STRETCH = 0.03
 # How square clicks are good to make the axes. Nothing changes from half to double.
 _SQUARE = 0.02
 
@@ -114,6 +116,7 @@ def unknown_optics(
     priors = (
         Prior("camera", CAMERA, "phi", (phi,), (0.5 * phi,)),
         Prior("camera", CAMERA, "principal_point", tuple(middle), (0.04 * image_size[0],) * 2),
+        Prior("camera", CAMERA, "aspect", (1.0,), (_STRETCH,)),
     )
     return FreeIntrinsics(_FREED, (*priors, *lengths), hints)
 

@@ -75,16 +75,17 @@ def follow(
     tracker = _Tracker(grey, target, curves, free or FreeIntrinsics())
     tried = tracker.tried(starts)
     best = next(tried)
-    if not (best.may_be_worn and tracker.free.names):
+    if not tracker.free.names:
         return best
-    best = tracker.refined(best)
-    for one in islice(tried, _MOST_OTHERS):
-        if best.holds and not best.built.is_other:
-            break
-        again = tracker.refined(one) if one.holds else one
-        if again.holds and not again.built.is_other and not again.built.dimensions:
-            best = again
-    return best
+    if best.may_be_worn:
+        best = tracker.refined(best)
+        for one in islice(tried, _MOST_OTHERS):
+            if best.is_field:
+                break
+            again = tracker.refined(one) if one.holds else one
+            if again.is_field and not again.built.dimensions:
+                best = again
+    return best if best.is_field else tracker.stretched(best)
 
 
 def approach(grey: Array32, target: Target, camera: Camera, curves: Collection[str], free: FreeIntrinsics) -> Followed:
@@ -95,10 +96,13 @@ def approach(grey: Array32, target: Target, camera: Camera, curves: Collection[s
 def look_again(
     grey: Array32, target: Target, seen: Followed, curves: Collection[str], free: FreeIntrinsics
 ) -> Followed:
-    """What nearly is the field, with the kind of lens that suits best, or as drawn next to where it was seen."""
+    """What nearly is the field, with the kind of lens that suits best, or as drawn next to where it was seen, or in a
+    picture that was stretched.
+    """
     tracker = _Tracker(grey, target, curves, free)
     refined = tracker.refined(seen)
-    return refined if refined.holds and not refined.built.is_other else tracker.as_drawn(seen)
+    drawn = refined if refined.is_field else tracker.as_drawn(seen)
+    return drawn if drawn.is_field else tracker.stretched(drawn)
 
 
 def refine(grey: Array32, target: Target, camera: Camera, curves: Collection[str], free: FreeIntrinsics) -> Followed:
@@ -217,6 +221,16 @@ class _Tracker:
         drawn = replace(self, curves=drawn.curves, missing=drawn.missing).without_aside(drawn)
         return other if drawn.built.is_other or drawn.built.dimensions else drawn
 
+    def stretched(self, other: Followed) -> Followed:
+        """What is not the field with square pixels, or the field in a picture that was stretched one way."""
+        names = [name for name in self.free.names if name in intrinsic_names(other.camera.lens)]
+        free = replace(self.free, names=("aspect", *names))
+        there = replace(self, free=free).close_in(other.camera, _FAR_REACHES_PX)
+        if not there.holds:
+            return other
+        refined = self.refined(there)
+        return refined if refined.is_field and not refined.built.dimensions else other
+
     def without_aside(self, followed: Followed) -> Followed:
         """The same without the curves that lie aside: none of them draws the camera to where others look aside."""
         free = _free(followed.camera)
@@ -268,8 +282,9 @@ class _Tracker:
             if lens.set_at_start:
                 continue  # a few lines do not tell a lens without a formula
             try:
-                powers = (lens.trial_powers or ((),))[-1]
-                calibration = calibrate(observations, Options(lens=kind, powers=powers, priors=known))
+                powers, stretched = (lens.trial_powers or ((),))[-1], followed.camera.aspect != 1.0
+                options = Options(lens=kind, powers=powers, priors=known, free_aspect=stretched)
+                calibration = calibrate(observations, options)
             except CalibrationError:
                 continue
             fits.append((calibration.fit.curve_scale * len(lines.found) / calibration.fit.curves, calibration))
@@ -321,8 +336,8 @@ class _Tracker:
 
 
 def _free(camera: Camera) -> tuple[str, ...]:
-    """Names of the intrinsics that a photograph may change."""
-    return tuple(name for name in intrinsic_names(camera.lens) if name != "aspect")
+    """Names of the intrinsics that a photograph may change: its pixels are square where they are so far."""
+    return tuple(name for name in intrinsic_names(camera.lens) if name != "aspect" or camera.aspect != 1.0)
 
 
 def _moved_px(camera: Camera, refitted: Camera, pixels: Array) -> float:

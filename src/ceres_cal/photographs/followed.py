@@ -78,6 +78,11 @@ class Followed:
         return self.share >= LEAST_SHARE and self._has_all
 
     @property
+    def is_field(self) -> bool:
+        """Whether it holds, and its curves lie as those of the target do."""
+        return self.holds and not self.built.is_other
+
+    @property
     def may_be_worn(self) -> bool:
         """Whether it is at least the field if its lines are worn to dashes."""
         return self.share >= _LEAST_IF_WORN and self._has_all

@@ -27,7 +27,8 @@ from ceres_cal.solve.noise import SAME, Inliers, Noise, Redundancy, noise_of, re
 from ceres_cal.solve.problem import Problem, Weighting
 from ceres_cal.solve.robust import RobustSolution
 from ceres_cal.solve.shared_cost import Judged, of_world
-from ceres_cal.solve.shares import Asked, Histogram, Looked, Share, Used, cut
+from ceres_cal.solve.shares import Asked, Share, cut
+from ceres_cal.solve.sums import Histogram, Looked, Used
 
 MANY = 2_000_000
 """Observations of the world from which on a part decides, and the rest answers with sums."""
