@@ -14,7 +14,7 @@ from test_competing import NOISE, half_field, moved_aside, wholes
 from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
 from ceres_cal.model.quantities import difference
-from ceres_cal.observations import Observations
+from ceres_cal.observations import Observations, thinning
 from ceres_cal.simulate import Disturbance, simulate
 from ceres_cal.solve import Progress, bulk, shares
 
@@ -33,7 +33,7 @@ def in_shares(monkeypatch: pytest.MonkeyPatch) -> Calibrated:
 
     def calibrated(observations: Observations, progress: Callable[[Progress], None] | None = None) -> Calibration:
         with monkeypatch.context() as patch:
-            patch.setattr(bulk, "MANY", 100)
+            patch.setattr(thinning, "MANY", 100)
             patch.setattr(bulk, "_PART", 2_000)
             patch.setattr(bulk, "_FEWEST_VIEWS", 16)
             patch.setattr(bulk, "_STANDING_OUT", 2)

@@ -20,7 +20,8 @@ from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
 from ceres_cal.cli import main
 from ceres_cal.detect.boards import BoardDetections
-from ceres_cal.diagnostics import Diagnosis, choose, cross_validate, diagnose
+from ceres_cal.diagnostics import Diagnosis, diagnose
+from ceres_cal.diagnostics.held_out import choose, cross_validate
 from ceres_cal.model.equations import Equations, whole_structure, write_equations
 from ceres_cal.model.parameters import Options, intrinsics_vector, with_intrinsics
 from ceres_cal.model.residuals import residuals

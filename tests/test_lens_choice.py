@@ -17,7 +17,7 @@ from ceres_cal.calibrating import Watched, calibrate
 from ceres_cal.calibration import Calibration
 from ceres_cal.cli import main
 from ceres_cal.detect.boards import BoardDetections
-from ceres_cal.diagnostics import choose
+from ceres_cal.diagnostics.held_out import choose
 from ceres_cal.lens_choice import PAPER, candidates, decide, label_of
 from ceres_cal.lens_choice.kinds import Candidate
 from ceres_cal.model.equations import write_equations

@@ -20,7 +20,7 @@ from ceres_cal.base.errors import InputError, SolutionError
 from ceres_cal.calibrating import calibrate
 from ceres_cal.cli import main
 from ceres_cal.model.quantities import difference
-from ceres_cal.observations import Observations
+from ceres_cal.observations import Observations, thinning
 from ceres_cal.observations.columns import FileRows, read_rows
 from ceres_cal.simulate import simulate
 from ceres_cal.solve import Progress, bulk, engines, shares
@@ -30,7 +30,7 @@ distributed = pytest.importorskip("distributed", reason="Dask is an extra: pip i
 
 @pytest.fixture(autouse=True)
 def in_shares(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bulk, "MANY", 100)
+    monkeypatch.setattr(thinning, "MANY", 100)
     monkeypatch.setattr(bulk, "_PART", 2_000)
     monkeypatch.setattr(bulk, "_FEWEST_VIEWS", 16)
     monkeypatch.setattr(shares, "_ROWS", 250)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -14,13 +14,13 @@ from ceres_cal.base.threads import at_most, meanwhile, single_threaded_blas
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.caveats import resting_phi, unknown_phi
 from ceres_cal.calibration.outcome import came_out, of_all
-from ceres_cal.lens_choice import choose_lens, papers
 from ceres_cal.model.parameters import AUTO, Estimate, Layout, Options, make_layout
 from ceres_cal.model.priors import gather_priors
 from ceres_cal.model.quantities import difference
 from ceres_cal.model.residuals import residuals
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights, gather_sights
+from ceres_cal.observations.thinning import is_bulk
 from ceres_cal.solve import (
     AsBuilt,
     Conflicts,
@@ -36,7 +36,6 @@ from ceres_cal.solve import (
     solve_robustly,
 )
 from ceres_cal.solve.as_built import solve_as_built, tolerances_of
-from ceres_cal.solve.bulk import Bulk, Part, Settled, is_bulk
 from ceres_cal.solve.competing import compete
 from ceres_cal.solve.conflicts import contradicted_by
 from ceres_cal.solve.dimensions import free_dimensions, require_measured
@@ -49,12 +48,16 @@ from ceres_cal.start.baseline import four_point_baseline
 from ceres_cal.start.initialise import Start, initialise
 from ceres_cal.uncertainty import Posterior, Scatter, assess, measure_scatter
 
+if TYPE_CHECKING:
+    from ceres_cal.solve.bulk import Bulk, Part, Settled
+
 # Share of the standard deviation of usual principal points: observations that say as much need nothing usual. Half and
 # double leave ordinary fields and boards, whose share is under a tenth, as they are.
 _SAYS_LESS = 0.5
 # Share of a dimension by which it may come out another than drawn without a second solve from there, whose start and
 # outliers are those of the right drawing; and how many there may be.
 _REDRAWN, _MOST_DRAWINGS = 0.005, 4
+_LONG_TO_DIGEST = 20_000  # observations: fewer take less than a thread, and what makes one
 _OTHERWISE = (
     "no calibration agrees with what was stated beforehand, though the observations make one without it: check the "
     "priors and their units"
@@ -119,6 +122,8 @@ def _calibrated(
     observations.require_inside()
     if options.closed_form_only or not (client is not None or is_bulk(observations)):
         return _chosen(observations, options, Watched(progress))
+    from ceres_cal.solve.bulk import Bulk
+
     digest, bulk = meanwhile(lambda: observations.digest), Bulk(observations, client)
     try:
         part = _part(bulk, options)
@@ -131,9 +136,16 @@ def _calibrated(
 def _chosen(observations: Observations, options: Options, watched: Watched) -> Calibration:
     """With the lens that is named, or the one that is chosen."""
     sights = gather_sights(observations)
-    start = initialise(observations, sights, options if options.lens != AUTO else papers(options))
-    if options.lens != AUTO:
-        return _of_lens(start, observations, sights, options, watched)
+    if options.lens == AUTO:
+        return _of_any_lens(observations, sights, options, watched)
+    return _of_lens(initialise(observations, sights, options), observations, sights, options, watched)
+
+
+def _of_any_lens(observations: Observations, sights: Sights, options: Options, watched: Watched) -> Calibration:
+    """With the lens that the data ask for."""
+    from ceres_cal.lens_choice import choose_lens, papers
+
+    start = initialise(observations, sights, papers(options))
     if options.closed_form_only:
         return _of_lens(start, observations, sights, papers(options), watched)
     chosen = choose_lens(observations, options, start)
@@ -148,6 +160,8 @@ def _chosen(observations: Observations, options: Options, watched: Watched) -> C
 
 def _part(bulk: Bulk, options: Options) -> Part:
     """The part that decides: of the world some views, with those that stand out at a first solution of others."""
+    from ceres_cal.lens_choice import papers
+
     part, given = bulk.part(), options if options.lens != AUTO else papers(options)
     few, sights = part.observations, gather_sights(part.observations)
     start = initialise(few, sights, given)
@@ -257,7 +271,8 @@ def solved_from(
     Raises:
         CalibrationError: see `calibrate`.
     """
-    digest = meanwhile(lambda: observations.digest) if watched.settle is None else None
+    takes_long = len(observations.points) + len(observations.curves) > _LONG_TO_DIGEST
+    digest = meanwhile(lambda: observations.digest) if takes_long and watched.settle is None else None
     usual = again.scales if again else None
     end = solve_robustly(problem, observations, start.estimate, usual, watched.progress, is_near=start.is_near)
     if again is None:

@@ -1,6 +1,6 @@
 """Arrays by the kind of their numbers, once for the whole package. Shapes stand in the docstrings."""
 
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,3 +19,21 @@ Image = NDArray[Any]
 """A photograph as read, of any depth."""
 Image8 = NDArray[np.uint8]
 AnyArray = NDArray[Any]
+_Kind = TypeVar("_Kind", bound=np.generic)
+
+
+# `np.unique` and `np.median` import masked arrays when they are first called, which takes as long as many a solve.
+
+
+def distinct(values: NDArray[_Kind], axis: int | None = None) -> NDArray[_Kind]:
+    """The different values in an array, in order; or the different rows along an axis."""
+    return np.asarray(np.unique(values, return_counts=True, axis=axis)[0])
+
+
+def median(values: Array) -> float:
+    """The middle of some numbers (N,), or between the two in the middle; NaN where one of them is, or none is there."""
+    if not len(values):
+        return np.nan
+    low, high, last = (len(values) - 1) // 2, len(values) // 2, len(values) - 1
+    ordered = np.partition(values, (low, high, last))  # NaN is the last
+    return float(ordered[last] if np.isnan(ordered[last]) else 0.5 * (ordered[low] + ordered[high]))

@@ -132,7 +132,7 @@ def euler_from_rotation(rotation: ArrayLike) -> tuple[float, float, float]:
     return float(alpha), float(np.arctan2(-r[0, 2], cos_beta)), float(gamma)
 
 
-@dataclass(frozen=True, eq=False, repr=False)
+@dataclass(frozen=True, eq=False)
 class Pose:
     """A rigid transform b_from_a: x_b = rotation @ x_a + translation.
 

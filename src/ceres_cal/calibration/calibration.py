@@ -44,7 +44,7 @@ _ALIKE = (
 """What the file has as it is."""
 
 
-@dataclass(frozen=True, eq=False, repr=False)
+@dataclass(frozen=True, eq=False)
 class Calibration:
     """Calibrated cameras and where they stood.
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,8 +14,10 @@ from ceres_cal.calibration.origin import COPY, Fit, Rejected
 from ceres_cal.model.parameters import Layout
 from ceres_cal.observations import Observations
 from ceres_cal.solve import Problem, RobustSolution
-from ceres_cal.solve.bulk import Settled
 from ceres_cal.solve.explanation import Explanation
+
+if TYPE_CHECKING:
+    from ceres_cal.solve.bulk import Settled
 
 
 def came_out(

@@ -45,7 +45,8 @@ def _run(args: Namespace) -> Answer:
     rate = _require_fitting(args)
     from ceres_cal.base.executing import processes
     from ceres_cal.cli.diagnosis import diagnosis_data, diagnosis_text
-    from ceres_cal.diagnostics import choose, diagnose
+    from ceres_cal.diagnostics import diagnose
+    from ceres_cal.diagnostics.held_out import choose
 
     calibration, observations = read_calibration(args), read_observations(args.observations)
     photographs = report_photographs(args, observations)

@@ -13,7 +13,8 @@ import numpy as np
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.words import chance, plural
 from ceres_cal.cli.outputs import WIDTH, section, wrapped, written, written_data
-from ceres_cal.diagnostics import Choice, Diagnosis, Finding, HeldOut, Noise, ResidualTable, Summary
+from ceres_cal.diagnostics import Diagnosis, Finding, Noise, ResidualTable, Summary
+from ceres_cal.diagnostics.held_out import Choice, HeldOut
 from ceres_cal.report.findings import CHOSEN_BY, choice_marks, chosen_lens
 
 _MOST_ROWS = 8

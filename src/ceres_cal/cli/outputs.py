@@ -18,7 +18,8 @@ from ceres_cal.cli.progress import progress_bar
 
 if TYPE_CHECKING:
     from ceres_cal.calibration import Calibration
-    from ceres_cal.diagnostics import Choice, Diagnosis
+    from ceres_cal.diagnostics import Diagnosis
+    from ceres_cal.diagnostics.held_out import Choice
     from ceres_cal.observations import Observations
     from ceres_cal.report import FramePhotographs
 

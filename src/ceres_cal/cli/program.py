@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import atexit
+import gc
 import io
 import os
 import signal
@@ -11,6 +12,7 @@ from contextlib import suppress
 from types import FrameType
 from typing import NoReturn
 
+_OBJECTS = 50_000  # between collections: what is imported is no garbage, and to look it through takes time
 TERMINATED = 143
 """What a shell reports of a program that SIGTERM ended."""
 
@@ -22,6 +24,7 @@ class Terminated(KeyboardInterrupt):
 def as_a_program() -> None:
     """Take SIGTERM like Ctrl-C, print whatever a name holds, and let nobody but us write on standard error."""
     signal.signal(signal.SIGTERM, _terminate)
+    gc.set_threshold(_OBJECTS)
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # to begin threads that are not used (base.threads) takes time
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):

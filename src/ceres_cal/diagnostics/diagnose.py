@@ -8,6 +8,7 @@ import numpy as np
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.calibration import Calibration
+from ceres_cal.diagnostics.alternatives import Sums
 from ceres_cal.diagnostics.diagnostic import Case, Tested
 from ceres_cal.diagnostics.findings import Finding
 from ceres_cal.diagnostics.labels import find_mislabelled
@@ -157,13 +158,13 @@ def _judged(calibration: Calibration, observations: Observations, there: Residua
 
 def _tested(case: Case, rate: float) -> Tested:
     """Alternatives chosen at a rate of false alarms, and the noise that they leave."""
-    families = all_families(case)
+    alternatives = [Sums.of(case.model, family) for family in all_families(case)]
     extra = sum(one.tests(case) for one in DIAGNOSTICS.values())
-    selection = select(case.model, families, rate, extra)
+    selection = select(case.model, alternatives, rate, extra)
     noise = measure_noise(case.observations, selection.model, case.model, case.inliers)
     level = selection.log_level
     inflation = max((one.inflation for one in noise if one.correlation_log_p < level), default=1.0)
     if inflation > 1.0 and selection.chosen:  # correlated noise makes every other test too eager
-        selection = select(case.model, families, rate, extra, inflation)
+        selection = select(case.model, alternatives, rate, extra, inflation)
         noise = measure_noise(case.observations, selection.model, case.model, case.inliers)
     return Tested(case, selection, noise, rate)

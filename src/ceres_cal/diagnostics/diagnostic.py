@@ -10,16 +10,18 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices, Mask
+from ceres_cal.base.arrays import Array, Indices, Mask, distinct
 from ceres_cal.base.words import first_of, two_digits
 from ceres_cal.calibration import Calibration
+from ceres_cal.diagnostics.alternatives import Family
 from ceres_cal.diagnostics.findings import Amount, Finding, Wrong
 from ceres_cal.diagnostics.labels import Mislabelling
 from ceres_cal.diagnostics.leftover import Noise
-from ceres_cal.diagnostics.scores import Family, Score, Selection
+from ceres_cal.diagnostics.scores import Score, Selection
 from ceres_cal.diagnostics.table import ResidualTable, plane_shift
-from ceres_cal.model.equations import Equations
+from ceres_cal.model.equations import Equations, whole_structure
 from ceres_cal.model.parameters import Estimate
+from ceres_cal.model.structure import Structure
 from ceres_cal.observations import Observations
 from ceres_cal.solve import AsBuilt, Problem
 from ceres_cal.solve.linear_model import LinearModel
@@ -70,9 +72,19 @@ class Case:
         of_sight = np.array([self.cameras.index(key.camera) for key in self.equations.sights.keys])
         return np.asarray(of_sight[self.equations.sight])
 
+    @cached_property
+    def whole_structure(self) -> Structure:
+        """Everything that could be built otherwise than it is drawn."""
+        return whole_structure(self.observations.targets)
+
+    @cached_property
+    def slots(self) -> tuple[Indices, Indices]:
+        """(E, BUILT) the offsets of that structure, and of the estimate's own: see `Equations`."""
+        return self.equations.slots(self.whole_structure), self.equations.slots(self.estimate.structure)
+
     def effect(self, shift: Array, rows: Mask) -> Effect:
         """What a displacement (E,) px does to the observations of some equations."""
-        count = len(np.unique(self.equations.observation[rows]))
+        count = len(distinct(self.equations.observation[rows]))
         with np.errstate(divide="ignore", invalid="ignore"):
             x, y = plane_shift(self.equations, shift)
         twice = np.where(self.equations.is_curve, 1.0, 2.0)  # both equations of a point carry its whole shift in mm
@@ -81,7 +93,7 @@ class Case:
 
     def noise_px(self, left_over: Array, rows: Mask) -> float:
         """Root mean square over observations of what is left over, (E,) in standard deviations, px."""
-        count = len(np.unique(self.equations.observation[rows]))
+        count = len(distinct(self.equations.observation[rows]))
         return float(np.sqrt(np.sum((left_over / self.model.weight)[rows] ** 2) / count))
 
 

@@ -8,9 +8,9 @@ below that of a field, by the same share whatever the lens.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -31,6 +31,9 @@ from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights, gather_sights
 from ceres_cal.observations.thinning import column_of, frames_of, thinned
 from ceres_cal.solve import Problem, Weighting, solve
+
+if TYPE_CHECKING:
+    from concurrent.futures import Executor
 
 FOLDS = 5
 MOST_OBSERVATIONS = 10_000

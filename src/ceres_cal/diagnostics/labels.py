@@ -12,7 +12,7 @@ from functools import cache, cached_property
 import numpy as np
 
 from ceres_cal import kernels
-from ceres_cal.base.arrays import Array, Indices, Mask
+from ceres_cal.base.arrays import Array, Indices, Mask, distinct
 from ceres_cal.base.tails import log_binomial_tail
 from ceres_cal.model.parameters import Estimate
 from ceres_cal.model.residuals import camera_optics
@@ -74,9 +74,9 @@ def find_mislabelled(
     for column, rejected, scale in both:
         rows = np.flatnonzero(rejected)
         rows = rows[:: max(1, len(rows) // _MOST)]
-        for number in np.unique(column.view[rows]):
+        for number in distinct(column.view[rows]):
             own, view = rows[column.view[rows] == number], observations.views[number]
-            tried += len(np.unique(column.feature[own]))
+            tried += len(distinct(column.feature[own]))
             if view.placement is None or view.placement in estimate.placements:
                 bound = reject_sigma * scale * column.sigma_px[own]
                 seen = sight(view.target, view.station, view.placement)
@@ -119,7 +119,7 @@ def _of_view(sight: _Sight, column: Columns, view: int, rows: Indices, bound: Ar
     away = distance[np.arange(len(rows)), nearest]
     fits = away <= bound
     groups = []
-    for label, instead in np.unique(np.column_stack([named, nearest])[fits], axis=0):
+    for label, instead in distinct(np.column_stack([named, nearest])[fits], axis=0):
         tried = named == label
         chosen = fits & tried & (nearest == instead)
         near = sight.chance(is_curve, float(away[chosen].max()))

@@ -8,9 +8,9 @@ from typing import ClassVar
 import numpy as np
 
 from ceres_cal.base.arrays import Array
+from ceres_cal.diagnostics.alternatives import Family
 from ceres_cal.diagnostics.diagnostic import Case, Evidence, ScoreTest, Words
 from ceres_cal.diagnostics.findings import SMALL, amounts
-from ceres_cal.diagnostics.scores import Family
 from ceres_cal.model.parameters import intrinsic_names, unit_px
 from ceres_cal.scene.lens import LENSES, Lens
 

@@ -10,9 +10,9 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.transforms import skew
+from ceres_cal.diagnostics.alternatives import Family, grouped
 from ceres_cal.diagnostics.diagnostic import Case, Evidence, ScoreTest, Words
 from ceres_cal.diagnostics.findings import amounts
-from ceres_cal.diagnostics.scores import Family, grouped
 from ceres_cal.diagnostics.table import numbers_of
 
 

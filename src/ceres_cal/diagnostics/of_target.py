@@ -10,10 +10,9 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask
 from ceres_cal.base.words import first_of
+from ceres_cal.diagnostics.alternatives import Family, grouped
 from ceres_cal.diagnostics.diagnostic import Case, Evidence, ScoreTest, Tested, Words
 from ceres_cal.diagnostics.findings import Amount, Finding, amounts
-from ceres_cal.diagnostics.scores import Family, grouped
-from ceres_cal.model.equations import whole_structure
 from ceres_cal.model.structure import WARP, Kind, numbers_by_kind
 from ceres_cal.scene.targets import Arc, Segment
 from ceres_cal.solve import AsBuilt
@@ -52,9 +51,8 @@ class _AsBuilt(ScoreTest):
         return _FEWEST_ON_CURVE if self.curves else 2 * _FEWEST_OF_POINT
 
     def families(self, case: Case) -> Iterator[Family]:
-        equations, structure = case.equations, whole_structure(case.observations.targets)
-        slot = equations.slots(structure)[:, self.places.start]
-        own = equations.slots(case.estimate.structure)[:, self.places.start]
+        equations, structure = case.equations, case.whole_structure
+        slot, own = (slots[:, self.places.start] for slots in case.slots)
         solved = (own >= 0) & (own < case.estimate.structure.own)
         rows = (equations.is_curve == self.curves) & (slot >= 0) & ~solved
         numbers, group = grouped(slot, rows)

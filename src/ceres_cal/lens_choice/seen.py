@@ -9,7 +9,7 @@ from functools import cached_property
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices, Mask
+from ceres_cal.base.arrays import Array, Indices, Mask, distinct
 from ceres_cal.base.errors import CalibrationError, DegenerateError
 from ceres_cal.lens_choice.forms import Form
 from ceres_cal.lens_choice.kinds import Candidate, Kind
@@ -167,7 +167,7 @@ def require_groups(sights: Sights) -> None:
     placed = _placed(sights)
     count = int(np.count_nonzero(placed))
     for own in (sights[int(number)] for number in np.flatnonzero(~placed)):
-        count += len(np.unique(own.point_index)) + len(np.unique(own.track_index))
+        count += len(distinct(own.point_index)) + len(distinct(own.track_index))
     if count < _FEWEST_GROUPS:
         raise FewGroupsError("too few views or features to tell lenses apart")
 

@@ -15,7 +15,7 @@ from typing import Literal
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices, Indices32, Mask
+from ceres_cal.base.arrays import Array, Indices, Indices32, Mask, distinct
 from ceres_cal.base.errors import InputError
 from ceres_cal.model.dimensions import dimension_slopes
 from ceres_cal.model.keys import Key
@@ -293,7 +293,7 @@ def numbers_by_kind(structure: Structure, targets: Mapping[str, Target]) -> dict
         tracks = structure.track_slots[curves[place] : curves[place + 1]]
         kinds: tuple[tuple[Kind, Indices32], ...] = (("lines", tracks), ("points", own[:, :2]), ("warp", own[:, 2:]))
         every = {
-            (name, kind): np.unique(slots[(slots >= 0) & (slots < structure.own)]).astype(np.int64)
+            (name, kind): distinct(slots[(slots >= 0) & (slots < structure.own)]).astype(np.int64)
             for kind, slots in kinds
         }
         numbers |= {of: slots for of, slots in every.items() if len(slots)}

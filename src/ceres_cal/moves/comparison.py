@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array
+from ceres_cal.base.arrays import Array, median
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.tails import upper_tail
 from ceres_cal.base.transforms import nearest_rotation, rotation_log
@@ -233,7 +233,7 @@ def _common_turn(seen: Array, also: Array) -> Array:
     turn = np.eye(3)
     for _ in range(_ROUNDS):
         away = np.linalg.norm(seen @ turn.T - also, axis=1)
-        weights = 1.0 / (1.0 + (away / max(float(np.median(away)), 1e-15)) ** 2)
+        weights = 1.0 / (1.0 + (away / max(median(away), 1e-15)) ** 2)
         turn = nearest_rotation((also * weights[:, None]).T @ seen)
     return turn
 

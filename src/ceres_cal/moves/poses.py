@@ -12,7 +12,7 @@ from itertools import product
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array
+from ceres_cal.base.arrays import Array, distinct, median
 from ceres_cal.base.transforms import Pose
 from ceres_cal.model.parameters import Estimate
 from ceres_cal.model.residuals import Residuals, residuals
@@ -121,7 +121,7 @@ def equations(sight: Sights) -> int:
     """
     tracks, counts = np.unique(sight.track_index, return_counts=True)
     most = np.where(sight.is_arc[tracks], 3, 2)
-    return 2 * len(np.unique(sight.points, axis=0)) + int(np.sum(np.minimum(counts, most)))
+    return 2 * len(distinct(sight.points, axis=0)) + int(np.sum(np.minimum(counts, most)))
 
 
 def closed_form(search: PoseSearch) -> Pose | None:
@@ -166,7 +166,7 @@ def candidate_at(search: PoseSearch, pose: Pose) -> PoseCandidate:
     there = search.residuals(pose)
     points, curves = there.in_sigmas(search.sight, search.scales)
     lengths = np.nan_to_num(np.concatenate([points / 1.1774, curves / 0.6745]), nan=np.inf)
-    scale = float(np.median(lengths))
+    scale = median(lengths)
     sigmas = np.nan_to_num(np.concatenate([points, curves]), nan=np.inf)
     share = float(np.mean(sigmas <= _FITS_SIGMA * np.clip(scale, 1.0, _FITS_SCALE)))
     return PoseCandidate(pose, there.misfit(search.sight, search.camera, search.scales), scale, share)

@@ -92,7 +92,7 @@ class Prior:
 TYPES = {"view": np.int32, "feature": np.int32, "pixels": np.float64, "sigma_px": np.float64, "side": np.int8}
 
 
-@dataclass(frozen=True, eq=False, repr=False)
+@dataclass(frozen=True, eq=False)
 class Columns:
     """Columns of observations, read-only: index of the view, index into the target's names, pixel, its sigma."""
 
@@ -127,7 +127,7 @@ class Points(Columns):
     """The point observations."""
 
 
-@dataclass(frozen=True, eq=False, repr=False)
+@dataclass(frozen=True, eq=False)
 class Curves(Columns):
     """The curve observations; `side` is 0 for the centre of the paint, +1 for left, -1 for right."""
 

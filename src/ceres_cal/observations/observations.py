@@ -41,7 +41,7 @@ from ceres_cal.scene.targets import Target
 _NAMES = attrgetter("camera", "station", "target", "placement")
 
 
-@dataclass(frozen=True, eq=False, repr=False)
+@dataclass(frozen=True, eq=False)
 class Observations(Content):
     """Everything that was observed.
 

@@ -4,10 +4,20 @@ from __future__ import annotations
 
 import numpy as np
 
-from ceres_cal.base.arrays import AnyArray, Indices
+from ceres_cal.base.arrays import AnyArray, Indices, distinct
 from ceres_cal.observations.observations import Observations
 
 FEWEST_FRAMES = 40
+MANY = 2_000_000
+"""Observations of the world from which on a part decides, and the rest answers with sums."""
+
+
+def is_bulk(observations: Observations) -> bool:
+    """Whether a part is to decide."""
+    if len(observations.points) + len(observations.curves) <= MANY:
+        return False
+    world = np.array([view.placement is None for view in observations.views])
+    return sum(int(np.diff(ends)[world].sum()) for ends in observations.ends) > MANY
 
 
 def column_of(observations: Observations, name: str) -> AnyArray:
@@ -18,7 +28,7 @@ def column_of(observations: Observations, name: str) -> AnyArray:
 def frames_of(observations: Observations) -> tuple[tuple[str, ...], Indices]:
     """Names of the frames that show anything, and (N + M,) the frame's number of each observation."""
     views = column_of(observations, "view")
-    names = dict.fromkeys(observations.views[int(view)].frame for view in np.unique(views))
+    names = dict.fromkeys(observations.views[int(view)].frame for view in distinct(views))
     order = {name: number for number, name in enumerate(names)}
     return tuple(names), np.array([order.get(view.frame, -1) for view in observations.views])[views]
 

@@ -6,9 +6,8 @@ quality of a calibration, few for the page.
 
 from typing import TYPE_CHECKING, Any
 
-from ceres_cal.report.material import FramePhotographs
-
 if TYPE_CHECKING:
+    from ceres_cal.report.material import FramePhotographs as FramePhotographs
     from ceres_cal.report.report import make_report as make_report
     from ceres_cal.report.report import write_report as write_report
 

@@ -7,7 +7,8 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from ceres_cal.base.words import DASH, chance, counted, fixed, grouped, mm, powered, sentence, short
-from ceres_cal.diagnostics import Choice, Finding, HeldOut, Noise
+from ceres_cal.diagnostics import Finding, Noise
+from ceres_cal.diagnostics.held_out import Choice, HeldOut
 from ceres_cal.report.grounds import is_against
 from ceres_cal.report.material import Material
 from ceres_cal.report.page import Card, Chapter, Piece, Table, Text

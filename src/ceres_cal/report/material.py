@@ -14,7 +14,8 @@ from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.errors import CalibrationError
 from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
-from ceres_cal.diagnostics import Choice, Diagnosis
+from ceres_cal.diagnostics import Diagnosis
+from ceres_cal.diagnostics.held_out import Choice
 from ceres_cal.model.residuals import residuals
 from ceres_cal.observations.sights import gather_sights
 from ceres_cal.report.quality import Quality, Seam

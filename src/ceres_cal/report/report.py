@@ -9,7 +9,8 @@ from ceres_cal.base.files import write_bytes
 from ceres_cal.base.progress import StepProgress
 from ceres_cal.base.words import counted, first_of
 from ceres_cal.calibration import Calibration
-from ceres_cal.diagnostics import Choice, Diagnosis, diagnose
+from ceres_cal.diagnostics import Diagnosis, diagnose
+from ceres_cal.diagnostics.held_out import Choice
 from ceres_cal.observations import Observations
 from ceres_cal.report.findings import findings
 from ceres_cal.report.grounds import promises

@@ -38,7 +38,7 @@ def _rows(values: ArrayLike, columns: int, name: str) -> Array:
 _FAR_M = 10.0  # a height of as many metres, far over its camera, is one in millimetres
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True)
 class Camera:
     """One camera at one pose.
 

@@ -14,7 +14,7 @@ from uuid import uuid4
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices, Mask
+from ceres_cal.base.arrays import Array, Indices, Mask, distinct
 from ceres_cal.model.parameters import Estimate, Layout
 from ceres_cal.model.residuals import residuals
 from ceres_cal.observations import Observations
@@ -30,8 +30,6 @@ from ceres_cal.solve.shared_cost import Judged, of_world
 from ceres_cal.solve.shares import Asked, Share, cut
 from ceres_cal.solve.sums import Histogram, Looked, Used
 
-MANY = 2_000_000
-"""Observations of the world from which on a part decides, and the rest answers with sums."""
 # Observations of the part, and views of it at least.
 _PART, _FEWEST_VIEWS = 300_000, 200
 # Relative change of the cost at which a solve of all ends: sums in another order end elsewhere by its root.
@@ -66,14 +64,6 @@ class Settled:
     end: RobustSolution
     used: Used
     explanations: tuple[Explanation, ...]
-
-
-def is_bulk(observations: Observations) -> bool:
-    """Whether a part is to decide."""
-    if len(observations.points) + len(observations.curves) <= MANY:
-        return False
-    world = np.array([view.placement is None for view in observations.views])
-    return sum(int(np.diff(ends)[world].sum()) for ends in observations.ends) > MANY
 
 
 class Bulk:
@@ -127,7 +117,7 @@ class Bulk:
         spare = np.maximum(looked.equations, 1.0)
         above = (looked.squares / spare - 1.0) * np.sqrt(spare) * (looked.equations > 0)
         worst = [looked.view[np.argsort(-by, kind="stable")[:_STANDING_OUT]] for by in (above, looked.beyond)]
-        return np.unique(np.concatenate(worst))
+        return distinct(np.concatenate(worst))
 
     # ---- all of them ------------------------------------------------------------------------------------------------
 
@@ -161,7 +151,7 @@ class Bulk:
             ((few.points, self.observations.points), (few.curves, self.observations.curves))
         ):
             rows = np.flatnonzero(explanation.rows[split:] if is_curve else explanation.rows[:split])
-            features, views = np.unique(own.feature[rows]), np.zeros(len(self._world), dtype=bool)
+            features, views = distinct(own.feature[rows]), np.zeros(len(self._world), dtype=bool)
             views[own.view[rows]] = True
             if np.count_nonzero(views & self._world) > 1:  # a feature in all frames
                 shown = {(few.views[v].station, few.views[v].target) for v in np.flatnonzero(views)}

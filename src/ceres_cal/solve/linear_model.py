@@ -121,10 +121,19 @@ class LinearModel:
         return rest
 
     @cached_property
+    def _is_private(self) -> Mask:
+        """(S,) whether each sight's placement is projected out."""
+        return np.asarray(np.any(self.private[self.equations.bounds[:-1]] != 0.0, axis=1))
+
+    @cached_property
     def _private_ranges(self) -> list[tuple[int, int]]:
         bounds = self.equations.bounds
-        filled = np.flatnonzero(np.any(self.private[bounds[:-1]] != 0.0, axis=1))
-        return [(int(bounds[i]), int(bounds[i + 1])) for i in filled]
+        return [(int(bounds[i]), int(bounds[i + 1])) for i in np.flatnonzero(self._is_private)]
+
+    @cached_property
+    def of_private(self) -> Mask:
+        """(E,) the equations of sights whose placement is projected out."""
+        return self.equations.of_sights(self._is_private)
 
     @cached_property
     def placed_score(self) -> Array:
@@ -211,10 +220,17 @@ def inverse_root(normal: Array, sizes: Array, least: float) -> Array:
     Directions that keep less than `least` of `sizes`, the squared lengths before anything was projected out, are left
     out.
     """
+    root, rank = inverse_roots(normal, sizes, least)
+    return np.asarray(root[:, len(sizes) - int(rank) :])
+
+
+def inverse_roots(normals: Array, sizes: Array, least: float) -> tuple[Array, Indices]:
+    """The same of a stack (..., Q, Q): roots (..., Q, Q) whose first columns are 0 for what is left out, and ranks."""
     scale = 1.0 / np.sqrt(np.where(sizes > 0.0, sizes, 1.0))
-    values, vectors = np.linalg.eigh(scale[:, None] * normal * scale)
+    values, vectors = np.linalg.eigh(scale[..., :, None] * normals * scale[..., None, :])
     kept = values > least
-    return np.asarray(scale[:, None] * vectors[:, kept] / np.sqrt(values[kept]))
+    roots = scale[..., :, None] * vectors / np.sqrt(np.where(kept, values, np.inf))[..., None, :]
+    return np.asarray(roots), np.asarray(np.count_nonzero(kept, axis=-1))
 
 
 def equation_weights(
@@ -281,13 +297,10 @@ def _private_basis(equations: Equations, problem: Problem, weight: Array, used: 
     parts = [slice(equations.bounds[number], equations.bounds[number + 1]) for number in numbers]
     normal = np.array([inside[part].T @ inside[part] for part in parts])
     sizes = np.diagonal(normal, axis1=1, axis2=2)
-    scale = 1.0 / np.sqrt(np.where(sizes > 0.0, sizes, 1.0))
-    values, vectors = np.linalg.eigh(scale[:, :, None] * normal * scale[:, None, :])
-    kept = values > SINGULAR
-    roots = scale[:, :, None] * vectors * np.where(kept, values, np.inf)[:, None, :] ** -0.5
+    roots, ranks = inverse_roots(normal, sizes, SINGULAR)
     for part, root in zip(parts, roots, strict=True):
         np.matmul(columns[part], root, out=basis[part])
-    return basis, int(np.count_nonzero(kept))
+    return basis, int(np.sum(ranks))
 
 
 def shared_columns(equations: Equations, estimate: Estimate, keys: Sequence[Key]) -> Array:

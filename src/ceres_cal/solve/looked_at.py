@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ceres_cal.base.arrays import AnyArray, Array, Indices, Mask
+from ceres_cal.base.arrays import AnyArray, Array, Indices, Mask, distinct, median
 from ceres_cal.observations import Observations
 from ceres_cal.observations.thinning import column_of
 from ceres_cal.solve.problem import Problem
@@ -124,7 +124,7 @@ def views_looked_at(
         largest, most = excess(observations, wholes, end, taking_part)[_owner(wholes, view)], _MOST_WHOLE_VIEWS
     with_some, others = np.flatnonzero(shows_some), np.flatnonzero(shows_some == 0)
     chosen = np.zeros(len(shows_some), dtype=bool)
-    chosen[np.unique(view[recalled])[:most]] = True
+    chosen[distinct(view[recalled])[:most]] = True
     chosen[with_some[np.argsort(-largest[with_some], kind="stable")][: most // 2]] = True
     chosen[with_some[:: max(1, 2 * len(with_some) // most)]] = True
     chosen[others[:: max(1, len(others) // _MOST_OTHERS)]] = True
@@ -153,7 +153,7 @@ def excess(observations: Observations, wholes: Wholes, end: RobustSolution, taki
     square = np.bincount(of, lengths**2, minlength=size)
     spare[-1] = square[-1] = 0.0  # of what is in none
     square, there = square / np.maximum(spare, 1.0), spare > 0.0
-    middle = float(np.median(square[there])) if np.any(there) else 1.0
+    middle = median(square[there]) if np.any(there) else 1.0
     return np.asarray((square / max(middle, 1e-12) - 1.0) / np.sqrt(2.0 / np.maximum(spare, 1.0)) * there)
 
 

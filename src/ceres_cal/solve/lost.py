@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array
+from ceres_cal.base.arrays import Array, median
 from ceres_cal.model.parameters import Estimate
 from ceres_cal.observations.sights import Sights
 from ceres_cal.solve.bundle import placement_costs
@@ -56,7 +56,7 @@ def _by_consensus(sight: Sights, estimate: Estimate, weighting: Weighting) -> Ar
     if len(points) < _FEWEST or np.ptp(points[:, 2]) > 1e-9:
         return None
     ideal = np.column_stack([camera.phi * rays[:, :2] / rays[:, 2:], np.ones(len(rays))])
-    limit_px = max(5.0 * weighting.point_scale * float(np.median(sight.sigma_px)), 1.0)
+    limit_px = max(5.0 * weighting.point_scale * median(sight.sigma_px), 1.0)
     homography = consensus_homography(points[:, :2], ideal, limit_px)
     if homography is None:
         return None

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices
+from ceres_cal.base.arrays import Array, Indices, median
 from ceres_cal.solve.linear_model import LinearModel
 
 # Probability, before anything was seen, that some feature does not belong. From half to double the log odds change by
@@ -107,5 +107,5 @@ def measure_offsets(model: LinearModel, columns: Array, group: Indices) -> Offse
     modes[there] = turns * np.sqrt(size)
     modes = np.swapaxes(modes.reshape(groups, width, -1), 1, 2)
     rest = float(np.sum(model.left_over[model.used] ** 2) - value @ value)
-    least = model.spare * (_LEAST_PX * float(np.median(model.weight[rows]))) ** 2
+    least = model.spare * (_LEAST_PX * median(model.weight[rows])) ** 2
     return Offsets(size, value, modes, max(rest, least), model.spare)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array
+from ceres_cal.base.arrays import Array, distinct
 from ceres_cal.base.errors import SolutionError
 from ceres_cal.model.parameters import Estimate
 from ceres_cal.model.residuals import Residuals
@@ -93,7 +93,7 @@ def _places_of_world(observations: Observations, sight: Sights) -> Array:
     """
     world = np.array([not observations.targets[view.target].movable for view in observations.views])
     points = sight.points[world[observations.points.view[sight.point_rows]]]
-    tracks = sight.tracks[np.unique(sight.track_index[world[observations.curves.view[sight.curve_rows]]])]
+    tracks = sight.tracks[distinct(sight.track_index[world[observations.curves.view[sight.curve_rows]]])]
     return np.concatenate([points, *(tracks[:, 0] + along for along in (0.0, tracks[:, 1], tracks[:, 2]))])
 
 

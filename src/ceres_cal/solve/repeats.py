@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices
+from ceres_cal.base.arrays import Array, Indices, median
 from ceres_cal.base.words import two_digits
 from ceres_cal.model.equations import Equations, equations_of, whole_structure
 from ceres_cal.model.parameters import Estimate, unit_px
@@ -209,7 +209,7 @@ class _Repeats:
         inverse = np.linalg.inv(information + ridge)
         left = left - _placed(model, np.sum(columns.values * np.append(inverse @ score, 0.0)[columns.slots], axis=1))
         spare = model.spare - float(np.sum(inverse * information))
-        least = spare * (_LEAST_PX * float(np.median(model.weight))) ** 2
+        least = spare * (_LEAST_PX * median(model.weight)) ** 2
         return cls(
             score,
             information,

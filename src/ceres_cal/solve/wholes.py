@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices, Indices32, Mask
+from ceres_cal.base.arrays import Array, Indices, Indices32, Mask, distinct
 from ceres_cal.model.equations import Equations
 from ceres_cal.observations import Columns, Observations, View
 from ceres_cal.observations.sights import Sights
@@ -137,7 +137,7 @@ def wholes_of(observations: Observations, sights: Sights) -> Iterator[Wholes]:
         if view.placement is not None:
             owner[number] = len(views) + placed.setdefault(view.placement, len(placed))
     owner[(owner < len(views)) & (frames == 0)] = -1
-    if len(np.unique(owner[owner >= 0])) >= FEWEST_VIEWS:
+    if len(distinct(owner[owner >= 0])) >= FEWEST_VIEWS:
         of = owner[np.concatenate([observations.points.view, observations.curves.view])]
         yield Wholes(observations, of.astype(np.int32), len(views) + len(placed), frames, of_features=False)
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ceres_cal.base.arrays import Array, Indices
+from ceres_cal.base.arrays import Array, Indices, median
 from ceres_cal.base.errors import DegenerateError
 from ceres_cal.base.threads import parts_of, run_parts
 from ceres_cal.base.transforms import Pose
@@ -101,7 +101,7 @@ def facing(homography: Array, plane_points: Array, image_points: Array) -> Array
     """The homography with the sign that sends the plane points to their image points, not to their opposites."""
     sent = np.column_stack([plane_points, np.ones(len(plane_points))]) @ homography.T
     agree = np.sum(sent * image_points, axis=1)
-    return homography if np.median(agree) >= 0.0 else -homography
+    return homography if median(agree) >= 0.0 else -homography
 
 
 def poses_from_homographies(homographies: Array, phi: float = 1.0) -> Array:
@@ -255,11 +255,11 @@ def fit_lines(lines: Array, image_points: Array, rounds: int) -> tuple[Array | N
         inverse = vectors[:, 0].reshape(3, 3)
         sent = image_points @ inverse.T
         distance = np.abs(np.sum(lines * sent, axis=1)) / np.maximum(np.abs(sent[:, 2]), 1e-9)
-        typical = float(np.median(distance))
+        typical = median(distance)
         bound = max(3.0 * typical, 1e-9)
         weights = 1.0 / (np.maximum(sent[:, 2] ** 2, 1e-9) * (1.0 + (distance / bound) ** 2))
         weights /= weights.mean()
-    inverse *= np.copysign(1.0, np.median(sent[:, 2]))
+    inverse *= np.copysign(1.0, median(sent[:, 2]))
     # More than one G fits, or one that sends the image to a line.
     if values[1] < _NO_SECOND**2 or abs(np.linalg.det(inverse)) < _SINGULAR:
         return None, typical

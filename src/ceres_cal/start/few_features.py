@@ -14,7 +14,7 @@ from functools import cache
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices, Mask
+from ceres_cal.base.arrays import Array, Indices, Mask, distinct
 from ceres_cal.base.errors import DegenerateError
 from ceres_cal.base.transforms import rotation_exp
 from ceres_cal.observations.sights import Sights
@@ -173,7 +173,7 @@ def _features(
 
 
 def _evenly(count: int) -> Indices:
-    return np.unique(np.linspace(0, max(count - 1, 0), min(count, _MOST)).round().astype(np.int64))
+    return distinct(np.linspace(0, max(count - 1, 0), min(count, _MOST)).round().astype(np.int64))
 
 
 def _refined(features: _Features) -> tuple[Array, Array]:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices
+from ceres_cal.base.arrays import Array, Indices, distinct
 from ceres_cal.base.errors import DegenerateError
 from ceres_cal.base.transforms import Pose, Poses, chained, inverted
 from ceres_cal.model.parameters import Estimate, Options, Station, anchored_stations, unit_px
@@ -322,6 +322,6 @@ def _require_all(
         frames = ", ".join(repr(observations.views[i].frame) for i in sight.views[0][:3])
         raise DegenerateError(
             f"frame {frames} ({key}): {len(sight.point_rows)} points and {len(sight.curve_rows)} curve observations "
-            f"(on {len(np.unique(sight.track_index))} curves) cannot fix its pose: give at least four points, "
+            f"(on {len(distinct(sight.track_index))} curves) cannot fix its pose: give at least four points, "
             "not on one line, or straight lines in two directions, two of each, or remove the view"
         )

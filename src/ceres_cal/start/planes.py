@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices, Mask
+from ceres_cal.base.arrays import Array, Indices, Mask, distinct, median
 from ceres_cal.base.errors import DegenerateError
 from ceres_cal.base.native import kept_signals
 from ceres_cal.kernels import grouped_scatter
@@ -60,12 +60,12 @@ class PlaneSight:
     @property
     def segments(self) -> int:
         """Number of the straight lines of which something is seen."""
-        return len(np.unique(self.lines[2 * len(self.points) :], axis=0))
+        return len(distinct(self.lines[2 * len(self.points) :], axis=0))
 
     @property
     def equations(self) -> int:
         """What the sight can say of a homography's eight numbers: two for each point, two for each line."""
-        return 2 * len(np.unique(self.points, axis=0)) + 2 * self.segments
+        return 2 * len(distinct(self.points, axis=0)) + 2 * self.segments
 
     @property
     def size_px(self) -> float:
@@ -190,7 +190,7 @@ def _profile_of_boards(board: Sights, data: PlaneData, unit: float) -> RadialPro
 
     A profile needs no more: every other homography follows from it.
     """
-    numbers = np.unique(np.linspace(0, len(board) - 1, _ENOUGH_BOARDS).round().astype(np.int64))
+    numbers = distinct(np.linspace(0, len(board) - 1, _ENOUGH_BOARDS).round().astype(np.int64))
     rows, sizes = ranges(data.bounds, numbers), np.diff(board.point_bounds)[numbers]
     few = PlaneData(
         bounds_of(np.diff(data.bounds)[numbers]), data.plane.take(rows, axis=0), data.offsets.take(rows, axis=0)
@@ -198,7 +198,7 @@ def _profile_of_boards(board: Sights, data: PlaneData, unit: float) -> RadialPro
     terms = int(np.clip((sizes.sum() - 3 * len(numbers)) // 8, 1, 3))
     first = radial_alignment(few, unit, terms, rounds=2)
     wrong = (first.relative_error > _SUSPICIOUS) & (first.error_px > 1.0)
-    if np.mean(wrong) < 0.02 and np.median(first.error_px) < _ROUGH_PX:
+    if np.mean(wrong) < 0.02 and median(first.error_px) < _ROUGH_PX:
         return first.profile
     some = board.take(numbers)
     return radial_alignment(_plane_data(some, np.arange(len(some.points))), unit, terms, rounds=8).profile
@@ -291,7 +291,7 @@ def ring_radii(sight: Sights) -> RingRadii:
 
 def _from_rings(sight: Sights, unit: float) -> tuple[RadialProfile, Array]:
     radii = ring_radii(sight)
-    if len(np.unique(radii.ring_m)) < 3:  # they tell a magnification, and nothing of the lens
+    if len(distinct(radii.ring_m)) < 3:  # they tell a magnification, and nothing of the lens
         profile, kappa = RadialProfile((0.0, 0.0), unit), float(np.mean(radii.measured_px / radii.ring_m))
     else:
         profile, kappa = ring_profile(radii.measured_px, radii.ring_m, unit)
@@ -302,7 +302,7 @@ def _from_rings(sight: Sights, unit: float) -> tuple[RadialProfile, Array]:
 def _homographies_of_boards(board: Sights, data: PlaneData, profile: RadialProfile) -> Array:
     """The homographies, by LO-RANSAC (pycolmap) where some points of a sight lie far off while most fit."""
     homographies, error_px = homographies_of_sights(data, profile)
-    limit = max(_SUSPICIOUS * float(np.median(error_px)), 2.0)
+    limit = max(_SUSPICIOUS * median(error_px), 2.0)
     far = np.add.reduceat(error_px > limit, data.bounds[:-1], dtype=np.int64)
     sizes = np.diff(data.bounds)
     for number in np.flatnonzero((far > 0.1 * sizes) & (sizes >= 8)):

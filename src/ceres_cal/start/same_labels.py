@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices
+from ceres_cal.base.arrays import Array, Indices, median
 from ceres_cal.base.transforms import Pose, rotation_exp
 from ceres_cal.model.parameters import Options
 from ceres_cal.observations import Observations, View
@@ -110,7 +110,7 @@ def _turns(
     target_of = {view.placement: observations.targets[view.target] for view in observations.views}
     turns = [symmetries(target_of[b.placement]) for _, b in shared]
     between = [[poses[b] @ turn @ poses[a].inverse for turn in own] for (a, b), own in zip(shared, turns, strict=True)]
-    depth = float(np.median([poses[b].position @ poses[b].position for _, b in shared]) ** 0.5)
+    depth = median(np.array([poses[b].position @ poses[b].position for _, b in shared])) ** 0.5
     answers = []
     for pose in (one for own in between for one in own):
         off = [[_apart(pose, other, depth) for other in own] for own in between]

@@ -195,18 +195,22 @@ class _Placements(Mapping[str, Information]):
     inflation: float = 1.0
 
     @cached_property
-    def _matrices(self) -> dict[str, Array]:
+    def _informations(self) -> dict[str, Information]:
         parts = ((part.names, _placement_information(part, self.shared, self.inflation)) for part in self.eliminated)
-        return {name: matrix for names, matrices in parts for name, matrix in zip(names, matrices, strict=True)}
+        return {
+            name: Information(tuple(pose_keys("placement", name)), matrix)
+            for names, matrices in parts
+            for name, matrix in zip(names, matrices, strict=True)
+        }
 
     def __getitem__(self, name: str) -> Information:
-        return Information(tuple(pose_keys("placement", name)), self._matrices[name])
+        return self._informations[name]
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self._matrices)
+        return iter(self._informations)
 
     def __len__(self) -> int:
-        return len(self._matrices)
+        return len(self._informations)
 
 
 def _placement_information(part: Eliminated, shared: Information, inflation: float) -> Array:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices
+from ceres_cal.base.arrays import Array, Indices, distinct
 from ceres_cal.base.tails import NORMAL_95
 from ceres_cal.model.parameters import Estimate
 from ceres_cal.observations import Columns, Observations
@@ -127,7 +127,7 @@ def disagreement(
     common = [thing for thing in a if thing in b]
     places = np.array([a[thing].place for thing in common]).reshape(-1, 3)
     covariances = np.empty((len(common), 2, 2))
-    for height_m in np.unique(places[:, 2]):
+    for height_m in distinct(places[:, 2]):
         here = places[:, 2] == height_m
         covariances[here] = predicted(estimate, posterior, pair, places[here, :2], float(height_m))
     gaps = [_gap(a[thing], b[thing], covariance) for thing, covariance in zip(common, covariances, strict=True)]
@@ -162,7 +162,7 @@ def _sightings(
         feet, start = along_track(tracks, is_arc, s), curve.parameter_range[0]
         length = (turned_on(curve, s) - start) * np.linalg.norm(tracks[:, 1], axis=1)
         stretch = np.floor(length / _BIN_M).astype(int)
-        for number in np.unique(stretch):
+        for number in distinct(stretch):
             part = stretch == number
             if np.count_nonzero(part) >= _FEWEST:
                 sighting = _sighting(camera, curves, rows[part], feet[part], scales[1])
@@ -187,7 +187,7 @@ def _rows(observations: Observations, columns: Columns, station: str) -> Iterato
             rows.setdefault(view.target, []).append(np.arange(first, last))
     for name, parts in rows.items():
         every = np.concatenate(parts)
-        for feature in np.unique(columns.feature[every]):
+        for feature in distinct(columns.feature[every]):
             yield observations.targets[name], int(feature), every[columns.feature[every] == feature]
 
 

@@ -9,7 +9,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices, Mask
+from ceres_cal.base.arrays import Array, Indices, Mask, distinct, median
 from ceres_cal.model.equations import Equations
 from ceres_cal.observations.sights import bounds_of
 
@@ -131,7 +131,7 @@ class Family:
         """Median distance to the nearest neighbour, m; 0 where no strand has two places."""
         apart = np.where(self.distance > 0.0, self.distance, np.inf).min(axis=2)
         apart = apart[np.isfinite(apart)]
-        return float(np.median(apart)) if len(apart) else 0.0
+        return median(apart) if len(apart) else 0.0
 
     @cached_property
     def longest(self) -> float:
@@ -168,4 +168,4 @@ class Family:
 def _near_and_far(count: int) -> Indices:
     """Rows of a strand: some next to one another in its middle, and some over all of it."""
     middle = max(0, (count - _NEAR) // 2)
-    return np.union1d(np.arange(middle, min(count, middle + _NEAR)), evenly(count, _FAR))
+    return distinct(np.append(np.arange(middle, min(count, middle + _NEAR)), evenly(count, _FAR)))

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ceres_cal.base.arrays import Array
+from ceres_cal.base.arrays import Array, median
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.words import two_digits
 from ceres_cal.model.parameters import Estimate
@@ -89,7 +89,7 @@ class Uncertainty:
     @property
     def widening(self) -> str:
         """Why standard deviations are larger than by the model alone, in a line; "" where they are not."""
-        dependence, factor = self.posterior.dependence, float(np.median(self.posterior.factors))
+        dependence, factor = self.posterior.dependence, median(self.posterior.factors)
         if dependence is None or not dependence.causes or factor < _WIDENED:
             return ""
         return f"{' and '.join(dependence.causes)}: standard deviations {two_digits(factor)} times as large as without"

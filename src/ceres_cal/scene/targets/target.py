@@ -39,7 +39,7 @@ class Grid:
     checkered: bool = False
 
 
-@dataclass(frozen=True, eq=False, repr=False)
+@dataclass(frozen=True, eq=False)
 class Target:
     """A rigid thing of known geometry, in a frame of its own, in metres; a field's frame is the world.
 

@@ -1,0 +1,33 @@
+"""arrays: what stands in for functions of NumPy's that import more than they need."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from ceres_cal.base.arrays import distinct, median
+
+
+@pytest.mark.parametrize("count", range(1, 9))
+def test_median_is_numpys(count: int) -> None:
+    values = np.random.default_rng(count).normal(size=count)
+    assert median(values) == np.median(values)
+
+
+def test_median_of_what_is_not_finite() -> None:
+    assert median(np.array([1.0, np.inf, 2.0])) == 2.0 and median(np.array([1.0, np.inf])) == np.inf
+    assert np.isnan(median(np.array([1.0, np.nan, 2.0]))) and np.isnan(median(np.zeros(0)))
+
+
+def test_distinct_is_numpys_unique() -> None:
+    values = np.random.default_rng(1).integers(0, 3, (20, 2))
+    np.testing.assert_array_equal(distinct(values), np.unique(values))
+    np.testing.assert_array_equal(distinct(values, axis=0), np.unique(values, axis=0))
+
+
+def test_they_import_no_masked_arrays() -> None:
+    call = "distinct(np.arange(3)), distinct(np.eye(3), axis=0), median(np.arange(3.0))"
+    code = f"import sys, numpy as np; from ceres_cal.base.arrays import *; {call}; print('numpy.ma' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["False"]
