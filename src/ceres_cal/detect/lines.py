@@ -12,35 +12,22 @@ import cv2
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Array32, Indices, Indices32, Mask
+from ceres_cal.detect.blur import blur_of, no_blur
 from ceres_cal.detect.courses import Course
-from ceres_cal.detect.profiles import (
-    LEAST_BLUR_PX,
-    MOST_BLUR_PX,
-    Profiles,
-    Windows,
-    cut_windows,
-    fit_profiles,
-    fit_shape,
-)
+from ceres_cal.detect.profiles import Profiles, Windows, cut_windows, fit_profiles
 from ceres_cal.detect.sampling import drawn_aside
 
 HALF_WIDTH_PX = 3  # of a window, along the line
 SPACING_PX = 2.0 * HALF_WIDTH_PX + 2.0  # neighbouring windows share no pixels
-_BEYOND_PX = 4.5  # of a window, past the paint's border
+_BEYOND_PX = 4.5  # of a window, past the paint's border; farther where the picture is blurred
 _SEARCH_STEP_PX = 0.5
 _TINY = 1e-9  # grey levels
 _BAND_PX = 3.0  # of background, to either side of the paint, in the search
-_SHAPE_WINDOWS = 150
 # Of blur, in standard deviations: the part of a blurred line that is brightest.
 _AS_WIDE = 2.5
-# Blur, px, from which a line is so wide that it must be searched as such: no lens in focus has that.
-_WIDE_BLUR_PX = 1.7
-# Of a wide blur: what is fitted. A camera does not move evenly, and not the brightest place of its smear is the mean
-# one but the middle of its weight, which a wider profile finds.
-_OF_WIDE = 1.5
-# Directions that lines run in, of which each has its own blur where the camera moved; windows to tell it by; and
-# windows that count as much as no direction having any.
-_SECTORS, _FEWEST_IN_SECTOR, _ALIKE = 4, 12, 10.0
+# Of blur, in standard deviations: how far past the paint's border a blurred line reaches. Where that is more than the
+# usual window it is searched, and measured, as wide as it is, and as smeared.
+_AS_FAR = 2.5
 # Contrast over noise. Of 3100 line centres two more are taken at half of it, 77 fewer at double, none of them wrong.
 _LEAST_CLARITY = 4.0
 # Share of the usual contrast. Nothing changes from half to double.
@@ -71,7 +58,7 @@ class Lines:
         found: (N,) where paint was measured.
         offset_px: (N,) how far along the normal from the course's place the paint's middle lies; NaN where not found.
         sigma_px: (N,) standard deviation of it. contrast: (N,) grey levels.
-        blur_px: standard deviation of the picture's blur, lens and pixel together.
+        blur_px: standard deviation of the picture's blur, lens, pixel and motion together.
         stretch: the paint's width over what the target says, as far as the blur lets it be seen.
     """
 
@@ -122,14 +109,15 @@ def search(
     far = reach_px + float(np.max(width_px)) + _BAND_PX + 2.0
     steps = np.arange(-np.ceil(far / _SEARCH_STEP_PX), np.ceil(far / _SEARCH_STEP_PX) + 1.0) * _SEARCH_STEP_PX
     light = np.mean([_along_normals(grey, course, steps, shift) for shift in (-2.0, 0.0, 2.0)], axis=0)
-    total = np.cumsum(np.column_stack([np.zeros(len(light)), light]), axis=1)
+    # Between steps, not of them: a mean must lie as far to one side of its place as to the other.
+    total = np.cumsum(np.pad(0.5 * (light[:, 1:] + light[:, :-1]), ((0, 0), (1, 0))), axis=1)
 
     def mean(low: Array, high: Array) -> Array:
         """(N, S) mean light from `low` to `high` (N,) px beyond each step."""
         first, last = (np.round(edge / _SEARCH_STEP_PX).astype(int) for edge in (low, high))
         places = np.arange(len(steps))
-        a = np.clip(places + first[:, None], 0, len(steps) - 1)
-        b = np.clip(places + np.maximum(last, first + 1)[:, None], a + 1, len(steps))
+        a = np.clip(places + first[:, None], 0, len(steps) - 2)
+        b = np.clip(places + last[:, None], a + 1, len(steps) - 1)
         rows = np.arange(len(light))[:, None]
         return np.asarray((total[rows, b] - total[rows, a]) / (b - a))
 
@@ -161,20 +149,28 @@ def _along_normals(grey: Array32, course: Course, steps: Array, shift_px: float)
     return np.asarray(cv2.remap(grey, x.astype(np.float32), y.astype(np.float32), flags, borderMode=border), float)
 
 
-def measure(grey: Array32, course: Course, reach_px: float) -> Lines:
-    """Measure the paint at every place of a course, whose windows hold no other paint (see `courses.clear_px`).
+def measure(grey: Array32, course: Course, reach_px: float, clear_px: Array | float = np.inf) -> Lines:
+    """Measure the paint at the places of a course whose windows hold no other paint.
 
     Args:
-        reach_px: how far the course may be off.
+        reach_px: how far the course may be off. clear_px: (N,) or one, from each place to other paint (see
+            `courses.clear_px`).
     """
-    if not len(course):
-        none = np.empty(0)
-        return Lines(course, np.empty(0, dtype=bool), none, none, none, 1.0, 1.0)
-    rough, windows, blur, stretch = _shaped(grey, course, reach_px, 0.0)
-    if np.max(blur) > _WIDE_BLUR_PX:
-        rough, windows, blur, stretch = _shaped(grey, course, reach_px, blur)
+    clear, blur, beyond = np.broadcast_to(clear_px, len(course)), no_blur(len(course)), _BEYOND_PX
+    for _ in range(2):
+        alone = clear > _window_px(course, beyond)
+        course, clear, blur = course.take(alone), clear[alone], blur.take(alone)
+        if not len(course):
+            none = np.empty(0)
+            return Lines(course, np.empty(0, dtype=bool), none, none, none, 1.0, 1.0)
+        rough, bright = search(grey, course, reach_px, 0.0, blur.blur_px)
+        windows = _windows(grey, course, rough, beyond)
+        blur = blur_of(windows, course, bright, blur)
+        if _AS_FAR * np.max(blur.blur_px) <= beyond:
+            break
+        beyond = _AS_FAR * float(np.max(blur.blur_px))
     edges = np.column_stack([-0.5 * course.width_px, 0.5 * course.width_px])
-    fits = fit_profiles(windows, stretch * edges, np.where(blur > _WIDE_BLUR_PX, _OF_WIDE, 1.0) * blur, 1.5)
+    fits = fit_profiles(windows, blur.stretch * edges, blur.blur_px, 1.5, blur.smear_px)
     contrast = np.minimum(fits.heights[:, 0], -fits.heights[:, 1])
     offset = rough + fits.offset_px
     found = _is_paint(course, fits, contrast, np.median(windows.values, axis=1))
@@ -189,64 +185,21 @@ def measure(grey: Array32, course: Course, reach_px: float) -> Lines:
         np.where(found, offset, np.nan),
         sigma,
         contrast,
-        float(np.sqrt(np.mean(blur**2))),
-        stretch,
+        blur.usual_px,
+        blur.stretch,
     )
 
 
-def window_px(course: Course) -> Array:
-    """(N,) how far from a place its window may reach: other paint must be farther away."""
-    return np.asarray(1.2 * (course.width_px + _BEYOND_PX) + HALF_WIDTH_PX)
+def _window_px(course: Course, beyond_px: float) -> Array:
+    """(N,) how far from a place its window may reach: other paint, as blurred as its own, must be farther away."""
+    return np.asarray(1.2 * (course.width_px + beyond_px) + HALF_WIDTH_PX + beyond_px - _BEYOND_PX)
 
 
-def _shaped(
-    grey: Array32, course: Course, reach_px: float, blur_px: Array | float
-) -> tuple[Array, Windows, Array, float]:
-    """Where the paint is, roughly, (N,) px along the normals; the windows there; the blur (N,) and stretch of all."""
-    rough, bright = search(grey, course, reach_px, 0.0, blur_px)
-    places = course.pixels + rough[:, None] * course.normals
-    usual_length = float(np.quantile(0.5 * course.width_px + _BEYOND_PX, 0.9))
-    windows = cut_windows(grey, places, course.normals, course.curvature, usual_length, HALF_WIDTH_PX)
-    return (rough, windows, *_shape(windows, course, bright))
-
-
-def _shape(windows: Windows, course: Course, bright: Array) -> tuple[Array, float]:
-    """The blur (N,) across each place, of a picture that may be moved in one direction, and the stretch of all."""
-    angle = np.mod(np.arctan2(course.normals[:, 1], course.normals[:, 0]), np.pi)
-    rows = np.flatnonzero(windows.inside)
-    if not len(rows):
-        return np.ones(len(course)), 1.0
-    edges = np.column_stack([-0.5 * course.width_px, 0.5 * course.width_px])
-    blur, stretch = _shape_of(windows, edges, _brightest(bright, rows), 1.0, 1.0)
-    sector = np.floor(angle[rows] / np.pi * _SECTORS + 0.5) % _SECTORS
-    own = [_brightest(bright, rows[sector == number]) for number in np.unique(sector)]
-    own = [some for some in own if len(some) >= _FEWEST_IN_SECTOR]
-    if len(own) < 2:
-        return np.full(len(course), blur), stretch
-    squares = np.array([_shape_of(windows, edges, some, blur, stretch)[0] ** 2 for some in own])
-    towards = np.array([np.mean(_doubled(angle[some]), axis=0) for some in own])
-    count = np.array([float(min(len(some), _SHAPE_WINDOWS)) for some in own])
-    # s^2 = a + b cos 2t + c sin 2t: what any blur that is an ellipse does across a line in direction t.
-    columns = np.column_stack([np.ones(len(own)), towards])
-    normal = columns.T @ (count[:, None] * columns) + np.diag([0.0, _ALIKE, _ALIKE])
-    a, b, c = np.linalg.solve(normal, columns.T @ (count * squares))
-    across = a + _doubled(angle) @ [b, c]
-    return np.sqrt(np.clip(across, LEAST_BLUR_PX**2, MOST_BLUR_PX**2)), stretch
-
-
-def _brightest(bright: Array, rows: Indices) -> Indices:
-    """Of these rows, those that are surely on paint: what a moved camera smears is fainter in one direction."""
-    return rows[bright[rows] >= 0.5 * np.quantile(bright[rows], 0.8)]
-
-
-def _doubled(angle: Array) -> Array:
-    return np.column_stack([np.cos(2.0 * angle), np.sin(2.0 * angle)])
-
-
-def _shape_of(windows: Windows, edges: Array, rows: Indices, blur: float, stretch: float) -> tuple[float, float]:
-    rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), _SHAPE_WINDOWS)).astype(int)]
-    some = Windows(windows.values[rows], windows.distance[rows], windows.inside[rows])
-    return fit_shape(some, edges[rows], blur, stretch)
+def _windows(grey: Array32, course: Course, rough_px: Array, beyond_px: float) -> Windows:
+    """Windows about where the paint is, roughly, (N,) px along the normals, that reach so far past its border."""
+    places = course.pixels + rough_px[:, None] * course.normals
+    usual_length = float(np.quantile(0.5 * course.width_px + beyond_px, 0.9))
+    return cut_windows(grey, places, course.normals, course.curvature, usual_length, HALF_WIDTH_PX)
 
 
 def _is_paint(course: Course, fits: Profiles, contrast: Array, around: Array) -> Mask:

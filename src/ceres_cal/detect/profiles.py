@@ -9,6 +9,9 @@ side, for a painted line), blurred by a Gaussian of standard deviation s that st
 background of any slope that may differ from one side to the other. With g and the heights free, neither blur nor light
 nor slope pulls c aside: all are even about it. Nothing is interpolated, so the noise of the pixels is as the sensor
 made it, and the curvature of the least squares tells the standard deviation of c.
+
+A camera that moves while the shutter is open smears that over m along the normal: Phi becomes its mean from t - m / 2
+to t + m / 2. That is even about c, too, and its two ends tell c much better than a Gaussian as wide would.
 """
 
 from __future__ import annotations
@@ -20,8 +23,9 @@ import numpy as np
 from ceres_cal.base.arrays import Array, Array32, Mask
 
 LEAST_BLUR_PX, MOST_BLUR_PX = 0.3, 4.0
-_SHAPE_RANGE = (np.log([LEAST_BLUR_PX, 0.4]), np.log([MOST_BLUR_PX, 2.5]))
-_SHAPE_SIGMA = np.array([1.0, 0.3])  # of the logarithms of blur and stretch, beforehand
+LEAST_SMEAR_PX, MOST_SMEAR_PX = 0.3, 20.0
+_SHAPE_RANGE = (np.log([LEAST_BLUR_PX, 0.4, LEAST_SMEAR_PX]), np.log([MOST_BLUR_PX, 2.5, MOST_SMEAR_PX]))
+_SHAPE_SIGMA = np.array([1.0, 0.3, 1.0])  # of the logarithms of blur, stretch and smear, beforehand
 _MOST_STEP_PX = 0.7
 # Grey levels: how much brighter one side of a line is than the other, beforehand. Of a line much narrower than its blur
 # the pixels alone tell such a step and the line's place hardly apart.
@@ -62,6 +66,22 @@ class Profiles:
     noise: Array
 
 
+@dataclass(frozen=True)
+class Shape:
+    """What a picture makes of edges: blur_px, the Gaussian's standard deviation; stretch, a factor on the edges'
+    distances; smear_px, how far a camera that moved smears them, 0 of one that did not.
+    """
+
+    blur_px: float
+    stretch: float = 1.0
+    smear_px: float = 0.0
+
+    @property
+    def logarithms(self) -> Array:
+        """(2,), or (3,) with a smear."""
+        return np.log([self.blur_px, self.stretch, self.smear_px][: 3 if self.smear_px > 0.0 else 2])
+
+
 def cut_windows(
     image: Array32, places: Array, normals: Array, curvature: Array, half_length_px: float, half_width_px: int
 ) -> Windows:
@@ -96,16 +116,19 @@ def cut_windows(
     return Windows(image[y, x].reshape(shape).astype(float), distance.reshape(shape), inside)
 
 
-def fit_profiles(windows: Windows, edges: Array, blur_px: Array | float, reach_px: float) -> Profiles:
+def fit_profiles(
+    windows: Windows, edges: Array, blur_px: Array | float, reach_px: float, smear_px: Array | float = 0.0
+) -> Profiles:
     """Fit the model to every window.
 
     Args:
         edges: (N, E) px: where the steps are, relative to c. blur_px: (N,) or one, the Gaussian's standard deviation.
-        reach_px: a c farther from the place than this is none.
+        reach_px: a c farther from the place than this is none. smear_px: (N,) or one, of a camera that moved.
     """
     offset = np.zeros(len(windows.values))
-    blur = np.broadcast_to(np.asarray(blur_px, dtype=float), offset.shape)
-    normal, right = _linear(windows, edges, blur, offset)
+    blur, smear = (np.broadcast_to(np.asarray(one, dtype=float), offset.shape) for one in (blur_px, smear_px))
+    steps = _Steps(edges, blur, smear)
+    normal, right = _normal(_columns(windows, steps, offset, None), windows.values)
     heights = _solve(normal, right)[:, 2:]
     squares = np.sum(windows.values**2, axis=1)
     variance = (squares - np.sum(_solve(normal, right) * right, axis=1)) / windows.values.shape[1]
@@ -113,7 +136,7 @@ def fit_profiles(windows: Windows, edges: Array, blur_px: Array | float, reach_p
     level[2:-1] = 1.0 if edges.shape[1] > 1 else 0.0
     for _ in range(_STEPS):
         known = np.maximum(variance, 0.0)[:, None, None] * np.outer(level, level) / _LEVEL_SIGMA**2
-        columns = _columns(windows, edges, blur, offset, heights)
+        columns = _columns(windows, steps, offset, heights)
         normal, right = _normal(columns, windows.values)
         solution = _solve(normal + known, right)
         variance = _misfit(squares, normal, right, solution) / windows.values.shape[1]
@@ -136,41 +159,43 @@ def _misfit(squares: Array, normal: Array, right: Array, solution: Array) -> Arr
     )
 
 
-def fit_shape(
-    windows: Windows, edges: Array, blur_px: float, stretch: float = 1.0, rounds: int = 8
-) -> tuple[float, float]:
-    """The blur that all windows share, and the factor on the edges' distances that suits them best.
+def fit_shape(windows: Windows, edges: Array, start: Shape, rounds: int = 8) -> Shape:
+    """What all windows share: the blur, the factor on the edges' distances that suits them best, and the smear.
 
-    Both are pulled towards where they start, by as much as one window in good light would outweigh: of a line that is
+    Each is pulled towards where it starts, by as much as one window in good light would outweigh: of a line that is
     narrower than its blur no picture tells the width.
 
     Args:
-        blur_px, stretch: where to start.
+        start: where to start; without a smear none is looked for.
     """
-    start = np.log([blur_px, stretch])
-    shape, offset = start.copy(), np.zeros(len(windows.values))
+    begin = start.logarithms
+    shape, offset, free = begin.copy(), np.zeros(len(windows.values)), len(begin)
     heights = None
     for _ in range(rounds):
-        blur, apart = np.full(len(offset), np.exp(shape[0])), edges * np.exp(shape[1])
+        now = np.exp(shape)
+        steps = _Steps(edges * now[1], np.full(len(offset), now[0]), np.full(len(offset), now[2] if free > 2 else 0.0))
         if heights is None:
-            heights = _solve(*_linear(windows, apart, blur, offset))[:, 2:]
-        columns = _columns(windows, apart, blur, offset, heights, shape=True)
+            heights = _solve(*_normal(_columns(windows, steps, offset, None), windows.values))[:, 2:]
+        columns = _columns(windows, steps, offset, heights, free=free)
         normal, right = _normal(columns, windows.values)
-        own, squares = normal[:, :-2, :-2], np.sum(windows.values**2, axis=1)
-        solution = _solve(own, right[:, :-2])
-        noise = np.maximum(squares - np.sum(solution * right[:, :-2], axis=1), 1.0) / windows.values.shape[1]
-        cross = normal[:, :-2, -2:]
+        own, squares = normal[:, :-free, :-free], np.sum(windows.values**2, axis=1)
+        solution = _solve(own, right[:, :-free])
+        noise = np.maximum(squares - np.sum(solution * right[:, :-free], axis=1), 1.0) / windows.values.shape[1]
+        cross = normal[:, :-free, -free:]
         away = np.linalg.solve(own + _ridge(own), cross)
-        schur = np.sum((normal[:, -2:, -2:] - np.matmul(np.swapaxes(cross, 1, 2), away)) / noise[:, None, None], axis=0)
-        left = right[:, -2:] - np.einsum("npq,np->nq", cross, solution)
-        pull = np.diag(1.0 / _SHAPE_SIGMA**2)
-        change = np.linalg.solve(schur + pull, np.sum(left / noise[:, None], axis=0) + pull @ (start - shape))
-        shape = np.clip(shape + np.clip(change, -0.3, 0.3), *_SHAPE_RANGE)
+        schur = normal[:, -free:, -free:] - np.matmul(np.swapaxes(cross, 1, 2), away)
+        left = right[:, -free:] - np.einsum("npq,np->nq", cross, solution)
+        pull = np.diag(1.0 / _SHAPE_SIGMA[:free] ** 2)
+        change = np.linalg.solve(
+            np.sum(schur / noise[:, None, None], axis=0) + pull,
+            np.sum(left / noise[:, None], axis=0) + pull @ (begin - shape),
+        )
+        shape = np.clip(shape + np.clip(change, -0.3, 0.3), *(limit[:free] for limit in _SHAPE_RANGE))
         offset = offset + np.clip(solution[:, -1], -_MOST_STEP_PX, _MOST_STEP_PX)
         heights = solution[:, 2:-1]
         if np.all(np.abs(change) < 1e-3):
             break
-    return float(np.exp(shape[0])), float(np.exp(shape[1]))
+    return Shape(*np.exp(shape).tolist())
 
 
 def normal_step(x: Array) -> tuple[Array, Array]:
@@ -185,33 +210,47 @@ def normal_step(x: Array) -> tuple[Array, Array]:
 # ---- least squares over many small problems -------------------------------------------------------------------------
 
 
-def _linear(windows: Windows, edges: Array, blur: Array, offset: Array) -> tuple[Array, Array]:
-    """Normal equations of background, slope and heights, c being held."""
-    columns = _columns(windows, edges, blur, offset, None)
-    return _normal(columns, windows.values)
+@dataclass(frozen=True, eq=False)
+class _Steps:
+    """Steps at `edges` (N, E) beside each c, blurred by `blur` (N,) and smeared over `smear` (N,) px."""
+
+    edges: Array
+    blur: Array
+    smear: Array
+
+    def rise(self, number: int, distance: Array) -> tuple[Array, Array, Array, Array]:
+        """(N, K) how high step `number` is at distances from c, and the derivatives of that by the distance and by the
+        logarithms of blur and smear.
+        """
+        away, blur = distance - self.edges[:, number, None], self.blur[:, None]
+        if not np.any(self.smear):
+            high, bell = normal_step(away / blur)
+            return high, bell / blur, -bell * away / blur, np.zeros_like(high)
+        smear = np.maximum(self.smear, LEAST_SMEAR_PX)[:, None]
+        ends = away - 0.5 * smear, away + 0.5 * smear
+        (low, low_bell), (high, high_bell) = (normal_step(end / blur) for end in ends)
+        by_blur = (high_bell - low_bell) * blur / smear
+        rise = (ends[1] * high - ends[0] * low) / smear + by_blur
+        return rise, (high - low) / smear, by_blur, 0.5 * (low + high) - rise
 
 
-def _columns(
-    windows: Windows, edges: Array, blur: Array, offset: Array, heights: Array | None, *, shape: bool = False
-) -> Array:
-    """(N, P, K) derivatives of the model: by b, g, each height; with heights by c too; with `shape` by ln s and the
-    logarithm of the edges' stretch.
+def _columns(windows: Windows, steps: _Steps, offset: Array, heights: Array | None, *, free: int = 0) -> Array:
+    """(N, P, K) derivatives of the model: by b, g, each height; with heights by c too; and by as many as are `free` of
+    the logarithms of blur, the edges' stretch and smear.
     """
-    count, pixels = windows.distance.shape
-    steps = edges.shape[1]
-    extra = 0 if heights is None else 3 if shape else 1
-    columns = np.zeros((count, 2 + steps + extra, pixels))
-    columns[:, 0], columns[:, 1] = 1.0, windows.distance - offset[:, None]
-    for j in range(steps):
-        x = (windows.distance - (offset + edges[:, j])[:, None]) / blur[:, None]
-        columns[:, 2 + j], bell = normal_step(x)
+    (count, pixels), number = windows.distance.shape, steps.edges.shape[1]
+    columns = np.zeros((count, 2 + number + (0 if heights is None else 1 + free), pixels))
+    away = windows.distance - offset[:, None]
+    columns[:, 0], columns[:, 1] = 1.0, away
+    for j in range(number):
+        columns[:, 2 + j], slope, by_blur, by_smear = steps.rise(j, away)
         if heights is None:
             continue
-        by_place = -(heights[:, j] / blur)[:, None] * bell
-        columns[:, 2 + steps] += by_place
-        if shape:
-            columns[:, 3 + steps] += by_place * x * blur[:, None]
-            columns[:, 4 + steps] += by_place * edges[:, j, None]
+        columns[:, 2 + number] -= heights[:, j, None] * slope
+        if free:
+            by_shape = (by_blur, -steps.edges[:, j, None] * slope, by_smear)
+            for k in range(free):
+                columns[:, 3 + number + k] += heights[:, j, None] * by_shape[k]
     return columns
 
 

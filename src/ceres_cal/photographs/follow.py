@@ -12,7 +12,7 @@ from ceres_cal.base.arrays import Array, Array32
 from ceres_cal.base.errors import CalibrationError
 from ceres_cal.calibrating import calibrate
 from ceres_cal.detect.courses import Course, clear_px, predict
-from ceres_cal.detect.lines import SPACING_PX, Lines, measure, search, window_px
+from ceres_cal.detect.lines import SPACING_PX, Lines, measure, search
 from ceres_cal.detect.registration import nearness, shifted
 from ceres_cal.model.parameters import Options, intrinsic_names
 from ceres_cal.observations import Observations, Prior
@@ -272,7 +272,8 @@ class _Tracker:
     def with_best_lens(self, followed: Followed) -> Followed:
         """What is found when the lines are predicted with the kind of lens that suits them best.
 
-        A polynomial that is a pixel off bends what crossings are extrapolated along.
+        A polynomial that is a pixel off bends what crossings are extrapolated along, and one that folds in the picture
+        does so where nothing was measured.
         """
         lines, fits = followed.lines, []
         known = tuple(prior for prior in self.free.priors if prior.dimension)
@@ -289,7 +290,7 @@ class _Tracker:
             fits.append((calibration.fit.curve_scale * len(lines.found) / calibration.fit.curves, calibration))
         if not fits:
             return followed
-        best = min(fits, key=lambda fit: fit[0])[1]
+        best = min(fits, key=lambda fit: (fit[1].station().folds, fit[0]))[1]
         camera, target = best.station(), best.targets[TARGET]
         lines = replace(self, target=target).measured(camera)
         moved = _moved_px(followed.camera, camera, lines.course.pixels)
@@ -324,8 +325,8 @@ class _Tracker:
 
     def measured(self, camera: Camera) -> Lines:
         course = predict(self.target, camera, self.curves, SPACING_PX, SPACING_PX)
-        clear = clear_px(self.target, camera, course, self.curves) > window_px(course)
-        return measure(self.grey, course.take(clear), _LAST_REACH_PX)
+        clear = clear_px(self.target, camera, course, self.curves)
+        return measure(self.grey, course, _LAST_REACH_PX, clear)
 
     def _observed(self, lines: Lines, camera: Camera) -> Observations:
         rows = lines.found
