@@ -13,7 +13,7 @@ from ceres_cal.base.errors import CalibrationError, DegenerateError, SolutionErr
 from ceres_cal.base.threads import at_most, meanwhile, single_threaded_blas
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.caveats import resting_phi, unknown_phi
-from ceres_cal.calibration.outcome import came_out, of_all
+from ceres_cal.calibration.outcome import came_out, of_all, of_closed_form
 from ceres_cal.model.parameters import AUTO, Estimate, Layout, Options, make_layout
 from ceres_cal.model.priors import gather_priors
 from ceres_cal.model.quantities import difference
@@ -28,7 +28,6 @@ from ceres_cal.solve import (
     Progress,
     ReducedInformation,
     RobustSolution,
-    Solution,
     find_conflicts,
     information,
     least_of_few,
@@ -41,10 +40,8 @@ from ceres_cal.solve.conflicts import contradicted_by
 from ceres_cal.solve.dimensions import free_dimensions, require_measured
 from ceres_cal.solve.explanation import Explanation
 from ceres_cal.solve.looked_at import Asked
-from ceres_cal.solve.noise import visible_from
 from ceres_cal.solve.possible import require_possible
 from ceres_cal.solve.usable import require_fits, require_usable
-from ceres_cal.start.baseline import four_point_baseline
 from ceres_cal.start.initialise import Start, initialise
 from ceres_cal.uncertainty import Posterior, Scatter, assess, measure_scatter
 
@@ -183,7 +180,7 @@ def _of_lens(
         priors = gather_priors(observations, given, start.estimate.structure)
         problem = Problem(sights, make_layout(observations, given), priors, options=given)
         if given.closed_form_only:
-            return _closed_form(start, observations, problem)
+            return of_closed_form(start, observations, problem)
         return solved_from(start, observations, problem, watched=watched)
 
     if not options.usual_camera:
@@ -314,16 +311,6 @@ def solved_from(
     calibration = replace(calibration, warnings=warnings, posterior=posterior, conflicts=conflicts.every)
     tolerances = {**problem.options.tolerances, **tolerances_of(as_built)}
     return replace(calibration, options=replace(problem.options, tolerances=tolerances), as_built=as_built)
-
-
-def _closed_form(start: Start, observations: Observations, problem: Problem) -> Calibration:
-    """The paper's own method alone: nothing is minimised."""
-    estimate = four_point_baseline(problem.sights, start.estimate)
-    there = residuals(observations, problem.sights, estimate)
-    require_possible(observations, problem.sights, estimate, there)
-    solution = Solution(estimate, np.nan, False, "the paper's closed form, nothing was minimised", ())
-    end = RobustSolution(problem, solution, visible_from(observations, there), there, 0)
-    return came_out(start.phi_from, observations, problem, end)
 
 
 def _assess(

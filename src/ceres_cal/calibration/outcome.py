@@ -12,9 +12,14 @@ from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.calibration.calibration import Calibration
 from ceres_cal.calibration.origin import COPY, Fit, Rejected
 from ceres_cal.model.parameters import Layout
+from ceres_cal.model.residuals import residuals
 from ceres_cal.observations import Observations
-from ceres_cal.solve import Problem, RobustSolution
+from ceres_cal.solve import Problem, RobustSolution, Solution
 from ceres_cal.solve.explanation import Explanation
+from ceres_cal.solve.noise import visible_from
+from ceres_cal.solve.possible import require_possible
+from ceres_cal.start.baseline import four_point_baseline
+from ceres_cal.start.initialise import Start
 
 if TYPE_CHECKING:
     from ceres_cal.solve.bulk import Settled
@@ -44,6 +49,16 @@ def came_out(
         problem.options,
         observations.digest,
     )
+
+
+def of_closed_form(start: Start, observations: Observations, problem: Problem) -> Calibration:
+    """The paper's own method alone: nothing is minimised."""
+    estimate = four_point_baseline(problem.sights, start.estimate)
+    there = residuals(observations, problem.sights, estimate)
+    require_possible(observations, problem.sights, estimate, there)
+    solution = Solution(estimate, np.nan, False, "the paper's closed form, nothing was minimised", ())
+    end = RobustSolution(problem, solution, visible_from(observations, there), there, 0)
+    return came_out(start.phi_from, observations, problem, end)
 
 
 def of_all(calibration: Calibration, settled: Settled) -> Calibration:

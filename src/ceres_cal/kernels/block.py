@@ -13,7 +13,8 @@ import numpy as np
 from ceres_cal.kernels.arguments import ROUNDING, Blocks, CurveColumns, Loss, Optics, PointColumns, Unknowns
 from ceres_cal.kernels.jit import jit
 from ceres_cal.kernels.lenses import prepared
-from ceres_cal.kernels.sight import normal_equations, order_of_rows, working_space
+from ceres_cal.kernels.sight import normal_equations, order_of_rows
+from ceres_cal.kernels.workspace import working_space
 
 
 @jit

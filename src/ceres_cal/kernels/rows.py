@@ -10,14 +10,8 @@ from ceres_cal.kernels.arguments import BUILT, CurveColumns, Loss, Optics, Point
 from ceres_cal.kernels.jit import borrowing, jit
 from ceres_cal.kernels.lenses import prepared
 from ceres_cal.kernels.losses import robust_loss
-from ceres_cal.kernels.sight import (
-    CHUNK,
-    curve_directions,
-    jacobian_rows,
-    move_to_feet,
-    shown_points,
-    working_space,
-)
+from ceres_cal.kernels.sight import curve_directions, jacobian_rows, move_to_feet, shown_points
+from ceres_cal.kernels.workspace import CHUNK, working_space
 
 
 @jit
