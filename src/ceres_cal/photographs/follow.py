@@ -85,7 +85,7 @@ def follow(
             again = tracker.refined(one) if one.holds else one
             if again.is_field and not again.built.dimensions:
                 best = again
-    return best if best.is_field else tracker.stretched(best)
+    return best if best.holds else tracker.stretched(best)
 
 
 def approach(grey: Array32, target: Target, camera: Camera, curves: Collection[str], free: FreeIntrinsics) -> Followed:
@@ -102,7 +102,7 @@ def look_again(
     tracker = _Tracker(grey, target, curves, free)
     refined = tracker.refined(seen)
     drawn = refined if refined.is_field else tracker.as_drawn(seen)
-    return drawn if drawn.is_field else tracker.stretched(drawn)
+    return drawn if drawn.holds else tracker.stretched(drawn)
 
 
 def refine(grey: Array32, target: Target, camera: Camera, curves: Collection[str], free: FreeIntrinsics) -> Followed:
@@ -222,7 +222,7 @@ class _Tracker:
         return other if drawn.built.is_other or drawn.built.dimensions else drawn
 
     def stretched(self, other: Followed) -> Followed:
-        """What is not the field with square pixels, or the field in a picture that was stretched one way."""
+        """What does not hold with square pixels, or the field in a picture that was stretched one way."""
         names = [name for name in self.free.names if name in intrinsic_names(other.camera.lens)]
         free = replace(self.free, names=("aspect", *names))
         there = replace(self, free=free).close_in(other.camera, _FAR_REACHES_PX)
