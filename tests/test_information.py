@@ -136,6 +136,12 @@ def test_directions_of_which_nothing_is_known(seed: int, count: int, data: st.Da
     assert known.marginal(known.keys[: max(1, count - rank)]).known_rank <= rank
 
 
+def test_one_direction_of_numbers_far_apart() -> None:
+    """Whose plain inverse is rounding that adds up to nothing."""
+    known = drawn(504336568, 3, 1)
+    assert np.trace(known.inverse @ known.matrix) == pytest.approx(1.0, abs=1e-9)
+
+
 def test_nothing() -> None:
     known = Information.nothing(KEYS)
     assert known.known_rank == 0 and known.root.shape == (0, 6)

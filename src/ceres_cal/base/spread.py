@@ -62,8 +62,8 @@ def _regular_inverses(scaled: Array) -> Array | None:
         inverse = np.linalg.inv(scaled)
     except np.linalg.LinAlgError:
         return None
-    sizes = np.trace(inverse, axis1=-2, axis2=-1)  # not less than one by the least eigenvalue
-    regular = np.all((sizes > 0.0) & (sizes < _REGULAR))
+    sizes = np.diagonal(inverse, axis1=-2, axis2=-1)  # of ones on the diagonal no less than one; else it is rounding
+    regular = np.all(sizes > 0.5) and np.all(sizes.sum(axis=-1) < _REGULAR)
     return np.asarray(0.5 * (inverse + np.swapaxes(inverse, -1, -2))) if regular else None
 
 
