@@ -15,6 +15,8 @@ from ceres_cal.base.arrays import Array
 from ceres_cal.scene.lens.base import Lens
 from ceres_cal.scene.lens.polynomials import STEPS, Profile, Ratio, invert_increasing
 
+_LONGEST = 0.1  # step of Newton's method, of the limit
+
 
 class Planar(Lens):
     """A lens by its map of a plane, in units of its own."""
@@ -93,6 +95,9 @@ class Planar(Lens):
             xx, xy, yx, yy = self._jacobian(here)
             step = np.column_stack([yy * error[:, 0] - xy * error[:, 1], xx * error[:, 1] - yx * error[:, 0]])
             step /= (xx * yy - xy * yx)[:, None]
+            # At the limit the map hardly grows, and a whole step would end behind others that lead past it.
+            length = np.linalg.norm(step, axis=1)
+            step *= np.minimum(1.0, _LONGEST * self._limit / np.maximum(length, 1e-300))[:, None]
             flat[rows] = here - step
             rows = rows[np.any(np.abs(step) > 1e-13, axis=1)]
             if not len(rows):
