@@ -2,11 +2,14 @@
 
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from ceres_cal.base.arrays import distinct, median
+
+SAMPLE = Path(__file__).parents[1] / "data" / "ssl_field" / "observations.json"
 
 
 @pytest.mark.parametrize("count", range(1, 9))
@@ -31,3 +34,10 @@ def test_they_import_no_masked_arrays() -> None:
     code = f"import sys, numpy as np; from ceres_cal.base.arrays import *; {call}; print('numpy.ma' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["False"]
+
+
+def test_nor_does_a_calibration(tmp_path: Path) -> None:
+    command = ["calibrate", str(SAMPLE), "-o", str(tmp_path / "calibration.json"), "--quiet"]
+    code = f"import sys; from ceres_cal.cli import main; main({command}); print('numpy.ma' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split()[-1] == "False"

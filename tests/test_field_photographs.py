@@ -10,10 +10,11 @@ import photograph_shots as script
 import photographs
 import pytest
 
+from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.calibrating import calibrate
 from ceres_cal.cli import main
-from ceres_cal.detect.courses import clear_px, predict
+from ceres_cal.detect.courses import Course, clear_px, predict
 from ceres_cal.detect.crossings import find_crossings
 from ceres_cal.detect.images import light, read_light
 from ceres_cal.detect.lines import SPACING_PX, measure
@@ -23,7 +24,7 @@ from ceres_cal.photographs.clicks import FORMAT, clicks_from_json
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Radial
 from ceres_cal.scene.targets import Segment, custom, ssl_field
-from ceres_cal.simulate import Photography, Station, field_scene, overhead_pose
+from ceres_cal.simulate import Photography, Scene, Station, field_scene, overhead_pose
 from ceres_cal.simulate.photograph import photograph
 
 FIELD = ssl_field("B")
@@ -91,18 +92,29 @@ def test_a_mosaic_of_colours_draws_no_line_aside(tmp_path: Path) -> None:
         assert np.array_equal(read_light(tmp_path / "picture.png"), light(picture))
 
 
+def of_slanted_lines(places: Array) -> Scene:
+    """A small camera over thin lines that rise by 1 to 4 degrees, from these places (N,), m, on."""
+    angles = np.deg2rad(np.linspace(1.0, 4.0, len(places)))
+    lines = {
+        f"line {k}": Segment((-6.0, y, 0.0), (6.0, y + 12.0 * np.tan(angle), 0.0), 0.03)
+        for k, (y, angle) in enumerate(zip(places, angles, strict=True))
+    }
+    optics, pose = Camera((320, 240), 100.0, (159.5, 119.5), Radial((0.0,), (3,))), overhead_pose(0.0, 0.0, 5.0)
+    return field_scene(custom(curves=lines), {"overhead": optics}, {"overhead": Station("overhead", pose)})
+
+
+def course_in(scene: Scene) -> Course:
+    """Places on all of its lines, well inside the picture."""
+    field = scene.targets["field"]
+    return predict(field, scene.camera_at("overhead"), field.curve_names, SPACING_PX, 12.0)
+
+
 @pytest.mark.parametrize("turned", [False, True])
 def test_a_moved_camera_draws_no_line_aside(turned: bool) -> None:
     """Seven pixels across the lines: what looks for them first must be as even as what measures them then."""
-    angles = np.deg2rad(np.linspace(1.0, 4.0, 6))
-    lines = {
-        f"line {k}": Segment((-6.0, y, 0.0), (6.0, y + 12.0 * np.tan(angle), 0.0), 0.03)
-        for k, (y, angle) in enumerate(zip(np.linspace(-5.0, 3.0, 6), angles, strict=True))
-    }
-    optics, pose = Camera((320, 240), 100.0, (159.5, 119.5), Radial((0.0,), (3,))), overhead_pose(0.0, 0.0, 5.0)
-    scene = field_scene(custom(curves=lines), {"overhead": optics}, {"overhead": Station("overhead", pose)})
+    scene = of_slanted_lines(np.linspace(-5.0, 3.0, 6))
     picture = light(photograph(scene, "overhead", "0001", Photography(carpet_texture=0.02), 1).image)
-    course = predict(scene.targets["field"], scene.camera_at("overhead"), tuple(lines), SPACING_PX, 12.0)
+    course = course_in(scene)
     if turned:
         course = replace(course, normals=-course.normals, curvature=-course.curvature)
     found = measure(np.asarray(cv2.blur(picture, (1, 7)), np.float32), course, 3.0)
@@ -112,16 +124,10 @@ def test_a_moved_camera_draws_no_line_aside(turned: bool) -> None:
 
 def test_what_windows_cannot_know_is_added_to_their_sigmas() -> None:
     """Paint thinner than a pixel, sampled without blur: errors of a tenth of a pixel, alike over several places."""
-    angles = np.deg2rad(np.linspace(1.0, 4.0, 12))
-    lines = {
-        f"line {k}": Segment((-6.0, y, 0.0), (6.0, y + 12.0 * np.tan(angle), 0.0), 0.03)
-        for k, (y, angle) in enumerate(zip(np.linspace(-5.0, 4.0, 12), angles, strict=True))
-    }
-    optics, pose = Camera((320, 240), 100.0, (159.5, 119.5), Radial((0.0,), (3,))), overhead_pose(0.0, 0.0, 5.0)
-    scene = field_scene(custom(curves=lines), {"overhead": optics}, {"overhead": Station("overhead", pose)})
+    scene = of_slanted_lines(np.linspace(-5.0, 4.0, 12))
     dim = np.linspace(0.2, 1.0, 320)[None, :, None]  # windows on the right know much better than those on the left
     picture = photograph(scene, "overhead", "0001", Photography(blur_px=0.0, vignetting=0.0, read_noise=0.0), 1).image
-    course = predict(scene.targets["field"], scene.camera_at("overhead"), tuple(lines), SPACING_PX, 12.0)
+    course = course_in(scene)
     noise = np.random.default_rng(2).normal(0.0, 2.0, picture.shape[:2])
     found = measure((light(picture) * dim[..., 0] + noise).astype(np.float32), course, 3.0)
     off = found.offset_px / found.sigma_px

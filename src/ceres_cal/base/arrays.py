@@ -22,7 +22,7 @@ AnyArray = NDArray[Any]
 _Kind = TypeVar("_Kind", bound=np.generic)
 
 
-# `np.unique` and `np.median` import masked arrays when they are first called, which takes as long as many a solve.
+# `np.median`, and `np.unique` unless it counts, import masked arrays when first called, which takes as long as a solve.
 
 
 def distinct(values: NDArray[_Kind], axis: int | None = None) -> NDArray[_Kind]:
