@@ -220,6 +220,16 @@ def test_the_real_photograph_without_its_clicks(real_data: Path) -> None:
     assert figures["BottomLeftCorner off its published click, px"].value < 15.0  # 3.8 px
 
 
+def test_the_real_photograph_by_defaults(real_data: Path) -> None:
+    """Its lines wander by pixels: no lens is to bend after them."""
+    path, target = real_data / "ssl_tigers_line_corners" / "camera_frame_1224x1024_crop.png", script.real_target()
+    painted = [name for name in target.curve_names if name not in script.NOT_PAINTED]
+    found = detect_field([path], target, Auto((Facing("LeftGoalLine", "left"),)), painted)
+    calibration = calibrate(found.observations)
+    assert calibration.lens_choice is not None and not calibration.lens_choice.chosen.startswith("spline")
+    assert calibration.station().phi == pytest.approx(728.0, rel=0.03)  # 731; 726 to 731 with the centre held
+
+
 # ---- the whole way --------------------------------------------------------------------------------------------------
 
 
