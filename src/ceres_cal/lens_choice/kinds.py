@@ -20,7 +20,7 @@ from ceres_cal.solve.left_out import GroupNormals
 # Probability of what a lens leaves more than a longer one, under which it is no lens for these observations. At 0.001
 # halves of real sets took a lens too simple, 4 to 5 standard deviations off; at 0.02 the paper's is missed more often.
 _REFUTED = 0.01
-_UNSEEN_GROUPS = 10.0  # so many that scatter as the noise has it stand beside those that were seen: a dozen overshoot
+_UNSEEN_GROUPS = 10.0  # so many that scatter as the noise has it stand beside those that were seen: a dozen vary
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +94,10 @@ class Candidate:
     def refutes(self, other: Candidate) -> bool:
         """Whether the other lens, which has fewer numbers, leaves more than it may by chance."""
         more = self.form.size - other.form.size
-        return more > 0 and upper_tail((other.least - self.least) / self.of.scatter, more) < _REFUTED
+        if more <= 0 or self.squares is None:
+            return False
+        known = len(self.squares) + _UNSEEN_GROUPS
+        return upper_tail((other.least - self.least) / self.of.scatter, more, known) < _REFUTED
 
     def may_win(self, best: Candidate | None) -> bool:
         """Whether it is the longest of a kind whose shorter ones may be as good as the best."""

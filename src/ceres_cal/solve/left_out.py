@@ -58,12 +58,16 @@ class GroupNormals:
     def scatter_of(self, numbers: Indices) -> float:
         """Mean of the variances of some of the numbers as groups scatter, over those by the noise alone.
 
-        The delete-one jackknife (Efron and Stein, Annals of Statistics 9, 1981), which overshoots where groups are few.
+        Each group's residuals are taken as large as without its own share in the fit (CR2: Bell and McCaffrey, Survey
+        Methodology 28, 2002), so that it is 1 on average where errors are independent, however few groups there are.
+        The jackknife divides by that share twice, and overshoots where one group nearly alone tells a direction.
         """
         axes = np.linalg.qr(self._root[numbers].T)[0]
         gradient = (self.gradient + self.normal @ self._least_step) @ self._root
-        without = self._left_out(self._root, gradient)[1] @ axes
-        return float((len(without) - 1.0) * np.mean(np.var(without, axis=0)))
+        rest, turn = np.linalg.eigh(self._split(self._root)[1])
+        along = (gradient[:, None, :] @ turn) / np.sqrt(rest)[:, None, :]
+        moved = (along @ np.swapaxes(turn, 1, 2))[:, 0] @ axes
+        return float(len(moved) * np.mean(moved**2))
 
     def held_out(self, held: Mapping[Key, float]) -> tuple[Array, Array]:
         """(G,) squared errors of each group predicted from all others, and the step (K,) to where the least squares
@@ -78,15 +82,15 @@ class GroupNormals:
         moved = self.normal @ step
         squares = self.squares + 2.0 * (self.gradient @ step) + moved @ step
         gradient = (self.gradient + moved) @ root
-        own, without = self._left_out(root, gradient)
+        own, rest = self._split(root)
+        without = np.linalg.solve(rest, gradient[:, :, None])[:, :, 0]
         squares += np.einsum("gk,gk->g", 2.0 * gradient + np.einsum("gkl,gl->gk", own, without), without)
         return squares, step
 
-    def _left_out(self, root: Array, gradient: Array) -> tuple[Array, Array]:
-        """Each group's share (G, R, R) of the information, and where the others are without it (G, R), along a root."""
+    def _split(self, root: Array) -> tuple[Array, Array]:
+        """(G, R, R) each group's share of the information along a root of everything's, and that of all others."""
         own = root.T @ self.normal @ root
-        rest = (1.0 + _RIDGE) * np.eye(root.shape[1]) - own
-        return np.asarray(own), np.asarray(np.linalg.solve(rest, gradient[:, :, None])[:, :, 0])
+        return np.asarray(own), np.asarray((1.0 + _RIDGE) * np.eye(root.shape[1]) - own)
 
     @cached_property
     def _whole(self) -> Array:
