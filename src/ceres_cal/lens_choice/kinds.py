@@ -17,9 +17,10 @@ from ceres_cal.model.parameters import Estimate
 from ceres_cal.model.quantities import moved, values_of
 from ceres_cal.solve.left_out import GroupNormals
 
-# Probability of what a lens leaves more than a longer one, under which it is no lens for these observations. At 0.001
-# halves of real sets took a lens too simple, 4 to 5 standard deviations off; at 0.02 the paper's is missed more often.
-_REFUTED = 0.01
+# Probability of what a lens leaves more than a longer one, under which it is no lens for these observations. At 0.01 the
+# paper's is missed more often, and seams in a carpet are decentring; at 0.001, by a scatter that one group could swell,
+# halves of real sets took a lens too simple.
+_REFUTED = 0.003
 _UNSEEN_GROUPS = 10.0  # so many that scatter as the noise has it stand beside those that were seen: a dozen vary
 
 
@@ -63,15 +64,17 @@ class Kind:
 
     @cached_property
     def scatter(self) -> float:
-        """Mean of the variances of its coefficients as groups scatter, over those by the noise alone; at least 1, and
-        the nearer to it the fewer groups there are.
+        """Mean of the variances of its coefficients as groups scatter, over those by the stated noise; at least what
+        noise alone makes of it, and the nearer to that the fewer groups there are.
         """
         if self.normals is None:
             return 1.0
         names = set(self.forms[0].names)
         own = [i for i, key in enumerate(self.normals.keys) if key.kind == "camera" and key.quantity in names]
-        more, groups = self.normals.scatter_of(np.array(own)) - 1.0, len(self.normals.counts)
-        return 1.0 + max(0.0, more) * groups / (groups + _UNSEEN_GROUPS)
+        groups, spare = len(self.normals.counts), self.normals.counts.sum() - len(self.normals.keys)
+        noise = min(1.0, self.least / max(float(spare), 1.0))  # a first solve with another lens may have left more
+        more = self.normals.scatter_of(np.array(own)) - noise
+        return noise + max(0.0, more) * groups / (groups + _UNSEEN_GROUPS)
 
 
 @dataclass(frozen=True, eq=False)
