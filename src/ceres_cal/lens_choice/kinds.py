@@ -17,9 +17,9 @@ from ceres_cal.model.parameters import Estimate
 from ceres_cal.model.quantities import moved, values_of
 from ceres_cal.solve.left_out import GroupNormals
 
-# Probability of what a lens leaves more than a longer one, under which it is no lens for these observations. At 0.01 the
-# paper's is missed more often, and seams in a carpet are decentring; at 0.001, by a scatter that one group could swell,
-# halves of real sets took a lens too simple.
+# Probability of what a lens leaves more than a longer one, under which it is no lens for these observations. At 0.01
+# the paper's is missed more often, and seams in a carpet are decentring; at 0.001, by a scatter that one group could
+# swell, halves of real sets took a lens too simple.
 _REFUTED = 0.003
 _UNSEEN_GROUPS = 10.0  # so many that scatter as the noise has it stand beside those that were seen: a dozen vary
 
