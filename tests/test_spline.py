@@ -19,12 +19,12 @@ from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
 from ceres_cal.diagnostics import diagnose
 from ceres_cal.formats import export
-from ceres_cal.model.parameters import Options
+from ceres_cal.model.parameters import Options, Station
 from ceres_cal.observations import NO_CURVES, Observations, Points, View, taken
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Spline, make_lens
 from ceres_cal.scene.targets import checkerboard
-from ceres_cal.simulate import Disturbance, Simulation, simulate
+from ceres_cal.simulate import Disturbance, Simulation, board_scene, simulate
 
 
 @st.composite
@@ -126,6 +126,26 @@ def test_it_is_as_smooth_as_the_data_say() -> None:
     assert spline < 4.0 * formula  # 0.020 against 0.007 px measured
     (camera,) = calibration.cameras.values()
     assert isinstance(camera.lens, Spline) and np.abs(camera.lens.values[12:]).max() < 1.0
+
+
+def crooked(lens: str, aside_px: float) -> Observations:
+    """60 boards before a lens that displaces by so much across, too, which its first powers do not."""
+    own = {"camera": scenes.camera(lens)}
+    scene = board_scene(checkerboard(9, 6, 0.1), own, {"camera": Station("camera", Pose.identity())}, count=60, seed=1)
+    plain = simulate(scene, Disturbance(points_sigma_px=0.2), seed=3).observations
+    x, y = ((plain.points.pixels - (651.3, 468.9)) / 800.0).T
+    aside = aside_px * np.column_stack([np.cos(7.0 * x + 3.0 * y), np.sin(8.0 * y - 2.0 * x)])
+    return replace(plain, points=replace(plain.points, pixels=plain.points.pixels + aside))
+
+
+def test_it_becomes_longer_where_views_agree_on_what_it_leaves() -> None:
+    """Unless its powers are stated, or it leaves nothing."""
+    straight = calibrate(crooked("kannala-brandt", 0.0), Options(lens="spline"))
+    observations = crooked("kannala-brandt", 0.8)
+    grown, held = (calibrate(observations, Options(lens="spline", powers=powers)) for powers in ((), (2, 3)))
+    assert straight.options.powers == held.options.powers == (2, 3)
+    assert len(grown.options.powers) > 3 and grown.options.free_aspect and not held.options.free_aspect
+    assert held.fit.points_rms_px > 1.15 * grown.fit.points_rms_px
 
 
 def test_where_nothing_was_seen_nothing_is_known() -> None:

@@ -273,6 +273,7 @@ def solved_from(
     usual = again.scales if again else None
     end = solve_robustly(problem, observations, start.estimate, usual, watched.progress, is_near=start.is_near)
     if again is None:
+        problem, start, end = _grown(problem, observations, start, end, watched)
         require_measured(end.problem, end.solution.estimate)
 
     def solved(others: Problem, some: Asked) -> RobustSolution:
@@ -311,6 +312,21 @@ def solved_from(
     calibration = replace(calibration, warnings=warnings, posterior=posterior, conflicts=conflicts.every)
     tolerances = {**problem.options.tolerances, **tolerances_of(as_built)}
     return replace(calibration, options=replace(problem.options, tolerances=tolerances), as_built=as_built)
+
+
+def _grown(
+    problem: Problem, observations: Observations, start: Start, end: RobustSolution, watched: Watched
+) -> tuple[Problem, Start, RobustSolution]:
+    """With a lens as long as the residuals ask for, where that was left open."""
+    if problem.options.powers:
+        return problem, start, end
+    from ceres_cal.lens_choice.growing import grown, seen_longer
+
+    def solved(longer: Problem, near: Estimate) -> RobustSolution:
+        return solve_robustly(longer, observations, near, None, watched.progress)
+
+    problem, end = grown(problem, observations, end, solved)
+    return problem, replace(start, estimate=seen_longer(start.estimate, problem.options)), end
 
 
 def _assess(

@@ -76,7 +76,7 @@ class Spline(Planar):
     powers: tuple[int, ...] = (2, 3)
     kind: ClassVar[str] = "spline"
     acts_on_pixels: ClassVar[bool] = True
-    trial_powers: ClassVar[tuple[tuple[int, ...], ...]] = ((2, 3), (2, 3, 4, 5))
+    trial_powers: ClassVar[tuple[tuple[int, ...], ...]] = ((2, 3), (2, 3, 4, 5), tuple(range(2, MOST + 1)))
     missing_powers: ClassVar[tuple[int, ...]] = ()
     set_at_start: ClassVar[tuple[str, ...]] = ("rim",)
     work_rows: ClassVar[int] = WORK_ROWS
