@@ -44,6 +44,7 @@ from ceres_cal.solve.possible import require_possible
 from ceres_cal.solve.usable import require_fits, require_usable
 from ceres_cal.start.initialise import Start, initialise
 from ceres_cal.uncertainty import Posterior, Scatter, assess, measure_scatter
+from ceres_cal.uncertainty.rough import shifts_by_roughness
 
 if TYPE_CHECKING:
     from ceres_cal.solve.bulk import Bulk, Part, Settled
@@ -297,6 +298,8 @@ def solved_from(
     if assessed:
         end, posterior = _assess(end, observations, problem, again)
         posterior = _with_doubts(posterior.in_doubt(conflicts.keys, conflicts.shifts), end, explanations)
+        if problem.options.blank_lens.roughness and again is None:
+            posterior = posterior.in_doubt(*shifts_by_roughness(end, observations))
         if not posterior.profiles:  # a valley that is followed has its other places in it
             known = posterior.by_model or posterior.information
             shifts = shifts_to(others, end.solution.estimate, known, posterior.half_width)

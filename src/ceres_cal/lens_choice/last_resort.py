@@ -37,6 +37,8 @@ def _between_cells(seen: Seen, kind: Kind) -> float:
     left = np.concatenate([points[:, 0], points[:, 1], curves])
     cell = cells_of(seen.sights, seen.observations.cameras)
     counts = np.bincount(cell)
-    between = np.bincount(cell, left) ** 2 / counts
+    seen_in = counts > 0
+    counts = counts[seen_in]
+    between = np.bincount(cell, left)[seen_in] ** 2 / counts
     within = float(left @ left - between.sum()) / max(len(left) - len(counts), 1)
     return float(between.mean()) / within
