@@ -78,6 +78,14 @@ def test_powers_are_those_across() -> None:
         make_lens("spline", (1, 2))
 
 
+def test_its_knots_end_in_steps() -> None:
+    """So that numbers of two calibrations of one camera, from other views, mean the same."""
+    blank, angles = make_lens("spline", (2, 3)), np.linspace(0.5, 0.8, 61)
+    rims = np.array([blank.spanning(angle, 700.0, 1.15).values[0] for angle in angles])
+    asked = 1.15 * 1400.0 * np.tan(0.5 * angles)
+    assert len(set(rims.tolist())) == 7 and np.abs(rims / asked - 1.0).max() < 0.045
+
+
 # ---- other lenses ---------------------------------------------------------------------------------------------------
 
 
