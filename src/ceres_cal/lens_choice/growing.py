@@ -35,10 +35,10 @@ def grown(
         return problem, end
     rungs = options.blank_lens.trial_powers if options.coefficients is None else ()
     problem, end = _named(problem), replace(end, problem=_named(end.problem))
-    for powers in rungs[1:]:
+    for powers in rungs:
         if agreement(end, observations.cameras) <= AGREES:
             break
-        # An aspect and a skew are what displaces by the first power.
+        # First an aspect and a skew, which are what displaces by the first power.
         aspect, skew = (name not in options.fixed for name in ("aspect", "skew"))
         longer = replace(options, powers=powers, free_aspect=aspect, free_skew=skew)
         with suppress(CalibrationError):
