@@ -94,7 +94,7 @@ DECIDING: tuple[Constant, ...] = (
     *_of("solve.competing", "_STANDS_OUT", "calibrate"),
     *_of("solve.looked_at", "_LEFT", "calibrate"),
     *_of("solve.explanation", "DOUBTFUL", "calibrate"),
-    *_of("solve.offsets", "_FAULTY _INDEPENDENT", "calibrate"),
+    *_of("solve.offsets", "_FAULTY_FEATURE _FAULTY_VIEW _INDEPENDENT", "calibrate"),
     *_of("solve.repeats", "_REPEATS _AS_DRAWN _LIKELY", "calibrate", "diagnose"),
     *_of("solve.wholes", "FEWEST", "calibrate"),
     *_of("solve.bundle", "_POSED", "calibrate"),

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ceres_cal.base.arrays import distinct, median
+from ceres_cal.base.arrays import distinct, median, medians
 
 SAMPLE = Path(__file__).parents[1] / "data" / "ssl_field" / "observations.json"
 
@@ -16,6 +16,8 @@ SAMPLE = Path(__file__).parents[1] / "data" / "ssl_field" / "observations.json"
 def test_median_is_numpys(count: int) -> None:
     values = np.random.default_rng(count).normal(size=count)
     assert median(values) == np.median(values)
+    rows = np.stack([values, -2.0 * values])
+    assert np.array_equal(medians(rows), np.median(rows, axis=1))
 
 
 def test_median_of_what_is_not_finite() -> None:

@@ -25,7 +25,7 @@ from ceres_cal.scene.lens import Radial
 from ceres_cal.scene.targets import ssl_field
 from ceres_cal.simulate import Disturbance, Scene, Station, field_scene, overhead_pose, simulate
 from ceres_cal.solve import Problem, competing, looked_at, solve_robustly
-from ceres_cal.solve.offsets import Offsets
+from ceres_cal.solve.offsets import Offsets, fault_of
 
 NOISE = Disturbance(points_sigma_px=0.3, curves_sigma_px=0.3)
 LINES = ("TopTouchLine", "BottomTouchLine", "HalfwayLine", "CenterLine", "LeftPenaltyStretch")
@@ -248,7 +248,7 @@ def offsets(values: Array) -> Offsets:
     """Ten groups of one mode each, all directions as well determined."""
     size = np.full(len(values), 20.0)
     modes = np.sqrt(20.0) * np.eye(len(values))[:, :, None]
-    return Offsets(size, values, modes, 200.0, 200 + len(values))
+    return Offsets(size, values, modes, 200.0, 200 + len(values), fault_of(features=False))
 
 
 @pytest.mark.parametrize(("scatter", "is_wrong"), [(1.0, True), (5.0, False), (25.0, False)])

@@ -141,6 +141,15 @@ def test_the_wrong_one_of_two_that_fight_is_named() -> None:
     assert {"height", "phi"} <= set(one.words.replace(",", "").split())  # nothing tells which: both are named
 
 
+@pytest.mark.parametrize("tilt_deg, seed, stated", [(0.5, 2, RIGHT), (8.0, 1, WRONG)])
+def test_no_line_is_blamed_for_what_is_stated(tilt_deg: float, seed: int, stated: tuple[float, float]) -> None:
+    """Two whole lines, 34 good rows, were taken out and a line was in doubt while statements had a part in it."""
+    phi = Prior("camera", "overhead", "phi", (700.0,), (5.0,))
+    calibration = calibrate(seen(tilt_deg, seed), under(height(*stated), *([phi] if stated == RIGHT else [])))
+    assert calibration.conflicts and not calibration.rejected
+    assert not any("the whole of" in warning for warning in calibration.warnings)
+
+
 @pytest.mark.parametrize(
     "fixed, quantity, truth",
     [({"phi": 700.0}, "phi", 868.0), ({"cx": 600.0}, "cx", 651.3), ({"a2": 0.0}, "a2", -5.2e-5)],

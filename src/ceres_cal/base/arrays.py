@@ -32,8 +32,15 @@ def distinct(values: NDArray[_Kind], axis: int | None = None) -> NDArray[_Kind]:
 
 def median(values: Array) -> float:
     """The middle of some numbers (N,), or between the two in the middle; NaN where one of them is, or none is there."""
-    if not len(values):
-        return np.nan
-    low, high, last = (len(values) - 1) // 2, len(values) // 2, len(values) - 1
-    ordered = np.partition(values, (low, high, last))  # NaN is the last
-    return float(ordered[last] if np.isnan(ordered[last]) else 0.5 * (ordered[low] + ordered[high]))
+    return float(medians(values))
+
+
+def medians(values: Array) -> Array:
+    """(...) those of the numbers along the last axis of (..., N)."""
+    count = values.shape[-1]
+    if not count:
+        return np.full(values.shape[:-1], np.nan)
+    low, high, last = (count - 1) // 2, count // 2, count - 1
+    ordered = np.partition(values, (low, high, last), axis=-1)  # NaN is the last
+    largest = ordered[..., last]
+    return np.asarray(np.where(np.isnan(largest), largest, 0.5 * (ordered[..., low] + ordered[..., high])))

@@ -20,17 +20,18 @@ from ceres_cal.model.equations import write_equations
 from ceres_cal.model.residuals import residuals
 from ceres_cal.observations import Observations
 from ceres_cal.solve.bundle import with_placements_at_best
+from ceres_cal.solve.conflicts import without_suspects
 from ceres_cal.solve.explanation import DOUBTFUL, Explanation
 from ceres_cal.solve.linear_model import LinearModel, equation_weights, make_linear_model
 from ceres_cal.solve.looked_at import Asked, asked, excess, inliers_of, mostly_rejected, rows_looked_at
-from ceres_cal.solve.offsets import Offsets, measure_offsets
+from ceres_cal.solve.offsets import Offsets, fault_of, measure_offsets
 from ceres_cal.solve.problem import Problem
 from ceres_cal.solve.robust import RobustSolution
 from ceres_cal.solve.wholes import FEWEST, Wholes, wholes_of
 
-# Log odds, by the linear model, from which on a whole is looked at by a solve without it: one in thirty sound scenes is
-# above -9, errors that agree along lines over 2 m reach -3, a line 1.2 px aside is above -7.
-_SUSPECT = -9.0
+# Log Bayes factor, by the linear model, from which on a whole is looked at by a solve without it: one in thirty sound
+# scenes is above -4.4, errors that agree along lines over 2 m reach 1.6, a line 1.2 px aside is above -4.7.
+_SUSPECT = -4.4
 # Standard deviations by which a view's mean square must stand out, beyond the largest of so many by noise, for views to
 # be looked at: boards whose drawing is 3 % too short in one of ten do by 2 to 4, 10 % by 17.
 _STANDS_OUT = 2.5
@@ -52,7 +53,7 @@ def compete(
     every = Asked(problem, observations, end, list(wholes_of(observations, problem.sights)))
     if not every.kinds:
         return end, ()
-    some = asked(every)
+    some = _without_suspects(asked(every), solver)
     trials, explanations = _Competition(some, solver).decided(), list[Explanation]()
     taking_part = np.ones(len(observations.points) + len(observations.curves), dtype=bool)
     for trial in trials:
@@ -66,6 +67,18 @@ def compete(
         end = end if some is every else solver(every.without(~taking_part), every)
         end = replace(end, residuals=residuals(observations, problem.sights, end.solution.estimate))
     return end, tuple(explanations)
+
+
+def _without_suspects(every: Asked, solver: Solver) -> Asked:
+    """The same without the statements that look wrong: a line is not blamed for what they bend."""
+    freed = without_suspects(every.problem, every.observations, every.end)
+    if freed is every.problem:
+        return every
+    try:
+        end = solver(freed, every)
+    except CalibrationError:
+        return every
+    return every if end.solution.failed else replace(every, problem=freed, end=end)
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,7 +175,7 @@ class _Competition:
         none, each = offsets.log_evidence(), offsets.log_evidence_with_each()
         first = int(np.argmax(each))
         for number in np.argsort(-each)[:2]:
-            if each[number] - none > _SUSPECT:
+            if each[number] - none > _SUSPECT + np.log(offsets.fault.probability):
                 yield (int(chosen[number]),)
         both = offsets.log_evidence_with_each((first,))
         second = int(np.argmax(both))
@@ -239,7 +252,9 @@ class _Competition:
             agreeing[own] = agree
         if back:
             model = make_linear_model(problem, end.solution.estimate, equations, replace(weights, used=agreeing))
-        return chosen, measure_offsets(model, columns, group) if len(chosen) > 1 else None
+        if len(chosen) < 2:
+            return chosen, None
+        return chosen, measure_offsets(model, columns, group, fault_of(wholes.of_features))
 
 
 def _odds(offsets: Offsets, chosen: Indices, number: int, wrong: tuple[int, ...]) -> tuple[float, int | None]:

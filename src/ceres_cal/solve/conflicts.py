@@ -65,6 +65,19 @@ def find_conflicts(
     return Conflicts((*(one for _, one in pairs), *search.conflicts()), reduced.shared.keys, tuple(shifts))
 
 
+def without_suspects(problem: Problem, observations: Observations, end: RobustSolution) -> Problem:
+    """The problem without what is stated of cameras and looks wrong where it was solved: it may bend what is said of
+    others. Tolerances stay: a line that its own one does not hold is a line aside.
+    """
+    estimate = end.solution.estimate
+    for one in statements(problem, observations, estimate):
+        if one.kind in ("earlier", "tolerance"):
+            continue
+        if worst_test(one, linear_rest(one, end, observations)).log_p < np.log(_SUSPICIOUS):
+            problem = one.left_out(problem, estimate)
+    return problem
+
+
 def contradicted_by(
     priors: Sequence[GaussianPrior], estimate: Estimate, posterior: Information, degrees_of_freedom: float
 ) -> str | None:

@@ -22,16 +22,37 @@ import numpy as np
 from ceres_cal.base.arrays import Array, Indices, median
 from ceres_cal.solve.linear_model import LinearModel
 
-# Probability, before anything was seen, that some feature does not belong. From half to double the log odds change by
-# 0.7, those of a line 3 px aside are 10 to 20.
-_FAULTY = 0.01
+# Probability, before anything was seen, that some feature does not belong (lines are painted by hand), or some view.
+# From half to double the log odds change by 0.7, of a line 3 px aside they are 10 to 20. At 0.1 two of 200 sound
+# fields come into doubt; at 0.01 a quarter of the lines four standard deviations aside go unseen that need not.
+_FAULTY_FEATURE, _FAULTY_VIEW = 0.05, 0.01
 # Probability, before anything was seen, that errors do not go together along features. The log odds change by as much.
 _INDEPENDENT = 0.5
-# Standard deviations of offsets in those of one observation's noise: of features that belong, and of those that do not.
+# Standard deviations of offsets in those of one observation's noise: of what belongs; of what does not; of features
+# that do not, besides.
 _SCATTER = np.concatenate([[0.0], np.geomspace(0.1, 60.0, 14)])
-_ASIDE = np.array([10.0, 40.0, 160.0])
+_ASIDE = (10.0, 40.0, 160.0)
+_LEAST_ASIDE = 3.0
 _LEAST_PX = 1e-3  # noise that nothing is measured better than: of exact observations rounding is no offset
 _DETERMINED = 1e-5  # of the largest squared length of a mode: what the model leaves of directions that can be judged
+
+
+@dataclass(frozen=True)
+class Fault:
+    """What is expected of groups that do not belong, before anything was seen.
+
+    Attributes:
+        probability: that there is one. sizes: standard deviations of its offset, each as likely, in those of one
+            observation's noise.
+    """
+
+    probability: float
+    sizes: tuple[float, ...]
+
+
+def fault_of(features: bool) -> Fault:
+    """Of features, or of views and placements."""
+    return Fault(_FAULTY_FEATURE, (_LEAST_ASIDE, *_ASIDE)) if features else Fault(_FAULTY_VIEW, _ASIDE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +62,7 @@ class Offsets:
     Attributes:
         size: (R,) S of each direction. value: (R,) w. modes: (G, R, M) what an offset of each group does to w.
         rest: squared residuals that no offset explains. spare: equations left over in all.
+        fault: of groups that do not belong.
     """
 
     size: Array
@@ -48,6 +70,7 @@ class Offsets:
     modes: Array
     rest: float
     spare: int
+    fault: Fault
 
     def log_evidence(self, wrong: Sequence[int] = ()) -> float:
         """Of these groups not belonging, all others scattering alike."""
@@ -75,7 +98,7 @@ class Offsets:
         prior = np.log(np.where(_SCATTER == 0.0, _INDEPENDENT, (1.0 - _INDEPENDENT) / (len(_SCATTER) - 1)))
         prior = prior + 0.5 * np.sum(np.log(precision), axis=1)
         logs = []
-        for aside in _ASIDE[: len(_ASIDE) if count else 1]:
+        for aside in self.fault.sizes[: None if count else 1]:
             wider = np.eye(width) + aside**2 * normal
             explained = aside**2 * np.sum(slope * np.linalg.solve(wider, slope[..., None])[..., 0], axis=-1)
             left = np.log((self.rest + total - explained) / max(self.spare, 1))
@@ -83,14 +106,15 @@ class Offsets:
         every = np.concatenate(logs, axis=1)
         most = np.max(every, axis=1)
         summed = np.log(np.sum(np.exp(every - most[:, None]), axis=1) / len(logs))
-        return np.asarray(most + summed + count * np.log(_FAULTY / len(self.modes)))
+        return np.asarray(most + summed + count * np.log(self.fault.probability / len(self.modes)))
 
 
-def measure_offsets(model: LinearModel, columns: Array, group: Indices) -> Offsets:
+def measure_offsets(model: LinearModel, columns: Array, group: Indices, fault: Fault) -> Offsets:
     """What a model's residuals say of offsets.
 
     Args:
         columns: (E, M) of the modes, in standard deviations, of order one. group: (E,) of each equation, -1 in none.
+        fault: of groups that do not belong.
     """
     groups, width = int(group.max()) + 1, columns.shape[1]
     rows = np.flatnonzero((group >= 0) & model.used)
@@ -108,4 +132,4 @@ def measure_offsets(model: LinearModel, columns: Array, group: Indices) -> Offse
     modes = np.swapaxes(modes.reshape(groups, width, -1), 1, 2)
     rest = float(np.sum(model.left_over[model.used] ** 2) - value @ value)
     least = model.spare * (_LEAST_PX * median(model.weight[rows])) ** 2
-    return Offsets(size, value, modes, max(rest, least), model.spare)
+    return Offsets(size, value, modes, max(rest, least), model.spare, fault)

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ceres_cal.base.arrays import Array, Indices, median
+from ceres_cal.base.arrays import Array, Indices, median, medians
 from ceres_cal.base.errors import DegenerateError
 from ceres_cal.base.threads import parts_of, run_parts
 from ceres_cal.base.transforms import Pose
@@ -238,32 +238,62 @@ def _restored(lifts: Array) -> Array:
 def fit_lines(lines: Array, image_points: Array, rounds: int) -> tuple[Array | None, float]:
     """H (3, 3) from the plane to image points d (N, 3) that are seen on lines l (N, 3) of it, all homogeneous.
 
-    The DLT of points on lines, l . G d = 0 with G = H^-1 (design, section 7), reweighted to distances on the plane and
-    against wrong labels. A point of the plane is two lines that cross in it. The sign of H keeps what is seen in front.
+    A point of the plane is two lines that cross in it. The sign of H keeps what is seen in front.
 
     Returns:
         H, None where the lines cannot fix it; the median distance on the plane, in units of its size.
     """
-    plane_scale = (1.0, 1.0, 1.0 / max(float(np.max(np.abs(lines[:, 2]))), 1e-9))
-    reach = float(np.max(np.abs(image_points[:, :2])))
-    image_scale = (1.0 / reach, 1.0 / reach, 1.0)
-    lines, image_points = lines * plane_scale, image_points * image_scale
-    rows = (lines[:, :, None] * image_points[:, None, :]).reshape(-1, 9)
-    weights = np.ones(len(lines))
-    for _ in range(rounds):
-        values, vectors = np.linalg.eigh((rows * weights[:, None]).T @ rows / len(rows))
-        inverse = vectors[:, 0].reshape(3, 3)
-        sent = image_points @ inverse.T
-        distance = np.abs(np.sum(lines * sent, axis=1)) / np.maximum(np.abs(sent[:, 2]), 1e-9)
-        typical = median(distance)
-        bound = max(3.0 * typical, 1e-9)
-        weights = 1.0 / (np.maximum(sent[:, 2] ** 2, 1e-9) * (1.0 + (distance / bound) ** 2))
-        weights /= weights.mean()
-    inverse *= np.copysign(1.0, median(sent[:, 2]))
+    fit = _LineFit.of(lines, image_points[None], rounds)
+    inverse = fit.inverse[0] * np.copysign(1.0, median(fit.sent[0, :, 2]))
+    typical = float(fit.typical[0])
     # More than one G fits, or one that sends the image to a line.
-    if values[1] < _NO_SECOND**2 or abs(np.linalg.det(inverse)) < _SINGULAR:
+    if fit.second[0] < _NO_SECOND**2 or abs(np.linalg.det(inverse)) < _SINGULAR:
         return None, typical
-    return np.asarray(np.linalg.inv(np.diag(plane_scale) @ inverse @ np.diag(image_scale))), typical
+    return np.asarray(np.linalg.inv(fit.plane_scale @ inverse @ fit.image_scale[0])), typical
+
+
+def misfits_of_lines(lines: Array, image_points: Array, rounds: int) -> Array:
+    """(C,) median distances on the plane, in units of its size, of image points (C, N, 3) as C lenses have them."""
+    return _LineFit.of(lines, image_points, rounds).typical
+
+
+@dataclass(frozen=True, eq=False)
+class _LineFit:
+    """The DLT of points on lines, l . G d = 0 with G = H^-1 (design, section 7), reweighted to distances on the plane
+    and against wrong labels; of C lenses at once.
+
+    Attributes:
+        plane_scale: (3, 3) and image_scale: (C, 3, 3) of the units of the fit. inverse: (C, 3, 3) G in these.
+        second: (C,) the second least eigenvalue. sent: (C, N, 3) G d. typical: (C,) median distance on the plane.
+    """
+
+    plane_scale: Array
+    image_scale: Array
+    inverse: Array
+    second: Array
+    sent: Array
+    typical: Array
+
+    @classmethod
+    def of(cls, lines: Array, image_points: Array, rounds: int) -> _LineFit:
+        """Of image points (C, N, 3) on lines (N, 3)."""
+        plane_scale = np.array([1.0, 1.0, 1.0 / max(float(np.max(np.abs(lines[:, 2]))), 1e-9)])
+        reach = np.max(np.abs(image_points[:, :, :2]), axis=(1, 2))
+        image_scale = np.column_stack([1.0 / reach, 1.0 / reach, np.ones_like(reach)])
+        lines, image_points = lines * plane_scale, image_points * image_scale[:, None]
+        rows = (lines[:, :, None] * image_points[:, :, None, :]).reshape(*image_points.shape[:2], 9)
+        weights = np.ones(image_points.shape[:2])
+        for _ in range(rounds):
+            values, vectors = np.linalg.eigh(np.swapaxes(rows * weights[:, :, None], 1, 2) @ rows / len(lines))
+            inverse = vectors[:, :, 0].reshape(-1, 3, 3)
+            sent = image_points @ np.swapaxes(inverse, 1, 2)
+            distance = np.abs(np.sum(lines * sent, axis=2)) / np.maximum(np.abs(sent[:, :, 2]), 1e-9)
+            typical = medians(distance)
+            bound = np.maximum(3.0 * typical, 1e-9)[:, None]
+            weights = 1.0 / (np.maximum(sent[:, :, 2] ** 2, 1e-9) * (1.0 + (distance / bound) ** 2))
+            weights /= weights.mean(axis=1, keepdims=True)
+        scales = image_scale[:, :, None] * np.eye(3)
+        return cls(np.diag(plane_scale), scales, inverse, values[:, 1], sent, typical)
 
 
 def point_lines(points: Array) -> Array:

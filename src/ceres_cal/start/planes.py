@@ -22,6 +22,7 @@ from ceres_cal.start.closed_forms import (
     fit_lines,
     homographies_of_sights,
     homography_from_points,
+    misfits_of_lines,
     point_lines,
     profile_from_lines,
     radial_alignment,
@@ -240,21 +241,28 @@ def _profile_from_lines(planes: Sequence[tuple[Array, Array]], unit: float) -> R
     Args:
         planes: lines (N, 3) of each plane and the offsets (N, 2) px seen on them.
     """
-    candidates: list[tuple[float, ...]] = [(0.0, 0.0)]
-    candidates += [profile_from_lines(lines, offsets, unit, 2) for lines, offsets in planes]
-    candidates += [(c1, c2) for c1 in np.linspace(-1.0, 0.4, 8) for c2 in np.linspace(-0.6, 0.6, 5)]
+    if not planes:
+        return RadialProfile((0.0, 0.0), unit)
 
-    def misfit(c: tuple[float, ...]) -> float:
-        if np.min(1.0 + c[0] * _RADII**2 + c[1] * _RADII**4) < -0.5:
-            return np.inf
-        profile = RadialProfile(c, unit)
-        return sum(fit_lines(lines, profile.lift(offsets), rounds=2)[1] for lines, offsets in planes)
+    def best_of(candidates: Sequence[tuple[float, ...]]) -> tuple[float, ...]:
+        profiles = [RadialProfile(c, unit) for c in candidates if _is_lens(c)]
+        misfit = sum(
+            misfits_of_lines(lines, np.array([profile.lift(offsets) for profile in profiles]), rounds=2)
+            for lines, offsets in planes
+        )
+        return profiles[int(np.argmin(misfit))].coefficients
 
-    best = min(candidates, key=misfit) if planes else candidates[0]
-    for width in (0.1, 0.03, 0.01, 0.003) if planes else ():
-        around = [(best[0] + i * width, best[1] + j * width) for i in (-1, 0, 1) for j in (-1, 0, 1)]
-        best = min(around, key=misfit)
+    known = [profile_from_lines(lines, offsets, unit, 2) for lines, offsets in planes]
+    grid = [(c1, c2) for c1 in np.linspace(-1.0, 0.4, 8) for c2 in np.linspace(-0.6, 0.6, 5)]
+    best = best_of([(0.0, 0.0), *known, *grid])
+    for width in (0.1, 0.03, 0.01, 0.003):
+        best = best_of([(best[0] + i * width, best[1] + j * width) for i in (-1, 0, 1) for j in (-1, 0, 1)])
     return RadialProfile(best, unit)
+
+
+def _is_lens(c: tuple[float, ...]) -> bool:
+    """Whether a profile looks back nowhere, or hardly."""
+    return bool(np.min(1.0 + c[0] * _RADII**2 + c[1] * _RADII**4) >= -0.5)
 
 
 _RADII = np.linspace(0.0, 1.0, 21)

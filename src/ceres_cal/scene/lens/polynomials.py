@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any, Protocol
 
 import numpy as np
@@ -33,6 +33,11 @@ def derivative(polynomial: Array) -> Array:
 
 def first_root(polynomial: Array) -> float:
     """Where a polynomial with value 1 at 0 (lowest power first) first reaches 0; infinity where it never does."""
+    return _first_root(tuple(polynomial.tolist()))
+
+
+@lru_cache(maxsize=256)  # a camera that is moved and asked anew has the lens that it had
+def _first_root(polynomial: tuple[float, ...]) -> float:
     if not np.all(np.isfinite(polynomial)):
         return np.nan
     # The roots of the reversed polynomial are 1 / x: its leading coefficient is 1, however small the last ones are.
