@@ -1,11 +1,12 @@
 """Wide lenses that are rougher than any formula, before many boards: python scripts/rough_lenses.py [--help]
 
 A stereographic lens to 84 degrees over 6016 x 4016 px, with a wave along the radius, decentring, and waves across of
-random directions, of so many px and so long (one over their wave number, px); 186 views of a board of 10 x 10 corners that is
-bowed by 1 mm, 0.4 px of noise, 0.12 px that go together over a board, 2 % of outliers; solved as `--lens spline`
-with the board's warp. How far residuals exceed those that the true lens leaves is in the first row, then errors of rays
-over the standard deviation that is stated (as in other_lenses.py), then the difference of random halves of the views
-over what both state (as in halves.py). Exits with 1 when a figure is missed by more than two of its standard errors.
+random directions, of so many px and so long (one over their wave number, px); 186 views of a board of 10 x 10
+corners that is bowed by 1 mm, 0.4 px of noise, 0.12 px that go together over a board, 2 % of outliers; solved as
+`--lens spline` with the board's warp. How far residuals exceed those that the true lens leaves is in the first row,
+then errors of rays over the standard deviation that is stated (as in other_lenses.py), then the difference of random
+halves of the views over what both state (as in halves.py). Exits with 1 when a figure is missed by more than two of its
+standard errors.
 """
 
 from __future__ import annotations
