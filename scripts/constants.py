@@ -79,6 +79,7 @@ DECIDING: tuple[Constant, ...] = (
     *_of("lens_choice.kinds", "_REFUTED _UNSEEN_GROUPS", "lens"),
     *_of("lens_choice.seen", "_KEPT", "lens"),
     *_of("lens_choice.last_resort", "_TOGETHER", "lens"),
+    *_of("solve.in_cells", "AGREES", "lens"),
     *_of("calibration.caveats", "_RESTING", "calibrate"),
     *_of("observations.bounds", "_LARGE_M", "calibrate"),
     *_of("solve.robust", "_AT_REST _ENOUGH_PLACEMENTS _MUCH_LESS", "calibrate"),

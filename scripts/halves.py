@@ -33,6 +33,7 @@ from ceres_cal.model.quantities import camera_moved, natural_sizes, values_of
 from ceres_cal.observations import Curves, Observations, Points, View
 from ceres_cal.observations.columns import taken
 from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.lens import Lens
 from ceres_cal.scene.targets import checkerboard
 from ceres_cal.uncertainty import Posterior
 
@@ -129,14 +130,14 @@ class Agreement:
 
 def agreement(first: Calibration, second: Calibration, pixels: Array) -> Agreement:
     """Of the only camera of two calibrations from different observations; projections at pixels (N, 2). Of lenses
-    of two kinds the intrinsics do not mean the same: NaN.
+    of two kinds, or of other knots, the intrinsics do not mean the same: NaN.
     """
     posteriors = [one.uncertainty.posterior for one in (first, second)]
     keys = [key for key in posteriors[0].keys if key.kind == "camera" and key in posteriors[1].keys]
     sizes = natural_sizes(first.estimate, keys)
     step = (values_of(first.estimate, keys) - values_of(second.estimate, keys)) / sizes
     spread = sum(_covariance(posterior, keys) for posterior in posteriors) / sizes[:, None] / sizes
-    alike = len({type(one.estimate.cameras[keys[0].owner].lens) for one in (first, second)}) == 1
+    alike = len({_meaning(one.estimate.cameras[keys[0].owner].lens) for one in (first, second)}) == 1
     mahalanobis = float(step @ np.linalg.solve(spread, step)) / len(keys) if alike else np.nan
     cameras = [one.estimate.cameras[keys[0].owner].at(Pose.identity()) for one in (first, second)]
     rays = cameras[0].rays(pixels)
@@ -146,6 +147,11 @@ def agreement(first: Calibration, second: Calibration, pixels: Array) -> Agreeme
     off -= turned @ (turned.T @ off)
     stated = [stated_squares(*each, rays, turned) for each in zip((first, second), cameras, strict=True)]
     return Agreement(mahalanobis, float(np.mean(pairs(off**2) / pairs(np.sum(stated, axis=0)))))
+
+
+def _meaning(lens: Lens) -> tuple[object, ...]:
+    """What its numbers mean."""
+    return lens.kind, lens.names, *(lens.coefficients[name] for name in lens.set_at_start)
 
 
 def stated_squares(calibration: Calibration, camera: Camera, rays: Array, turned: Array) -> Array:

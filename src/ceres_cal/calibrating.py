@@ -44,6 +44,7 @@ from ceres_cal.solve.possible import require_possible
 from ceres_cal.solve.usable import require_fits, require_usable
 from ceres_cal.start.initialise import Start, initialise
 from ceres_cal.uncertainty import Posterior, Scatter, assess, measure_scatter
+from ceres_cal.uncertainty.rough import shifts_by_roughness
 
 if TYPE_CHECKING:
     from ceres_cal.solve.bulk import Bulk, Part, Settled
@@ -273,6 +274,7 @@ def solved_from(
     usual = again.scales if again else None
     end = solve_robustly(problem, observations, start.estimate, usual, watched.progress, is_near=start.is_near)
     if again is None:
+        problem, start, end = _grown(problem, observations, start, end, watched)
         require_measured(end.problem, end.solution.estimate)
 
     def solved(others: Problem, some: Asked) -> RobustSolution:
@@ -296,6 +298,8 @@ def solved_from(
     if assessed:
         end, posterior = _assess(end, observations, problem, again)
         posterior = _with_doubts(posterior.in_doubt(conflicts.keys, conflicts.shifts), end, explanations)
+        if problem.options.blank_lens.roughness and again is None:
+            posterior = posterior.in_doubt(*shifts_by_roughness(end, observations))
         if not posterior.profiles:  # a valley that is followed has its other places in it
             known = posterior.by_model or posterior.information
             shifts = shifts_to(others, end.solution.estimate, known, posterior.half_width)
@@ -311,6 +315,21 @@ def solved_from(
     calibration = replace(calibration, warnings=warnings, posterior=posterior, conflicts=conflicts.every)
     tolerances = {**problem.options.tolerances, **tolerances_of(as_built)}
     return replace(calibration, options=replace(problem.options, tolerances=tolerances), as_built=as_built)
+
+
+def _grown(
+    problem: Problem, observations: Observations, start: Start, end: RobustSolution, watched: Watched
+) -> tuple[Problem, Start, RobustSolution]:
+    """With a lens as long as the residuals ask for, where that was left open."""
+    if problem.options.powers:
+        return problem, start, end
+    from ceres_cal.lens_choice.growing import grown, seen_longer
+
+    def solved(longer: Problem, near: Estimate) -> RobustSolution:
+        return solve_robustly(longer, observations, near, None, watched.progress)
+
+    problem, end = grown(problem, observations, end, solved)
+    return problem, replace(start, estimate=seen_longer(start.estimate, problem.options)), end
 
 
 def _assess(

@@ -71,7 +71,8 @@ def _add_camera(parser: ArgumentParser) -> None:
     add(
         "--powers",
         metavar="2,3",
-        help="of a lens that leaves the choice; of one that is named default: 2,3, the paper's",
+        help="of a lens that leaves the choice; of one that is named default: 2,3, the paper's, of "
+        "spline then more as the residuals ask for",
     )
     add("--terms", metavar="NAME,...", default="", help="terms that a lens may have besides: " + _TERMS)
     add(

@@ -33,9 +33,9 @@ def candidates(options: Options) -> list[Options]:
     """Options with every sensible lens of the same kind, fewest coefficients first; the given one is among them."""
     lens = options.blank_lens
     if lens.powers:
-        powers = sorted({*lens.trial_powers, options.powers}, key=lambda p: (len(p), p))
+        powers = sorted({*lens.trial_powers, lens.powers}, key=lambda p: (len(p), p))
         if set(lens.names) & set(options.fixed):  # a held coefficient belongs to its own powers alone
-            powers = [options.powers]
+            powers = [lens.powers]
         return [replace(options, powers=one) for one in powers]
     by_order = [name for _, name in sorted(zip(lens.orders, lens.names, strict=True)) if name not in options.fixed]
     names = [name for name in by_order if name not in _tangential(lens)]
@@ -54,8 +54,8 @@ def _tangential(lens: Lens | type[Lens]) -> tuple[str, ...]:
 
 def label_of(options: Options) -> str:
     """How a lens is called: "radial 2,3" or "brown k1 k2 p1 p2"."""
-    if options.blank_lens.powers:
-        return f"{options.lens} {','.join(map(str, options.powers))}"
+    if powers := options.blank_lens.powers:
+        return f"{options.lens} {','.join(map(str, powers))}"
     return " ".join([options.lens, *(name for name in options.blank_lens.names if name not in options.held)])
 
 
@@ -68,7 +68,7 @@ def size_of(options: Options) -> int:
     """How much a lens may follow: its free coefficients, and two more where it is no pinhole without any: its series in
     the tangent has its first two coefficients chosen.
     """
-    blank = make_lens(options.lens, options.powers)
+    blank = make_lens(options.lens, options.blank_lens.powers)
     is_pinhole = np.isclose(blank.distort([[1.0, 0.0, 1.0]], _ANY_PHI)[0, 0], _ANY_PHI)
     return coefficients_of(options) + (0 if is_pinhole else _PROJECTION)
 

@@ -37,7 +37,8 @@ class Options:
 
     Attributes:
         lens: one of `scene.lens.LENSES`, or "auto": the one that the data ask for. powers: of a lens that leaves the
-            choice, as "radial" does, which powers alone stand for; () for (2, 3).
+            choice, as "radial" does, which powers alone stand for; () for (2, 3), of "spline" for as many as the
+            residuals ask for from there on (`lens_choice.growing`).
         coefficients: names of those of the lens that are solved for, the others are 0; None: all.
         free_principal_point: else it is held at the image centre, or where `fixed` says.
         free_aspect, free_skew: whether fy / fx and the lean of the pixels' columns are free; else 1 and 0, or what
@@ -91,7 +92,8 @@ class Options:
             object.__setattr__(self, "lens", _OF_POWERS)
         if self.lens != AUTO:
             lens_class(self.lens)
-            object.__setattr__(self, "powers", tuple(self.powers) or PAPERS_POWERS)
+            left_open = () if lens_class(self.lens).set_at_start else PAPERS_POWERS
+            object.__setattr__(self, "powers", tuple(self.powers) or left_open)
         elif self.terms:
             raise InputError("terms are of a lens that is named: leave them out, or name it")
         if self.loss not in LOSSES:
@@ -125,7 +127,7 @@ class Options:
         """What `fixed` holds, and at 0 the coefficients that are not solved for."""
         if self.coefficients is None:
             return self.fixed
-        names = make_lens(self.lens, self.powers, terms=self.terms).names
+        names = self._unset.names
         return {**{name: 0.0 for name in names if name not in self.coefficients}, **self.fixed}
 
     @cached_property
@@ -136,8 +138,13 @@ class Options:
     @cached_property
     def blank_lens(self) -> Lens:
         """The chosen lens with its fixed coefficients; the others are 0."""
-        names = make_lens(self.lens, self.powers, terms=self.terms).names
-        return make_lens(self.lens, self.powers, {k: v for k, v in self.fixed.items() if k in names}, self.terms)
+        lens = self._unset
+        return lens.with_values([self.fixed.get(name, 0.0) for name in lens.names])
+
+    @property
+    def _unset(self) -> Lens:
+        """The chosen lens with all coefficients 0."""
+        return make_lens(self.lens, self.powers or PAPERS_POWERS, terms=self.terms)
 
 
 def intrinsic_names(lens: Lens) -> tuple[str, ...]:

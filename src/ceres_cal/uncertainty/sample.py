@@ -108,7 +108,7 @@ def take_sample(
     weights = equation_weights(observations, problem.weighting, equations, there).within_sigma
     blank, columns = without_shared(problem, estimate, equations, weights)
     placed = blank.beyond_private(np.column_stack([columns, blank.score]))
-    root = _root(reduced.shared)
+    root = known_root(reduced.shared)
     curves, grouped = equations.is_curve, _groups(equations)
     return Sample(
         placed[:, :-1] @ root,
@@ -123,7 +123,7 @@ def take_sample(
     )
 
 
-def _root(shared: Information) -> Array:
+def known_root(shared: Information) -> Array:
     """(K, P) from directions in which all but the structure is known to one, which follows, to the shared numbers.
 
     How far the targets were built from their drawings has a scatter of its own (see `solve.as_built`).

@@ -18,6 +18,7 @@ from ceres_cal.scene.lens.planar import Planar
 from ceres_cal.scene.lens.spline_kernel import CONRADY, COUNT, DEGREE, INTERVALS, MOST, TINY, WORK_ROWS
 
 _TURNS = 48  # directions, between which nothing turns
+_STEPS = 8  # of rims, from one to its double: half of a step is less than they are beyond the image
 _START_WEIGHT = 1e-4  # of the roughness of a start beside its equations
 # Standard deviations before the data have spoken, in rims: loose, so that a first solve is not held by them. Least
 # ones: what usual lenses have, halved by each power, so that data that cannot tell do not take a lens for perfect.
@@ -76,7 +77,7 @@ class Spline(Planar):
     powers: tuple[int, ...] = (2, 3)
     kind: ClassVar[str] = "spline"
     acts_on_pixels: ClassVar[bool] = True
-    trial_powers: ClassVar[tuple[tuple[int, ...], ...]] = ((2, 3), (2, 3, 4, 5))
+    trial_powers: ClassVar[tuple[tuple[int, ...], ...]] = ((2, 3), (2, 3, 4, 5), tuple(range(2, MOST + 1)))
     missing_powers: ClassVar[tuple[int, ...]] = ()
     set_at_start: ClassVar[tuple[str, ...]] = ("rim",)
     work_rows: ClassVar[int] = WORK_ROWS
@@ -124,7 +125,8 @@ class Spline(Planar):
     # ---- its start and its roughness ---------------------------------------------------------------------------------
 
     def spanning(self, angle: float, phi: float, beyond: float) -> Spline:
-        rim = 2.0 * phi * np.tan(0.5 * angle) * beyond
+        # In steps, so that the numbers of two calibrations of one camera mean the same.
+        rim = 2.0 ** (np.rint(_STEPS * np.log2(2.0 * phi * np.tan(0.5 * angle) * beyond)) / _STEPS)
         return self if self.values[0] > 0.0 else replace(self, values=(float(rim), *self.values[1:]))
 
     def start_equations(self, measured: Array, ideal: Array, angle: Array, phi: float) -> LinearEquations:
