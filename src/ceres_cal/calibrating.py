@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -16,7 +16,6 @@ from ceres_cal.calibration.caveats import resting_phi, unknown_phi
 from ceres_cal.calibration.outcome import came_out, of_all, of_closed_form
 from ceres_cal.model.parameters import AUTO, Estimate, Layout, Options, make_layout
 from ceres_cal.model.priors import gather_priors
-from ceres_cal.model.quantities import difference
 from ceres_cal.model.residuals import residuals
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights, gather_sights
@@ -31,20 +30,18 @@ from ceres_cal.solve import (
     find_conflicts,
     information,
     least_of_few,
-    shifts_to,
     solve_robustly,
 )
 from ceres_cal.solve.as_built import solve_as_built, tolerances_of
 from ceres_cal.solve.competing import compete
 from ceres_cal.solve.conflicts import contradicted_by
 from ceres_cal.solve.dimensions import free_dimensions, require_measured
-from ceres_cal.solve.explanation import Explanation
 from ceres_cal.solve.looked_at import Asked
 from ceres_cal.solve.possible import require_possible
 from ceres_cal.solve.usable import require_fits, require_usable
 from ceres_cal.start.initialise import Start, initialise
 from ceres_cal.uncertainty import Posterior, Scatter, assess, measure_scatter
-from ceres_cal.uncertainty.rough import shifts_by_roughness
+from ceres_cal.uncertainty.doubts import with_doubts, with_roughness
 
 if TYPE_CHECKING:
     from ceres_cal.solve.bulk import Bulk, Part, Settled
@@ -274,7 +271,7 @@ def solved_from(
     usual = again.scales if again else None
     end = solve_robustly(problem, observations, start.estimate, usual, watched.progress, is_near=start.is_near)
     if again is None:
-        problem, start, end = _grown(problem, observations, start, end, watched)
+        problem, start, end = _as_long_as_asked(problem, observations, start, end, watched)
         require_measured(end.problem, end.solution.estimate)
 
     def solved(others: Problem, some: Asked) -> RobustSolution:
@@ -297,13 +294,8 @@ def solved_from(
     warnings = tuple(one.warning for one in (settled.explanations if settled else explanations))
     if assessed:
         end, posterior = _assess(end, observations, problem, again)
-        posterior = _with_doubts(posterior.in_doubt(conflicts.keys, conflicts.shifts), end, explanations)
-        if problem.options.blank_lens.roughness and again is None:
-            posterior = posterior.in_doubt(*shifts_by_roughness(end, observations))
-        if not posterior.profiles:  # a valley that is followed has its other places in it
-            known = posterior.by_model or posterior.information
-            shifts = shifts_to(others, end.solution.estimate, known, posterior.half_width)
-            posterior = posterior.in_doubt(posterior.keys, shifts)
+        posterior = with_doubts(posterior, end, conflicts, explanations, others)
+        posterior = with_roughness(posterior, end, observations) if again is None else posterior
         warnings = (*warnings, *(one.words for one in conflicts.every), *unknown_phi(end, posterior))
         warnings = (*warnings, *resting_phi(end, problem))
     if digest is not None:
@@ -317,19 +309,15 @@ def solved_from(
     return replace(calibration, options=replace(problem.options, tolerances=tolerances), as_built=as_built)
 
 
-def _grown(
+def _as_long_as_asked(
     problem: Problem, observations: Observations, start: Start, end: RobustSolution, watched: Watched
 ) -> tuple[Problem, Start, RobustSolution]:
-    """With a lens as long as the residuals ask for, where that was left open."""
+    """With a lens whose powers were left open as long as the residuals ask for."""
     if problem.options.powers:
         return problem, start, end
-    from ceres_cal.lens_choice.growing import grown, seen_longer
+    from ceres_cal.lens_choice.growing import grown
 
-    def solved(longer: Problem, near: Estimate) -> RobustSolution:
-        return solve_robustly(longer, observations, near, None, watched.progress)
-
-    problem, end = grown(problem, observations, end, solved)
-    return problem, replace(start, estimate=seen_longer(start.estimate, problem.options)), end
+    return grown(problem, observations, start, end, watched.progress)
 
 
 def _assess(
@@ -358,10 +346,3 @@ def _start_of(others: Problem, some: Asked, start: Start, again: Again | None) -
     if again is not None or set(others.sights.keys) != set(some.problem.sights.keys):
         return start.estimate
     return initialise(some.observations, others.sights, others.options).estimate
-
-
-def _with_doubts(posterior: Posterior, end: RobustSolution, explanations: Sequence[Explanation]) -> Posterior:
-    """The posterior with what the less probable explanations say in it."""
-    doubtful = [one for one in explanations if one.is_doubtful]
-    shifts = [one.doubt**0.5 * difference(one.other, end.solution.estimate, posterior.keys) for one in doubtful]
-    return posterior.in_doubt(posterior.keys, shifts)

@@ -15,24 +15,24 @@ from ceres_cal.lens_choice.seen import problem_of
 from ceres_cal.model.parameters import Estimate, Options
 from ceres_cal.observations import Observations
 from ceres_cal.scene.lens import make_lens
-from ceres_cal.solve import Problem, RobustSolution
+from ceres_cal.solve import Problem, Progress, RobustSolution, solve_robustly
 from ceres_cal.solve.in_cells import AGREES, agreement
+from ceres_cal.start.initialise import Start
 
 
 def grown(
     problem: Problem,
     observations: Observations,
+    start: Start,
     end: RobustSolution,
-    solved: Callable[[Problem, Estimate], RobustSolution],
-) -> tuple[Problem, RobustSolution]:
-    """The problem with the lens that the residuals ask for, and its end; as they are where its powers were stated.
+    progress: Callable[[Progress], None] | None = None,
+) -> tuple[Problem, Start, RobustSolution]:
+    """The problem with the lens that the residuals ask for, its start and its end.
 
     Args:
-        end: of the problem. solved: a problem from an estimate.
+        problem: whose powers are not stated. end: of its rounds.
     """
     options = problem.options
-    if options.powers:
-        return problem, end
     rungs = options.blank_lens.trial_powers if options.coefficients is None else ()
     problem, end = _named(problem), replace(end, problem=_named(end.problem))
     for powers in rungs:
@@ -43,10 +43,11 @@ def grown(
         longer = replace(options, powers=powers, free_aspect=aspect, free_skew=skew)
         with suppress(CalibrationError):
             try_of = problem_of(observations, problem.sights, longer, end.solution.estimate)
-            found = solved(try_of, seen_longer(end.solution.estimate, longer))
+            near = _seen_longer(end.solution.estimate, longer)
+            found = solve_robustly(try_of, observations, near, progress=progress)
             if not _folds(found):
                 problem, end = try_of, found
-    return problem, end
+    return problem, replace(start, estimate=_seen_longer(start.estimate, problem.options)), end
 
 
 def _named(problem: Problem) -> Problem:
@@ -54,7 +55,7 @@ def _named(problem: Problem) -> Problem:
     return replace(problem, options=replace(problem.options, powers=problem.options.blank_lens.powers))
 
 
-def seen_longer(estimate: Estimate, options: Options) -> Estimate:
+def _seen_longer(estimate: Estimate, options: Options) -> Estimate:
     """The estimate with the lens of the options, which holds its own."""
     cameras = dict(estimate.cameras)
     for name, camera in cameras.items():

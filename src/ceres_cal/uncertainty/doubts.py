@@ -1,0 +1,45 @@
+"""The posterior with what may be otherwise in it: statements in conflict, wholes that may not belong, other minima, and
+lenses rougher than their model.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from ceres_cal.model.quantities import difference
+from ceres_cal.observations import Observations
+from ceres_cal.solve import Conflicts, RobustSolution, Solution, shifts_to
+from ceres_cal.solve.explanation import Explanation
+from ceres_cal.uncertainty.posterior import Posterior
+
+
+def with_doubts(
+    posterior: Posterior,
+    end: RobustSolution,
+    conflicts: Conflicts,
+    explanations: Sequence[Explanation],
+    others: Sequence[Solution],
+) -> Posterior:
+    """Wider by how far the numbers move with each of them.
+
+    Args:
+        explanations: of which the less probable one counts as far as it is probable. others: minima beside the end.
+    """
+    estimate = end.solution.estimate
+    posterior = posterior.in_doubt(conflicts.keys, conflicts.shifts)
+    doubtful = [one for one in explanations if one.is_doubtful]
+    shifts = [one.doubt**0.5 * difference(one.other, estimate, posterior.keys) for one in doubtful]
+    posterior = posterior.in_doubt(posterior.keys, shifts)
+    if posterior.profiles:  # a valley that is followed has its other places in it
+        return posterior
+    known = posterior.by_model or posterior.information
+    return posterior.in_doubt(posterior.keys, shifts_to(others, estimate, known, posterior.half_width))
+
+
+def with_roughness(posterior: Posterior, end: RobustSolution, observations: Observations) -> Posterior:
+    """Wider by what a lens without a formula leaves in the same places of all views."""
+    if not end.problem.options.blank_lens.roughness:
+        return posterior
+    from ceres_cal.uncertainty.rough import shifts_by_roughness
+
+    return posterior.in_doubt(*shifts_by_roughness(end, observations))
