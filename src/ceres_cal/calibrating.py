@@ -174,6 +174,8 @@ def _of_lens(
 ) -> Calibration:
     """With a lens that is named, and what is usual of cameras where the observations say less."""
 
+    options = options.with_first_power(len(sights))
+
     def solved(given: Options) -> Calibration:
         priors = gather_priors(observations, given, start.estimate.structure)
         problem = Problem(sights, make_layout(observations, given), priors, options=given)

@@ -35,12 +35,10 @@ def grown(
     options = problem.options
     rungs = options.blank_lens.trial_powers if options.coefficients is None else ()
     problem, end = _named(problem), replace(end, problem=_named(end.problem))
-    for powers in rungs:
+    for powers in rungs[1:]:
         if agreement(end, observations.cameras) <= AGREES:
             break
-        # First an aspect and a skew, which are what displaces by the first power.
-        aspect, skew = (name not in options.fixed for name in ("aspect", "skew"))
-        longer = replace(options, powers=powers, free_aspect=aspect, free_skew=skew)
+        longer = replace(options, powers=powers)
         with suppress(CalibrationError):
             try_of = problem_of(observations, problem.sights, longer, end.solution.estimate)
             near = _seen_longer(end.solution.estimate, longer)
