@@ -130,14 +130,17 @@ class Agreement:
 
 def agreement(first: Calibration, second: Calibration, pixels: Array) -> Agreement:
     """Of the only camera of two calibrations from different observations; projections at pixels (N, 2). Of lenses
-    of two kinds, or of other knots, the intrinsics do not mean the same: NaN.
+    of two kinds the intrinsics do not mean the same: NaN; of one kind with other knots, or longer, those of the lens.
     """
     posteriors = [one.uncertainty.posterior for one in (first, second)]
     keys = [key for key in posteriors[0].keys if key.kind == "camera" and key in posteriors[1].keys]
+    lenses = [one.estimate.cameras[keys[0].owner].lens for one in (first, second)]
+    if len(set(map(_meaning, lenses))) > 1:
+        keys = [key for key in keys if key.quantity not in lenses[0].names]
     sizes = natural_sizes(first.estimate, keys)
     step = (values_of(first.estimate, keys) - values_of(second.estimate, keys)) / sizes
     spread = sum(_covariance(posterior, keys) for posterior in posteriors) / sizes[:, None] / sizes
-    alike = len({_meaning(one.estimate.cameras[keys[0].owner].lens) for one in (first, second)}) == 1
+    alike = lenses[0].kind == lenses[1].kind
     mahalanobis = float(step @ np.linalg.solve(spread, step)) / len(keys) if alike else np.nan
     cameras = [one.estimate.cameras[keys[0].owner].at(Pose.identity()) for one in (first, second)]
     rays = cameras[0].rays(pixels)
