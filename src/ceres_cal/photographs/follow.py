@@ -15,12 +15,11 @@ from ceres_cal.detect.courses import Course, clear_px, predict
 from ceres_cal.detect.lines import SPACING_PX, Lines, measure, search
 from ceres_cal.detect.registration import nearness, shifted
 from ceres_cal.model.parameters import Options, intrinsic_names
-from ceres_cal.observations import Observations
+from ceres_cal.observations import Observations, Prior
 from ceres_cal.photographs.as_built import AS_DRAWN, AsBuilt, as_built
-from ceres_cal.photographs.beside import among_others
 from ceres_cal.photographs.followed import Followed
-from ceres_cal.photographs.painted import painted_curves, visible_curves
-from ceres_cal.photographs.refit import TARGET, FreeIntrinsics, observations_of, refit_camera
+from ceres_cal.photographs.painted import painted_curves
+from ceres_cal.photographs.refit import TARGET, PointHints, observations_of, refit_camera
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import LENSES
 from ceres_cal.scene.targets import Target, target_from_spec
@@ -41,6 +40,23 @@ _ROUNDS = 6
 _NEARER = 2  # times that lines of other dimensions are looked for again
 _LESS = 0.02  # of the share: by so much less is no worse
 _AT_REST_PX = 0.02
+
+
+@dataclass(frozen=True, eq=False)
+class FreeIntrinsics:
+    """What of the camera, and of the target, a photograph may change besides the pose.
+
+    Attributes:
+        names: of the free intrinsics, in the order in which they are freed. priors: that hold them, and dimensions of
+            the target, which are free because of that.
+        hints: points that somebody showed, which hold the camera while lines are far off.
+        keep: whether the starts are known to be near: nothing far off is looked at.
+    """
+
+    names: tuple[str, ...] = ()
+    priors: tuple[Prior, ...] = ()
+    hints: PointHints | None = None
+    keep: bool = False
 
 
 def follow(
@@ -107,8 +123,7 @@ class _Tracker:
 
     def followed(self, camera: Camera, lines: Lines, moved_px: float) -> Followed:
         """What was measured from a camera."""
-        visible = visible_curves(self.grey, self.target, camera, self.curves)
-        return Followed(camera, self.target, tuple(self.curves), self.missing, lines, moved_px, visible)
+        return Followed(camera, self.target, tuple(self.curves), self.missing, lines, moved_px)
 
     def of_painted(self, camera: Camera) -> _Tracker:
         """The same without what the target may lack and this camera does not see."""
@@ -163,11 +178,7 @@ class _Tracker:
         for number, reach in enumerate(reaches_px):
             names = self.free.names[: max(0, 2 * number - 1)]
             tracker, camera = tracker._search_step(camera, names, reach) or (tracker, camera)
-        tracker = tracker.of_painted(camera)
-        other = among_others(self.grey, tracker.target, camera, tracker.curves, self.free)
-        if other is not None:
-            tracker, camera = replace(tracker, target=other[1]), other[0]
-        return tracker.at_rest(camera, self.free.names)
+        return tracker.of_painted(camera).at_rest(camera, self.free.names)
 
     def at_rest(self, camera: Camera, names: tuple[str, ...]) -> Followed:
         """Measured and refitted, with these intrinsics free, until nothing moves any more."""

@@ -31,7 +31,6 @@ class Followed:
         lines: what was measured there, but for curves that lie aside.
         beside: the same of the curves that lie aside.
         moved_px: how far the last refit moved the prediction; at rest below 0.02.
-        visible: names of the curves along which there is paint, whether it could be measured or not.
         built: how the curves lie, where the photograph had to tell the lens, too.
     """
 
@@ -41,7 +40,6 @@ class Followed:
     missing: tuple[str, ...]
     lines: Lines
     moved_px: float
-    visible: tuple[str, ...]
     built: AsBuilt = AS_DRAWN
     beside: Lines | None = None
 
@@ -59,12 +57,11 @@ class Followed:
 
     @property
     def absent(self) -> tuple[int, ...]:
-        """The curves in view of which next to nothing was found, or is to be seen."""
+        """The curves in view of which next to nothing was found."""
         curve, found = self.lines.course.curve, self.lines.found
         numbers, places = np.unique(curve, return_counts=True)
         counts = np.array([np.count_nonzero(found[curve == number]) for number in numbers])
-        visible = np.isin(numbers, [self.target.curve_index[name] for name in self.visible])
-        return tuple(int(number) for number in numbers[(counts < _ABSENT * places) & ~visible])
+        return tuple(int(number) for number in numbers[counts < _ABSENT * places])
 
     @property
     def lacking(self) -> tuple[str, ...]:
