@@ -130,7 +130,8 @@ class Agreement:
 
 def agreement(first: Calibration, second: Calibration, pixels: Array) -> Agreement:
     """Of the only camera of two calibrations from different observations; projections at pixels (N, 2). Of lenses
-    of two kinds the intrinsics do not mean the same: NaN; of one kind with other knots, or longer, those of the lens.
+    of two kinds the intrinsics do not mean the same: NaN; of one kind with other knots, or longer, coefficients do
+    not, and are left out.
     """
     posteriors = [one.uncertainty.posterior for one in (first, second)]
     keys = [key for key in posteriors[0].keys if key.kind == "camera" and key in posteriors[1].keys]

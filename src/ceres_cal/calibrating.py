@@ -173,7 +173,6 @@ def _of_lens(
     watched: Watched,
 ) -> Calibration:
     """With a lens that is named, and what is usual of cameras where the observations say less."""
-
     options = options.with_first_power(len(sights))
 
     def solved(given: Options) -> Calibration:

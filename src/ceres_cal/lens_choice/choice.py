@@ -93,7 +93,7 @@ def _compare(tried: list[Candidate], as_good: float, seen: Seen) -> tuple[list[C
 
 
 def _is_refuted(tried: Sequence[Candidate], number: int) -> bool:
-    return any(other.refutes(tried[number]) for other in tried if other.squares is not None)
+    return any(other.refutes(tried[number]) for other in tried)
 
 
 def _choice(tried: Sequence[Candidate], chosen: Candidate, share: float) -> LensChoice:

@@ -45,7 +45,7 @@ class Options:
         coefficients: names of those of the lens that are solved for, the others are 0; None: all.
         free_principal_point: else it is held at the image centre, or where `fixed` says.
         free_aspect, free_skew: whether fy / fx and the lean of the pixels' columns are free; else 1 and 0, or what
-            `fixed` says.
+            `fixed` says. Those of a "spline" whose powers are open are free from eight views on, unless `fixed`.
         usual_camera: whether a principal point that nobody states is taken to lie near the middle of its image, as is
             usual (`priors.USUAL_CENTRE`); where the data say otherwise it is left out.
         terms: of the lens, besides those that it always has: names of its `more_terms`.

@@ -20,7 +20,7 @@ from ceres_cal.model.equations import write_equations
 from ceres_cal.model.residuals import residuals
 from ceres_cal.observations import Observations
 from ceres_cal.solve.bundle import with_placements_at_best
-from ceres_cal.solve.conflicts import without_suspects
+from ceres_cal.solve.conflicts import without_suspicious
 from ceres_cal.solve.explanation import DOUBTFUL, Explanation
 from ceres_cal.solve.linear_model import LinearModel, equation_weights, make_linear_model
 from ceres_cal.solve.looked_at import Asked, asked, excess, inliers_of, mostly_rejected, rows_looked_at
@@ -53,7 +53,7 @@ def compete(
     every = Asked(problem, observations, end, list(wholes_of(observations, problem.sights)))
     if not every.kinds:
         return end, ()
-    some = _without_suspects(asked(every), solver)
+    some = _freed(asked(every), solver)
     trials, explanations = _Competition(some, solver).decided(), list[Explanation]()
     taking_part = np.ones(len(observations.points) + len(observations.curves), dtype=bool)
     for trial in trials:
@@ -69,9 +69,9 @@ def compete(
     return end, tuple(explanations)
 
 
-def _without_suspects(every: Asked, solver: Solver) -> Asked:
-    """The same without the statements that look wrong: a line is not blamed for what they bend."""
-    freed = without_suspects(every.problem, every.observations, every.end)
+def _freed(every: Asked, solver: Solver) -> Asked:
+    """Without the statements that look wrong: a line is not blamed for what they bend."""
+    freed = without_suspicious(every.problem, every.observations, every.end)
     if freed is every.problem:
         return every
     try:

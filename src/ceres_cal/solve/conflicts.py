@@ -65,7 +65,7 @@ def find_conflicts(
     return Conflicts((*(one for _, one in pairs), *search.conflicts()), reduced.shared.keys, tuple(shifts))
 
 
-def without_suspects(problem: Problem, observations: Observations, end: RobustSolution) -> Problem:
+def without_suspicious(problem: Problem, observations: Observations, end: RobustSolution) -> Problem:
     """The problem without what is stated of cameras and looks wrong where it was solved: it may bend what is said of
     others. Tolerances stay: a line that its own one does not hold is a line aside.
     """
