@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -44,6 +45,7 @@ from ceres_cal.uncertainty import Posterior, Scatter, assess, measure_scatter
 from ceres_cal.uncertainty.doubts import with_doubts, with_roughness
 
 if TYPE_CHECKING:
+    from ceres_cal.lens_choice import Chosen
     from ceres_cal.solve.bulk import Bulk, Part, Settled
 
 # Share of the standard deviation of usual principal points: observations that say as much need nothing usual. Half and
@@ -108,10 +110,7 @@ def _measured(
 
 
 def _calibrated(
-    observations: Observations,
-    options: Options,
-    progress: Callable[[Progress], None] | None = None,
-    client: Any = None,
+    observations: Observations, options: Options, progress: Callable[[Progress], None] | None = None, client: Any = None
 ) -> Calibration:
     """See `calibrate`."""
     observations.require_inside()
@@ -143,14 +142,21 @@ def _of_any_lens(observations: Observations, sights: Sights, options: Options, w
     start = initialise(observations, sights, papers(options))
     if options.closed_form_only:
         return _of_lens(start, observations, sights, papers(options), watched)
+
+    def solved(one: Chosen) -> Calibration:
+        return _of_lens(one.start, observations, sights, one.options, watched)
+
     chosen = choose_lens(observations, options, start)
     try:
-        calibration = _of_lens(chosen.start, observations, sights, chosen.options, watched)
+        calibration = solved(chosen)
     except CalibrationError as error:  # of all observations, not of those that took part in the choice
         chosen = chosen.without(str(error), papers(options), start)
-        calibration = _of_lens(start, observations, sights, chosen.options, watched)
-    caveats = filter(None, [chosen.choice.caveat])
-    return replace(calibration, lens_choice=chosen.choice, warnings=(*calibration.warnings, *caveats))
+        calibration = solved(chosen)
+    with suppress(CalibrationError):  # the first one stays
+        while other := chosen.unless_lost(*calibration.outlier_masks(observations)):
+            calibration, chosen = solved(other), other
+    warnings = (*calibration.warnings, *filter(None, [chosen.choice.caveat]))
+    return replace(calibration, lens_choice=chosen.choice, warnings=warnings)
 
 
 def _part(bulk: Bulk, options: Options) -> Part:
@@ -166,11 +172,7 @@ def _part(bulk: Bulk, options: Options) -> Part:
 
 
 def _of_lens(
-    start: Start,
-    observations: Observations,
-    sights: Sights,
-    options: Options,
-    watched: Watched,
+    start: Start, observations: Observations, sights: Sights, options: Options, watched: Watched
 ) -> Calibration:
     """With a lens that is named, and what is usual of cameras where the observations say less."""
     options = options.with_first_power(len(sights))
@@ -256,11 +258,7 @@ class Watched:
 
 
 def solved_from(
-    start: Start,
-    observations: Observations,
-    problem: Problem,
-    again: Again | None = None,
-    watched: Watched = Watched(),
+    start: Start, observations: Observations, problem: Problem, again: Again | None = None, watched: Watched = Watched()
 ) -> Calibration:
     """Solve, reject, solve, let explanations compete, solve for targets as built, assess, from a start.
 

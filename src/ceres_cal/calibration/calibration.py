@@ -142,6 +142,13 @@ class Calibration:
             masks[entry.kind == "curve"][entry.row] = False
         return masks
 
+    def outlier_masks(self, observations: Observations) -> tuple[Mask, Mask]:
+        """(N,) of points and (M,) of curve observations: which were taken out each for its own residual."""
+        masks = np.zeros(len(observations.points), bool), np.zeros(len(observations.curves), bool)
+        for entry in self.outliers:
+            masks[entry.kind == "curve"][entry.row] = not entry.is_of_whole
+        return masks
+
     def redrawn(self) -> Calibration:
         """The same with targets that are drawn with the dimensions that were solved for."""
         found = self.estimate.structure.dimensions

@@ -15,29 +15,37 @@ from functools import partial
 
 import numpy as np
 
+from ceres_cal.base.arrays import Mask
 from ceres_cal.base.errors import CalibrationError, DegenerateError
 from ceres_cal.base.transforms import Poses
 from ceres_cal.calibration import LensChoice, TriedLens
 from ceres_cal.lens_choice.comparing import compared_kinds
 from ceres_cal.lens_choice.forms import PAPER, papers
-from ceres_cal.lens_choice.kinds import Candidate
+from ceres_cal.lens_choice.kinds import Candidate, Kind
 from ceres_cal.lens_choice.last_resort import last_resort
+from ceres_cal.lens_choice.lost import is_lost
 from ceres_cal.lens_choice.rule import AS_GOOD, AS_GOOD_BESIDE_LENGTHS, decide, standard_errors
 from ceres_cal.lens_choice.seen import FewGroupsError, Seen
-from ceres_cal.model.parameters import Options
+from ceres_cal.model.parameters import Estimate, Options
 from ceres_cal.observations import Observations
 from ceres_cal.start.initialise import Start
 
 _BROKEN = "solved for, it leaves more than the equations of a longer lens had it"
+_LOST = "takes out observations that another lens explains"
 
 
 @dataclass(frozen=True, eq=False)
 class Chosen:
-    """The lens that was chosen: options with it, where to start from, and what it was compared with."""
+    """The lens that was chosen: options with it, where to start from, and what it was compared with.
+
+    Attributes:
+        among: the lenses it was chosen from; None where nothing could be compared.
+    """
 
     options: Options
     start: Start
     choice: LensChoice
+    among: Comparison | None = None
 
     def without(self, failure: str, options: Options, start: Start) -> Chosen:
         """The paper's lens in its place, where all of the observations make no calibration with it."""
@@ -45,12 +53,73 @@ class Chosen:
         tried = sorted(failed, key=lambda one: one.label != PAPER)
         return Chosen(options, start, replace(self.choice, chosen=PAPER, tried=tuple(tried)))
 
+    def unless_lost(self, points: Mask, curves: Mask) -> Chosen | None:
+        """The lens in its place, where others explain what it takes out of the observations; None where none does.
+
+        Args:
+            points, curves: (N,), (M,) which ones that is.
+        """
+        return None if self.among is None else self.among.again(points, curves)
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """The lenses that were compared, and the one that was chosen.
+
+    Attributes:
+        seen: the observations that took part, and `share` of all. as_good: how many standard errors worse is as good.
+        start: of everything. there: where the chosen one is at its best.
+    """
+
+    seen: Seen
+    share: float
+    as_good: float
+    start: Start
+    tried: tuple[Candidate, ...]
+    chosen: Candidate
+    there: Estimate
+
+    @classmethod
+    def of(cls, seen: Seen, share: float, as_good: float, start: Start, kinds: Sequence[Kind]) -> Comparison:
+        """The paper's lens and the longest of each kind come first: only where the paper's is not as good as the best
+        of them are the shorter ones looked at.
+        """
+        tried = [one for kind in kinds for one in kind.candidates(first=True)]
+        best = chosen = there = None
+        with suppress(DegenerateError):  # all of these fold, which shorter ones need not
+            tried, best, chosen, there = _compare(tried, as_good, seen)
+        if chosen is None or there is None or chosen.form.label != PAPER:
+            tried, _, chosen, there = _compare([*tried, *_shorter(tried, best)], as_good, seen)
+        more = list(last_resort(seen, chosen))
+        if clearly := next((one for one in more if one.clearly_beats(chosen)), None):
+            chosen, there = clearly, clearly.estimate
+        return cls(seen, share, as_good, start, (*tried, *more), chosen, there)
+
+    @property
+    def outcome(self) -> Chosen:
+        """The options with the lens that was chosen, and where to start from."""
+        there, form, start = self.there, self.chosen.form, self.start
+        placements = Poses.of(start.estimate.placements)
+        placements = placements.updated(list(there.placements), Poses.of(there.placements).stack)
+        near = replace(start, estimate=replace(there, placements=placements), is_near=not form.blank.roughness)
+        return Chosen(form.of(self.seen.options), near, _choice(self.tried, self.chosen, self.share), self)
+
+    def again(self, points: Mask, curves: Mask) -> Chosen | None:
+        """See `Chosen.unless_lost`; of very many observations some were compared, and the rest is not looked at."""
+        if self.share < 1.0 or not is_lost(self.seen, self.tried, self.chosen, points, curves, self.as_good):
+            return None
+        lost = [replace(one, squares=None, failed=_LOST) if one is self.chosen else one for one in self.tried]
+        known = {one.form.label for one in lost}
+        more = [one for one in _shorter(lost, None) if one.form.label not in known]
+        try:
+            tried, _, chosen, there = _compare([*lost, *more], self.as_good, self.seen)
+            return replace(self, tried=tuple(tried), chosen=chosen, there=there).outcome
+        except CalibrationError:
+            return None
+
 
 def choose_lens(observations: Observations, options: Options, start: Start) -> Chosen:
     """The lens that the data ask for, one for all cameras; the paper's where there is too little to tell by.
-
-    The paper's lens and the longest of each kind come first: only where the paper's is not as good as the best of them
-    are the shorter ones looked at.
 
     Args:
         options: their lens is not looked at. start: of everything, with whatever lens.
@@ -58,37 +127,32 @@ def choose_lens(observations: Observations, options: Options, start: Start) -> C
     as_good = AS_GOOD_BESIDE_LENGTHS if options.dimensions else AS_GOOD
     try:
         seen, kinds, share = compared_kinds(observations, options, start.estimate)
-        tried = [one for kind in kinds for one in kind.candidates(first=True)]
-        best = chosen = None
-        with suppress(DegenerateError):  # all of these fold, which shorter ones need not
-            tried, best, chosen = _compare(tried, as_good, seen)
-        if chosen is None or chosen.form.label != PAPER:
-            others = [one for longest in tried if longest.may_win(best) for one in longest.of.candidates(first=False)]
-            tried, _, chosen = _compare([*tried, *others], as_good, seen)
-        more = list(last_resort(seen, chosen))
-        tried, chosen = [*tried, *more], next((one for one in more if one.clearly_beats(chosen)), chosen)
+        return Comparison.of(seen, share, as_good, start, kinds).outcome
     except CalibrationError as error:
         failed = "" if isinstance(error, FewGroupsError) else str(error)
         return Chosen(papers(options), start, LensChoice(PAPER, (TriedLens(PAPER, 2, failed=failed),), 0, 0.0))
-    there = chosen.estimate
-    placements = Poses.of(start.estimate.placements).updated(list(there.placements), Poses.of(there.placements).stack)
-    near = replace(start, estimate=replace(there, placements=placements), is_near=not chosen.form.blank.roughness)
-    return Chosen(chosen.form.of(options), near, _choice(tried, chosen, share))
 
 
-def _compare(tried: list[Candidate], as_good: float, seen: Seen) -> tuple[list[Candidate], Candidate, Candidate]:
-    """The lenses, the best and the one that is chosen: one that folds where it must not gives no answer, nor does one
-    that leaves more than was promised.
+def _shorter(tried: Sequence[Candidate], best: Candidate | None) -> list[Candidate]:
+    """The lenses of each kind that were not tried, where they may be as good as the best."""
+    return [one for longest in tried if longest.may_win(best) for one in longest.of.candidates(first=False)]
+
+
+def _compare(
+    tried: list[Candidate], as_good: float, seen: Seen
+) -> tuple[list[Candidate], Candidate, Candidate, Estimate]:
+    """The lenses, the best and the one that is chosen, and where that one is: one that folds where it must not gives no
+    answer, nor does one that leaves more than was promised.
     """
     labels, sizes = [one.form.label for one in tried], [one.form.size for one in tried]
     while True:
         is_refuted = partial(_is_refuted, tried)
         best, chosen = decide(labels, sizes, [one.squares for one in tried], as_good, is_refuted)
         faults = {number: fault for number in (best, chosen) if (fault := tried[number].fault)}
-        if not faults and not seen.keeps(tried[chosen]):
-            faults = {chosen: _BROKEN}
-        if not faults:
-            return tried, tried[best], tried[chosen]
+        there = None if faults else seen.reached(tried[chosen])
+        if there is not None:
+            return tried, tried[best], tried[chosen], there
+        faults = faults or {chosen: _BROKEN}
         tried = [replace(one, squares=None, failed=faults[n]) if n in faults else one for n, one in enumerate(tried)]
 
 

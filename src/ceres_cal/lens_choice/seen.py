@@ -117,16 +117,22 @@ class Seen:
         points = there.points[sights.point_rows] / (scales[0] * sights.sigma_px[:, None])
         return points, there.curves[sights.curve_rows] / (scales[1] * sights.curve_sigma_px)
 
-    def keeps(self, candidate: Candidate) -> bool:
-        """Whether a lens leaves no more than the normal equations of a longer one promised, at once or when solved."""
+    def reached(self, candidate: Candidate) -> Estimate | None:
+        """Where a lens leaves no more than the normal equations of a longer one promised, at once or when solved."""
         with suppress(CalibrationError):
             points, curves = self.in_sigmas(candidate.estimate)
             if np.sum(points**2) + curves @ curves <= _KEPT * candidate.least:
-                return True
+                return candidate.estimate
             options = replace(candidate.form.of(self.options), max_iterations=_MOST_STEPS)
             problem = self._problem(options, candidate.estimate)
-            return 2.0 * solve(problem, candidate.estimate, precision=_PRECISION).cost <= _KEPT * candidate.least
-        return False
+            solution = solve(problem, candidate.estimate, precision=_PRECISION)
+            return solution.estimate if 2.0 * solution.cost <= _KEPT * candidate.least else None
+        return None
+
+    def solved_near(self, candidate: Candidate) -> Estimate:
+        """Where a lens is at its best, solved for from where the normal equations have it."""
+        options = candidate.form.of(self.options)
+        return solve(self._problem(options, candidate.estimate), candidate.estimate).estimate
 
     def _problem(self, options: Options, estimate: Estimate) -> Problem:
         """All inliers weigh the same with every kind: what one of them misses must not weigh less with it."""
