@@ -32,6 +32,7 @@ _NEAR_REACHES_PX = (12.0, 6.0, 4.0)
 # From points that were shown: what stands farther beside a line than they are off cannot draw it away.
 _SHOWN_REACHES_PX = (12.0, 12.0, 12.0, 8.0, 8.0, 5.0)
 _FAR_REACHES_PX = (45.0, 45.0, 30.0, 30.0, 20.0, 12.0, 8.0, 5.0)
+_ASPECTS = (1.0, 0.94, 0.97, 1.03, 1.06)  # that a picture which was stretched may have, to start from
 _LAST_REACH_PX = 5.0
 _CANDIDATES = 5
 _FEWEST = 12
@@ -224,8 +225,10 @@ class _Tracker:
     def stretched(self, other: Followed) -> Followed:
         """What does not hold with square pixels, or the field in a picture that was stretched one way."""
         names = [name for name in self.free.names if name in intrinsic_names(other.camera.lens)]
-        free = replace(self.free, names=("aspect", *names))
-        there = replace(self, free=free).close_in(other.camera, _FAR_REACHES_PX)
+        free = replace(self, free=replace(self.free, names=("aspect", *names)))
+        starts = [replace(other.camera, phi=other.camera.phi / one**0.5, aspect=one) for one in _ASPECTS]
+        tried = [free.close_in(start, _SHOWN_REACHES_PX) for start in starts]
+        there = max(tried, key=lambda one: (one.holds, one.share))
         if not there.holds:
             return other
         refined = self.refined(there)
