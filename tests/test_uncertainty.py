@@ -30,11 +30,13 @@ from ceres_cal.model.quantities import intrinsic_keys, moved, natural_sizes
 from ceres_cal.model.structure import make_structure
 from ceres_cal.observations import Observations, Prior, combine
 from ceres_cal.observations.sights import gather_sights
+from ceres_cal.scene.lens import KannalaBrandt
 from ceres_cal.scene.targets import Segment
 from ceres_cal.solve import Problem, Weighting, solve
 from ceres_cal.start.initialise import PHI_RANGE
 from ceres_cal.uncertainty import Posterior, Uncertainty, Verdict
 from ceres_cal.uncertainty.maps import locate_slopes, radius_95, visible_pixels
+from ceres_cal.uncertainty.other_lenses import shifts_to_lenses
 from ceres_cal.uncertainty.seam import predicted
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -149,6 +151,47 @@ def test_bounds_are_where_the_cost_has_risen_by_four(tilt_deg: float) -> None:
     else:
         assert verdict.verdict == "unknown" and verdict.low == 0.0
         assert cost_at(calibration, observations, 125.0) - least < rise
+
+
+def test_what_goes_along_a_valley_does_not_widen_it() -> None:
+    calibration = calibrated(1.0)
+    posterior = calibration.posterior
+    assert posterior is not None
+    valley = posterior.profiles["overhead"]
+    along, beside = valley.steps[-2], np.eye(len(valley.keys))[1] * 5.0  # px of the principal point
+    for shift, factor in ((along, 1.0), (beside, 5.0 / valley.across[3].spread.sd[0])):
+        sd = valley.in_doubt(valley.keys, shift[None]).across[3].spread.sd
+        assert sd[0] / valley.across[3].spread.sd[0] == pytest.approx(np.hypot(1.0, factor) if factor > 1.0 else 1.0)
+    wider = posterior.in_doubt(valley.keys, [beside]).profiles["overhead"]
+    assert wider.across[0].spread.sd[0] > valley.across[0].spread.sd[0]
+
+
+# ---- other lenses ---------------------------------------------------------------------------------------------------
+
+
+def test_another_lens_is_followed_over_the_floor() -> None:
+    """As far as the numbers can: of the same lens with other numbers wholly, of another kind nearly."""
+    calibration = calibrated(25.0)
+    near, keys = calibration.estimate, calibration.uncertainty.posterior.keys
+    camera = near.camera_at("overhead")
+    step = 1e-3 * natural_sizes(near, keys) * np.random.default_rng(2).standard_normal(len(keys))
+    fisheye = camera.nearest(KannalaBrandt((0.0, 0.0, 0.0, 0.0)))
+    others = [moved(near, keys, step), replace(near, cameras={"overhead": fisheye.at(Pose.identity())})]
+    shifts = shifts_to_lenses(near, others, keys, {"overhead": 300.0})
+    pixels = camera.principal_point + 200.0 * np.random.default_rng(3).uniform(-1.0, 1.0, (50, 2))
+    slopes = locate_slopes(near, keys, "overhead", pixels, 0.0)
+    for other, shift, left in zip(others, shifts, (0.02, 0.7), strict=True):  # 0.004 and 0.5
+        off = other.camera_at("overhead").locate(pixels) - camera.locate(pixels)
+        assert np.linalg.norm(slopes @ shift - off) < left * np.linalg.norm(off)
+
+
+def test_another_lens_is_followed_where_no_floor_is_seen() -> None:
+    """By the rays alone, and turned as well as can be: a principal point aside is a turn, but for the lens."""
+    near = calibrated(25.0).estimate
+    keys = [key for key in calibrated(25.0).uncertainty.posterior.keys if key.kind == "camera"]
+    step = np.array([{"phi": 5.0, "cx": 2.0}.get(key.quantity, 0.0) for key in keys])
+    (shift,) = shifts_to_lenses(near, [moved(near, keys, step)], keys, {"overhead": 300.0})
+    assert dict(zip([key.quantity for key in keys], shift, strict=True))["phi"] == pytest.approx(5.0, rel=0.03)
 
 
 def test_a_prior_on_phi_is_part_of_its_profile() -> None:

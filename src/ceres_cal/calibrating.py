@@ -42,7 +42,7 @@ from ceres_cal.solve.possible import require_possible
 from ceres_cal.solve.usable import require_fits, require_usable
 from ceres_cal.start.initialise import Start, initialise
 from ceres_cal.uncertainty import Posterior, Scatter, assess, measure_scatter
-from ceres_cal.uncertainty.doubts import with_doubts, with_roughness
+from ceres_cal.uncertainty.doubts import with_doubts, with_other_lenses, with_roughness
 
 if TYPE_CHECKING:
     from ceres_cal.lens_choice import Chosen
@@ -155,6 +155,9 @@ def _of_any_lens(observations: Observations, sights: Sights, options: Options, w
     with suppress(CalibrationError):  # the first one stays
         while other := chosen.unless_lost(*calibration.outlier_masks(observations)):
             calibration, chosen = solved(other), other
+    if calibration.posterior is not None and (others := chosen.others) is not None:
+        wider = with_other_lenses(calibration.posterior, others.near, others.estimates, others.odds, others.reach_px)
+        calibration = replace(calibration, posterior=wider)
     warnings = (*calibration.warnings, *filter(None, [chosen.choice.caveat]))
     return replace(calibration, lens_choice=chosen.choice, warnings=warnings)
 

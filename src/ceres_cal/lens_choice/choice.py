@@ -8,10 +8,10 @@ predict the others no better: a criterion that counts observations would take th
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -24,7 +24,7 @@ from ceres_cal.lens_choice.forms import PAPER, papers
 from ceres_cal.lens_choice.kinds import Candidate, Kind
 from ceres_cal.lens_choice.last_resort import last_resort
 from ceres_cal.lens_choice.lost import is_lost
-from ceres_cal.lens_choice.rule import AS_GOOD, AS_GOOD_BESIDE_LENGTHS, decide, standard_errors
+from ceres_cal.lens_choice.rule import AS_GOOD, AS_GOOD_BESIDE_LENGTHS, decide, odds, standard_errors
 from ceres_cal.lens_choice.seen import FewGroupsError, Seen
 from ceres_cal.model.parameters import Estimate, Options
 from ceres_cal.observations import Observations
@@ -32,6 +32,22 @@ from ceres_cal.start.initialise import Start
 
 _BROKEN = "solved for, it leaves more than the equations of a longer lens had it"
 _LOST = "takes out observations that another lens explains"
+_LEAST_ODDS = 0.02  # of another lens that counts: all that have less make no difference
+_LEAST_SHARE = 0.25  # of the observations: where fewer took part, what other lenses say by chance makes no difference
+
+
+@dataclass(frozen=True, eq=False)
+class Others:
+    """Other lenses than the chosen one, from the same observations: where each is at its best, and how probable it is.
+
+    Attributes:
+        near: where the chosen one is. reach_px: camera -> how far from its principal point it was observed.
+    """
+
+    near: Estimate
+    estimates: tuple[Estimate, ...]
+    odds: tuple[float, ...]
+    reach_px: Mapping[str, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +68,11 @@ class Chosen:
         failed = [replace(one, failed=failure) if one.label == self.choice.chosen else one for one in self.choice.tried]
         tried = sorted(failed, key=lambda one: one.label != PAPER)
         return Chosen(options, start, replace(self.choice, chosen=PAPER, tried=tuple(tried)))
+
+    @property
+    def others(self) -> Others | None:
+        """What other lenses would say, as far as they are probable; None where nothing was compared."""
+        return None if self.among is None else self.among.others
 
     def unless_lost(self, points: Mask, curves: Mask) -> Chosen | None:
         """The lens in its place, where others explain what it takes out of the observations; None where none does.
@@ -95,6 +116,30 @@ class Comparison:
             chosen, there = clearly, clearly.estimate
         return cls(seen, share, as_good, start, (*tried, *more), chosen, there)
 
+    @cached_property
+    def odds(self) -> tuple[float, ...]:
+        """How likely each lens that was tried is the one that predicts best; 0 where it gives no answer."""
+        known = {i: one.squares for i, one in enumerate(self.tried) if one.squares is not None}
+        likely = dict(zip(known, odds(list(known.values())).tolist(), strict=True)) if known else {}
+        return tuple(likely.get(i, 0.0) for i in range(len(self.tried)))
+
+    @cached_property
+    def others(self) -> Others:
+        """What other lenses would say; nothing beside one without a formula, or of many more observations."""
+        found = Others(self.there, (), (), self.chosen.of.reach_px)
+        if self.chosen.form.blank.roughness or self.share < _LEAST_SHARE:
+            return found
+        with suppress(CalibrationError):
+            found = replace(found, near=self.seen.solved_near(self.chosen))
+            for one, likely in zip(self.tried, self.odds, strict=True):
+                if one is self.chosen or likely < _LEAST_ODDS or one.form.blank.roughness or one.fault:
+                    continue
+                with suppress(CalibrationError):
+                    estimates, weights = (*found.estimates, self.seen.solved_near(one)), (*found.odds, likely)
+                    found = replace(found, estimates=estimates, odds=weights)
+        # What they say by chance is less by as much as there are more observations than took part.
+        return replace(found, odds=tuple(self.share * one for one in found.odds))
+
     @property
     def outcome(self) -> Chosen:
         """The options with the lens that was chosen, and where to start from."""
@@ -102,11 +147,15 @@ class Comparison:
         placements = Poses.of(start.estimate.placements)
         placements = placements.updated(list(there.placements), Poses.of(there.placements).stack)
         near = replace(start, estimate=replace(there, placements=placements), is_near=not form.blank.roughness)
-        return Chosen(form.of(self.seen.options), near, _choice(self.tried, self.chosen, self.share), self)
+        return Chosen(form.of(self.seen.options), near, _choice(self), self)
 
     def again(self, points: Mask, curves: Mask) -> Chosen | None:
-        """See `Chosen.unless_lost`; of very many observations some were compared, and the rest is not looked at."""
-        if self.share < 1.0 or not is_lost(self.seen, self.tried, self.chosen, points, curves, self.as_good):
+        """See `Chosen.unless_lost`; of very many observations some were compared, and the rest is not looked at. What
+        predicts clearly better, a lens without a formula, stays.
+        """
+        if self.share < 1.0 or self.chosen.form.blank.roughness:
+            return None
+        if not is_lost(self.seen, self.tried, self.chosen, points, curves):
             return None
         lost = [replace(one, squares=None, failed=_LOST) if one is self.chosen else one for one in self.tried]
         known = {one.form.label for one in lost}
@@ -160,13 +209,16 @@ def _is_refuted(tried: Sequence[Candidate], number: int) -> bool:
     return any(other.refutes(tried[number]) for other in tried)
 
 
-def _choice(tried: Sequence[Candidate], chosen: Candidate, share: float) -> LensChoice:
+def _choice(among: Comparison) -> LensChoice:
+    chosen = among.chosen
+
     def as_told(one: Candidate) -> TriedLens:
         label, count = one.form.label, len(one.form.names)
         if one.squares is None or chosen.squares is None:
             return TriedLens(label, count, failed=one.failed)
-        return TriedLens(label, count, one.rms_px, standard_errors(one.squares, chosen.squares))
+        likely = among.odds[among.tried.index(one)]
+        return TriedLens(label, count, one.rms_px, standard_errors(one.squares, chosen.squares), odds=likely)
 
-    order = sorted(tried, key=lambda one: (one is not chosen, one.rms_px if one.squares is not None else np.inf))
+    order = sorted(among.tried, key=lambda one: (one is not chosen, one.rms_px if one.squares is not None else np.inf))
     groups = 0 if chosen.squares is None else len(chosen.squares)
-    return LensChoice(chosen.form.label, tuple(map(as_told, order)), groups, share)
+    return LensChoice(chosen.form.label, tuple(map(as_told, order)), groups, among.share)

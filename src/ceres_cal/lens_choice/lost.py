@@ -15,7 +15,6 @@ import numpy as np
 from ceres_cal.base.arrays import Mask
 from ceres_cal.base.errors import CalibrationError
 from ceres_cal.lens_choice.kinds import Candidate
-from ceres_cal.lens_choice.rule import standard_errors
 from ceres_cal.lens_choice.seen import Seen
 from ceres_cal.model.parameters import Estimate
 
@@ -25,13 +24,10 @@ _EXPLAINED = 3.0
 _PRICE = 13.0
 
 
-def is_lost(
-    seen: Seen, tried: Sequence[Candidate], chosen: Candidate, points: Mask, curves: Mask, as_good: float
-) -> bool:
-    """Whether another lens that predicts as well explains so much of what the chosen one takes out that it is likelier.
+def is_lost(seen: Seen, tried: Sequence[Candidate], chosen: Candidate, points: Mask, curves: Mask) -> bool:
+    """Whether another lens explains so much of what the chosen one takes out that it is the likelier one.
 
     Args:
-        as_good: how many standard errors worse is as well.
         points, curves: (N,), (M,) what the chosen one takes out of all observations.
     """
     sights = seen.sights
@@ -40,13 +36,11 @@ def is_lost(
         return False
     price = float(np.log(sights.equations))
     for other in tried:
-        if other is chosen or other.squares is None or chosen.squares is None:
-            continue
-        if standard_errors(other.squares, chosen.squares) > as_good:
+        if other is chosen or other.squares is None:
             continue
         with suppress(CalibrationError):
             explained = _explained(seen, seen.solved_near(other), out)
-            if _PRICE * explained > price * (other.form.size - chosen.form.size):
+            if _PRICE * explained > price * max(other.form.size - chosen.form.size, 0):
                 return True
     return False
 

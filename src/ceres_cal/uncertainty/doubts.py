@@ -1,11 +1,12 @@
-"""The posterior with what may be otherwise in it: statements in conflict, wholes that may not belong, other minima, and
-lenses rougher than their model.
+"""The posterior with what may be otherwise in it: statements in conflict, wholes that may not belong, other minima,
+lenses rougher than their model, and other lenses.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
+from ceres_cal.model.parameters import Estimate
 from ceres_cal.model.quantities import difference
 from ceres_cal.observations import Observations
 from ceres_cal.solve import Conflicts, RobustSolution, Solution, shifts_to
@@ -43,3 +44,23 @@ def with_roughness(posterior: Posterior, end: RobustSolution, observations: Obse
     from ceres_cal.uncertainty.rough import shifts_by_roughness
 
     return posterior.in_doubt(*shifts_by_roughness(end, observations))
+
+
+def with_other_lenses(
+    posterior: Posterior,
+    near: Estimate,
+    others: Sequence[Estimate],
+    odds: Sequence[float],
+    reach_px: Mapping[str, float],
+) -> Posterior:
+    """Wider by what other lenses would say, each as far as it is probable.
+
+    Args:
+        near: with the chosen lens, from the same observations as the others. reach_px: see `shifts_to_lenses`.
+    """
+    if not others:
+        return posterior
+    from ceres_cal.uncertainty.other_lenses import shifts_to_lenses
+
+    shifts = shifts_to_lenses(near, others, posterior.keys, reach_px)
+    return posterior.in_doubt(posterior.keys, [one**0.5 * shift for one, shift in zip(odds, shifts, strict=True)])

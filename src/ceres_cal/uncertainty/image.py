@@ -46,7 +46,7 @@ class ImageMap:
 
 
 @dataclass(frozen=True, eq=False)
-class _Picture:
+class Picture:
     """What a camera shows at N pixels, and how that moves when the camera is another one."""
 
     camera: Camera
@@ -101,7 +101,7 @@ def image_map(estimate: Estimate, posterior: Posterior, camera: str) -> ImageMap
     own = estimate.cameras[camera].at(Pose.identity())
     x, y = image_grid(own.image_size)
     pixels = np.column_stack([part.ravel() for part in np.meshgrid(x, y)])
-    picture = _Picture(own, pixels)
+    picture = Picture(own, pixels)
     if camera in posterior.profiles:
         radius = _by_profile(picture, estimate, posterior, camera)
     else:
@@ -109,7 +109,7 @@ def image_map(estimate: Estimate, posterior: Posterior, camera: str) -> ImageMap
     return ImageMap(camera, x, y, np.where(np.isnan(own.rays(pixels)[:, 0]), np.nan, radius).reshape(len(y), len(x)))
 
 
-def _slopes(picture: _Picture, estimate: Estimate, keys: Sequence[Key], camera: str) -> Array:
+def picture_slopes(picture: Picture, estimate: Estimate, keys: Sequence[Key], camera: str) -> Array:
     """(N, 2, K) px per unit of each of the keys: 0 of what is not this camera's."""
     own = [column for column, key in enumerate(keys) if key[:2] == ("camera", camera)]
     sizes = STEP * natural_sizes(estimate, [keys[column] for column in own])
@@ -118,9 +118,9 @@ def _slopes(picture: _Picture, estimate: Estimate, keys: Sequence[Key], camera: 
     return np.nan_to_num(slopes)
 
 
-def _by_covariance(picture: _Picture, estimate: Estimate, posterior: Posterior, camera: str) -> Array:
+def _by_covariance(picture: Picture, estimate: Estimate, posterior: Posterior, camera: str) -> Array:
     """(N,) px, with what leaves the quadratic picture."""
-    slopes = _slopes(picture, estimate, posterior.keys, camera)
+    slopes = picture_slopes(picture, estimate, posterior.keys, camera)
     covariance, width = posterior.spread.through(slopes), posterior.half_width
     bends = posterior.bends
     if bends is not None:
@@ -137,15 +137,15 @@ def _by_covariance(picture: _Picture, estimate: Estimate, posterior: Posterior, 
     return np.asarray(radius_95(covariance) * width / NORMAL_95)
 
 
-def _by_profile(picture: _Picture, estimate: Estimate, posterior: Posterior, camera: str) -> Array:
+def _by_profile(picture: Picture, estimate: Estimate, posterior: Posterior, camera: str) -> Array:
     """(N,) px along the valley: where each of its nodes shows what this camera shows, and how sure it is of that."""
     profile: PhiProfile = posterior.profiles[camera]
     shifts, sds = [], []
     for step, across in zip(profile.steps, profile.across, strict=True):
         there = moved(estimate, profile.keys, step)
         shifts.append(picture.shift(there.cameras[camera].at(Pose.identity())).ravel())
-        node = _Picture(there.cameras[camera].at(Pose.identity()), picture.pixels)
-        variance = across.spread.through(_slopes(node, there, across.keys, camera))
+        node = Picture(there.cameras[camera].at(Pose.identity()), picture.pixels)
+        variance = across.spread.through(picture_slopes(node, there, across.keys, camera))
         sds.append(np.sqrt(np.diagonal(variance, axis1=1, axis2=2)).ravel())
     values = np.array(shifts)
     lost = np.isnan(values).any(axis=0)

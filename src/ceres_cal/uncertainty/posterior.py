@@ -64,7 +64,8 @@ class Posterior:
         information, placements = self.information.widened(whole), self.placements
         if isinstance(placements, _Placements):
             placements = replace(placements, shared=information)
-        return replace(self, information=information, placements=placements)
+        profiles = {name: one.in_doubt(self.keys, whole) for name, one in self.profiles.items()}
+        return replace(self, information=information, placements=placements, profiles=profiles)
 
     @property
     def spread(self) -> Spread:
