@@ -35,8 +35,9 @@ from ceres_cal.scene.targets import Segment
 from ceres_cal.solve import Problem, Weighting, solve
 from ceres_cal.start.initialise import PHI_RANGE
 from ceres_cal.uncertainty import Posterior, Uncertainty, Verdict
-from ceres_cal.uncertainty.maps import locate_slopes, radius_95, visible_pixels
-from ceres_cal.uncertainty.other_lenses import shifts_to_lenses
+from ceres_cal.uncertainty.doubts import with_other_lenses
+from ceres_cal.uncertainty.maps import locate_slopes, radius_95, spread_of_points, visible_pixels
+from ceres_cal.uncertainty.other_lenses import OtherLenses, shifts_to_lenses
 from ceres_cal.uncertainty.seam import predicted
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -153,20 +154,12 @@ def test_bounds_are_where_the_cost_has_risen_by_four(tilt_deg: float) -> None:
         assert cost_at(calibration, observations, 125.0) - least < rise
 
 
-def test_what_goes_along_a_valley_does_not_widen_it() -> None:
-    calibration = calibrated(1.0)
-    posterior = calibration.posterior
-    assert posterior is not None
-    valley = posterior.profiles["overhead"]
-    along, beside = valley.steps[-2], np.eye(len(valley.keys))[1] * 5.0  # px of the principal point
-    for shift, factor in ((along, 1.0), (beside, 5.0 / valley.across[3].spread.sd[0])):
-        sd = valley.in_doubt(valley.keys, shift[None]).across[3].spread.sd
-        assert sd[0] / valley.across[3].spread.sd[0] == pytest.approx(np.hypot(1.0, factor) if factor > 1.0 else 1.0)
-    wider = posterior.in_doubt(valley.keys, [beside]).profiles["overhead"]
-    assert wider.across[0].spread.sd[0] > valley.across[0].spread.sd[0]
-
-
 # ---- other lenses ---------------------------------------------------------------------------------------------------
+
+
+def others_of(near: Estimate, *others: Estimate) -> OtherLenses:
+    """Others that are as likely as can be: what they show counts as much as it is."""
+    return OtherLenses(near, others, (2.0,) * len(others), {"overhead": 300.0})
 
 
 def test_another_lens_is_followed_over_the_floor() -> None:
@@ -176,11 +169,11 @@ def test_another_lens_is_followed_over_the_floor() -> None:
     camera = near.camera_at("overhead")
     step = 1e-3 * natural_sizes(near, keys) * np.random.default_rng(2).standard_normal(len(keys))
     fisheye = camera.nearest(KannalaBrandt((0.0, 0.0, 0.0, 0.0)))
-    others = [moved(near, keys, step), replace(near, cameras={"overhead": fisheye.at(Pose.identity())})]
-    shifts = shifts_to_lenses(near, others, keys, {"overhead": 300.0})
+    lenses = others_of(near, moved(near, keys, step), replace(near, cameras={"overhead": fisheye.at(Pose.identity())}))
+    shifts = shifts_to_lenses(lenses, keys, near)
     pixels = camera.principal_point + 200.0 * np.random.default_rng(3).uniform(-1.0, 1.0, (50, 2))
     slopes = locate_slopes(near, keys, "overhead", pixels, 0.0)
-    for other, shift, left in zip(others, shifts, (0.02, 0.7), strict=True):  # 0.004 and 0.5
+    for other, shift, left in zip(lenses.others, shifts, (0.02, 0.7), strict=True):  # 0.004 and 0.5
         off = other.camera_at("overhead").locate(pixels) - camera.locate(pixels)
         assert np.linalg.norm(slopes @ shift - off) < left * np.linalg.norm(off)
 
@@ -190,8 +183,26 @@ def test_another_lens_is_followed_where_no_floor_is_seen() -> None:
     near = calibrated(25.0).estimate
     keys = [key for key in calibrated(25.0).uncertainty.posterior.keys if key.kind == "camera"]
     step = np.array([{"phi": 5.0, "cx": 2.0}.get(key.quantity, 0.0) for key in keys])
-    (shift,) = shifts_to_lenses(near, [moved(near, keys, step)], keys, {"overhead": 300.0})
+    (shift,) = shifts_to_lenses(others_of(near, moved(near, keys, step)), keys, near)
     assert dict(zip([key.quantity for key in keys], shift, strict=True))["phi"] == pytest.approx(5.0, rel=0.03)
+
+
+def test_another_lens_widens_a_valley_on_the_floor_alike_at_every_phi() -> None:
+    """What it shows beside the lines is the same wherever the camera hangs that the lines leave open."""
+    calibration = calibrated(1.0)
+    posterior, estimate = calibration.uncertainty.posterior, calibration.estimate
+    camera = estimate.cameras["overhead"]
+    off = replace(camera, principal_point=(camera.principal_point[0] + 2.0, camera.principal_point[1]))
+    wider = with_other_lenses(posterior, estimate, others_of(estimate, replace(estimate, cameras={"overhead": off})))
+    pixels = camera.principal_point + np.array([[0.0, 0.0], [150.0, -80.0]])
+    aside = 2.0 * estimate.camera_at("overhead").position[2] / camera.phi
+    for known, step in zip(wider.profiles["overhead"].across, wider.profiles["overhead"].steps, strict=True):
+        there = moved(estimate, wider.profiles["overhead"].keys, step)
+        slopes = locate_slopes(there, known.keys, "overhead", pixels, 0.0)
+        on_floor = np.sqrt(known.spread.through(slopes)[:, 0, 0])
+        assert on_floor == pytest.approx([aside, aside], rel=0.1)
+    sd = [calibration.uncertainty.located(pixels).sd_m, spread_of_points(estimate, wider, "overhead", pixels, 0.0).sd_m]
+    assert np.all(sd[1] > 3.0 * sd[0])
 
 
 def test_a_prior_on_phi_is_part_of_its_profile() -> None:

@@ -156,7 +156,7 @@ def _of_any_lens(observations: Observations, sights: Sights, options: Options, w
         while other := chosen.unless_lost(*calibration.outlier_masks(observations)):
             calibration, chosen = solved(other), other
     if calibration.posterior is not None and (others := chosen.others) is not None:
-        wider = with_other_lenses(calibration.posterior, others.near, others.estimates, others.odds, others.reach_px)
+        wider = with_other_lenses(calibration.posterior, calibration.estimate, others)
         calibration = replace(calibration, posterior=wider)
     warnings = (*calibration.warnings, *filter(None, [chosen.choice.caveat]))
     return replace(calibration, lens_choice=chosen.choice, warnings=warnings)

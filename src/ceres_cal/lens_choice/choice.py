@@ -8,7 +8,7 @@ predict the others no better: a criterion that counts observations would take th
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -29,25 +29,12 @@ from ceres_cal.lens_choice.seen import FewGroupsError, Seen
 from ceres_cal.model.parameters import Estimate, Options
 from ceres_cal.observations import Observations
 from ceres_cal.start.initialise import Start
+from ceres_cal.uncertainty.other_lenses import OtherLenses
 
 _BROKEN = "solved for, it leaves more than the equations of a longer lens had it"
 _LOST = "takes out observations that another lens explains"
 _LEAST_ODDS = 0.02  # of another lens that counts: all that have less make no difference
 _LEAST_SHARE = 0.25  # of the observations: where fewer took part, what other lenses say by chance makes no difference
-
-
-@dataclass(frozen=True, eq=False)
-class Others:
-    """Other lenses than the chosen one, from the same observations: where each is at its best, and how probable it is.
-
-    Attributes:
-        near: where the chosen one is. reach_px: camera -> how far from its principal point it was observed.
-    """
-
-    near: Estimate
-    estimates: tuple[Estimate, ...]
-    odds: tuple[float, ...]
-    reach_px: Mapping[str, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +57,7 @@ class Chosen:
         return Chosen(options, start, replace(self.choice, chosen=PAPER, tried=tuple(tried)))
 
     @property
-    def others(self) -> Others | None:
+    def others(self) -> OtherLenses | None:
         """What other lenses would say, as far as they are probable; None where nothing was compared."""
         return None if self.among is None else self.among.others
 
@@ -124,9 +111,9 @@ class Comparison:
         return tuple(likely.get(i, 0.0) for i in range(len(self.tried)))
 
     @cached_property
-    def others(self) -> Others:
+    def others(self) -> OtherLenses:
         """What other lenses would say; nothing beside one without a formula, or of many more observations."""
-        found = Others(self.there, (), (), self.chosen.of.reach_px)
+        found = OtherLenses(self.there, (), (), self.chosen.of.reach_px)
         if self.chosen.form.blank.roughness or self.share < _LEAST_SHARE:
             return found
         with suppress(CalibrationError):
@@ -135,8 +122,8 @@ class Comparison:
                 if one is self.chosen or likely < _LEAST_ODDS or one.form.blank.roughness or one.fault:
                     continue
                 with suppress(CalibrationError):
-                    estimates, weights = (*found.estimates, self.seen.solved_near(one)), (*found.odds, likely)
-                    found = replace(found, estimates=estimates, odds=weights)
+                    others, weights = (*found.others, self.seen.solved_near(one)), (*found.odds, likely)
+                    found = replace(found, others=others, odds=weights)
         # What they say by chance is less by as much as there are more observations than took part.
         return replace(found, odds=tuple(self.share * one for one in found.odds))
 

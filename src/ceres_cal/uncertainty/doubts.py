@@ -4,14 +4,21 @@ lenses rougher than their model, and other lenses.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
 
 from ceres_cal.model.parameters import Estimate
-from ceres_cal.model.quantities import difference
+from ceres_cal.model.quantities import difference, moved
 from ceres_cal.observations import Observations
 from ceres_cal.solve import Conflicts, RobustSolution, Solution, shifts_to
 from ceres_cal.solve.explanation import Explanation
 from ceres_cal.uncertainty.posterior import Posterior
+
+if TYPE_CHECKING:
+    from ceres_cal.uncertainty.other_lenses import OtherLenses
 
 
 def with_doubts(
@@ -46,21 +53,21 @@ def with_roughness(posterior: Posterior, end: RobustSolution, observations: Obse
     return posterior.in_doubt(*shifts_by_roughness(end, observations))
 
 
-def with_other_lenses(
-    posterior: Posterior,
-    near: Estimate,
-    others: Sequence[Estimate],
-    odds: Sequence[float],
-    reach_px: Mapping[str, float],
-) -> Posterior:
-    """Wider by what other lenses would say, each as far as it is probable.
-
-    Args:
-        near: with the chosen lens, from the same observations as the others. reach_px: see `shifts_to_lenses`.
-    """
-    if not others:
+def with_other_lenses(posterior: Posterior, estimate: Estimate, lenses: OtherLenses) -> Posterior:
+    """Wider by what other lenses would say, each as far as it is probable; across a valley along phi at each node."""
+    if not lenses.others:
         return posterior
     from ceres_cal.uncertainty.other_lenses import shifts_to_lenses
 
-    shifts = shifts_to_lenses(near, others, posterior.keys, reach_px)
-    return posterior.in_doubt(posterior.keys, [one**0.5 * shift for one, shift in zip(odds, shifts, strict=True)])
+    followed = {profile.keys[0] for profile in posterior.profiles.values()}
+    keys = [key for key in posterior.keys if key not in followed]
+    wider = posterior.in_doubt(keys, shifts_to_lenses(lenses, keys, lenses.near))
+    profiles = dict(posterior.profiles)
+    for name, valley in profiles.items():
+        nodes = [moved(estimate, valley.keys, step) for step in valley.steps]
+        across = [
+            known.widened(np.array(shifts_to_lenses(lenses, known.keys, node)))
+            for known, node in zip(valley.across, nodes, strict=True)
+        ]
+        profiles[name] = replace(valley, across=tuple(across))
+    return replace(wider, profiles=profiles)

@@ -64,8 +64,7 @@ class Posterior:
         information, placements = self.information.widened(whole), self.placements
         if isinstance(placements, _Placements):
             placements = replace(placements, shared=information)
-        profiles = {name: one.in_doubt(self.keys, whole) for name, one in self.profiles.items()}
-        return replace(self, information=information, placements=placements, profiles=profiles)
+        return replace(self, information=information, placements=placements)
 
     @property
     def spread(self) -> Spread:

@@ -9,7 +9,7 @@ valley exactly, across it by the quadratic picture.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -82,16 +82,6 @@ class PhiProfile:
     def phi(self) -> Array:
         """(N,) px."""
         return np.asarray(self.phi_px + self.steps[:, 0])
-
-    def in_doubt(self, keys: Sequence[Key], shifts: Array) -> PhiProfile:
-        """Wider across the valley by each shift (S, P) of some numbers, less what goes with phi along it."""
-        own = np.zeros((len(shifts), len(self.keys)))
-        common = [column for column, key in enumerate(self.keys) if key in set(keys)]
-        own[:, common] = shifts[:, [list(keys).index(self.keys[column]) for column in common]]
-        order = np.argsort(self.steps[:, 0])
-        along = [np.interp(own[:, 0], self.steps[order, 0], column) for column in self.steps[order].T]
-        rest = (own - np.column_stack(along))[:, 1:]
-        return replace(self, across=tuple(one.widened(rest) for one in self.across))
 
     def reaches(self, half_width: float) -> tuple[Array, Array]:
         """Fine steps along the valley within the 95 % bound: weights (M, N) that interpolate what is known at the N
