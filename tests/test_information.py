@@ -68,6 +68,24 @@ def test_the_marginal_of_a_sum(seed: int, other: int, count: int, data: st.DataO
     assert close(late.matrix, early.matrix)
 
 
+@given(seeds, sizes, st.integers(1, 3))
+def test_shifts_add_to_the_covariance(seed: int, count: int, shifts: int) -> None:
+    known = drawn(seed, count)
+    steps = np.random.default_rng(seed).standard_normal((shifts, count)) / np.sqrt(np.diagonal(known.matrix))
+    assert close(inverse(known.widened(steps).matrix), inverse(known.matrix) + steps.T @ steps, 1e-6)
+
+
+@given(seeds, st.integers(3, 6), st.floats(1.0, 1e6))
+def test_shifts_however_large_leave_information(seed: int, count: int, far: float) -> None:
+    """Where hardly anything is known, rounding gave numbers imaginary standard deviations."""
+    known = drawn(seed, count, rank=count - 2)
+    steps = far * np.random.default_rng(seed).standard_normal((2, count)) / np.sqrt(np.diagonal(known.matrix))
+    wider = known.widened(steps)
+    unit = np.sqrt(np.diagonal(known.matrix))
+    values = np.linalg.eigvalsh(wider.matrix / unit[:, None] / unit)
+    assert np.all(np.isfinite(values)) and values.min() > -1e-12
+
+
 @given(seeds, sizes, st.data())
 def test_step_by_step_or_at_once(seed: int, count: int, data: st.DataObject) -> None:
     known = drawn(seed, count)

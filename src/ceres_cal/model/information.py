@@ -82,15 +82,18 @@ class Information:
         return whole
 
     def widened(self, shifts: Array) -> Information:
-        """With a covariance that is larger by d d^T for each of the shifts d (S, K) (Woodbury)."""
+        """With a covariance that is larger by d d^T for each of the shifts d (S, K) (Woodbury).
+
+        By a root A of the matrix, so that what is left is none's rounding: A^T (1 + A D D^T A^T)^-1 A.
+        """
         if not len(shifts):
             return self
-        through = self.matrix @ shifts.T
-        middle = np.eye(len(shifts)) + shifts @ through
-        unit = np.sqrt(np.diagonal(middle))
-        scaled = through / unit
-        matrix = self.matrix - scaled @ np.linalg.solve(middle / unit[:, None] / unit, scaled.T)
-        return Information(self.keys, 0.5 * (matrix + matrix.T))
+        unit = np.sqrt(np.maximum(np.diagonal(self.matrix), np.finfo(float).tiny))
+        values, vectors = np.linalg.eigh(self.matrix / unit[:, None] / unit)
+        root = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T * unit
+        along, sizes, _ = np.linalg.svd(root @ shifts.T, full_matrices=False)
+        left = root - (along * (1.0 - 1.0 / np.hypot(1.0, sizes))) @ (along.T @ root)
+        return Information(self.keys, left.T @ left)
 
     def __add__(self, other: Information) -> Information:
         """Both together, over the keys of either."""
