@@ -23,9 +23,10 @@ from ceres_cal.observations import Observations
 from ceres_cal.photographs import Auto, Facing, detect_field
 from ceres_cal.photographs.candidates import candidates, prepare_search
 from ceres_cal.photographs.facing import agreeing_with_facing, nearest_to_before, side_of
-from ceres_cal.photographs.follow import FreeIntrinsics, refine
+from ceres_cal.photographs.follow import refine
 from ceres_cal.photographs.grid import grid_of
 from ceres_cal.photographs.painted import likelihood_of_place
+from ceres_cal.photographs.refit import FreeIntrinsics
 from ceres_cal.photographs.search import search
 from ceres_cal.photographs.upright import find_upright
 from ceres_cal.scene.camera import Camera

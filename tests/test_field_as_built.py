@@ -81,6 +81,18 @@ def test_lines_that_lie_aside_are_named_and_measured() -> None:
     assert any(words.startswith("BottomTouchLine lies ") for words in built.words())
 
 
+def test_lines_that_are_bent_as_by_no_lens_are_another_field_s() -> None:
+    """As when the camera is bent until a field of another width fits in parts; tape that wanders does less."""
+    course = predict(FIELD, CAMERA, FIELD.curve_names, 8.0, 8.0)
+    every = np.ones(len(course), dtype=bool)
+    for wave_px, is_other in ((0.15, False), (1.0, True)):
+        wave = wave_px * np.sin(course.pixels @ np.array([0.05, 0.04]))
+        lines = Lines(course, every, wave, np.full(len(course), 0.1), np.full(len(course), 50.0), 0.8, 1.0)
+        built = as_built(lines, CAMERA, FIELD, unknown_optics(CAMERA.image_size, CAMERA.phi, None).priors)
+        assert built.is_other == is_other, built.misfit
+        assert is_other == any("bent as by no lens" in words for words in built.words())
+
+
 def test_a_line_that_lies_aside_is_straight_nevertheless(tmp_path: Path) -> None:
     painted = moved({"BottomTouchLine": (0.0, -0.03), "RightGoalLine": (0.03, 0.0), "HalfwayLine": (-0.02, 0.0)})
     course = predict(painted, CAMERA, painted.curve_names, 8.0, 8.0)

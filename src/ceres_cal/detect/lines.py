@@ -23,6 +23,7 @@ _BEYOND_PX = 4.5  # of a window, past the paint's border; farther where the pict
 _SEARCH_STEP_PX = 0.5
 _TINY = 1e-9  # grey levels
 _BAND_PX = 3.0  # of background, to either side of the paint, in the search
+_NARROW_PX = 1.0  # the same where other paint may be near
 # Of blur, in standard deviations: the part of a blurred line that is brightest.
 _AS_WIDE = 2.5
 # Of blur, in standard deviations: how far past the paint's border a blurred line reaches. Where that is more than the
@@ -105,8 +106,25 @@ def search(
             where the other is twice as bright.
         blur_px: standard deviation of what makes lines wider, (N,) or one.
     """
+    steps, response = _responses(grey, course, reach_px, blur_px, _BAND_PX)
+    best = np.argmax(_preferred(response, steps / spare_px) if spare_px > 0.0 else response, axis=1)
+    return steps[best], response[np.arange(len(best)), best]
+
+
+def peaks(grey: Array32, course: Course, reach_px: float) -> tuple[Array, Array]:
+    """Everywhere along the normals where there may be paint, however near to other paint: offsets (S,) px, and how much
+    brighter than both sides each of them is (N, S), 0 where it is no peak.
+    """
+    steps, response = _responses(grey, course, reach_px, 0.0, _NARROW_PX)
+    return steps, np.where(_is_peak(response), np.maximum(response, 0.0), 0.0)
+
+
+def _responses(
+    grey: Array32, course: Course, reach_px: float, blur_px: Array | float, band_px: float
+) -> tuple[Array, Array]:
+    """Steps (S,) px along the normals, and (N, S) how much brighter a line there is than bands to either side."""
     width_px = np.maximum(course.width_px, np.maximum(_AS_WIDE * np.asarray(blur_px), 1.0))
-    far = reach_px + float(np.max(width_px)) + _BAND_PX + 2.0
+    far = reach_px + float(np.max(width_px)) + band_px + 2.0
     steps = np.arange(-np.ceil(far / _SEARCH_STEP_PX), np.ceil(far / _SEARCH_STEP_PX) + 1.0) * _SEARCH_STEP_PX
     light = np.mean([_along_normals(grey, course, steps, shift) for shift in (-2.0, 0.0, 2.0)], axis=0)
     # Between steps, not of them: a mean must lie as far to one side of its place as to the other.
@@ -122,11 +140,10 @@ def search(
         return np.asarray((total[rows, b] - total[rows, a]) / (b - a))
 
     half = 0.5 * width_px
-    left, right = mean(-half - 1.0 - _BAND_PX, -half - 1.0), mean(half + 1.0, half + 1.0 + _BAND_PX)
+    left, right = mean(-half - 1.0 - band_px, -half - 1.0), mean(half + 1.0, half + 1.0 + band_px)
     response = mean(-half, half) - np.maximum(left, right)
     response[:, np.abs(steps) > reach_px] = -np.inf
-    best = np.argmax(_preferred(response, steps / spare_px) if spare_px > 0.0 else response, axis=1)
-    return steps[best], response[np.arange(len(best)), best]
+    return steps, response
 
 
 def _preferred(response: Array, away: Array) -> Array:
@@ -134,10 +151,13 @@ def _preferred(response: Array, away: Array) -> Array:
     more paint: a boundary line beside the field's own is wider.
     """
     bright, usual = np.maximum(response, 0.0), max(float(np.median(np.max(response, axis=1))), _TINY)
-    higher = np.pad(response, ((0, 0), (1, 1)), constant_values=-np.inf)
-    peak = (response >= higher[:, :-2]) & (response >= higher[:, 2:])
-    preferred = peak * bright / (bright + 0.5 * usual) * np.exp(-0.5 * away**2)
+    preferred = _is_peak(response) * bright / (bright + 0.5 * usual) * np.exp(-0.5 * away**2)
     return np.where(np.isfinite(response), preferred, -np.inf)
+
+
+def _is_peak(response: Array) -> Mask:
+    higher = np.pad(response, ((0, 0), (1, 1)), constant_values=-np.inf)
+    return np.asarray((response >= higher[:, :-2]) & (response >= higher[:, 2:]))
 
 
 def _along_normals(grey: Array32, course: Course, steps: Array, shift_px: float) -> Array:
@@ -163,7 +183,7 @@ def measure(grey: Array32, course: Course, reach_px: float, clear_px: Array | fl
         if not len(course):
             none = np.empty(0)
             return Lines(course, np.empty(0, dtype=bool), none, none, none, 1.0, 1.0)
-        rough, bright = search(grey, course, reach_px, 0.0, blur.blur_px)
+        rough, bright = search(grey, course, reach_px, 0.5 * reach_px, blur.blur_px)
         windows = _windows(grey, course, rough, beyond)
         blur = blur_of(windows, course, bright, blur)
         if _AS_FAR * np.max(blur.blur_px) <= beyond:

@@ -32,6 +32,8 @@ _WIDEST = 0.45
 _BESIDE_PX, _COARSER = 11, 1.4
 # Of strokes that run beside each other: cosine of the angle between them, and how far apart they are at least.
 _SAME_WAY, _APART_PX = 0.97, 4.0
+# Of a stroke, how much it must be a line of its own where stripes hide the others: at most two run beside it.
+_OWN = 0.15
 # Of the picture, where nothing is seen of a ridge's other side.
 _BORDER_PX = 3
 # Between pieces of one stroke; of a stroke's length, what is paint: worn lines are dashes.
@@ -95,6 +97,12 @@ def find_strokes(grey: Array32) -> Strokes:
     fine = fine.take(_COARSER * fine.strength >= _strength_beside(fine, coarse, size))
     coarse = coarse.take(coarse.strength > _COARSER * _strength_beside(coarse, fine, size))
     return Strokes(*(np.concatenate([getattr(one, name) for one in (fine, coarse)]) for name in ("ends", "strength")))
+
+
+def find_narrow_strokes(grey: Array32, reach_px: float) -> Strokes:
+    """Those of the narrowest paint that are lines of their own: stripes of sun are wide, or run beside each other."""
+    strokes = _strokes(_ridge_points(grey))
+    return strokes.take(alone(strokes, reach_px) > _OWN)
 
 
 def _strength_beside(strokes: Strokes, other: Strokes, image_size: tuple[int, int]) -> Array:

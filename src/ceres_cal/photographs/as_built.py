@@ -9,7 +9,7 @@ dimensions that are others: a spike and slab prior (Mitchell and Beauchamp, JASA
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -34,6 +34,9 @@ _BEAM, _MOST = 24, 9
 _OTHER_FIELD = 0.02
 _SURELY = 10.0  # standard deviations of it, which take lines to be taped independently of each other
 _FARTHEST_M = 0.12  # of all curves that lie aside, root sum of squares: farther, they are others
+# Of what neither offsets nor dimensions explain, mean square over what is stated: below 0.5 of other lenses, motion,
+# wear and sun, 2 of tape that wanders by pixels, 8 to 29 of fields of other widths whose lines bend the camera.
+_MOST_MISFIT = 6.0
 _LEAST_SIGMA_PX = 0.05  # of places on a curve: what a model of its shape is good for
 _TOGETHER = 4.0  # neighbouring places whose errors go together, at least
 _APART, _ALIKE = 40, 0.1  # places up to which, and correlation down to which, errors are seen to go together
@@ -48,6 +51,7 @@ class AsBuilt:
         dimensions: name of a dimension -> its most likely value, m, where it is another one than the target's.
         sd_m: name of each of those -> its standard deviation, m.
         drawn: name of a dimension -> its value by the target, m. curves: how many there are to tell.
+        misfit: mean square, over what is stated, of what none of that explains.
     """
 
     aside_m: Mapping[str, float]
@@ -55,17 +59,21 @@ class AsBuilt:
     sd_m: Mapping[str, float]
     drawn: Mapping[str, float]
     curves: int
+    misfit: float = 0.0
 
     @property
     def is_other(self) -> bool:
-        """Whether this is another field: a dimension too far off for a tape measure, or lines all over the place."""
+        """Whether this is another field: a dimension too far off for a tape measure, lines all over the place, or bent
+        as by no lens.
+        """
         changes = [
             abs(length / self.drawn[name] - 1.0)
             for name, length in self.dimensions.items()
             if abs(length - self.drawn[name]) > _SURELY * self.sd_m[name]
         ]
         far = float(np.linalg.norm(list(self.aside_m.values())))
-        return max(changes, default=0.0) > _OTHER_FIELD or far > _FARTHEST_M or 2 * len(self.aside_m) > self.curves
+        elsewhere = far > _FARTHEST_M or 2 * len(self.aside_m) > self.curves
+        return elsewhere or max(changes, default=0.0) > _OTHER_FIELD or self.misfit > _MOST_MISFIT
 
     def words(self) -> tuple[str, ...]:
         """A sentence on each dimension and each curve that is not as drawn."""
@@ -78,7 +86,8 @@ class AsBuilt:
             f"{name} lies {1e3 * abs(aside):.0f} ± {1e3 * self.sd_m[name]:.0f} mm beside its drawing"
             for name, aside in self.aside_m.items()
         ]
-        return (*dimensions, *curves)
+        bent = f"its lines are bent as by no lens, {self.misfit**0.5:.1f} times what is stated"
+        return (*dimensions, *curves, *([bent] if self.misfit > _MOST_MISFIT else []))
 
 
 AS_DRAWN = AsBuilt({}, {}, {}, {}, 0)
@@ -119,12 +128,13 @@ def as_built(lines: Lines, camera: Camera, target: Target, priors: tuple[Prior, 
     there = np.flatnonzero(np.any(columns != 0.0, axis=0))
     normal, slope = model.left_of(columns[:, there])
     bent = model.with_columns(columns[:, there])  # lines that no offset straightens: wavy tape, another lens
-    noise = max(1.0, float(bent.left_over @ bent.left_over) / max(bent.spare, 1))
-    noise *= max(1.0, _places_together(bent.left_over, equations.feature) / _TOGETHER)
+    misfit = float(bent.left_over @ bent.left_over) / max(bent.spare, 1)
+    noise = max(1.0, misfit) * max(1.0, _places_together(bent.left_over, equations.feature) / _TOGETHER)
     names = tuple(dimensions_of(seen.targets))
     drawn_m, moves = dimension_slopes(structure.names, seen.targets, names)
     owner = np.array([_curve_of(structure.names[row]) for row in there])
-    return _Shape(normal / noise, slope / noise, owner, moves[there], names, drawn_m).explained()
+    shape = _Shape(normal / noise, slope / noise, owner, moves[there], names, drawn_m)
+    return replace(shape.explained(), misfit=misfit)
 
 
 def _places_together(residuals: Array, curve: Indices) -> float:

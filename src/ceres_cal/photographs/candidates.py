@@ -11,11 +11,11 @@ import numpy as np
 from ceres_cal.base.arrays import Array32
 from ceres_cal.base.transforms import Pose, rotation_log
 from ceres_cal.detect.registration import nearness_to
-from ceres_cal.detect.strokes import drawn, find_strokes
+from ceres_cal.detect.strokes import Strokes, drawn, find_narrow_strokes, find_strokes
 from ceres_cal.model.dimensions import redrawn
 from ceres_cal.observations import Prior
 from ceres_cal.photographs.grid import Grid, grid_of, offsets_of
-from ceres_cal.photographs.matching import FloorLines, Match, StrokeMap, lines_seen, match
+from ceres_cal.photographs.matching import CROWDED, FloorLines, Match, StrokeMap, lines_seen, match
 from ceres_cal.photographs.painted import likelihood_of_place
 from ceres_cal.photographs.upright import Upright, find_upright
 from ceres_cal.scene.camera import Camera
@@ -77,10 +77,20 @@ def prepare_search(
         InputError: the target has too few straight lines.
     """
     grid, *others = (grid_of(drawn, curves) for drawn in _drawings(target, curves, lengths))
+    return FieldSearch(
+        grey, _stroke_map(grey, find_strokes(grey)), grid, tuple(turns_of(target, curves)), tuple(others)
+    )
+
+
+def narrowed(search: FieldSearch) -> FieldSearch:
+    """The same among the strokes of narrow paint alone: where nothing else was found, stripes may have hidden it."""
+    strokes = find_narrow_strokes(search.grey, CROWDED * search.stroke_map.unit_px)
+    return replace(search, stroke_map=_stroke_map(search.grey, strokes))
+
+
+def _stroke_map(grey: Array32, strokes: Strokes) -> StrokeMap:
     size = (int(grey.shape[1]), int(grey.shape[0]))
-    strokes = find_strokes(grey)
-    stroke_map = StrokeMap(strokes, nearness_to(drawn(strokes, size)), size, 0.5 * (np.array(size) - 1.0))
-    return FieldSearch(grey, stroke_map, grid, tuple(turns_of(target, curves)), tuple(others))
+    return StrokeMap(strokes, nearness_to(drawn(strokes, size)), size, 0.5 * (np.array(size) - 1.0))
 
 
 def _drawings(target: Target, curves: Collection[str], lengths: Sequence[Prior]) -> Iterator[Target]:

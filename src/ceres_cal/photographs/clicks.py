@@ -14,8 +14,7 @@ from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import DegenerateError, InputError, naming
 from ceres_cal.base.files import check_header, convert, read_json
 from ceres_cal.observations import Prior
-from ceres_cal.photographs.follow import FreeIntrinsics
-from ceres_cal.photographs.refit import CAMERA, PointHints
+from ceres_cal.photographs.refit import CAMERA, FreeIntrinsics, PointHints
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Radial
 from ceres_cal.scene.targets import Target

@@ -20,9 +20,10 @@ from ceres_cal.observations import NO_POINTS, Curves, Observations, Points, Prio
 from ceres_cal.photographs.as_built import ASIDE_M
 from ceres_cal.photographs.candidates import prepare_search
 from ceres_cal.photographs.clicks import Clicks, starts_from_clicks
-from ceres_cal.photographs.follow import FreeIntrinsics, follow
+from ceres_cal.photographs.follow import follow
 from ceres_cal.photographs.followed import Followed
 from ceres_cal.photographs.judgement import is_shown, why_missed
+from ceres_cal.photographs.refit import FreeIntrinsics
 from ceres_cal.photographs.search import Auto, SearchResult, SeveralWaysError, search
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.targets import Target

@@ -8,18 +8,19 @@ from itertools import islice, product
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Array32
+from ceres_cal.base.arrays import Array32
 from ceres_cal.base.errors import CalibrationError
 from ceres_cal.calibrating import calibrate
 from ceres_cal.detect.courses import Course, clear_px, predict
 from ceres_cal.detect.lines import SPACING_PX, Lines, measure, search
 from ceres_cal.detect.registration import nearness, shifted
 from ceres_cal.model.parameters import Options, intrinsic_names
-from ceres_cal.observations import Observations, Prior
+from ceres_cal.observations import Observations
 from ceres_cal.photographs.as_built import AS_DRAWN, AsBuilt, as_built
+from ceres_cal.photographs.beside import among_others
 from ceres_cal.photographs.followed import Followed
-from ceres_cal.photographs.painted import painted_curves
-from ceres_cal.photographs.refit import TARGET, PointHints, observations_of, refit_camera
+from ceres_cal.photographs.painted import painted_curves, visible_curves
+from ceres_cal.photographs.refit import TARGET, FreeIntrinsics, moved_px, observations_of, refit_camera
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import LENSES
 from ceres_cal.scene.targets import Target, target_from_spec
@@ -41,23 +42,6 @@ _ROUNDS = 6
 _NEARER = 2  # times that lines of other dimensions are looked for again
 _LESS = 0.02  # of the share: by so much less is no worse
 _AT_REST_PX = 0.02
-
-
-@dataclass(frozen=True, eq=False)
-class FreeIntrinsics:
-    """What of the camera, and of the target, a photograph may change besides the pose.
-
-    Attributes:
-        names: of the free intrinsics, in the order in which they are freed. priors: that hold them, and dimensions of
-            the target, which are free because of that.
-        hints: points that somebody showed, which hold the camera while lines are far off.
-        keep: whether the starts are known to be near: nothing far off is looked at.
-    """
-
-    names: tuple[str, ...] = ()
-    priors: tuple[Prior, ...] = ()
-    hints: PointHints | None = None
-    keep: bool = False
 
 
 def follow(
@@ -106,9 +90,20 @@ def look_again(
     return drawn if drawn.holds else tracker.stretched(drawn)
 
 
-def refine(grey: Array32, target: Target, camera: Camera, curves: Collection[str], free: FreeIntrinsics) -> Followed:
-    """From a camera that is right but for its lens: the kind that suits best, without curves that lie aside."""
-    tracker = _Tracker(grey, target, curves, free).of_painted(camera)
+def refine(
+    grey: Array32,
+    target: Target,
+    camera: Camera,
+    curves: Collection[str],
+    free: FreeIntrinsics,
+    lacking: Sequence[tuple[str, ...]] = (),
+) -> Followed:
+    """From a camera that is right but for its lens: the kind that suits best, without curves that lie aside.
+
+    Args:
+        lacking: parts that this field is known to lack.
+    """
+    tracker = _Tracker(grey, target, curves, free).lacking(lacking).of_painted(camera)
     return tracker.refined(tracker.followed(camera, tracker.measured(camera), np.inf))
 
 
@@ -124,12 +119,19 @@ class _Tracker:
 
     def followed(self, camera: Camera, lines: Lines, moved_px: float) -> Followed:
         """What was measured from a camera."""
-        return Followed(camera, self.target, tuple(self.curves), self.missing, lines, moved_px)
+        visible = visible_curves(self.grey, self.target, camera, self.curves)
+        return Followed(camera, self.target, tuple(self.curves), self.missing, lines, moved_px, visible)
 
     def of_painted(self, camera: Camera) -> _Tracker:
         """The same without what the target may lack and this camera does not see."""
         painted = painted_curves(self.grey, self.target, camera, self.curves)
-        return replace(self, curves=painted, missing=tuple(name for name in self.curves if name not in painted))
+        missing = (*self.missing, *(name for name in self.curves if name not in painted))
+        return replace(self, curves=painted, missing=missing)
+
+    def lacking(self, parts: Sequence[tuple[str, ...]]) -> _Tracker:
+        """The same without some parts that the target may lack."""
+        names = [name for part in parts for name in part]
+        return replace(self, curves=[one for one in self.curves if one not in names], missing=tuple(names))
 
     def tried(self, starts: Sequence[Camera]) -> Iterator[Followed]:
         """What is reached from each start: what is surely the field at once, then the others, the best first."""
@@ -179,7 +181,11 @@ class _Tracker:
         for number, reach in enumerate(reaches_px):
             names = self.free.names[: max(0, 2 * number - 1)]
             tracker, camera = tracker._search_step(camera, names, reach) or (tracker, camera)
-        return tracker.of_painted(camera).at_rest(camera, self.free.names)
+        tracker = tracker.of_painted(camera)
+        other = among_others(self.grey, tracker.target, camera, tracker.curves, self.free)
+        if other is not None:
+            tracker, camera = replace(tracker, target=other[1]), other[0]
+        return tracker.at_rest(camera, self.free.names)
 
     def at_rest(self, camera: Camera, names: tuple[str, ...]) -> Followed:
         """Measured and refitted, with these intrinsics free, until nothing moves any more."""
@@ -191,7 +197,7 @@ class _Tracker:
             if refitted is None:
                 break
             before, (tracker, there) = camera, refitted
-            moved = _moved_px(before, there, lines.course.pixels)
+            moved = moved_px(before, there, lines.course.pixels)
             camera, lines = there, tracker.measured(there)
             if moved < _AT_REST_PX:
                 break
@@ -225,7 +231,8 @@ class _Tracker:
     def stretched(self, other: Followed) -> Followed:
         """What does not hold with square pixels, or the field in a picture that was stretched one way."""
         names = [name for name in self.free.names if name in intrinsic_names(other.camera.lens)]
-        free = replace(self, free=replace(self.free, names=("aspect", *names)))
+        free = self.lacking(other.lacks_wholly)
+        free = replace(free, free=replace(self.free, names=("aspect", *names)))
         starts = [replace(other.camera, phi=other.camera.phi / one**0.5, aspect=one) for one in _ASPECTS]
         tried = [free.close_in(start, _SHOWN_REACHES_PX) for start in starts]
         there = max(tried, key=lambda one: (one.holds, one.share))
@@ -296,7 +303,7 @@ class _Tracker:
         best = min(fits, key=lambda fit: (fit[1].station().folds, fit[0]))[1]
         camera, target = best.station(), best.targets[TARGET]
         lines = replace(self, target=target).measured(camera)
-        moved = _moved_px(followed.camera, camera, lines.course.pixels)
+        moved = moved_px(followed.camera, camera, lines.course.pixels)
         refined = replace(self, target=target).followed(camera, lines, moved)
         return refined if refined.may_be_worn and refined.share > followed.share - _LESS else followed
 
@@ -341,10 +348,3 @@ class _Tracker:
 def _free(camera: Camera) -> tuple[str, ...]:
     """Names of the intrinsics that a photograph may change: its pixels are square where they are so far."""
     return tuple(name for name in intrinsic_names(camera.lens) if name != "aspect" or camera.aspect != 1.0)
-
-
-def _moved_px(camera: Camera, refitted: Camera, pixels: Array) -> float:
-    """How far the floor that is seen at these pixels moves from one camera to the other, px at most."""
-    floor = camera.locate(pixels)
-    moved = refitted.project(np.column_stack([floor, np.zeros(len(floor))])) - pixels
-    return float(np.nanmax(np.linalg.norm(moved, axis=1), initial=0.0))

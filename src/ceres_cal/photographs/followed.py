@@ -31,6 +31,7 @@ class Followed:
         lines: what was measured there, but for curves that lie aside.
         beside: the same of the curves that lie aside.
         moved_px: how far the last refit moved the prediction; at rest below 0.02.
+        visible: names of the curves along which there is paint, whether it could be measured or not.
         built: how the curves lie, where the photograph had to tell the lens, too.
     """
 
@@ -40,6 +41,7 @@ class Followed:
     missing: tuple[str, ...]
     lines: Lines
     moved_px: float
+    visible: tuple[str, ...]
     built: AsBuilt = AS_DRAWN
     beside: Lines | None = None
 
@@ -57,11 +59,21 @@ class Followed:
 
     @property
     def absent(self) -> tuple[int, ...]:
-        """The curves in view of which next to nothing was found."""
+        """The curves in view of which next to nothing was found, nor is to be seen unless the target may lack them: of
+        these there may be others, elsewhere.
+        """
         curve, found = self.lines.course.curve, self.lines.found
         numbers, places = np.unique(curve, return_counts=True)
         counts = np.array([np.count_nonzero(found[curve == number]) for number in numbers])
-        return tuple(int(number) for number in numbers[counts < _ABSENT * places])
+        sure = set(self.visible).difference(*self.target.optional)
+        visible = np.isin(numbers, [self.target.curve_index[name] for name in sure])
+        return tuple(int(number) for number in numbers[(counts < _ABSENT * places) & ~visible])
+
+    @property
+    def lacks_wholly(self) -> tuple[tuple[str, ...], ...]:
+        """The parts that the target may lack of which nothing is there."""
+        none = {*self.missing, *(self.target.curve_names[number] for number in self.absent)}
+        return tuple(part for part in self.target.optional if none.issuperset(part))
 
     @property
     def lacking(self) -> tuple[str, ...]:

@@ -85,7 +85,7 @@ def is_shown(search: FieldSearch, followed: Followed) -> bool:
     """
     if followed.holds or not followed.may_be_worn:
         return followed.holds
-    if 2 * len(detected_curves(search, followed)) <= len(search.curves):
+    if 2 * len({*detected_curves(search, followed), *followed.visible}) <= len(search.curves):
         return False
     everywhere = explained(search, followed, everywhere=True)
     return everywhere > _EXPLAINED and explained(search, followed) > _EXPLAINED_IF_WORN

@@ -34,7 +34,7 @@ _KEPT = 800
 _TELLS_PX = 40.0  # of a line, as much as one place on it tells
 # Of the places on the target: a camera nearer than that sees too little of it.
 _LEAST_IN_VIEW = 0.03
-_CROWDED = 0.12  # half diagonals within which lines of a target hardly ever run beside each other
+CROWDED = 0.12  # half diagonals within which lines of a target hardly ever run beside each other
 _BLOCK = 2000
 _QUARTERS = np.array([[[c, -s, 0], [s, c, 0], [0, 0, 1]] for c, s in ((1, 0), (0, 1), (-1, 0), (0, -1))], dtype=float)
 
@@ -70,7 +70,7 @@ class StrokeMap:
     @cached_property
     def weights(self) -> Array:
         """(N,) px of each stroke, as far as it may be a line."""
-        return self.strokes.length_px * alone(self.strokes, _CROWDED * self.unit_px)
+        return self.strokes.length_px * alone(self.strokes, CROWDED * self.unit_px)
 
     @cached_property
     def paint_px(self) -> float:

@@ -19,6 +19,9 @@ _SPACING_PX, _REACH, _FEWEST = 8.0, 0.035, 12
 BY_CHANCE = 0.3  # of the places on any lines, those that look like paint: what is brighter than the others does
 _ANYWHERE = 400  # places of lines laid anywhere, by which that brightness is known
 _R3 = 1.2207440846057596 ** -np.arange(1.0, 4.0)
+_NEAR = 0.012  # the same where they are known to lie
+# Log-likelihood ratio from which on paint along a curve is none by chance.
+_SURELY = 3.0
 # Of the places on lines, at most, where lines that are not painted look like paint: 0.3 by chance, 0.8 of worn ones.
 _LACKS = 0.5
 
@@ -36,12 +39,14 @@ class _Seen:
         return bool(np.sum(self.bright[rows]) < _LACKS * np.sum(self.places[rows]))
 
 
-def _seen(grey: Array32, target: Target, camera: Camera, curves: Collection[str]) -> _Seen:
+def _seen(
+    grey: Array32, target: Target, camera: Camera, curves: Collection[str], share_of_image: float = _REACH
+) -> _Seen:
     course = predict(target, camera, curves, _SPACING_PX, _SPACING_PX)
     count = len(target.curves)
     if len(course) < _FEWEST:
         return _Seen(np.zeros(count), np.zeros(count))
-    reach_px = 0.5 * _REACH * float(np.hypot(*camera.image_size))
+    reach_px = 0.5 * share_of_image * float(np.hypot(*camera.image_size))
     anywhere = _laid_anywhere(camera.image_size, float(np.median(course.width_px)))
     by_chance = float(np.quantile(search(grey, anywhere, reach_px)[1], 1.0 - BY_CHANCE))
     bright = search(grey, course, reach_px)[1] > by_chance
@@ -62,6 +67,16 @@ def painted_curves(grey: Array32, target: Target, camera: Camera, curves: Collec
     seen = _seen(grey, target, camera, curves)
     lacking = {name for part in target.optional if seen.lacks(target, part) for name in part}
     return tuple(name for name in curves if name not in lacking)
+
+
+def visible_curves(grey: Array32, target: Target, camera: Camera, curves: Collection[str]) -> tuple[str, ...]:
+    """Those of the curves along which there is more paint than by chance, though it may be in dashes, or too near to
+    other paint, to be measured.
+    """
+    seen = _seen(grey, target, camera, curves, _NEAR)
+    share = np.maximum(seen.bright / np.maximum(seen.places, 1.0), BY_CHANCE)
+    sure = seen.places * divergence(share, BY_CHANCE) > _SURELY
+    return tuple(name for name in curves if sure[target.curve_index[name]])
 
 
 def likelihood_of_place(grey: Array32, target: Target, camera: Camera, curves: Collection[str]) -> float:

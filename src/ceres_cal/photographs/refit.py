@@ -11,6 +11,7 @@ from ceres_cal.base.errors import CalibrationError
 from ceres_cal.model.dimensions import redrawn
 from ceres_cal.model.parameters import Estimate, Layout, Options, Station, intrinsic_names
 from ceres_cal.model.priors import stated_prior
+from ceres_cal.model.residuals import residuals
 from ceres_cal.model.structure import make_structure
 from ceres_cal.observations import NO_POINTS, Curves, Observations, Points, Prior, View
 from ceres_cal.observations.sights import gather_sights
@@ -29,6 +30,23 @@ class PointHints:
     feature: Indices32
     pixels: Array
     sigma_px: Array
+
+
+@dataclass(frozen=True, eq=False)
+class FreeIntrinsics:
+    """What of the camera, and of the target, a photograph may change besides the pose.
+
+    Attributes:
+        names: of the free intrinsics, in the order in which they are freed. priors: that hold them, and dimensions of
+            the target, which are free because of that.
+        hints: points that somebody showed, which hold the camera while lines are far off.
+        keep: whether the starts are known to be near: nothing far off is looked at.
+    """
+
+    names: tuple[str, ...] = ()
+    priors: tuple[Prior, ...] = ()
+    hints: PointHints | None = None
+    keep: bool = False
 
 
 def observations_of(
@@ -93,3 +111,17 @@ def refit_camera(
     if not usable or not all(length > 0.0 for length in lengths.values()):
         return None
     return refitted, redrawn(observations.targets[TARGET], lengths)
+
+
+def misfit(camera: Camera, observations: Observations) -> float:
+    """Mean cost of the curve observations of one view, by the loss of `refit_camera`."""
+    problem, estimate = problem_of(camera, observations, (), ())
+    left = residuals(observations, problem.sights, estimate).curves / problem.weighting.loss_scale
+    return float(np.mean(np.log1p(np.nan_to_num(left, nan=np.inf) ** 2)))
+
+
+def moved_px(camera: Camera, refitted: Camera, pixels: Array) -> float:
+    """How far the floor that is seen at these pixels moves from one camera to the other, px at most."""
+    floor = camera.locate(pixels)
+    moved = refitted.project(np.column_stack([floor, np.zeros(len(floor))])) - pixels
+    return float(np.nanmax(np.linalg.norm(moved, axis=1), initial=0.0))

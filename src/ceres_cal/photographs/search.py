@@ -10,7 +10,7 @@ import numpy as np
 from ceres_cal.base.arrays import Array32
 from ceres_cal.base.errors import InputError
 from ceres_cal.observations import Prior
-from ceres_cal.photographs.candidates import FieldSearch, alike, candidates, prepare_search
+from ceres_cal.photographs.candidates import FieldSearch, alike, candidates, narrowed, prepare_search
 from ceres_cal.photographs.clicks import SIGMA_PX, unknown_optics
 from ceres_cal.photographs.facing import (
     Facing,
@@ -20,11 +20,11 @@ from ceres_cal.photographs.facing import (
     require_sides,
     side_of,
 )
-from ceres_cal.photographs.follow import SURE_SHARE, FreeIntrinsics, approach, look_again, refine
+from ceres_cal.photographs.follow import SURE_SHARE, approach, look_again, refine
 from ceres_cal.photographs.followed import Followed
 from ceres_cal.photographs.grid import grid_of
 from ceres_cal.photographs.judgement import detected_curves, explained, likelihood, objection, same_labels
-from ceres_cal.photographs.refit import PointHints
+from ceres_cal.photographs.refit import FreeIntrinsics, PointHints
 from ceres_cal.scene.camera import Camera, in_image
 from ceres_cal.scene.targets import Target
 
@@ -95,10 +95,31 @@ def search(grey: Array32, target: Target, curves: Collection[str], auto: Auto) -
     """
     require_sides(auto.facing, target, curves)
     problem = prepare_search(grey, target, curves, auto.lengths)
+    good, seen, reason = _looked(problem, problem, auto)
+    if not good:
+        good, other, against = _looked(problem, narrowed(problem), auto)
+        if seen is None or (other is not None and other.share > seen.share):
+            seen, reason = other, against
+    if not good:
+        return SearchResult(None, reason, seen=seen)
+    best = max(good, key=likelihood)
+    problem = replace(problem, grid=grid_of(best.target, curves))
+    similar = alike(problem, best.camera, detected_curves(problem, best))
+    others = [_followed(problem, auto, _turned(problem, auto, camera)) for camera in similar]
+    distinct = [best]
+    for other in (*good, *(one for one in others if not objection(problem, one))):
+        as_good = likelihood(other) >= _AS_GOOD * likelihood(best)
+        if as_good and not any(same_labels(problem, other, one) for one in distinct):
+            distinct.append(other)
+    return _one_way(problem, auto, distinct)
+
+
+def _looked(problem: FieldSearch, among: FieldSearch, auto: Auto) -> tuple[list[Followed], Followed | None, str]:
+    """What may be the field, by candidates from some strokes; else the best there is, and what speaks against it."""
     good: list[Followed] = []
     seen: Followed | None = None
     reason = _NO_LINES
-    for camera, grid in candidates(problem):
+    for camera, grid in candidates(among):
         own = replace(problem, grid=grid)
         followed = _followed(own, auto, _turned(problem, auto, camera))
         against = objection(problem, followed)
@@ -112,18 +133,7 @@ def search(grey: Array32, target: Target, curves: Collection[str], auto: Auto) -
             seen, reason = followed, against
         if good and explained(problem, good[-1]) > _SURE:
             break
-    if not good:
-        return SearchResult(None, reason, seen=seen)
-    best = max(good, key=likelihood)
-    problem = replace(problem, grid=grid_of(best.target, curves))
-    similar = alike(problem, best.camera, detected_curves(problem, best))
-    others = [_followed(problem, auto, _turned(problem, auto, camera)) for camera in similar]
-    distinct = [best]
-    for other in (*good, *(one for one in others if not objection(problem, one))):
-        as_good = likelihood(other) >= _AS_GOOD * likelihood(best)
-        if as_good and not any(same_labels(problem, other, one) for one in distinct):
-            distinct.append(other)
-    return _one_way(problem, auto, distinct)
+    return good, seen, reason
 
 
 def _turned(problem: FieldSearch, auto: Auto, camera: Camera) -> Camera:
@@ -155,8 +165,9 @@ def _one_way(problem: FieldSearch, auto: Auto, distinct: Sequence[Followed]) -> 
     ways = [one.camera.at(one.camera.cam_from_world @ turn) for one in distinct for turn in problem.turns]
     agreeing = _consistent(problem, auto, ways)
     number = agreeing[0] if agreeing else 0
-    camera, drawn = ways[number], distinct[number // len(problem.turns)].target
-    followed = refine(problem.grey, drawn, camera, curves, _free(drawn, auto, camera))
+    camera, one = ways[number], distinct[number // len(problem.turns)]
+    free = _free(one.target, auto, camera)
+    followed = refine(problem.grey, one.target, camera, curves, free, one.lacks_wholly)
     if against := objection(problem, followed):
         return SearchResult(None, against, seen=followed)
     if not agreeing:
