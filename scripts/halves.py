@@ -130,13 +130,14 @@ class Agreement:
 
 def agreement(first: Calibration, second: Calibration, pixels: Array) -> Agreement:
     """Of the only camera of two calibrations from different observations; projections at pixels (N, 2). Of lenses
-    of two kinds the intrinsics do not mean the same: NaN; of one kind with other knots, or longer, coefficients do
-    not, and are left out.
+    of two kinds the intrinsics do not mean the same: NaN; of one kind with other knots, or others free, coefficients
+    do not, and are left out.
     """
     posteriors = [one.uncertainty.posterior for one in (first, second)]
     keys = [key for key in posteriors[0].keys if key.kind == "camera" and key in posteriors[1].keys]
     lenses = [one.estimate.cameras[keys[0].owner].lens for one in (first, second)]
-    if len(set(map(_meaning, lenses))) > 1:
+    free = [tuple(key for key in one.keys if key.kind == "camera") for one in posteriors]
+    if len(set(map(_meaning, lenses))) > 1 or free[0] != free[1]:
         keys = [key for key in keys if key.quantity not in lenses[0].names]
     sizes = natural_sizes(first.estimate, keys)
     step = (values_of(first.estimate, keys) - values_of(second.estimate, keys)) / sizes
@@ -145,7 +146,8 @@ def agreement(first: Calibration, second: Calibration, pixels: Array) -> Agreeme
     mahalanobis = float(step @ np.linalg.solve(spread, step)) / len(keys) if alike else np.nan
     cameras = [one.estimate.cameras[keys[0].owner].at(Pose.identity()) for one in (first, second)]
     rays = cameras[0].rays(pixels)
-    pixels, rays = pixels[np.isfinite(rays[:, 0])], rays[np.isfinite(rays[:, 0])]
+    shown = np.isfinite(rays[:, 0]) & np.isfinite(cameras[1].project(rays)[:, 0])
+    pixels, rays = pixels[shown], rays[shown]
     turned = turn_basis(cameras[0], rays)
     off = (cameras[1].project(rays) - pixels).ravel()
     off -= turned @ (turned.T @ off)
