@@ -51,11 +51,11 @@ class OtherLenses:
     def pixels(self) -> dict[str, Array]:
         """Camera -> (N, 2) of a grid over its image, as far as it was observed."""
         pixels = {}
-        for name, camera in self.near.cameras.items():
+        for name, reach_px in self.reach_px.items():
+            camera = self.near.cameras[name]
             x, y = (np.linspace(0.0, side - 1.0, _PLACES) for side in camera.image_size)
             places = np.column_stack([part.ravel() for part in np.meshgrid(x, y)])
-            inside = np.linalg.norm(places - camera.principal_point, axis=1) <= self.reach_px[name]
-            pixels[name] = places[inside]
+            pixels[name] = places[np.linalg.norm(places - camera.principal_point, axis=1) <= reach_px]
         return pixels
 
     def shifts(self, camera: str) -> Array:
@@ -78,24 +78,27 @@ def shifts_to_lenses(lenses: OtherLenses, keys: Sequence[Key], there: Estimate) 
     """
     slopes, offsets = zip(*_compared(lenses, keys, there), strict=True)
     slope = np.concatenate([one.reshape(-1, len(keys)) for one in slopes])
-    offset = np.concatenate([one.reshape(len(lenses.others), -1) for one in offsets], axis=1).T
-    known = np.isfinite(slope).all(axis=1) & np.isfinite(offset).all(axis=1)
-    sizes = natural_sizes(there, keys)
-    steps = np.linalg.lstsq(slope[known] * sizes, offset[known], rcond=_FOLLOWED)[0]
-    return list(np.asarray((steps * np.sqrt(_COUNTED * np.array(lenses.odds))).T * sizes))
+    sizes, shifts = natural_sizes(there, keys), []
+    for number, odds in enumerate(lenses.odds):
+        offset = np.concatenate([one[number].ravel() for one in offsets])
+        known = np.isfinite(slope).all(axis=1) & np.isfinite(offset)
+        step = np.linalg.lstsq(slope[known] * sizes, offset[known], rcond=_FOLLOWED)[0]
+        shifts.append((_COUNTED * odds) ** 0.5 * step * sizes)
+    return shifts
 
 
 def _compared(lenses: OtherLenses, keys: Sequence[Key], there: Estimate) -> Iterator[tuple[Array, Array]]:
     """Of each camera: (N, 2, K) slopes of what it shows, px, and (L, N, 2) by how much others show it elsewhere."""
     known = {key.owner for key in keys if key.kind == "station"}
-    for name, camera in there.cameras.items():
+    for name, pixels in lenses.pixels.items():
+        camera = there.cameras[name]
         stations = [station for station in known if there.stations[station].camera == name]
         tells_phi = any(key[:3] == ("camera", name, "phi") for key in keys)
         for station in stations:
             px_per_m = camera.phi / max(abs(float(there.camera_at(station).position[2])), 1e-3)
             for height_m, part in zip(HEIGHTS_M[: 2 if tells_phi else 1], _PARTS, strict=False):
-                slopes = locate_slopes(there, keys, station, lenses.pixels[name], height_m)
+                slopes = locate_slopes(there, keys, station, pixels, height_m)
                 yield part * px_per_m * slopes, part * px_per_m * lenses.offsets(station, height_m)
         if not stations:
-            picture = Picture(camera.at(Pose.identity()), lenses.pixels[name])
+            picture = Picture(camera.at(Pose.identity()), pixels)
             yield picture_slopes(picture, there, keys, name), lenses.shifts(name)
