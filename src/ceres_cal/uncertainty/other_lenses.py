@@ -28,8 +28,8 @@ _PLACES = 12  # along each side of the picture
 # standard deviations off there.
 _PARTS = (1.0, 0.1)
 _FOLLOWED = 1e-4  # of the largest singular value: directions that show less are not moved along
-# Of the odds. Of 213 photographs fewest are off by other than 1 / 1.6 to 1.6 times what is stated, a quarter; a little
-# more at the whole of them, most of them wide, and nearly a third without, most of them too narrow.
+# Of the odds. Of maps by one photograph fewest are off by other than 1 / 1.6 to 1.6 times what is stated, a quarter;
+# a little more at the whole of them, most of them wide, and nearly a third without, most of them too narrow.
 _COUNTED = 0.5
 
 
