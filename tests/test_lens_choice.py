@@ -26,7 +26,7 @@ from ceres_cal.detect.boards import BoardDetections
 from ceres_cal.diagnostics.held_out import choose
 from ceres_cal.lens_choice import PAPER, candidates, decide, label_of
 from ceres_cal.lens_choice.kinds import Candidate
-from ceres_cal.lens_choice.rule import odds
+from ceres_cal.lens_choice.rule import pseudo_bma
 from ceres_cal.model.equations import write_equations
 from ceres_cal.model.keys import Key
 from ceres_cal.model.parameters import AUTO, Options
@@ -180,17 +180,17 @@ def _groups_of_ten(shared: float, seed: int, alone: float = 1.0) -> GroupNormals
     squares=hnp.arrays(float, st.tuples(st.integers(1, 6), st.integers(1, 40)), elements=st.floats(0.0, 1e4)),
     shift=st.floats(0.0, 1e3),
 )
-def test_odds_are_probabilities_that_know_of_differences_alone(squares: Array, shift: float) -> None:
-    likely = odds(list(squares))
+def test_probabilities_add_up_and_know_of_differences_alone(squares: Array, shift: float) -> None:
+    likely = pseudo_bma(list(squares))
     assert likely.sum() == pytest.approx(1.0) and np.all(likely >= 0.0)
-    assert odds(list(squares + shift)) == pytest.approx(likely, abs=1e-9)
-    assert odds([*squares, squares[0]])[[0, -1]] == pytest.approx(odds([squares[0], *squares])[:2])
+    assert pseudo_bma(list(squares + shift)) == pytest.approx(likely, abs=1e-9)
+    assert pseudo_bma([*squares, squares[0]])[[0, -1]] == pytest.approx(pseudo_bma([squares[0], *squares])[:2])
 
 
-def test_odds_are_as_sure_as_groups_agree() -> None:
+def test_probabilities_are_as_sure_as_groups_agree() -> None:
     """One lens predicts worse by 8 in all: by all groups alike, or by one group for it and one against it."""
-    alike = odds([np.zeros(16), np.full(16, 0.5)])
-    split = odds([np.zeros(16), np.array([58.0, -50.0, *np.zeros(14)])])
+    alike = pseudo_bma([np.zeros(16), np.full(16, 0.5)])
+    split = pseudo_bma([np.zeros(16), np.array([58.0, -50.0, *np.zeros(14)])])
     assert alike[1] < 0.05 < 0.3 < split[1]  # 0.022 and 0.375
 
 
@@ -201,7 +201,7 @@ def test_what_other_lenses_would_say_is_stated(tmp_path: Path) -> None:
     seen = detect_field([path], ssl_field("B"), disturbed.AUTO).observations
     calibration = calibrate(seen)
     choice = calibration.lens_choice
-    assert choice is not None and sum(one.odds or 0.0 for one in choice.tried) == pytest.approx(1.0)
+    assert choice is not None and sum(one.probability or 0.0 for one in choice.tried) == pytest.approx(1.0)
     alone = calibrate(seen, calibration.options)
     wider, narrow = (one.uncertainty.posterior for one in (calibration, alone))
     assert np.all(wider.sd >= narrow.sd * (1.0 - 1e-6))

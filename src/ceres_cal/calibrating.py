@@ -153,7 +153,7 @@ def _of_any_lens(observations: Observations, sights: Sights, options: Options, w
         chosen = chosen.without(str(error), papers(options), start)
         calibration = solved(chosen)
     with suppress(CalibrationError):  # the first one stays
-        while other := chosen.unless_lost(*calibration.outlier_masks(observations)):
+        while other := chosen.instead(*calibration.outlier_masks(observations)):
             calibration, chosen = solved(other), other
     if calibration.posterior is not None and (others := chosen.others) is not None:
         wider = with_other_lenses(calibration.posterior, calibration.estimate, others)

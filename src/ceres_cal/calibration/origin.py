@@ -52,7 +52,7 @@ class TriedLens:
         rms_px: of the errors with which views or features are predicted by all others; None where there is no answer.
         worse: by how many standard errors of the paired difference it predicts worse than the one that was chosen.
         failed: why there is no answer, "" where there is.
-        odds: how likely it is the one that predicts best; None where there is no answer, and in files of before.
+        probability: that it is the one that predicts best; None where there is no answer, and in files of before.
     """
 
     label: str
@@ -60,7 +60,7 @@ class TriedLens:
     rms_px: float | None = None
     worse: float | None = None
     failed: str = ""
-    odds: float | None = None
+    probability: float | None = None
 
 
 @dataclass(frozen=True)

@@ -23,8 +23,8 @@ from ceres_cal.lens_choice.comparing import compared_kinds
 from ceres_cal.lens_choice.forms import PAPER, papers
 from ceres_cal.lens_choice.kinds import Candidate, Kind
 from ceres_cal.lens_choice.last_resort import last_resort
-from ceres_cal.lens_choice.lost import is_lost
-from ceres_cal.lens_choice.rule import AS_GOOD, AS_GOOD_BESIDE_LENGTHS, decide, odds, standard_errors
+from ceres_cal.lens_choice.outliers import explained_by_another
+from ceres_cal.lens_choice.rule import AS_GOOD, AS_GOOD_BESIDE_LENGTHS, decide, pseudo_bma, standard_errors
 from ceres_cal.lens_choice.seen import FewGroupsError, Seen
 from ceres_cal.model.parameters import Estimate, Options
 from ceres_cal.observations import Observations
@@ -32,8 +32,8 @@ from ceres_cal.start.initialise import Start
 from ceres_cal.uncertainty.other_lenses import OtherLenses
 
 _BROKEN = "solved for, it leaves more than the equations of a longer lens had it"
-_LOST = "takes out observations that another lens explains"
-_LEAST_ODDS = 0.02  # of another lens that counts: all that have less make no difference
+_EXPLAINED = "takes out observations that another lens explains"
+_LEAST_PROBABILITY = 0.02  # of another lens that counts: all that have less make no difference
 _LEAST_SHARE = 0.25  # of the observations: where fewer took part, what other lenses say by chance makes no difference
 
 
@@ -61,13 +61,13 @@ class Chosen:
         """What other lenses would say, as far as they are probable; None where nothing was compared."""
         return None if self.among is None else self.among.others
 
-    def unless_lost(self, points: Mask, curves: Mask) -> Chosen | None:
+    def instead(self, points: Mask, curves: Mask) -> Chosen | None:
         """The lens in its place, where others explain what it takes out of the observations; None where none does.
 
         Args:
             points, curves: (N,), (M,) which ones that is.
         """
-        return None if self.among is None else self.among.again(points, curves)
+        return None if self.among is None else self.among.instead(points, curves)
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,30 +84,15 @@ class Comparison:
     as_good: float
     start: Start
     tried: tuple[Candidate, ...]
+    best: Candidate
     chosen: Candidate
     there: Estimate
 
-    @classmethod
-    def of(cls, seen: Seen, share: float, as_good: float, start: Start, kinds: Sequence[Kind]) -> Comparison:
-        """The paper's lens and the longest of each kind come first: only where the paper's is not as good as the best
-        of them are the shorter ones looked at.
-        """
-        tried = [one for kind in kinds for one in kind.candidates(first=True)]
-        best = chosen = there = None
-        with suppress(DegenerateError):  # all of these fold, which shorter ones need not
-            tried, best, chosen, there = _compare(tried, as_good, seen)
-        if chosen is None or there is None or chosen.form.label != PAPER:
-            tried, _, chosen, there = _compare([*tried, *_shorter(tried, best)], as_good, seen)
-        more = list(last_resort(seen, chosen))
-        if clearly := next((one for one in more if one.clearly_beats(chosen)), None):
-            chosen, there = clearly, clearly.estimate
-        return cls(seen, share, as_good, start, (*tried, *more), chosen, there)
-
     @cached_property
-    def odds(self) -> tuple[float, ...]:
-        """How likely each lens that was tried is the one that predicts best; 0 where it gives no answer."""
+    def probabilities(self) -> tuple[float, ...]:
+        """That each lens that was tried is the one that predicts best; 0 where it gives no answer."""
         known = {i: one.squares for i, one in enumerate(self.tried) if one.squares is not None}
-        likely = dict(zip(known, odds(list(known.values())).tolist(), strict=True)) if known else {}
+        likely = dict(zip(known, pseudo_bma(list(known.values())).tolist(), strict=True))
         return tuple(likely.get(i, 0.0) for i in range(len(self.tried)))
 
     @cached_property
@@ -118,14 +103,14 @@ class Comparison:
             return found
         with suppress(CalibrationError):
             found = replace(found, near=self.seen.solved_near(self.chosen))
-            for one, likely in zip(self.tried, self.odds, strict=True):
-                if one is self.chosen or likely < _LEAST_ODDS or one.form.blank.roughness or one.fault:
+            for one, likely in zip(self.tried, self.probabilities, strict=True):
+                if one is self.chosen or likely < _LEAST_PROBABILITY or one.form.blank.roughness or one.fault:
                     continue
                 with suppress(CalibrationError):
-                    others, weights = (*found.others, self.seen.solved_near(one)), (*found.odds, likely)
-                    found = replace(found, others=others, odds=weights)
+                    others, weights = (*found.others, self.seen.solved_near(one)), (*found.weights, likely)
+                    found = replace(found, others=others, weights=weights)
         # What they say by chance is less by as much as there are more observations than took part.
-        return replace(found, odds=tuple(self.share * one for one in found.odds))
+        return replace(found, weights=tuple(self.share * one for one in found.weights))
 
     @property
     def outcome(self) -> Chosen:
@@ -136,20 +121,19 @@ class Comparison:
         near = replace(start, estimate=replace(there, placements=placements), is_near=not form.blank.roughness)
         return Chosen(form.of(self.seen.options), near, _choice(self), self)
 
-    def again(self, points: Mask, curves: Mask) -> Chosen | None:
-        """See `Chosen.unless_lost`; of very many observations some were compared, and the rest is not looked at. What
+    def instead(self, points: Mask, curves: Mask) -> Chosen | None:
+        """See `Chosen.instead`; of very many observations some were compared, and the rest is not looked at. What
         predicts clearly better, a lens without a formula, stays.
         """
         if self.share < 1.0 or self.chosen.form.blank.roughness:
             return None
-        if not is_lost(self.seen, self.tried, self.chosen, points, curves):
+        if not explained_by_another(self.seen, self.tried, self.chosen, points, curves):
             return None
-        lost = [replace(one, squares=None, failed=_LOST) if one is self.chosen else one for one in self.tried]
-        known = {one.form.label for one in lost}
-        more = [one for one in _shorter(lost, None) if one.form.label not in known]
+        others = [replace(one, squares=None, failed=_EXPLAINED) if one is self.chosen else one for one in self.tried]
+        known = {one.form.label for one in others}
+        more = [one for one in _shorter(others, None) if one.form.label not in known]
         try:
-            tried, _, chosen, there = _compare([*lost, *more], self.as_good, self.seen)
-            return replace(self, tried=tuple(tried), chosen=chosen, there=there).outcome
+            return _compared(self.seen, self.share, self.as_good, self.start, [*others, *more]).outcome
         except CalibrationError:
             return None
 
@@ -163,7 +147,7 @@ def choose_lens(observations: Observations, options: Options, start: Start) -> C
     as_good = AS_GOOD_BESIDE_LENGTHS if options.dimensions else AS_GOOD
     try:
         seen, kinds, share = compared_kinds(observations, options, start.estimate)
-        return Comparison.of(seen, share, as_good, start, kinds).outcome
+        return _among(seen, share, as_good, start, kinds).outcome
     except CalibrationError as error:
         failed = "" if isinstance(error, FewGroupsError) else str(error)
         return Chosen(papers(options), start, LensChoice(PAPER, (TriedLens(PAPER, 2, failed=failed),), 0, 0.0))
@@ -174,11 +158,29 @@ def _shorter(tried: Sequence[Candidate], best: Candidate | None) -> list[Candida
     return [one for longest in tried if longest.may_win(best) for one in longest.of.candidates(first=False)]
 
 
-def _compare(
-    tried: list[Candidate], as_good: float, seen: Seen
-) -> tuple[list[Candidate], Candidate, Candidate, Estimate]:
-    """The lenses, the best and the one that is chosen, and where that one is: one that folds where it must not gives no
-    answer, nor does one that leaves more than was promised.
+def _among(seen: Seen, share: float, as_good: float, start: Start, kinds: Sequence[Kind]) -> Comparison:
+    """The paper's lens and the longest of each kind come first: only where the paper's is not as good as the best of
+    them are the shorter ones looked at.
+    """
+    tried = [one for kind in kinds for one in kind.candidates(first=True)]
+    found: Comparison | None = None
+    with suppress(DegenerateError):  # all of these fold, which shorter ones need not
+        found = _compared(seen, share, as_good, start, tried)
+    if found is None:
+        found = _compared(seen, share, as_good, start, [*tried, *_shorter(tried, None)])
+    elif found.chosen.form.label != PAPER:
+        found = _compared(seen, share, as_good, start, [*found.tried, *_shorter(found.tried, found.best)])
+    more = tuple(last_resort(seen, found.chosen))
+    found = replace(found, tried=(*found.tried, *more))
+    clearly = next((one for one in more if one.clearly_beats(found.chosen)), None)
+    return found if clearly is None else replace(found, chosen=clearly, there=clearly.estimate)
+
+
+def _compared(seen: Seen, share: float, as_good: float, start: Start, tried: Sequence[Candidate]) -> Comparison:
+    """Some lenses: one that folds where it must not gives no answer, nor does one that leaves more than was promised.
+
+    Raises:
+        DegenerateError: none gives one.
     """
     labels, sizes = [one.form.label for one in tried], [one.form.size for one in tried]
     while True:
@@ -187,7 +189,7 @@ def _compare(
         faults = {number: fault for number in (best, chosen) if (fault := tried[number].fault)}
         there = None if faults else seen.reached(tried[chosen])
         if there is not None:
-            return tried, tried[best], tried[chosen], there
+            return Comparison(seen, share, as_good, start, tuple(tried), tried[best], tried[chosen], there)
         faults = faults or {chosen: _BROKEN}
         tried = [replace(one, squares=None, failed=faults[n]) if n in faults else one for n, one in enumerate(tried)]
 
@@ -203,8 +205,8 @@ def _choice(among: Comparison) -> LensChoice:
         label, count = one.form.label, len(one.form.names)
         if one.squares is None or chosen.squares is None:
             return TriedLens(label, count, failed=one.failed)
-        likely = among.odds[among.tried.index(one)]
-        return TriedLens(label, count, one.rms_px, standard_errors(one.squares, chosen.squares), odds=likely)
+        likely = among.probabilities[among.tried.index(one)]
+        return TriedLens(label, count, one.rms_px, standard_errors(one.squares, chosen.squares), probability=likely)
 
     order = sorted(among.tried, key=lambda one: (one is not chosen, one.rms_px if one.squares is not None else np.inf))
     groups = 0 if chosen.squares is None else len(chosen.squares)

@@ -55,8 +55,8 @@ def decide(
     return best, next((i for i in near if not is_refuted(i)), best)
 
 
-def odds(squares: Sequence[Array]) -> Array:
-    """(L,) how likely each of L lenses is the one that predicts best: their likelihoods, averaged over draws of groups.
+def pseudo_bma(squares: Sequence[Array]) -> Array:
+    """(L,) probability that each lens is the one that predicts best: likelihoods, averaged over draws of groups.
 
     Pseudo-BMA+ of Yao, Vehtari, Simpson and Gelman (Bayesian Analysis 13, 2018, section 3.4), but that the draws are
     balanced half samples, twice each (McCarthy, Review of the International Statistical Institute 37, 1969): nothing

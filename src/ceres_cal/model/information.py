@@ -84,7 +84,7 @@ class Information:
     def widened(self, shifts: Array) -> Information:
         """With a covariance that is larger by d d^T for each of the shifts d (S, K) (Woodbury).
 
-        By a root A of the matrix, so that what is left is none's rounding: A^T (1 + A D D^T A^T)^-1 A.
+        By a root A of the matrix, so that rounding makes no variance negative: A^T (1 + A D D^T A^T)^-1 A.
         """
         if not len(shifts):
             return self

@@ -231,10 +231,9 @@ class _Tracker:
     def stretched(self, other: Followed) -> Followed:
         """What does not hold with square pixels, or the field in a picture that was stretched one way."""
         names = [name for name in self.free.names if name in intrinsic_names(other.camera.lens)]
-        free = self.lacking(other.lacks_wholly)
-        free = replace(free, free=replace(self.free, names=("aspect", *names)))
+        anew = replace(self.lacking(other.lacks_wholly), free=replace(self.free, names=("aspect", *names)))
         starts = [replace(other.camera, phi=other.camera.phi / one**0.5, aspect=one) for one in _ASPECTS]
-        tried = [free.close_in(start, _SHOWN_REACHES_PX) for start in starts]
+        tried = [anew.close_in(start, _SHOWN_REACHES_PX) for start in starts]
         there = max(tried, key=lambda one: (one.holds, one.share))
         if not there.holds:
             return other

@@ -46,17 +46,24 @@ def _lens_choice(choice: LensChoice | None) -> Iterator[Piece]:
     if choice is None:
         return
     rows = tuple(
-        (one.label, str(one.coefficients), fixed(one.rms_px, 4), fixed(one.worse, 1, "+"), _percent(one.odds), "")
+        (
+            one.label,
+            str(one.coefficients),
+            fixed(one.rms_px, 4),
+            fixed(one.worse, 1, "+"),
+            _percent(one.probability),
+            "",
+        )
         if one.rms_px is not None and one.worse is not None
         else (one.label, str(one.coefficients), DASH, DASH, DASH, one.failed)
         for one in choice.tried
     )
-    head = ("lens", "coefficients", "held-out px", "worse, standard errors", "predicts best, odds", "")
+    head = ("lens", "coefficients", "held-out px", "worse, standard errors", "predicts best, probability", "")
     yield Table(head, rows, f"The lens that the data ask for: {choice.chosen}", stacked=True)
 
 
-def _percent(odds: float | None) -> str:
-    return DASH if odds is None else f"{100.0 * odds:.0f} %"
+def _percent(share: float | None) -> str:
+    return DASH if share is None else f"{100.0 * share:.0f} %"
 
 
 def _camera(material: Material, name: str) -> Table:

@@ -28,7 +28,7 @@ _PLACES = 12  # along each side of the picture
 # standard deviations off there.
 _PARTS = (1.0, 0.1)
 _FOLLOWED = 1e-4  # of the largest singular value: directions that show less are not moved along
-# Of the odds. Of maps by one photograph fewest are off by other than 1 / 1.6 to 1.6 times what is stated, a quarter;
+# Of the weights. Of maps by one photograph fewest are off by other than 1 / 1.6 to 1.6 times what is stated, a quarter;
 # a little more at the whole of them, most of them wide, and nearly a third without, most of them too narrow.
 _COUNTED = 0.5
 
@@ -38,13 +38,13 @@ class OtherLenses:
     """Other lenses than the chosen one, solved for from the same observations.
 
     Attributes:
-        near: with the chosen lens. others: with others. odds: of each of them.
+        near: with the chosen lens. others: with others. weights: of each, its probability or less.
         reach_px: camera -> how far from its principal point it was observed: farther out nothing is compared.
     """
 
     near: Estimate
     others: tuple[Estimate, ...]
-    odds: tuple[float, ...]
+    weights: tuple[float, ...]
     reach_px: Mapping[str, float]
 
     @cached_property
@@ -79,17 +79,17 @@ def shifts_to_lenses(lenses: OtherLenses, keys: Sequence[Key], there: Estimate) 
     slopes, offsets = zip(*_compared(lenses, keys, there), strict=True)
     slope = np.concatenate([one.reshape(-1, len(keys)) for one in slopes])
     sizes, shifts = natural_sizes(there, keys), []
-    for number, odds in enumerate(lenses.odds):
+    for number, weight in enumerate(lenses.weights):
         offset = np.concatenate([one[number].ravel() for one in offsets])
         known = np.isfinite(slope).all(axis=1) & np.isfinite(offset)
         step = np.linalg.lstsq(slope[known] * sizes, offset[known], rcond=_FOLLOWED)[0]
-        shifts.append((_COUNTED * odds) ** 0.5 * step * sizes)
+        shifts.append((_COUNTED * weight) ** 0.5 * step * sizes)
     return shifts
 
 
 def _compared(lenses: OtherLenses, keys: Sequence[Key], there: Estimate) -> Iterator[tuple[Array, Array]]:
     """Of each camera: (N, 2, K) slopes of what it shows, px, and (L, N, 2) by how much others show it elsewhere."""
-    known = {key.owner for key in keys if key.kind == "station"}
+    known = dict.fromkeys(key.owner for key in keys if key.kind == "station")
     for name, pixels in lenses.pixels.items():
         camera = there.cameras[name]
         stations = [station for station in known if there.stations[station].camera == name]

@@ -24,7 +24,7 @@ _EXPLAINED = 3.0
 _PRICE = 13.0
 
 
-def is_lost(seen: Seen, tried: Sequence[Candidate], chosen: Candidate, points: Mask, curves: Mask) -> bool:
+def explained_by_another(seen: Seen, tried: Sequence[Candidate], chosen: Candidate, points: Mask, curves: Mask) -> bool:
     """Whether another lens explains so much of what the chosen one takes out that it is the likelier one.
 
     Args:
