@@ -25,6 +25,7 @@ from statistics import median
 from typing import Any
 
 import numpy as np
+from benchmark_lenses import lens_rows
 from benchmark_peers import PEERS, WARM_UP_FRAMES, Answer, Corners, peak_mib, reset_peak, solve_warm
 from benchmark_problems import (
     HEIGHT_M,
@@ -339,6 +340,16 @@ FRAMES = {
     "times_wall": ("wall", ".3f"),
     "peak_mib": ("peak MiB", ".0f"),
 }
+LENSES = {
+    "frames": ("frames", "d"),
+    "brown": ("brown s", ".4f"),
+    "spline": ("spline s", ".4f"),
+    "spline_times": ("times brown's", ".2f"),
+    "by_name": ("chosen by name s", ".4f"),
+    "auto": ("auto s", ".4f"),
+    "auto_adds": ("auto adds %", "+.0f"),
+    "chosen": ("chosen", ""),
+}
 PIXELS_TOLD = {"lens": ("lens", ""), "locate": ("locate s", ".3f"), "project": ("project s", ".3f")}
 
 
@@ -461,6 +472,13 @@ def measure_processes(repeat: int) -> dict[str, Any]:
     return {"environment": environment(), "process": rows}
 
 
+def measure_lenses(chosen: argparse.Namespace) -> dict[str, Any]:
+    """A lens by its name beside another one and beside the choice of it, printed."""
+    rows = lens_rows(chosen.frames, chosen.repeat, chosen.warm_up)
+    print_table(f"the wide lens by lens, median of {chosen.repeat} turns, and of ratios within each", LENSES, rows)
+    return {"environment": environment(), "lenses": rows}
+
+
 def compare_all(chosen: argparse.Namespace, imports: Mapping[str, float | None]) -> list[dict[str, Any]]:
     """Every size of the comparison, by the solvers that are there."""
     warm_up_s = chosen.warm_up
@@ -518,6 +536,7 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--scale-frames", type=numbers, default="1e3,1e4,1e5", help="in --scale: %(default)s")
     parser.add_argument("--workers", type=numbers, default="0,1,2", help="of Dask in --scale, 0 is none: %(default)s")
     parser.add_argument("--process", action="store_true", help="whole processes in turns, and no more")
+    parser.add_argument("--lenses", action="store_true", help="spline and auto beside a lens by name, and no more")
     parser.add_argument("--alone", nargs=3, help=argparse.SUPPRESS)
     chosen = parser.parse_args(arguments)
     if chosen.alone:
@@ -529,6 +548,8 @@ def main(arguments: Sequence[str]) -> int:
         chosen.warm_up = 0.0
     if chosen.scale:
         report = measure_scale(chosen)
+    elif chosen.lenses:
+        report = measure_lenses(chosen)
     else:
         report = measure_processes(chosen.repeat) if chosen.process else measure(chosen)
     if chosen.json:
