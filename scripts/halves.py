@@ -157,7 +157,7 @@ def agreement(first: Calibration, second: Calibration, pixels: Array) -> Agreeme
 
 def _meaning(lens: Lens) -> tuple[object, ...]:
     """What its numbers mean."""
-    return lens.kind, lens.names, *(lens.coefficients[name] for name in lens.set_at_start)
+    return lens.kind, lens.names, *(lens.coefficients.get(name) for name in lens.set_at_start)
 
 
 def stated_squares(calibration: Calibration, camera: Camera, rays: Array, turned: Array) -> Array:

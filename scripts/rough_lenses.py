@@ -124,12 +124,12 @@ def rows(name: str, runs: int) -> Iterator[Row]:
     for seed in range(runs):
         seen = observed(lens, seed)
         whole, pixels = calibrate(seen, _OPTIONS), seen_grid(seen)
-        chosen[str(max(whole.options.powers))] += 1
+        chosen["a surface" if whole.options.terms else "none"] += 1
         scales.append(whole.fit.point_scale)
         off.append(off_over_stated(whole, partial(lens.shown, seed=seed), seen))
         one, other = (calibrate(half, _OPTIONS) for half in halves(seen, seed))
         apart.append(agreement(one, other, pixels))
-    note = "powers to " + ", ".join(f"{power} {count}" for power, count in chosen.most_common())
+    note = ", ".join(f"{term} {count}" for term, count in chosen.most_common())
     noise = float(np.hypot(_NOISE_PX, _TOGETHER_PX))
     yield Row(name, "noise found over true", *_mean(np.array(scales) / noise), 0.95, 1.05, note)
     yield Row(name, "error over stated, rms", *_root(off), 0.5, 1.25, note)

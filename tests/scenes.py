@@ -6,10 +6,13 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
+import numpy as np
+
 from ceres_cal.base.transforms import Pose
 from ceres_cal.model.parameters import Options
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Brown, KannalaBrandt, Lens, Radial, Spline
+from ceres_cal.scene.lens.surface_kernel import COLUMNS, ROWS
 from ceres_cal.scene.targets import Segment, Target, checkerboard, custom, rings, ssl_field
 from ceres_cal.simulate import Held, Scene, Station, board_scene, field_scene, join, overhead_pose, rings_scene
 
@@ -30,6 +33,7 @@ _SPLINE = (
     *(-1.2, -4.0, -9.0, -15.0, -21.0, -26.0, -29.0, -30.0, -29.5, -28.0, -27.0),
     *(0.9, -1.3, 0.4, 0.7) * 6,
 )
+_SURFACE = (*_SPLINE[:26], 0.92, 0.69, *(0.7 * np.sin(0.37 * np.arange(2 * COLUMNS * ROWS))).tolist())
 _MORE: dict[str, tuple[float, Lens, float]] = {
     "brown-all": (825.0, Brown(_RATIONAL, ("rational", "prism")), 5.2),
     "brown-rational": (825.0, Brown(_RATIONAL[:8], ("rational",)), 5.2),
@@ -39,9 +43,10 @@ _MORE: dict[str, tuple[float, Lens, float]] = {
         3.2,
     ),
     "spline": (825.0, Spline(_SPLINE, (2, 3, 4)), 5.2),
+    "spline-surface": (825.0, Spline(_SURFACE, (2, 3), ("surface",)), 5.2),
 }
-EVERY_LENS = (*_LENSES, *_MORE)
-"""Also with terms that a lens has only where they are asked for."""
+EVERY_LENS = tuple(name for name in (*_LENSES, *_MORE) if name != "spline-surface")
+"""Also with terms that a lens has only where they are asked for, but for a surface: most of its nodes show nowhere."""
 
 RADIAL = Options(lens="radial")
 """The paper's lens, of tests that do not ask which lens it is."""

@@ -278,7 +278,9 @@ def test_every_residual_knows_its_derivatives(lens: str) -> None:
     steps = np.concatenate([intrinsics_steps(camera), POSE_STEPS])
     error = np.abs(found - np.vstack([derivative(project, steps), derivative(distance, steps)]))
     error /= np.maximum(np.max(np.abs(found), axis=0), 1e-12)  # nothing is seen by some of a spline's numbers
-    moved_once = [intrinsic_names(camera.lens).index(name) for name in camera.lens.set_at_start]
+    moved_once = [
+        intrinsic_names(camera.lens).index(name) for name in camera.lens.set_at_start if name in camera.lens.names
+    ]
     error = np.delete(error, moved_once, axis=1)  # its knots: differences across them are not so smooth
     points = 2 * len(seen[0].places)
     assert np.max(error[:points]) < 5e-8  # 6e-9 measured

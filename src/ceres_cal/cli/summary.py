@@ -151,7 +151,7 @@ def _intrinsics(name: str, camera: Camera, options: Options, phi_from: str, qual
     if options.free_skew or camera.skew != 0.0:
         rows.append(("skew", f"{_coefficient(quality, name, 'skew', camera.skew)}{held('skew')}"))
     rows.append(("principal point", f"{known('cx', cx)}, {known('cy', cy)}{centre}"))
-    for coefficient, value in camera.lens.coefficients.items():
+    for coefficient, value in camera.lens.listed.items():
         rows.append((coefficient, f"{_coefficient(quality, name, coefficient, value)}{held(coefficient)}"))
     lines = [f"{title:16}{value}" for title, value in rows]
     return [*lines, camera.lens.note] if camera.lens.note else lines

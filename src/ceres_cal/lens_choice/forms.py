@@ -55,7 +55,7 @@ def _tangential(lens: Lens | type[Lens]) -> tuple[str, ...]:
 def label_of(options: Options) -> str:
     """How a lens is called: "radial 2,3" or "brown k1 k2 p1 p2"."""
     if powers := options.blank_lens.powers:
-        return f"{options.lens} {','.join(map(str, powers))}"
+        return " ".join([options.lens, ",".join(map(str, powers)), *options.terms])
     return " ".join([options.lens, *(name for name in options.blank_lens.names if name not in options.held)])
 
 

@@ -17,6 +17,7 @@ from ceres_cal.observations import Observations
 from ceres_cal.scene.lens import make_lens
 from ceres_cal.solve import Problem, Progress, RobustSolution, solve_robustly
 from ceres_cal.solve.in_cells import AGREES, agreement
+from ceres_cal.solve.usable import all_shown
 from ceres_cal.start.initialise import Start
 
 
@@ -33,18 +34,16 @@ def grown(
         problem: whose powers are not stated. end: of its rounds.
     """
     options = problem.options
-    rungs = options.blank_lens.trial_powers if options.coefficients is None else ()
     problem, end = _named(problem), replace(end, problem=_named(end.problem))
-    for powers in rungs[1:]:
-        if agreement(end, observations.cameras) <= AGREES:
-            break
-        longer = replace(options, powers=powers)
+    longer = replace(options, terms=tuple(options.blank_lens.more_terms))
+    may_grow = options.blank_lens.roughness and options.coefficients is None and not options.terms
+    if may_grow and agreement(end, observations.cameras) > AGREES:
         with suppress(CalibrationError):
-            try_of = problem_of(observations, problem.sights, longer, end.solution.estimate)
             near = _seen_longer(end.solution.estimate, longer)
+            try_of = problem_of(observations, problem.sights, longer, near)
             found = solve_robustly(try_of, observations, near, progress=progress)
-            if not _folds(found):
-                problem, end = try_of, found
+            if _shows_all(found):
+                problem, end = _named(try_of), replace(found, problem=_named(found.problem))
     return problem, replace(start, estimate=_seen_longer(start.estimate, problem.options)), end
 
 
@@ -57,14 +56,14 @@ def _seen_longer(estimate: Estimate, options: Options) -> Estimate:
     """The estimate with the lens of the options, which holds its own."""
     cameras = dict(estimate.cameras)
     for name, camera in cameras.items():
-        cameras[name] = replace(camera, lens=make_lens(options.lens, options.powers, camera.lens.coefficients))
+        lens = make_lens(options.lens, options.blank_lens.powers, camera.lens.coefficients, options.terms)
+        # Its own span is set, and nothing else is asked for.
+        cameras[name] = replace(camera, lens=lens.spanning(0.0, camera.phi, 1.0, camera.image_size))
     return replace(estimate, cameras=cameras)
 
 
-def _folds(end: RobustSolution) -> bool:
-    """Whether a lens folds inside what was observed."""
-    for name, camera in end.solution.estimate.cameras.items():
-        reach_px = end.problem.sights.of_camera(name).about(camera).reach_px
-        if camera.lens.monotone_radius(camera.phi) <= reach_px:
-            return True
-    return False
+def _shows_all(end: RobustSolution) -> bool:
+    """Whether no lens folds inside what was observed."""
+    sights = end.problem.sights
+    cameras = end.solution.estimate.cameras.items()
+    return all(all_shown(camera, sights.of_camera(name).about(camera)) for name, camera in cameras)

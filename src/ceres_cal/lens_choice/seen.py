@@ -53,7 +53,7 @@ def seen_through(estimate: Estimate, options: Options, profiles: Mapping[str, Le
     cameras = dict(estimate.cameras)
     for name, profile in profiles.items():
         phi, edge = cameras[name].phi, edge_over(cameras[name], profile.reach_px)
-        blank = options.blank_lens.spanning(float(profile.angles[-1]), phi, edge)
+        blank = options.blank_lens.spanning(float(profile.angles[-1]), phi, edge, cameras[name].image_size)
         lens = profile.nearest(blank, phi, options.held)
         cameras[name] = replace(cameras[name], lens=lens)
     return replace(estimate, cameras=cameras)

@@ -72,7 +72,7 @@ def _camera(material: Material, name: str) -> Table:
     cx, cy = camera.principal_point
     values = {"phi": (camera.phi, "px"), "cx": (cx, "px"), "cy": (cy, "px"), "aspect": (camera.aspect, "")}
     values["skew"] = (camera.skew, "")
-    values |= {key: (value, "") for key, value in camera.lens.coefficients.items()}
+    values |= {key: (value, "") for key, value in camera.lens.listed.items()}
     rows = tuple(
         _row(_named(camera, key), value, unit, material.verdicts.get(("camera", name, key)))
         for key, (value, unit) in values.items()

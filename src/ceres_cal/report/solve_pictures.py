@@ -171,7 +171,7 @@ def _comparison(bundle: Calibration, closed: Calibration, curves: dict[str, Arra
     for name, camera in bundle.cameras.items():
         other = closed.cameras[name]
         rows.append((f"phi of {name}, px", f"{other.phi:.2f}", f"{camera.phi:.2f}"))
-        for key, value in camera.lens.coefficients.items():
+        for key, value in camera.lens.listed.items():
             rows.append((f"{key} of {name}", f"{other.lens.coefficients[key]:.4g}", f"{value:.4g}"))
     for name, station in bundle.stations.items():
         rows.append((f"height of {name}, m", f"{closed.stations[name].position[2]:.4f}", f"{station.position[2]:.4f}"))

@@ -35,6 +35,7 @@ def _rows(values: ArrayLike, columns: int, name: str) -> Array:
     return rows
 
 
+_ALONG_AN_EDGE = 16  # steps along each side of the image
 _FAR_M = 10.0  # a height of as many metres, far over its camera, is one in millimetres
 
 
@@ -107,14 +108,21 @@ class Camera:
     @property
     def corner_radius(self) -> float:
         """Distance (px, square pixels) from the principal point to the farthest image corner."""
-        width, height = self.image_size
-        corners = np.array([[-0.5, -0.5], [width - 0.5, -0.5], [-0.5, height - 0.5], [width - 0.5, height - 0.5]])
-        return float(np.max(np.linalg.norm(self.offsets(corners), axis=1)))
+        return float(np.max(np.linalg.norm(self._edge, axis=1)))
+
+    @property
+    def _edge(self) -> Array:
+        """(N, 2) offsets of places along the image's edge, its corners among them."""
+        along = np.linspace(-0.5, 0.5, _ALONG_AN_EDGE + 1)
+        ends = [np.full_like(along, end) for end in (-0.5, 0.5)]
+        sides = [np.column_stack(one) for end in ends for one in ((along, end), (end, along))]
+        size = np.array(self.image_size)
+        return self.offsets(np.vstack(sides) * size + 0.5 * (size - 1.0))
 
     @property
     def folds(self) -> bool:
         """Whether the lens stops being monotone inside the image, so that some pixels have no single answer."""
-        return self.lens.monotone_radius(self.phi) < self.corner_radius
+        return not np.all(self.lens.shows(self._edge, self.phi))
 
     def require_monotone(self, name: str) -> None:
         """Raise InputError naming the camera where its lens folds over inside the image."""

@@ -16,7 +16,8 @@ from ceres_cal.solve.robust import RobustSolution
 
 AGREES = 3.0
 """From how many standard deviations on a lens leaves something: of one that leaves nothing one in a thousand does."""
-_IN_A_CELL, _MOST_CELLS = 8, 8  # observations on average; cells along the image
+# Observations on average; cells along the image: some show what is long, many what a surface's nodes do not follow.
+_IN_A_CELL, _MOST_CELLS, _FINE_CELLS = 8, 8, 24
 _RINGS = 24  # from the middle to the farthest observation
 _MOST_EQUATIONS = 50_000  # of more, those of some sights
 
@@ -31,7 +32,8 @@ def agreement(end: RobustSolution, sizes: Mapping[str, tuple[int, int]]) -> floa
     points, curves = _in_sigmas(end, sights)
     of_points, of_curves = _sight_of(sights.point_bounds), _sight_of(sights.curve_bounds)
     sight = np.concatenate([of_points, of_points, of_curves])
-    return _agreement(cells_of(sights, sizes), sight, np.concatenate([points[:, 0], points[:, 1], curves]))
+    left = np.concatenate([points[:, 0], points[:, 1], curves])
+    return max(_agreement(cells_of(sights, sizes, most), sight, left) for most in (_MOST_CELLS, _FINE_CELLS))
 
 
 def agreement_in_rings(end: RobustSolution) -> float:
@@ -75,11 +77,13 @@ def _agreement(place: Indices, sight: Indices, left: Array) -> float:
     return float(np.sum(total - squares)) / np.sqrt(variance) if variance > 0.0 else 0.0
 
 
-def cells_of(sights: Sights, sizes: Mapping[str, tuple[int, int]]) -> Indices:
-    """(2 N + M,) numbers of the cells of all points' x, of their y and of all curve observations, each curve apart."""
+def cells_of(sights: Sights, sizes: Mapping[str, tuple[int, int]], most: int = _MOST_CELLS) -> Indices:
+    """(2 N + M,) numbers of the cells of all points' x, of their y and of all curve observations, each curve apart;
+    no more than so many along the image.
+    """
     names = sorted(sizes)
     count = (len(sights.point_rows) + len(sights.curve_rows)) / (_IN_A_CELL * len(names))
-    side = min(_MOST_CELLS, max(2, int(np.sqrt(count))))
+    side = min(most, max(2, int(np.sqrt(count))))
     owners = np.array([names.index(key.camera) for key in sights.keys])
     per_px = side / np.array([sizes[name] for name in names], dtype=float)
 

@@ -7,6 +7,8 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from ceres_cal.base.errors import SolutionError
+from ceres_cal.observations.sights import Sights
+from ceres_cal.scene.camera import Camera
 from ceres_cal.solve.explanation import Explanation
 from ceres_cal.solve.noise import Inliers
 from ceres_cal.solve.problem import Problem
@@ -36,6 +38,12 @@ def require_fits(end: RobustSolution, problem: Problem) -> None:
             )
 
 
+def all_shown(camera: Camera, sights: Sights) -> bool:
+    """Whether the lens folds nowhere inside of what was observed: the camera's sights `about` it."""
+    places = (sights.pixels, sights.curve_pixels)
+    return all(bool(np.all(camera.lens.shows(pixels, camera.phi))) for pixels in places)
+
+
 def require_usable(end: RobustSolution, problem: Problem, explanations: Sequence[Explanation]) -> tuple[str, ...]:
     """Warnings about the solution; SolutionError where it must not be used."""
     warnings = []
@@ -51,15 +59,15 @@ def require_usable(end: RobustSolution, problem: Problem, explanations: Sequence
             continue
         fold, corner = camera.lens.monotone_radius(camera.phi), camera.corner_radius
         where = f"camera {name!r}: the solved {camera.lens.kind} lens folds {fold:.0f} px from the principal point"
-        farthest = end.problem.sights.of_camera(name).about(camera).reach_px
-        if not camera.lens.may_fold or fold <= farthest:
+        observed = end.problem.sights.of_camera(name).about(camera)
+        if not camera.lens.may_fold or not all_shown(camera, observed):
             raise SolutionError(
                 f"{where}, inside the image (corner at {corner:.0f} px): "
                 "choose fewer or other coefficients, or observe nearer to the corners"
             )
         warnings.append(
             f"{where}: from there to the corner ({corner:.0f} px) pixels have no answer; "
-            f"observations reach {farthest:.0f} px"
+            f"observations reach {observed.reach_px:.0f} px"
         )
     return (*warnings, *_lost(end.inliers, problem, explanations))
 

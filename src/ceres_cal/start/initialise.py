@@ -100,7 +100,8 @@ def _start_camera(blank: Camera, sights: Sights, options: Options, priors: Seque
     r = _RADII * sights.reach_px
     w = profile.lift(np.column_stack([r, np.zeros_like(r)]))[:, 2]
     seen = LensProfile(r, np.arctan2(r, phi * w))
-    spanning = blank.lens.spanning(float(seen.angles[-1]), phi, edge_over(blank, sights.reach_px))
+    beyond = edge_over(blank, sights.reach_px)
+    spanning = blank.lens.spanning(float(seen.angles[-1]), phi, beyond, blank.image_size)
     lens = seen.nearest(spanning, phi, options.held)
     camera = replace(blank, phi=phi, lens=lens)
     numbers, poses = homographies.sights, _poses_at(homographies, phi)

@@ -28,7 +28,10 @@ from ceres_cal.solve.linear_model import LinearModel, equation_weights, without_
 from ceres_cal.uncertainty.sample import known_root
 
 _MOST_EQUATIONS = 12_000  # that tell how rough a lens is: of more, those of some views
-_ALONG, _OVER = 36, (6, 12)  # bumps from the middle to the farthest observation, or along the longer side of the image
+_ALONG, _OVER = (
+    36,
+    (6, 12, 24),
+)  # bumps from the middle to the farthest observation, or along the longer side of the image
 _LOOSE_PX, _LEAST_PX = 3.0, 1e-3  # of bumps, before the data have spoken, and what they cannot talk below
 _STEPS, _AT_REST = 40, 0.02  # relative change of a size
 

@@ -106,12 +106,14 @@ def unknown_placements(posterior: Posterior) -> dict[str, tuple[str, ...]]:
 
 
 def weak_directions(estimate: Estimate, posterior: Posterior) -> tuple[WeakDirection, ...]:
-    """Directions, weakest first, along which sigma exceeds KNOWN in natural sizes; structure is not looked at.
+    """Directions, weakest first, along which sigma exceeds KNOWN in natural sizes; neither structure nor the nodes of
+    a lens's surface are looked at.
 
     Natural sizes make units irrelevant: a direction is weak when moving along it by what goes unnoticed changes some
     number by more than a hundredth of itself.
     """
-    keys = [key for key in posterior.keys if key.kind != "structure"]
+    nodes = {(name, quantity) for name, camera in estimate.cameras.items() for quantity in camera.lens.nodes}
+    keys = [key for key in posterior.keys if key.kind != "structure" and key[1:3] not in nodes]
     at = posterior.information.columns(keys)
     sizes = natural_sizes(estimate, keys)
     lost = posterior.spread.unknown[at] / sizes[:, None]

@@ -11,7 +11,8 @@ import numpy as np
 from ceres_cal.base.arrays import Array
 from ceres_cal.scene.lens.spline_kernel import DEGREE, END, INTERVALS
 
-_SAMPLES = 400  # radii up to the end, between which nothing turns
+_SAMPLES = 100  # radii up to the end, between which nothing turns
+_REFINED = 8  # steps to where growth ends
 
 
 def _b_splines(u: Array) -> Array:
@@ -106,17 +107,22 @@ class Growth:
     @cached_property
     def limit(self) -> float:
         """Where it stops growing, `END` at most."""
-        return first_fall(self.slope)
+        return float(first_falls(self.slope)[0])
 
 
-def first_fall(growth: Callable[[Array], Array]) -> float:
-    """Where a growth (N,) at radii (N,) is first not above 0, `END` at most."""
+def first_falls(growth: Callable[[Array], Array], directions: int = 1) -> Array:
+    """(T,) where a growth (N, T) at radii (N, T) is first not above 0 in each direction, `END` at most."""
     places = np.linspace(0.0, END, _SAMPLES + 1)
-    falling = np.flatnonzero(growth(places) <= 0.0)
-    if not len(falling):
-        return END
-    low, high = places[max(falling[0] - 1, 0)], places[falling[0]]
-    for _ in range(50):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if growth(np.array([middle]))[0] > 0.0 else (low, middle)
-    return float(low)
+    values = growth(np.repeat(places[:, None], directions, axis=1))
+    falling = values <= 0.0
+    first, all_of = np.argmax(falling, axis=0), np.arange(directions)
+    before = np.maximum(first - 1, 0)
+    low, high, above, below = places[before], places[first], values[before, all_of], values[first, all_of]
+    for _ in range(_REFINED if np.any(falling) else 0):  # by the rule of false position (Illinois), from both sides
+        share = above / np.where(above > below, above - below, 1.0)
+        middle = low + np.clip(share, 0.01, 0.99) * (high - low)
+        value = growth(middle[None])[0]
+        grows = value > 0.0
+        below, above = np.where(grows, 0.5 * below, value), np.where(grows, value, 0.5 * above)
+        low, high = np.where(grows, middle, low), np.where(grows, high, middle)
+    return np.where(np.any(falling, axis=0), low, END)

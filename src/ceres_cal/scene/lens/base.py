@@ -20,7 +20,7 @@ from typing import Any, ClassVar, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ceres_cal.base.arrays import Array
+from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.errors import InputError
 
 LinearEquations = tuple[dict[str, Array], Array]
@@ -78,7 +78,8 @@ class Lens(ABC):
         trial_powers: of the kinds that leave the choice of powers: those worth a trial, the plainest first.
         missing_powers: of the radius that a diagnosis tries, lowest first.
         more_terms: what it may have besides, by name, with the coefficients of each.
-        set_at_start: names of numbers that say where the model is defined: they are chosen, not solved for.
+        set_at_start: names of numbers that say where the model, or a term of it, is defined: they are chosen, not
+            solved for.
         work_rows: how many numbers per observation `distort_chunk` keeps for `differentiate_chunk`.
     """
 
@@ -120,6 +121,16 @@ class Lens(ABC):
     def terms(self) -> tuple[str, ...]:
         """Those of `more_terms` that it has."""
         return ()
+
+    @property
+    def nodes(self) -> frozenset[str]:
+        """Those of its coefficients that say nothing one by one, of a surface."""
+        return frozenset()
+
+    @property
+    def listed(self) -> dict[str, float]:
+        """The other coefficients."""
+        return {name: value for name, value in self.coefficients.items() if name not in self.nodes}
 
     @classmethod
     def blank(cls, powers: Sequence[int]) -> Lens:
@@ -179,6 +190,10 @@ class Lens(ABC):
         Where it is not the same all around, that of the direction in which it is least.
         """
 
+    def shows(self, offsets: Array, phi: float) -> Mask:
+        """(N,) whether the model has an answer at measured offsets (N, 2) px."""
+        return np.asarray(np.hypot(offsets[:, 0], offsets[:, 1]) <= self.monotone_radius(phi))
+
     @property
     def units(self) -> tuple[str, ...]:
         """The unit of each coefficient."""
@@ -205,8 +220,10 @@ class Lens(ABC):
         radius = unit_px if self.acts_on_pixels else unit_px / phi
         return [radius ** (1 - order) for order in self.orders]
 
-    def spanning(self, angle: float, phi: float, beyond: float) -> Lens:
-        """The model made for a picture that is seen up to an angle, and `beyond` times as far in pixels."""
+    def spanning(self, angle: float, phi: float, beyond: float, image_size: tuple[int, int]) -> Lens:
+        """The model made for a picture of this size that is seen up to an angle, and `beyond` times as far in pixels;
+        where it was made for one before, for that.
+        """
         return self
 
     @property

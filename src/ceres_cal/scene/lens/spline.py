@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import cache, cached_property
+from types import MappingProxyType
 from typing import ClassVar
 
 import numpy as np
 
-from ceres_cal.base.arrays import AnyArray, Array
+from ceres_cal.base.arrays import AnyArray, Array, Mask
 from ceres_cal.base.errors import InputError
 from ceres_cal.scene.lens import spline_kernel
-from ceres_cal.scene.lens.b_splines import Growth, bending, first_fall, pieces, profile_columns
-from ceres_cal.scene.lens.base import LinearEquations, Roughness
+from ceres_cal.scene.lens.b_splines import Growth, bending, first_falls, pieces, profile_columns
+from ceres_cal.scene.lens.base import Lens, LinearEquations, Roughness
 from ceres_cal.scene.lens.planar import Planar
 from ceres_cal.scene.lens.spline_kernel import CONRADY, COUNT, DEGREE, INTERVALS, MOST, TINY, WORK_ROWS
+from ceres_cal.scene.lens.surface import EXTENTS, NODES, Surface, roughness
+from ceres_cal.scene.lens.surface_kernel import COLUMNS, ROWS
 
 _TURNS = 48  # directions, between which nothing turns
 _STEPS = 8  # of rims, from one to its double: half of a step is less than they are beyond the image
@@ -23,6 +26,8 @@ _START_WEIGHT = 1e-4  # of the roughness of a start beside its equations
 # Standard deviations before the data have spoken, in rims: loose, so that a first solve is not held by them. Least
 # ones: what usual lenses have, halved by each power, so that data that cannot tell do not take a lens for perfect.
 _LOOSE, _LOOSE_ACROSS, _LEAST, _LEAST_ACROSS = 1000.0, 1e-2, 0.1, 3e-3
+_LOOSE_SURFACE, _LEAST_SURFACE = 1e-3, 1e-5
+_BEYOND = 1.15  # of the picture, how far a surface goes: places move by less than that
 
 
 @dataclass(frozen=True)
@@ -64,22 +69,33 @@ def _names(powers: tuple[int, ...]) -> tuple[str, ...]:
     return ("rim", *(f"g{k}" for k in range(1, COUNT + 1)), *across)
 
 
+def _shorter(places: Array, ends: Array) -> Mask:
+    """(N,) whether places (N, 2) lie nearer than ends (T,), of directions all around, on either side of theirs."""
+    turn = np.arctan2(places[:, 1], places[:, 0]) / (2.0 * np.pi) * len(ends)
+    first = np.floor(np.nan_to_num(turn)).astype(int)
+    end = np.minimum(ends[first % len(ends)], ends[(first + 1) % len(ends)])
+    return np.asarray(np.hypot(places[:, 0], places[:, 1]) <= end)
+
+
 @dataclass(frozen=True)
 class Spline(Planar):
     """A quintic spline along the radius and polynomials across it.
 
     The ideal place q is phi 2 tan(angle / 2) over `rim`, the radius (px) that the knots go up to, set at the start; it
     is measured at rim q + G(|q|) q / |q| + sum c q^m conj(q)^n, all coefficients in px. G has value and slope 0 at the
-    axis, so that phi is the focal length there. The powers are those of the displacements across.
+    axis, so that phi is the focal length there. The powers are those of the displacements across. Where it is asked
+    for, a surface (see there) is added, whose half sides, in rims, are set at the start, too.
     """
 
     values: tuple[float, ...] = ()
     powers: tuple[int, ...] = (2, 3)
+    terms: tuple[str, ...] = ()
     kind: ClassVar[str] = "spline"
     acts_on_pixels: ClassVar[bool] = True
-    trial_powers: ClassVar[tuple[tuple[int, ...], ...]] = ((2, 3), (2, 3, 4, 5), tuple(range(2, MOST + 1)))
+    trial_powers: ClassVar[tuple[tuple[int, ...], ...]] = ((2, 3),)
     missing_powers: ClassVar[tuple[int, ...]] = ()
-    set_at_start: ClassVar[tuple[str, ...]] = ("rim",)
+    more_terms: ClassVar[Mapping[str, tuple[str, ...]]] = MappingProxyType({"surface": (*EXTENTS, *NODES)})
+    set_at_start: ClassVar[tuple[str, ...]] = ("rim", *EXTENTS)
     work_rows: ClassVar[int] = WORK_ROWS
 
     def __post_init__(self) -> None:
@@ -94,7 +110,7 @@ class Spline(Planar):
 
     @property
     def names(self) -> tuple[str, ...]:
-        return _names(self.powers)
+        return (*_names(self.powers), *self.names_of_terms)
 
     @property
     def orders(self) -> tuple[int, ...]:
@@ -102,7 +118,7 @@ class Spline(Planar):
 
     @property
     def units(self) -> tuple[str, ...]:
-        return ("px",) * len(self.names)
+        return tuple("1" if name in EXTENTS else "px" for name in self.names)
 
     @classmethod
     def blank(cls, powers: Sequence[int]) -> Spline:
@@ -114,20 +130,35 @@ class Spline(Planar):
 
     @property
     def note(self) -> str:
-        return "g1, g2, ... are displacements (px) along the radius from the axis to rim, the others across it at rim"
+        said = "g1, g2, ... are displacements (px) along the radius from the axis to rim, the others across it at rim"
+        if self._surface is None:
+            return said
+        size_px = self._rim_px * self._surface.size(1.0 / _BEYOND)
+        return (
+            f"{said}; a surface of {len(NODES) // 2} nodes displaces by {size_px:.2g} px besides (rms over the picture)"
+        )
+
+    @property
+    def nodes(self) -> frozenset[str]:
+        return frozenset(NODES) if self.terms else frozenset()
 
     def scales(self, unit_px: float) -> Array:
-        return np.full(len(self.names), 1.0 / unit_px)
+        return np.array([1.0 if name in EXTENTS else 1.0 / unit_px for name in self.names])
 
     def natural_sizes(self, phi: float, unit_px: float) -> list[float]:
-        return [unit_px] * len(self.names)
+        return [1.0 if name in EXTENTS else unit_px for name in self.names]
 
     # ---- its start and its roughness ---------------------------------------------------------------------------------
 
-    def spanning(self, angle: float, phi: float, beyond: float) -> Spline:
-        # In steps, so that the numbers of two calibrations of one camera mean the same.
-        rim = 2.0 ** (np.rint(_STEPS * np.log2(2.0 * phi * np.tan(0.5 * angle) * beyond)) / _STEPS)
-        return self if self.values[0] > 0.0 else replace(self, values=(float(rim), *self.values[1:]))
+    def spanning(self, angle: float, phi: float, beyond: float, image_size: tuple[int, int]) -> Lens:
+        given = self.coefficients
+        if given["rim"] <= 0.0:
+            # In steps, so that the numbers of two calibrations of one camera mean the same.
+            rim = 2.0 ** (np.rint(_STEPS * np.log2(2.0 * phi * np.tan(0.5 * angle) * beyond)) / _STEPS)
+            given["rim"] = float(rim)
+        for name, side in zip(EXTENTS, image_size, strict=True) if self.terms else ():
+            given[name] = given[name] or float(_BEYOND * side / np.hypot(*image_size))
+        return self.with_values(list(given.values()))
 
     def start_equations(self, measured: Array, ideal: Array, angle: Array, phi: float) -> LinearEquations:
         rim = self._rim_px
@@ -146,6 +177,9 @@ class Spline(Planar):
             own = tuple(dict.fromkeys(n for one in _monomials((power,)) for n in one.names))
             least = _LEAST_ACROSS * rim / 2.0 ** (power - 2)
             across.append(Roughness(own, np.eye(len(own)), _LOOSE_ACROSS * rim, least))
+        if self._surface is not None:
+            matrix = roughness(*self._surface.extents.tolist())
+            across.append(Roughness(NODES, matrix, _LOOSE_SURFACE * rim, _LEAST_SURFACE * rim))
         return (along, *across)
 
     # ---- in arrays ---------------------------------------------------------------------------------------------------
@@ -180,9 +214,18 @@ class Spline(Planar):
         rim = self._rim_px
         return [(one, (c.conjugate() if one.turned else c) * one.weight / rim) for one, c in both if c != 0.0]
 
+    @cached_property
+    def _surface(self) -> Surface | None:
+        if not self.terms:
+            return None
+        named = self.coefficients
+        wide, high, *heights = (named[name] for name in (*EXTENTS, *NODES))
+        extents = np.where(np.array([wide, high]) > 0.0, [wide, high], 1.0)
+        return Surface(extents, np.reshape(heights, (COLUMNS, ROWS, 2)) / self._rim_px)
+
     @property
     def _is_round(self) -> bool:
-        return not self._across
+        return not self._across and (self._surface is None or not np.any(self._surface.heights))
 
     @cached_property
     def _profile(self) -> Growth:
@@ -194,18 +237,34 @@ class Spline(Planar):
         return np.column_stack([np.cos(turns), np.sin(turns)])
 
     @cached_property
-    def _limit(self) -> float:
-        return first_fall(self._least_growth)
+    def _limits(self) -> Array:
+        """(T,) `_limit` of each direction: where nothing was observed the map may end before it does elsewhere."""
+        return first_falls(self._least_growth, len(self._directions))
 
     @cached_property
+    def _rims(self) -> Array:
+        """(T,) where the map ends in each direction."""
+        return np.asarray(np.linalg.norm(self._map(self._limits[:, None] * self._directions), axis=1))
+
+    @property
+    def _limit(self) -> float:
+        return float(np.min(self._limits))
+
+    @property
     def _rim(self) -> float:
-        return float(np.min(np.linalg.norm(self._map(self._limit * self._directions), axis=1)))
+        return float(np.min(self._rims))
 
     def _least_growth(self, u: Array) -> Array:
-        """(N,) least eigenvalue of the symmetric part of the map's derivative on each circle."""
-        xx, xy, yx, yy = self._jacobian((u[:, None, None] * self._directions).reshape(-1, 2))
+        """(N, T) least eigenvalue of the symmetric part of the map's derivative at radii (N, T)."""
+        xx, xy, yx, yy = self._jacobian((u[:, :, None] * self._directions).reshape(-1, 2))
         least = 0.5 * (xx + yy) - np.hypot(0.5 * (xx - yy), 0.5 * (xy + yx))
-        return np.asarray(np.min(least.reshape(len(u), -1), axis=1))
+        return np.asarray(least.reshape(u.shape))
+
+    def _within(self, flat: Array) -> Array:
+        return np.where(_shorter(flat, self._limits)[:, None], flat, np.nan)
+
+    def shows(self, offsets: Array, phi: float) -> Mask:
+        return _shorter(offsets, self._unit(phi) * self._rims)
 
     def _map(self, flat: Array) -> Array:
         u = np.maximum(np.hypot(flat[:, 0], flat[:, 1]), TINY)
@@ -215,7 +274,7 @@ class Spline(Planar):
         for one, c in self._across:
             z = c * q[one.m] * conjugate[one.n]
             answer += np.column_stack([z.real, z.imag])
-        return answer
+        return answer if self._surface is None else answer + self._surface.at(flat)[0]
 
     def _raised(self, q: AnyArray) -> tuple[list[AnyArray], list[AnyArray]]:
         """Powers of complex places (N,) and of their conjugates, from 0 as far as displacements across have them."""
@@ -239,7 +298,11 @@ class Spline(Planar):
                 second += c * one.n * q[one.m] * conjugate[one.n - 1]
         both, other = first + second, first - second
         xx, yy = 1.0 + stretch + bend * x * x + both.real, 1.0 + stretch + bend * y * y + other.real
-        return xx, bend * x * y - other.imag, bend * x * y + both.imag, yy
+        xy, yx = bend * x * y - other.imag, bend * x * y + both.imag
+        if self._surface is None:
+            return xx, xy, yx, yy
+        more = self._surface.at(flat)[1]
+        return xx + more[:, 0, 0], xy + more[:, 0, 1], yx + more[:, 1, 0], yy + more[:, 1, 1]
 
     # ---- for the solve -----------------------------------------------------------------------------------------------
 
@@ -253,7 +316,8 @@ class Spline(Planar):
             if not one.names[0].startswith("p")
         ]
         conrady = 4.0 + names.index("p2") if 2 in self.powers else 0.0
-        head = [0.0, float(len(rows)), float(max(self.powers, default=0)), conrady]
+        surface = 4.0 + names.index(EXTENTS[0]) if self.terms else 0.0
+        head = [0.0, float(len(rows)), float(max(self.powers, default=0)), conrady, surface]
         room = np.zeros(INTERVALS * (DEGREE + 1))
         return np.concatenate([head, np.swapaxes(pieces(), 1, 2).ravel(), room, np.array(rows).ravel()])
 

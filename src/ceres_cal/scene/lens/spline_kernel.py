@@ -1,9 +1,9 @@
 """The spline lens for the solve: plain numbers and loops, which the kernels compile.
 
 The state is the limit, how many monomials there are and the highest power of the place in them, and where among the
-intrinsics Conrady's decentring is (0: nowhere); the table of the B-splines' pieces (see `b_splines`), coefficients by
-power, those of all pieces of an interval side by side; the profile's polynomial on each interval; of each monomial the
-place of its coefficient among the intrinsics, m and n.
+intrinsics Conrady's decentring and the surface are (0: nowhere); the table of the B-splines' pieces (see `b_splines`),
+coefficients by power, those of all pieces of an interval side by side; the profile's polynomial on each interval; of
+each monomial the place of its coefficient among the intrinsics, m and n.
 """
 
 from __future__ import annotations
@@ -12,13 +12,15 @@ from typing import Any
 
 import numpy as np
 
+from ceres_cal.scene.lens.surface_kernel import add_surface, differentiate_surface
+
 INTERVALS, DEGREE = 8, 5
 CONRADY = 3  # terms of the decentring
 COUNT = INTERVALS + DEGREE - 2  # of the B-splines: value and slope at the axis are 0
 MOST = 9  # powers across the radius
 END = 2.0  # rims: nothing is observed farther out
 TINY = 1e-150
-HEAD = 4  # of the state
+HEAD = 5  # of the state
 TABLE = INTERVALS * (DEGREE + 1) ** 2
 MONOMIALS = HEAD + TABLE + INTERVALS * (DEGREE + 1)
 WORK_ROWS = 3 + 2 * (MOST + 1) + 2
@@ -59,6 +61,8 @@ def distort(n: int, intrinsics: Any, unit: float, state: Any, rays: Any, image: 
     for k in range(int(state[1])):
         row = MONOMIALS + 3 * k
         _add_monomial(n, intrinsics, int(state[row]), int(state[row + 1]), int(state[row + 2]), work, image)
+    if state[4] > 0.0:
+        add_surface(n, intrinsics, int(state[4]), work, image)
     for i in range(n):  # by itself: its look-up keeps the rest from SIMD registers
         image[5, i], image[6, i] = _profile(state, work[2, i])
     good = True
@@ -123,6 +127,8 @@ def differentiate(n: int, intrinsics: Any, unit: float, state: Any, image: Any, 
             x, y = unit * (a * c + b * d), unit * (b * c - a * d)
             jacobian[at, 0, i], jacobian[at, 1, i] = x, aspect * y
             jacobian[at + 1, 0, i], jacobian[at + 1, 1, i] = -y, aspect * x
+    if state[4] > 0.0:
+        differentiate_surface(n, intrinsics, unit, int(state[4]), work, jacobian)
 
 
 def _weigh_pieces(n: int, state: Any, work: Any, jacobian: Any) -> None:

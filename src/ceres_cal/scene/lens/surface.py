@@ -1,0 +1,97 @@
+"""A surface over the picture: cubic B-splines on a grid, which follow what no term of a lens does, as smooth as the
+data say (`solve/smoothness.py`).
+
+Polynomials that are long enough to do that bend where nothing was observed; here each place is displaced by the sixteen
+nodes around it, and beyond the observations by no more than a smooth continuation.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+
+from ceres_cal.base.arrays import Array
+from ceres_cal.scene.lens.surface_kernel import COLUMNS, ROWS
+
+EXTENTS = ("wide", "high")
+NODES = tuple(f"{axis}{i:02d}{j:02d}" for i in range(COLUMNS) for j in range(ROWS) for axis in "xy")
+"""Names of the coefficients: axis, column, row."""
+_SPLINES = np.array([[1.0, -3.0, 3.0, -1.0], [4.0, 0.0, -6.0, 3.0], [1.0, 3.0, 3.0, -3.0], [0.0, 0.0, 0.0, 1.0]]) / 6.0
+# Powers of the place that other terms of the lens and the camera displace by are none of the surface's: it has a
+# thousandth of its size in them.
+_DEGREE, _WITHOUT = 3, 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """Attributes: extents: half its width and height. heights: (columns, rows, 2), the displacement of each node."""
+
+    extents: Array
+    heights: Array
+
+    def at(self, flat: Array) -> tuple[Array, Array]:
+        """Displacements (N, 2) at places (N, 2), and their derivatives (N, 2, 2): the same beyond the grid's edge."""
+        (column, x, dx), (row, y, dy) = (_cells(flat[:, k] / self.extents[k], (COLUMNS, ROWS)[k]) for k in (0, 1))
+        steps = np.arange(4)
+        nodes = self.heights[column[:, None, None] + steps[:, None], row[:, None, None] + steps]
+        slopes = [np.einsum("ni,nj,nijk->nk", *one, nodes) for one in ((dx, y), (x, dy))]
+        answer = np.einsum("ni,nj,nijk->nk", x, y, nodes)
+        return np.asarray(answer), np.stack([slopes[k] / self.extents[k] for k in (0, 1)], axis=2)
+
+    def size(self, part: float) -> float:
+        """Root mean square of the displacements over such a part of its sides."""
+        x, y = (part * np.linspace(-1.0, 1.0, 4 * count) for count in (COLUMNS, ROWS))
+        places = np.column_stack([one.ravel() for one in np.meshgrid(x, y)]) * self.extents
+        return float(np.sqrt(np.mean(np.sum(self.at(places)[0] ** 2, axis=1))))
+
+
+def _cells(place: Array, count: int) -> tuple[Array, Array, Array]:
+    """Of places from -1 to 1: the first of the four nodes, their weights (N, 4) and the slopes of these."""
+    place = np.nan_to_num(place)
+    inside, cells = np.clip(place, -1.0, 1.0), 0.5 * (count - 3)
+    first = np.minimum(((inside + 1.0) * cells).astype(int), count - 4)
+    t = ((inside + 1.0) * cells - first)[:, None]
+    slopes = np.hstack([t**0, 2.0 * t, 3.0 * t * t]) @ _SPLINES[:, 1:].T
+    return first, np.hstack([t**0, t, t * t, t**3]) @ _SPLINES.T, slopes * (cells * (inside == place))[:, None]
+
+
+@cache
+def _products(count: int) -> tuple[tuple[Array, ...], Array]:
+    """Along one axis from -1 to 1: integrals (count, count) of products of the B-splines, of their slopes and of their
+    second derivatives; (degree + 1, count) mean products with Legendre's polynomials of root mean square 1.
+    """
+    cells = 0.5 * (count - 3)
+    t, weight = np.polynomial.legendre.leggauss(5)
+    t, weight = 0.5 + 0.5 * t, 0.5 * weight / cells
+    powers = np.vander(t, 4, increasing=True)
+    orders = [powers, np.column_stack([0.0 * t, t**0, 2.0 * t, 3.0 * t * t]) * cells]
+    orders.append(np.column_stack([0.0 * t, 0.0 * t, 2.0 * t**0, 6.0 * t]) * cells**2)
+    grams = [np.zeros((count, count)) for _ in orders]
+    moments = np.zeros((_DEGREE + 1, count))
+    sizes = np.sqrt(2.0 * np.arange(_DEGREE + 1) + 1.0)[:, None]
+    for first in range(count - 3):
+        nodes = slice(first, first + 4)
+        for gram, order in zip(grams, orders, strict=True):
+            values = order @ _SPLINES.T
+            gram[nodes, nodes] += (values.T * weight) @ values
+        legendre = sizes * np.polynomial.legendre.legvander((first + t) / cells - 1.0, _DEGREE).T
+        moments[:, nodes] += 0.5 * (legendre * weight) @ (powers @ _SPLINES.T)
+    return tuple(grams), moments
+
+
+@cache
+def roughness(wide: float, high: float) -> Array:
+    """(K, K) over the names of `NODES`: bending of the x and y displacements, each by itself, over a picture of these
+    half sides; variances of its inverse have a median of 1.
+    """
+    (across, slope_x, bend_x), moments_x = _products(COLUMNS)
+    (down, slope_y, bend_y), moments_y = _products(ROWS)
+    bending = np.kron(bend_x, down) / wide**4 + np.kron(across, bend_y) / high**4
+    bending += 2.0 * np.kron(slope_x, slope_y) / (wide * high) ** 2
+    low = [np.kron(moments_x[i], moments_y[j]) for i in range(_DEGREE + 1) for j in range(_DEGREE + 1 - i)]
+    without = np.transpose(low) @ np.array(low)
+    free = np.linalg.inv(bending + 1.0 / _WITHOUT**2 * np.trace(bending) * without)
+    own = float(np.median(np.diag(free))) * bending + without / _WITHOUT**2
+    return np.asarray(np.kron(own, np.eye(2)))

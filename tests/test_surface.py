@@ -1,0 +1,86 @@
+"""The surface of a lens without a formula: its map, its derivatives, and how rough it is."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scenes
+
+from ceres_cal.base.arrays import Array
+from ceres_cal.model.parameters import unit_px
+from ceres_cal.scene.lens import Spline, make_lens
+from ceres_cal.scene.lens.surface import NODES, Surface, roughness
+from ceres_cal.scene.lens.surface_kernel import COLUMNS, ROWS
+
+CAMERA = scenes.camera("spline-surface")
+EXTENTS = np.array([0.92, 0.69])
+
+
+def rays() -> Array:
+    """(7, 3): within the grid, and two beyond its edge."""
+    rng = np.random.default_rng(3)
+    across = np.vstack([rng.uniform(-0.5, 0.5, (5, 2)), (0.2, 0.75), (-1.05, 0.1)])
+    return np.column_stack([across, np.ones(len(across))])
+
+
+def by_kernel(lens: Spline) -> tuple[Array, Array]:
+    """Offsets (N, 2) px, and their derivatives (numbers of the lens, 2, N) in the units of the files."""
+    unit, seen = unit_px(CAMERA), np.ascontiguousarray(rays().T)
+    scales = lens.scales(unit)
+    intrinsics = np.array([CAMERA.phi, 1.0, 0.0, 0.0, *(np.array(lens.values) * scales)])
+    state, count = lens.state, seen.shape[1]
+    image, work = np.zeros((8, count)), np.zeros((lens.work_rows, count))
+    jacobian = np.zeros((len(intrinsics) + 6, 2, count))
+    lens.prepare(intrinsics, unit, state)
+    assert lens.distort_chunk(count, intrinsics, unit, state, seen, image, work)
+    lens.differentiate_chunk(count, intrinsics, unit, state, image, work, jacobian)
+    return image[:2].T, jacobian[4 : len(intrinsics)] * scales[:, None, None]
+
+
+def test_kernel_and_arrays_are_one_map() -> None:
+    lens = CAMERA.lens
+    assert isinstance(lens, Spline)
+    found, slopes = by_kernel(lens)
+    assert np.abs(found - lens.distort(rays(), CAMERA.phi)).max() < 1e-10  # 2e-13 px measured
+    for name in ("wide", "high", "g3", "p1", NODES[0], NODES[2 * (7 * ROWS + 5)], NODES[2 * (9 * ROWS + 8) + 1]):
+        k, step = lens.names.index(name), 1e-4
+        ends = [np.array(lens.values) + sign * step * np.eye(len(lens.names))[k] for sign in (1.0, -1.0)]
+        there, back = (lens.with_values(end).distort(rays(), CAMERA.phi) for end in ends)
+        differences = (there - back).T / (2.0 * step)
+        assert np.abs(slopes[k] - differences).max() < 1e-6 * (1.0 + np.abs(differences).max())
+
+
+def test_there_and_back() -> None:
+    pixels = np.array([(x, y) for x in np.linspace(-600.0, 600.0, 13) for y in np.linspace(-450.0, 450.0, 10)])
+    found = CAMERA.lens.distort(CAMERA.lens.undistort(pixels, CAMERA.phi), CAMERA.phi)
+    assert np.abs(found - pixels).max() < 1e-9
+
+
+def test_the_same_beyond_its_edge() -> None:
+    surface = Surface(EXTENTS, np.random.default_rng(0).normal(size=(COLUMNS, ROWS, 2)))
+    places = np.array([(0.92, 0.3), (1.5, 0.3), (0.1, -0.69), (0.1, -2.0)])
+    values, slopes = surface.at(places)
+    assert np.allclose(values[0], values[1]) and np.allclose(values[2], values[3])
+    assert not slopes[1, :, 0].any() and not slopes[3, :, 1].any() and slopes[1, :, 1].any()
+
+
+def test_low_powers_are_left_to_the_rest_of_the_lens() -> None:
+    """How large a surface of each shape is for one standard deviation of its prior."""
+    x, y = (np.linspace(-1.0, 1.0, count) * (count - 1) / (count - 3) for count in (COLUMNS, ROWS))
+
+    def size(shape: Array) -> float:
+        heights = np.stack([shape, 0.0 * shape], axis=2).ravel()
+        return float(1.0 / np.sqrt(heights @ roughness(*EXTENTS.tolist()) @ heights))
+
+    long, short = (size(np.outer(np.cos(k * np.pi * x), np.cos(k * np.pi * y))) for k in (1, 3))
+    assert long > 3.0 * short  # 0.37 and 0.11 measured
+    assert max(size(np.outer(x**2, y)), size(np.outer(x, y)), size(np.outer(x**3, y**0))) < 0.04 * short  # 0.035
+
+
+def test_it_is_asked_for_by_its_name() -> None:
+    plain, longer = make_lens("spline"), make_lens("spline", terms=("surface",))
+    assert set(longer.names) - set(plain.names) == {"wide", "high", *NODES} and not plain.nodes
+    assert set(longer.listed) == {*plain.names, "wide", "high"}
+    assert make_lens("spline", coefficients={"x0304": 1.0}).names == longer.names
+    spanned = longer.spanning(0.6, 800.0, 1.1, (1280, 960)).coefficients
+    assert spanned["wide"] == pytest.approx(0.92) and spanned["high"] == pytest.approx(0.69)
