@@ -19,7 +19,7 @@ from functools import partial
 import cv2
 import numpy as np
 from cases import Row, run
-from real_data import real_folder
+from real_data import ov_plane, real_folder
 
 from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.errors import CalibrationError
@@ -30,7 +30,7 @@ from ceres_cal.detect.boards import detect_boards
 from ceres_cal.model.keys import Key
 from ceres_cal.model.parameters import Options
 from ceres_cal.model.quantities import camera_moved, natural_sizes, values_of
-from ceres_cal.observations import Curves, Observations, Points, View
+from ceres_cal.observations import Observations, Points
 from ceres_cal.observations.columns import taken
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Lens
@@ -39,7 +39,6 @@ from ceres_cal.uncertainty import Posterior
 
 LEAST, MOST = 0.85, 1.25
 _CONTROL = 0.9, 1.1
-NO_CURVES = Curves(np.empty(0, np.int32), np.empty(0, np.int32), np.empty((0, 2)), np.empty(0), np.empty(0, np.int8))
 _GRID = 12  # places along the longer side of the image
 _STEP = 1e-5  # of each number's natural size
 
@@ -59,19 +58,6 @@ def _photographed(pattern: str, columns: int, rows: int, square_m: float) -> Obs
     return detect_boards(sorted(real_folder().glob(pattern)), checkerboard(columns, rows, square_m)).observations
 
 
-def _ov_plane() -> Observations:
-    """The corners of the training views, which come as numbers."""
-    with np.load(real_folder() / "babelcalib_ov_plane" / "train.npz") as data:
-        board, view, point, pixels, size = (data[n] for n in ("board_m", "view", "point", "pixels", "image_size"))
-    pitch_m = float(board[0, 0])
-    column, row = np.rint(board[:, :2] / pitch_m).astype(np.int32).T - 1
-    count = len(pixels)
-    views = tuple(View(f"{n:02d}", "camera", "camera", "board", f"{n:02d}") for n in range(int(view.max()) + 1))
-    points = Points(view.astype(np.int32), (22 * row + column)[point], pixels, np.ones(count))
-    board_target, sizes = {"board": checkerboard(22, 22, pitch_m)}, {"camera": (int(size[0]), int(size[1]))}
-    return Observations(board_target, sizes, views, points, NO_CURVES)
-
-
 _ORDINARY = Options(lens="radial")
 _WIDE = Options(lens="kannala-brandt", free_aspect=True)
 SETS: dict[str, RealSet] = {
@@ -79,7 +65,7 @@ SETS: dict[str, RealSet] = {
     "opencv right": RealSet(partial(_photographed, "opencv_left_right/right*.jpg", 9, 6, 0.025), _ORDINARY),
     "sony": RealSet(partial(_photographed, "boofcv_sony_chess/*.jpg", 4, 6, 0.03), _ORDINARY),
     "gopro": RealSet(partial(_photographed, "udacity_gopro_wide/GOPR*.jpg", 8, 6, 1.0), _WIDE),
-    "ov plane": RealSet(_ov_plane, _WIDE),
+    "ov plane": RealSet(partial(ov_plane, "train"), _WIDE),
 }
 _DEFAULTS = ", by defaults"
 SETS |= {f"{name}{_DEFAULTS}": replace(one, options=Options()) for name, one in SETS.items()}

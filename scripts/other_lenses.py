@@ -16,14 +16,14 @@ from functools import partial
 
 import numpy as np
 from cases import Row, run
-from halves import NO_CURVES, pairs, seen_grid, stated_squares, turn_basis
+from halves import pairs, seen_grid, stated_squares, turn_basis
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import CalibrationError
 from ceres_cal.base.transforms import Pose, rotation_exp
 from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
-from ceres_cal.observations import Observations, Points, View
+from ceres_cal.observations import NO_CURVES, Observations, Points, View
 from ceres_cal.scene.targets import checkerboard
 
 Project = Callable[[Array], Array]

@@ -19,7 +19,7 @@ from functools import partial
 
 import numpy as np
 from cases import Row, run
-from halves import NO_CURVES, agreement, halves, seen_grid
+from halves import agreement, halves, seen_grid
 from other_lenses import off_over_stated
 
 from ceres_cal.base.arrays import Array
@@ -27,7 +27,7 @@ from ceres_cal.base.transforms import rotation_exp
 from ceres_cal.calibrating import calibrate
 from ceres_cal.model.parameters import Options
 from ceres_cal.model.structure import Tolerance
-from ceres_cal.observations import Observations, Points, View
+from ceres_cal.observations import NO_CURVES, Observations, Points, View
 from ceres_cal.scene.targets import checkerboard
 
 _SIZE, _CENTRE, _PHI, _REACH_DEG = (6016, 4016), np.array([3021.3, 1997.8]), 1900.0, 86.0

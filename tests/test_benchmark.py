@@ -48,3 +48,13 @@ def test_scale_leaves_nothing_behind(tmp_path: Path) -> None:
     assert abs(row["focal_error_px"]) < 1.0  # -0.30 measured
     assert all(one["peak_mib"] > 10.0 for one in (row, *report["frames"])) and row["worker_mib"] > 10.0
     assert "power" in printed and row["iteration_bytes"] < 10_000
+
+
+def test_lenses_are_timed_side_by_side(tmp_path: Path) -> None:
+    path = tmp_path / "report.json"
+    command = [sys.executable, str(SCRIPT), "--lenses", "--frames", "20", "--repeat", "1", "--warm-up", "0"]
+    printed = subprocess.run([*command, "--json", str(path)], capture_output=True, text=True, check=True).stdout
+    (row,) = json.loads(path.read_text(encoding="utf-8"))["lenses"]
+    assert row["chosen"] == "brown k1 k2" and row["chosen"] in printed
+    assert row["spline_times"] == pytest.approx(row["spline"] / row["brown"])
+    assert row["auto_adds"] == pytest.approx(100.0 * (row["auto"] / row["by_name"] - 1.0))

@@ -39,7 +39,9 @@ def upper_tail(value: float, degrees: int, freedom: float = math.inf) -> float:
         few = degrees <= _FEW and value < _FAR
         return _few(0.5 * value, degrees) if few else float(np.exp(log_chi2_tail(value, degrees)))
     values, weights = _over_noise(value, freedom)
-    return float(np.average(np.exp(log_chi2_tail(values, degrees)), weights=weights))
+    few = degrees <= _FEW and values[-1] < _FAR
+    tails = [_few(0.5 * one, degrees) for one in values.tolist()] if few else np.exp(log_chi2_tail(values, degrees))
+    return float(weights @ tails / weights.sum())
 
 
 def _few(x: float, degrees: int) -> float:

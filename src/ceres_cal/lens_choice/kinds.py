@@ -13,6 +13,7 @@ from ceres_cal.base.errors import CalibrationError
 from ceres_cal.base.tails import upper_tail
 from ceres_cal.lens_choice.forms import PAPER, Form
 from ceres_cal.lens_choice.rule import AS_GOOD, CLEARLY, standard_errors, surprise
+from ceres_cal.model.keys import Key
 from ceres_cal.model.parameters import Estimate
 from ceres_cal.model.quantities import moved, values_of
 from ceres_cal.solve.left_out import GroupNormals
@@ -56,11 +57,19 @@ class Kind:
         if self.normals is None:
             return Candidate(form, self, failed=self.failed)
         lens = set(self.forms[0].names) - set(form.names)
-        held = [key for key in self.normals.keys if key.kind == "camera" and key.quantity in lens]
-        squares, step = self.normals.held_out(dict(zip(held, -values_of(self.estimate, held), strict=True)))
+        squares, step = self.normals.held_out({key: step for key, step in self._to_nothing.items() if key[2] in lens})
         rms_px = self.sigma_px * float(np.sqrt(squares.sum() / self.normals.counts.sum()))
         least = self.normals.squares_at(step)
         return Candidate(form, self, surprise(squares, self.normals.counts), rms_px, step, least)
+
+    @cached_property
+    def _to_nothing(self) -> dict[Key, float]:
+        """How far from where they stand the coefficients of its longest lens are 0."""
+        names = set(self.forms[0].names)
+        keys = (
+            [key for key in self.normals.keys if key.kind == "camera" and key.quantity in names] if self.normals else []
+        )
+        return dict(zip(keys, (-values_of(self.estimate, keys)).tolist(), strict=True))
 
     @cached_property
     def scatter(self) -> float:

@@ -86,6 +86,8 @@ def surprise(squares: Array, counts: Array) -> Array:
 
 def standard_errors(squares: Array, others: Array) -> float:
     """By how many standard errors of the difference squared errors by group exceed others; 0 of the same."""
-    more = squares - others
-    error = float(np.sqrt(len(more)) * np.std(more, ddof=1)) if len(more) > 1 else np.inf
-    return float(more.sum()) / error if error > 0.0 else 0.0
+    more, count = squares - others, len(squares)
+    total = float(more.sum())
+    apart = more - total / count
+    error = (float(apart @ apart) * count / (count - 1)) ** 0.5 if count > 1 else np.inf
+    return total / error if error > 0.0 else 0.0

@@ -20,6 +20,7 @@ AGREES = 3.0
 _IN_A_CELL, _MOST_CELLS, _FINE_CELLS = 8, 8, 24
 _RINGS = 24  # from the middle to the farthest observation
 _MOST_EQUATIONS = 50_000  # of more, those of some sights
+_MOST_GROUPS = 200  # of sights: products within one do not count, a half of a percent
 
 
 def agreement(end: RobustSolution, sizes: Mapping[str, tuple[int, int]]) -> float:
@@ -56,7 +57,9 @@ def _some(end: RobustSolution) -> Sights:
 
 
 def _sight_of(bounds: Indices) -> Indices:
-    return np.repeat(np.arange(len(bounds) - 1), np.diff(bounds))
+    """Of each observation its sight's number; of very many sights, that of some beside each other."""
+    sights = len(bounds) - 1
+    return np.repeat(np.arange(sights) * min(sights, _MOST_GROUPS) // max(sights, 1), np.diff(bounds))
 
 
 def _in_sigmas(end: RobustSolution, sights: Sights) -> tuple[Array, Array]:

@@ -38,8 +38,8 @@ _STILL = 0.05  # variances by which a lens that is as smooth as the data say sta
 _ROUGH, _ROUGH_WITHOUT_FORMULA = 1e-3, 1e-4
 _TO_THE_END = 1e-14  # the same of every further one
 # Of a lens that is as smooth as the data say, sigmas of a tenth, less is near enough: so many variances may be left,
-# and no number is off by 0.07 of its standard deviations.
-_LEFT_OF_SMOOTH = 5e-3
+# and no number is off by 0.1 of its standard deviations. Measured are a hundredth of that and 0.01.
+_LEFT_OF_SMOOTH = 1e-2
 _MOST_REFINED = 3
 # Share of the residuals' scale: a rough solve that leaves less is followed by another one at the new scale. A line that
 # is painted aside is told from noise only at a scale near the noise's own.
@@ -195,7 +195,7 @@ class _Rounds:
         few = problem.of_sights(_evenly(problem))
         if problem.options.blank_lens.roughness and len(few.sights) < len(problem.sights):
             of_few = _Rounds(few, self._observations, self._usual, self._progress)
-            end = of_few.to_rest(of_few.first(estimate))
+            end = of_few.to_rest(of_few.first(estimate), most_rounds=2)
             self._problem = replace(self._problem, smoothness=end.problem.smoothness)
             solution = end.solution
         else:
