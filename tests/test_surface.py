@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import scenes
@@ -54,6 +56,21 @@ def test_there_and_back() -> None:
     pixels = np.array([(x, y) for x in np.linspace(-600.0, 600.0, 13) for y in np.linspace(-450.0, 450.0, 10)])
     found = CAMERA.lens.distort(CAMERA.lens.undistort(pixels, CAMERA.phi), CAMERA.phi)
     assert np.abs(found - pixels).max() < 1e-9
+
+
+def test_it_may_end_in_one_direction_alone() -> None:
+    """Where nobody observed: the rest of the picture has its answers."""
+    heights = np.zeros((COLUMNS, ROWS, 2))
+    heights[0, :, 0] = 400.0  # the left edge is folded back
+    named = {**CAMERA.lens.coefficients, **dict(zip(NODES, heights.ravel().tolist(), strict=True))}
+    folded = replace(CAMERA, lens=CAMERA.lens.with_values(list(named.values())))
+    left, right = np.array([[-630.0, 0.0]]), np.array([[600.0, -440.0], [600.0, 440.0], [-300.0, 100.0]])
+    assert folded.folds and not CAMERA.folds
+    assert folded.lens.shows(right, CAMERA.phi).all() and not folded.lens.shows(left, CAMERA.phi).any()
+    assert folded.lens.monotone_radius(CAMERA.phi) < 630.0
+    rays_there = folded.lens.undistort(right, CAMERA.phi)
+    assert np.abs(folded.lens.distort(rays_there, CAMERA.phi) - right).max() < 1e-9
+    assert np.isnan(folded.lens.undistort(left, CAMERA.phi)).all()
 
 
 def test_the_same_beyond_its_edge() -> None:
