@@ -34,7 +34,10 @@ if TYPE_CHECKING:
 
 _AUTO = "auto"
 _PATIENCE_S = 5.0  # with a scheduler
-_TERMS = "rational (OpenCV's k4 to k6) and prism (its s1 to s4) of brown, tangential (p1, p2) of kannala-brandt"
+_TERMS = (
+    "rational (OpenCV's k4 to k6) and prism (its s1 to s4) of brown, tangential (p1, p2) of kannala-brandt, "
+    "surface (nodes over the picture) of spline"
+)
 
 
 def _lens_kind(name: str) -> str:

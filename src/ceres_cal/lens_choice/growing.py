@@ -1,7 +1,7 @@
-"""A lens without a formula becomes longer while residuals of different views agree from place to place.
+"""A lens without a formula has all of its terms where residuals of different views agree from place to place.
 
-How large its numbers are the data say in any case (`solve/smoothness.py`): more of them cost time, and are asked for
-where the lens leaves something behind.
+How large their numbers are the data say in any case (`solve/smoothness.py`): they cost time, and are asked for where
+the lens leaves something behind.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def grown(
     options = problem.options
     problem, end = _named(problem), replace(end, problem=_named(end.problem))
     longer = replace(options, terms=tuple(options.blank_lens.more_terms))
-    may_grow = options.blank_lens.roughness and options.coefficients is None and not options.terms
+    may_grow = bool(options.blank_lens.roughness) and options.coefficients is None and not options.terms
     if may_grow and agreement(end, observations.cameras) > AGREES:
         with suppress(CalibrationError):
             near = _seen_longer(end.solution.estimate, longer)

@@ -2,13 +2,14 @@
 data say (`solve/smoothness.py`).
 
 Polynomials that are long enough to do that bend where nothing was observed; here each place is displaced by the sixteen
-nodes around it, and beyond the observations by no more than a smooth continuation.
+nodes around it, and beyond the observations by no more than a smooth continuation (thin plates; Wahba, Spline Models
+for Observational Data, SIAM 1990).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 
 import numpy as np
 
@@ -26,7 +27,11 @@ _DEGREE, _WITHOUT = 3, 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """Attributes: extents: half its width and height. heights: (columns, rows, 2), the displacement of each node."""
+    """Displacements of the places of a plane.
+
+    Attributes:
+        extents: (2,) half its width and height. heights: (columns, rows, 2), the displacement of each node.
+    """
 
     extents: Array
     heights: Array
@@ -34,11 +39,17 @@ class Surface:
     def at(self, flat: Array) -> tuple[Array, Array]:
         """Displacements (N, 2) at places (N, 2), and their derivatives (N, 2, 2): the same beyond the grid's edge."""
         (column, x, dx), (row, y, dy) = (_cells(flat[:, k] / self.extents[k], (COLUMNS, ROWS)[k]) for k in (0, 1))
-        steps = np.arange(4)
-        nodes = self.heights[column[:, None, None] + steps[:, None], row[:, None, None] + steps]
-        slopes = [np.einsum("ni,nj,nijk->nk", *one, nodes) for one in ((dx, y), (x, dy))]
-        answer = np.einsum("ni,nj,nijk->nk", x, y, nodes)
-        return np.asarray(answer), np.stack([slopes[k] / self.extents[k] for k in (0, 1)], axis=2)
+        answer, slopes = np.zeros((len(flat), 2)), np.zeros((len(flat), 2, 2))
+        for i in range(4):  # of arrays of all sixteen nodes most of the time would be spent on memory
+            down, slope_down = np.zeros((2, len(flat), 2))
+            for j in range(4):
+                node = self.heights[column + i, row + j]
+                down += y[:, j, None] * node
+                slope_down += dy[:, j, None] * node
+            answer += x[:, i, None] * down
+            slopes[:, :, 0] += dx[:, i, None] * down
+            slopes[:, :, 1] += x[:, i, None] * slope_down
+        return answer, slopes / self.extents
 
     def size(self, part: float) -> float:
         """Root mean square of the displacements over such a part of its sides."""
@@ -81,7 +92,7 @@ def _products(count: int) -> tuple[tuple[Array, ...], Array]:
     return tuple(grams), moments
 
 
-@cache
+@lru_cache(maxsize=8)
 def roughness(wide: float, high: float) -> Array:
     """(K, K) over the names of `NODES`: bending of the x and y displacements, each by itself, over a picture of these
     half sides; variances of its inverse have a median of 1.
