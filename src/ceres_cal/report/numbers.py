@@ -35,7 +35,9 @@ def numbers(material: Material) -> Chapter:
         )
     ]
     pieces += _lens_choice(material.calibration.lens_choice)
-    pieces += [_camera(material, name) for name in material.observations.cameras]
+    for name in material.observations.cameras:
+        note = material.calibration.cameras[name].lens.note
+        pieces += [_camera(material, name), *([Text(f"{note}.")] if note else [])]
     pieces += [_station(material, name) for name in material.observations.stations]
     pieces += [*_as_built(material), *_weak(material), *_seams(material), _fit(material)]
     return Chapter("numbers", "The numbers", tuple(pieces))
