@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Protocol
@@ -11,7 +11,6 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask
 from ceres_cal.model.information import Information
-from ceres_cal.model.keys import Key
 from ceres_cal.model.parameters import Estimate, Layout, Options
 from ceres_cal.model.priors import GaussianPrior
 from ceres_cal.model.quantities import free_keys, intrinsic_keys
@@ -107,9 +106,21 @@ class Problem:
             sigmas = self.smoothness.get(name, tuple(form.loose for form in forms))
             for form, sigma in zip(forms, sigmas, strict=True):
                 own = tuple(keys[quantity] for quantity in form.names)
-                if free & set(own) and not any(_determines(prior, own) for prior in self.priors):
+                if free & set(own) and name not in self.known_lenses:
                     whole = GaussianPrior(Information(own, form.matrix / sigma**2), np.zeros(len(own)))
                     yield whole.given(free)
+
+    @cached_property
+    def known_lenses(self) -> frozenset[str]:
+        """Cameras whose lens a posterior states in every direction: how smooth it is, is in there."""
+        rough = {name for form in self.options.blank_lens.roughness for name in form.names}
+        known = set()
+        for prior in self.priors if rough else ():
+            for name in {key.owner for key in prior.keys if key.kind == "camera"}:
+                own = tuple(key for key in prior.keys if key[:2] == ("camera", name) and key.quantity in rough)
+                if len(own) == len(rough) and prior.information.given(own).known_rank == len(own):
+                    known.add(name)
+        return frozenset(known)
 
     @property
     def equations(self) -> int:
@@ -142,8 +153,3 @@ class Problem:
     def holding(self, camera: str, number: int) -> Problem:
         """The problem with one of a camera's intrinsics held, by its place in the solver's vector."""
         return replace(self, layout=self.layout.holding(camera, number))
-
-
-def _determines(prior: GaussianPrior, keys: Collection[Key]) -> bool:
-    """Whether it says something of every direction of some numbers, as a posterior does."""
-    return set(keys) <= set(prior.keys) and prior.information.given(tuple(keys)).known_rank == len(keys)

@@ -42,7 +42,11 @@ def with_smoothness(
     for name, camera in estimate.cameras.items():
         forms = camera.lens.roughness
         free = {key.quantity: key for key in reduced.shared.keys if key[:2] == ("camera", name)}
-        if not forms or not all(quantity in free for form in forms for quantity in form.names):
+        if (
+            name in problem.known_lenses
+            or not forms
+            or not all(quantity in free for form in forms for quantity in form.names)
+        ):
             continue
         before = problem.smoothness.get(name, tuple(form.loose for form in forms))
         found[name], step = _sigmas(forms, before, free, estimate, reduced)

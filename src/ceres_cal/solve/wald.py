@@ -30,6 +30,7 @@ from ceres_cal.solve.stated import Statement, Test
 LARGEST_FREEDOM = 1e6
 """Degrees of freedom that count as infinitely many."""
 _LEAST_TOLD = 1e-7  # of what is known of a number, the share that others must bring to speak of it
+_STATED = 1e-14  # eigenvalue, at unit diagonal, from which on a direction counts as stated
 # Of a standard deviation, and at most of a number's natural size, to either side, for the slope of the cost along what
 # is held.
 _STEP, _MOST_STEP = 0.1, 1e-3
@@ -130,10 +131,7 @@ def worst_test(statement: Statement, rest: Rest) -> Test:
 def _tested(off: Array, stated: Information | None, rest: Rest) -> Test:
     """The test of numbers that are off by so much; `stated` None: they were held."""
     matrix = rest.information.matrix
-    if stated is not None:  # (M^-1 + P^-1)^-1, where M or P may be singular
-        both = Information(stated.keys, stated.matrix + matrix)
-        matrix = stated.matrix - stated.matrix @ both.inverse @ stated.matrix
-    squared = max(float(off @ matrix @ off), 0.0)
+    squared = max(float(off @ matrix @ off), 0.0) if stated is None else _squared(off, stated.matrix, matrix)
     own = np.zeros(len(off)) if stated is None else stated.spread.sd
     others, keys = rest.information.spread.sd, rest.information.keys
     with np.errstate(invalid="ignore"):
@@ -148,6 +146,20 @@ def _tested(off: Array, stated: Information | None, rest: Rest) -> Test:
         (value, float(others[worst])),
         float(apart[worst]),
     )
+
+
+def _squared(off: Array, stated: Array, rest: Array) -> float:
+    """off^T (M^-1 + P^-1)^-1 off: where everything else, M, says nothing beside what is stated, P, it is 0 however far
+    off that seems.
+    """
+    size = np.sqrt(np.where(np.diagonal(stated) > 0.0, np.diagonal(stated), 1.0))
+    values, vectors = np.linalg.eigh(stated / size[:, None] / size)
+    kept = values > _STATED
+    vectors, root = vectors[:, kept], np.sqrt(values[kept])
+    back = vectors / root / size[:, None]
+    told, turn = np.linalg.eigh(back.T @ rest @ back)  # in directions in which each is stated to one
+    along = (off * size) @ (vectors * root) @ turn
+    return float(np.sum(np.where(told > _LEAST_TOLD, told / (1.0 + told), 0.0) * along**2))
 
 
 def log_probability(squared: float, rest: Rest) -> float:
