@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 import scenes
+from real_data import ov_plane
 from test_cli import Say, refused, say
 
 from ceres_cal.base.errors import InputError
@@ -153,17 +154,10 @@ def test_score_and_compare_as_typed(say: Say, calibration: Calibration, tmp_path
     assert "ceres-cal score" in refused(say("refit", known, new, "--what", "pose-only"))
 
 
-def test_ov_plane(real_data: Path) -> None:
+@pytest.mark.usefixtures("real_data")
+def test_ov_plane() -> None:
     """Its own split: scipy leaves 0.482 px in training, and 0.475 px of the test views with poses alone."""
-    parts = [_ov_plane(real_data / "babelcalib_ov_plane" / f"{name}.npz") for name in ("train", "test")]
+    parts = [ov_plane(name) for name in ("train", "test")]
     known = calibrate(parts[0], Options(lens="kannala-brandt", free_aspect=True, loss="trivial", reject_sigma=np.inf))
     assert known.fit.points_rms_px == pytest.approx(0.4815, abs=5e-4)
     assert score(known, parts[1]).fit.points_rms_px == pytest.approx(0.4746, abs=5e-4)
-
-
-def _ov_plane(path: Path) -> Observations:
-    with np.load(path) as data:
-        board, view, point, pixels, size = (data[n] for n in ("board_m", "view", "point", "pixels", "image_size"))
-    seen = np.full((int(view.max()) + 1, len(board), 2), np.nan)
-    seen[view, point] = pixels
-    return Observations.from_points(list(seen), board, (int(size[0]), int(size[1])), moves=True)

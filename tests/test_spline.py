@@ -11,6 +11,7 @@ import pytest
 import scenes
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from real_data import ov_plane
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
@@ -21,7 +22,7 @@ from ceres_cal.diagnostics import diagnose
 from ceres_cal.formats import export
 from ceres_cal.model.parameters import Options, Station
 from ceres_cal.moves.refitting import refit
-from ceres_cal.observations import NO_CURVES, Observations, Points, View, taken
+from ceres_cal.observations import Observations, taken
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Spline, make_lens
 from ceres_cal.scene.targets import checkerboard
@@ -217,18 +218,11 @@ def test_a_refit_of_it_contradicts_nothing() -> None:
     )
 
 
-def test_a_real_fisheye_to_93_degrees(real_data: Path) -> None:
+@pytest.mark.usefixtures("real_data")
+def test_a_real_fisheye_to_93_degrees() -> None:
     """BabelCalib's OV-plane: kannala-brandt leaves 0.482 px of its training views, plain least squares."""
-    with np.load(real_data / "babelcalib_ov_plane" / "train.npz") as data:
-        places, view, point, pixels, size = (data[n] for n in ("board_m", "view", "point", "pixels", "image_size"))
-    pitch_m = float(places[0, 0])
-    column, row = np.rint(places[:, :2] / pitch_m).astype(np.int32).T - 1
-    views = tuple(View(f"{n:02d}", "camera", "camera", "board", f"{n:02d}") for n in range(int(view.max()) + 1))
-    points = Points(view.astype(np.int32), (22 * row + column)[point], pixels, np.ones(len(pixels)))
-    board, sizes = {"board": checkerboard(22, 22, pitch_m)}, {"camera": (int(size[0]), int(size[1]))}
-    observations = Observations(board, sizes, views, points, NO_CURVES)
     plain = Options(lens="spline", powers=(2, 3), free_aspect=True, loss="trivial", reject_sigma=1e9)
-    assert calibrate(observations, plain).fit.points_rms_px < 0.472  # measured 0.468
+    assert calibrate(ov_plane("train"), plain).fit.points_rms_px < 0.472  # measured 0.468
 
 
 def test_what_is_finer_than_its_knots_is_named() -> None:
