@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import halves
@@ -24,7 +26,7 @@ from ceres_cal.calibration import Calibration
 from ceres_cal.cli import main
 from ceres_cal.detect.boards import BoardDetections
 from ceres_cal.diagnostics.held_out import choose
-from ceres_cal.lens_choice import PAPER, candidates, decide, label_of
+from ceres_cal.lens_choice import PAPER, candidates, choose_lens, decide, label_of, papers, seen
 from ceres_cal.lens_choice.kinds import Candidate
 from ceres_cal.lens_choice.rule import pseudo_bma
 from ceres_cal.model.equations import write_equations
@@ -32,15 +34,16 @@ from ceres_cal.model.keys import Key
 from ceres_cal.model.parameters import AUTO, Options
 from ceres_cal.model.residuals import residuals
 from ceres_cal.observations import Observations
-from ceres_cal.observations.sights import Sights
+from ceres_cal.observations.sights import Sights, gather_sights
 from ceres_cal.photographs import detect_field
 from ceres_cal.scene.camera import in_image
 from ceres_cal.scene.lens import KannalaBrandt
 from ceres_cal.scene.targets import ssl_field
 from ceres_cal.simulate import Disturbance, simulate
+from ceres_cal.solve import Solution, solve
 from ceres_cal.solve.left_out import GroupNormals, group_normals
 from ceres_cal.solve.linear_model import LinearModel, equation_weights, make_linear_model
-from ceres_cal.start.initialise import Start
+from ceres_cal.start.initialise import Start, initialise
 
 _PLAIN = Options(loss="trivial", reject_sigma=50.0)
 _NOISE = Disturbance(points_sigma_px=0.3, curves_sigma_px=0.3)
@@ -207,6 +210,22 @@ def test_what_other_lenses_would_say_is_stated(tmp_path: Path) -> None:
     assert np.all(wider.sd >= narrow.sd * (1.0 - 1e-6))
     on_floor = [np.nanmean(one.uncertainty.map_sd_mm("camera").errors_mm) for one in (calibration, alone)]
     assert 1.15 < on_floor[0] / on_floor[1] < 2.0  # 1.28
+
+
+def test_a_lens_that_cannot_be_solved_for_says_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ceres leaves a solve that failed where it started, which may be anywhere."""
+    failing = itertools.count()
+
+    def solved(*given: Any, **more: Any) -> Solution:
+        found = solve(*given, **more)
+        return replace(found, cost=np.inf, failed=True) if "precision" not in more and next(failing) else found
+
+    observations, options = _seen("radial-2-3", "lines-arcs"), papers(Options())
+    start = initialise(observations, gather_sights(observations), options)
+    every = choose_lens(observations, Options(), start).others
+    monkeypatch.setattr(seen, "solve", solved)
+    few = choose_lens(observations, Options(), start).others
+    assert every is not None and every.others and few is not None and not few.others
 
 
 def test_the_simplest_wins_among_equals_and_the_papers_before_it() -> None:

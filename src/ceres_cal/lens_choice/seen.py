@@ -130,9 +130,16 @@ class Seen:
         return None
 
     def solved_near(self, candidate: Candidate) -> Estimate:
-        """Where a lens is at its best, solved for from where the normal equations have it."""
+        """Where a lens is at its best, solved for from where the normal equations have it.
+
+        Raises:
+            CalibrationError: it cannot be solved for.
+        """
         options = candidate.form.of(self.options)
-        return solve(self._problem(options, candidate.estimate), candidate.estimate).estimate
+        solution = solve(self._problem(options, candidate.estimate), candidate.estimate)
+        if solution.failed:
+            raise DegenerateError(f"cannot be solved for: {solution.termination}")
+        return solution.estimate
 
     def _problem(self, options: Options, estimate: Estimate) -> Problem:
         """All inliers weigh the same with every kind: what one of them misses must not weigh less with it."""

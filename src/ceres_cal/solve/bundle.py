@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -17,6 +17,7 @@ from ceres_cal.base.transforms import Pose, Poses
 from ceres_cal.model.parameters import Estimate, Layout, Station, intrinsics_vector, with_intrinsics
 from ceres_cal.observations.sights import SightKey, Sights
 from ceres_cal.solve.cached_cost import Run
+from ceres_cal.solve.charts import Chart, ChartedCost, chart_of
 from ceres_cal.solve.costs import ROWS_WORTH_A_THREAD, EliminatedCost, SightCost
 from ceres_cal.solve.prior_cost import PriorCost
 from ceres_cal.solve.problem import Problem, Weighting
@@ -26,6 +27,7 @@ _NOTHING_LEFT = "Nothing left to gain."
 _SUCCESS = (pyceres.TerminationType.CONVERGENCE, pyceres.TerminationType.USER_SUCCESS)
 # Relative change of a placement's cost that a start may leave. Nothing changes from half to double.
 _POSED = 1e-2
+_MOST_INVALID = 20  # steps one after the other: the trust region shrinks ever faster, and what is beyond has no pose
 _DENSE_LIMIT = 600  # numbers that stay after the Schur complement; above it a sparse factorisation is faster
 
 
@@ -43,9 +45,9 @@ class Solution:
     """The end of one solve.
 
     Attributes:
-        cost: half the sum of all rho, at the end. history: the same at every iteration.
+        cost: half the sum of all rho, at the end, infinite where it failed. history: the same at every iteration.
         converged: False when the iterations ran out or the solver failed; termination: Ceres' own words why it stopped.
-        failed: the estimate must not be used.
+        failed: the estimate is where it started.
     """
 
     estimate: Estimate
@@ -88,6 +90,17 @@ class _Blocks:
     def owned_by(self, kind: str, name: str) -> Array:
         """The array of a camera, a station, or the structure."""
         return self.cameras[name] if kind == "camera" else self.stations[name] if kind == "station" else self.structure
+
+    def charts(self, estimate: Estimate, layout: Layout) -> dict[int, Chart]:
+        """Those of the arrays that are not moved as they are, by the array's id."""
+        charts = {id(self.cameras[n]): chart_of(camera, layout.free[n]) for n, camera in estimate.cameras.items()}
+        return {number: chart for number, chart in charts.items() if chart is not None}
+
+    def change(self, charts: Mapping[int, Chart], by: Callable[[Chart, Array], Array]) -> None:
+        """Each array that has a chart, in its place."""
+        for array in self.cameras.values():
+            if id(array) in charts:
+                array[:] = by(charts[id(array)], array)
 
     def unpack(self, estimate: Estimate, layout: Layout) -> Estimate:
         cameras = {}
@@ -218,10 +231,12 @@ def solve(
     run, layout = Run(), problem.layout
     with at_most(problem.options.threads):
         assembly = _assemble(run, problem, estimate)
-    ceres = pyceres.Problem()
+    ceres, charts = pyceres.Problem(), assembly.blocks.charts(estimate, layout)
     for cost, arrays in assembly.costs:
+        own = [charts.get(id(array)) for array in arrays]
         if arrays:
-            ceres.add_residual_block(cost, None, arrays)
+            ceres.add_residual_block(ChartedCost(cost, own) if any(own) else cost, None, arrays)
+    assembly.blocks.change(charts, Chart.moved)
     settings = _solver_options(problem, assembly, precision)
     settings.callbacks = [_Watcher(run, progress, precision)]
     if is_near and problem.weighting.is_convex:
@@ -231,19 +246,21 @@ def solve(
         pyceres.solve(settings, ceres, summary)
     if run.failure is not None:
         raise run.failure
+    assembly.blocks.change(charts, Chart.numbers)
     try:
         solved = assembly.blocks.unpack(estimate, layout)
     except InputError as error:  # phi or aspect below 0
         raise SolutionError(f"the solve ended at no camera ({error}): check labels and target dimensions") from None
     for eliminated, arrays in assembly.eliminated:
         solved = solved.with_placements(*eliminated.converged(arrays))
+    usable = bool(summary.IsSolutionUsable())
     return Solution(
         solved,
-        float(summary.final_cost),
+        float(summary.final_cost) if usable else np.inf,
         summary.termination_type in _SUCCESS or _rests(run.history),
         _NOTHING_LEFT if summary.termination_type == pyceres.TerminationType.USER_SUCCESS else str(summary.message),
         tuple(run.history),
-        not summary.IsSolutionUsable(),
+        not usable,
     )
 
 
@@ -297,6 +314,7 @@ def _solver_options(problem: Problem, assembly: _Assembly, precision: float) -> 
     if len(assembly.blocks.structure) and not assembly.blocks.placements:  # nothing is left to be eliminated
         solver.linear_solver_type = pyceres.LinearSolverType.DENSE_NORMAL_CHOLESKY
     solver.max_num_iterations = problem.options.max_iterations
+    solver.max_num_consecutive_invalid_steps = _MOST_INVALID
     solver.function_tolerance = precision
     solver.parameter_tolerance = 1e-12
     solver.gradient_tolerance = 1e-14

@@ -73,6 +73,7 @@ class Lens(ABC):
         values: the coefficients, in the order of `names` and in the units of the files and reports.
         kind: how files and options call it.
         acts_on_pixels: whether the coefficients act on radii in pixels, not on directions.
+        acts_on_tangents: whether they act on x / z and y / z, each with the power of its order.
         may_fold: whether the model may fold in a corner of the image that nobody observed.
         decentring: names of the coefficients that displace tangentially.
         trial_powers: of the kinds that leave the choice of powers: those worth a trial, the plainest first.
@@ -86,6 +87,7 @@ class Lens(ABC):
     values: tuple[float, ...] = ()
     kind: ClassVar[str]
     acts_on_pixels: ClassVar[bool] = False
+    acts_on_tangents: ClassVar[bool] = False
     may_fold: ClassVar[bool] = True
     decentring: ClassVar[tuple[str, ...]] = ()
     trial_powers: ClassVar[tuple[tuple[int, ...], ...]] = ()

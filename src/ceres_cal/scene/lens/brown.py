@@ -26,6 +26,7 @@ class Brown(Decentred):
     values: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0)
     terms: tuple[str, ...] = ()
     kind: ClassVar[str] = "brown"
+    acts_on_tangents: ClassVar[bool] = True
     decentring: ClassVar[tuple[str, ...]] = ("p1", "p2")
     more_terms: ClassVar[Mapping[str, tuple[str, ...]]] = MappingProxyType(
         {"rational": ("k4", "k5", "k6"), "prism": ("s1", "s2", "s3", "s4")}
