@@ -252,12 +252,16 @@ def test_boards_in_another_unit_are_refused(name: str, square_m: float, why: str
 @given(st.integers(0, 2**31), st.integers(1, 4), st.floats(1e-2, 1e2))
 @settings(max_examples=50)
 def test_what_stands_beside_a_prior(seed: int, size: int, strength: float) -> None:
-    """C^-1 - P of numbers in any units is what the others say of them, also where that is nothing of some."""
+    """C^-1 - P of numbers in any units is what the others say of them, also where that is nothing of some; the step from
+    where both are to where the others would be is one along what they say.
+    """
     rng = np.random.default_rng(seed)
     units = 10.0 ** rng.uniform(-6.0, 3.0, size)
     rows = rng.standard_normal((int(rng.integers(0, 2 * size + 1)), size)) / units
     rest, told = rows.T @ rows, np.diag((strength / units) ** 2)
-    beside = _beside(np.asarray(np.linalg.inv(rest + told)), np.asarray(told, dtype=float))
+    slope = rest @ (units * rng.standard_normal(size))
+    beside, step = _beside(np.asarray(np.linalg.inv(rest + told)), np.asarray(told, dtype=float), slope)
+    assert (rest @ step) * units == pytest.approx(slope * units, abs=1e-4 * (1.0 + strength**2))
     assert beside * units[:, None] * units == pytest.approx(
         rest * units[:, None] * units, abs=1e-5 * (1.0 + strength**2)
     )

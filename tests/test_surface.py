@@ -9,10 +9,14 @@ import pytest
 import scenes
 
 from ceres_cal.base.arrays import Array
-from ceres_cal.model.parameters import unit_px
+from ceres_cal.model.parameters import Options, make_layout, unit_px
+from ceres_cal.observations.sights import gather_sights
 from ceres_cal.scene.lens import Spline, make_lens
 from ceres_cal.scene.lens.surface import NODES, Surface, roughness
 from ceres_cal.scene.lens.surface_kernel import COLUMNS, ROWS
+from ceres_cal.simulate import Disturbance, simulate
+from ceres_cal.solve import Problem, solve
+from ceres_cal.start.initialise import initialise
 
 CAMERA = scenes.camera("spline-surface")
 EXTENTS = np.array([0.92, 0.69])
@@ -102,3 +106,13 @@ def test_it_is_asked_for_by_its_name() -> None:
     assert make_lens("spline", coefficients={"x0304": 1.0}).names == longer.names
     spanned = longer.spanning(0.6, 800.0, 1.1, (1280, 960)).coefficients
     assert spanned["wide"] == pytest.approx(0.92) and spanned["high"] == pytest.approx(0.69)
+
+
+def test_fewer_observations_than_numbers_leave_a_cost_to_rely_on() -> None:
+    """Rounding in what they leave open had made it thousands of times as large, and another one at each look."""
+    seen = simulate(scenes.lines("brown"), Disturbance(curves_sigma_px=0.3), 1).observations
+    options = Options(lens="spline", terms=("surface",), max_iterations=6)
+    start = initialise(seen, gather_sights(seen), options).estimate
+    problem = Problem(gather_sights(seen), make_layout(seen, options), options=options)
+    assert problem.layout.size > 400 > 216 == problem.equations
+    assert solve(problem, start, is_near=False).cost < 76.0  # 74.6 at its end

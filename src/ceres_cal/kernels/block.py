@@ -16,14 +16,19 @@ from ceres_cal.kernels.lenses import prepared
 from ceres_cal.kernels.sight import normal_equations, order_of_rows
 from ceres_cal.kernels.workspace import working_space
 
+# Numbers from which on rounding in what the observations leave open adds up, and the share of the diagonal that is
+# added against it: that changes no slope.
+_MANY, _LIFT = 64, 1e-12
+
 
 @jit
 def cholesky(normal: Any, upper: Any) -> None:
     """U with U^T U = A from A's lower triangle; where A is singular the row of U is zero."""
     size = len(normal)
+    whole = 1.0 + (_LIFT if size > _MANY else 0.0)
     upper[:] = 0.0
     for k in range(size):
-        pivot = normal[k, k]
+        pivot = whole * normal[k, k]
         for j in range(k):
             pivot -= upper[j, k] * upper[j, k]
         if not pivot > 1e-15 * normal[k, k]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,7 +21,6 @@ _STRUCTURE = 3  # slot
 ROWS_WORTH_A_THREAD = 20_000
 NORMAL_NS = 60.0
 """That an observation's share of the normal equations takes."""
-_LARGE, _LIFT = 64, 1e-12  # numbers from which on LAPACK is faster; share of the diagonal
 # Of a sight's cost, by the step its pose would take: the complement takes that along exactly, to second order. From
 # half to double the answer moves by under 1 % of its error.
 _LEFT_TO_THE_COMPLEMENT = 1e-2
@@ -77,18 +75,6 @@ class SightCost(CachedCost):
         if mixing is not None:
             jacobians[_STRUCTURE] = (jacobians[_STRUCTURE].reshape(rows, -1) @ mixing).reshape(-1)
         return Answer(at, residuals, [jacobians[slot] for slot in self.slots]) if answered else None
-
-
-def _factor(normal: Array, upper: Array) -> None:
-    """See `kernels.cholesky`. Of many numbers by LAPACK, which wants what the observations leave open a little less so:
-    that changes the diagonal, and no slope.
-    """
-    if len(normal) > _LARGE:
-        diagonal = np.diagonal(normal)
-        with suppress(np.linalg.LinAlgError):
-            upper[:] = np.linalg.cholesky(normal + np.diag(_LIFT * (diagonal + _LIFT * diagonal.max()))).T
-            return
-    kernels.cholesky(normal, upper)
 
 
 def kernel_loss(weighting: Weighting) -> kernels.Loss:
@@ -170,7 +156,7 @@ class EliminatedCost(CachedCost):
             cost = float(np.sum(swept.costs))
             if not np.isfinite(cost):
                 return None
-            _factor(swept.reduced, upper)
+            kernels.cholesky(swept.reduced, upper)
             residuals = upper[:, -1].copy()
             missing = cost - float(residuals[:-1] @ residuals[:-1])
             if missing > -kernels.ROUNDING * cost:  # else Newton's step promises more than there is

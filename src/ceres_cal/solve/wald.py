@@ -52,31 +52,38 @@ def linear_rest(statement: Statement, end: RobustSolution, observations: Observa
         reduced = end.reduced or information(end.problem, estimate)
         stated = reduce(add, (prior.information for prior in statement.priors), Information.nothing(statement.keys))
         at = reduced.shared.columns(stated.keys)
-        rest = Information(stated.keys, _beside(reduced.shared.inverse[np.ix_(at, at)], stated.matrix))
         slope = np.zeros(len(stated.keys))
         for prior in statement.priors:
             slope[stated.columns(prior.keys)] += prior.information.matrix @ prior.offsets(estimate)
+        matrix, step = _beside(reduced.shared.inverse[np.ix_(at, at)], stated.matrix, slope)
+        rest = Information(stated.keys, matrix)
     else:
         freed = statement.left_out(end.problem, estimate)
         rest = information(freed, estimate).shared.marginal(statement.keys)
         slope = -_slopes(end.problem, observations, estimate, rest)
-    step = rest.inverse @ slope
+        step = rest.inverse @ slope
     # It swells the noise that the rest is measured by, as far as the linear picture goes.
     noise = max(freedom - float(slope @ step), 1.0) / freedom if end.inliers.degrees_of_freedom < np.inf else 1.0
     return Rest(estimate, step, Information(rest.keys, rest.matrix / noise), freedom)
 
 
-def _beside(covariance: Array, stated: Array) -> Array:
-    """C^-1 - P, with 0 where that is lost in rounding beside P."""
-    size = np.sqrt(np.where(np.diagonal(stated) > 0.0, np.diagonal(stated), 1.0))
-    values, vectors = np.linalg.eigh(stated / size[:, None] / size)
-    kept = values > _LEAST_TOLD
-    root = vectors[:, kept] * np.sqrt(values[kept])
-    share, turned = np.linalg.eigh(root.T @ (covariance * size[:, None] * size) @ root)
+def _beside(covariance: Array, stated: Array, slope: Array) -> tuple[Array, Array]:
+    """M = C^-1 - P and the step M^-1 z, both 0 where M is lost in rounding beside P."""
+    root, back = _roots(stated, _LEAST_TOLD)
+    share, turned = np.linalg.eigh(root.T @ covariance @ root)
     share = np.clip(share, 1e-300, None)
-    rest = np.where(share < 1.0 - _LEAST_TOLD, 1.0 / share - 1.0, 0.0)
-    whole = size[:, None] * (root @ turned)
-    return np.asarray(whole * rest @ whole.T)
+    told = share < 1.0 - _LEAST_TOLD
+    root, back, rest = root @ turned[:, told], back @ turned[:, told], 1.0 / share[told] - 1.0
+    return np.asarray(root * rest @ root.T), np.asarray(back @ (back.T @ slope / rest))
+
+
+def _roots(stated: Array, least: float) -> tuple[Array, Array]:
+    """(n, k) R and B with R R^T = P and B^T R = 1, over what is stated by more than the least at unit diagonal."""
+    size = np.sqrt(np.where(np.diagonal(stated) > 0.0, np.diagonal(stated), 1.0))[:, None]
+    values, vectors = np.linalg.eigh(stated / size / size.T)
+    kept = values > least
+    vectors, root = vectors[:, kept], np.sqrt(values[kept])
+    return size * vectors * root, vectors / root / size
 
 
 def _slopes(problem: Problem, observations: Observations, estimate: Estimate, rest: Information) -> Array:
@@ -152,13 +159,9 @@ def _squared(off: Array, stated: Array, rest: Array) -> float:
     """off^T (M^-1 + P^-1)^-1 off: where everything else, M, says nothing beside what is stated, P, it is 0 however far
     off that seems.
     """
-    size = np.sqrt(np.where(np.diagonal(stated) > 0.0, np.diagonal(stated), 1.0))
-    values, vectors = np.linalg.eigh(stated / size[:, None] / size)
-    kept = values > _STATED
-    vectors, root = vectors[:, kept], np.sqrt(values[kept])
-    back = vectors / root / size[:, None]
+    root, back = _roots(stated, _STATED)
     told, turn = np.linalg.eigh(back.T @ rest @ back)  # in directions in which each is stated to one
-    along = (off * size) @ (vectors * root) @ turn
+    along = off @ root @ turn
     return float(np.sum(np.where(told > _LEAST_TOLD, told / (1.0 + told), 0.0) * along**2))
 
 
