@@ -252,8 +252,8 @@ def test_boards_in_another_unit_are_refused(name: str, square_m: float, why: str
 @given(st.integers(0, 2**31), st.integers(1, 4), st.floats(1e-2, 1e2))
 @settings(max_examples=50)
 def test_what_stands_beside_a_prior(seed: int, size: int, strength: float) -> None:
-    """C^-1 - P of numbers in any units is what the others say of them, also where that is nothing of some; the step from
-    where both are to where the others would be is one along what they say.
+    """C^-1 - P of numbers in any units is what the others say of them, also where that is nothing of some; the step
+    from where both are to where the others would be is one along what they say.
     """
     rng = np.random.default_rng(seed)
     units = 10.0 ** rng.uniform(-6.0, 3.0, size)

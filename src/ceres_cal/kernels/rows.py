@@ -15,9 +15,9 @@ from ceres_cal.kernels.workspace import CHUNK, working_space
 
 
 @jit
-def point_rows(optics: Optics, poses: Any, points: PointColumns, rows: Any) -> bool:
-    """d project(X) / d [intrinsics | 6 pose | x, y, the warp's numbers] into `rows` (N, 2, intrinsics + 6 + BUILT);
-    False where one cannot be projected.
+def point_rows(optics: Optics, poses: Any, points: PointColumns, rows: Any) -> None:
+    """d project(X) / d [intrinsics | 6 pose | x, y, the warp's numbers] into `rows` (N, 2, intrinsics + 6 + BUILT); NaN
+    where a sight has points that cannot be projected.
 
     Args:
         See `point_residuals`. The pose columns are left perturbations in the camera frame: (dw x R X) + dt.
@@ -29,7 +29,8 @@ def point_rows(optics: Optics, poses: Any, points: PointColumns, rows: Any) -> b
         for start in range(points.bounds[v], points.bounds[v + 1], CHUNK):
             n = min(CHUNK, points.bounds[v + 1] - start)
             if not shown_points(n, start, optics, poses[v], points, space):
-                return False
+                rows[start : start + n] = np.nan
+                continue
             jacobian_rows(n, optics, space, False)
             for i in range(n):
                 for k in range(BUILT - 2):
@@ -39,7 +40,6 @@ def point_rows(optics: Optics, poses: Any, points: PointColumns, rows: Any) -> b
                     for k in range(len(jacobian)):
                         row[k] = jacobian[k, c, i]
                     _add_built(poses[v], directions, row)
-    return True
 
 
 @jit

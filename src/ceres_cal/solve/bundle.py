@@ -307,11 +307,10 @@ def _require_enough(problem: Problem, estimate: Estimate) -> None:
 
 def _solver_options(problem: Problem, assembly: _Assembly, precision: float) -> Any:
     solver = pyceres.SolverOptions()
-    kept = sum(len(free) for free in problem.layout.free.values())
-    kept += 6 * len(problem.layout.stations) if assembly.blocks.placements else 0
-    few = kept < _DENSE_LIMIT
+    kept = sum(len(free) for free in problem.layout.free.values()) + len(assembly.blocks.structure)
+    few = kept + 6 * len(problem.layout.stations) < _DENSE_LIMIT
     solver.linear_solver_type = pyceres.LinearSolverType.DENSE_SCHUR if few else pyceres.LinearSolverType.SPARSE_SCHUR
-    if len(assembly.blocks.structure) and not assembly.blocks.placements:  # nothing is left to be eliminated
+    if few and not assembly.blocks.placements:  # nothing is left to be eliminated
         solver.linear_solver_type = pyceres.LinearSolverType.DENSE_NORMAL_CHOLESKY
     solver.max_num_iterations = problem.options.max_iterations
     solver.max_num_consecutive_invalid_steps = _MOST_INVALID

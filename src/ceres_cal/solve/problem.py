@@ -11,10 +11,11 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask
 from ceres_cal.model.information import Information
-from ceres_cal.model.parameters import Estimate, Layout, Options
+from ceres_cal.model.parameters import OF_PIXELS, Estimate, Layout, Options
 from ceres_cal.model.priors import GaussianPrior
 from ceres_cal.model.quantities import free_keys, intrinsic_keys
 from ceres_cal.observations.sights import SightKey, Sights
+from ceres_cal.scene.lens import Lens
 
 _CONVEX = ("trivial", "huber", "soft_l1")
 
@@ -106,21 +107,26 @@ class Problem:
             sigmas = self.smoothness.get(name, tuple(form.loose for form in forms))
             for form, sigma in zip(forms, sigmas, strict=True):
                 own = tuple(keys[quantity] for quantity in form.names)
-                if free & set(own) and name not in self.known_lenses:
+                if free & set(own) and not self.knows_lens(name, camera.lens):
                     whole = GaussianPrior(Information(own, form.matrix / sigma**2), np.zeros(len(own)))
                     yield whole.given(free)
 
+    def knows_lens(self, camera: str, lens: Lens) -> bool:
+        """Whether a posterior states a camera's lens in every direction: how smooth it is, is in there."""
+        rough = {name for form in lens.roughness for name in form.names}
+        return bool(rough) and rough <= self._stated_whole.get(camera, frozenset())
+
     @cached_property
-    def known_lenses(self) -> frozenset[str]:
-        """Cameras whose lens a posterior states in every direction: how smooth it is, is in there."""
-        rough = {name for form in self.options.blank_lens.roughness for name in form.names}
-        known = set()
-        for prior in self.priors if rough else ():
+    def _stated_whole(self) -> dict[str, frozenset[str]]:
+        """Camera -> the coefficients of its lens, where a prior states these in every direction."""
+        stated: dict[str, frozenset[str]] = {}
+        for prior in self.priors:
             for name in {key.owner for key in prior.keys if key.kind == "camera"}:
-                own = tuple(key for key in prior.keys if key[:2] == ("camera", name) and key.quantity in rough)
-                if len(own) == len(rough) and prior.information.given(own).known_rank == len(own):
-                    known.add(name)
-        return frozenset(known)
+                of_camera = [key for key in prior.keys if key[:2] == ("camera", name)]
+                own = [key for key in of_camera if key.quantity not in (*OF_PIXELS, "skew")]
+                if own and prior.information.given(own).known_rank == len(own):
+                    stated[name] = frozenset(key.quantity for key in own) | stated.get(name, frozenset())
+        return stated
 
     @property
     def equations(self) -> int:

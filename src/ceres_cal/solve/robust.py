@@ -121,7 +121,8 @@ class _Rounds:
         self._last: tuple[Inliers, Sights] | None = None
         self._no_change = _AT_REST if usual is None else _AT_REST_AGAIN
         self._rough_end, self._end = _ROUGH, _TO_THE_END
-        if problem.options.blank_lens.roughness and not problem.known_lenses:
+        lens = problem.options.blank_lens
+        if lens.roughness and not any(problem.knows_lens(name, lens) for name in problem.layout.free):
             self._rough_end, self._end = _ROUGH_WITHOUT_FORMULA, _LEFT_OF_SMOOTH / max(problem.equations, 1)
 
     def to_rest(

@@ -43,8 +43,8 @@ def with_smoothness(
         forms = camera.lens.roughness
         free = {key.quantity: key for key in reduced.shared.keys if key[:2] == ("camera", name)}
         if (
-            name in problem.known_lenses
-            or not forms
+            not forms
+            or problem.knows_lens(name, camera.lens)
             or not all(quantity in free for form in forms for quantity in form.names)
         ):
             continue

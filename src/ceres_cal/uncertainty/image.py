@@ -17,17 +17,17 @@ import numpy as np
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.tails import NORMAL_95
-from ceres_cal.base.transforms import Pose, rotation_exp
+from ceres_cal.base.transforms import Pose
 from ceres_cal.model.keys import Key
-from ceres_cal.model.parameters import Estimate
-from ceres_cal.model.quantities import camera_moved, moved, natural_sizes
+from ceres_cal.model.parameters import Estimate, intrinsic_names
+from ceres_cal.model.quantities import moved
+from ceres_cal.model.slopes import PixelSlopes, pixel_slopes
 from ceres_cal.scene.camera import Camera
-from ceres_cal.uncertainty.maps import STEP, radius_95
+from ceres_cal.uncertainty.maps import radius_95
 from ceres_cal.uncertainty.posterior import Posterior
 from ceres_cal.uncertainty.profile import PhiProfile
 
 _STEPS = 32  # along the longer side
-_TURN = 1e-5  # rad
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,12 +57,13 @@ class Picture:
         return self.camera.rays(self.pixels)
 
     @cached_property
+    def _by(self) -> PixelSlopes:
+        return pixel_slopes(self.camera, self._rays)
+
+    @property
     def _turns(self) -> Array:
         """(2 N, 3) px per rad about the camera's axes; 0 where the lens shows nothing."""
-        columns = [
-            (self.camera.project(self._rays @ rotation_exp(_TURN * axis).T) - self.pixels) / _TURN for axis in np.eye(3)
-        ]
-        return np.nan_to_num(np.stack(columns, axis=-1).reshape(-1, 3))
+        return np.nan_to_num(self._by.turns.reshape(-1, 3))
 
     def shift(self, other: Camera) -> Array:
         """(N, 2) px from where this camera shows its rays to where another one does, turned as well as can be; NaN
@@ -73,14 +74,13 @@ class Picture:
         turn = np.linalg.lstsq(self._turns[known], shift.ravel()[known], rcond=None)[0]
         return np.asarray(shift - (self._turns @ turn).reshape(-1, 2))
 
-    def slopes(self, quantities: Sequence[str], sizes: Array) -> Array:
-        """(N, 2, K) px per unit of some intrinsics."""
-        sides = [
-            [self.shift(camera_moved(self.camera, [name], np.array([s]))) for s in (size, -size)]
-            for name, size in zip(quantities, sizes, strict=True)
-        ]
-        columns = [(ahead - behind) / (2.0 * size) for (ahead, behind), size in zip(sides, sizes, strict=True)]
-        return np.stack(columns, axis=-1) if columns else np.zeros((*self.pixels.shape, 0))
+    def slopes(self, quantities: Sequence[str]) -> Array:
+        """(N, 2, K) px per unit of some intrinsics, turned as well as can be; 0 where the lens shows nothing."""
+        names = intrinsic_names(self.camera.lens)
+        moving = np.nan_to_num(self._by.intrinsics[:, :, [names.index(name) for name in quantities]])
+        flat = moving.reshape(-1, len(quantities))
+        turn = np.linalg.lstsq(self._turns, flat, rcond=None)[0]
+        return np.asarray((flat - self._turns @ turn).reshape(moving.shape))
 
 
 def image_grid(image_size: tuple[int, int]) -> tuple[Array, Array]:
@@ -109,18 +109,17 @@ def image_map(estimate: Estimate, posterior: Posterior, camera: str) -> ImageMap
     return ImageMap(camera, x, y, np.where(np.isnan(own.rays(pixels)[:, 0]), np.nan, radius).reshape(len(y), len(x)))
 
 
-def picture_slopes(picture: Picture, estimate: Estimate, keys: Sequence[Key], camera: str) -> Array:
+def picture_slopes(picture: Picture, keys: Sequence[Key], camera: str) -> Array:
     """(N, 2, K) px per unit of each of the keys: 0 of what is not this camera's."""
     own = [column for column, key in enumerate(keys) if key[:2] == ("camera", camera)]
-    sizes = STEP * natural_sizes(estimate, [keys[column] for column in own])
     slopes = np.zeros((*picture.pixels.shape, len(keys)))
-    slopes[:, :, own] = picture.slopes([keys[column].quantity for column in own], sizes)
-    return np.nan_to_num(slopes)
+    slopes[:, :, own] = picture.slopes([keys[column].quantity for column in own])
+    return slopes
 
 
 def _by_covariance(picture: Picture, estimate: Estimate, posterior: Posterior, camera: str) -> Array:
     """(N,) px, with what leaves the quadratic picture."""
-    slopes = picture_slopes(picture, estimate, posterior.keys, camera)
+    slopes = picture_slopes(picture, posterior.keys, camera)
     covariance, width = posterior.spread.through(slopes), posterior.half_width
     bends = posterior.bends
     if bends is not None:
@@ -145,7 +144,7 @@ def _by_profile(picture: Picture, estimate: Estimate, posterior: Posterior, came
         there = moved(estimate, profile.keys, step)
         shifts.append(picture.shift(there.cameras[camera].at(Pose.identity())).ravel())
         node = Picture(there.cameras[camera].at(Pose.identity()), picture.pixels)
-        variance = across.spread.through(picture_slopes(node, there, across.keys, camera))
+        variance = across.spread.through(picture_slopes(node, across.keys, camera))
         sds.append(np.sqrt(np.diagonal(variance, axis1=1, axis2=2)).ravel())
     values = np.array(shifts)
     lost = np.isnan(values).any(axis=0)

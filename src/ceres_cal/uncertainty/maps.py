@@ -17,13 +17,12 @@ from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.tails import NORMAL_95, NORMAL_95_ONE_SIDED
 from ceres_cal.model.keys import STATION_QUANTITIES, Key
-from ceres_cal.model.parameters import Estimate
-from ceres_cal.model.quantities import camera_moved, moved, natural_sizes
+from ceres_cal.model.parameters import Estimate, intrinsic_names
+from ceres_cal.model.quantities import moved
+from ceres_cal.model.slopes import pixel_slopes
 from ceres_cal.uncertainty.bent import weak_axes
 from ceres_cal.uncertainty.posterior import Posterior
 from ceres_cal.uncertainty.profile import FARTHER
-
-STEP = 1e-5  # of each number's natural size: the differences are good to 1e-9 of the slope
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,33 +55,24 @@ def station_keys(estimate: Estimate, posterior: Posterior, station: str) -> tupl
 
 
 def locate_slopes(estimate: Estimate, keys: Sequence[Key], station: str, pixels: Array, height_m: float) -> Array:
-    """(N, 2, K) derivatives of where pixels (N, 2) are located on the plane z = height_m, by each of the keys.
+    """(N, 2, K) derivatives of where pixels (N, 2) are located on the plane z = height_m, by each of the keys; NaN
+    where they are located nowhere.
 
-    In closed form for the pose, by differences of the rays for the intrinsics.
+    What a number moves in the picture the place takes back: it moves by the inverse of how places move it.
     """
     camera = estimate.camera_at(station)
-    rotation, rays = camera.cam_from_world.rotation, camera.rays(pixels)
-    directions = rays @ rotation
-    slant = directions[:, :2] / directions[:, 2:]
-    distance = (height_m - camera.position[2]) / directions[:, 2:]
-
-    def turned(rays_change: Array) -> Array:
-        change = rays_change @ rotation
-        return np.asarray(distance * (change[:, :2] - slant * change[:, 2:]))
-
-    slopes = np.zeros((len(pixels), 2, len(keys)))
-    for k, (key, size) in enumerate(zip(keys, STEP * natural_sizes(estimate, keys), strict=True)):
+    located = camera.locate(pixels, height_m)
+    by = pixel_slopes(camera, np.column_stack([located, np.full(len(located), height_m)]))
+    names = intrinsic_names(camera.lens)
+    moving = np.zeros((len(pixels), 2, len(keys)))
+    for k, key in enumerate(keys):
         if key[:2] == ("station", station):
             axis = STATION_QUANTITIES.index(key.quantity)
-            if axis == 2:
-                slopes[:, :, k] = -slant
-            elif axis < 2:
-                slopes[:, axis, k] = 1.0
-            else:  # the camera turns by w, so rays in the world turn by -w x ray
-                slopes[:, :, k] = turned(np.cross(rays, np.eye(3)[axis - 3]))
+            moving[:, :, k] = -by.places[:, :, axis] if axis < 3 else by.turns[:, :, axis - 3]
         elif key[:2] == ("camera", estimate.stations[station].camera):
-            ahead, behind = (camera_moved(camera, [key.quantity], np.array([s])).rays(pixels) for s in (size, -size))
-            slopes[:, :, k] = turned((ahead - behind) / (2.0 * size))
+            moving[:, :, k] = by.intrinsics[:, :, names.index(key.quantity)]
+    slopes, known = np.full(moving.shape, np.nan), np.isfinite(by.places[:, 0, 0])
+    slopes[known] = -np.linalg.solve(by.places[known, :, :2], moving[known])
     return slopes
 
 

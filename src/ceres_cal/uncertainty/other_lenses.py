@@ -101,4 +101,4 @@ def _compared(lenses: OtherLenses, keys: Sequence[Key], there: Estimate) -> Iter
                 yield part * px_per_m * slopes, part * px_per_m * lenses.offsets(station, height_m)
         if not stations:
             picture = Picture(camera.at(Pose.identity()), pixels)
-            yield picture_slopes(picture, there, keys, name), lenses.shifts(name)
+            yield picture_slopes(picture, keys, name), lenses.shifts(name)
