@@ -204,9 +204,14 @@ def test_a_real_photograph_that_was_stretched(
     assert answer["stretched"] and 0.945 < answer["found"][0]["aspect"] < 0.97  # 0.958; circle: 185 px high, 193 wide
     observations = Observations.load(out)
     names = [observations.targets["field"].point_names[number] for number in observations.points.feature]
-    clicked = {"TopLeftGoalAreaCorner": (75, 148), "BottomRightGoalAreaCorner": (656, 467)}
-    away = [np.linalg.norm(observations.points.pixels[names.index(name)] - place) for name, place in clicked.items()]
-    assert max(away) < 5.0  # 1.2 px
+    clicked = {"TopLeft": (75, 148), "TopRight": (654, 149), "BottomRight": (656, 467), "BottomLeft": (73, 470)}
+    places = {f"{which}GoalAreaCorner": place for which, place in clicked.items()}
+    away = [
+        np.linalg.norm(pixel - places[name])
+        for name, pixel in zip(names, observations.points.pixels, strict=True)
+        if name in places
+    ]
+    assert len(away) >= 2 and max(away) < 5.0  # 2 or 3 of them, with rounding, 1.3 px away
 
 
 def _towards(seen: Camera) -> str:

@@ -36,7 +36,7 @@ def pixel_slopes(camera: Camera, places: Array) -> PixelSlopes:
         np.ascontiguousarray(places[known]),
         np.zeros((count, 2)),
         kernels.NOTHING,
-        np.empty((0, kernels.BUILT), dtype=np.int64),
+        np.empty((0, kernels.BUILT), dtype=np.int32),
         np.zeros((count, kernels.BUILT - 2)),
     )
     rows = np.full((len(places), 2, size + 6 + kernels.BUILT), np.nan)
