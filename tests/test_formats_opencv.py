@@ -12,7 +12,7 @@ from ceres_cal import Camera, InputError
 from ceres_cal.base.arrays import Array
 from ceres_cal.formats import export, import_calibration
 from ceres_cal.scene.foreign import ForeignCamera
-from ceres_cal.scene.lens import Brown
+from ceres_cal.scene.lens import Brown, make_lens
 
 ENDINGS = (".yml", ".xml", ".json")
 EXACT = ("brown", "kannala-brandt", "brown-rational", "brown-all")
@@ -129,6 +129,15 @@ def test_to_and_from_opencv() -> None:
     everything = with_lens("brown-all")
     assert len(everything.to_opencv().distortion) == 12
     assert same_camera(Camera.from_opencv(camera.image_size, *everything.to_opencv()), everything)
+
+
+def test_what_sees_across_is_a_fisheye() -> None:
+    """Up to 106 degrees from the axis, by a lens that OpenCV does not have."""
+    lens = make_lens("spline", coefficients={"rim": 800.0, "g11": 2.0, "p1": 1.0})
+    camera = Camera((1280, 960), 300.0, (640.0, 480.0), lens)
+    found = camera.to_opencv()
+    assert found.fisheye and found.error_px[1] < 5.0  # 2.9 px
+    assert not replace(camera, phi=900.0).to_opencv().fisheye
 
 
 @pytest.mark.parametrize("count", [12, 14])

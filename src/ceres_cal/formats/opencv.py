@@ -39,8 +39,7 @@ def _export(request: ExportRequest) -> Exported:
     cameras, losses = [], []
     for name in request.stations:
         camera = request.calibration.station(name)
-        models = (FISHEYE,) if camera.lens.kind == "kannala-brandt" else ("opencv5", "opencv8", "opencv12")
-        foreign, loss = as_foreign(camera, name, models, box)
+        foreign, loss = as_foreign(camera, name, camera.opencv_models, box)
         cameras.append(foreign)
         losses.append(loss)
     entries = _mono(cameras[0], losses[0]) if len(cameras) == 1 else _stereo(cameras)

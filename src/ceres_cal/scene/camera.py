@@ -36,6 +36,7 @@ def _rows(values: ArrayLike, columns: int, name: str) -> Array:
 
 
 _ALONG_AN_EDGE = 16  # steps along each side of the image
+_ACROSS = 0.1  # depth of a unit ray: beside shallower ones tangents grow beyond what functions of them follow
 _FAR_M = 10.0  # a height of as many metres, far over its camera, is one in millimetres
 
 
@@ -272,11 +273,17 @@ class Camera:
         """K, coefficients, rvec and tvec as OpenCV takes them; where it does not have the lens, or for a skew, the best
         fit, with its error.
         """
-        fisheye = self.lens.kind == KannalaBrandt.kind
-        foreign = self.to_foreign(FISHEYE) if fisheye else self.to_foreign("opencv5", "opencv8", "opencv12")
-        pose = self.cam_from_world
+        foreign, pose = self.to_foreign(*self.opencv_models), self.cam_from_world
         vector, distortion = rotation_log(pose.rotation), np.array(foreign.coefficients)
+        fisheye = foreign.model == FISHEYE
         return OpenCvCamera(foreign.matrix, distortion, vector, pose.translation.copy(), fisheye, foreign.error_px)
+
+    @property
+    def opencv_models(self) -> tuple[str, ...]:
+        """Those of OpenCV's models that may come near it: its fisheye where our lens is that, or sees across."""
+        rays = self.rays(image_grid(self.image_size))
+        fisheye = self.lens.kind == KannalaBrandt.kind or bool(np.any(rays[:, 2] < _ACROSS))
+        return (FISHEYE,) if fisheye else ("opencv5", "opencv8", "opencv12")
 
     @classmethod
     def from_opencv(
