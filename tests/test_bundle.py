@@ -36,7 +36,7 @@ from ceres_cal.scene.targets import ssl_field
 from ceres_cal.simulate import Disturbance, field_scene, overhead_pose, simulate
 from ceres_cal.solve import Problem, Progress, Weighting, solve
 from ceres_cal.solve.bundle import _left_to_gain
-from ceres_cal.solve.charts import chart_of
+from ceres_cal.solve.charts import Chart, chart_of
 from ceres_cal.start.initialise import initialise
 
 NOISE = Disturbance(points_sigma_px=0.3, curves_sigma_px=0.3, outliers=0.03, outlier_spread_px=5.0)
@@ -339,6 +339,18 @@ def test_phi_against_height_does_not_creep(seed: int) -> None:
     start = initialise(seen, gather_sights(seen), options).estimate
     found = solve(problem_of(seen, options, Weighting(), start), start, is_near=False)
     assert found.converged and len(found.history) < 45
+
+
+def test_what_is_raised_on_the_way_to_a_cost_ends_the_solve(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Such as Ctrl-C: no exception travels through C++."""
+
+    def interrupted(*given: Any) -> Array:
+        raise KeyboardInterrupt
+
+    start = start_of("brown/boards")
+    monkeypatch.setattr(Chart, "chained", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        solved("brown/boards", Weighting(), start)
 
 
 @given(

@@ -235,7 +235,7 @@ def solve(
     for cost, arrays in assembly.costs:
         own = [charts.get(id(array)) for array in arrays]
         if arrays:
-            ceres.add_residual_block(ChartedCost(cost, own) if any(own) else cost, None, arrays)
+            ceres.add_residual_block(ChartedCost(run, cost, own) if any(own) else cost, None, arrays)
     assembly.blocks.change(charts, Chart.moved)
     settings = _solver_options(problem, assembly, precision)
     settings.callbacks = [_Watcher(run, progress, precision)]

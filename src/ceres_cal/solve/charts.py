@@ -16,6 +16,7 @@ import pyceres
 from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.model.parameters import unit_px
 from ceres_cal.scene.camera import Camera
+from ceres_cal.solve.cached_cost import Run
 
 _PHI = 0  # of the intrinsics
 
@@ -43,6 +44,7 @@ class Chart:
         chained[:, self._phi] += jacobian @ (self._powers * numbers) / numbers[self._phi]
         return np.asarray(chained)
 
+    @np.errstate(all="ignore")  # phi may be 0 on the way: no camera, which shows nothing
     def _scales(self, numbers: Array) -> Array:
         return np.asarray((numbers[self._phi] / self._unit) ** self._powers)
 
@@ -55,19 +57,23 @@ def chart_of(camera: Camera, free: Indices) -> Chart | None:
 class ChartedCost(pyceres.CostFunction):
     """A cost function over what Ceres moves, of one over the numbers themselves."""
 
-    def __init__(self, cost: Any, charts: Sequence[Chart | None]) -> None:
+    def __init__(self, run: Run, cost: Any, charts: Sequence[Chart | None]) -> None:
         super().__init__()
-        self._cost, self._charts = cost, charts
+        self._run, self._cost, self._charts = run, cost, charts
         self.set_num_residuals(cost.num_residuals())
         self.set_parameter_block_sizes(cost.parameter_block_sizes())
 
     def Evaluate(self, parameters: Sequence[Array], residuals: Array, jacobians: Sequence[Array] | None) -> bool:
-        numbers = [
-            chart.numbers(block) if chart else block for chart, block in zip(self._charts, parameters, strict=True)
-        ]
-        if not self._cost.Evaluate(numbers, residuals, jacobians):
+        try:
+            numbers = [
+                chart.numbers(block) if chart else block for chart, block in zip(self._charts, parameters, strict=True)
+            ]
+            if not self._cost.Evaluate(numbers, residuals, jacobians):
+                return False
+            for chart, jacobian, block in zip(self._charts, jacobians or (), numbers, strict=False):
+                if chart:
+                    jacobian[:] = chart.chained(jacobian.reshape(len(residuals), -1), block).reshape(-1)
+        except BaseException as error:  # see `CachedCost`
+            self._run.failure = self._run.failure or error
             return False
-        for chart, jacobian, block in zip(self._charts, jacobians or (), numbers, strict=False):
-            if chart:
-                jacobian[:] = chart.chained(jacobian.reshape(len(residuals), -1), block).reshape(-1)
         return True
