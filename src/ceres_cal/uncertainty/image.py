@@ -14,7 +14,7 @@ from functools import cached_property
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array
+from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.tails import NORMAL_95
 from ceres_cal.base.transforms import Pose
@@ -59,6 +59,11 @@ class Picture:
     @cached_property
     def _by(self) -> PixelSlopes:
         return pixel_slopes(self.camera, self._rays)
+
+    @property
+    def shown(self) -> Mask:
+        """(N,) which pixels the lens has an answer for."""
+        return np.isfinite(self._by.turns[:, 0, 0])
 
     @property
     def _turns(self) -> Array:
@@ -106,7 +111,7 @@ def image_map(estimate: Estimate, posterior: Posterior, camera: str) -> ImageMap
         radius = _by_profile(picture, estimate, posterior, camera)
     else:
         radius = _by_covariance(picture, estimate, posterior, camera)
-    return ImageMap(camera, x, y, np.where(np.isnan(own.rays(pixels)[:, 0]), np.nan, radius).reshape(len(y), len(x)))
+    return ImageMap(camera, x, y, np.where(picture.shown, radius, np.nan).reshape(len(y), len(x)))
 
 
 def picture_slopes(picture: Picture, keys: Sequence[Key], camera: str) -> Array:
