@@ -357,13 +357,6 @@ def test_the_command_says_what_to_do_first(file: str, capsys: pytest.CaptureFixt
     )
 
 
-def test_a_lens_without_a_formula_is_advised_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = tmp_path / "calibration.json"
-    calibrate(observed("whole field, 3 deg"), Options(lens="spline")).save(path)
-    assert main(["advise", str(path)]) == 0
-    assert "measure the camera's height to 10 mm" in capsys.readouterr().out
-
-
 def test_the_command_for_scripts(file: str, capsys: pytest.CaptureFixture[str]) -> None:
     """The same from the file as from the calibration in memory, everything in it."""
     assert main(["advise", file, "--json", "--height-mm", "150"]) == 0

@@ -20,13 +20,15 @@ from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
 from ceres_cal.diagnostics import diagnose
 from ceres_cal.formats import export
-from ceres_cal.model.parameters import Options, Station
+from ceres_cal.model.parameters import Options, Station, make_layout
 from ceres_cal.moves.refitting import refit
 from ceres_cal.observations import Observations, taken
+from ceres_cal.observations.sights import gather_sights
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Spline, make_lens
 from ceres_cal.scene.targets import checkerboard
 from ceres_cal.simulate import Disturbance, Simulation, board_scene, simulate
+from ceres_cal.solve import Problem
 
 
 @st.composite
@@ -206,6 +208,14 @@ def test_it_is_saved_loaded_and_exported(tmp_path: Path) -> None:
     assert loaded.cameras == calibration.cameras and loaded.options == calibration.options
     (loss,) = export(loaded, "opencv", tmp_path / "a.yml", [next(iter(loaded.stations))]).losses
     assert loss.image_px is not None and loss.image_px[0] < 0.05
+
+
+def test_how_smooth_it_is_needs_no_options() -> None:
+    """Advice poses problems without any: its command ended in an unknown lens."""
+    calibration, observations = solved("brown", 0.0), seen("brown", 0.0).observations
+    problem = Problem(gather_sights(observations), make_layout(observations, calibration.options))
+    (camera,) = calibration.cameras.values()
+    assert len(problem.priors_at(calibration.estimate)) == len(camera.lens.roughness) > 0
 
 
 def test_a_refit_of_it_contradicts_nothing() -> None:
