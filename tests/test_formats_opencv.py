@@ -140,6 +140,14 @@ def test_what_sees_across_is_a_fisheye() -> None:
     assert not replace(camera, phi=900.0).to_opencv().fisheye
 
 
+def test_a_decentred_fisheye_is_what_comes_nearer() -> None:
+    """OpenCV's fisheye has no decentring: up to 60 degrees its rational model, which has, comes nearer."""
+    lens = make_lens("kannala-brandt", coefficients={"k1": 0.05, "k2": 0.01, "p1": 4e-3, "p2": -3e-3})
+    camera = Camera((1280, 960), 800.0, (640.0, 480.0), lens)
+    found = camera.to_opencv()
+    assert not found.fisheye and found.error_px[0] < camera.to_foreign("fisheye").error_px[0]
+
+
 @pytest.mark.parametrize("count", [12, 14])
 def test_thin_prisms_are_opencvs(count: int) -> None:
     k = np.array([-0.2, 0.05, 1e-3, -5e-4, 0.01, 0.02, 0.01, 0.0, 1e-3, 2e-4, -1e-3, 3e-4, 0.0, 0.0])[:count]

@@ -25,7 +25,7 @@ from ceres_cal.scene.foreign import (
     image_grid,
     lens_fitted,
 )
-from ceres_cal.scene.lens import KannalaBrandt, Lens
+from ceres_cal.scene.lens import Lens
 
 
 def _rows(values: ArrayLike, columns: int, name: str) -> Array:
@@ -280,9 +280,9 @@ class Camera:
 
     @property
     def opencv_models(self) -> tuple[str, ...]:
-        """Those of OpenCV's models that may come near it: its fisheye where our lens is that, or sees across."""
-        rays = self.rays(image_grid(self.image_size))
-        fisheye = self.lens.kind == KannalaBrandt.kind or bool(np.any(rays[:, 2] < _ACROSS))
+        """Those of OpenCV's models that may come near it: its fisheye where that is our lens, or sees across."""
+        is_one = ForeignCamera.coefficients_of(self.lens, FISHEYE) is not None
+        fisheye = is_one or bool(np.any(self.rays(image_grid(self.image_size))[:, 2] < _ACROSS))
         return (FISHEYE,) if fisheye else ("opencv5", "opencv8", "opencv12")
 
     @classmethod
