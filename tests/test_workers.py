@@ -25,6 +25,7 @@ from ceres_cal.observations.columns import FileRows, read_rows
 from ceres_cal.simulate import simulate
 from ceres_cal.solve import Progress, bulk, engines, shares
 
+dask = pytest.importorskip("dask", reason="Dask is an extra: pip install 'ceres-cal[dask]'")
 distributed = pytest.importorskip("distributed", reason="Dask is an extra: pip install 'ceres-cal[dask]'")
 
 
@@ -149,6 +150,15 @@ def test_no_scheduler_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
     assert "--scheduler nonsense://nowhere: no scheduler answers there" in capsys.readouterr().err
 
 
+def test_workers_are_seen_while_the_client_polls(cluster_client: Any) -> None:
+    """What the client remembers of its scheduler names no worker for a moment after each of its polls."""
+    often = dask.config.set({"distributed.client.scheduler-info-interval": "1ms"})
+    with often, distributed.Client(cluster_client.cluster.scheduler_address) as polling:
+        share: Any = "a share"
+        for _ in range(60):  # where its memory is asked, one in twelve finds no worker
+            engines.OnWorkers(polling, [share]).close()
+
+
 def _kept_by(client: Any) -> int:
     """Keys that workers hold once what was let go has gone."""
     for _ in range(50):
@@ -166,7 +176,7 @@ def test_workers_that_keep_nothing_are_lost_in_words(monkeypatch: pytest.MonkeyP
         scheduler = None
 
         def __getattr__(self, name: str) -> Callable[..., Any]:
-            answers = {"scheduler_info": {"workers": ["a"]}, "submit": self, "who_has": {}, "run": {}}
+            answers = {"nthreads": {"a": 1}, "submit": self, "who_has": {}, "run": {}}
             return lambda *_, **__: answers.get(name)
 
         key = "a"

@@ -86,7 +86,8 @@ class OnWorkers:
 
     def __init__(self, client: Any, shares: Sequence[Share]) -> None:
         self._client = client
-        workers = sorted(client.scheduler_info(n_workers=-1)["workers"])
+        # Not scheduler_info(): between its question and its answer the client's own poll may empty what it returns.
+        workers = sorted(client.nthreads())
         if not workers:
             raise SolutionError("the scheduler has no workers: start some with `dask worker ADDRESS`")
         groups = _groups_of(shares, len(workers))
