@@ -23,6 +23,7 @@ from ceres_cal.base.threads import available
 from ceres_cal.batch import Job, Outcome, read_plan, run_jobs
 from ceres_cal.batch.jobs import RESULTS, remember, remembered
 from ceres_cal.cli import main
+from ceres_cal.cli.outputs import finishing
 from ceres_cal.diagnostics.held_out import cross_validate
 from ceres_cal.observations import Observations
 from ceres_cal.scene.heights import ROBOT_TOP_M
@@ -223,6 +224,29 @@ def test_ctrl_c_leaves_what_is_done_and_no_process(tmp_path: Path) -> None:
             break
         time.sleep(0.1)
     assert alive == []
+
+
+def _writing(folder: Path) -> None:
+    """What is interrupted while it writes, and would go on for long."""
+    with finishing():
+        (folder / "begun").touch()
+        time.sleep(0.3)
+    time.sleep(5.0)
+    (folder / "ended").touch()
+
+
+def test_what_is_interrupted_while_it_writes_ends(tmp_path: Path) -> None:
+    def interrupted() -> None:
+        with processes(2) as executor:
+            assert executor is not None
+            executor.submit(_writing, tmp_path)
+            while not (tmp_path / "begun").exists():
+                time.sleep(0.01)
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert not (tmp_path / "ended").exists()
 
 
 def test_one_process_is_none() -> None:

@@ -12,6 +12,7 @@ from ceres_cal.base.errors import InputError
 from ceres_cal.base.threads import share_cores
 
 _T = TypeVar("_T")
+_ASKED_AGAIN_S = 0.1
 
 
 def each(function: Callable[..., _T], *items: Iterable[Any], executor: Executor | None = None) -> Iterator[_T]:
@@ -50,7 +51,9 @@ def processes(jobs: int) -> Iterator[Executor | None]:
         yield pool
     except BaseException:
         for child in set(multiprocessing.active_children()) - before:
-            child.terminate()  # what waits fails with them; to cancel it besides makes Python 3.11 complain
+            while child.is_alive():  # what writes its results does not hear the first time
+                child.terminate()  # what waits fails with them; to cancel it besides makes Python 3.11 complain
+                child.join(_ASKED_AGAIN_S)
         raise
     finally:
         pool.shutdown()
