@@ -103,5 +103,11 @@ def intrinsics_rows(n: int, optics: Optics, image: Any, work: Any, jacobian: Any
     if skew != 0.0:
         for k in range(count):
             if not 1 <= k <= 3:
-                for i in range(n):
-                    jacobian[k, 0, i] += skew / aspect * jacobian[k, 1, i]
+                _lean(n, skew / aspect, jacobian[k, 0], jacobian[k, 1])
+
+
+@borrowing
+def _lean(n: int, factor: float, x: Any, y: Any) -> None:
+    """x += factor times y."""
+    for i in range(n):
+        x[i] += factor * y[i]

@@ -10,14 +10,32 @@ from typing import Any
 from ceres_cal.kernels.arguments import Loss
 from ceres_cal.kernels.jit import borrowing
 from ceres_cal.kernels.losses import bend
+from ceres_cal.kernels.workspace import Workspace
 
 _FLAT, _MOSTLY_FLAT = 0.7, 0.5  # a bend; share of a chunk beyond which it says nothing of where the minimum lies
 
 
 @borrowing
-def add_products(n: int, count: int, panel: Any, products: Any) -> None:
-    """products += P P^T over the panel's first n columns, lower triangle; four rows by three, to read each one less.
-    (Of more sums at once than the processor has registers for each takes longer.)
+def product_of(n: int, x: Any, y: Any, product: Any) -> None:
+    """x times y, number by number: whole rows, for SIMD needs plain indices."""
+    for i in range(n):
+        product[i] = x[i] * y[i]
+
+
+@borrowing
+def add_products(n: int, count: int, space: Workspace, normal: Any) -> None:
+    """normal += P P^T over the panel's first n columns, lower triangle."""
+    panel, products, places = space.panel, space.products, space.places
+    _multiply(n, count, panel, products)
+    for k in range(count):
+        for j in range(k + 1):
+            normal[places[k], places[j]] += products[k, j]
+
+
+@borrowing
+def _multiply(n: int, count: int, panel: Any, products: Any) -> None:
+    """products = P P^T, lower triangle; four rows by three, to read each one less. (Of more sums at once than the
+    processor has registers for each takes longer.)
 
     Both have room for three rows more.
     """
@@ -40,18 +58,10 @@ def add_products(n: int, count: int, panel: Any, products: Any) -> None:
                 s30 += d * x
                 s31 += d * y
                 s32 += d * z
-            products[k, j] += s00
-            products[k, j + 1] += s01
-            products[k, j + 2] += s02
-            products[k + 1, j] += s10
-            products[k + 1, j + 1] += s11
-            products[k + 1, j + 2] += s12
-            products[k + 2, j] += s20
-            products[k + 2, j + 1] += s21
-            products[k + 2, j + 2] += s22
-            products[k + 3, j] += s30
-            products[k + 3, j + 1] += s31
-            products[k + 3, j + 2] += s32
+            products[k, j], products[k, j + 1], products[k, j + 2] = s00, s01, s02
+            products[k + 1, j], products[k + 1, j + 1], products[k + 1, j + 2] = s10, s11, s12
+            products[k + 2, j], products[k + 2, j + 1], products[k + 2, j + 2] = s20, s21, s22
+            products[k + 3, j], products[k + 3, j + 1], products[k + 3, j + 2] = s30, s31, s32
 
 
 @borrowing
@@ -80,15 +90,19 @@ def bend_rows(n: int, components: int, loss: Loss, squared: Any, last: int, pane
 
 
 @borrowing
-def add_structure(i: int, n: int, components: int, slots: Any, pose: Any, places: Any, space: Any, normal: Any) -> None:
+def add_structure(
+    i: int, n: int, components: int, slots: Any, pose: Any, base: int, last: int, space: Workspace, normal: Any
+) -> None:
     """The share of the chunk's observation i in the rows of the structure numbers `slots` (-1: none) that move it.
 
     Moving the target along one of the workspace's directions, a slot each, moves the point by R times it in the camera
-    frame: the pose's translation rows of the panel say what that does. Structure numbers stand between the free
-    intrinsics and the pose.
+    frame: the pose's translation rows of the panel say what that does.
+
+    Args:
+        base: where the structure numbers begin, between the free intrinsics and the pose. last: the residual's row.
     """
-    panel, directions, columns = space.panel, space.directions, space.columns
-    base, translation = len(places) - 7, len(places) - 4
+    panel, directions, columns, places = space.panel, space.directions, space.columns, space.places
+    translation = last - 3
     for a in range(len(slots)):
         if slots[a] < 0:
             continue
@@ -99,7 +113,7 @@ def add_structure(i: int, n: int, components: int, slots: Any, pose: Any, places
                 for k in range(3):
                     turned += pose[j, k] * directions[a, k]
                 columns[a, c] += panel[translation + j, c * n + i] * turned
-        for k in range(len(places)):
+        for k in range(last + 1):
             value = 0.0
             for c in range(components):
                 value += columns[a, c] * panel[k, c * n + i]

@@ -14,10 +14,10 @@ from ceres_cal.kernels.arguments import BUILT, CurveColumns, Loss, Optics, Point
 from ceres_cal.kernels.jit import borrowing, jit
 from ceres_cal.kernels.lenses import distort, intrinsics_rows, prepared
 from ceres_cal.kernels.losses import robust_loss
-from ceres_cal.kernels.panel import add_products, add_structure, bend_rows
+from ceres_cal.kernels.panel import add_products, add_structure, bend_rows, product_of
 from ceres_cal.kernels.workspace import CHUNK, Workspace, working_space
 
-_POSE_ALONE = 7  # rows: nothing of the camera is free
+_OF_POSE = 7  # rows, with the residual's
 _FOOT_STEPS = 30
 _FOOT_TOLERANCE_PX = 1e-9
 
@@ -149,20 +149,43 @@ def order_of_rows(unknowns: Unknowns, intrinsics: int) -> Order:
 
 
 @borrowing
+def _rows_shown(n: int, optics: Optics, order: Order, space: Workspace) -> int:
+    """The chunk's Jacobian, and its rows that take part: the residual's number among them. What the chunk shows nothing
+    of, most of a lens that has its numbers place by place, is left out.
+    """
+    free, rows, places = len(order.rows) - _OF_POSE, space.rows, space.places
+    jacobian_rows(n, optics, space, free == 0)
+    count = 0
+    for k in range(len(order.rows)):
+        if k >= free or _shows(n, space.jacobian[order.rows[k]]):
+            rows[count], places[count] = order.rows[k], order.places[k]
+            count += 1
+    return count - 1
+
+
+@borrowing
+def _shows(n: int, row: Any) -> bool:
+    for c in range(2):
+        for i in range(n):
+            if row[c, i] != 0.0:
+                return True
+    return False
+
+
+@borrowing
 def _add_points(
     sight: int, optics: Optics, pose: Any, points: PointColumns, loss: Loss, newton: bool, order: Order,
     normal: Any, space: Workspace,
 ) -> float:  # fmt: skip
     """Sum of rho over the point observations, NaN where one cannot be projected; their share of `normal`."""
-    rows, intrinsics = order.rows, optics.intrinsics
-    pixels, weights = points.pixels, points.weights
-    image, jacobian, panel = space.image, space.jacobian, space.panel
-    last = len(rows) - 1
+    intrinsics, pixels, weights = optics.intrinsics, points.pixels, points.weights
+    image, jacobian, panel, rows = space.image, space.jacobian, space.panel, space.rows
     cost = 0.0
     for start in range(points.bounds[sight], points.bounds[sight + 1], CHUNK):
         n = min(CHUNK, points.bounds[sight + 1] - start)
         if not shown_points(n, start, optics, pose, points, space):
             return np.nan
+        last = _rows_shown(n, optics, order, space)
         error_x, error_y, factor, squared = panel[last, :n], panel[last, n : 2 * n], space.local[0], space.local[1]
         for i in range(n):
             w = weights[start + i]
@@ -174,14 +197,13 @@ def _add_points(
             root = np.sqrt(slope)
             error_x[i], error_y[i] = root * dx, root * dy
             factor[i] = root * w
-        jacobian_rows(n, optics, space, len(rows) <= _POSE_ALONE)
         for k in range(last):
-            own, x, y = jacobian[rows[k]], panel[k, :n], panel[k, n : 2 * n]  # whole rows: SIMD needs plain indices
-            for i in range(n):
-                x[i], y[i] = factor[i] * own[0, i], factor[i] * own[1, i]
+            own = jacobian[rows[k]]
+            product_of(n, factor, own[0], panel[k])
+            product_of(n, factor, own[1], panel[k, n:])
         if newton:
             bend_rows(n, 2, loss, squared, last, panel)
-        add_products(2 * n, len(rows), panel, space.products)
+        add_products(2 * n, last + 1, space, normal)
         if len(points.slots) > 0:
             directions = space.directions
             directions[:] = 0.0
@@ -190,7 +212,7 @@ def _add_points(
                 for k in range(BUILT - 2):
                     directions[2 + k, 2] = points.bends[start + i, k]
                 slots = points.slots[start + i]
-                add_structure(i, n, 2, slots, pose, order.places, space, normal)
+                add_structure(i, n, 2, slots, pose, len(order.rows) - _OF_POSE, last, space, normal)
     return cost
 
 
@@ -217,14 +239,14 @@ def _add_curves(
 
     By the envelope theorem its derivative is that of the projected foot with s held, along the normal.
     """
-    rows, weights, track = order.rows, curves.weights, curves.track
+    rows, weights, track = space.rows, curves.weights, curves.track
     local, foot, jacobian, panel = space.local, space.foot, space.jacobian, space.panel
-    last = len(rows) - 1
     cost = 0.0
     for start in range(curves.bounds[sight], curves.bounds[sight + 1], CHUNK):
         n = min(CHUNK, curves.bounds[sight + 1] - start)
         if not move_to_feet(n, start, optics, pose, curves, space):
             return np.nan
+        last = _rows_shown(n, optics, order, space)
         for i in range(n):
             length = np.sqrt(foot[7, i])
             nx, ny = -foot[1, i] / length, foot[0, i] / length
@@ -235,14 +257,13 @@ def _add_curves(
             root = np.sqrt(slope)
             panel[last, i] = root * e
             local[0, i], local[1, i] = root * weights[start + i] * nx, root * weights[start + i] * ny
-        jacobian_rows(n, optics, space, len(rows) <= _POSE_ALONE)
         for k in range(last):
             own, x = jacobian[rows[k]], panel[k]
             for i in range(n):
                 x[i] = local[0, i] * own[0, i] + local[1, i] * own[1, i]
         if newton:
             bend_rows(n, 1, loss, local[2], last, panel)
-        add_products(n, len(rows), panel, space.products)
+        add_products(n, last + 1, space, normal)
         if len(curves.slots) > 0:
             directions = space.directions
             directions[:] = 0.0
@@ -250,7 +271,7 @@ def _add_curves(
             for i in range(n):
                 k = track[start + i]
                 curve_directions(i, k, curves, space.tangents, directions)
-                add_structure(i, n, 1, curves.slots[k], pose, order.places, space, normal)
+                add_structure(i, n, 1, curves.slots[k], pose, len(order.rows) - _OF_POSE, last, space, normal)
     return cost
 
 
@@ -266,17 +287,12 @@ def normal_equations(
         newton: whether A takes rho'' along, for a step, or rho' alone, as the weight that each observation has.
         order: see `order_of_rows`; structure numbers come after the intrinsics, before the pose.
     """
-    products, rows, places = space.products, order.rows, order.places
-    products[:] = 0.0
     normal[:] = 0.0
     cost = 0.0
     if points.bounds[sight + 1] > points.bounds[sight]:
         cost += _add_points(sight, optics, pose, points, loss, newton, order, normal, space)
     if curves.bounds[sight + 1] > curves.bounds[sight]:
         cost += _add_curves(sight, optics, pose, curves, loss, newton, order, normal, space)
-    for k in range(len(rows)):
-        for j in range(k + 1):
-            normal[places[k], places[j]] += products[k, j]
     return cost
 
 

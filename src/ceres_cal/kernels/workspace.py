@@ -19,6 +19,7 @@ class Workspace(NamedTuple):
         jacobian: (intrinsics + 6, 2, n) rows phi, aspect, cx, cy, coefficients, skew, pose; x and y
             components.
         panel: (rows + 3, 2 n) the weighted rows, see `panel`. products: (rows + 3,) squared, of those rows.
+        rows, places: (rows,) which ones these are, and where they stand in the normal equations, see `sight.Order`.
         local, rotated, rays: (3, n) the point X in its frame, R X, and R X + t.
         image (8, n): the offset (ox, oy) from the principal point on square pixels, its derivatives xx, xy, yy with
             respect to the ray's x and y, and xz, yz with respect to its z; yx - xy.
@@ -31,6 +32,8 @@ class Workspace(NamedTuple):
     jacobian: Any
     panel: Any
     products: Any
+    rows: Any
+    places: Any
     local: Any
     rotated: Any
     rays: Any
@@ -50,6 +53,8 @@ def working_space(optics: Optics, rows: int) -> Workspace:
         np.empty((len(optics.intrinsics) + 6, 2, CHUNK)),
         np.zeros((rows + 3, 2 * CHUNK)),
         np.empty((rows + 3, rows + 3)),
+        np.empty(rows, np.int64),
+        np.empty(rows, np.int64),
         scratch[:3],
         scratch[3:6],
         scratch[6:9],

@@ -159,13 +159,14 @@ def _shorter(tried: Sequence[Candidate], best: Candidate | None) -> list[Candida
 
 
 def _among(seen: Seen, share: float, as_good: float, start: Start, kinds: Sequence[Kind]) -> Comparison:
-    """The paper's lens and the longest of each kind come first: only where the paper's is not as good as the best of
-    them are the shorter ones looked at.
+    """The paper's lens, where it gives an answer, and the longest of each kind come first: only where it is not as good
+    as the best of them are the shorter ones looked at.
     """
     tried = [one for kind in kinds for one in kind.candidates(first=True)]
     found: Comparison | None = None
-    with suppress(DegenerateError):  # all of these fold, which shorter ones need not
-        found = _compared(seen, share, as_good, start, tried)
+    if any(one.form.label == PAPER and one.squares is not None for one in tried):
+        with suppress(DegenerateError):  # all of these fold, which shorter ones need not
+            found = _compared(seen, share, as_good, start, tried)
     if found is None:
         found = _compared(seen, share, as_good, start, [*tried, *_shorter(tried, None)])
     elif found.chosen.form.label != PAPER:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cache
+from typing import Any
 
 import numpy as np
 
@@ -103,9 +104,10 @@ class Form:
         chosen = options.lens, options.powers, options.coefficients, options.terms
         return cls(*chosen, names, label_of(options), size_of(options), options.blank_lens)
 
-    def of(self, options: Options) -> Options:
-        """The options with this lens."""
-        return replace(options, lens=self.lens, powers=self.powers, coefficients=self.coefficients, terms=self.terms)
+    def of(self, options: Options, **more: Any) -> Options:
+        """The options with this lens, and others of them changed."""
+        more |= {"lens": self.lens, "powers": self.powers, "coefficients": self.coefficients, "terms": self.terms}
+        return replace(options, **more)
 
 
 @cache

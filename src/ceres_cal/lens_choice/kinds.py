@@ -22,6 +22,7 @@ from ceres_cal.solve.left_out import GroupNormals
 # the paper's is missed more often, and seams in a carpet are decentring; at 0.001, by a scatter that one group could
 # swell, halves of real sets took a lens too simple.
 _REFUTED = 0.003
+_NO_NOISE = 1e-12  # mean square that rounding leaves of exact observations, or less
 _UNSEEN_GROUPS = 10.0  # so many that scatter as the noise has it stand beside those that were seen: a dozen vary
 
 
@@ -72,6 +73,16 @@ class Kind:
         return dict(zip(keys, (-values_of(self.estimate, keys)).tolist(), strict=True))
 
     @cached_property
+    def noise(self) -> float:
+        """Mean square of what it leaves, over the stated noise: 1 at most, for a first solve with another lens may have
+        left more.
+        """
+        if self.normals is None:
+            return 1.0
+        spare = float(self.normals.counts.sum() - len(self.normals.keys))
+        return min(1.0, max(self.least / max(spare, 1.0), _NO_NOISE))
+
+    @cached_property
     def scatter(self) -> float:
         """Mean of the variances of its coefficients as groups scatter, over those by the stated noise; at least what
         noise alone makes of it, and the nearer to that the fewer groups there are.
@@ -80,10 +91,9 @@ class Kind:
             return 1.0
         names = set(self.forms[0].names)
         own = [i for i, key in enumerate(self.normals.keys) if key.kind == "camera" and key.quantity in names]
-        groups, spare = len(self.normals.counts), self.normals.counts.sum() - len(self.normals.keys)
-        noise = min(1.0, self.least / max(float(spare), 1.0))  # a first solve with another lens may have left more
-        more = self.normals.scatter_of(np.array(own)) - noise
-        return noise + max(0.0, more) * groups / (groups + _UNSEEN_GROUPS)
+        groups = len(self.normals.counts)
+        more = self.normals.scatter_of(np.array(own)) - self.noise
+        return self.noise + max(0.0, more) * groups / (groups + _UNSEEN_GROUPS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,8 +118,10 @@ class Candidate:
         more = self.form.size - other.form.size
         if more <= 0 or self.squares is None:
             return False
-        known = len(self.squares) + _UNSEEN_GROUPS
-        return upper_tail((other.least - self.least) / self.of.scatter, more, known) < _REFUTED
+        left, known = other.least - self.least, len(self.squares) + _UNSEEN_GROUPS
+        # Seldom does it leave more than the noise alone explains, which takes less to know.
+        by_noise = upper_tail(left / self.of.noise, more, known) < _REFUTED
+        return by_noise and upper_tail(left / self.of.scatter, more, known) < _REFUTED
 
     def may_win(self, best: Candidate | None) -> bool:
         """Whether it is the longest of a kind whose shorter ones may be as good as the best."""

@@ -77,7 +77,7 @@ class Seen:
 
     def kind(self, forms: tuple[Form, ...], *, is_solved: bool) -> Kind:
         """A kind near its best, and the normal equations of each group there; `is_solved`: the one that was solved."""
-        options = replace(forms[0].of(self.options), max_iterations=_MOST_STEPS)
+        options = forms[0].of(self.options, max_iterations=_MOST_STEPS)
         estimate = self.end.solution.estimate
         try:
             problem = self._problem(options, estimate)
@@ -123,7 +123,7 @@ class Seen:
             points, curves = self.in_sigmas(candidate.estimate)
             if np.sum(points**2) + curves @ curves <= _KEPT * candidate.least:
                 return candidate.estimate
-            options = replace(candidate.form.of(self.options), max_iterations=_MOST_STEPS)
+            options = candidate.form.of(self.options, max_iterations=_MOST_STEPS)
             problem = self._problem(options, candidate.estimate)
             solution = solve(problem, candidate.estimate, precision=_PRECISION)
             return solution.estimate if 2.0 * solution.cost <= _KEPT * candidate.least else None

@@ -142,7 +142,7 @@ class Options:
     def blank_lens(self) -> Lens:
         """The chosen lens with its fixed coefficients; the others are 0."""
         lens = self._unset
-        return lens.with_values([self.fixed.get(name, 0.0) for name in lens.names])
+        return lens.with_values([self.fixed.get(name, 0.0) for name in lens.names]) if self.fixed else lens
 
     def with_first_power(self, views: int) -> Options:
         """These options with an aspect and a skew, what displaces by the first power, of a lens whose powers are left

@@ -7,6 +7,7 @@ x_cam = R (x_world - t) with t the camera's position (paper, section 3).
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -114,11 +115,7 @@ class Camera:
     @property
     def _edge(self) -> Array:
         """(N, 2) offsets of places along the image's edge, its corners among them."""
-        along = np.linspace(-0.5, 0.5, _ALONG_AN_EDGE + 1)
-        ends = [np.full_like(along, end) for end in (-0.5, 0.5)]
-        sides = [np.column_stack(one) for end in ends for one in ((along, end), (end, along))]
-        size = np.array(self.image_size)
-        return self.offsets(np.vstack(sides) * size + 0.5 * (size - 1.0))
+        return self.offsets(_edge(self.image_size))
 
     @property
     def folds(self) -> bool:
@@ -311,3 +308,13 @@ class Camera:
 def in_image(pixels: Array, image_size: tuple[int, int]) -> Mask:
     """(N,) whether pixels (N, 2) lie within half a pixel of one of the image's; False for NaN."""
     return np.asarray(np.all((pixels >= -0.5) & (pixels <= np.array(image_size) - 0.5), axis=-1))
+
+
+@lru_cache(maxsize=64)
+def _edge(image_size: tuple[int, int]) -> Array:
+    """(N, 2) places along an image's edge, px."""
+    along = np.linspace(-0.5, 0.5, _ALONG_AN_EDGE + 1)
+    ends = [np.full_like(along, end) for end in (-0.5, 0.5)]
+    sides = [np.column_stack(one) for end in ends for one in ((along, end), (end, along))]
+    size = np.array(image_size)
+    return np.asarray(np.vstack(sides) * size + 0.5 * (size - 1.0))

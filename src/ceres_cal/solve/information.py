@@ -194,12 +194,7 @@ class _Sums:
         batch = max(1, _BATCH // size**2)
         for first in range(0, len(sights), batch):
             last = min(first + batch, len(sights))
-            parts = [
-                first + place
-                for place in parts_of(last - first, len(sights.points) + len(sights.curve_pixels), NORMAL_NS)
-            ]
-            normals = {kind: _joined(run_parts(one.of, parts))[:, :-1, :-1] for kind, one in kernel_of.items()}
-            yield poses[first:last], normals
+            yield poses[first:last], {kind: one.of(first, last)[:, :-1, :-1] for kind, one in kernel_of.items()}
 
     def _eliminate(self, sights: Sights) -> Eliminated:
         """The private placements of one station; what is left of their sights is added to the sums."""
@@ -249,10 +244,6 @@ class _Sums:
             self._matrices[kind][np.ix_(everywhere, everywhere)] += steps.T @ normal @ steps
 
 
-def _joined(parts: list[Array]) -> Array:
-    return parts[0] if len(parts) == 1 else np.concatenate(parts)
-
-
 def _limits(own: Array) -> Array:
     """(S, 6) sigmas beyond which a placement's number is unknown: what remains of a turn about the middle of rings, in
     sums over all of their rows, is rounding of its other turns.
@@ -272,6 +263,7 @@ class _Normals:
         units = np.ones(len(free) + offsets + 7)
         units[: len(free)] = intrinsics_scales(camera)[free]
         self._size, self._chain = len(units), structure.chain(len(free), 7)
+        self._rows = (len(sights.points) + len(sights.curve_pixels)) / len(sights)
         self._arguments = (
             camera_optics(camera),
             kernels.Unknowns(free, offsets),
@@ -289,7 +281,11 @@ class _Normals:
             SolutionError: an observation cannot be projected.
         """
         normals = np.empty((last - first, self._size, self._size))
-        if not kernels.sight_normals(first, last, *self._arguments, normals):
+
+        def part(begin: int, end: int) -> bool:
+            return kernels.sight_normals(first + begin, first + end, *self._arguments, normals[begin:end])
+
+        if not all(run_parts(part, parts_of(last - first, int(self._rows * (last - first)), NORMAL_NS))):
             raise SolutionError(
                 "an observation cannot be projected where the solve ended: no uncertainty can be given: choose another "
                 "lens (for wide ones kannala-brandt or spline), free what is held of this one, or leave out what lies "

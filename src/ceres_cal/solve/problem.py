@@ -101,9 +101,10 @@ class Problem:
     def _smooth_at(self, estimate: Estimate) -> Iterator[GaussianPrior]:
         """What its smoothness says of each lens, where no posterior says so already."""
         for name, camera in estimate.cameras.items():
+            if not (forms := camera.lens.roughness):
+                continue
             keys = {key.quantity: key for key in intrinsic_keys(name, camera.lens)}
             free = {key for number, key in enumerate(keys.values()) if number in self.layout.free[name]}
-            forms = camera.lens.roughness
             sigmas = self.smoothness.get(name, tuple(form.loose for form in forms))
             for form, sigma in zip(forms, sigmas, strict=True):
                 own = tuple(keys[quantity] for quantity in form.names)

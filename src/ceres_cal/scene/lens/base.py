@@ -13,7 +13,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, lru_cache
 from types import MappingProxyType
 from typing import Any, ClassVar, TypeVar
 
@@ -333,8 +333,13 @@ def make_lens(
     given = dict(coefficients or {})
     model = lens_class(kind)
     named = {term for term, names in model.more_terms.items() if {*names} & {*given}}
-    blank = model.blank(powers).with_terms({*terms, *named})
+    blank = _blank(model, tuple(powers), frozenset({*terms, *named}))
     for name in given:
         if name not in blank.names:
             raise InputError(f"lens {kind!r} has no coefficient {name!r}: it has {', '.join(blank.names)}")
-    return blank.with_values([given.get(name, 0.0) for name in blank.names])
+    return blank.with_values([given.get(name, 0.0) for name in blank.names]) if given else blank
+
+
+@lru_cache(maxsize=64)
+def _blank(model: type[Lens], powers: tuple[int, ...], terms: frozenset[str]) -> Lens:
+    return model.blank(powers).with_terms(terms)

@@ -120,7 +120,8 @@ class Decentred(Planar):
     below: ClassVar[tuple[str, ...]] = ()
 
     def _named(self, names: Sequence[str]) -> Array:
-        return np.array([self.coefficients.get(name, 0.0) for name in names])
+        known = self.coefficients
+        return np.array([known.get(name, 0.0) for name in names])
 
     @cached_property
     def _radial(self) -> Ratio:

@@ -50,9 +50,12 @@ def distort(n: int, intrinsics: Any, unit: float, state: Any, rays: Any, image: 
     phi = intrinsics[0]
     rim = intrinsics[4] if intrinsics[4] > 0.0 else 1.0
     scale = 2.0 * phi / (unit * rim)
+    per_scale, per_phi = 1.0 / scale, 1.0 / phi
     for i in range(n):
         x, y, z = rays[0, i], rays[1, i], rays[2, i]
-        s = scale / (np.sqrt(x * x + y * y + z * z) + z)
+        length = np.sqrt(x * x + y * y + z * z)
+        s = scale / (length + z)
+        work[2 * MOST + 5, i], work[2 * MOST + 6, i] = length, s
         work[0, i], work[1, i] = s * x, s * y
         work[2, i] = np.sqrt(work[0, i] * work[0, i] + work[1, i] * work[1, i])
     _add_conrady(n, intrinsics, int(state[3]), work, image)
@@ -69,16 +72,16 @@ def distort(n: int, intrinsics: Any, unit: float, state: Any, rays: Any, image: 
     for i in range(n):
         x, y, z = rays[0, i], rays[1, i], rays[2, i]
         u, v, radius, slope = work[0, i], work[1, i], work[2, i], image[6, i]
-        stretch = image[5, i] / (radius + TINY)
-        bend = (slope - stretch) / (radius * radius + TINY)
+        length, s = work[2 * MOST + 5, i], work[2 * MOST + 6, i]
+        per_radius, per_length = 1.0 / (radius + TINY), 1.0 / length
+        stretch = image[5, i] * per_radius
+        bend = (slope - stretch) * per_radius * per_radius
         # Derivatives by q (rows 2, 3) and by its conjugate (rows 4, 5) become those by x and y.
         first_x, first_y = image[2, i] + image[4, i], image[3, i] + image[7, i]
         second_x, second_y = image[2, i] - image[4, i], image[3, i] - image[7, i]
         jxx, jyy = rim + stretch + bend * u * u + first_x, rim + stretch + bend * v * v + second_x
         jxy, jyx = bend * u * v - second_y, bend * u * v + first_y
-        length = np.sqrt(x * x + y * y + z * z)
-        s = scale / (length + z)
-        f = s / (length * (length + z))
+        f = s * s * per_scale * per_length
         ax, ab, by = s - f * x * x, -f * x * y, s - f * y * y
         image[0, i] = unit * ((rim + stretch) * u + image[0, i])
         image[1, i] = unit * ((rim + stretch) * v + image[1, i])
@@ -86,8 +89,8 @@ def distort(n: int, intrinsics: Any, unit: float, state: Any, rays: Any, image: 
         image[2, i], image[3, i], image[4, i] = unit * (jxx * ax + jxy * ab), xy, unit * (jyx * ab + jyy * by)
         image[7, i] = unit * (jyx * ax + jyy * ab) - xy
         along_x, along_y = unit * (jxx * u + jxy * v), unit * (jyx * u + jyy * v)
-        image[5, i], image[6, i] = -along_x / length, -along_y / length
-        work[2 * MOST + 5, i], work[2 * MOST + 6, i] = along_x / phi, along_y / phi
+        image[5, i], image[6, i] = -along_x * per_length, -along_y * per_length
+        work[2 * MOST + 5, i], work[2 * MOST + 6, i] = along_x * per_phi, along_y * per_phi
         good &= (length + z > 1e-9 * length) & (radius < limit) & (jxx * jyy > jxy * jyx) & (jxx + jyy > 0.0)
     return good
 
@@ -212,17 +215,17 @@ def _raise_powers(n: int, most: int, work: Any) -> None:
 def _add_monomial(n: int, intrinsics: Any, at: int, m: int, p: int, work: Any, image: Any) -> None:
     """c q^m conj(q)^p in the same way."""
     real, imaginary = intrinsics[at], intrinsics[at + 1]
-    before, under = max(m - 1, 0), max(p - 1, 0)
+    _add_product(n, real, imaginary, m, p, work, image[0], image[1])
+    if m > 0:
+        _add_product(n, m * real, m * imaginary, m - 1, p, work, image[2], image[3])
+    if p > 0:
+        _add_product(n, p * real, p * imaginary, m, p - 1, work, image[4], image[7])
+
+
+def _add_product(n: int, real: float, imaginary: float, m: int, p: int, work: Any, along: Any, across: Any) -> None:
+    """The same of one pair of rows: of fewer rows the compiler sees that they are not each other's."""
     for i in range(n):
         a, b, c, d = work[3 + 2 * m, i], work[4 + 2 * m, i], work[3 + 2 * p, i], work[4 + 2 * p, i]
         x, y = a * c + b * d, b * c - a * d
-        image[0, i] += real * x - imaginary * y
-        image[1, i] += real * y + imaginary * x
-        e, f = m * work[3 + 2 * before, i], m * work[4 + 2 * before, i]
-        x, y = e * c + f * d, f * c - e * d
-        image[2, i] += real * x - imaginary * y
-        image[3, i] += real * y + imaginary * x
-        e, f = p * work[3 + 2 * under, i], p * work[4 + 2 * under, i]
-        x, y = a * e + b * f, b * e - a * f
-        image[4, i] += real * x - imaginary * y
-        image[7, i] += real * y + imaginary * x
+        along[i] += real * x - imaginary * y
+        across[i] += real * y + imaginary * x
