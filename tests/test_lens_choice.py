@@ -37,7 +37,7 @@ from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights, gather_sights
 from ceres_cal.photographs import detect_field
 from ceres_cal.scene.camera import in_image
-from ceres_cal.scene.lens import KannalaBrandt
+from ceres_cal.scene.lens import LENSES, KannalaBrandt
 from ceres_cal.scene.targets import ssl_field
 from ceres_cal.simulate import Disturbance, simulate
 from ceres_cal.solve import Solution, solve
@@ -149,8 +149,29 @@ def test_a_lens_that_was_not_chosen_is_named(monkeypatch: pytest.MonkeyPatch) ->
 
     monkeypatch.setattr(calibrating, "_of_lens", broken)
     calibration = calibrate(seen)
-    assert label_of(calibration.options) == PAPER
-    assert [one for one in calibration.warnings if "radial 2,3, which was taken, predicts" in one]
+    label = label_of(calibration.options)
+    assert not label.startswith("kannala-brandt")
+    assert [one for one in calibration.warnings if f"{label}, which was taken, predicts" in one]
+    choice = calibration.lens_choice
+    assert choice is not None and choice.chosen == choice.tried[0].label == label
+    of_kind = [one for one in choice.tried if one.label.startswith("kannala-brandt")]
+    assert of_kind and all(one.failed == "no camera" for one in of_kind)
+    rms = {one.label: one.rms_px for one in choice.tried}
+    assert rms[label] < rms[PAPER]  # the best of what is left
+
+
+def test_where_no_lens_makes_a_calibration_the_papers_is_the_last(monkeypatch: pytest.MonkeyPatch) -> None:
+    """After every other kind; what it says is said."""
+    seen, asked = _seen("radial-2-3", "boards"), list[str]()
+
+    def broken(start: Start, seen: Observations, sights: Sights, options: Options, watched: Watched) -> Calibration:
+        asked.append(label_of(options))
+        raise SolutionError(f"no camera with {asked[-1]}")
+
+    monkeypatch.setattr(calibrating, "_of_lens", broken)
+    with pytest.raises(SolutionError, match=f"no camera with {PAPER}"):
+        calibrate(seen)
+    assert asked[0] == asked[-1] == PAPER and len(asked) <= len(LENSES)  # once near, once from nothing
 
 
 def test_groups_scatter_as_the_noise_has_it_or_more() -> None:

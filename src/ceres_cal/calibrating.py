@@ -147,11 +147,7 @@ def _of_any_lens(observations: Observations, sights: Sights, options: Options, w
         return _of_lens(one.start, observations, sights, one.options, watched)
 
     chosen = choose_lens(observations, options, start)
-    try:
-        calibration = solved(chosen)
-    except CalibrationError as error:  # of all observations, not of those that took part in the choice
-        chosen = chosen.without(str(error), papers(options), start)
-        calibration = solved(chosen)
+    calibration, chosen = chosen.first_solved(solved, papers(options), start)
     with suppress(CalibrationError):  # the first one stays
         while other := chosen.instead(*calibration.outlier_masks(observations)):
             calibration, chosen = solved(other), other

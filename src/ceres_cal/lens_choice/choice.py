@@ -8,10 +8,11 @@ predict the others no better: a criterion that counts observations would take th
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from typing import TypeVar
 
 import numpy as np
 
@@ -31,6 +32,7 @@ from ceres_cal.observations import Observations
 from ceres_cal.start.initialise import Start
 from ceres_cal.uncertainty.other_lenses import OtherLenses
 
+_T = TypeVar("_T")
 _BROKEN = "solved for, it leaves more than the equations of a longer lens had it"
 _EXPLAINED = "takes out observations that another lens explains"
 _LEAST_PROBABILITY = 0.02  # of another lens that counts: all that have less make no difference
@@ -50,8 +52,29 @@ class Chosen:
     choice: LensChoice
     among: Comparison | None = None
 
-    def without(self, failure: str, options: Options, start: Start) -> Chosen:
-        """The paper's lens in its place, where all of the observations make no calibration with it."""
+    def first_solved(self, solved: Callable[[Chosen], _T], options: Options, start: Start) -> tuple[_T, Chosen]:
+        """What is solved with it, or where all of the observations make no calibration with it, with the best lens of
+        another kind, or with the paper's at last; and with which.
+
+        Args:
+            options: with the paper's lens. start: of everything.
+
+        Raises:
+            CalibrationError: none makes one.
+        """
+        try:
+            return solved(self), self
+        except CalibrationError as error:
+            if self.among is None:
+                raise
+            other = self._without(str(error), options, start)
+        return other.first_solved(solved, options, start)
+
+    def _without(self, failure: str, options: Options, start: Start) -> Chosen:
+        """The best lens of another kind, or the paper's from the start of everything."""
+        if self.among is not None:
+            with suppress(CalibrationError):
+                return self.among.without_kind(failure)
         failed = [replace(one, failed=failure) if one.label == self.choice.chosen else one for one in self.choice.tried]
         tried = sorted(failed, key=lambda one: one.label != PAPER)
         return Chosen(options, start, replace(self.choice, chosen=PAPER, tried=tuple(tried)))
@@ -129,13 +152,32 @@ class Comparison:
             return None
         if not explained_by_another(self.seen, self.tried, self.chosen, points, curves):
             return None
-        others = [replace(one, squares=None, failed=_EXPLAINED) if one is self.chosen else one for one in self.tried]
-        known = {one.form.label for one in others}
-        more = [one for one in _shorter(others, None) if one.form.label not in known]
-        try:
-            return _compared(self.seen, self.share, self.as_good, self.start, [*others, *more]).outcome
-        except CalibrationError:
-            return None
+        with suppress(CalibrationError):
+            return self._excluding(lambda one: one is self.chosen, _EXPLAINED).outcome
+        return None
+
+    def without_kind(self, failure: str) -> Chosen:
+        """The best of the other kinds; how much worse it predicts is said.
+
+        Raises:
+            DegenerateError: none gives an answer.
+        """
+        found = self._excluding(lambda one: one.of is self.chosen.of, failure)
+        choice, now, before = _choice(found), found.chosen.squares, self.chosen.squares
+        worse = 0.0 if now is None or before is None else standard_errors(now, before)
+        taken = replace(choice.tried[0], worse=worse if worse > self.as_good else 0.0)
+        return replace(found.outcome, choice=replace(choice, tried=(taken, *choice.tried[1:])))
+
+    def _excluding(self, is_out: Callable[[Candidate], bool], why: str) -> Comparison:
+        """Without some lenses, of which it is said why.
+
+        Raises:
+            DegenerateError: no other one gives an answer.
+        """
+        known = {one.form.label for one in self.tried}
+        every = [*self.tried, *(one for one in _shorter(self.tried, None) if one.form.label not in known)]
+        others = [replace(one, squares=None, failed=one.failed or why) if is_out(one) else one for one in every]
+        return _compared(self.seen, self.share, self.as_good, self.start, others)
 
 
 def choose_lens(observations: Observations, options: Options, start: Start) -> Chosen:

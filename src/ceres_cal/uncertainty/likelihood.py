@@ -111,8 +111,7 @@ def _independent(family: Family, squared: float) -> Likelihoods:
 def _of_shares(family: Family, at: _Eigenbasis, shares: Array, squared: float, place: _Place) -> Likelihoods:
     """The restricted likelihood at one place for some shares (A,)."""
     diagonal = 1.0 - shares[:, None, None] * (1.0 - at.values)
-    products = np.swapaxes(at.columns, 1, 2) @ (at.columns / diagonal[..., None])
-    logs, reduced, taken = _without_private(products, family.group)
+    logs, reduced, taken = _without_private(at.columns / np.sqrt(diagonal)[..., None], family.group)
     size, count = at.columns.shape[2] - 7, int(np.count_nonzero(family.filled))
     log, variance, freedom = _restricted(family, reduced, count - taken)
     parts = (1.0 - shares) * at.white.sum(), shares * np.sum(at.white * at.values)
@@ -139,23 +138,25 @@ def _impossible(family: Family, at: _Eigenbasis, shares: Array, squared: float, 
     return Likelihoods(number, smooth, length, shares, -np.inf * one, one, one, one)
 
 
-def _without_private(products: Array, group: Indices) -> tuple[Array, Array, int]:
-    """The private placement of each view eliminated from products (A, S, Z, Z): logarithms of the determinants (A,),
-    what is left over of all (A, P + 1, P + 1), and how many numbers were eliminated.
+def _without_private(columns: Array, group: Indices) -> tuple[Array, Array, int]:
+    """The private placement of each view eliminated from products of columns (A, S, M, Z): logarithms of the
+    determinants (A,), what is left over of all (A, P + 1, P + 1), and how many numbers were eliminated.
     """
+    count, size = len(columns), columns.shape[-1] - 6
+    shared = columns[..., 6:].reshape(count, -1, size)
+    rest = np.swapaxes(shared, 1, 2) @ shared
     views, view = np.unique(group, return_inverse=True)
-    whole = (np.arange(len(views))[:, None] == view).astype(float) @ products.reshape(*products.shape[:2], -1)
-    whole = whole.reshape(len(products), len(views), *products.shape[2:])
-    own, coupling, rest = whole[..., :6, :6], whole[..., :6, 6:], whole[..., 6:, 6:].sum(axis=1)
+    products = (np.swapaxes(columns[..., :6], 2, 3) @ columns).reshape(count, len(view), -1)
+    whole = ((np.arange(len(views))[:, None] == view).astype(float) @ products).reshape(count, -1, 6, 6 + size)
+    own, coupling = whole[..., :6], whole[..., 6:]
     there = np.diagonal(own, axis1=2, axis2=3) > 1e-9
     taken = int(np.count_nonzero(there[0]))
     if not taken:
-        return np.zeros(len(products)), rest, 0
+        return np.zeros(count), rest, 0
     own = np.where(there[..., :, None] & there[..., None, :], own, np.eye(6))
     coupling = np.where(there[..., :, None], coupling, 0.0)
-    size = coupling.shape[-1]
-    eliminated = np.linalg.solve(own, coupling).reshape(len(products), -1, size)
-    rest -= np.swapaxes(coupling.reshape(len(products), -1, size), 1, 2) @ eliminated
+    eliminated = np.linalg.solve(own, coupling).reshape(count, -1, size)
+    rest -= np.swapaxes(coupling.reshape(count, -1, size), 1, 2) @ eliminated
     return np.linalg.slogdet(own)[1].sum(axis=1), rest, taken
 
 
