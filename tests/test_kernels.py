@@ -619,6 +619,31 @@ def test_structure_knows_its_derivatives(lens: str) -> None:
     )
 
 
+def test_what_a_chunk_says_nothing_of_is_left_out_of_it_alone() -> None:
+    """A surface's nodes, each shown by few observations, beside the structure's numbers: summed up one by one, where
+    nearly all rows are left out, and at once.
+    """
+    camera, seen = looked_at("spline-surface")
+    seen, structure = everything_moves(seen)
+    points, curves = seen
+
+    def alone(one: Shown) -> Array:
+        return normal_equations(camera, one, structure=structure)[1]
+
+    parts = [take(seen, curves=slice(k, k + 1)) for k in range(len(curves.pixels))]
+    for k in range(len(points.pixels)):
+        own = slice(k, k + 1)
+        parts.append(with_points(take(seen, points=own), slots=points.slots[own], bends=points.bends[own]))
+    whole, total = alone(seen), np.sum([alone(part) for part in parts], axis=0)
+    size = np.sqrt(np.diag(total))
+    shown = size > 0.0
+    assert 0.1 < np.mean(shown) < 0.9
+    assert np.array_equal(shown, np.diag(whole) > 0.0)
+    close = np.abs(whole - total)[np.ix_(shown, shown)] / np.outer(size[shown], size[shown])
+    assert np.max(close) < 1e-8  # see above
+    assert all(np.count_nonzero(np.diag(alone(part))) < 80 for part in parts[::20])
+
+
 # ---- placements eliminated ------------------------------------------------------------------------------------------
 
 
