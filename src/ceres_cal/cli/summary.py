@@ -160,7 +160,7 @@ def _intrinsics(name: str, camera: Camera, options: Options, phi_from: str, qual
 def _coefficient(quality: Quality, camera: str, quantity: str, value: float) -> str:
     verdict = quality.verdicts.get(("camera", camera, quantity))
     if verdict is None:
-        return repr(value)
+        return f"{value:.8g}"
     shown = at_precision(value, verdict.sd)
     return f"{shown} ± {verdict.sd:.2g}" if np.isfinite(verdict.sd) else f"{shown}, unknown"
 
