@@ -20,8 +20,8 @@ from ceres_cal.base.arrays import Array, Indices, Indices32
 from ceres_cal.base.transforms import Pose, rotation_exp
 from ceres_cal.kernels import CurveColumns, Loss, PointColumns, Unknowns
 from ceres_cal.kernels.lenses import prepared
+from ceres_cal.kernels.panel import order_of_rows
 from ceres_cal.kernels.sight import normal_equations as sum_up
-from ceres_cal.kernels.sight import order_of_rows
 from ceres_cal.kernels.workspace import working_space
 from ceres_cal.model.parameters import intrinsic_names, intrinsics_vector, with_intrinsics
 from ceres_cal.model.residuals import camera_optics

@@ -13,7 +13,8 @@ import numpy as np
 from ceres_cal.kernels.arguments import ROUNDING, Blocks, CurveColumns, Loss, Optics, PointColumns, Unknowns
 from ceres_cal.kernels.jit import jit
 from ceres_cal.kernels.lenses import prepared
-from ceres_cal.kernels.sight import normal_equations, order_of_rows
+from ceres_cal.kernels.panel import order_of_rows
+from ceres_cal.kernels.sight import normal_equations
 from ceres_cal.kernels.workspace import working_space
 
 # Numbers from which on rounding in what the observations leave open adds up, and the share of the diagonal that is

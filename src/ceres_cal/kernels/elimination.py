@@ -15,7 +15,8 @@ from ceres_cal.kernels.arguments import CurveColumns, Loss, Optics, PointColumns
 from ceres_cal.kernels.block import rotation
 from ceres_cal.kernels.jit import borrowing, jit
 from ceres_cal.kernels.lenses import prepared
-from ceres_cal.kernels.sight import normal_equations, order_of_rows
+from ceres_cal.kernels.panel import order_of_rows
+from ceres_cal.kernels.sight import normal_equations
 from ceres_cal.kernels.workspace import working_space
 
 _MOST_STEPS = 50

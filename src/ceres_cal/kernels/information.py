@@ -9,7 +9,8 @@ import numpy as np
 from ceres_cal.kernels.arguments import CurveColumns, Loss, Optics, PointColumns, Unknowns
 from ceres_cal.kernels.jit import jit
 from ceres_cal.kernels.lenses import prepared
-from ceres_cal.kernels.sight import normal_equations, order_of_rows
+from ceres_cal.kernels.panel import order_of_rows
+from ceres_cal.kernels.sight import normal_equations
 from ceres_cal.kernels.workspace import working_space
 
 

@@ -1,18 +1,54 @@
 """The panel: a chunk's weighted Jacobian rows with the residual as the last one, column by column an observation.
 
-What `sight` does with it once it is filled: Newton's share of the loss, the products, the structure's share.
+Which numbers the rows are, and what `sight` does with it once it is filled: Newton's share of the loss, the products,
+the structure's share.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
-from ceres_cal.kernels.arguments import Loss
-from ceres_cal.kernels.jit import borrowing
+import numpy as np
+
+from ceres_cal.kernels.arguments import Loss, Unknowns
+from ceres_cal.kernels.jit import borrowing, jit
 from ceres_cal.kernels.losses import bend
 from ceres_cal.kernels.workspace import Workspace
 
 _FLAT, _MOSTLY_FLAT = 0.7, 0.5  # a bend; share of a chunk beyond which it says nothing of where the minimum lies
+
+
+class Order(NamedTuple):
+    """Which numbers take part: A is [free intrinsics | structure | 6 pose | residual].
+
+    Attributes:
+        rows: indices into [intrinsics | 6 pose | residual], the last one the residual's. places: their rows in A.
+    """
+
+    rows: Any
+    places: Any
+
+
+@jit
+def order_of_rows(unknowns: Unknowns, intrinsics: int) -> Order:
+    """The order of some unknowns of so many intrinsics."""
+    count = len(unknowns.free)
+    rows, places = np.empty(count + 7, np.int64), np.empty(count + 7, np.int64)
+    rows[:count] = unknowns.free
+    rows[count:] = np.arange(intrinsics, intrinsics + 7)
+    places[:count] = np.arange(count)
+    places[count:] = np.arange(count + unknowns.structure, count + unknowns.structure + 7)
+    return Order(rows, places)
+
+
+@borrowing
+def shows(n: int, row: Any) -> bool:
+    """Whether a number's derivatives (2, n) are anywhere other than 0."""
+    for c in range(2):
+        for i in range(n):
+            if row[c, i] != 0.0:
+                return True
+    return False
 
 
 @borrowing

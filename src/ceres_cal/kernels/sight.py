@@ -6,15 +6,15 @@ columns are left perturbations in the camera frame, (dw x R X) + dt.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from ceres_cal.kernels.arguments import BUILT, CurveColumns, Loss, Optics, PointColumns, Unknowns
+from ceres_cal.kernels.arguments import BUILT, CurveColumns, Loss, Optics, PointColumns
 from ceres_cal.kernels.jit import borrowing, jit
 from ceres_cal.kernels.lenses import distort, intrinsics_rows, prepared
 from ceres_cal.kernels.losses import robust_loss
-from ceres_cal.kernels.panel import add_products, add_structure, bend_rows, product_of
+from ceres_cal.kernels.panel import Order, add_products, add_structure, bend_rows, product_of, shows
 from ceres_cal.kernels.workspace import CHUNK, Workspace, working_space
 
 _OF_POSE = 7  # rows, with the residual's
@@ -125,29 +125,6 @@ def move_to_feet(n: int, start: int, optics: Optics, pose: Any, curves: CurveCol
 # ---- one sight ------------------------------------------------------------------------------------------------------
 
 
-class Order(NamedTuple):
-    """Which numbers take part: A is [free intrinsics | structure | 6 pose | residual].
-
-    Attributes:
-        rows: indices into [intrinsics | 6 pose | residual], the last one the residual's. places: their rows in A.
-    """
-
-    rows: Any
-    places: Any
-
-
-@jit
-def order_of_rows(unknowns: Unknowns, intrinsics: int) -> Order:
-    """The order of some unknowns of so many intrinsics."""
-    count = len(unknowns.free)
-    rows, places = np.empty(count + 7, np.int64), np.empty(count + 7, np.int64)
-    rows[:count] = unknowns.free
-    rows[count:] = np.arange(intrinsics, intrinsics + 7)
-    places[:count] = np.arange(count)
-    places[count:] = np.arange(count + unknowns.structure, count + unknowns.structure + 7)
-    return Order(rows, places)
-
-
 @borrowing
 def _rows_shown(n: int, optics: Optics, order: Order, space: Workspace) -> int:
     """The chunk's Jacobian, and its rows that take part: the residual's number among them. What the chunk shows nothing
@@ -157,19 +134,10 @@ def _rows_shown(n: int, optics: Optics, order: Order, space: Workspace) -> int:
     jacobian_rows(n, optics, space, free == 0)
     count = 0
     for k in range(len(order.rows)):
-        if k >= free or _shows(n, space.jacobian[order.rows[k]]):
+        if k >= free or shows(n, space.jacobian[order.rows[k]]):
             rows[count], places[count] = order.rows[k], order.places[k]
             count += 1
     return count - 1
-
-
-@borrowing
-def _shows(n: int, row: Any) -> bool:
-    for c in range(2):
-        for i in range(n):
-            if row[c, i] != 0.0:
-                return True
-    return False
 
 
 @borrowing

@@ -19,7 +19,7 @@ class Workspace(NamedTuple):
         jacobian: (intrinsics + 6, 2, n) rows phi, aspect, cx, cy, coefficients, skew, pose; x and y
             components.
         panel: (rows + 3, 2 n) the weighted rows, see `panel`. products: (rows + 3,) squared, of those rows.
-        rows, places: (rows,) which ones these are, and where they stand in the normal equations, see `sight.Order`.
+        rows, places: (rows,) which ones these are, and where they stand in the normal equations, see `panel.Order`.
         local, rotated, rays: (3, n) the point X in its frame, R X, and R X + t.
         image (8, n): the offset (ox, oy) from the principal point on square pixels, its derivatives xx, xy, yy with
             respect to the ray's x and y, and xz, yz with respect to its z; yx - xy.
