@@ -22,11 +22,13 @@ from ceres_cal import calibrating
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError, SolutionError
 from ceres_cal.calibrating import Watched, calibrate
-from ceres_cal.calibration import Calibration
+from ceres_cal.calibration import Calibration, LensChoice
 from ceres_cal.cli import main
 from ceres_cal.detect.boards import BoardDetections
 from ceres_cal.diagnostics.held_out import choose
 from ceres_cal.lens_choice import PAPER, candidates, choose_lens, decide, label_of, papers, seen
+from ceres_cal.lens_choice import choice as choosing
+from ceres_cal.lens_choice.choice import Comparison
 from ceres_cal.lens_choice.kinds import Candidate
 from ceres_cal.lens_choice.rule import pseudo_bma
 from ceres_cal.model.equations import write_equations
@@ -142,8 +144,10 @@ def test_a_lens_that_was_not_chosen_is_named(monkeypatch: pytest.MonkeyPatch) ->
     assert [one for one in calibration.warnings if one.startswith("no lens could be chosen (no lens can be")]
     of_lens = calibrating._of_lens
 
+    gone = {"kannala-brandt"}
+
     def broken(start: Start, seen: Observations, sights: Sights, options: Options, watched: Watched) -> Calibration:
-        if options.lens == "kannala-brandt":
+        if options.lens in gone:
             raise SolutionError("no camera")
         return of_lens(start, seen, sights, options, watched)
 
@@ -158,6 +162,21 @@ def test_a_lens_that_was_not_chosen_is_named(monkeypatch: pytest.MonkeyPatch) ->
     assert of_kind and all(one.failed == "no camera" for one in of_kind)
     rms = {one.label: one.rms_px for one in choice.tried if one.rms_px is not None}
     assert rms[label] < rms[PAPER]  # the best of what is left
+    gone.clear()
+    outcomes, of_choice = list[Comparison](), choosing._choice
+
+    def seen_choice(among: Comparison) -> LensChoice:
+        outcomes.append(among)
+        return of_choice(among)
+
+    monkeypatch.setattr(choosing, "_choice", seen_choice)
+    for worse in (0.0, 2.79, 0.0):  # brown, kannala-brandt, radial, which is as good as brown
+        choice = calibrate(_seen("brown", "boards")).lens_choice
+        assert choice is not None and choice.chosen.split()[0] not in gone
+        assert choice.tried[0].worse == pytest.approx(worse, abs=0.3)
+        gone.add(choice.chosen.split()[0])
+    labels = [one.passed.form.label.split()[0] if one.passed else "" for one in outcomes]
+    assert labels == ["", "", "brown", "", "brown", "brown"]  # what each is compared with: the first that was passed
 
 
 def test_where_no_lens_makes_a_calibration_the_papers_is_the_last(monkeypatch: pytest.MonkeyPatch) -> None:

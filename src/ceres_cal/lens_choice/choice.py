@@ -100,6 +100,7 @@ class Comparison:
     Attributes:
         seen: the observations that took part, and `share` of all. as_good: how many standard errors worse is as good.
         start: of everything. there: where the chosen one is at its best.
+        passed: the one that was chosen first, where all of the observations make no calibration with it.
     """
 
     seen: Seen
@@ -110,6 +111,7 @@ class Comparison:
     best: Candidate
     chosen: Candidate
     there: Estimate
+    passed: Candidate | None = None
 
     @cached_property
     def probabilities(self) -> tuple[float, ...]:
@@ -117,6 +119,14 @@ class Comparison:
         known = {i: one.squares for i, one in enumerate(self.tried) if one.squares is not None}
         likely = dict(zip(known, pseudo_bma(list(known.values())).tolist(), strict=True))
         return tuple(likely.get(i, 0.0) for i in range(len(self.tried)))
+
+    @property
+    def worse_than_passed(self) -> float:
+        """By how many standard errors it predicts worse than the one that was passed over; 0 where that is as good."""
+        if self.passed is None or self.passed.squares is None or self.chosen.squares is None:
+            return 0.0
+        worse = standard_errors(self.chosen.squares, self.passed.squares)
+        return worse if worse > self.as_good else 0.0
 
     @cached_property
     def others(self) -> OtherLenses:
@@ -163,10 +173,7 @@ class Comparison:
             DegenerateError: none gives an answer.
         """
         found = self._excluding(lambda one: one.of is self.chosen.of, failure)
-        choice, now, before = _choice(found), found.chosen.squares, self.chosen.squares
-        worse = 0.0 if now is None or before is None else standard_errors(now, before)
-        taken = replace(choice.tried[0], worse=worse if worse > self.as_good else 0.0)
-        return replace(found.outcome, choice=replace(choice, tried=(taken, *choice.tried[1:])))
+        return replace(found, passed=self.passed or self.chosen).outcome
 
     def _excluding(self, is_out: Callable[[Candidate], bool], why: str) -> Comparison:
         """Without some lenses, of which it is said why.
@@ -249,7 +256,8 @@ def _choice(among: Comparison) -> LensChoice:
         if one.squares is None or chosen.squares is None:
             return TriedLens(label, count, failed=one.failed)
         likely = among.probabilities[among.tried.index(one)]
-        return TriedLens(label, count, one.rms_px, standard_errors(one.squares, chosen.squares), probability=likely)
+        worse = among.worse_than_passed if one is chosen else standard_errors(one.squares, chosen.squares)
+        return TriedLens(label, count, one.rms_px, worse, probability=likely)
 
     order = sorted(among.tried, key=lambda one: (one is not chosen, one.rms_px if one.squares is not None else np.inf))
     groups = 0 if chosen.squares is None else len(chosen.squares)
