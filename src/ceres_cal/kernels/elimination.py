@@ -14,7 +14,7 @@ import numpy as np
 from ceres_cal.kernels.arguments import CurveColumns, Loss, Optics, PointColumns, Sweep, Unknowns
 from ceres_cal.kernels.block import rotation
 from ceres_cal.kernels.jit import borrowing, jit
-from ceres_cal.kernels.lenses import prepared
+from ceres_cal.kernels.lenses import add_multiple, prepared
 from ceres_cal.kernels.panel import order_of_rows
 from ceres_cal.kernels.sight import normal_equations
 from ceres_cal.kernels.workspace import working_space
@@ -56,19 +56,12 @@ def _solve_pose(normal: Any, count: int, damping: float, lower: Any, gain: Any) 
             own[column] = known[column]
         gain[k, count] = normal[count + 6, count + k]
         for j in range(k):
-            _less(count + 1, lower[k, j], gain[j], gain[k])
+            add_multiple(count + 1, -lower[k, j], gain[j], gain[k])
         _scaled(count + 1, lower[k, k], gain[k])
     for k in range(5, -1, -1):
         for j in range(k + 1, 6):
-            _less(count + 1, lower[j, k], gain[j], gain[k])
+            add_multiple(count + 1, -lower[j, k], gain[j], gain[k])
         _scaled(count + 1, lower[k, k], gain[k])
-
-
-@borrowing
-def _less(n: int, factor: float, row: Any, own: Any) -> None:
-    """own -= factor times row."""
-    for i in range(n):
-        own[i] -= factor * row[i]
 
 
 @borrowing

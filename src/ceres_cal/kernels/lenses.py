@@ -103,11 +103,11 @@ def intrinsics_rows(n: int, optics: Optics, image: Any, work: Any, jacobian: Any
     if skew != 0.0:
         for k in range(count):
             if not 1 <= k <= 3:
-                _lean(n, skew / aspect, jacobian[k, 0], jacobian[k, 1])
+                add_multiple(n, skew / aspect, jacobian[k, 1], jacobian[k, 0])
 
 
 @borrowing
-def _lean(n: int, factor: float, x: Any, y: Any) -> None:
-    """x += factor times y."""
+def add_multiple(n: int, factor: float, row: Any, own: Any) -> None:
+    """own += factor times row: of two rows by themselves the compiler sees that they are not each other's."""
     for i in range(n):
-        x[i] += factor * y[i]
+        own[i] += factor * row[i]

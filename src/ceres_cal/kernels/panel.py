@@ -23,10 +23,12 @@ class Order(NamedTuple):
 
     Attributes:
         rows: indices into [intrinsics | 6 pose | residual], the last one the residual's. places: their rows in A.
+        free: how many intrinsics there are, and where the structure begins.
     """
 
     rows: Any
     places: Any
+    free: int
 
 
 @jit
@@ -38,7 +40,7 @@ def order_of_rows(unknowns: Unknowns, intrinsics: int) -> Order:
     rows[count:] = np.arange(intrinsics, intrinsics + 7)
     places[:count] = np.arange(count)
     places[count:] = np.arange(count + unknowns.structure, count + unknowns.structure + 7)
-    return Order(rows, places)
+    return Order(rows, places, count)
 
 
 @borrowing

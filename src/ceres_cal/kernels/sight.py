@@ -17,7 +17,6 @@ from ceres_cal.kernels.losses import robust_loss
 from ceres_cal.kernels.panel import Order, add_products, add_structure, bend_rows, product_of, shows
 from ceres_cal.kernels.workspace import CHUNK, Workspace, working_space
 
-_OF_POSE = 7  # rows, with the residual's
 _FOOT_STEPS = 30
 _FOOT_TOLERANCE_PX = 1e-9
 
@@ -127,14 +126,14 @@ def move_to_feet(n: int, start: int, optics: Optics, pose: Any, curves: CurveCol
 
 @borrowing
 def _rows_shown(n: int, optics: Optics, order: Order, space: Workspace) -> int:
-    """The chunk's Jacobian, and its rows that take part: the residual's number among them. What the chunk shows nothing
-    of, most of a lens that has its numbers place by place, is left out.
+    """The chunk's Jacobian, and which of its rows take part; the answer is which of these is the residual's, the last.
+    What the chunk shows nothing of, most of a lens that has its numbers place by place, is left out.
     """
-    free, rows, places = len(order.rows) - _OF_POSE, space.rows, space.places
-    jacobian_rows(n, optics, space, free == 0)
+    rows, places = space.rows, space.places
+    jacobian_rows(n, optics, space, order.free == 0)
     count = 0
     for k in range(len(order.rows)):
-        if k >= free or shows(n, space.jacobian[order.rows[k]]):
+        if k >= order.free or shows(n, space.jacobian[order.rows[k]]):
             rows[count], places[count] = order.rows[k], order.places[k]
             count += 1
     return count - 1
@@ -180,7 +179,7 @@ def _add_points(
                 for k in range(BUILT - 2):
                     directions[2 + k, 2] = points.bends[start + i, k]
                 slots = points.slots[start + i]
-                add_structure(i, n, 2, slots, pose, len(order.rows) - _OF_POSE, last, space, normal)
+                add_structure(i, n, 2, slots, pose, order.free, last, space, normal)
     return cost
 
 
@@ -239,7 +238,7 @@ def _add_curves(
             for i in range(n):
                 k = track[start + i]
                 curve_directions(i, k, curves, space.tangents, directions)
-                add_structure(i, n, 1, curves.slots[k], pose, len(order.rows) - _OF_POSE, last, space, normal)
+                add_structure(i, n, 1, curves.slots[k], pose, order.free, last, space, normal)
     return cost
 
 

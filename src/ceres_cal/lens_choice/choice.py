@@ -67,14 +67,11 @@ class Chosen:
         except CalibrationError as error:
             if self.among is None:
                 raise
-            other = self._without(str(error), options, start)
+            other = self.among.without_kind(str(error)) or self._papers(str(error), options, start)
         return other.first_solved(solved, options, start)
 
-    def _without(self, failure: str, options: Options, start: Start) -> Chosen:
-        """The best lens of another kind, or the paper's from the start of everything."""
-        if self.among is not None:
-            with suppress(CalibrationError):
-                return self.among.without_kind(failure)
+    def _papers(self, failure: str, options: Options, start: Start) -> Chosen:
+        """The paper's lens in its place, from the start of everything."""
         failed = [replace(one, failed=failure) if one.label == self.choice.chosen else one for one in self.choice.tried]
         tried = sorted(failed, key=lambda one: one.label != PAPER)
         return Chosen(options, start, replace(self.choice, chosen=PAPER, tried=tuple(tried)))
@@ -166,14 +163,12 @@ class Comparison:
             return self._excluding(lambda one: one is self.chosen, _EXPLAINED).outcome
         return None
 
-    def without_kind(self, failure: str) -> Chosen:
-        """The best of the other kinds; how much worse it predicts is said.
-
-        Raises:
-            DegenerateError: none gives an answer.
-        """
-        found = self._excluding(lambda one: one.of is self.chosen.of, failure)
-        return replace(found, passed=self.passed or self.chosen).outcome
+    def without_kind(self, failure: str) -> Chosen | None:
+        """The best of the other kinds, how much worse it predicts said with it; None where none gives an answer."""
+        with suppress(CalibrationError):
+            found = self._excluding(lambda one: one.of is self.chosen.of, failure)
+            return replace(found, passed=self.passed or self.chosen).outcome
+        return None
 
     def _excluding(self, is_out: Callable[[Candidate], bool], why: str) -> Comparison:
         """Without some lenses, of which it is said why.

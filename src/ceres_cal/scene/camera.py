@@ -115,7 +115,7 @@ class Camera:
     @property
     def _edge(self) -> Array:
         """(N, 2) offsets of places along the image's edge, its corners among them."""
-        return self.offsets(_edge(self.image_size))
+        return self.offsets(_along_edge(self.image_size))
 
     @property
     def folds(self) -> bool:
@@ -311,7 +311,7 @@ def in_image(pixels: Array, image_size: tuple[int, int]) -> Mask:
 
 
 @lru_cache(maxsize=64)
-def _edge(image_size: tuple[int, int]) -> Array:
+def _along_edge(image_size: tuple[int, int]) -> Array:
     """(N, 2) places along an image's edge, px."""
     along = np.linspace(-0.5, 0.5, _ALONG_AN_EDGE + 1)
     ends = [np.full_like(along, end) for end in (-0.5, 0.5)]

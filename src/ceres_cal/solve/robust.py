@@ -197,7 +197,7 @@ class _Rounds:
         if problem.options.blank_lens.roughness and len(few.sights) < len(problem.sights):
             of_few = _Rounds(few, self._observations, self._usual, self._progress)
             end = of_few.to_rest(of_few.first(estimate), most_rounds=2)
-            self._scales = of_few._scales
+            self._scales = of_few._scales  # at which they were solved, not those of the start
             self._problem = replace(self._problem, smoothness=end.problem.smoothness)
             solution = end.solution
         else:
