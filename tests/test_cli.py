@@ -737,6 +737,16 @@ def test_locate_and_project_are_inverse(say: Say, calibrated: Path) -> None:
     assert np.allclose(projected["pixels"], located["pixels"], rtol=0.0, atol=1e-8)  # 2e-12
 
 
+def test_what_no_pixel_of_the_image_shows_is_not_located(say: Say, calibrated: Path) -> None:
+    """A mistyped pixel has a place on the floor, too, which the camera does not see."""
+    said = say("locate", calibrated, "640,480", "1500,1100", "-5,20")
+    assert said.code == 1
+    rows = [line for line in said.out.splitlines() if "no answer" in line]
+    assert len(rows) == 2 and all("outside the image of 1280 x 960 px" in line for line in rows)
+    corners = say("locate", calibrated, "0,0", "1279,959", "--json")
+    assert json.loads(corners.out)["no_answer"] == []
+
+
 def test_locate_in_text(say: Say, calibrated: Path) -> None:
     x, y = Calibration.load(calibrated).station().locate(np.array([[640.0, 480.0]]))[0]
     assert say("locate", calibrated, "640,480") == Said(0, f"{x:.4f} {y:.4f}\n", "")

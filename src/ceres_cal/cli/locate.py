@@ -37,10 +37,15 @@ def _add_project(parser: ArgumentParser) -> None:
 
 
 def _locate(args: Namespace) -> Answer:
+    import numpy as np
+
+    from ceres_cal.scene.camera import in_image
+
     pixels = _read_rows(args, (2,))
     height = height_m(args)
     name, camera = _station(args)
-    points = camera.locate(pixels, height)
+    inside = in_image(pixels, camera.image_size)
+    points = np.where(inside[:, None], camera.locate(pixels, height), np.nan)  # beyond nothing was ever measured
     lost = {row: _why_not_located(camera, pixels[row], height) for row in _rows_without_answer(points)}
     data = {"station": name, "height_m": height, "pixels": pixels.tolist()}
     return _answer({**data, "points_m": _or_null(points)}, points, lost)
@@ -142,9 +147,13 @@ def _or_null(values: Array) -> list[list[float] | None]:
 
 
 def _why_not_located(camera: Camera, pixel: Array, height_m: float) -> str:
+    from ceres_cal.scene.camera import in_image
+
     radius = camera.lens.monotone_radius(camera.phi)
     if camera.rays(pixel[None])[0, 0] != camera.rays(pixel[None])[0, 0]:
         return f"it lies past the {radius:.0f} px from the principal point where the lens has one answer"
+    if not in_image(pixel, camera.image_size):
+        return "it lies outside the image of {} x {} px: check its coordinates".format(*camera.image_size)
     return f"its ray does not meet the plane z = {height_m:g} m in front of the camera"
 
 
