@@ -162,7 +162,8 @@ def _of_camera(posterior: Posterior, estimate: Estimate, camera: str) -> Posteri
     """What is known of a camera, its stations and the targets as built, all else integrated out."""
     owners = {("camera", camera), *(("station", name) for name, s in estimate.stations.items() if s.camera == camera)}
     keys = [key for key in posterior.keys if key[:2] in owners or key.is_structure]
-    return replace(posterior, information=posterior.information.marginal(keys), bends=None)
+    stated = posterior.stated.over(posterior.keys).marginal(keys)
+    return replace(posterior, information=posterior.information.marginal(keys), bends=None, stated=stated)
 
 
 def _weighting(fit: Fit) -> Weighting:

@@ -262,7 +262,7 @@ def _apart(case: _Case, used: Sights, least: float, estimate: Estimate) -> tuple
     best = seen.inverse @ (earlier.matrix @ offsets) / noise**2
     scatter = measure_scatter(case.observed, problem, residuals(case.observed, used, estimate), estimate, reduced)
     if scatter is not None:
-        seen = scatter.widened_alone(seen, reduced.shared)
+        seen = scatter.widened(seen)
         freedom = 1.0 / (1.0 / freedom + scatter.dependence.inverse_freedom)
     before = case.calibration.uncertainty.posterior.degrees_of_freedom
     old = Statement(*case.known(used, (), estimate, keys), before)

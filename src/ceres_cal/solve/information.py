@@ -59,6 +59,7 @@ class ReducedInformation:
 
     Attributes:
         points, curves: what the observations of either kind say. priors: what was known before.
+        stated: that part of the priors which somebody stated, or an earlier calibration found.
         eliminated: the private placements, by station.
         point_leverage, curve_leverage: equations of either kind that private placements take up by themselves.
     """
@@ -66,6 +67,7 @@ class ReducedInformation:
     points: Information
     curves: Information
     priors: Information
+    stated: Information
     eliminated: tuple[Eliminated, ...]
     point_leverage: float
     curve_leverage: float
@@ -174,7 +176,9 @@ class _Sums:
         points, curves = (Information(self._keys, 0.5 * (matrix + matrix.T)) for matrix in self._matrices)
         priors = [prior.information for prior in self._problem.priors_at(self._estimate)]
         known = reduce(add, priors, Information.nothing(self._keys))
-        return ReducedInformation(points, curves, known, tuple(eliminated), *self._leverages.tolist())
+        every = self._problem.stated_at(self._estimate)
+        stated = reduce(add, (prior.information for prior in every if not prior.is_usual), Information.nothing())
+        return ReducedInformation(points, curves, known, stated, tuple(eliminated), *self._leverages.tolist())
 
     def _owned(self, kind: str, name: str) -> Indices:
         return self._columns.get((kind, name), np.empty(0, dtype=np.int64))

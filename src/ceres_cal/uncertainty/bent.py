@@ -18,7 +18,7 @@ import numpy as np
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import CalibrationError, InputError
 from ceres_cal.model.information import Information
-from ceres_cal.model.keys import Key
+from ceres_cal.model.keys import Key, over
 from ceres_cal.model.parameters import Estimate
 from ceres_cal.model.priors import GaussianPrior
 from ceres_cal.model.quantities import difference, moved, natural_sizes
@@ -55,7 +55,24 @@ class Bends:
 
     def widened(self, information: Information) -> Information:
         """Information about some of the keys with the excesses as variances of their own."""
-        return information.widened(self.excesses[:, [self.keys.index(key) for key in information.keys]])
+        return information.widened(over(self.excesses, self.keys, information.keys))
+
+    def beside(self, information: Information, stated: Information) -> Bends:
+        """With ends no farther than what was stated lets them be.
+
+        With L what the observations say, P what was stated, C = (L + P)^-1 and E the excesses, the covariance of L + P
+        with L widened by E is C + G^T N^-1 G, where G = E L C and N = 1 + E L C P E^T: N^-1/2 G takes the place of E.
+
+        Args:
+            information: L + P of the keys.
+        """
+        if not np.any(stated.matrix):
+            return self
+        moved = self.excesses @ information.less(stated).matrix @ information.inverse
+        left = moved @ stated.matrix @ self.excesses.T
+        values, vectors = np.linalg.eigh(np.eye(len(left)) + 0.5 * (left + left.T))
+        excesses = (vectors / np.sqrt(np.maximum(values, 1.0))) @ vectors.T @ moved
+        return replace(self, ends=self.steps + self.half_width * excesses)
 
 
 def weak_axes(information: Information, estimate: Estimate, keys: Sequence[Key]) -> Array:

@@ -81,6 +81,8 @@ class PosteriorFile(msgspec.Struct, forbid_unknown_fields=True):
     by_model: list[float] | None = None
     dependence: Dependence | None = None
     bends: BendsFile | None = None
+    stated_keys: list[Key] = []
+    stated: list[float] = []
 
     @classmethod
     def of(cls, posterior: Posterior) -> PosteriorFile:
@@ -95,6 +97,8 @@ class PosteriorFile(msgspec.Struct, forbid_unknown_fields=True):
             None if posterior.by_model is None else lower_triangle(posterior.by_model),
             posterior.dependence,
             None if posterior.bends is None else BendsFile.of(posterior.bends),
+            list(posterior.stated.keys),
+            lower_triangle(posterior.stated),
         )
 
     def posterior(self) -> Posterior:
@@ -108,7 +112,10 @@ class PosteriorFile(msgspec.Struct, forbid_unknown_fields=True):
         by_model = self.by_model and information_from(self.by_model, self.keys, "posterior.by_model")
         freedom = np.inf if self.freedom is None else self.freedom
         bends = None if self.bends is None else self.bends.bends(self.keys)
-        return Posterior(information, placements, freedom, profiles, by_model or None, self.dependence, bends)
+        if not set(self.stated_keys) <= set(self.keys):
+            raise InputError("posterior.stated_keys names keys that the posterior does not have: calibrate again")
+        stated = information_from(self.stated, self.stated_keys, "posterior.stated")
+        return Posterior(information, placements, freedom, profiles, by_model or None, self.dependence, bends, stated)
 
 
 def lower_triangle(information: Information) -> list[float]:

@@ -76,7 +76,10 @@ def shifts_to_lenses(lenses: OtherLenses, keys: Sequence[Key], there: Estimate) 
     Args:
         there: with the chosen lens, at its best or elsewhere in a valley along phi.
     """
-    slopes, offsets = zip(*_compared(lenses, keys, there), strict=True)
+    every = list(_compared(lenses, keys, there))
+    if not every:
+        return []
+    slopes, offsets = zip(*every, strict=True)
     slope = np.concatenate([one.reshape(-1, len(keys)) for one in slopes])
     sizes, shifts = natural_sizes(there, keys), []
     for number, weight in enumerate(lenses.weights):
@@ -88,9 +91,14 @@ def shifts_to_lenses(lenses: OtherLenses, keys: Sequence[Key], there: Estimate) 
 
 
 def _compared(lenses: OtherLenses, keys: Sequence[Key], there: Estimate) -> Iterator[tuple[Array, Array]]:
-    """Of each camera: (N, 2, K) slopes of what it shows, px, and (L, N, 2) by how much others show it elsewhere."""
+    """Of each camera that the keys say anything of: (N, 2, K) slopes of what it shows, px, and (L, N, 2) by how much
+    others show it elsewhere.
+    """
     known = dict.fromkeys(key.owner for key in keys if key.kind == "station")
+    spoken_of = {key.owner for key in keys if key.kind == "camera"} | {there.stations[name].camera for name in known}
     for name, pixels in lenses.pixels.items():
+        if name not in spoken_of:
+            continue
         camera = there.cameras[name]
         stations = [station for station in known if there.stations[station].camera == name]
         tells_phi = any(key[:3] == ("camera", name, "phi") for key in keys)
