@@ -83,7 +83,7 @@ def test_a_wrong_height_is_named_with_both_values() -> None:
 
 
 def test_nothing_is_promised_then() -> None:
-    """ "to 1 mm at robot height" was promised, 27 mm off. The height is as certain as it was stated, and is named."""
+    """1 mm at robot height was promised, 27 mm off. The height is as certain as it was stated, and is named."""
     assert wrong().uncertainty.posterior.sd_of("station", "overhead", "height") <= WRONG[1]
     judged = verdict(wrong(), seen())
     assert judged.level == "no" and "mm" not in judged.headline
