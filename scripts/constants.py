@@ -103,6 +103,7 @@ DECIDING: tuple[Constant, ...] = (
     *_of("start.planes", "_ROUGH_PX _SUSPICIOUS _NO_FIT", "calibrate"),
     *_of("kernels.planes", "_WRONG", "calibrate"),
     *_of("uncertainty.assess", "_BENT", "verdicts"),
+    *_of("uncertainty.between", "_LEAST_LEFT", "verdicts"),
     *_of("uncertainty.profile", "_FAR _BOUNDED _SHRINKING", "verdicts"),
     *_of("uncertainty.weak", "KNOWN WEAK _IN_WORDS _TOGETHER", "verdicts"),
     *_of("advice.ranking", "_MUST_LEAVE _LARGER _LESS", "advice"),

@@ -193,9 +193,13 @@ def main(arguments: Sequence[str]) -> int:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0], allow_abbrev=False)
     parser.add_argument("--runs", type=int, default=1, help=f"scenes of each of the {len(SET_UPS)} set-ups (default 1)")
     parser.add_argument("--first", type=int, default=0, help="seed of the first one (default 0)")
+    parser.add_argument(
+        "--cameras", type=int, nargs="+", choices=list(_PLACES), default=list(_PLACES), help="only these"
+    )
     parser.add_argument("--pairs", action="store_true", help="only set-ups in which each two values come together")
     given = parser.parse_args(arguments)
-    found = list(outcomes(pairwise() if given.pairs else SET_UPS, given.runs, given.first))
+    chosen = [one for one in (pairwise() if given.pairs else SET_UPS) if one.cameras in given.cameras]
+    found = list(outcomes(chosen, given.runs, given.first))
     _print_table(found)
     return int(any(one.fault for one in found))
 

@@ -64,10 +64,17 @@ class OtherLenses:
         return np.array([picture.shift(one.cameras[camera].at(Pose.identity())) for one in self.others])
 
     def offsets(self, station: str, height_m: float) -> Array:
-        """(L, N, 2) m by how much the others locate pixels elsewhere."""
-        pixels = self.pixels[self.near.stations[station].camera]
-        located = self.near.camera_at(station).locate(pixels, height_m)
-        return np.array([one.camera_at(station).locate(pixels, height_m) - located for one in self.others])
+        """(L, N, 2) m by how much the others locate pixels elsewhere; every node of a valley asks for the same."""
+        if (station, height_m) not in self._offsets:
+            pixels = self.pixels[self.near.stations[station].camera]
+            located = self.near.camera_at(station).locate(pixels, height_m)
+            every = [one.camera_at(station).locate(pixels, height_m) - located for one in self.others]
+            self._offsets[station, height_m] = np.array(every)
+        return self._offsets[station, height_m]
+
+    @cached_property
+    def _offsets(self) -> dict[tuple[str, float], Array]:
+        return {}
 
 
 def shifts_to_lenses(lenses: OtherLenses, keys: Sequence[Key], there: Estimate) -> list[Array]:
