@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.numerical import numerical
 from ceres_cal.calibration import Calibration
 from ceres_cal.diagnostics.alternatives import Sums
 from ceres_cal.diagnostics.diagnostic import Case, Tested
@@ -61,6 +62,7 @@ class Diagnosis:
         return any(finding.is_model_error for finding in self.findings)
 
 
+@numerical("the diagnosis")
 def diagnose(
     calibration: Calibration,
     observations: Observations,

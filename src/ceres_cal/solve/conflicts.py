@@ -13,6 +13,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import CalibrationError
+from ceres_cal.base.numerical import numerical
 from ceres_cal.model.information import Information
 from ceres_cal.model.keys import Key
 from ceres_cal.model.parameters import Estimate
@@ -45,6 +46,7 @@ class Conflicts:
     shifts: tuple[Array, ...] = ()
 
 
+@numerical("the test of what was stated")
 def find_conflicts(
     problem: Problem, observations: Observations, end: RobustSolution, usual: tuple[float, float] | None = None
 ) -> Conflicts:
