@@ -21,6 +21,7 @@ from ceres_cal.model.priors import gather_priors
 from ceres_cal.model.ranges import require_possible_numbers
 from ceres_cal.model.residuals import residuals
 from ceres_cal.observations import Observations
+from ceres_cal.observations.bounds import unfilled
 from ceres_cal.observations.sights import Sights, gather_sights
 from ceres_cal.observations.thinning import is_bulk
 from ceres_cal.solve import (
@@ -91,7 +92,9 @@ def calibrate(
     with single_threaded_blas(), at_most(options.threads):
         try:
             return _measured(observations, options, progress, client)
-        except (DegenerateError, SolutionError):
+        except (DegenerateError, SolutionError) as error:
+            if odd := next(unfilled(observations), None):
+                raise type(error)(f"{error}; {odd}") from None
             free = _without_priors(observations, options)
             if free is None:
                 raise

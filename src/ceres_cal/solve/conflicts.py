@@ -185,8 +185,8 @@ class _Search:
             least, most = solve(without, rest.estimate), solve(bound, self.end.solution.estimate)
         except CalibrationError:
             return test
-        rise = 2.0 * (most.cost - least.cost)
+        rise = max(2.0 * (most.cost - least.cost), 0.0)  # of exact observations it is rounding
         if rise >= test.squared or len(statement.priors) > 1:
             return test
-        share = float(np.sqrt(max(rise, 0.0) / test.squared))
+        share = float(np.sqrt(rise / test.squared))
         return test._replace(squared=rise, log_p=log_probability(rise, rest), sigmas=test.sigmas * share)

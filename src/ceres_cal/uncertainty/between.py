@@ -26,6 +26,7 @@ FEWEST_GROUPS = 3
 INDEPENDENT = 0.8
 """Probability, before anything was seen, that errors are independent."""
 _RIDGE = 1e-3  # of a view's information: one that tells a direction alone cannot be left out
+_SCATTER = 1e-9  # of its squares, in units of the score's own: what is less is rounding
 _LOG_C = np.linspace(0.02, 6.0, 300)  # either way exponential of mean 1, where views do not scatter as expected
 
 
@@ -56,6 +57,8 @@ def compare_groups(sample: Sample, scatter: Array, whole: Array) -> tuple[Betwee
     white, root = (vectors * values**-0.5) @ vectors.T, (vectors * values**0.5) @ vectors.T
     expected, spread = _expected(sample.informations, scatter, whole, white)
     mean = float(np.sum(np.trace(expected, axis1=1, axis2=2)))
+    if not mean > _SCATTER * len(whole):  # as many equations as numbers: nothing is left to scatter
+        return Between(len(scatter), 1.0, 0.0, np.inf), whole
     ratio, degrees = float(np.sum((sample.scores @ white) ** 2)) / mean, 2.0 * mean**2 / spread
     variance, probability = _averaged(ratio, degrees, float(np.trace(whole)) / len(whole))
     size, traces = len(whole), np.trace(sample.informations, axis1=1, axis2=2)
