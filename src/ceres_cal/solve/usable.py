@@ -82,7 +82,7 @@ def require_usable(end: RobustSolution, problem: Problem, explanations: Sequence
 
 
 def _is_of_smaller(camera: Camera, reach: Array, off_px: float) -> bool:
-    """Whether the principal point suits an image that ends where the observations do, and not the one that is stated."""
+    """Whether the principal point suits an image that ends where the observations do, not the stated one."""
     size = np.array(camera.image_size, dtype=float)
     other_px = float(np.hypot(*(camera.principal_point - 0.5 * reach)))
     return bool(
