@@ -72,6 +72,8 @@ def _of(module: str, names: str, *figures: str) -> list[Constant]:
 
 DECIDING: tuple[Constant, ...] = (
     *_of("model.parameters", "Options.loss_scale Options.reject_sigma", "calibrate", "diagnose"),
+    *_of("model.ranges", "PHI_RANGE _BUILT _REDRAWN", "calibrate"),
+    *_of("observations.bounds", "_SIGMA_RATIO _FAR", "calibrate"),
     *_of("solve.usable", "_NO_FIT _OFF_CENTRE", "calibrate"),
     *_of("calibrating", "_SAYS_LESS", "calibrate"),
     *_of("lens_choice.rule", "AS_GOOD ALIKE CLEARLY", "lens"),

@@ -11,14 +11,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ceres_cal.base.errors import CalibrationError, DegenerateError, SolutionError
+from ceres_cal.base.numerical import numerical
 from ceres_cal.base.threads import at_most, meanwhile, single_threaded_blas
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.caveats import resting_phi, unknown_phi
 from ceres_cal.calibration.outcome import came_out, of_all, of_closed_form
 from ceres_cal.model.parameters import AUTO, Estimate, Layout, Options, make_layout
 from ceres_cal.model.priors import gather_priors
+from ceres_cal.model.ranges import require_possible_numbers
 from ceres_cal.model.residuals import residuals
 from ceres_cal.observations import Observations
+from ceres_cal.observations.bounds import unfilled
 from ceres_cal.observations.sights import Sights, gather_sights
 from ceres_cal.observations.thinning import is_bulk
 from ceres_cal.solve import (
@@ -61,6 +64,7 @@ _OTHERWISE = (
 )
 
 
+@numerical("the calibration")
 def calibrate(
     observations: Observations,
     options: Options | None = None,
@@ -82,11 +86,15 @@ def calibrate(
         SolutionError: no usable camera came out.
         InputError: a prior or a fixed number that the camera does not have; pixels outside their image.
     """
-    observations, options = free_dimensions(observations, options or Options())
+    options = options or Options()
+    require_possible_numbers(observations, options)
+    observations, options = free_dimensions(observations, options)
     with single_threaded_blas(), at_most(options.threads):
         try:
             return _measured(observations, options, progress, client)
-        except (DegenerateError, SolutionError):
+        except (DegenerateError, SolutionError) as error:
+            if odd := next(unfilled(observations), None):
+                raise type(error)(f"{error}; {odd}") from None
             free = _without_priors(observations, options)
             if free is None:
                 raise

@@ -14,6 +14,7 @@ from ceres_cal.advice.measurements import Ground, Measurement
 from ceres_cal.advice.outlook import BENT, Errors, Outlook
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.executing import each
+from ceres_cal.base.numerical import numerical
 from ceres_cal.base.progress import StepProgress
 from ceres_cal.calibration import Calibration, Fit
 from ceres_cal.model.information import Information
@@ -76,6 +77,7 @@ class Advice:
     good_enough_mm: float | None
 
 
+@numerical("the advice")
 def advise(
     calibration: Calibration,
     station: str | None = None,

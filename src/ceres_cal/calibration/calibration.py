@@ -245,11 +245,12 @@ class Calibration:
         """The calibration that a file describes; InputError naming the place inside it."""
         options = options_from_json(data.options)
         targets = targets_from_specs(data.targets)
+        estimate = data.estimate(targets, options)
         return cls(
-            data.estimate(targets, options),
+            estimate,
             targets,
             options=options,
-            posterior=None if data.posterior is None else data.posterior.posterior(),
+            posterior=None if data.posterior is None else data.posterior.posterior(estimate),
             refitted=None if data.refitted is None else data.refitted.refitted(),
             notes=data.notes if isinstance(data.notes, dict) else {},
             **{name: getattr(data, name) for name in _ALIKE},

@@ -16,6 +16,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import CalibrationError, InputError
+from ceres_cal.base.numerical import numerical
 from ceres_cal.base.tails import upper_tail
 from ceres_cal.base.transforms import Pose
 from ceres_cal.calibrating import calibrate
@@ -63,6 +64,7 @@ class StationAudit:
     ours: Calibration
 
 
+@numerical("the audit")
 def audit(foreign: Calibration, observations: Observations) -> dict[str, StationAudit]:
     """Hold a calibration, ours or another program's, against observations of its stations.
 

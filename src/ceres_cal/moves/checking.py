@@ -15,6 +15,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.errors import CalibrationError, InputError
+from ceres_cal.base.numerical import numerical
 from ceres_cal.base.transforms import Pose
 from ceres_cal.calibration import Calibration
 from ceres_cal.model.information import Information
@@ -107,6 +108,7 @@ class Check:
         return all(station.holds for station in self.stations.values())
 
 
+@numerical("the check")
 def check(
     calibration: Calibration, observations: Observations, false_alarms: float = FALSE_ALARMS, checks: int = 1
 ) -> Check:

@@ -7,11 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 
+from ceres_cal.base.numerical import numerical
 from ceres_cal.model.information import Information
 from ceres_cal.model.parameters import Estimate, unit_px
+from ceres_cal.model.ranges import PHI_RANGE
 from ceres_cal.scene.camera import Camera
 from ceres_cal.solve import Problem, ReducedInformation, information
-from ceres_cal.start.initialise import PHI_RANGE, USUAL_PHI, USUAL_PHI_FACTOR
+from ceres_cal.start.initialise import USUAL_PHI, USUAL_PHI_FACTOR
 from ceres_cal.uncertainty.bent import bends
 from ceres_cal.uncertainty.dependence import Scatter
 from ceres_cal.uncertainty.posterior import Posterior, make_posterior, widths_over
@@ -21,6 +23,7 @@ from ceres_cal.uncertainty.profile import Node, PhiProfile, profile, valley
 _BENT = 0.05
 
 
+@numerical("the uncertainty")
 def assess(
     problem: Problem,
     estimate: Estimate,

@@ -20,8 +20,8 @@ from ceres_cal.model.information import Information
 from ceres_cal.model.keys import Key
 from ceres_cal.model.parameters import Estimate, unit_px
 from ceres_cal.model.quantities import difference, moved
+from ceres_cal.model.ranges import PHI_RANGE
 from ceres_cal.solve import Problem, information, solve
-from ceres_cal.start.initialise import PHI_RANGE
 
 # Rise of twice the cost at which the valley is followed no further: three sigma, well beyond any 95 % bound. Nothing
 # changes from half to double.

@@ -123,6 +123,11 @@ class Target:
         return np.array([isinstance(curve, Arc) for curve in self.curves.values()], dtype=bool)
 
     @cached_property
+    def places(self) -> Array:
+        """(P, 3) m: its points, and where its curves begin."""
+        return np.concatenate([self.point_array, self.tracks[0, :, 0] + self.tracks[0, :, 1]])
+
+    @cached_property
     def box(self) -> Array:
         """(2, 2) m, the lowest and the highest x and y of its points and curves."""
         reach = [along_curve(curve, _farthest(curve))[:, :2] for curve in self.curves.values()]
