@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array
+from ceres_cal.base.cached import cached_property
 from ceres_cal.base.errors import CalibrationError
 from ceres_cal.base.tails import upper_tail
 from ceres_cal.lens_choice.forms import PAPER, Form

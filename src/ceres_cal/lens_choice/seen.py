@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Mask, distinct
+from ceres_cal.base.cached import cached_property
 from ceres_cal.base.errors import CalibrationError, DegenerateError
 from ceres_cal.lens_choice.forms import Form
 from ceres_cal.lens_choice.kinds import Candidate, Kind

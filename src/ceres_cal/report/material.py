@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
 from itertools import islice, pairwise
 from pathlib import Path
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Mask
+from ceres_cal.base.cached import cached_property
 from ceres_cal.base.errors import CalibrationError
 from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration

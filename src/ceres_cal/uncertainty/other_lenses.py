@@ -9,11 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array
+from ceres_cal.base.cached import cached_property
 from ceres_cal.base.transforms import Pose
 from ceres_cal.model.keys import Key
 from ceres_cal.model.parameters import Estimate
