@@ -9,7 +9,6 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Sequence
-from contextlib import suppress
 
 from ceres_cal.base.errors import CalibrationError, InputError, SolutionError
 from ceres_cal.base.words import first_of
@@ -21,7 +20,7 @@ from ceres_cal.cli.program import TERMINATED, Terminated, as_a_program, ended
 
 _BEGINNINGS = {"", *(name.partition(" ")[0] for name in COMMANDS if " " in name)}
 _MOST_LETTERS = 200  # of an error that nobody wrote for people
-_INTERRUPTED, _PIPE_CLOSED = 130, 141  # what a shell reports of a program that SIGINT or SIGPIPE ended
+_INTERRUPTED = 130  # what a shell reports of a program that SIGINT ended
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -32,8 +31,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     Returns:
         0 success, 1 the answer is no, 2 bad usage or input, 3 no usable solution, 130 interrupted, 143 terminated.
-        Every failure is one line on standard error, with --json also an object on standard output; with
-        CERES_CAL_DEBUG set an unexpected one is raised instead.
+        It says how the work ended, whether or not its words could be written. Every failure is one line on standard
+        error, with --json also an object on standard output; with CERES_CAL_DEBUG set an unexpected one is raised
+        instead.
     """
     if arguments is not None:
         return _answer(list(arguments))
@@ -55,10 +55,6 @@ def _answer(arguments: list[str]) -> int:
             how, code = ("terminated", TERMINATED) if isinstance(error, Terminated) else ("interrupted", _INTERRUPTED)
             written = f"written were {first_of(files, 3)}" if files else "nothing was written"
             return _fail(f"{how}: {written}", code, as_json)
-        except BrokenPipeError:
-            # Or Python complains when it closes the stream.
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-            return _PIPE_CLOSED
         except MemoryError:
             text = "out of memory: give fewer observations or images at a time"
             return _fail(text, InputError.exit_code, as_json)
@@ -80,8 +76,7 @@ def _fail(message: str, exit_code: int, as_json: bool) -> int:
     if as_json:
         import json
 
-        with suppress(OSError):
-            print(json.dumps({"error": line, "exit_code": exit_code}), flush=True)
+        print(json.dumps({"error": line, "exit_code": exit_code}), flush=True)
     return exit_code
 
 

@@ -90,7 +90,7 @@ def _all_printable(data: Any) -> Any:
 
 
 def print_answer(answer: Answer, *, as_json: bool) -> None:
-    """Print an answer; BrokenPipeError here, not at the program's end, when nobody reads on."""
+    """Print an answer."""
     if as_json:
         import msgspec
 
@@ -103,4 +103,3 @@ def print_answer(answer: Answer, *, as_json: bool) -> None:
         print(msgspec.json.format(encoded, indent=1).decode())
     else:
         print(coloured(answer.text()) if in_colour(sys.stdout) else answer.text())
-    sys.stdout.flush()
