@@ -6,6 +6,8 @@ import json
 import os
 import subprocess
 import sys
+import time
+from collections.abc import Callable
 from itertools import product
 from pathlib import Path
 
@@ -48,7 +50,7 @@ print(json.dumps(codes))
 """
 
 
-def codes_of(calls: list[tuple[list[str], tuple[str, str]]]) -> list[int]:
+def codes_of(calls: list[tuple[list[str], tuple[str, ...]]]) -> list[int]:
     words = [sys.executable, "-c", FORKING, json.dumps(calls)]
     run = subprocess.run(words, env=ENVIRONMENT, capture_output=True, text=True, timeout=120, check=True)
     codes: list[int] = json.loads(run.stdout)
@@ -112,3 +114,44 @@ def test_a_pipe_that_does_not_block_gets_all() -> None:
         with open(reading) as stream:  # noqa: PTH123 a descriptor
             assert json.loads(stream.read())
     assert process.returncode == 0
+
+
+WORKING = """
+import os, sys, time
+from pathlib import Path
+from ceres_cal.base.executing import processes
+
+def work(folder):
+    Path(folder, str(os.getpid())).touch()
+    time.sleep(60.0)
+
+if __name__ == "__main__":
+    with processes(2) as pool:
+        list(pool.map(work, sys.argv[1:] * 2))
+"""
+
+
+def test_processes_end_with_a_parent_that_is_killed(tmp_path: Path) -> None:
+    """In the middle of their work; those of `batch --jobs` and of all others come from `base.executing`."""
+    (tmp_path / "working.py").write_text(WORKING)
+    (pids := tmp_path / "pids").mkdir()
+    process = subprocess.Popen([sys.executable, str(tmp_path / "working.py"), str(pids)], env=ENVIRONMENT)
+    until(lambda: len(list(pids.iterdir())) == 2)
+    process.kill()
+    process.wait()
+    until(lambda: not any(runs(one.name) for one in pids.iterdir()))
+
+
+def runs(pid: str) -> bool:
+    """Neither gone nor only waiting for somebody to ask how it ended."""
+    try:
+        return bool(Path("/proc", pid, "cmdline").read_bytes())
+    except OSError:
+        return False
+
+
+def until(holds: Callable[[], bool]) -> None:
+    ends = time.monotonic() + 20.0
+    while not holds():
+        assert time.monotonic() < ends
+        time.sleep(0.02)
