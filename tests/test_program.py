@@ -73,7 +73,7 @@ def test_streams_do_not_change_an_exit_code() -> None:
 
 
 def test_every_command_fails_as_one_where_nothing_can_be_said() -> None:
-    kinds = [("closed", "closed"), ("open", "closed"), ("full", "full"), ("broken", "broken")]
+    kinds: list[tuple[str, ...]] = [("closed", "closed"), ("open", "closed"), ("full", "full"), ("broken", "broken")]
     calls = [([*name.split(), "--bogus"], both) for name in COMMANDS for both in kinds]
     codes = zip(calls, codes_of(calls), strict=True)
     assert [call for call, code in codes if code != 2] == []

@@ -97,7 +97,7 @@ def print_answer(answer: Answer, *, as_json: bool) -> None:
         # What is infinite or NaN becomes null; arrays and numbers of NumPy's what they hold.
         try:
             encoded = msgspec.json.encode(answer.data, enc_hook=lambda value: value.tolist())
-        except UnicodeEncodeError:  # a file's name that is no UTF-8
+        except UnicodeEncodeError:  # quiet: a file's name that is no UTF-8 is printed with its bytes spelt out
             plain = msgspec.to_builtins(answer.data, enc_hook=lambda value: value.tolist())
             encoded = msgspec.json.encode(_all_printable(plain))
         print(msgspec.json.format(encoded, indent=1).decode())

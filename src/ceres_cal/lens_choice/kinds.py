@@ -158,7 +158,7 @@ class Candidate:
         """Why it cannot be used, "" where it can."""
         try:
             cameras = self.estimate.cameras
-        except CalibrationError as error:
+        except CalibrationError as error:  # reads: "..." beside that lens, why it failed
             return str(error)
         for name, reach_px in self.of.reach_px.items():
             camera = cameras[name]

@@ -86,7 +86,7 @@ class Seen:
                 self._shown(estimate)
                 estimate = solve(problem, estimate, precision=_PRECISION, is_near=False).estimate
             return self._near_best(forms, problem, estimate)
-        except CalibrationError as error:
+        except CalibrationError as error:  # reads: "..." beside that lens, why it failed
             return Kind(forms, estimate, failed=str(error))
 
     def solved(self, forms: tuple[Form, ...], near: Estimate) -> Kind:
@@ -99,7 +99,7 @@ class Seen:
             estimate = end.solution.estimate
             problem = replace(self._problem(options, estimate), smoothness=end.problem.smoothness)
             return self._near_best(forms, problem, estimate)
-        except CalibrationError as error:
+        except CalibrationError as error:  # reads: "..." beside that lens, why it failed
             return Kind(forms, estimate, failed=str(error))
 
     @property
@@ -119,7 +119,7 @@ class Seen:
 
     def reached(self, candidate: Candidate) -> Estimate | None:
         """Where a lens leaves no more than the normal equations of a longer one promised, at once or when solved."""
-        with suppress(CalibrationError):
+        with suppress(CalibrationError):  # quiet: the lens does not reach what was promised, and gives no answer
             points, curves = self.in_sigmas(candidate.estimate)
             if np.sum(points**2) + curves @ curves <= _KEPT * candidate.least:
                 return candidate.estimate

@@ -101,7 +101,7 @@ class Material(Quality):
             return "this calibration is the closed form itself"
         try:
             calibration = calibrate(self.observations, replace(self.calibration.options, closed_form_only=True))
-        except CalibrationError as error:
+        except CalibrationError as error:  # reads: "..." in place of the paper's method
             return str(error)
         remaining = residuals(self.observations, gather_sights(self.observations), calibration.estimate)
         lengths = np.concatenate([np.linalg.norm(remaining.points, axis=1), np.abs(remaining.curves)])

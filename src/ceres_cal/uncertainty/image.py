@@ -131,7 +131,7 @@ def _by_covariance(picture: Picture, estimate: Estimate, posterior: Posterior, c
         at = posterior.information.columns(bends.keys)
         for step, end in zip(bends.steps, bends.ends, strict=True):
             off = np.full(picture.pixels.shape, np.inf)
-            with suppress(InputError):  # no camera there
+            with suppress(InputError):  # reads: "unknown" at these places of the map
                 there = moved(estimate, bends.keys, end).cameras[camera].at(Pose.identity())
                 off = np.nan_to_num(picture.shift(there) - slopes[:, :, at] @ step, nan=np.inf)
             lost = np.isinf(off).any(axis=1)

@@ -40,12 +40,14 @@ class OtherLenses:
     Attributes:
         near: with the chosen lens. others: with others. weights: of each, its probability or less.
         reach_px: camera -> how far from its principal point it was observed: farther out nothing is compared.
+        failed: why nothing could be compared; "" where it could.
     """
 
     near: Estimate
     others: tuple[Estimate, ...]
     weights: tuple[float, ...]
     reach_px: Mapping[str, float]
+    failed: str = ""
 
     @cached_property
     def pixels(self) -> dict[str, Array]:
