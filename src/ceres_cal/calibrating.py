@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -156,13 +155,20 @@ def _of_any_lens(observations: Observations, sights: Sights, options: Options, w
 
     chosen = choose_lens(observations, options, start)
     calibration, chosen = chosen.first_solved(solved, papers(options), start)
-    with suppress(CalibrationError):  # the first one stays
+    said = []
+    try:
         while other := chosen.instead(*calibration.outlier_masks(observations)):
             calibration, chosen = solved(other), other
+    except CalibrationError as error:
+        # reads: "another lens explains observations that were taken out, but makes no calibration of all: ..."
+        said.append(f"another lens explains observations that were taken out, but makes no calibration of all: {error}")
     if calibration.posterior is not None and (others := chosen.others) is not None:
         wider = with_other_lenses(calibration.posterior, calibration.estimate, others)
         calibration = replace(calibration, posterior=wider)
-    warnings = (*calibration.warnings, *filter(None, [chosen.choice.caveat]))
+        if others.failed:
+            without = "the standard deviations do not include what they would say"
+            said.append(f"other lenses could not be compared, so {without}: {others.failed}")
+    warnings = (*calibration.warnings, *filter(None, [chosen.choice.caveat]), *said)
     return replace(calibration, lens_choice=chosen.choice, warnings=warnings)
 
 
@@ -196,12 +202,13 @@ def _of_lens(
     try:
         alone = solved(replace(options, usual_camera=False))
     except CalibrationError:
+        # quiet: with what is usual it is solved for or the failure is told; what rests on that is a warning
         return solved(options)
     if _says_centres(alone, observations, options):
         return alone
     try:
         calibration = solved(options)
-    except CalibrationError:
+    except CalibrationError:  # quiet: the observations alone determine it, with their own standard deviations
         return alone
     unusual = [one.words for one in calibration.conflicts if one.kind == "usual"]
     return replace(alone, warnings=(*alone.warnings, *unusual)) if unusual else calibration
@@ -226,7 +233,7 @@ def _without_priors(observations: Observations, options: Options) -> Calibration
         return None
     try:
         return _calibrated(replace(observations, priors=()), replace(options, priors=()))
-    except CalibrationError:
+    except CalibrationError:  # quiet: the caller raises the first failure
         return None
 
 

@@ -134,7 +134,7 @@ def _observed(args: Namespace, images: list[Path]) -> Iterator[_Step]:
             found = _step(args, DETECT_BOARD[0], [*rest, *board, *goal], most=1)
             rest = [path for path in rest if path not in found.data["found"]]
             yield found if args.target is None else replace(found, lines=found.lines[:1])  # the rest may be the field
-        except NothingShownError as error:
+        except NothingShownError as error:  # reads: "..." below the command of this step
             if args.target is None:
                 raise
             yield _Step(_typed(DETECT_BOARD[0], [*rest, *board, *goal]), (str(error),), {})
@@ -164,7 +164,7 @@ def _exported(args: Namespace, form: str, goal: str) -> _Step:
     arguments = [str(args.output / "calibration.json"), "--to", form, "-o", goal]
     try:
         return _step(args, EXPORT[0], arguments)
-    except InputError as error:
+    except InputError as error:  # reads: "error ..." in place of the export
         return _Step(_typed(EXPORT[0], arguments), (section("error", [str(error)]),), {})
 
 

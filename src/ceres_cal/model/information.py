@@ -8,11 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices
+from ceres_cal.base.cached import cached_property
 from ceres_cal.base.spread import Spread, known_inverses, without
 from ceres_cal.model.keys import Key, sigma_limits
 

@@ -9,12 +9,12 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from numbers import Integral, Real
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices
+from ceres_cal.base.cached import cached_property
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.transforms import Pose, Poses, chained, inverted
 from ceres_cal.model.structure import Structure, Tolerance

@@ -188,7 +188,7 @@ class _Case:
         start = replace(self.estimate, stations={self.name: station})
         try:
             solution = solve(self.problem(used, freed), start)
-        except CalibrationError:
+        except CalibrationError:  # reads: "check no ..." that nothing explains the observations
             return None
         return None if solution.failed else (2.0 * solution.cost, solution.estimate)
 

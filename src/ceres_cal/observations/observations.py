@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import partial
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ceres_cal.base.arrays import Indices, Mask
+from ceres_cal.base.cached import cached_property
 from ceres_cal.base.errors import InputError, naming
 from ceres_cal.observations.bounds import odd_sizes, require_alike, stray_pixels
 from ceres_cal.observations.columns import (

@@ -51,7 +51,7 @@ class AsBuilt:
         dimensions: name of a dimension -> its most likely value, m, where it is another one than the target's.
         sd_m: name of each of those -> its standard deviation, m.
         drawn: name of a dimension -> its value by the target, m. curves: how many there are to tell.
-        misfit: mean square, over what is stated, of what none of that explains.
+        misfit: mean square, over what is stated, of what none of that explains; infinite where the camera shows none.
     """
 
     aside_m: Mapping[str, float]
@@ -118,8 +118,8 @@ def as_built(lines: Lines, camera: Camera, target: Target, priors: tuple[Prior, 
     problem, estimate = problem_of(camera, seen, free, priors)
     try:
         equations = write_equations(seen, problem.sights, estimate, residuals(seen, problem.sights, estimate))
-    except SolutionError:
-        return AS_DRAWN
+    except SolutionError:  # reads: "..." of `AsBuilt.words`: this is another field
+        return replace(AS_DRAWN, misfit=np.inf)
     every = np.ones(len(equations), dtype=bool)
     weights = Weights(1.0 / sigma[equations.observation], every, np.ones(len(equations)))
     model = make_linear_model(problem, estimate, equations, weights)

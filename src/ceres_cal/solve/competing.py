@@ -78,7 +78,7 @@ def _freed(every: Asked, solver: Solver) -> Asked:
         return every
     try:
         end = solver(freed, every)
-    except CalibrationError:
+    except CalibrationError:  # quiet: they are competed with as stated; what contradicts them is tested afterwards
         return every
     return every if end.solution.failed else replace(every, problem=freed, end=end)
 
@@ -228,7 +228,7 @@ class _Competition:
         gone = wholes.among(np.array(numbers))
         try:
             end = self._solver(self._some.without(gone | ~self._taking_part), self._some)
-        except CalibrationError:
+        except CalibrationError:  # quiet: what determines nothing without the suspects is no explanation
             return None
         if wholes.of_features:
             return end

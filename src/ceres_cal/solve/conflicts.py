@@ -169,7 +169,7 @@ class _Search:
         """The problem solved from where the last one ended; None where it cannot be."""
         try:
             after = solve_robustly(problem, self.observations, self.end.solution.estimate, self.usual)
-        except CalibrationError:
+        except CalibrationError:  # quiet: the linear test decides
             return None
         return None if after.solution.failed else after
 
@@ -183,7 +183,7 @@ class _Search:
         bound = replace(without, priors=self.problem.priors, layout=self.problem.layout)
         try:
             least, most = solve(without, rest.estimate), solve(bound, self.end.solution.estimate)
-        except CalibrationError:
+        except CalibrationError:  # quiet: the linear test decides
             return test
         rise = max(2.0 * (most.cost - least.cost), 0.0)  # of exact observations it is rounding
         if rise >= test.squared or len(statement.priors) > 1:

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, reduce
+from functools import reduce
 from operator import add
 
 import numpy as np
 
 from ceres_cal import kernels
 from ceres_cal.base.arrays import Array, Indices
+from ceres_cal.base.cached import cached_property
 from ceres_cal.base.errors import SolutionError
 from ceres_cal.base.spread import known_inverses
 from ceres_cal.base.threads import parts_of, run_parts

@@ -148,7 +148,7 @@ def _end(problem: Problem, estimate: Estimate, keys: tuple[Key, ...], step: Arra
     """The least cost where the part of the numbers along a step is as long as it; None where it is not found."""
     sizes = natural_sizes(estimate, keys)
     row = step / sizes**2 / float(np.sum((step / sizes) ** 2)) / _HELD
-    with suppress(InputError):  # no camera there
+    with suppress(InputError):  # quiet: no camera there; the end counts as far away as any
         held = GaussianPrior.about(Information(keys, np.outer(row, row)), moved(estimate, keys, step))
         solution = _solved(replace(problem, priors=(*problem.priors, held)), estimate)
         if solution is not None:
@@ -162,7 +162,7 @@ def _solved(problem: Problem, start: Estimate) -> Solution | None:
     short = replace(problem.options, max_iterations=min(_MOST_ITERATIONS, problem.options.max_iterations))
     try:
         solution = solve(replace(problem, options=short), start)
-    except CalibrationError:
+    except CalibrationError:  # quiet: the end counts as far away as any
         return None
     return None if solution.failed else solution
 

@@ -10,11 +10,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Mask
+from ceres_cal.base.cached import cached_property
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.tails import NORMAL_95
 from ceres_cal.base.transforms import Pose
@@ -129,7 +129,7 @@ def _by_covariance(picture: Picture, estimate: Estimate, posterior: Posterior, c
         taken = over(bends.steps, bends.keys, posterior.keys)
         for step, end in zip(taken, bends.ends, strict=True):
             off = np.full(picture.pixels.shape, np.inf)
-            with suppress(InputError):  # no camera there
+            with suppress(InputError):  # reads: "unknown" at these places of the map
                 there = moved(estimate, bends.keys, end).cameras[camera].at(Pose.identity())
                 off = np.nan_to_num(picture.shift(there) - slopes @ step, nan=np.inf)
             lost = np.isinf(off).any(axis=1)

@@ -131,7 +131,7 @@ def _bend(
     total = np.zeros((len(pixels), 2, 2))
     for step, end in zip(*steps, strict=True):
         off = np.full((len(pixels), 2), np.nan)
-        with suppress(InputError):  # no camera there
+        with suppress(InputError):  # reads: "unknown" at these places of the map
             off = moved(estimate, keys, end).camera_at(station).locate(pixels, height_m) - located - slopes @ step
         total += off[:, :, None] * off[:, None, :]
     lost = np.isnan(total).any(axis=(1, 2))

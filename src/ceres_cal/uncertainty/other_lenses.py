@@ -9,11 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array
+from ceres_cal.base.cached import cached_property
 from ceres_cal.base.transforms import Pose
 from ceres_cal.model.keys import Key
 from ceres_cal.model.parameters import Estimate
@@ -40,12 +40,14 @@ class OtherLenses:
     Attributes:
         near: with the chosen lens. others: with others. weights: of each, its probability or less.
         reach_px: camera -> how far from its principal point it was observed: farther out nothing is compared.
+        failed: why nothing could be compared; "" where it could.
     """
 
     near: Estimate
     others: tuple[Estimate, ...]
     weights: tuple[float, ...]
     reach_px: Mapping[str, float]
+    failed: str = ""
 
     @cached_property
     def pixels(self) -> dict[str, Array]:

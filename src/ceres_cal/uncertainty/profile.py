@@ -195,7 +195,7 @@ def _node(camera: str, problem: Problem, start: Estimate, inflation: float) -> N
         held = problem.holding(camera, 0)
         solution = solve(held, start)
         known = None if solution.failed else information(problem, solution.estimate).shared
-    except CalibrationError:
+    except CalibrationError:  # quiet: a smaller step is tried; a valley without an end stays open
         return None
     if known is None:
         return None

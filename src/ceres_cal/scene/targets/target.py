@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Mask
+from ceres_cal.base.cached import cached_property
 from ceres_cal.base.errors import InputError
 from ceres_cal.scene.curves import Arc, Curve, along_curve
 from ceres_cal.scene.targets.crossings import aliases
