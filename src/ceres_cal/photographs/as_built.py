@@ -203,12 +203,12 @@ class _Shape:
         """The best set of the parts, each a root (Q, Z) of a covariance, and the scatter of paint, m, beside it."""
         width = max((root.shape[1] for root in roots), default=1)
         padded = [np.pad(root, ((0, 0), (0, width - root.shape[1]))) for root in roots]
-        modes = self.effects.modes(np.array(padded).reshape(-1, len(self.owner), width))
+        modes = self.effects.modes(np.array(padded).reshape(len(roots), len(self.owner), width))
         beam: list[frozenset[int]] = [frozenset()]
         best, most, scatter_m = frozenset[int](), -np.inf, float(_SCATTER_M[0])
         for _ in range(_MOST + 1):
             sets = np.swapaxes(modes[np.array([sorted(one) for one in beam], dtype=int)], 1, 2)
-            evidence = self.effects.log_evidence(sets.reshape(*sets.shape[:2], -1), _SCATTER_M)
+            evidence = self.effects.log_evidence(sets.reshape(*sets.shape[:2], len(beam[0]) * width), _SCATTER_M)
             score = evidence.max(axis=1) + _LOG_ODDS * len(beam[0])
             order = np.argsort(-score)
             if score[order[0]] > most:
