@@ -28,7 +28,7 @@ from ceres_cal.model.parameters import (
     with_intrinsics,
 )
 from ceres_cal.model.structure import make_structure
-from ceres_cal.observations import NO_CURVES, Observations, Points, View
+from ceres_cal.observations import NO_CURVES, Observations, Points, Prior, View
 from ceres_cal.observations.sights import SightKey
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Brown, KannalaBrandt, Radial, make_lens
@@ -207,3 +207,31 @@ def test_poses_chain_from_frame_to_camera() -> None:
     stack = estimate.pose_stack([SightKey("lens", "up", "there"), SightKey("lens", "up", None)])
     for matrix, pose in zip(stack, (station @ placement, station), strict=True):
         assert np.max(np.abs(matrix - np.column_stack([pose.rotation, pose.translation]))) < 1e-15
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"priors": "x"}, r"Options\(priors=\.\.\.\): Expected `array`, got `str`"),
+        ({"coefficients": "k1"}, r"Options\(coefficients=\.\.\.\): Expected `array | null`"),
+        ({"lens": None}, r"Options\(lens=\.\.\.\): Expected `str`, got `null`"),
+        ({"fixed": {"phi": "x"}}, r"Options\(fixed=\.\.\.\): Expected `float`, got `str`"),
+        ({"tolerances": {"field": 0.01}}, r"Options\(tolerances=\.\.\.\): Expected `object`"),
+        ({"free_skew": 1}, r"Options\(free_skew=\.\.\.\): Expected `bool`"),
+        ({"threads": 10**30}, "threads must be 2147483647 at most, not 1e\\+30"),
+        ({"max_iterations": 2**31}, "max_iterations must be 2147483647 at most"),
+    ],
+)
+def test_options_of_another_type_are_named(given: dict[str, Any], words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        Options(**given)
+
+
+def test_numbers_of_numpy_are_numbers() -> None:
+    powers: Any = np.array([2, 3])
+    options = Options(powers=powers, loss_scale=np.float64(2.0), fixed={"phi": np.float32(800.0)})
+    assert (options.powers, options.fixed) == ((2, 3), {"phi": 800.0}) and type(options.powers[0]) is int
+    prior = Prior("station", "s", "height_m", np.array([4.0]), [np.int64(1)])  # type: ignore[arg-type]
+    assert (prior.value, prior.sigma) == ((4.0,), (1.0,))
+    with pytest.raises(InputError, match=r"Prior\(value=\.\.\.\): Expected `array`, got `str`"):
+        Prior("station", "s", "height_m", "x", (1.0,))  # type: ignore[arg-type]

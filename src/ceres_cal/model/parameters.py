@@ -16,6 +16,7 @@ import numpy as np
 from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.transforms import Pose, Poses, chained, inverted
+from ceres_cal.base.typed import take_types
 from ceres_cal.model.structure import Structure, Tolerance
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.observations.sights import SightKey
@@ -31,6 +32,7 @@ OF_PIXELS = ("phi", "aspect", "cx", "cy")
 # Views that tell an aspect and a skew beside the lens: no test decides there (halves of a set whose pixels are 0.2 %
 # higher than wide were 3 sd of phi apart, one with them and one without).
 _ENOUGH_VIEWS = 8
+_LARGEST = 2**31 - 1  # whole number that Ceres counts with
 LOSSES = ("trivial", "huber", "soft_l1", "cauchy", "tukey")
 
 
@@ -91,6 +93,7 @@ class Options:
     threads: int = 0
 
     def __post_init__(self) -> None:
+        take_types(self)
         if self.lens == AUTO and self.powers:
             object.__setattr__(self, "lens", _OF_POWERS)
         if self.lens != AUTO:
@@ -120,6 +123,9 @@ class Options:
                 raise InputError(f"{name} must be above 0, not {getattr(self, name)}")
         if self.threads < 0:
             raise InputError(f"threads must be 0 (to choose) or above, not {self.threads}")
+        for name in ("max_iterations", "threads"):
+            if getattr(self, name) > _LARGEST:
+                raise InputError(f"{name} must be {_LARGEST} at most, not {getattr(self, name):.3g}")
 
     @property
     def _which(self) -> str:
