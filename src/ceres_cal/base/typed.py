@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping
+from collections.abc import Mapping
 from functools import cache
 from typing import Any, get_type_hints
 
@@ -18,13 +18,13 @@ def take_types(instance: Any) -> None:
     Raises:
         InputError: a value is of another type: names the field.
     """
-    for name, kind in _fields(type(instance)).items():
+    for name, kind in _fields(type(instance)).items():  # type: ignore[arg-type] # a class has a hash
         where = f"{type(instance).__name__}({name}=...)"
         object.__setattr__(instance, name, convert(_plain(getattr(instance, name)), kind, where))
 
 
 @cache
-def _fields(of: Hashable) -> dict[str, Any]:
+def _fields(of: type) -> dict[str, Any]:
     return get_type_hints(of)
 
 
