@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Collection, Sequence
 from functools import cache
 
 import msgspec
@@ -36,9 +37,12 @@ class ProfileFile(msgspec.Struct, forbid_unknown_fields=True):
         across = [lower_triangle(information) for information in profile.across]
         return cls(list(profile.keys), profile.phi_px, steps, rises, across, profile.open_below, profile.open_above)
 
-    def profile(self, camera: str) -> PhiProfile:
-        """The valley along phi of a camera; InputError where its numbers do not fit each other."""
+    def profile(self, camera: str, known: Collection[Key]) -> PhiProfile:
+        """The valley along phi of a camera; InputError where its numbers do not fit each other, or those known."""
         where = f"posterior.profiles.{camera}"
+        require_keys(self.keys, known, where)
+        if not self.keys or self.keys[0][:3] != ("camera", camera, "phi"):
+            raise InputError(f"{where} does not begin with phi of camera {camera!r}: calibrate again")
         counts = {len(self.steps), len(self.rises), len(self.information)}
         if len(counts) != 1 or any(len(row) != len(self.keys) for row in self.steps):
             raise InputError(f"{where}: steps, rises and information do not fit each other: calibrate again")
@@ -60,13 +64,12 @@ class BendsFile(msgspec.Struct, forbid_unknown_fields=True):
         """As a file has it."""
         return cls(list(bends.keys), bends.steps.tolist(), bends.ends.tolist(), bends.half_width)
 
-    def bends(self, known: Sequence[Key]) -> Bends:
+    def bends(self, known: Collection[Key]) -> Bends:
         """The bends; InputError where their numbers do not fit each other, or those that are known."""
         rows = [*self.steps, *self.ends]
         if len(self.steps) != len(self.ends) or any(len(row) != len(self.keys) for row in rows):
             raise InputError("posterior.bends: steps, ends and keys do not fit each other: calibrate again")
-        if not set(self.keys) <= set(known):
-            raise InputError("posterior.bends names keys that the posterior does not have: calibrate again")
+        require_keys(self.keys, known, "posterior.bends")
         return Bends(tuple(self.keys), np.array(self.steps), np.array(self.ends), self.half_width)
 
 
@@ -97,14 +100,17 @@ class PosteriorFile(msgspec.Struct, forbid_unknown_fields=True):
             None if posterior.bends is None else BendsFile.of(posterior.bends),
         )
 
-    def posterior(self) -> Posterior:
-        """The posterior; InputError where a matrix has the wrong size."""
+    def posterior(self, known: Collection[Key]) -> Posterior:
+        """The posterior; InputError where a matrix has the wrong size, or a number is none of those known."""
+        require_keys(self.keys, known, "posterior.keys")
+        for name in self.placements:
+            require_keys(pose_keys("placement", name), known, "posterior.placements")
         placements = {
             name: information_from(row, pose_keys("placement", name), f"posterior.placements.{name}")
             for name, row in self.placements.items()
         }
         information = information_from(self.information, self.keys, "posterior.information")
-        profiles = {name: entry.profile(name) for name, entry in self.profiles.items()}
+        profiles = {name: entry.profile(name, self.keys) for name, entry in self.profiles.items()}
         by_model = self.by_model and information_from(self.by_model, self.keys, "posterior.by_model")
         freedom = np.inf if self.freedom is None else self.freedom
         bends = None if self.bends is None else self.bends.bends(self.keys)
@@ -120,6 +126,15 @@ def lower_triangle(information: Information) -> list[float]:
 def _lower_triangle(size: int) -> tuple[Indices, Indices]:
     rows, columns = np.tril_indices(size)
     return rows, columns
+
+
+def require_keys(keys: Sequence[Key], known: Collection[Key], where: str) -> None:
+    """Raise InputError where a key of a file is there twice, or is none of those known."""
+    for key, count in Counter(keys).items():
+        if count > 1:
+            raise InputError(f"{where} names {key.quantity!r} of {key.whose} twice: calibrate again")
+        if key not in known:
+            raise InputError(f"{where} names {key.quantity!r} of {key.whose}, which is not there: calibrate again")
 
 
 def information_from(triangle: Sequence[float], keys: Sequence[Key], where: str) -> Information:
