@@ -33,6 +33,8 @@ OF_PIXELS = ("phi", "aspect", "cx", "cy")
 # higher than wide were 3 sd of phi apart, one with them and one without).
 _ENOUGH_VIEWS = 8
 _LARGEST = 2**31 - 1  # whole number that Ceres counts with
+# Standard deviations that somebody may mean: a bound below takes every observation out, one above takes out none.
+_SIGMAS = (1e-3, 1e9)
 LOSSES = ("trivial", "huber", "soft_l1", "cauchy", "tukey")
 
 
@@ -118,9 +120,12 @@ class Options:
                 raise InputError(f"cannot fix {name!r}: {self._which} has {', '.join(names)}")
             if not np.isfinite(value):
                 raise InputError(f"cannot fix {name} at {value}: give a finite number")
-        for name in ("loss_scale", "reject_sigma", "max_iterations"):
-            if not getattr(self, name) > 0:
-                raise InputError(f"{name} must be above 0, not {getattr(self, name)}")
+        for name in ("loss_scale", "reject_sigma"):
+            if not _SIGMAS[0] <= getattr(self, name) <= _SIGMAS[1]:
+                least, most = _SIGMAS
+                raise InputError(f"{name} must be {least:g} to {most:g} sigmas, not {getattr(self, name)}")
+        if not self.max_iterations > 0:
+            raise InputError(f"max_iterations must be above 0, not {self.max_iterations}")
         if self.threads < 0:
             raise InputError(f"threads must be 0 (to choose) or above, not {self.threads}")
         for name in ("max_iterations", "threads"):
