@@ -28,6 +28,10 @@ class Group:
     port: int = 10006
     interface: str = "0.0.0.0"
 
+    def __post_init__(self) -> None:
+        if not 0 < self.port < 65536:
+            raise InputError(f"port {self.port:.6g}: give one from 1 to 65535")
+
 
 def wrapped(geometry: Mapping[str, Any]) -> bytes:
     """The wrapper packet of an SSL_GeometryData as plain data; vision-processor takes over any for its camera's id."""
