@@ -1,369 +1,318 @@
-"""Damaged files before every reader: scripts/fuzz.py [--files N | --minutes N] [--seed N] [--keep FOLDER]
+"""Odd input before every command: scripts/fuzz.py [--runs N | --minutes N] [--seed N] [--keep FOLDER]
 
-Files of a small corpus, made of what the package ships, are mutated: bytes, numbers and names of JSON, columns of
-archives, headers of images. A reader must refuse in one line that names the file, or accept; what is accepted must
-survive being written and read again. Counted as failures: other exceptions, warnings, over 10 s of processor time or
-60 s on the wall, over 1 GiB more than before, deaths of the process, and what does not come back. Exits with 1 when
-there is one; --keep keeps the files that did it.
+Commands over a small corpus, made of what the package ships, are run whole with changes of every kind: numbers, types,
+sizes, names and order in JSON, columns, text and pictures; damaged bytes; exchanged, missing and odd files; words and
+options of the command line (scripts/fuzz_commands.py, scripts/fuzz_mutations.py). A command must answer, or refuse in
+one line with a documented exit code; what it writes must be whole, and be read again. Counted as failures: any other
+exception, warnings, more than a line, half-written files, over 20 s of processor time or 300 s on the wall, over 2 GiB
+more than before, and deaths of the process. Exits with 1 when there is one; --keep keeps the folders that did it.
+Run N of a seed is the same whatever runs beside it: --only N repeats it alone.
 """
 
 from __future__ import annotations
 
 import argparse
-import base64
 import faulthandler
+import importlib
 import io
 import json
+import math
 import multiprocessing
 import os
+import pkgutil
 import re
 import resource
+import shlex
 import shutil
 import signal
 import sys
 import tempfile
 import time
+import traceback
 import warnings
-import zipfile
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
-from itertools import takewhile
+from collections.abc import Iterator, Sequence
+from contextlib import redirect_stderr, redirect_stdout, suppress
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
-from ssl_settings_file import settings
+from fuzz_commands import FORMATS, Case, corpus, make_case
 
+import ceres_cal
 from ceres_cal.base.errors import CalibrationError
-from ceres_cal.base.files import write_json
-from ceres_cal.calibrating import calibrate
-from ceres_cal.calibration import Calibration
-from ceres_cal.detect.images import read_colour, read_grey
-from ceres_cal.formats import LookupTable, export, make_lookup_table, read_foreign
-from ceres_cal.observations import Observations
-from ceres_cal.photographs.clicks import load_clicks
-from ceres_cal.simulate import built_in_scene, load_scene
-from ceres_cal.simulate.files import scene_to_json
 
-DATA = Path(__file__).resolve().parents[1] / "data"
-LONGEST_S, LONGEST_WAIT_S, MOST_MB = 10, 60, 1024
+LONGEST_S, LONGEST_WAIT_S, MOST_MB = 20, 300, 2048
+TOGETHER = 20  # commands of one child: a fork takes as long as a short one
+EXIT_CODES = {0, 1, 2, 3}
 TRACE = "where.txt"  # a process that took too long was
-FAILURES = ("unexpected", "warning", "changed", "many lines", "slow", "died", "memory")
-TOKENS = b'0 -1 1 2 1e400 -0.0 1e308 5e-324 NaN -Infinity 9000000000 1e24 null true [] {} "" "a"'.split()
-TOKENS += [b'"\\ud800"', b'"\\u0000"', b'"' + b"x" * 300 + b'"', b"[" * 500, b"1" + b"0" * 400, b"[[1,2],[3]]"]
-WORDY = (".json", ".yml", ".yaml", ".xml", ".cameramodel", ".txt", ".vnl", ".csv")
-NUMBER = re.compile(rb"-?[0-9]+(\.[0-9]+)?(e-?[0-9]+)?")
-WORD = re.compile(rb'"(?:[^"\\]|\\.)*"|-?[0-9][0-9.eE+-]*|true|false|null|[\[\]{}:,]')
-
-Reader = Callable[[Path], object]
+FAILURES = ("unexpected", "warning", "half written", "many lines", "exit code", "slow", "died", "memory")
+_KEPT = 3  # of each failure
+_SAID_EVERY = 200
 
 
-# ---- what is read ---------------------------------------------------------------------------------------------------
+class Outcome(NamedTuple):
+    """What a command came to, and in which words; where, of an exception, is its place in the package."""
+
+    what: str
+    words: str
+    where: str = ""
 
 
-def _image(path: Path) -> None:
-    read_grey(path)
-    read_colour(path)
+# ---- one command ----------------------------------------------------------------------------------------------------
 
 
-def _foreign(form: str, **options: Any) -> Reader:
-    return lambda path: read_foreign(path, form, **options)
+def outcome(case: Case, place: Path) -> Outcome:
+    """Run a command in its folder and look at what it says and leaves."""
+    out, err = io.StringIO(), io.StringIO()
+    before = set(place.rglob("*"))
+    with redirect_stdout(out), redirect_stderr(err):
+        try:
+            with warnings.catch_warnings(record=True) as heard:
+                warnings.simplefilter("always")
+                code = case.run()
+        except CalibrationError as error:  # of Python's own: the others are words by then
+            code = error.exit_code
+            print(f"ceres-cal: {error}", file=err)
+        except MemoryError as error:
+            return Outcome("memory", repr(error), _place_of(error))
+        except BaseException as error:
+            return Outcome("unexpected", repr(error)[:300], _place_of(error))
+        said = err.getvalue()
+        if heard:
+            return Outcome("warning", str(heard[0].message), f"{heard[0].filename}:{heard[0].lineno}")
+        if "Traceback" in said + out.getvalue() or "out of memory" in said:
+            return Outcome("memory" if "out of memory" in said else "unexpected", said[:300])
+        if code not in EXIT_CODES:
+            return Outcome("exit code", f"{code}: {said[:300]}")
+        *progress, last = said.splitlines() or [""]
+        if code >= 2 and case.name != "batch" and not last.startswith("ceres-cal: "):
+            return Outcome("many lines", said[-300:])
+        if any(line.startswith("ceres-cal: ") for line in progress):
+            return Outcome("many lines", said[-300:])
+        if half := _half_written(place, before):
+            return Outcome("half written", half)
+    return Outcome(("accepted", "no", "refused", "no solution")[code], said.strip())
 
 
-def _model(path: Path) -> object:
-    return read_foreign(path.parent, "colmap")
+def _place_of(error: BaseException) -> str:
+    """Where in the package, from the inside out."""
+    frames = [f for f in traceback.extract_tb(error.__traceback__) if "ceres_cal" in f.filename]
+    return " < ".join(f"{Path(f.filename).name}:{f.lineno}" for f in reversed(frames[-4:]))
 
 
-EXPORTED = {"opencv.yml": "opencv", "opencv.xml": "opencv", "opencv.json": "opencv", "ros.yaml": "ros"}
-EXPORTED |= {"chain.yaml": "kalibr", "own.cameramodel": "mrcal", "paper.txt": "paper"}
-EXPORTED |= {"geometry.pb": "ssl-vision", "geometry.yml": "vision-processor"}
-BOARD: dict[str, Any] = {"columns": 2, "rows": 2, "square": 0.1, "image_size": "640x480"}
-OTHERS = {
-    "corners.vnl": b"# filename x y level\n" + b"".join(b"a.png %d 20 %d\n" % (10 * n, n % 2) for n in range(4)),
-    "table.csv": b"frame,point,curve,x_px,y_px,sigma_px\n1,TopLeftCorner,,9,5,0.3\n1,,TopTouchLine,12,5,\n",
-}
-READERS: dict[str, Reader] = {
-    **{name: _foreign(form) for name, form in EXPORTED.items()},
-    "corners.vnl": _foreign("corners-vnl", **BOARD),
-    "table.csv": _foreign("csv", target="ssl-b", image_size="640x480"),
-    "columns.npz": _foreign("npz-columns", image_size="640x480"),
-    "boards.cameramodel": _foreign("mrcal-observations"),
-    "camera.xml": _foreign("ssl-vision-xml"),
-    **{f"colmap/{part}.txt": _model for part in ("cameras", "frames", "images", "rigs")},
-    "observations.json": Observations.load,
-    "observations.npz": Observations.load,
-    "calibration.json": Calibration.load,
-    "table.npz": LookupTable.load,
-    "scene.json": load_scene,
-    "corners.json": load_clicks,
-    **{f"image{ending}": _image for ending in (".png", ".jpg", ".bmp", ".tif", ".webp", ".pgm", ".ppm", ".jp2")},
-}
+def _half_written(place: Path, before: set[Path]) -> str:
+    """What is wrong with a file that was not there before; nothing where all are whole."""
+    for path in sorted(set(place.rglob("*")) - before):
+        if path.name.endswith(".part") or (path.is_file() and path.stat().st_size == 0):
+            return f"{path.name} is left"
+        try:
+            if path.suffix == ".json" and path.is_file():
+                data = json.loads(path.read_bytes())
+                stated = data.get("format") if isinstance(data, dict) else None
+                if stated in FORMATS:
+                    FORMATS[stated](path)
+            elif path.suffix == ".npz":
+                with np.load(path, allow_pickle=False) as archive:
+                    _ = [archive[name] for name in archive.files]
+        except (CalibrationError, ValueError, OSError) as error:
+            return f"{path.name} cannot be read: {error}"
+    return ""
 
 
-def corpus(folder: Path) -> None:
-    """One good file for each reader."""
-    observations = Observations.load(DATA / "ssl_field_moved" / "observations.json")
-    observations.save(folder / "observations.json")
-    observations.save(folder / "observations.npz")
-    calibration = calibrate(observations)
-    calibration.save(folder / "calibration.json")
-    x, y = np.array([-4.5, 4.5]), np.array([-3.0, 3.0])
-    station = next(iter(calibration.stations))
-    make_lookup_table(calibration.stations[station], station, x, y, step_px=128).save(folder / "table.npz")
-    for name, form in EXPORTED.items():
-        options: dict[str, Any] = {"camera_id": "0"} if "geometry" in name else {}
-        export(calibration, form, folder / name, [station], **options)
-    export(calibration, "colmap", folder / "colmap", [station])
-    (folder / "camera.xml").write_text(settings(cameras=1))
-    foreign_observations(folder)
-    write_json(folder / "scene.json", scene_to_json(*built_in_scene("ssl-field")))
-    corners = {name: [10.0 * number, 20.0] for number, name in enumerate("abcd")}
-    write_json(folder / "corners.json", {"format": "ceres-cal/corners", "version": 1, "points": corners})
-    photograph = next((DATA / "ssl_field_moved" / "photographs").iterdir())
-    small = cv2.resize(read_colour(photograph), (64, 48))
-    for ending in (".png", ".jpg", ".bmp", ".tif", ".webp", ".ppm", ".jp2", ".pgm"):
-        cv2.imwrite(str(folder / f"image{ending}"), small if ending != ".pgm" else small[:, :, 0])
+# ---- children -------------------------------------------------------------------------------------------------------
 
 
-def foreign_observations(folder: Path) -> None:
-    for name, content in OTHERS.items():
-        (folder / name).write_bytes(content)
-    x, y = np.arange(4.0), np.ones(4)
-    np.savez(folder / "columns.npz", x_px=x, y_px=y, X_m=x, Y_m=y)
-    stream, sizes = io.BytesIO(), np.array([[640, 480]])
-    inputs: dict[str, Any] = {"observations_board": np.ones((1, 2, 2, 3)), "calibration_object_spacing": np.array(0.1)}
-    indices = np.array([[0, 0, -1]])
-    np.savez(stream, **inputs, imagersizes=sizes, indices_frame_camintrinsics_camextrinsics=indices)
-    packed = {"optimization_inputs": base64.b85encode(stream.getvalue())}
-    (folder / "boards.cameramodel").write_text(repr(packed))
-
-
-def round_trip(loaded: object, path: Path) -> bool:
-    """Whether what was accepted comes back from a file of its own, to the last byte."""
-    if not isinstance(loaded, Observations | Calibration | LookupTable):
-        return True
-    ending = ".npz" if path.suffix == ".npz" else ".json"
-    again = [path.with_name(f"again{number}{ending}") for number in (1, 2)]
-    loaded.save(again[0])
-    type(loaded).load(again[0]).save(again[1])
-    return again[0].read_bytes() == again[1].read_bytes()
-
-
-# ---- mutations ------------------------------------------------------------------------------------------------------
-
-
-def bytes_changed(content: bytes, rng: np.random.Generator) -> bytes:
-    out = bytearray(content)
-    for _ in range(int(rng.integers(1, 5))):
-        at, length = int(rng.integers(0, len(out) + 1)), int(rng.integers(1, 40))
-        kind = rng.integers(0, 6)
-        if kind == 0 and at < len(out):
-            out[at] ^= 1 << int(rng.integers(0, 8))
-        elif kind == 1:
-            out[at : at + length] = rng.bytes(length)
-        elif kind == 2:
-            del out[at : at + length]
-        elif kind == 3:
-            out[at:at] = out[at : at + length]
-        elif kind == 4:
-            out[at : at + 4] = rng.choice([b"\xff\xff\xff\xff", b"\0\0\0\0", b"\x7f\xff\xff\xff", b"\xff\xff\xff\x7f"])
-        else:
-            del out[at:]
-    return bytes(out)
-
-
-def words_changed(content: bytes, rng: np.random.Generator) -> bytes:
-    """JSON with some of its words exchanged, doubled, left out or replaced by odd ones."""
-    places = [match.span() for match in WORD.finditer(content)]
-    for _ in range(int(rng.integers(1, 4))):
-        first, last = places[int(rng.integers(0, len(places)))]
-        other = content[slice(*places[int(rng.integers(0, len(places)))])]
-        if NUMBER.fullmatch(content[first:last]):
-            other = repr(float(content[first:last]) * rng.choice([-1.0, 0.0, 0.5, 1e-9, 1e3, 1e9, 1e200])).encode()
-        word = [TOKENS[int(rng.integers(0, len(TOKENS)))], other, b"", content[first:last] * 2][int(rng.integers(0, 4))]
-        content = content[:first] + word + content[last:]
-        places = [(a, b) for a, b in places if b <= first] or places[:1]
-    return content
-
-
-def columns_changed(content: bytes, rng: np.random.Generator) -> bytes:
-    """An archive whose columns are other ones: bytes, headers, numbers; its own checks agree with them."""
-    stream = io.BytesIO()
-    with zipfile.ZipFile(io.BytesIO(content)) as old, zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as new:
-        names = old.namelist()
-        chosen = names[int(rng.integers(0, len(names)))]
-        for name in names:
-            column = old.read(name)
-            if name == chosen:
-                column = bytes_changed(column, rng) if rng.integers(0, 2) else header_changed(column, rng)
-            new.writestr(name, column)
-    return stream.getvalue()
-
-
-def header_changed(column: bytes, rng: np.random.Generator) -> bytes:
-    words = [
-        b"<f8",
-        b"<i8",
-        b"|O",
-        b"<U9",
-        b"True",
-        b"(1000000000000,)",
-        b"(-1,)",
-        b"()",
-        b"(0,)",
-        b"(2, 2)",
-        b"<M8[s]",
-    ]
-    old = re.findall(rb"'[<|>][a-zA-Z][0-9]*'|False|\([0-9, ]*\)", column[:120]) or [b"{"]
-    chosen, word = old[int(rng.integers(0, len(old)))], words[int(rng.integers(0, len(words)))]
-    return column.replace(chosen, word if word[:1] in b"(T" else b"'" + word + b"'", 1)
-
-
-def mutated(name: str, content: bytes, rng: np.random.Generator) -> bytes:
-    special = columns_changed if name.endswith(".npz") else words_changed if name.endswith(WORDY) else None
-    return (special if special is not None and rng.random() < 0.7 else bytes_changed)(content, rng)
-
-
-# ---- work -----------------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Goal:
-    """So many files, or until a time of the clock."""
-
-    files: int
-    end: float
-
-    def after(self, files: int) -> Goal | None:
-        """What is left after so many files; None where nothing is."""
-        left = replace(self, files=self.files - files)
-        return left if left.files > 0 and time.time() < self.end else None
-
-    def __iter__(self) -> Iterator[int]:
-        return takewhile(lambda _: time.time() < self.end, range(self.files))
-
-
-def outcome(reader: Reader, path: Path) -> tuple[str, str]:
-    """What a reader made of a file, and in which words."""
-    try:
-        with warnings.catch_warnings(record=True) as heard:
-            warnings.simplefilter("always")
-            loaded = reader(path)
-            whole = round_trip(loaded, path)
-    except CalibrationError as error:
-        text = str(error)
-        named = text.startswith((f"{path}", f"{path.parent}:"))  # a model of several files goes by its folder
-        return ("refused" if "\n" not in text and named else "many lines"), text
-    except Exception as error:
-        return "unexpected", repr(error)
-    if heard:
-        return "warning", str(heard[0].message)
-    return ("accepted" if whole else "changed"), ""
-
-
-def work(folder: Path, names: Sequence[str], seed: int, goal: Goal, keep: Path | None, answers: Any) -> None:
-    """Mutate and read until the goal is reached; each answer is (reader, outcome, words, seconds, MB)."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # what image libraries say
+def work(folder: Path, seed: int, numbers: Sequence[int], answers: Any) -> None:
+    """The runs of these numbers; each answer is (number, name, outcome, seconds, MB)."""
+    os.setpgid(0, 0)  # whoever ends this one ends its children
+    for descriptor in (1, 2):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), descriptor)  # what libraries say
+    os.environ["CERES_CAL_DEBUG"] = "1"  # raises what would be one line that begins with "unexpected"
     trace = (folder / TRACE).open("w")
-    for number in (signal.SIGALRM, signal.SIGPROF):
-        faulthandler.register(number, trace, all_threads=True, chain=True)
-    rng, before_mb = np.random.default_rng(seed), _peak_mb()  # a fork begins with what its parent has
-    contents = {name: (folder / name).read_bytes() for name in names}
-    place = Path(tempfile.mkdtemp(dir=folder))
-    shutil.copytree(folder / "colmap", place / "colmap")
-    for _ in goal:
-        name = names[int(rng.integers(0, len(names)))]
-        path = place / name
-        path.write_bytes(mutated(name, contents[name], rng))
-        answers.send((name, "begun", str(path), 0.0, 0.0))
+    for told in (signal.SIGUSR1, signal.SIGPROF):
+        faulthandler.register(told, trace, all_threads=True, chain=True)
+    place = Path(tempfile.mkdtemp(dir=folder, prefix="run"))
+    os.chdir(place)
+    before_mb = _peak_mb()  # a fork begins with what its parent has
+    for number in numbers:
+        _emptied(place)
+        case = make_case(folder / "good", place, _rng(seed, number))
+        answers.send((number, case.name, Outcome("begun", _line_of(case)), 0.0, 0.0))
         signal.setitimer(signal.ITIMER_PROF, LONGEST_S + 5)  # ends this process, even in native code
-        signal.alarm(LONGEST_WAIT_S)  # the same for one that sleeps
         begin = time.process_time()
-        what, words = outcome(READERS[name], path)
+        found = outcome(case, place)
         seconds = time.process_time() - begin
         signal.setitimer(signal.ITIMER_PROF, 0.0)
-        signal.alarm(0)
         peak_mb = _peak_mb() - before_mb
-        what = "slow" if seconds > LONGEST_S else "memory" if peak_mb > MOST_MB else what
-        if what in FAILURES:
-            put_aside(path, keep, what, name)
-        path.write_bytes(contents[name])  # the others of a model are whole
-        answers.send((name, what, words, seconds, peak_mb))
-        if what == "memory":  # whose peak would be that of all that follow
+        if peak_mb > MOST_MB:
+            found = found._replace(what="memory")
+        elif seconds > LONGEST_S:
+            found = found._replace(what="slow")
+        answers.send((number, case.name, found, seconds, peak_mb))
+        if peak_mb > MOST_MB / 4:  # whose peak would be that of all that follow
             return
+
+
+def _emptied(place: Path) -> None:
+    for path in place.iterdir():
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink()
+
+
+def _line_of(case: Case) -> str:
+    return shlex.join([case.program or "ceres-cal", *case.words]) + f"  # {', '.join(case.changes)}"
 
 
 def _peak_mb() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
-def fuzz(folder: Path, goal: Goal, seed: int, keep: Path | None, names: Sequence[str] = ()) -> Counter[tuple[str, str]]:
-    """How often each reader came to each outcome."""
-    names = names or tuple(READERS)
-    counts: Counter[tuple[str, str]] = Counter()
-    slowest_s = peak_mb = 0.0
+def _rng(seed: int, number: int) -> np.random.Generator:
+    return np.random.default_rng((seed, number))
+
+
+# ---- all of them ----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Goal:
+    """So many runs of a seed, or until a time of the clock."""
+
+    numbers: range
+    end: float = math.inf
+
+
+class Counts(Counter[tuple[str, str]]):
+    """How often each command came to each outcome; and each failure by where it is."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.failures: Counter[tuple[str, str, str]] = Counter()
+        self.slowest_s = self.peak_mb = 0.0
+
+    def add(self, name: str, found: Outcome, seconds: float, megabytes: float) -> int:
+        """Count it; of a failure, how many of its kind there are."""
+        self[name, found.what] += 1
+        self.slowest_s, self.peak_mb = max(self.slowest_s, seconds), max(self.peak_mb, megabytes)
+        if found.what not in FAILURES:
+            return 0
+        key = (found.what, name if not found.where else "", found.where or re.sub(r"[0-9]+", "0", found.words[:60]))
+        self.failures[key] += 1
+        return self.failures[key]
+
+
+def fuzz(folder: Path, goal: Goal, seed: int, keep: Path | None = None) -> Counts:
+    """Run what the goal says over the corpus in folder/good."""
+    counts, left = Counts(), goal.numbers
     context = multiprocessing.get_context("fork")
-    while (left := goal.after(sum(counts.values()))) is not None:
+    while left and time.time() < goal.end:
         answers, theirs = context.Pipe(duplex=False)
-        worker = context.Process(target=work, args=(folder, names, seed, left, keep, theirs))
+        worker = context.Process(target=work, args=(folder, seed, left[:TOGETHER], theirs))
         worker.start()
         theirs.close()
-        name = path = ""
-        try:
-            while True:
-                name, what, words, seconds, megabytes = answers.recv()
-                if what == "begun":
-                    path = words
-                    continue
-                counts[name, what] += 1
-                slowest_s, peak_mb = max(slowest_s, seconds), max(peak_mb, megabytes)
-                if what in FAILURES:
-                    print(f"{name}: {what}: {words[:300]}", flush=True)
-                name = ""
-        except EOFError:
-            worker.join()
-        if worker.exitcode and not name:
-            raise SystemExit(f"a worker ended with exit code {worker.exitcode} before it read anything")
-        if worker.exitcode:
-            counts[name, "died"] += 1
-            where = (folder / TRACE).read_text()
-            print(f"{name}: died: exit code {worker.exitcode}\n{where}", end="", flush=True)
-            put_aside(Path(path), keep, "died", name)
-        seed += 1
-    print(f"slowest {slowest_s:.2f} s, peak {peak_mb:.0f} MB", flush=True)
+        for number, name, found, seconds, megabytes in _answers(worker, answers, folder):
+            left = goal.numbers[goal.numbers.index(number) + 1 :]
+            if number % _SAID_EVERY == 0:
+                print(f"at run {number}, {time.process_time():.0f} s", file=sys.stderr, flush=True)
+            how_many = counts.add(name, found, seconds, megabytes)
+            if 0 < how_many <= _KEPT:
+                line = put_aside(folder, keep, found, seed, number)
+                print(f"{number}: {found.what}: {line}\n    {found.words[:300]}\n    {found.where}", flush=True)
     return counts
 
 
-def put_aside(path: Path, keep: Path | None, what: str, name: str) -> None:
+def _answers(worker: Any, answers: Any, folder: Path) -> Iterator[tuple[int, str, Outcome, float, float]]:
+    """What a child says of each of its runs, and what is to be said of it where it died in one."""
+    begun: tuple[int, str] | None = None
+    with suppress(EOFError):
+        while answers.poll(LONGEST_WAIT_S) or _ended(worker):
+            number, name, found, seconds, megabytes = answers.recv()
+            begun = (number, name) if found.what == "begun" else None
+            if begun is None:
+                yield number, name, found, seconds, megabytes
+    worker.join()
+    if begun is not None:
+        where = (folder / TRACE).read_text()
+        what = "slow" if worker.exitcode in (-signal.SIGPROF, -signal.SIGUSR1, -signal.SIGKILL) else "died"
+        lines = [line.split(", in ")[0] for line in where.splitlines() if "ceres_cal" in line][:4]
+        yield *begun, Outcome(what, f"exit code {worker.exitcode}", " < ".join(_last(line) for line in lines)), 0.0, 0.0
+    elif worker.exitcode:
+        raise SystemExit(f"a child ended with exit code {worker.exitcode} between its runs")
+
+
+def _last(line: str) -> str:
+    """FILE:LINE of a line of a trace."""
+    return re.sub(r'.*/([^/]*)", line ([0-9]+).*', r"\1:\2", line)
+
+
+def _ended(worker: Any) -> bool:
+    """End a child that says nothing any more, and its children: its trace first. True: all that it said is there."""
+    with suppress(ProcessLookupError):
+        os.kill(worker.pid, signal.SIGUSR1)
+        worker.join(2.0)
+        os.killpg(worker.pid, signal.SIGKILL)
+    return True
+
+
+def put_aside(folder: Path, keep: Path | None, found: Outcome, seed: int, number: int) -> str:
+    """Make a run's folder once more, to be kept; its words."""
+    place = Path(tempfile.mkdtemp(dir=folder))
     if keep is not None:
-        keep.mkdir(parents=True, exist_ok=True)
-        (keep / f"{what} {time.time_ns()} {name}".replace(" ", "-").replace("/", "-")).write_bytes(path.read_bytes())
+        place = keep / f"{found.what} {seed} {number}".replace(" ", "-")
+        shutil.rmtree(place, ignore_errors=True)
+        place.mkdir(parents=True)
+    line = _line_of(make_case(folder / "good", place, _rng(seed, number)))
+    if keep is not None:
+        text = f"{line}\n{found.what}: {found.words}\n{found.where}\n"
+        (place / "fuzz.txt").write_text(text, errors="surrogateescape")
+    return line.encode(errors="backslashreplace").decode()
+
+
+def prepare(folder: Path) -> Path:
+    """The corpus in folder/good, and all of the package imported: forks have it, and the kernels."""
+    for module in pkgutil.walk_packages(ceres_cal.__path__, "ceres_cal."):
+        importlib.import_module(module.name)
+    (folder / "good").mkdir()
+    corpus(folder / "good")
+    return folder
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     how_many = parser.add_mutually_exclusive_group()
     how_many.add_argument("--minutes", type=float, default=1.0)
-    how_many.add_argument("--files", type=int, metavar="N", help="so many, however long it takes")
+    how_many.add_argument("--runs", type=int, metavar="N", help="so many, however long it takes")
+    how_many.add_argument("--only", type=int, metavar="NUMBER", help="this run of the seed alone")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--keep", type=Path, metavar="FOLDER", help="for files that were not handled well")
-    parser.add_argument("--reader", action="append", default=[], choices=tuple(READERS), help="only this; repeatable")
+    parser.add_argument("--keep", type=Path, metavar="FOLDER", help="for what was not handled well")
     parser.add_argument("--json", action="store_true")
     given = parser.parse_args(arguments)
-    with tempfile.TemporaryDirectory() as folder:
-        corpus(Path(folder))
-        goal = Goal(given.files or sys.maxsize, np.inf if given.files else time.time() + 60.0 * given.minutes)
-        counts = fuzz(Path(folder), goal, given.seed, given.keep, given.reader)
-    failures = sum(count for (_, what), count in counts.items() if what in FAILURES)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        prepare(folder)
+        goal = Goal(range(sys.maxsize), time.time() + 60.0 * given.minutes)
+        if given.runs is not None:
+            goal = Goal(range(given.runs))
+        if given.only is not None:
+            goal = Goal(range(given.only, given.only + 1))
+        counts = fuzz(folder, goal, given.seed, given.keep)
+    failed = sum(count for (_, what), count in counts.items() if what in FAILURES)
     if given.json:
         print(json.dumps({f"{name}: {what}": count for (name, what), count in sorted(counts.items())}))
     else:
         for (name, what), count in sorted(counts.items()):
-            print(f"{name:18} {what:10} {count:8}")
-    print(f"{sum(counts.values())} files, {failures} failures", file=sys.stderr)
-    return 1 if failures else 0
+            print(f"{name:18} {what:12} {count:8}")
+        for (what, name, where), count in counts.failures.most_common():
+            print(f"{count:6} {what}: {name} {where}")
+    print(
+        f"slowest {counts.slowest_s:.2f} s of processor, peak {counts.peak_mb:.0f} MB more than before", file=sys.stderr
+    )
+    print(f"{sum(counts.values())} commands, {failed} failures", file=sys.stderr)
+    return 1 if failed else 0
 
 
 if __name__ == "__main__":

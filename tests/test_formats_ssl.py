@@ -413,3 +413,9 @@ def test_a_calibration_without_a_field_asks_for_one(tmp_path: Path) -> None:
     export(over_field(with_lens("radial-3")), "ssl-vision", tmp_path / "a.pb")
     export(alone, "ssl-vision", tmp_path / "a.pb")  # into a file that has one
     assert import_calibration(tmp_path / "a.pb").station().lens.kind == "radial"
+
+
+@pytest.mark.parametrize("port", [0, -1, 65536, 10**30])
+def test_a_port_that_is_none_is_refused(port: int) -> None:
+    with pytest.raises(InputError, match=r"port .*: give one from 1 to 65535"):
+        Group(port=port)

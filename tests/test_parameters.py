@@ -28,7 +28,7 @@ from ceres_cal.model.parameters import (
     with_intrinsics,
 )
 from ceres_cal.model.structure import make_structure
-from ceres_cal.observations import NO_CURVES, Observations, Points, View
+from ceres_cal.observations import NO_CURVES, Observations, Points, Prior, View
 from ceres_cal.observations.sights import SightKey
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Brown, KannalaBrandt, Radial, make_lens
@@ -69,9 +69,9 @@ def watched(*views: tuple[str, str | None], cameras: dict[str, str] | None = Non
         ({"lens": "brown", "fixed": {"a2": 0.0}}, "cannot fix 'a2': the brown lens has .*k1, k2, p1, p2, k3"),
         ({"fixed": {"phi": np.nan}}, "cannot fix phi at nan: give a finite number"),
         ({"fixed": {"cx": np.inf}}, "cannot fix cx at inf"),
-        ({"loss_scale": 0.0}, "loss_scale must be above 0, not 0.0"),
-        ({"loss_scale": np.nan}, "loss_scale must be above 0, not nan"),
-        ({"reject_sigma": -1.0}, "reject_sigma must be above 0"),
+        ({"loss_scale": 0.0}, "loss_scale must be 0.001 to 1e\\+09 sigmas, not 0.0"),
+        ({"loss_scale": np.nan}, "loss_scale must be 0.001 to .* not nan"),
+        ({"reject_sigma": -1.0}, "reject_sigma must be 0.001 to"),
         ({"max_iterations": 0}, "max_iterations must be above 0"),
         ({"threads": -1}, "threads must be 0 .* or above, not -1"),
         ({"powers": (1,)}, "powers of the radial lens"),
@@ -207,3 +207,34 @@ def test_poses_chain_from_frame_to_camera() -> None:
     stack = estimate.pose_stack([SightKey("lens", "up", "there"), SightKey("lens", "up", None)])
     for matrix, pose in zip(stack, (station @ placement, station), strict=True):
         assert np.max(np.abs(matrix - np.column_stack([pose.rotation, pose.translation]))) < 1e-15
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"priors": "x"}, r"Options\(priors=\.\.\.\): Expected `array`, got `str`"),
+        ({"coefficients": "k1"}, r"Options\(coefficients=\.\.\.\): Expected `array | null`"),
+        ({"lens": None}, r"Options\(lens=\.\.\.\): Expected `str`, got `null`"),
+        ({"fixed": {"phi": "x"}}, r"Options\(fixed=\.\.\.\): Expected `float`, got `str`"),
+        ({"tolerances": {"field": 0.01}}, r"Options\(tolerances=\.\.\.\): Expected `object`"),
+        ({"free_skew": 1}, r"Options\(free_skew=\.\.\.\): Expected `bool`"),
+        ({"reject_sigma": 1e300}, "reject_sigma must be 0.001 to 1e\\+09 sigmas, not 1e\\+300"),
+        ({"reject_sigma": np.inf}, "reject_sigma must be 0.001 to"),  # which no file of JSON holds
+        ({"loss_scale": 1e-300}, "loss_scale must be 0.001 to 1e\\+09 sigmas, not 1e-300"),
+        ({"threads": 10**30}, "threads must be 2147483647 at most, not 1e\\+30"),
+        ({"max_iterations": 2**31}, "max_iterations must be 2147483647 at most"),
+    ],
+)
+def test_options_of_another_type_are_named(given: dict[str, Any], words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        Options(**given)
+
+
+def test_numbers_of_numpy_are_numbers() -> None:
+    given: dict[str, Any] = {"powers": np.array([2, 3]), "fixed": {"phi": np.float32(800.0)}}
+    options = Options(loss_scale=np.float64(2.0), **given)
+    assert (options.powers, options.fixed) == ((2, 3), {"phi": 800.0}) and type(options.powers[0]) is int
+    prior = Prior("station", "s", "height_m", np.array([4.0]), [np.int64(1)])  # type: ignore[arg-type]
+    assert (prior.value, prior.sigma) == ((4.0,), (1.0,))
+    with pytest.raises(InputError, match=r"Prior\(value=\.\.\.\): Expected `array`, got `str`"):
+        Prior("station", "s", "height_m", "x", (1.0,))  # type: ignore[arg-type]

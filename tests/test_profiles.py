@@ -1,9 +1,12 @@
 """The fit of edges and painted lines to raw pixels: unbiased by blur, slope and light, with honest sigmas."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from ceres_cal.base.arrays import Array, Array32
+from ceres_cal.detect.blur import blur_of, no_blur
 from ceres_cal.detect.profiles import Shape, cut_windows, fit_profiles, fit_shape, normal_step
 
 WIDTH_PX = 2.4
@@ -108,3 +111,15 @@ def test_normal_step() -> None:
     step, bell = normal_step(x)
     assert np.max(np.abs(step - scipy.norm.cdf(x))) < 2e-7
     assert np.max(np.abs(bell - scipy.norm.pdf(x))) < 1e-15
+
+
+def test_a_blur_is_told_where_nothing_is_bright() -> None:
+    """Places that are all darker than their surroundings: half of a negative quantile is above all of them."""
+    image = 255.0 - stripe(np.array([1.0, 0.0]), 0.0, 1.0)
+    places = np.column_stack([np.full(40, 30.0), np.linspace(12.0, 48.0, 40)])
+    normals = np.tile([1.0, 0.0], (40, 1))
+    windows = cut_windows(image.astype(np.float32), places, normals, np.zeros(40), 6.0, 3)
+    course = SimpleNamespace(normals=normals, width_px=np.full(40, WIDTH_PX))
+    for bright in (np.linspace(-90.0, -10.0, 40), np.zeros(40), np.linspace(10.0, 90.0, 40)):
+        found = blur_of(windows, course, bright, no_blur(40))  # type: ignore[arg-type]
+        assert np.all(np.isfinite(found.blur_px))

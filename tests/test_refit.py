@@ -219,7 +219,7 @@ def test_the_prior_of_an_older_file_is_the_same(calibration: Calibration, observ
         stations={name: PoseFile.of(station.cam_from_world) for name, station in estimate.stations.items()},
         structure_m=dict(zip(estimate.structure.names, estimate.structure.values.tolist(), strict=True)),
     )
-    for prior in (file.prior(), older.prior()):
+    for prior in (file.prior(file.keys), older.prior(file.keys)):
         assert prior.keys == refitted.prior.keys and prior.mean.tolist() == refitted.prior.mean.tolist()
         assert np.array_equal(prior.information.matrix, refitted.prior.information.matrix)
         assert prior.rotations.keys() == refitted.prior.rotations.keys()

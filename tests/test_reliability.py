@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import json
-import math
 import multiprocessing
 import os
 import re
@@ -25,6 +24,7 @@ from typing import Any
 
 import cv2
 import fuzz
+import fuzz_commands
 import numpy as np
 import photographs
 import pytest
@@ -65,9 +65,10 @@ def calibration(observations: Observations) -> Calibration:
 
 @pytest.fixture(scope="module")
 def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with one good file for each reader."""
-    folder = tmp_path_factory.mktemp("good")
-    fuzz.corpus(folder)
+    """A folder with one good file for each reader, and what commands take besides."""
+    folder = tmp_path_factory.mktemp("fuzz") / "good"
+    folder.mkdir()
+    fuzz_commands.corpus(folder)
     return folder
 
 
@@ -99,6 +100,31 @@ def test_only_regular_files_are_read(tmp_path: Path) -> None:
     refused(Observations.load, Path("/dev/zero"), "it is a pipe or a device")
     refused(Observations.load, loop, "Too many levels of symbolic links")
     assert main(["calibrate", str(loop), "-o", str(loop)]) == 2
+
+
+def test_a_pipe_among_columns_is_refused(tmp_path: Path, good: Path) -> None:
+    """NumPy would wait for its writer for ever; and rows in Fortran order do not lie one by one."""
+    place = tmp_path / "a.columns"
+    shutil.copytree(good / "observations.columns", place)
+    column = place / "points_pixels.npy"
+    pixels = np.load(column)
+    np.save(column, np.asfortranarray(pixels))
+    with pytest.raises(InputError, match=r"points_pixels.npy: its rows do not lie one by one"):
+        Observations.load(place)
+    column.unlink()
+    os.mkfifo(column)
+    with pytest.raises(InputError, match=r"points_pixels.npy: cannot be read: it is a pipe"):
+        Observations.load(place)
+
+
+def test_columns_in_fortran_order_are_the_same_observations(tmp_path: Path, good: Path) -> None:
+    """The compiled kernels take rows that lie one by one; numba would compile others for half a minute."""
+    with np.load(good / "observations.npz") as archive:
+        arrays: dict[str, Any] = {name: np.asfortranarray(archive[name]) for name in archive.files}
+    np.savez(tmp_path / "fortran.npz", **arrays)
+    here, there = Observations.load(good / "observations.npz"), Observations.load(tmp_path / "fortran.npz")
+    assert here.digest == there.digest
+    assert there.points.pixels.flags.c_contiguous and there.curves.pixels.flags.c_contiguous
 
 
 def test_sizes_are_limited_and_the_limit_can_be_raised(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -168,6 +194,25 @@ def test_images_that_claim_more_than_they_hold(tmp_path: Path) -> None:
         refused(read_grey, tmp_path / name, words)
 
 
+@pytest.mark.parametrize("size", [(1, 1), (15, 400), (60000, 1), (1, 60000)])
+def test_pictures_in_which_nothing_can_be_seen(size: tuple[int, int], tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "a.png"), np.zeros(size[::-1], np.uint8))
+    refused(
+        read_grey, tmp_path / "a.png", f"{size[0]} x {size[1]} px is no photograph: at least 16 px are needed each way"
+    )
+    command = [
+        "detect",
+        "field",
+        str(tmp_path / "a.png"),
+        "--target",
+        "ssl-b",
+        "--auto",
+        "-o",
+        str(tmp_path / "o.json"),
+    ]
+    assert main(command) == 2
+
+
 def test_targets_have_a_largest_size(tmp_path: Path) -> None:
     data = json.loads(SAMPLE.read_text())
     board = {"kind": "checkerboard", "columns": 9_000_000_000, "rows": 6_000_000_000, "square_m": 0.025}
@@ -210,7 +255,12 @@ def changed(path: Path, change: Callable[[dict[str, Any]], object], folder: Path
         (lambda d: d.update(digest="\ud800"), "not valid JSON (cut short?)"),
         (lambda d: d.update(rounds=10**400), "inf is no finite number"),
         (lambda d: next(iter(d["cameras"].values())).update(phi=10**400), "inf is no finite number"),
-        (lambda d: d["posterior"].update(keys=d["posterior"]["keys"] * 5000), "numbers, not"),
+        (lambda d: d["posterior"].update(keys=d["posterior"]["keys"] * 5000), "'phi' of camera 'overhead' twice"),
+        (lambda d: d["posterior"]["keys"][0].__setitem__(1, "x"), "posterior.keys names 'phi' of camera 'x', which is"),
+        (lambda d: d["posterior"]["keys"][3].__setitem__(2, "k9"), "names 'k9' of camera 'overhead', which is not"),
+        (lambda d: d["posterior"].update(placements={"x": [1.0] * 21}), "posterior.placements names 'x' of placement"),
+        (lambda d: d["options"].update(threads=10**30), "Expected `int`, got `float` - at `$.threads`"),
+        (lambda d: d["options"].update(threads=2**40), "threads must be 2147483647 at most, not 1.1e+12"),
     ],
 )
 def test_calibrations_that_contradict_themselves(
@@ -279,14 +329,41 @@ def test_numbers_of_others_that_cannot_be(
     assert changed
     (tmp_path / name).write_bytes(content)
     with pytest.raises(InputError, match=words):
-        fuzz.READERS[name](tmp_path / name)
+        fuzz_commands.READERS[name](tmp_path / name)
 
 
-def test_damaged_files_of_every_kind(good: Path) -> None:
+def test_odd_input_before_every_command(good: Path) -> None:
     """A short run of scripts/fuzz.py."""
-    counts = fuzz.fuzz(good, fuzz.Goal(1000, math.inf), 1, None)
-    assert sum(counts.values()) > 30
-    assert not {what for _, what in counts} & set(fuzz.FAILURES), counts
+    counts = fuzz.fuzz(good.parent, fuzz.Goal(range(60)), 1)
+    assert sum(counts.values()) == 60
+    assert not counts.failures
+
+
+def test_what_the_fuzzer_counts_as_failures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It sees a raw error, a warning, a file that is cut short, two lines of error and an unknown exit code."""
+
+    def half(_: list[str]) -> int:
+        (tmp_path / "half.json").write_text('{"a": ')
+        return 0
+
+    def lines(_: list[str]) -> int:
+        sys.stderr.write("ceres-cal: a\nceres-cal: b\n")
+        return 2
+
+    odd: dict[str, Callable[[list[str]], int]] = {
+        "unexpected": lambda _: int("a"),
+        "warning": lambda _: int(np.isfinite(np.float64(1e308) * 10)),
+        "half written": half,
+        "many lines": lines,
+        "exit code": lambda _: 7,
+        "memory": lambda _: len(bytearray(2**62)),
+        "accepted": lambda _: 0,
+    }
+    monkeypatch.setattr(fuzz_commands, "PROGRAMS", odd)
+    for name in odd:
+        case = fuzz_commands.Case(name, (), ())
+        assert fuzz.outcome(case, tmp_path).what == name
+        (tmp_path / "half.json").unlink(missing_ok=True)
 
 
 # ---- numbers that cannot be right -----------------------------------------------------------------------------------
@@ -485,6 +562,22 @@ def test_names_in_other_encodings(tmp_path: Path) -> None:
     named = tmp_path / "kalibrierung-ä.json"
     run = program("calibrate", SAMPLE, "-o", named, env={"LC_ALL": "C", "PYTHONIOENCODING": "ascii"})
     assert run.returncode == 0 and named.exists() and "\\xe4" in run.stdout, run
+
+
+def test_a_name_that_is_no_utf8_stops_no_batch(tmp_path: Path, good: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The others are calibrated, and it has its line, its file and its place on the page."""
+    rooms = tmp_path / os.fsdecode(b"rooms\xe9")
+    rooms.mkdir()
+    for name in (b"caf\xe9.json", b"b.json"):
+        shutil.copy(good / "custom.json", rooms / os.fsdecode(name))
+    (rooms / os.fsdecode(b"\xe9 broken.json")).write_text('{"format": "ceres-cal/observations"')
+    command = ["batch", str(rooms), "-o", str(tmp_path / "out"), "--jobs", "1", "--options", "--lens radial", "--json"]
+    assert main(command) == 3
+    levels = {job["job"]: job["level"] for job in json.loads(capsys.readouterr().out)["jobs"]}
+    assert levels.pop("\\udce9 broken") == "failed"
+    assert set(levels) == {"b", "caf\\udce9"} and "failed" not in levels.values()
+    assert (tmp_path / "out" / "caf\\udce9.json").exists()
+    assert main([*command, "--options", "'"]) == 2 and "--options" in capsys.readouterr().err
 
 
 def test_libraries_say_nothing_of_damaged_images(tmp_path: Path) -> None:

@@ -415,7 +415,31 @@ BAD_SPECS: list[tuple[Any, str]] = [
         "two curves are named 'e'",
     ),
     ({"kind": "custom", "lines": {}}, "unknown field `lines`"),
+    ({"kind": "custom", "points": {"a": [0, 0, 1e7]}}, "point 'a' must have three finite numbers of metres"),
+    ({"kind": "custom", "segments": {"e": {"from": [0, 0, 0], "to": [1e300, 0, 0]}}}, "curve 'e' needs finite numbers"),
+    ({"kind": "custom", "arcs": {"c": {"centre": [0, 0, 0], "radius_m": 1, "to_rad": 1e6}}}, "more than once round"),
+    ({"kind": "rings", "radii_m": [0.1, 1e300]}, "curve 'ring_2' needs finite numbers"),
+    (
+        {"kind": "checkerboard", "columns": 9, "rows": 6, "square_m": 1e300},
+        "point '1,0' must have three finite numbers",
+    ),
+    ({"kind": "ssl-field", "division": "B", "field_length_m": 1e300}, "field_length_m must be a positive number"),
 ]
+
+
+@pytest.mark.parametrize("number", ["x", None, [1.0], (0.0, 1.0)])
+def test_a_curve_of_no_numbers_is_named(number: Any) -> None:
+    with pytest.raises(InputError, match=r"Segment\(end=\.\.\.\): .* is no number, or no three"):
+        Segment((0.0, 0.0, 0.0), number)
+    with pytest.raises(InputError, match=r"Arc\(radius_m=\.\.\.\): .* is no number"):
+        Arc((0.0, 0.0, 0.0), number)
+
+
+def test_a_target_of_nan_is_refused_however_it_is_made() -> None:
+    """From Python, too: a NaN in a line would be one in every number of the calibration."""
+    line = Segment((0.0, 0.0, 0.0), (np.nan, 0.0, 0.0))
+    with pytest.raises(InputError, match="custom: curve 'e' needs finite numbers"):
+        Target({"kind": "custom"}, {}, {"e": line})
 
 
 @pytest.mark.parametrize("spec, message", BAD_SPECS)

@@ -48,4 +48,5 @@ def naming(where: object) -> Iterator[None]:
         yield
     except InputError as error:
         text = str(error)
-        raise InputError(text if text.startswith((f"{where}: ", f"{where}.")) else f"{where}: {text}") from None
+        begins_with_it = text.startswith((f"{where}: ", f"{where}.", f"{where}/"))
+        raise InputError(text if begins_with_it else f"{where}: {text}") from None

@@ -15,7 +15,7 @@ import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import IO, Any, Literal, TypeVar
 
 import msgspec
 
@@ -65,20 +65,31 @@ def read_bytes(path: str | Path) -> bytes:
     """The content of a file.
 
     Raises:
-        InputError: it is missing, cannot be read, is no regular file (reading a pipe or a device may never end), or is
-            too large.
+        InputError: it is missing, cannot be read, is no regular file, or is too large.
+    """
+    with opened(path) as stream:
+        size = os.fstat(stream.fileno()).st_size
+        require_room(size, str(path))
+        return stream.read(size)
+
+
+@contextmanager
+def opened(path: str | Path) -> Iterator[IO[bytes]]:
+    """A file, open for reading.
+
+    Raises:
+        InputError: it is missing, cannot be read, or is no regular file (reading a pipe or a device may never end).
     """
     try:
         # Opening a pipe would wait for its writer, but for O_NONBLOCK, which regular files ignore.
         handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
         with os.fdopen(handle, "rb") as stream:
-            status = os.fstat(handle)
-            if stat.S_ISDIR(status.st_mode):
+            mode = os.fstat(handle).st_mode
+            if stat.S_ISDIR(mode):
                 raise InputError(f"{path}: cannot be read: Is a directory")
-            if not stat.S_ISREG(status.st_mode):
+            if not stat.S_ISREG(mode):
                 raise InputError(f"{path}: cannot be read: it is a pipe or a device: save its content to a file first")
-            require_room(status.st_size, str(path))
-            return stream.read(status.st_size)
+            yield stream
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
     except (OSError, ValueError) as error:

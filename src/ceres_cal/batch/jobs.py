@@ -13,6 +13,7 @@ import msgspec
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import convert, read_bytes
 from ceres_cal.base.version import __version__
+from ceres_cal.base.words import printable
 from ceres_cal.base.written import note
 
 RESULTS = "results.jsonl"
@@ -70,6 +71,10 @@ class Outcome:
     reasons: tuple[str, ...] = ()
     worst_mm: float | None = None
     key: str = ""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "line", printable(self.line))  # which may name a file that is not called in UTF-8
+        object.__setattr__(self, "reasons", tuple(map(printable, self.reasons)))
 
     @property
     def order(self) -> tuple[int, float, str]:

@@ -17,6 +17,7 @@ import msgspec
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import convert, parse_json, read_bytes
+from ceres_cal.base.words import printable
 from ceres_cal.observations import FORMAT
 
 _ENDINGS = (".jsonl", ".csv", ".toml")
@@ -64,9 +65,10 @@ def _of_folder(folder: Path) -> Iterator[Planned]:
         if place.is_dir():
             files = sorted(file for file in place.iterdir() if _holds_observations(file))
             if files:
-                yield Planned(place.name, "calibrate", tuple(str(file.relative_to(folder)) for file in files))
+                names = tuple(str(file.relative_to(folder)) for file in files)
+                yield Planned(printable(place.name), "calibrate", names)
         elif _holds_observations(place):
-            yield Planned(place.stem, "calibrate", (place.name,))
+            yield Planned(printable(place.stem), "calibrate", (place.name,))
 
 
 def _holds_observations(file: Path) -> bool:

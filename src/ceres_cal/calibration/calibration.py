@@ -29,6 +29,7 @@ from ceres_cal.model.dimensions import redrawn
 from ceres_cal.model.keys import Key
 from ceres_cal.model.parameters import Estimate, Options, make_layout
 from ceres_cal.model.priors import GaussianPrior, gather_priors
+from ceres_cal.model.quantities import every_key
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import gather_sights
 from ceres_cal.scene.camera import Camera
@@ -246,12 +247,13 @@ class Calibration:
         options = options_from_json(data.options)
         targets = targets_from_specs(data.targets)
         estimate = data.estimate(targets, options)
+        known = every_key(estimate)
         return cls(
             estimate,
             targets,
             options=options,
-            posterior=None if data.posterior is None else data.posterior.posterior(estimate),
-            refitted=None if data.refitted is None else data.refitted.refitted(),
+            posterior=None if data.posterior is None else data.posterior.posterior(known),
+            refitted=None if data.refitted is None else data.refitted.refitted(known),
             notes=data.notes if isinstance(data.notes, dict) else {},
             **{name: getattr(data, name) for name in _ALIKE},
         )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import asdict, replace
 from typing import Any
 
@@ -21,7 +21,7 @@ from ceres_cal.observations import prior_from_json, prior_to_json
 from ceres_cal.scene.files import CameraFile, Matrix, PoseFile, Vector
 from ceres_cal.scene.targets import Target
 from ceres_cal.solve import AsBuilt, Conflict
-from ceres_cal.uncertainty import PosteriorFile, information_from, lower_triangle
+from ceres_cal.uncertainty import PosteriorFile, information_from, lower_triangle, require_keys
 
 FORMAT, VERSION = "ceres-cal/calibration", 1
 _ALIKE = 1e-5  # somebody who edits a file rounds
@@ -72,8 +72,9 @@ class PriorFile(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True):
         rotations = {name: rotation.tolist() for name, rotation in prior.rotations.items()}
         return cls(list(prior.keys), lower_triangle(prior.information), prior.mean.tolist(), rotations)
 
-    def prior(self) -> GaussianPrior:
-        """The prior; InputError where its numbers do not fit its keys."""
+    def prior(self, known: Collection[Key]) -> GaussianPrior:
+        """The prior; InputError where its numbers do not fit its keys, or one is none of those known."""
+        require_keys(self.keys, known, "refitted.prior.keys")
         information = information_from(self.information, self.keys, "refitted.prior.information")
         if self.mean is not None:
             if len(self.mean) != len(self.keys):
@@ -103,9 +104,9 @@ class RefittedFile(msgspec.Struct, forbid_unknown_fields=True):
         """As a file has it."""
         return cls(**{**vars(refitted), "prior": PriorFile.of(refitted.prior)})
 
-    def refitted(self) -> Refitted:
-        """What the file says; InputError where the prior's numbers do not fit."""
-        return Refitted(**{**msgspec.structs.asdict(self), "prior": self.prior.prior()})
+    def refitted(self, known: Collection[Key]) -> Refitted:
+        """What the file says; InputError where the prior's numbers do not fit, or are none of those known."""
+        return Refitted(**{**msgspec.structs.asdict(self), "prior": self.prior.prior(known)})
 
 
 class CalibrationFile(msgspec.Struct, forbid_unknown_fields=True):

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.words import plural
+from ceres_cal.base.words import plural, printable
 from ceres_cal.cli.arguments import add_jobs, add_quiet
 from ceres_cal.cli.calibrate import COMMANDS as CALIBRATE
 from ceres_cal.cli.check import COMMANDS as CHECK
@@ -74,7 +74,7 @@ def _run(args: Namespace) -> Answer:
             if not (args.quiet or args.json):
                 print(_line(outcome, len(outcomes), len(jobs), is_old), file=sys.stdout, flush=True)
     pages = {job.name: file.name for job in jobs for file in job.outputs if file.suffix == ".html" and file.exists()}
-    title = args.plan.resolve().name
+    title = printable(args.plan.resolve().name)
     write_bytes(args.output / _SUMMARY, summary_page(title, outcomes, pages).encode())
     worst = min(outcomes, key=lambda one: one.order).level
     return Answer(_data(args, outcomes, again), lambda: _text(args, outcomes, again), _EXIT_CODES.get(worst, 0))
@@ -109,9 +109,13 @@ def plan_jobs(plan: Path, to: Path, options: str = "", *, reports: bool = False)
     from ceres_cal.batch import read_plan
 
     base = plan if plan.is_dir() else plan.parent
+    try:
+        of_all = shlex.split(options)
+    except ValueError as error:
+        raise InputError(f"--options {options!r}: {error}") from None
     jobs = []
     for row in read_plan(plan):
-        more = shlex.split(options) if row.command == "calibrate" else []
+        more = of_all if row.command == "calibrate" else []
         try:
             jobs.append(_job(row.name, row.command, [*row.arguments, *more], base, to, reports))
         except InputError as error:

@@ -102,8 +102,11 @@ def _between(angle: Array, own: list[Indices], shapes: list[Shape]) -> tuple[Arr
 
 
 def _brightest(bright: Array, rows: Indices) -> Indices:
-    """Of these rows, those that are surely on paint: what a moved camera smears is fainter in one direction."""
-    return rows[bright[rows] >= 0.5 * np.quantile(bright[rows], 0.8)]
+    """Of these rows, those that are surely on paint: what a moved camera smears is fainter in one direction. Where the
+    photograph has no bright place, the brightest fifth: half of a negative quantile would be above all of them.
+    """
+    fifth = np.quantile(bright[rows], 0.8)
+    return rows[bright[rows] >= min(0.5 * fifth, fifth)]
 
 
 def _doubled(angle: Array) -> Array:

@@ -16,6 +16,7 @@ _BYTES_PER_PIXEL = 3
 # Of the pixels of a colour sensor, those that see blue, green and red.
 _OF_MOSAIC = np.array([0.25, 0.5, 0.25], np.float32)
 _AROUND_PX = (301, 101, 31)  # over which what is left out is filled, ever nearer
+_LEAST_PX = 16  # of either side: what is looked at around a corner or across a line is wider
 _PIXELS_PER_BYTE = 8 * 1032  # the most that PNG's compression makes of a byte, at a bit each
 
 
@@ -71,7 +72,13 @@ def _decoded(path: str | Path, channels: int) -> Image:
 
 
 def _require_believable(size: tuple[int, int], length: int, path: str) -> None:
-    """Raise InputError where a header claims more pixels than there is room for, or than its file can hold."""
+    """Raise InputError where a header claims more pixels than there is room for, or than its file can hold, or too few
+    for anything to be seen in them.
+    """
+    if min(size) < _LEAST_PX:
+        raise InputError(
+            f"{path}: {size[0]} x {size[1]} px is no photograph: at least {_LEAST_PX} px are needed each way"
+        )
     pixels = size[0] * size[1]
     require_room(_BYTES_PER_PIXEL * pixels, f"{path}: an image of {size[0]} x {size[1]} px")
     if pixels > _PIXELS_PER_BYTE * length:

@@ -43,10 +43,18 @@ def read_yaml(text: str) -> dict[str, Any]:
 
 @cache
 def _loader() -> Any:
-    """PyYAML's safe one, but for keys that are there twice, and for merged ones, which may multiply without end."""
+    """PyYAML's safe one, but for keys that are there twice, for merged ones, which may multiply without end, and for
+    numbers in base 60 such as 1:30:00, which are text since YAML 1.2: to add them up takes the square of their length.
+    """
     import yaml
 
-    return type("Loader", (yaml.SafeLoader,), {"flatten_mapping": _require_unique_keys})
+    def number(loader: Any, node: Any) -> Any:
+        text = loader.construct_scalar(node)
+        return text if ":" in text else loader.construct_yaml_int(node)
+
+    loader: Any = type("Loader", (yaml.SafeLoader,), {"flatten_mapping": _require_unique_keys})
+    loader.add_constructor("tag:yaml.org,2002:int", number)
+    return loader
 
 
 def _require_unique_keys(_: Any, node: Any) -> None:

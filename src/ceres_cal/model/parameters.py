@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from numbers import Integral, Real
 
 import numpy as np
 
@@ -17,6 +16,7 @@ from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.cached import cached_property
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.transforms import Pose, Poses, chained, inverted
+from ceres_cal.base.typed import take_types
 from ceres_cal.model.structure import Structure, Tolerance
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.observations.sights import SightKey
@@ -32,6 +32,9 @@ OF_PIXELS = ("phi", "aspect", "cx", "cy")
 # Views that tell an aspect and a skew beside the lens: no test decides there (halves of a set whose pixels are 0.2 %
 # higher than wide were 3 sd of phi apart, one with them and one without).
 _ENOUGH_VIEWS = 8
+_LARGEST = 2**31 - 1  # whole number that Ceres counts with
+# Standard deviations that somebody may mean: a bound below takes every observation out, one above takes out none.
+_SIGMAS = (1e-3, 1e9)
 LOSSES = ("trivial", "huber", "soft_l1", "cauchy", "tukey")
 
 
@@ -92,7 +95,7 @@ class Options:
     threads: int = 0
 
     def __post_init__(self) -> None:
-        self._require_types()
+        take_types(self)
         if self.lens == AUTO and self.powers:
             object.__setattr__(self, "lens", _OF_POWERS)
         if self.lens != AUTO:
@@ -117,28 +120,17 @@ class Options:
                 raise InputError(f"cannot fix {name!r}: {self._which} has {', '.join(names)}")
             if not np.isfinite(value):
                 raise InputError(f"cannot fix {name} at {value}: give a finite number")
-        for name in ("loss_scale", "reject_sigma", "max_iterations"):
-            if not getattr(self, name) > 0:
-                raise InputError(f"{name} must be above 0, not {getattr(self, name)}")
+        for name in ("loss_scale", "reject_sigma"):
+            if not _SIGMAS[0] <= getattr(self, name) <= _SIGMAS[1]:
+                least, most = _SIGMAS
+                raise InputError(f"{name} must be {least:g} to {most:g} sigmas, not {getattr(self, name)}")
+        if not self.max_iterations > 0:
+            raise InputError(f"max_iterations must be above 0, not {self.max_iterations}")
         if self.threads < 0:
             raise InputError(f"threads must be 0 (to choose) or above, not {self.threads}")
-
-    def _require_types(self) -> None:
-        """Raise InputError where an option is of another kind than it says."""
-        parts = {"priors": Prior, "powers": Integral, "terms": str, "coefficients": str, "dimensions": str}
-        for name, kind in parts.items():
-            given = getattr(self, name)
-            if given is not None and (
-                isinstance(given, str) or not all(isinstance(one, kind) for one in _listed(given))
-            ):
-                raise InputError(f"{name} must be a sequence of {kind.__name__}, not {given!r}")
-        for name, kind in {"fixed": Real, "tolerances": Tolerance}.items():
-            given = getattr(self, name)
-            if not isinstance(given, Mapping) or not all(isinstance(one, kind) for one in given.values()):
-                raise InputError(f"{name} must be a mapping from names to {kind.__name__}, not {given!r}")
-        for name in ("loss_scale", "reject_sigma", "max_iterations", "threads"):
-            if not isinstance(getattr(self, name), Real):
-                raise InputError(f"{name} must be a number, not {getattr(self, name)!r}")
+        for name in ("max_iterations", "threads"):
+            if getattr(self, name) > _LARGEST:
+                raise InputError(f"{name} must be {_LARGEST} at most, not {getattr(self, name):.3g}")
 
     @property
     def _which(self) -> str:
@@ -175,11 +167,6 @@ class Options:
     def _unset(self) -> Lens:
         """The chosen lens with all coefficients 0."""
         return make_lens(self.lens, self.powers or PAPERS_POWERS, terms=self.terms)
-
-
-def _listed(given: object) -> Iterable[object]:
-    """What is in a sequence; of anything else itself, which is no part."""
-    return given if isinstance(given, Iterable) else (given, None)
 
 
 def intrinsic_names(lens: Lens) -> tuple[str, ...]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence, Set
 from dataclasses import replace
+from itertools import chain
 
 import numpy as np
 
@@ -86,6 +87,14 @@ def intrinsic_keys(name: str, lens: Lens) -> list[Key]:
     """Keys of all intrinsics of a camera, in the order of the solver's vector."""
     units = ("px", "1", "px", "px", *lens.units, "1")
     return [Key("camera", name, quantity, unit) for quantity, unit in zip(intrinsic_names(lens), units, strict=True)]
+
+
+def every_key(estimate: Estimate) -> frozenset[Key]:
+    """Keys of everything that an estimate has, free or held."""
+    intrinsics = (intrinsic_keys(name, camera.lens) for name, camera in estimate.cameras.items())
+    stations = (pose_keys("station", name) for name in estimate.stations)
+    placements = (pose_keys("placement", name) for name in estimate.placements)
+    return frozenset(chain(*intrinsics, *stations, *placements, estimate.structure.keys))
 
 
 def free_keys(estimate: Estimate, layout: Layout, private: Set[str | None] = frozenset()) -> tuple[Key, ...]:

@@ -17,6 +17,7 @@ import numpy as np
 from ceres_cal.base.arrays import Array, Indices, Indices32, Mask, distinct
 from ceres_cal.base.cached import cached_property
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.typed import take_types
 from ceres_cal.model.dimensions import dimension_slopes
 from ceres_cal.model.keys import Key
 from ceres_cal.observations.sights import Sights
@@ -47,6 +48,7 @@ class Tolerance:
     curve_m: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        take_types(self)
         for name, value in ({**vars(self), **self.curve_m}).items():
             if name != "curve_m" and not (np.isfinite(value) and value >= 0.0):
                 raise InputError(f"tolerance {name} must be a number of metres from 0 on, not {value}")

@@ -14,6 +14,7 @@ import numpy as np
 from ceres_cal.base.arrays import AnyArray, Array, Codes, Indices, Indices32, Mask
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.threads import parts_of, run_parts
+from ceres_cal.base.typed import take_types
 
 
 @dataclass(frozen=True)
@@ -52,8 +53,7 @@ class Prior:
     sigma: tuple[float, ...]
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "value", tuple(float(v) for v in self.value))
-        object.__setattr__(self, "sigma", tuple(float(s) for s in self.sigma))
+        take_types(self)
         here = f"prior on {self.quantity!r} of {self.name!r}"
         if self.owner not in PRIOR_OWNERS:
             raise InputError(f"{here}: its owner must be one of {', '.join(PRIOR_OWNERS)}, not {self.owner!r}")
@@ -105,7 +105,7 @@ class Columns:
         for name, values in vars(self).items():
             if isinstance(values, np.memmap) or _is_kept(values, TYPES[name]):  # which stays in its file, or as it is
                 continue
-            column = np.array(values, dtype=TYPES[name])
+            column = np.array(values, dtype=TYPES[name], order="C")  # the compiled kernels take no other order
             column.setflags(write=False)
             object.__setattr__(self, name, column)
 
@@ -117,9 +117,13 @@ class Columns:
 
 
 def _is_kept(values: AnyArray, dtype: type) -> bool:
-    """Whether a column is one already: of its type, by itself, and read-only."""
+    """Whether a column is one already: of its type, row by row in memory, by itself, and read-only."""
     return (
-        isinstance(values, np.ndarray) and values.dtype == dtype and values.flags.owndata and not values.flags.writeable
+        isinstance(values, np.ndarray)
+        and values.dtype == dtype
+        and values.flags.c_contiguous
+        and values.flags.owndata
+        and not values.flags.writeable
     )
 
 

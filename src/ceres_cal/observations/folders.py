@@ -16,6 +16,7 @@ import numpy as np
 from ceres_cal.base.archives import Column, require_columns
 from ceres_cal.base.arrays import AnyArray
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.files import opened
 from ceres_cal.observations.columns import Columns, read_rows, rows_of
 
 ENDING, HEADER = ".columns", "header.json"
@@ -61,11 +62,15 @@ def read_folder(path: Path, columns: Mapping[str, Column]) -> dict[str, AnyArray
     arrays: dict[str, AnyArray] = {}
     for name in columns:
         file = path / f"{name}.npy"
+        if not file.exists():
+            raise InputError(f"{path}: column {name} is missing: write the folder again")
+        with opened(file):  # which refuses a pipe, where NumPy would wait for ever
+            pass
         try:
-            arrays[name] = np.load(file, mmap_mode="r", allow_pickle=False)
-        except FileNotFoundError:
-            raise InputError(f"{path}: column {name} is missing: write the folder again") from None
-        except (OSError, ValueError, EOFError) as error:
+            arrays[name] = np.lib.format.open_memmap(file, mode="r")
+        except Exception as error:  # NumPy raises half a dozen kinds for a broken header
             raise InputError(f"{file}: cannot be read, it is cut short or no column ({error})") from None
+        if not arrays[name].flags.c_contiguous:
+            raise InputError(f"{file}: its rows do not lie one by one (Fortran order): save it in C order")
     require_columns(arrays, columns, str(path))
     return arrays

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ceres_cal.base.arrays import Array, Mask
+from ceres_cal.base.errors import InputError
 
 SIDES = {"centre": 0, "left": 1, "right": -1}
 """Which part of a painted curve was observed. Left and right are those of someone walking along it: from `start` to
@@ -86,7 +87,11 @@ Curve = Segment | Arc
 def _with_plain_floats(curve: Curve, *places: str) -> None:
     """Plain floats in a frozen curve, whatever kinds of numbers it was made of: what a file would give back."""
     for name, value in msgspec.structs.asdict(curve).items():
-        msgspec.structs.force_setattr(curve, name, xyz(value) if name in places else float(value))
+        try:
+            plain = xyz(value) if name in places else float(value)
+        except (TypeError, ValueError):
+            raise InputError(f"{type(curve).__name__}({name}=...): {value!r} is no number, or no three") from None
+        msgspec.structs.force_setattr(curve, name, plain)
 
 
 # ---- along a curve --------------------------------------------------------------------------------------------------

@@ -2,7 +2,7 @@
 
 from ceres_cal.uncertainty.assess import assess
 from ceres_cal.uncertainty.dependence import Dependence, Scatter, measure_scatter
-from ceres_cal.uncertainty.files import PosteriorFile, information_from, lower_triangle
+from ceres_cal.uncertainty.files import PosteriorFile, information_from, lower_triangle, require_keys
 from ceres_cal.uncertainty.image import ImageMap, image_grid
 from ceres_cal.uncertainty.maps import FieldMap, PointSpread
 from ceres_cal.uncertainty.posterior import Posterior, make_posterior
@@ -31,4 +31,5 @@ __all__ = [
     "lower_triangle",
     "make_posterior",
     "measure_scatter",
+    "require_keys",
 ]

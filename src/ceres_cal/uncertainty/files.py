@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Collection, Sequence
 from functools import cache
 
 import msgspec
@@ -12,8 +13,6 @@ from ceres_cal.base.arrays import Indices
 from ceres_cal.base.errors import InputError
 from ceres_cal.model.information import Information
 from ceres_cal.model.keys import Key, pose_keys
-from ceres_cal.model.parameters import Estimate
-from ceres_cal.model.quantities import intrinsic_keys
 from ceres_cal.uncertainty.bent import Bends
 from ceres_cal.uncertainty.dependence import Dependence
 from ceres_cal.uncertainty.posterior import Posterior
@@ -38,9 +37,12 @@ class ProfileFile(msgspec.Struct, forbid_unknown_fields=True):
         across = [lower_triangle(information) for information in profile.across]
         return cls(list(profile.keys), profile.phi_px, steps, rises, across, profile.open_below, profile.open_above)
 
-    def profile(self, camera: str) -> PhiProfile:
-        """The valley along phi of a camera; InputError where its numbers do not fit each other."""
+    def profile(self, camera: str, known: Collection[Key]) -> PhiProfile:
+        """The valley along phi of a camera; InputError where its numbers do not fit each other, or those known."""
         where = f"posterior.profiles.{camera}"
+        require_keys(self.keys, known, where)
+        if not self.keys or self.keys[0][:3] != ("camera", camera, "phi"):
+            raise InputError(f"{where} does not begin with phi of camera {camera!r}: calibrate again")
         counts = {len(self.steps), len(self.rises), len(self.information)}
         if len(counts) != 1 or any(len(row) != len(self.keys) for row in self.steps):
             raise InputError(f"{where}: steps, rises and information do not fit each other: calibrate again")
@@ -62,13 +64,12 @@ class BendsFile(msgspec.Struct, forbid_unknown_fields=True):
         """As a file has it."""
         return cls(list(bends.keys), bends.steps.tolist(), bends.ends.tolist(), bends.half_width)
 
-    def bends(self, known: Sequence[Key]) -> Bends:
+    def bends(self, known: Collection[Key]) -> Bends:
         """The bends; InputError where their numbers do not fit each other, or those that are known."""
         rows = [*self.steps, *self.ends]
         if len(self.steps) != len(self.ends) or any(len(row) != len(self.keys) for row in rows):
             raise InputError("posterior.bends: steps, ends and keys do not fit each other: calibrate again")
-        if not set(self.keys) <= set(known):
-            raise InputError("posterior.bends names keys that the posterior does not have: calibrate again")
+        require_keys(self.keys, known, "posterior.bends")
         return Bends(tuple(self.keys), np.array(self.steps), np.array(self.ends), self.half_width)
 
 
@@ -103,37 +104,23 @@ class PosteriorFile(msgspec.Struct, forbid_unknown_fields=True):
             lower_triangle(posterior.stated),
         )
 
-    def posterior(self, estimate: Estimate) -> Posterior:
-        """The posterior; InputError where a matrix has the wrong size, or a number is none of the estimate's."""
-        for key in (*self.keys, *(key for profile in self.profiles.values() for key in profile.keys)):
-            if key not in _keys_of(estimate, key.kind, key.owner):
-                raise InputError(
-                    f"posterior names {key.quantity!r} of {key.whose}, which is not there: calibrate again"
-                )
-        for name in (*self.profiles.keys() - estimate.cameras.keys(), *self.placements.keys() - {*estimate.placements}):
-            raise InputError(f"posterior: {name!r} is not there: calibrate again")
+    def posterior(self, known: Collection[Key]) -> Posterior:
+        """The posterior; InputError where a matrix has the wrong size, or a number is none of those known."""
+        require_keys(self.keys, known, "posterior.keys")
+        for name in self.placements:
+            require_keys(pose_keys("placement", name), known, "posterior.placements")
         placements = {
             name: information_from(row, pose_keys("placement", name), f"posterior.placements.{name}")
             for name, row in self.placements.items()
         }
         information = information_from(self.information, self.keys, "posterior.information")
-        profiles = {name: entry.profile(name) for name, entry in self.profiles.items()}
+        profiles = {name: entry.profile(name, self.keys) for name, entry in self.profiles.items()}
         by_model = self.by_model and information_from(self.by_model, self.keys, "posterior.by_model")
         freedom = np.inf if self.freedom is None else self.freedom
         bends = None if self.bends is None else self.bends.bends(self.keys)
-        if not set(self.stated_keys) <= set(self.keys):
-            raise InputError("posterior.stated_keys names keys that the posterior does not have: calibrate again")
+        require_keys(self.stated_keys, self.keys, "posterior.stated_keys")
         stated = information_from(self.stated, self.stated_keys, "posterior.stated")
         return Posterior(information, placements, freedom, profiles, by_model or None, self.dependence, bends, stated)
-
-
-def _keys_of(estimate: Estimate, kind: str, owner: str) -> Sequence[Key]:
-    """The keys of the estimate that one owner has; none where it is not there."""
-    if kind == "camera" and owner in estimate.cameras:
-        return intrinsic_keys(owner, estimate.cameras[owner].lens)
-    if kind == "station" and owner in estimate.stations:
-        return pose_keys("station", owner)
-    return estimate.structure.keys if kind in ("structure", "dimension") else ()
 
 
 def lower_triangle(information: Information) -> list[float]:
@@ -145,6 +132,15 @@ def lower_triangle(information: Information) -> list[float]:
 def _lower_triangle(size: int) -> tuple[Indices, Indices]:
     rows, columns = np.tril_indices(size)
     return rows, columns
+
+
+def require_keys(keys: Sequence[Key], known: Collection[Key], where: str) -> None:
+    """Raise InputError where a key of a file is there twice, or is none of those known."""
+    for key, count in Counter(keys).items():
+        if count > 1:
+            raise InputError(f"{where} names {key.quantity!r} of {key.whose} twice: calibrate again")
+        if key not in known:
+            raise InputError(f"{where} names {key.quantity!r} of {key.whose}, which is not there: calibrate again")
 
 
 def information_from(triangle: Sequence[float], keys: Sequence[Key], where: str) -> Information:

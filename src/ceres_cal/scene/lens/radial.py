@@ -17,6 +17,7 @@ from ceres_cal.scene.lens.polynomials import Ratio, dense_polynomial, growing_un
 
 _FAR = 6.0  # half image diagonals: nothing is observed farther out
 _TINY = 1e-150  # its square is still a number
+_MOST_POWER = 30  # 100,000 px to this power has a square that a computer holds
 
 
 @dataclass(frozen=True)
@@ -37,8 +38,11 @@ class Radial(Lens):
 
     def __post_init__(self) -> None:
         powers = tuple(int(p) for p in self.powers)
-        if not powers or min(powers) < 2 or len(set(powers)) != len(powers) or powers != tuple(self.powers):
-            raise InputError(f"powers of the radial lens must be different whole numbers from 2 on, not {self.powers}")
+        distinct = powers and len(set(powers)) == len(powers) and powers == tuple(self.powers)
+        if not distinct or not all(2 <= power <= _MOST_POWER for power in powers):
+            raise InputError(
+                f"powers of the radial lens must be different whole numbers from 2 to {_MOST_POWER}, not {self.powers}"
+            )
         object.__setattr__(self, "powers", powers)
         super().__post_init__()
 

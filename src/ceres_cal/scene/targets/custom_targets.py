@@ -12,7 +12,7 @@ from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import convert
 from ceres_cal.scene.curves import Arc, Curve, Segment, xyz
 from ceres_cal.scene.targets.crossings import with_crossings
-from ceres_cal.scene.targets.target import Target, TargetKind
+from ceres_cal.scene.targets.target import Target, TargetKind, require_places
 
 
 class _Spec(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True):
@@ -41,15 +41,7 @@ def custom(
     points, curves = {name: xyz(place) for name, place in (points or {}).items()}, dict(curves or {})
     if not points and not curves:
         raise InputError("custom target: give at least one point, segment or arc")
-    for name, place in points.items():
-        if not np.all(np.isfinite(place)):
-            raise InputError(f"custom target: point {name!r} must have three finite numbers, not {place}")
-    for name, curve in curves.items():
-        numbers = np.hstack(msgspec.structs.astuple(curve))
-        if not np.all(np.isfinite(numbers)) or curve.length_m <= 0.0 or curve.width_m < 0.0:
-            raise InputError(f"custom target: curve {name!r} needs finite numbers, a length and a width_m from 0 on")
-        if isinstance(curve, Arc) and not curve.radius_m > 0.5 * curve.width_m:
-            raise InputError(f"custom target: arc {name!r} must have a radius of more than half its width")
+    require_places("custom target", points, curves)
     segments = {name: curve for name, curve in curves.items() if isinstance(curve, Segment)}
     arcs = {name: curve for name, curve in curves.items() if isinstance(curve, Arc)}
     spec = msgspec.to_builtins(_Spec("custom", points, segments, arcs, movable))

@@ -16,13 +16,12 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
-import numpy as np
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import convert
 from ceres_cal.scene.curves import Arc, Curve, Segment
 from ceres_cal.scene.targets.crossings import with_crossings
-from ceres_cal.scene.targets.target import Target, TargetKind
+from ceres_cal.scene.targets.target import LARGEST_M, Target, TargetKind
 
 _FOLDER = Path(__file__).parent / "fields"
 _FUNCTIONS = {name: getattr(math, name) for name in ("acos", "asin", "atan2", "pi", "sqrt")} | {"max": max}
@@ -160,7 +159,7 @@ class Template(msgspec.Struct, forbid_unknown_fields=True):
             key = self.variants.key if self.variants else "variant"
             raise InputError(f"{self.kind}: {missing[0]} is missing: name a {key} or give every dimension")
         for name, value in every.items():
-            if not (np.isfinite(value) and value > 0.0):
+            if not 0.0 < value < LARGEST_M:
                 raise InputError(f"{self.kind}: {name} must be a positive number of metres, not {value}")
         return {name: float(value) for name, value in every.items()}
 

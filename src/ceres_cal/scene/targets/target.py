@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Mask
@@ -17,6 +18,26 @@ from ceres_cal.scene.targets.paper import Paper
 
 MOST_FEATURES = 100_000
 """Points and curves of all targets of a file; ten boards of 100 x 100 corners."""
+
+
+_ONCE_ROUND = 2.0 * np.pi * (1.0 + 1e-6)  # people round
+LARGEST_M = 1e7
+"""Of any number of a target: more than the radius of the Earth. Products of four such numbers keep their meaning."""
+
+
+def require_places(kind: str, points: Mapping[str, Sequence[float]], curves: Mapping[str, Curve]) -> None:
+    """Raise InputError where a point or a curve of a target has numbers that cannot be."""
+    for name, place in points.items():
+        if not np.all(np.abs(place) < LARGEST_M):
+            raise InputError(f"{kind}: point {name!r} must have three finite numbers of metres, not {place}")
+    for name, curve in curves.items():
+        numbers = np.hstack(msgspec.structs.astuple(curve))
+        if not np.all(np.abs(numbers) < LARGEST_M) or curve.length_m <= 0.0 or curve.width_m < 0.0:
+            raise InputError(f"{kind}: curve {name!r} needs finite numbers, a length and a width_m from 0 on")
+        if isinstance(curve, Arc) and not curve.radius_m > 0.5 * curve.width_m:
+            raise InputError(f"{kind}: arc {name!r} must have a radius of more than half its width")
+        if isinstance(curve, Arc) and curve.to_rad - curve.from_rad > _ONCE_ROUND:
+            raise InputError(f"{kind}: arc {name!r} goes more than once round: its to_rad is too large")
 
 
 def require_size(features: float, what: str) -> None:
@@ -68,6 +89,9 @@ class Target:
     mistaken_for: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     dimensions: Mapping[str, float] = field(default_factory=dict)
     optional: tuple[tuple[str, ...], ...] = ()
+
+    def __post_init__(self) -> None:
+        require_places(self.kind, self.points, self.curves)
 
     def __eq__(self, other: object) -> bool:
         return (
