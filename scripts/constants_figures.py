@@ -37,6 +37,7 @@ from moves import (
 )
 from photograph_shots import Shot, clicks, distances_px, floor_error_mm, hidden_places, off_by, take, turned, varied
 from photographs_auto import FACING, VIEWS, near, outcome, searched, take_view
+from rendering.photograph import frames, photograph
 
 from ceres_cal.advice import advise
 from ceres_cal.base.errors import CalibrationError
@@ -55,7 +56,6 @@ from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import KannalaBrandt, Radial
 from ceres_cal.scene.targets import checkerboard, ssl_field
 from ceres_cal.simulate import Held, Station, board_scene, built_in_scene, overhead_pose, simulate
-from ceres_cal.simulate.photograph import frames, photograph
 
 Figures = dict[str, float]
 

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from rendering.photograph import photograph
 
 from ceres_cal.base.errors import CalibrationError
 from ceres_cal.calibrating import calibrate
@@ -24,7 +25,6 @@ from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Radial
 from ceres_cal.scene.targets import ssl_field
 from ceres_cal.simulate import Disturbance, Photography, Scene, Station, field_scene, overhead_pose, simulate
-from ceres_cal.simulate.photograph import photograph
 
 CAMERA = Camera((1280, 960), 600.0, (651.3, 468.9), Radial((-5.2e-5, 6.1e-7)))
 KNOWN = {

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from rendering.album import Album, take_album
 
 from ceres_cal.base.files import write_bytes, write_json
 from ceres_cal.model.parameters import Station
@@ -23,7 +24,6 @@ from ceres_cal.simulate import (
     truth_to_json,
     write_simulation,
 )
-from ceres_cal.simulate.album import Album, take_album
 
 DATA = Path(__file__).resolve().parents[1] / "data"
 SEED = 1

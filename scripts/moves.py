@@ -22,6 +22,7 @@ from accuracy import map_errors_mm
 from accuracy_scenes import FIELD, field_places
 from cases import Row, run
 from photograph_shots import varied
+from rendering.photograph import frames, photograph
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import CalibrationError
@@ -52,7 +53,6 @@ from ceres_cal.simulate import (
     overhead_pose,
     simulate,
 )
-from ceres_cal.simulate.photograph import frames, photograph
 from ceres_cal.solve import Weighting, information
 from ceres_cal.uncertainty.maps import locate_slopes, visible_pixels
 

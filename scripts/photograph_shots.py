@@ -15,6 +15,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from cases import Row
+from rendering.photograph import Photograph, photograph
 
 from ceres_cal.base.arrays import Array, Array32, Indices32, Mask
 from ceres_cal.base.errors import CalibrationError
@@ -30,7 +31,6 @@ from ceres_cal.scene.curves import along_track, nearest_on_track
 from ceres_cal.scene.lens import Brown, KannalaBrandt, Lens, Radial
 from ceres_cal.scene.targets import Target, ssl_field
 from ceres_cal.simulate import Photography, Scene, Station, built_in_scene, field_scene, overhead_pose
-from ceres_cal.simulate.photograph import Photograph, photograph
 
 LENSES: tuple[tuple[float, Lens], ...] = (
     (868.0, Radial((-5.2e-5, 6.1e-7), (2, 3))),

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from cases import Row
 from photograph_shots import LENSES, NOT_PAINTED, Shot, distances_px, real_target, take, varied
+from rendering.photograph import photograph
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.detect.images import read_light
@@ -23,7 +24,6 @@ from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import KannalaBrandt, Radial
 from ceres_cal.scene.targets import Target, ssl_field
 from ceres_cal.simulate import Station, field_scene, overhead_pose
-from ceres_cal.simulate.photograph import photograph
 
 FACING = Auto((Facing("LeftGoalLine", "top"),))  # as the cameras of `take` are mounted
 WIDE = (

@@ -15,6 +15,7 @@ import numpy as np
 from cases import Row
 from msgspec import structs
 from photograph_outcomes import MOVED_MM, STATED, USUAL_MM, Outcome, outcome
+from rendering.photograph import photograph
 
 from ceres_cal.base.arrays import Image8
 from ceres_cal.photographs import Auto, Facing
@@ -23,7 +24,6 @@ from ceres_cal.scene.curves import Arc, Curve, Segment
 from ceres_cal.scene.lens import Brown, KannalaBrandt, Lens, Radial
 from ceres_cal.scene.targets import Target, custom, ssl_field
 from ceres_cal.simulate import Photography, Station, field_scene, overhead_pose
-from ceres_cal.simulate.photograph import photograph
 
 SIZE = (780, 580)
 WRONG, MOST_S = 4.0, 15.0

@@ -9,11 +9,11 @@ import numpy as np
 from cases import Row
 from photograph_shots import LENSES, Shot, varied
 from photographs_auto import rows_for, searched, whole
+from rendering.photograph import photograph
 
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.targets import Target, tape_grid, targets_by_name
 from ceres_cal.simulate import Photography, Station, field_scene, overhead_pose
-from ceres_cal.simulate.photograph import photograph
 
 USUAL_SIZE = np.array([9.0, 6.0])  # of the field that `whole` looks at
 ROBOTS_FROM_M = 5.0  # on smaller fields the renderer's robots would stand on everything

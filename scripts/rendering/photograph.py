@@ -12,11 +12,11 @@ from ceres_cal.base.arrays import Array, Array32, Image8, Mask
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.curves import along_curve, curve_points
 from ceres_cal.scene.targets import Target
-from ceres_cal.simulate import render
-from ceres_cal.simulate.ground import Ground, ground_of
 from ceres_cal.simulate.photography import Photography
 from ceres_cal.simulate.scene import Scene
-from ceres_cal.simulate.things import Ball, Robot, Shadow, Thing, outline, patches, shadow_outline
+from rendering import render
+from rendering.ground import Ground, ground_of
+from rendering.things import Ball, Robot, Shadow, Thing, outline, patches, shadow_outline
 
 Stretches = Mapping[str, tuple[tuple[float, float], ...]]
 """Curve -> (from, to) m along it."""
