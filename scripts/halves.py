@@ -18,8 +18,8 @@ from functools import partial
 
 import cv2
 import numpy as np
-from cases import Row, run
-from real_data import ov_plane, real_folder
+from photos.real_data import ov_plane, real_folder
+from runner import Row, script
 
 from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.errors import CalibrationError
@@ -233,10 +233,8 @@ def _rows(
         yield Row(name, f"{what}: difference over stated, rms", value, error, *limits, note)
 
 
-def main(arguments: Sequence[str]) -> int:
-    cases = {name: partial(rows, name, chosen) for name, chosen in SETS.items()}
-    return run(cases, arguments, __doc__, (20, "random splits of each set"), 2)
-
+_cases = {name: partial(rows, name, chosen) for name, chosen in SETS.items()}
+main = script(_cases, __doc__, (20, "random splits of each set"), 2)
 
 if __name__ == "__main__":
     sys.exit(main(sys.argv[1:]))

@@ -266,7 +266,8 @@ def measured(name: str, checkout: Path, chosen: argparse.Namespace) -> list[Figu
         arguments += {"file": ["--json", str(path)], "stdout": ["--json"], "": []}[command.json]
         start = time.perf_counter()
         try:
-            line = [str(python), str(script), *arguments]
+            named = [script] if script.parent.name == "scripts" else [checkout / "scripts" / "run.py", command.script]
+            line = [str(python), *map(str, named), *arguments]
             done = subprocess.run(line, cwd=checkout, env=_environment(), stdout=subprocess.PIPE, text=True)
         except OSError as error:
             raise NoFiguresError(f"{python} does not start: {error.strerror}") from None

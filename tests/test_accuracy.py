@@ -1,8 +1,8 @@
 """The statistical limit, by small samples: efficiency, bias, outliers, mirrored poses, ssl-vision's table, as built.
 
-`scripts/accuracy.py` has the full samples. Here each calibration is compared with the best one that its own noise
-allows (known truth, sigmas and outliers), so that few runs tell a few percent; the best itself keeps to the Cramer-Rao
-bound.
+`scripts/accuracy/accuracy.py` has the full samples. Here each calibration is compared with the best one that its own
+noise allows (known truth, sigmas and outliers), so that few runs tell a few percent; the best itself keeps to the
+Cramer-Rao bound.
 """
 
 from __future__ import annotations
@@ -12,12 +12,12 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
-import accuracy
-import accuracy_bound as limit
-import accuracy_scenes as scenes
 import numpy as np
 import pytest
-from benchmark_problems import corner_observations, wide_lens
+from accuracy import accuracy
+from accuracy import bound as limit
+from accuracy import scenes as scenes
+from benchmarks.problems import corner_observations, wide_lens
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.transforms import Pose

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import photograph_shots as script
-import photographs_auto as auto_script
-import photographs_disturbed as disturbed
 import pytest
+from photos import auto as auto_script
+from photos import disturbed as disturbed
+from photos import shots as script
 from rendering.photograph import photograph
 
 from ceres_cal.base.errors import InputError

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import photograph_shots as script
 import photographs
 import pytest
+from photos import shots as script
 from rendering.photograph import photograph
 
 from ceres_cal.base.arrays import Array

@@ -73,6 +73,8 @@ def test_another_checkout_is_measured_with_its_own_scripts(tmp_path: Path, capsy
     (tmp_path / "scripts" / "accuracy").mkdir(parents=True)
     (tmp_path / ".venv").symlink_to(sys.prefix)
     script = tmp_path / "scripts" / "accuracy" / "odd_scenes.py"
+    runs = "import runpy, sys; runpy.run_path(f'{sys.path[0]}/accuracy/{sys.argv[1]}.py')"
+    (tmp_path / "scripts" / "run.py").write_text(runs)
     script.write_text(f"print({ODD!r})")
     stored = tmp_path / "table.json"
     asked = ["--quick", "--checkout", str(tmp_path), "--only", "odd_scenes"]
