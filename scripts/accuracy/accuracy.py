@@ -12,9 +12,9 @@ from functools import partial
 
 import numpy as np
 from benchmarks.problems import corner_observations, wide_lens
-from runner import Row, over, script
+from runner import Row, mean_and_error, over, script
 
-from accuracy.bound import attempts, best, bound, efficiency, make_trial, mean_and_error
+from accuracy.bound import attempts, best, bound, efficiency, make_trial
 from accuracy.scenes import (
     CLEAN_NOISE,
     GROSS_NOISE,

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
-from runner import Row, script
+from runner import Row, mean_and_error, script, share_error
 
 from accuracy.bound import attempts
 from accuracy.scenes import CLEAN_NOISE, FIELD, Problem, tilted
@@ -136,16 +136,14 @@ class Kept:
             told = (
                 f"{np.mean(promised[:, column]):.2f} mm promised, {np.mean(stated[:, column]):.2f} stated, {runs} runs"
             )
-            error = float(np.std(ratios, ddof=1) / np.sqrt(runs))
-            yield Row(case, f"{words}: {what} stated", float(np.mean(ratios)), error, *limits, told)
+            yield Row(case, f"{words}: {what} stated", *mean_and_error(ratios), *limits, told)
             expected = float(np.sqrt(np.mean(at_truth[:, column] ** 2)))
             ratio = float(fact[column]) / expected
             told = f"{expected:.2f} mm promised, {fact[column]:.2f} in fact"
             yield Row(case, f"{words}: {what} in fact", ratio, ratio / np.sqrt(2.0 * runs), *limits, told)
         if self.in_range:
             share = float(np.mean(self.in_range))
-            error = float(np.sqrt(share * (1.0 - share) / runs))
-            yield Row(case, f"{words}: in the range", share, error, LEAST_IN_RANGE)
+            yield Row(case, f"{words}: in the range", share, share_error(share, runs), LEAST_IN_RANGE)
 
     def rough_row(self, case: str, words: str) -> Row:
         """Rough promises, shown and not judged: the worst error stated over the one promised, if not both unknown."""

@@ -14,7 +14,7 @@ from functools import partial
 
 import numpy as np
 from halves import SETS
-from runner import Row, over, script
+from runner import Row, mean_and_error, over, script, share_error
 
 from accuracy.scenes import RADIAL
 from ceres_cal.base.arrays import Array
@@ -102,23 +102,11 @@ def board_rows(case: str, board: Board, runs: int) -> Iterator[Row]:
             sigmas[one.kind].append(one.sigma_m)
     flat = board.points_m == board.bow_m == 0.0
     share, note = float(np.mean(found)), f"{runs} boards of {board.views} views"
-    error = float(np.sqrt(share * (1.0 - share) / runs))
-    yield Row(case, "share found not as drawn", share, error, *((0.0, 0.1) if flat else (0.0, 1.0)), note=note)
-    inside = np.mean(np.abs(offs) < 1.96, axis=1)
-    yield Row(case, "95 % intervals that hold", *_mean_and_error(inside), 0.9, 0.98, note)
-    yield Row(
-        case, "standard deviations over as drawn", *_mean_and_error(np.array(spreads)), most=1.03 if flat else np.inf
-    )
-    ratio = np.sum(squares, axis=0)
-    yield Row(case, "squared error over as drawn", ratio[0] / ratio[1], most=1.03 if flat else 1.0, note=note)
+    yield Row(case, "share found not as drawn", share, share_error(share, runs), 0.0, 0.1 if flat else 1.0, note)
     for kind, truth in (("points", board.points_m), ("warp", board.bow_m)):
         if truth and sigmas[kind]:
             ratios = np.array(sigmas[kind]) / truth
-            yield Row(case, f"sigma of {kind} over the true one", *_mean_and_error(ratios), note=f"{len(ratios)} found")
-
-
-def _mean_and_error(values: Array) -> tuple[float, float]:
-    return float(np.mean(values)), float(np.std(values) / np.sqrt(max(len(values) - 1, 1)))
+            yield Row(case, f"sigma of {kind} over the true one", *mean_and_error(ratios), note=f"{len(ratios)} found")
 
 
 # ---- real sets ------------------------------------------------------------------------------------------------------

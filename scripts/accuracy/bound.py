@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from runner import over
+from runner import mean_and_error, over
 
 from accuracy.scenes import Problem
 from ceres_cal import solve
@@ -148,11 +148,6 @@ def _attempt(problem: Problem, disturbance: Disturbance, seed: int) -> tuple[Tri
         return trial, calibrate(trial.observations, problem.options)
     except CalibrationError:
         return trial, None
-
-
-def mean_and_error(values: Array) -> tuple[float, float]:
-    """The mean and its standard error."""
-    return float(np.mean(values)), float(np.std(values, ddof=1) / np.sqrt(len(values)))
 
 
 def efficiency(problem: Problem, disturbance: Disturbance, seeds: Sequence[int]) -> Efficiency:

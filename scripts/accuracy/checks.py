@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from functools import cache, partial
 
 import numpy as np
-from runner import Row, over, script
+from runner import Row, over, script, share_error
 
 from accuracy.dependent_errors import along_lines
 from accuracy.moves import ALARMS, DAY, HOME, NOISE, calibrated, clean, seen, thinned, truth_of
@@ -75,7 +75,7 @@ def false_case(runs: int) -> Iterator[Row]:
     for kind in KINDS:
         share = np.mean([not one.holds for one in over(partial(_checked_by_turns, kind), range(runs))])
         note = f"{runs} unmoved cases, {min(runs, CALIBRATIONS)} calibrations"
-        yield Row("false alarms at 1 %", kind.name, float(share), _error(ALARMS, runs), 0.005, 0.015, note)
+        yield Row("false alarms at 1 %", kind.name, float(share), share_error(ALARMS, runs), 0.005, 0.015, note)
 
 
 def unlucky_case(runs: int) -> Iterator[Row]:
@@ -93,7 +93,7 @@ def unlucky_case(runs: int) -> Iterator[Row]:
             "given the calibration",
             what,
             float(np.mean(rates)),
-            _error(ALARMS, len(some) * each),
+            share_error(ALARMS, len(some) * each),
             most=0.015,
             note=note,
         )
@@ -107,7 +107,7 @@ def unlucky_case(runs: int) -> Iterator[Row]:
             "hourly for a month, --checks 720",
             what,
             MONTH * once,
-            MONTH * _error(ALARMS / MONTH, len(some) * each),
+            MONTH * share_error(ALARMS / MONTH, len(some) * each),
             most=0.015,
         )
 
@@ -160,10 +160,6 @@ def _off(calibration: Calibration) -> float:
     keys = [key for key in posterior.keys if key.kind == "station" or key.quantity == "phi"]
     off: Array = difference(truth_of(calibration, HOME), calibration.estimate, keys)
     return float(np.sqrt(off @ posterior.information.marginal(keys).matrix @ off))
-
-
-def _error(share: float, count: int) -> float:
-    return float(np.sqrt(share * (1.0 - share) / count))
 
 
 main = script(CASES, __doc__, (400, "checks of each row"))

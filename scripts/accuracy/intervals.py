@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
-from runner import Row, over, script
+from runner import Row, mean_and_error, over, script, share_error
 
 from accuracy.bound import Trial, make_trial
 from accuracy.dependent_errors import SIGMA_PX, Errors, along_lines, in_rows, line_aside, warped
@@ -178,8 +178,7 @@ def _add(found: Coverage, case: Case, trial: Trial, calibration: Calibration) ->
 
 def share(held: Sequence[Mask]) -> tuple[float, float]:
     """Mean over everything, and its standard error over the runs."""
-    each = np.array([np.mean(run) for run in held])
-    return float(np.mean(each)), float(np.std(each, ddof=1) / np.sqrt(len(each)))
+    return mean_and_error([np.mean(run) for run in held])
 
 
 def rows(name: str, case: Case, runs: int) -> Iterator[Row]:
@@ -190,7 +189,7 @@ def rows(name: str, case: Case, runs: int) -> Iterator[Row]:
     yield Row(name, "parameters in their 95 % intervals", *share(found.parameters), least, most, note)
     each = np.mean(found.parameters, axis=0)
     worst = int(np.argmin(each))
-    error = float(np.sqrt(each[worst] * (1.0 - each[worst]) / runs))
+    error = share_error(float(each[worst]), runs)
     yield Row(name, "the parameter least often", float(each[worst]), error, least_parameter, note=found.names[worst])
     if found.placements:
         yield Row(name, "poses of the boards", *share(found.placements), least, most)

@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 from photos.shots import varied
 from rendering.photograph import frames, photograph
-from runner import Row, script
+from runner import Row, script, share_error
 
 from accuracy.accuracy import map_errors_mm
 from accuracy.scenes import FIELD, field_places
@@ -245,7 +245,7 @@ def photographs_case(runs: int) -> Iterator[Row]:
         known = [_from_photographs(folder, seed) for seed in range(count)]
         false, noise = _photographed_alarms(known, HOME, CHECKS, 1, folder)
         total = count * CHECKS
-        error = float(np.sqrt(ALARMS * (1.0 - ALARMS) / total))
+        error = share_error(ALARMS, total)
         note = f"{total} photographs, {count} calibrations"
         yield Row("check by photographs", "false alarms at 1 %", false, error, most=0.01 + 3.0 * error, note=note)
         yield Row(

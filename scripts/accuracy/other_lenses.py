@@ -15,7 +15,7 @@ from functools import partial
 
 import numpy as np
 from halves import pairs, seen_grid, stated_squares, turn_basis
-from runner import Row, script
+from runner import Row, root_and_error, script
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import CalibrationError
@@ -147,11 +147,9 @@ def rows(name: str, runs: int) -> Iterator[Row]:
             continue
         squares.append(off_over_stated(calibration, lens, observations))
         chosen[calibration.lens_choice.chosen if calibration.lens_choice else ""] += 1
-    value = float(np.sqrt(np.mean(squares)))
-    error = float(np.std(squares, ddof=1) / np.sqrt(len(squares)) / (2.0 * value))
     note = ", ".join(f"{label} {count}" for label, count in chosen.most_common(3))
     note += f"; {refused} refused" if refused else ""
-    yield Row(name, f"error over stated, rms of {len(squares)}", value, error, _LEAST, _MOST, note)
+    yield Row(name, f"error over stated, rms of {len(squares)}", *root_and_error(squares), _LEAST, _MOST, note)
 
 
 main = script({name: partial(rows, name) for name in LENSES}, __doc__, (12, "scenes of each lens"))

@@ -12,13 +12,13 @@ standard errors.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 from halves import agreement, halves, seen_grid
-from runner import Row, script
+from runner import Row, mean_and_error, root_and_error, script
 
 from accuracy.other_lenses import off_over_stated
 from ceres_cal.base.arrays import Array
@@ -130,20 +130,11 @@ def rows(name: str, runs: int) -> Iterator[Row]:
         apart.append(agreement(one, other, pixels))
     note = ", ".join(f"{term} {count}" for term, count in chosen.most_common())
     noise = float(np.hypot(_NOISE_PX, _TOGETHER_PX))
-    yield Row(name, "noise found over true", *_mean(np.array(scales) / noise), 0.95, 1.05, note)
-    yield Row(name, "error over stated, rms", *_root(off), 0.5, 1.25, note)
-    yield Row(name, "halves, intrinsics over stated", *_root([one.intrinsics for one in apart]), 0.4, 1.25, note)
-    yield Row(name, "halves, projections over stated", *_root([one.projections for one in apart]), 0.4, 1.25, note)
-
-
-def _mean(values: Array) -> tuple[float, float]:
-    return float(np.mean(values)), float(np.std(values, ddof=1) / np.sqrt(len(values)))
-
-
-def _root(squares: Sequence[float]) -> tuple[float, float]:
-    """Root mean square and its standard error."""
-    mean, error = _mean(np.array(squares))
-    return float(np.sqrt(mean)), error / (2.0 * float(np.sqrt(mean)))
+    yield Row(name, "noise found over true", *mean_and_error(np.array(scales) / noise), 0.95, 1.05, note)
+    yield Row(name, "error over stated, rms", *root_and_error(off), 0.5, 1.25, note)
+    for what in ("intrinsics", "projections"):
+        squares = [getattr(one, what) for one in apart]
+        yield Row(name, f"halves, {what} over stated", *root_and_error(squares), 0.4, 1.25, note)
 
 
 main = script({name: partial(rows, name) for name in LENSES}, __doc__, (6, "scenes of each lens"), 2)
