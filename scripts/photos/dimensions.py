@@ -15,7 +15,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from rendering.photograph import photograph
-from runner import Row, root_and_error, script, share_error
+from runner import Row, mean_and_error, root_and_error, script
 
 from ceres_cal.base.errors import CalibrationError
 from ceres_cal.calibrating import calibrate
@@ -83,16 +83,15 @@ def rows(case: str, solve: _Solve, names: tuple[str, ...], runs: int) -> Iterato
             except CalibrationError as error:
                 failed.append(f"{seed}: {error}")
                 continue
-            for verdict in calibration.uncertainty.verdicts:
-                if verdict.key.kind == "dimension":
-                    off = verdict.value - true[verdict.key.quantity]
-                    inside.append(verdict.low <= true[verdict.key.quantity] <= verdict.high)
-                    errors.append(1e3 * abs(off))
-                    squares.append((off / verdict.sd) ** 2)
+            found = [one for one in calibration.uncertainty.verdicts if one.key.kind == "dimension"]
+            right = [true[one.key.quantity] for one in found]
+            off = np.array([one.value - value for one, value in zip(found, right, strict=True)])
+            inside.append(np.mean([one.low <= value <= one.high for one, value in zip(found, right, strict=True)]))
+            errors += (1e3 * np.abs(off)).tolist()
+            squares.append(np.mean((off / [one.sd for one in found]) ** 2))
     yield Row(case, "fields without a calibration", len(failed), most=0.0, note="; ".join(failed))
     if inside:
-        share = float(np.mean(inside))
-        yield Row(case, "dimensions in their 95 % intervals", share, share_error(share, len(inside)), 0.9, 0.98)
+        yield Row(case, "dimensions in their 95 % intervals", *mean_and_error(inside), 0.9, 0.98)
         yield Row(case, "error over sd, rms", *root_and_error(squares), 0.8, 1.25)
         yield Row(case, "median error, mm", float(np.median(errors)), note=f"largest {np.max(errors):.2f} mm")
 
