@@ -34,7 +34,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from faults.ssl_settings_file import settings
+from ssl_settings_file import settings
 
 from ceres_cal.base.errors import CalibrationError
 from ceres_cal.base.files import write_json

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from faults.ssl_settings_file import settings
 from foreign_cases import LENSES, SSL_LENS, over_field, places, same_camera, two_cameras, with_lens
 from google.protobuf import descriptor_pb2, descriptor_pool, json_format, message_factory
+from ssl_settings_file import settings
 
 from ceres_cal import Calibration, InputError
 from ceres_cal.base.arrays import Array
