@@ -15,7 +15,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from rendering.photograph import photograph
-from runner import Row, mean_and_error, root_and_error, script
+from runner import Row, mean_and_error, over, root_and_error, script
 
 from ceres_cal.base.errors import CalibrationError
 from ceres_cal.calibrating import calibrate
@@ -73,16 +73,25 @@ def photographed(seed: int, names: tuple[str, ...], folder: Path) -> tuple[dict[
 _Solve = Callable[[int, tuple[str, ...], Path], tuple[dict[str, float], Calibration]]
 
 
+def _solved(
+    solve: _Solve, names: tuple[str, ...], folder: Path, seed: int
+) -> tuple[dict[str, float], Calibration] | str:
+    """What it comes to, or why to nothing."""
+    try:
+        return solve(seed, names, folder)
+    except CalibrationError as error:
+        return str(error)
+
+
 def rows(case: str, solve: _Solve, names: tuple[str, ...], runs: int) -> Iterator[Row]:
     """Coverage and errors, of all dimensions together."""
     inside, errors, squares, failed = [], [], [], []
     with tempfile.TemporaryDirectory() as folder:
-        for seed in range(runs):
-            try:
-                true, calibration = solve(seed, names, Path(folder))
-            except CalibrationError as error:
-                failed.append(f"{seed}: {error}")
+        for seed, came in enumerate(over(partial(_solved, solve, names, Path(folder)), range(runs))):
+            if isinstance(came, str):
+                failed.append(f"{seed}: {came}")
                 continue
+            true, calibration = came
             found = [one for one in calibration.uncertainty.verdicts if one.key.kind == "dimension"]
             right = [true[one.key.quantity] for one in found]
             off = np.array([one.value - value for one, value in zip(found, right, strict=True)])

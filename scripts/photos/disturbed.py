@@ -8,13 +8,14 @@ import sys
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import cv2
 import numpy as np
 from msgspec import structs
 from rendering.photograph import photograph
-from runner import Row
+from runner import Row, over
 
 from ceres_cal.base.arrays import Image8
 from ceres_cal.photographs import Auto, Facing
@@ -174,33 +175,32 @@ def taken(name: str, seed: int, field: Target) -> Taken:
 # ---- what comes of it -----------------------------------------------------------------------------------------------
 
 
-def came_of(shot: Taken, asked: Target, folder: Path) -> Outcome:
+def came_of(shot: Taken, asked: Target) -> Outcome:
     """Found without a start, calibrated, and compared with the truth."""
-    path = folder / "photograph.png"
-    cv2.imwrite(str(path), shot.image)
     length, width = (asked.dimensions[f"field_{side}_m"] for side in ("length", "width"))
     x, y = np.meshgrid(np.linspace(-0.5, 0.5, 10) * length, np.linspace(-0.5, 0.5, 7) * width)
     floor = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
     pixels = shot.camera.project(floor)
     inside = np.all((pixels >= 0.0) & (pixels <= np.array(SIZE) - 1.0), axis=1)
-    return outcome(path, asked, AUTO, (pixels[inside], floor[inside, :2]))
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "photograph.png"
+        cv2.imwrite(str(path), shot.image)
+        return outcome(path, asked, AUTO, (pixels[inside], floor[inside, :2]))
 
 
 def disturbed_rows(runs: int) -> Iterator[Row]:
     """Each kind: how many are found, in time, how well, and whether the statement holds."""
-    field = ssl_field("B")
-    with tempfile.TemporaryDirectory() as folder:
-        for name, kind in KINDS.items():
-            every = []
-            for seed in range(runs):
-                every.append(came_of(taken(name, seed, field), field, Path(folder)))
-                one = every[-1]
-                print(
-                    f"{name} {seed}: {one.why or f'{one.mean_mm:.2f} mm, {one.over_stated:.2f} of stated'}, "
-                    f"{one.lens} {one.seconds:.1f} s",
-                    file=sys.stderr,
-                )
-            yield from _rows(name, every, kind.most_mm)
+    for name, kind in KINDS.items():
+        every = []
+        for seed, one in enumerate(over(partial(_disturbed, name), range(runs))):
+            every.append(one)
+            said = one.why or f"{one.mean_mm:.2f} mm, {one.over_stated:.2f} of stated"
+            print(f"{name} {seed}: {said}, {one.lens} {one.seconds:.1f} s", file=sys.stderr)
+        yield from _rows(name, every, kind.most_mm)
+
+
+def _disturbed(name: str, seed: int) -> Outcome:
+    return came_of(taken(name, seed, ssl_field("B")), ssl_field("B"))
 
 
 def _rows(name: str, every: Sequence[Outcome], most_mm: float) -> Iterator[Row]:
@@ -257,13 +257,14 @@ def wrong_rows(runs: int) -> Iterator[Row]:
     """Other fields than the one that is asked for: none may be certified."""
     names = (*OTHERS, "B for A", "A for B", "none")
     certified: dict[str, list[str]] = {name: [] for name in names}
-    with tempfile.TemporaryDirectory() as folder:
-        for number in range(runs):
-            name, seed = names[number % len(names)], number // len(names)
-            shot, asked = other(name, seed)
-            came = came_of(shot, asked, Path(folder))
-            print(f"{name} {seed}: {came.why or 'CERTIFIED'}, {came.seconds:.1f} s", file=sys.stderr)
-            if not came.why:
-                certified[name].append(f"{seed}: {came.mean_mm:.0f} mm")
+    asked = [(names[number % len(names)], number // len(names)) for number in range(runs)]
+    for (name, seed), came in zip(asked, over(_wrong, *zip(*asked, strict=True)), strict=True):
+        print(f"{name} {seed}: {came.why or 'CERTIFIED'}, {came.seconds:.1f} s", file=sys.stderr)
+        if not came.why:
+            certified[name].append(f"{seed}: {came.mean_mm:.0f} mm")
     for name in names[: min(runs, len(names))]:
         yield Row("another field", name, len(certified[name]), most=0.0, note=", ".join(certified[name]))
+
+
+def _wrong(name: str, seed: int) -> Outcome:
+    return came_of(*other(name, seed))

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from runner import Row
+from runner import Row, over
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.photographs import Auto, Clicks, Facing
@@ -84,11 +84,14 @@ def known_photographs(folder: Path) -> list[Known]:
 
 def shared_rows(folder: Path) -> Iterator[Row]:
     """Every photograph without a start and from four rough clicks; other fields must be refused."""
-    for shown in known_photographs(folder):
-        side = Facing(*shown.truth["facing"].split("="))
-        for how, start in (("auto", Auto((side,))), ("clicks", shown.clicks())):
-            target = targets_by_name()[shown.truth["asked_as"]]
-            yield from _rows(shown, how, outcome(shown.path, target, start, shown.floor()))
+    asked = [(shown, how) for shown in known_photographs(folder) for how in ("auto", "clicks")]
+    for (shown, how), came in zip(asked, over(_came_of, *zip(*asked, strict=True)), strict=True):
+        yield from _rows(shown, how, came)
+
+
+def _came_of(shown: Known, how: str) -> Outcome:
+    start = shown.clicks() if how == "clicks" else Auto((Facing(*shown.truth["facing"].split("=")),))
+    return outcome(shown.path, targets_by_name()[shown.truth["asked_as"]], start, shown.floor())
 
 
 def _rows(shown: Known, how: str, came: Outcome) -> Iterator[Row]:
