@@ -185,7 +185,7 @@ def rows(runs: int) -> Iterator[Row]:
     """Of so many files."""
     with tempfile.TemporaryDirectory() as folder:
         for what, value, most in week(Path(folder), runs):
-            yield Row("week", what, value, most=most)
+            yield Row("week", what, float(value), most=most)
 
 
 main = script({"week": rows}, __doc__, (20_000, "files"))
