@@ -25,9 +25,9 @@ from statistics import median
 from typing import Any
 
 import numpy as np
-from benchmark_lenses import lens_rows
-from benchmark_peers import PEERS, WARM_UP_FRAMES, Answer, Corners, peak_mib, reset_peak, solve_warm
-from benchmark_problems import (
+from benchmarks.lenses import lens_rows
+from benchmarks.peers import PEERS, WARM_UP_FRAMES, Answer, Corners, peak_mib, reset_peak, solve_warm
+from benchmarks.problems import (
     HEIGHT_M,
     OVERHEAD,
     TILT_DEG,
@@ -37,8 +37,8 @@ from benchmark_problems import (
     field_observations,
     wide_lens,
 )
-from benchmark_process import process_rows
-from benchmark_scale import FOLDER, folder_for, frames_in_turns, stored_growth, write_field
+from benchmarks.process import process_rows
+from benchmarks.scale import FOLDER, folder_for, frames_in_turns, stored_growth, write_field
 
 from ceres_cal.scene.heights import ROBOT_TOP_M
 from ceres_cal.scene.lens import KannalaBrandt
@@ -89,7 +89,7 @@ def solve_apart(name: str, warm_up_s: float, corners: Corners) -> tuple[Answer, 
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "corners.npz"
         corners.save(path)
-        script = Path(__file__).with_name("benchmark_peers.py")
+        script = Path(__file__).parent / "benchmarks" / "peers.py"
         found = json.loads(run(name, str(script), name, str(path), str(warm_up_s)))
     answer = Answer(found["seconds"], np.array(found["intrinsics"]), np.array(found["cam_from_board"]))
     return answer, found["peak_mib"]

@@ -204,7 +204,7 @@ def short(value: Value) -> str:
 
 def _measure(figures: str, folder: Path, runs: int, setting: Sequence[str] | None) -> int:
     """In the process that `measured` starts: set the constant, then measure; the last line printed is the answer."""
-    from constants_figures import FIGURES  # with it, everything that copies constants
+    from accuracy.constants_figures import FIGURES  # with it, everything that copies constants
 
     from ceres_cal.kernels import library
 

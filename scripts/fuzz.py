@@ -2,7 +2,7 @@
 
 Commands over a small corpus, made of what the package ships, are run whole with changes of every kind: numbers, types,
 sizes, names and order in JSON, columns, text and pictures; damaged bytes; exchanged, missing and odd files; words and
-options of the command line (scripts/fuzz_commands.py, scripts/fuzz_mutations.py). A command must answer, or refuse in
+options of the command line (scripts/faults/). A command must answer, or refuse in
 one line with a documented exit code; what it writes must be whole, and be read again. Counted as failures: any other
 exception, warnings, more than a line, half-written files, over 20 s of processor time or 300 s on the wall, over 2 GiB
 more than before, and deaths of the process. Exits with 1 when there is one; --keep keeps the folders that did it.
@@ -38,7 +38,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from fuzz_commands import FORMATS, Case, corpus, make_case
+from faults.fuzz_commands import FORMATS, Case, corpus, make_case
 
 import ceres_cal
 from ceres_cal.base.errors import CalibrationError

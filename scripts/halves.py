@@ -18,8 +18,8 @@ from functools import partial
 
 import cv2
 import numpy as np
-from cases import Row, run
-from real_data import ov_plane, real_folder
+from photos.real_data import ov_plane, real_folder
+from runner import Row, root_and_error, script
 
 from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.errors import CalibrationError
@@ -227,16 +227,12 @@ def _rows(
     views = " and ".join(str(len(half.shown_views)) for half in pairs[0])
     note = f"{len(found)} splits into {views} views" + (f", {failed} without a calibration" if failed else "")
     for what in ("intrinsics", "projections"):
-        squares = np.array([value for one in found if np.isfinite(value := getattr(one, what))])
-        value = float(np.sqrt(np.mean(squares)))
-        error = float(np.std(squares, ddof=1) / np.sqrt(len(squares)) / (2.0 * value))
-        yield Row(name, f"{what}: difference over stated, rms", value, error, *limits, note)
+        squares = [value for one in found if np.isfinite(value := getattr(one, what))]
+        yield Row(name, f"{what}: difference over stated, rms", *root_and_error(squares), *limits, note)
 
 
-def main(arguments: Sequence[str]) -> int:
-    cases = {name: partial(rows, name, chosen) for name, chosen in SETS.items()}
-    return run(cases, arguments, __doc__, (20, "random splits of each set"), 2)
-
+_cases = {name: partial(rows, name, chosen) for name, chosen in SETS.items()}
+main = script(_cases, __doc__, (20, "random splits of each set"), 2)
 
 if __name__ == "__main__":
     sys.exit(main(sys.argv[1:]))

@@ -14,7 +14,7 @@ from types import TracebackType
 from typing import Any
 
 import pytest
-from make_report_picture import chromium
+from data.make_report_picture import chromium
 
 
 def chromium_path() -> str:

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import TypeVar
 
 import pytest
+from accuracy.moves import DAY, HOME, MOVED, calibrated, seen
 from hypothesis import settings
-from moves import DAY, HOME, MOVED, calibrated, seen
-from real_data import real_place
+from photos.real_data import real_place
 
 from ceres_cal.detect.boards import BoardDetections, detect_boards
 from ceres_cal.moves.labels import MIRRORED, relabelled

@@ -1,8 +1,8 @@
 """The statistical limit, by small samples: efficiency, bias, outliers, mirrored poses, ssl-vision's table, as built.
 
-`scripts/accuracy.py` has the full samples. Here each calibration is compared with the best one that its own noise
-allows (known truth, sigmas and outliers), so that few runs tell a few percent; the best itself keeps to the Cramer-Rao
-bound.
+`scripts/accuracy/accuracy.py` has the full samples. Here each calibration is compared with the best one that its own
+noise allows (known truth, sigmas and outliers), so that few runs tell a few percent; the best itself keeps to the
+Cramer-Rao bound.
 """
 
 from __future__ import annotations
@@ -12,12 +12,13 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
-import accuracy
-import accuracy_bound as limit
-import accuracy_scenes as scenes
 import numpy as np
 import pytest
-from benchmark_problems import corner_observations, wide_lens
+from accuracy import accuracy
+from accuracy import bound as limit
+from accuracy import scenes as scenes
+from benchmarks.problems import corner_observations, wide_lens
+from runner import mean_and_error
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.transforms import Pose
@@ -66,7 +67,7 @@ def test_efficient_with_a_fifth_of_outliers(name: str) -> None:
 def test_the_best_keeps_to_the_bound(name: str) -> None:
     """So the bound is that of this problem, and the excess over the best is that over the bound."""
     squared = np.concatenate([found(name, outliers).best_squared for outliers in (0.0, 0.2)])
-    mean, _ = limit.mean_and_error(squared)
+    mean, _ = mean_and_error(squared)
     expected_error = np.sqrt(2.0 / (len(found(name, 0.0).keys) * len(squared)))  # of a chi-squared variable
     assert mean == pytest.approx(1.0, abs=4.0 * expected_error)
 

@@ -1,6 +1,6 @@
 """What advice promises: its information against the observations themselves, its millimetres against what is obtained.
 
-`scripts/advice.py` has the full samples; here are small ones.
+`scripts/accuracy/advice.py` has the full samples; here are small ones.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from accuracy_bound import make_trial
-from accuracy_scenes import CLEAN_NOISE, FIELD, tilted, two_cameras
-from accuracy_scenes import Problem as Case
-from advice import CASES, Kept, followed, promised_for
+from accuracy.advice import CASES, Kept, followed, promised_for
+from accuracy.bound import make_trial
+from accuracy.scenes import CLEAN_NOISE, FIELD, tilted, two_cameras
+from accuracy.scenes import Problem as Case
 from scenes import RADIAL
 
 from ceres_cal.advice import Advice, Errors, Measurement, Promise, advise, promised

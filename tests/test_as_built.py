@@ -3,11 +3,11 @@
 from dataclasses import replace
 from pathlib import Path
 
-import accuracy
-import accuracy_scenes
 import numpy as np
 import pytest
-from as_built import CAMERAS, Board, observed, sigmas_off
+from accuracy import accuracy
+from accuracy import scenes as accuracy_scenes
+from accuracy.as_built import CAMERAS, Board, observed, sigmas_off
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.calibrating import calibrate
@@ -35,7 +35,7 @@ def test_boards_as_drawn_stay_as_drawn() -> None:
     for seed in range(8):
         _, observations = observed(Board(views=8), seed)
         calibration = calibrate(observations, BUILT)
-        assert not calibration.as_built  # none of 100 (scripts/as_built.py)
+        assert not calibration.as_built  # none of 100 (scripts/accuracy/as_built.py)
         assert not calibration.options.tolerances and not len(calibration.estimate.structure.names)
         assert phi_of(calibration) == phi_of(calibrate(observations, DRAWN))
 

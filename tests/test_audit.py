@@ -1,14 +1,14 @@
-"""Audits of other programs' calibrations. Many of them: scripts/audit.py --runs."""
+"""Audits of other programs' calibrations. Many of them: scripts/accuracy/audit.py --runs."""
 
 import json
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
-import audit as planted
 import cv2
 import numpy as np
 import pytest
+from accuracy import audit as planted
 
 from ceres_cal import Calibration, Camera, InputError, Observations, audit, calibrate, checkerboard
 from ceres_cal.base.transforms import Pose

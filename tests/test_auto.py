@@ -6,10 +6,11 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import photograph_shots as script
-import photographs_auto as auto_script
-import photographs_disturbed as disturbed
 import pytest
+from photos import auto as auto_script
+from photos import disturbed as disturbed
+from photos import shots as script
+from rendering.photograph import photograph
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.transforms import Pose
@@ -34,7 +35,6 @@ from ceres_cal.scene.lens import Radial
 from ceres_cal.scene.symmetry import turns_of
 from ceres_cal.scene.targets import Arc, Segment, Target, custom, ssl_field
 from ceres_cal.simulate import Scene, Station, field_scene, overhead_pose
-from ceres_cal.simulate.photograph import photograph
 
 FIELD = ssl_field("B")
 NAMES = FIELD.curve_names

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import photographs_disturbed as disturbed
-from photograph_shots import Shot, distances_px
+from photos import disturbed as disturbed
+from photos.shots import Shot, distances_px
 
 from ceres_cal.base.arrays import Array, Indices32
 from ceres_cal.base.transforms import Pose

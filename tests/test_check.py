@@ -1,13 +1,13 @@
-"""Whether calibrations still hold, on the scenes of scripts/moves.py."""
+"""Whether calibrations still hold, on the scenes of scripts/accuracy/moves.py."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from accuracy_scenes import FIELD
-from checks import KINDS, Kind, checked
-from moves import CAMERA, DAY, HOME, NOISE, SMALL_SHIFT, SMALL_TILT, seen, thinned
-from moves import calibrated as calibrated_at_home
+from accuracy.checks import KINDS, Kind, checked
+from accuracy.moves import CAMERA, DAY, HOME, NOISE, SMALL_SHIFT, SMALL_TILT, seen, thinned
+from accuracy.moves import calibrated as calibrated_at_home
+from accuracy.scenes import FIELD
 from scenes import side_by_side
 
 from ceres_cal.base.errors import InputError, SolutionError
@@ -36,7 +36,7 @@ def lines(pose: Pose, seed: int, disturbance: Disturbance = DAY, camera: Camera 
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.name)
 def test_alarms_are_as_rare_as_stated_whatever_the_observations_are_like(kind: Kind) -> None:
     found = np.array([checked(kind, seed % 4, seed).probability for seed in range(16)])
-    assert np.count_nonzero(found < 0.01) <= 1  # 0; `python scripts/checks.py` has the figures
+    assert np.count_nonzero(found < 0.01) <= 1  # 0; `python scripts/run.py checks` has the figures
     assert np.median(found) > 0.25  # of one half: no one is unlucky, and the test allows for that
 
 

@@ -1,6 +1,5 @@
 """The commands as someone types them: answers, wrong usage, bad input, Ctrl-C, progress."""
 
-import importlib.util
 import io
 import json
 import os
@@ -18,8 +17,9 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 import pytest
-from accuracy_bound import make_trial
-from accuracy_scenes import CLEAN_NOISE, tilted
+from accuracy.bound import make_trial
+from accuracy.compare_with_truth import main as compare_with_truth
+from accuracy.scenes import CLEAN_NOISE, tilted
 from scenes import RADIAL
 
 import ceres_cal.calibrating
@@ -812,18 +812,6 @@ def test_wrong_rows(
 
 
 # ---- simulate, and the way through ----------------------------------------------------------------------------------
-
-
-def _compare_with_truth() -> Callable[[Sequence[str]], int]:
-    spec = importlib.util.spec_from_file_location("compare_with_truth", ROOT / "scripts" / "compare_with_truth.py")
-    assert spec is not None and spec.loader is not None
-    script = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(script)
-    run: Callable[[Sequence[str]], int] = script.main
-    return run
-
-
-compare_with_truth = _compare_with_truth()
 
 
 # A single view from almost straight above leaves phi / height open: 213 mm too low and 7 mm off at robot height.

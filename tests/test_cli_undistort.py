@@ -7,8 +7,8 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import photograph_shots as script
 import pytest
+from photos import shots as script
 from test_cli import Say, refused, say
 
 from ceres_cal.calibrating import calibrate

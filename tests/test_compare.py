@@ -5,8 +5,8 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from moves import CAMERA, DAY, HOME, MOVED, seen
-from moves import calibrated as calibrated_at_home
+from accuracy.moves import CAMERA, DAY, HOME, MOVED, seen
+from accuracy.moves import calibrated as calibrated_at_home
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.calibration import Calibration

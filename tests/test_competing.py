@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from diagnostic_scenes import held_boards
+from accuracy.diagnostic_scenes import held_boards
 from scenes import RADIAL, boards, lines_and_arcs
 
 from ceres_cal.base.arrays import Array, Mask

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from accuracy_scenes import CLEAN_NOISE, RADIAL, SSL_PROBLEMS, boards
-from dependent_errors import Errors, along_lines, warped
+from accuracy.dependent_errors import Errors, along_lines, warped
+from accuracy.intervals import CASES, cover, share
+from accuracy.scenes import CLEAN_NOISE, RADIAL, SSL_PROBLEMS, boards
 from hypothesis import given
 from hypothesis import strategies as st
-from intervals import CASES, cover, share
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.tails import NORMAL_95, student_95
@@ -77,7 +77,7 @@ def test_white_noise_stays_white() -> None:
 
 
 def test_distorted_views_widen_everything() -> None:
-    """Where one view alone is distorted, it is taken out as a whole, or what is stated widens: scripts/intervals.py."""
+    """Where one view alone is distorted, it is taken out as a whole, or all widens: accuracy/intervals.py."""
     errors = partial(warped, sigma_px=1.0, views=3)
     assert np.median([factors(calibrate(ten_boards(errors, seed), TEN.options)) for seed in range(6)]) > 1.1
 
@@ -320,7 +320,7 @@ def test_the_spread_of_scores_is_that_over_all_pairs_of_views() -> None:
 
 @pytest.mark.parametrize("name", ["lines together over 0.5 m", "ten boards, smooth errors"])
 def test_intervals_hold_where_errors_go_together(name: str) -> None:
-    """scripts/intervals.py has more runs; without it 62 % and 68 %."""
+    """scripts/accuracy/intervals.py has more runs; without it 62 % and 68 %."""
     found = cover(CASES[name], range(15))
     assert found.far == 0 and found.failed == 0
     assert 0.88 < share(found.parameters)[0] < 0.995

@@ -5,9 +5,9 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
-import diagnostic_scenes as scenes
 import numpy as np
 import pytest
+from accuracy import diagnostic_scenes as scenes
 from scenes import RADIAL
 
 from ceres_cal import write_report

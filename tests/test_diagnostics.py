@@ -7,10 +7,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import diagnostic_scenes as scenes
 import numpy as np
 import pytest
 import scenes as usual
+from accuracy import diagnostic_scenes as scenes
 from scenes import RADIAL
 
 from ceres_cal.base.arrays import Array

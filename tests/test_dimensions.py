@@ -10,6 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from rendering.photograph import photograph
 
 from ceres_cal.base.arrays import Image
 from ceres_cal.base.errors import DegenerateError, InputError
@@ -39,7 +40,6 @@ from ceres_cal.simulate import (
     overhead_pose,
     simulate,
 )
-from ceres_cal.simulate.photograph import photograph
 
 FIELD = ssl_field("B")
 TRUE = {"field_length_m": 8.28, "field_width_m": 5.52}

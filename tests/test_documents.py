@@ -4,14 +4,14 @@ import re
 import shlex
 from pathlib import Path
 
-import documents
 import pytest
-from documents import DOCUMENTS, Step, agree, differences, rewritten, run, steps_of
+from data.documents import DOCUMENTS, Step, agree, differences, rewritten, run, steps_of
 
 from ceres_cal import InputError
 from ceres_cal.cli import chosen
+from data import documents
 
-RUN = ("README.md", "docs/cron.md")  # `python scripts/documents.py` runs the others, too, which hold little else
+RUN = ("README.md", "docs/cron.md")  # `python scripts/run.py documents` runs the others, too, which hold little else
 CODE = re.compile(r"^```(?:console|text)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 INLINE = re.compile(r"`(ceres-cal [^`]+)`")
 
@@ -27,7 +27,7 @@ def typed(text: str) -> list[list[str]]:
 @pytest.mark.parametrize("name", RUN)
 def test_every_command_works_and_prints_what_is_said(name: str) -> None:
     found = differences(documents.ROOT / name)
-    assert not found, "\n".join([*found, f"if that is right: python scripts/documents.py --write {name}"])
+    assert not found, "\n".join([*found, f"if that is right: python scripts/run.py documents --write {name}"])
 
 
 @pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: path.name)

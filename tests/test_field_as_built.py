@@ -6,9 +6,9 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import photograph_shots as script
 import pytest
-from photographs_disturbed import AUTO, taken
+from photos import shots as script
+from photos.disturbed import AUTO, taken
 
 from ceres_cal.base.errors import NothingShownError
 from ceres_cal.calibrating import calibrate

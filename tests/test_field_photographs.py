@@ -6,9 +6,10 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import photograph_shots as script
 import photographs
 import pytest
+from photos import shots as script
+from rendering.photograph import photograph
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
@@ -25,7 +26,6 @@ from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Radial
 from ceres_cal.scene.targets import Segment, custom, ssl_field
 from ceres_cal.simulate import Photography, Scene, Station, field_scene, overhead_pose
-from ceres_cal.simulate.photograph import photograph
 
 FIELD = ssl_field("B")
 

@@ -44,7 +44,7 @@ FLOORS = {
 DOORS = {
     "pyceres": {"solve"},
     "numba": {"kernels"},
-    "cv2": {"detect", "simulate", "pictures", "formats"},
+    "cv2": {"detect", "pictures", "formats"},
     "pycolmap": {"start", "formats"},
     "matplotlib": {"report"},
     "google": {"formats"},  # protobuf

@@ -1,11 +1,11 @@
-"""The league's set-ups: an answer, or one line that refuses. `scripts/league.py` has all of them."""
+"""The league's set-ups: an answer, or one line that refuses. `scripts/run.py league` has all of them."""
 
 from __future__ import annotations
 
 from itertools import combinations
 
 import pytest
-from league import SET_UPS, SetUp, outcome, pairwise
+from accuracy.league import SET_UPS, SetUp, outcome, pairwise
 
 
 def test_each_two_values_come_together() -> None:

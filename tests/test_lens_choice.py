@@ -11,12 +11,12 @@ from typing import Any
 import cv2
 import halves
 import numpy as np
-import photographs_disturbed as disturbed
 import pytest
 import scenes
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from photos import disturbed as disturbed
 
 from ceres_cal import calibrating
 from ceres_cal.base.arrays import Array

@@ -5,9 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from accuracy_scenes import FIELD
-from moves import CAMERA, DAY, MOVED, NOISE, seen
-from moves import calibrated as calibrated_at_home
+from accuracy.moves import CAMERA, DAY, MOVED, NOISE, seen
+from accuracy.moves import calibrated as calibrated_at_home
+from accuracy.scenes import FIELD
 from scenes import side_by_side
 
 from ceres_cal.calibrating import calibrate

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from moves import CAMERA, HOME
+from accuracy.moves import CAMERA, HOME
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.formats import LookupTable, make_lookup_table

@@ -7,7 +7,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from diagnostic_scenes import held_boards
+from accuracy.diagnostic_scenes import held_boards
 from scenes import RADIAL
 
 from ceres_cal.base.arrays import Array

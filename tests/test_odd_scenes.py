@@ -1,9 +1,9 @@
-"""Odd scenes that once gave a wrong answer in silence: `scripts/odd_scenes.py` has the full samples."""
+"""Odd scenes that once gave a wrong answer in silence: `scripts/accuracy/odd_scenes.py` has the full samples."""
 
 from __future__ import annotations
 
 import pytest
-from odd_scenes import BESIDE, MOST_RADII, MOST_SIGMAS, ODD, outcome
+from accuracy.odd_scenes import BESIDE, MOST_RADII, MOST_SIGMAS, ODD, outcome
 
 # Sigmas of the farthest "known" number, radii of the farthest place: before, and measured since.
 _MENDED = {

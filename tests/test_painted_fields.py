@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from photographs_templates import take_field
+from photos.templates import take_field
 from scenes import camera
 
 from ceres_cal import InputError, Observations, calibrate, painted_field, ssl_field, tape_grid

@@ -7,12 +7,16 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from rendering.album import take_album
+from rendering.photograph import frames, photograph
+from rendering.render import SUBPIXELS, averaged, blank_canvas, fill, paint_curves, print_sheet
+from rendering.simulate_photographs import main as simulate_photographs
+from rendering.things import BALL_RADIUS_M, Ball, Robot, outline
 from scenes import LENSES, camera, lines
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.transforms import Pose
-from ceres_cal.cli import main
 from ceres_cal.detect.images import read_grey
 from ceres_cal.detect.saddles import measure_saddles
 from ceres_cal.scene.camera import Camera
@@ -33,10 +37,6 @@ from ceres_cal.simulate import (
     scene_to_json,
     simulate,
 )
-from ceres_cal.simulate.album import take_album
-from ceres_cal.simulate.photograph import frames, photograph
-from ceres_cal.simulate.render import SUBPIXELS, averaged, blank_canvas, fill, paint_curves, print_sheet
-from ceres_cal.simulate.things import BALL_RADIUS_M, Ball, Robot, outline
 
 PLAIN = Photography(
     blur_px=0.0, vignetting=0.0, unevenness=0.0, carpet_texture=0.0, read_noise=0.0, shot_noise=0.0, carpet=0.2
@@ -247,10 +247,10 @@ def test_command_writes_images(tmp_path: Path, capsys: pytest.CaptureFixture[str
     data["cameras"]["overhead"] |= {"phi": 217.0, "principal_point": [161.0, 119.0]}
     data["cameras"]["overhead"]["lens"]["coefficients"] = {"a2": -2e-4, "a3": 9.8e-6}
     (tmp_path / "scene.json").write_text(json.dumps(data))
-    assert (
-        main(["simulate", str(tmp_path / "scene.json"), "-o", str(tmp_path / "out"), "--images", "png", "--json"]) == 0
-    )
-    answer = json.loads(capsys.readouterr().out)
-    assert [Path(path).name for path in answer["images"]] == ["0001.png", "0002.png", "0003.png", "0004.png"]
-    assert read_grey(answer["images"][3]).shape == (240, 320)
-    assert main(["simulate", "boards", "-o", str(tmp_path / "out"), "--images", "gif"]) == 2
+    assert simulate_photographs([str(tmp_path / "scene.json"), "-o", str(tmp_path / "out")]) == 0
+    assert capsys.readouterr().out.endswith("4 photographs\n")
+    images = sorted((tmp_path / "out" / "photographs").iterdir())
+    assert [path.name for path in images] == ["0001.png", "0002.png", "0003.png", "0004.png"]
+    assert read_grey(images[3]).shape == (240, 320)
+    assert simulate_photographs(["nothing", "-o", str(tmp_path / "out")]) == 2
+    assert "there is no scene 'nothing'" in capsys.readouterr().err

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import photograph_shots as script
 import pytest
-import straightness
 from hypothesis import given
 from hypothesis import strategies as st
+from photos import shots as script
+from photos import straightness
 from scenes import LENSES, camera
 
 from ceres_cal.base.arrays import Array

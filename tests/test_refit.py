@@ -1,12 +1,11 @@
-"""Refits after a move, on the scenes of scripts/moves.py."""
+"""Refits after a move, on the scenes of scripts/accuracy/moves.py."""
 
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from accuracy_scenes import FIELD
-from moves import (
+from accuracy.moves import (
     CAMERA,
     CORNERS,
     DAY,
@@ -23,7 +22,8 @@ from moves import (
     thinned,
     truth_of,
 )
-from moves import calibrated as calibrated_at_home
+from accuracy.moves import calibrated as calibrated_at_home
+from accuracy.scenes import FIELD
 from scenes import side_by_side
 
 from ceres_cal.base.errors import DegenerateError, InputError, SolutionError

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 import refit_after_move
-import week
-from moves import MOVED, NOISE, seen
+from accuracy.moves import MOVED, NOISE, seen
+from faults import week
 
 from ceres_cal.calibration import Calibration
 from ceres_cal.moves import check
@@ -100,8 +100,8 @@ def test_a_week_in_fast_motion(monkeypatch: pytest.MonkeyPatch, capsys: pytest.C
     """A move, a folder that is away and a full disk, each with files that are damaged beside good ones."""
     for name, value in (("HEAP", 10), ("KINDS", 3), ("MOVE_EVERY", 30), ("AWAY_EVERY", 20), ("FULL_EVERY", 40)):
         monkeypatch.setattr(week, name, value)
-    assert week.main(["--files", "60", "--seed", "1", "--json"]) == 0
-    figures = {row["figure"]: row["value"] for row in json.loads(capsys.readouterr().out)}
+    assert week.main(["--runs", "60", "--json"]) == 0
+    figures = {row["what"]: row["value"] for row in json.loads(capsys.readouterr().out)}
     assert figures["files that were lost"] == 0 and "refits that are not one of 1 moves" in figures
 
 

@@ -24,12 +24,12 @@ from typing import Any
 
 import cv2
 import fuzz
-import fuzz_commands
 import numpy as np
 import photographs
 import pytest
 import refit_after_move
 import watching
+from faults import fuzz_commands
 from scenes import RADIAL
 
 from ceres_cal.base.errors import CalibrationError, InputError

@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from data.write_schemas import FOLDER
 from foreign_cases import over_field, with_lens
-from write_schemas import FOLDER
 
 from ceres_cal import Calibration, InputError, Observations
 from ceres_cal.formats.schema import file_schemas
@@ -20,7 +20,7 @@ def fields(schema: dict[str, Any]) -> set[str]:
 
 @pytest.mark.parametrize("name", file_schemas())
 def test_the_shipped_schema_is_the_readers(name: str) -> None:
-    assert json.loads((FOLDER / name).read_text()) == file_schemas()[name], "run scripts/write_schemas.py"
+    assert json.loads((FOLDER / name).read_text()) == file_schemas()[name], "run scripts/data/write_schemas.py"
 
 
 @pytest.mark.parametrize("name", file_schemas())

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 import scenes
-from real_data import ov_plane
+from photos.real_data import ov_plane
 from test_cli import Say, refused, say
 
 from ceres_cal.base.errors import InputError

@@ -526,7 +526,7 @@ def test_folder_that_cannot_be_made(tmp_path: Path) -> None:
 
 
 def test_sample_data_come_from_the_script(tmp_path: Path) -> None:
-    script = [sys.executable, str(ROOT / "scripts" / "make_data.py"), str(tmp_path)]
+    script = [sys.executable, str(ROOT / "scripts" / "run.py"), "make_data", str(tmp_path)]
     printed = subprocess.run(script, capture_output=True, text=True, check=True).stdout
     shipped = {path.relative_to(ROOT / "data"): path.read_bytes() for path in (ROOT / "data").glob("*/*.json")}
     made = {path.relative_to(tmp_path): path.read_bytes() for path in tmp_path.glob("*/*.json")}

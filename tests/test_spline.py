@@ -11,7 +11,7 @@ import pytest
 import scenes
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from real_data import ov_plane
+from photos.real_data import ov_plane
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError

@@ -1,6 +1,6 @@
 """Verdicts, profile bounds, maps in mm and seams, against what was built in and against brute force.
 
-`scripts/intervals.py` has the full samples; here are small ones.
+`scripts/accuracy/intervals.py` has the full samples; here are small ones.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from accuracy_bound import bound, make_trial
-from accuracy_scenes import CLEAN_NOISE, FIELD, painted_by_two_cameras, tilted, two_cameras
-from intervals import CASES, cover, share
+from accuracy.bound import bound, make_trial
+from accuracy.intervals import CASES, cover, share
+from accuracy.scenes import CLEAN_NOISE, FIELD, painted_by_two_cameras, tilted, two_cameras
 from scenes import RADIAL, SCENES
 
 from ceres_cal.base.arrays import Array
@@ -261,7 +261,7 @@ def test_bounds_in_words(low: float, high: float, words: str) -> None:
     [("tilt 25 deg", 60), ("tilt 3 deg", 30), ("tilt 1 deg", 60), ("tilt 1 deg, height", 60), ("boards", 60)],
 )
 def test_intervals_hold_what_they_say(name: str, runs: int) -> None:
-    """Four standard errors around 0.95; scripts/intervals.py has 500 runs of each, 0.943 to 0.964 measured. (25
+    """Four standard errors around 0.95; accuracy/intervals.py has 500 runs of each, 0.943 to 0.964 measured. (25
     degrees: 0.98 in these 60, 0.955 in 150; where nearly all hold a sample's own error is too small.)
     """
     found, wider = cover(CASES[name], range(runs)), np.sqrt(60.0 / runs)

@@ -8,10 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.words import plural
-from ceres_cal.cli.arguments import add_quiet
 from ceres_cal.cli.command import Answer, Command
 from ceres_cal.cli.outputs import finishing
-from ceres_cal.cli.progress import progress_bar
 
 if TYPE_CHECKING:
     from ceres_cal.simulate import Simulation
@@ -22,12 +20,6 @@ def _add_arguments(parser: ArgumentParser) -> None:
     add("scene", nargs="?", metavar="SCENE", help="name of a built-in scene, or a scene file (.json)")
     add("-o", "--output", metavar="DIR", type=Path, help="folder for observations.json and truth.json; made if missing")
     add("--seed", type=int, default=0, metavar="N", help="the same seed gives the same observations; default: 0")
-    add(
-        "--images",
-        choices=("png", "jpg"),
-        help="take photographs too, into photographs/ beside the observations; what robots hide there is not observed",
-    )
-    add_quiet(parser)
     add("--list", action="store_true", help="list the built-in scenes")
 
 
@@ -49,19 +41,9 @@ def _run(args: Namespace) -> Answer:
     is_file = args.scene not in scenes and (Path(args.scene).exists() or args.scene.endswith(".json"))
     scene, disturbance = load_scene(args.scene) if is_file else built_in_scene(args.scene)
     simulation = simulate(scene, disturbance, args.seed)
-    images: list[str] = []
-    if args.images is not None:
-        from ceres_cal.simulate.album import take_album
-
-        with progress_bar(args) as bar:
-            album = take_album(simulation, args.images, bar.update)
-        simulation, images = album.simulation, [str(args.output / name) for name in album.images]
     with finishing():
-        if args.images is not None:
-            album.write(args.output)
-        else:
-            write_simulation(simulation, args.output)
-    data = _data(simulation, args.scene, args.output) | {"images": images}
+        write_simulation(simulation, args.output)
+    data = _data(simulation, args.scene, args.output)
     return Answer(data, lambda: _text(data))
 
 
@@ -71,7 +53,7 @@ COMMANDS = (
         "make observations of a scene, with noise and errors, and their truth",
         _add_arguments,
         _run,
-        ("ssl-field -o try/", "photographs -o try/ --images png --seed 3", "--list"),
+        ("ssl-field -o try/", "two-cameras -o try/ --seed 3", "--list"),
     ),
 )
 
@@ -99,5 +81,4 @@ def _text(data: dict[str, Any]) -> str:
         f"{plural(data['curves'], 'curve observation')}, of them {plural(data['outliers'], 'outlier')} and "
         f"{plural(data['wrong_labels'], 'wrong label')}\n"
         f"{data['truth']}: what is true of them"
-        + (f"\n{Path(data['images'][0]).parent}: {plural(len(data['images']), 'photograph')}" if data["images"] else "")
     )

@@ -18,7 +18,7 @@ from ceres_cal.scene.camera import Camera
 
 _POINT_NS = 10.0
 # Share of observations that may be anywhere in the image: as many as are wrong in the simulated days of
-# scripts/moves.py. Nothing changes from half to double.
+# scripts/accuracy/moves.py. Nothing changes from half to double.
 _STRAY = 0.05
 
 

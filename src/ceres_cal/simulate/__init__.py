@@ -1,6 +1,6 @@
-"""Simulation of scenes: observations as numbers with noise, outliers and hidden stretches, photographs, their truth.
+"""Simulation of scenes: observations with noise, outliers and hidden stretches, and their truth.
 
-What draws (`photograph`, `album`) needs OpenCV and is imported where it is used, by its own name.
+A scene also says how photographs of it look (`Photography`); scripts/rendering draws them.
 """
 
 from ceres_cal.model.parameters import Station

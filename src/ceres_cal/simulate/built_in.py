@@ -134,7 +134,7 @@ _SCENES: dict[str, tuple[str, Callable[[], tuple[Scene, Disturbance]]]] = {
     "field-2004": ("the paper's camera over half of a field of 4.9 x 3.4 m: data/field_2004/field.json", _field_2004),
     "two-cameras": ("two overhead cameras over a division B field, and boards that both see at once", _two_cameras),
     "moved-camera": ("one camera at three stations over half of a division B field", _moved_camera),
-    "photographs": ("half of a division B field with robots, for --images: lamps, shadows, worn paint", _photographs),
+    "photographs": ("half of a division B field, to be drawn with robots, lamps, shadows and worn paint", _photographs),
     "boards": ("a checkerboard held before one camera at 20 places", _boards),
     "fisheye": ("a camera of over 120 degrees over a division B field", _fisheye),
 }

@@ -1,0 +1,1 @@
+"""What simulated observations say of answers: how near, how honest, how often wrong."""

@@ -1,0 +1,301 @@
+"""Calibrations of too little, too flat or too lopsided observations: python scripts/run.py odd_scenes [--help]
+
+Random scenes that somebody does give to a calibration: four to ten points, parallel lines, a field from straight above,
+one board or two, an arc and a line, a few points beside many line points; every lens, noise as stated. A refusal is a
+right answer; counted are calibrations of which a number that is called "known" is over 5 standard deviations off, and
+those that locate a place farther off than 2.5 times its stated 95 % radius. Exits with 1 where there are more of them
+than asked.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+from runner import Row, finished, over, over_processes, parser
+
+from accuracy.scenes import FIELD, Problem
+from ceres_cal.base.arrays import Array
+from ceres_cal.base.errors import CalibrationError
+from ceres_cal.base.transforms import Pose
+from ceres_cal.calibrating import calibrate
+from ceres_cal.calibration import Calibration
+from ceres_cal.model.parameters import Estimate, Options
+from ceres_cal.model.quantities import difference
+from ceres_cal.observations import Prior
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.heights import HEIGHTS_M
+from ceres_cal.scene.lens import Brown, KannalaBrandt, Lens, Radial
+from ceres_cal.scene.targets import checkerboard
+from ceres_cal.simulate import Disturbance, Held, Scene, Station, board_scene, field_scene, overhead_pose, simulate
+from ceres_cal.simulate.compose import well_inside
+from ceres_cal.uncertainty.maps import visible_pixels
+
+MOST_SIGMAS, MOST_RADII = 5.0, 2.5
+MOST_WRONG_KNOWN, MOST_WRONG_PLACES = 0, 2  # of 2000 scenes
+NOISES_PX = (0.1, 0.3, 1.0)
+_PLACES = np.array([[x, y] for x in np.linspace(-4.0, 4.0, 9) for y in np.linspace(-2.8, 2.8, 7)])
+_ACROSS = ("LeftGoalLine", "RightGoalLine", "HalfwayLine", "LeftPenaltyStretch", "RightPenaltyStretch")
+_ALONG = ("TopTouchLine", "BottomTouchLine", "CenterLine")
+_STRAIGHT = tuple(name for name in FIELD.curve_names if name != "CenterCircle")
+
+LENSES: dict[str, Callable[[np.random.Generator], tuple[float, Lens]]] = {
+    "radial": lambda rng: (rng.uniform(700, 1000), Radial((rng.uniform(-8e-5, 0.0), rng.uniform(2e-7, 8e-7)))),
+    "brown": lambda rng: (
+        rng.uniform(700, 1000),
+        Brown((rng.uniform(-0.28, -0.1), rng.uniform(0.03, 0.09), *rng.uniform(-5e-4, 5e-4, 2), 0.0)),
+    ),
+    "kannala-brandt": lambda rng: (
+        rng.uniform(450, 650),
+        KannalaBrandt((rng.uniform(-0.03, 0.02), rng.uniform(-0.005, 0.005), -0.002, 0.0004)),
+    ),
+}
+"""phi and lens of cameras that see a field; the script's image is of 1280 x 960 px."""
+
+
+# ---- scenes ---------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class _Drawn:
+    """A camera drawn at random, and what draws the rest."""
+
+    rng: np.random.Generator
+    camera: Camera
+
+    def over_the_field(
+        self, tilt_deg: tuple[float, float], points: tuple[int, int], curves: Sequence[str], spacing_m: float
+    ) -> Scene:
+        """What one station over the field shows of some of the points it sees (from, to) and of curves."""
+        rng = self.rng
+        tilt, direction = rng.uniform(*tilt_deg), rng.uniform(0.0, 2.0 * np.pi)
+        height_m = rng.uniform(4.0, 7.0) * (0.65 if self.camera.lens.kind == "kannala-brandt" else 1.0)
+        x_m, y_m = rng.uniform(-1.0, 1.0, 2)
+        tilts = tilt * np.cos(direction), tilt * np.sin(direction)
+        pose = overhead_pose(x_m, y_m, height_m, *tilts, yaw_deg=rng.uniform(-180.0, 180.0))
+        shown = well_inside(self.camera.at(pose), FIELD.point_array)
+        seen = [name for name, inside in zip(FIELD.point_names, shown, strict=True) if inside]
+        stations = {"a": Station("a", pose)}
+        names = tuple(self.some(seen, *points)), tuple(curves)
+        return field_scene(FIELD, {"a": self.camera}, stations, points=names[0], curves=names[1], spacing_m=spacing_m)
+
+    def some(self, names: Sequence[str], least: int, most: int) -> list[str]:
+        """Some of the names, at random."""
+        return [str(name) for name in self.rng.permutation(names)[: self.rng.integers(least, most + 1)]]
+
+
+def _few_points(drawn: _Drawn) -> Scene:
+    return drawn.over_the_field((0.0, 30.0), (4, 10), (), 1.0)
+
+
+def _few_line_points(drawn: _Drawn) -> Scene:
+    return drawn.over_the_field((0.0, 30.0), (0, 0), drawn.some(_STRAIGHT, 5, 9), drawn.rng.uniform(0.3, 2.0))
+
+
+def _points_and_few_line_points(drawn: _Drawn) -> Scene:
+    return drawn.over_the_field((0.0, 30.0), (4, 8), drawn.some(_STRAIGHT, 1, 4), drawn.rng.uniform(0.3, 2.0))
+
+
+def _parallel(drawn: _Drawn) -> Scene:
+    lines = _ALONG if drawn.rng.random() < 0.5 else _ACROSS
+    return drawn.over_the_field((0.0, 30.0), (0, 6), lines, drawn.rng.uniform(0.1, 0.5))
+
+
+def _frontal(drawn: _Drawn) -> Scene:
+    return drawn.over_the_field((0.0, 2.0), (0, 12), FIELD.curve_names, drawn.rng.uniform(0.1, 0.5))
+
+
+def _one_curve(drawn: _Drawn) -> Scene:
+    curves = ["CenterCircle", *drawn.some(_STRAIGHT, 1, 2)]
+    return drawn.over_the_field((0.0, 30.0), (2, 6), curves, drawn.rng.uniform(0.05, 0.3))
+
+
+def _boards(drawn: _Drawn, most: int) -> Scene:
+    rng = drawn.rng
+    board = checkerboard(int(rng.integers(5, 10)), int(rng.integers(4, 7)), 0.1)
+    low = rng.uniform(0.0, 40.0)
+    near = rng.uniform(0.6, 3.0)
+    held = Held((near, 1.3 * near), (low, low + 5.0))
+    stations = {"a": Station("a", Pose.identity())}
+    return board_scene(board, {"a": drawn.camera}, stations, most, int(rng.integers(1 << 30)), held)
+
+
+def _points_beside_lines(drawn: _Drawn) -> Scene:
+    return drawn.over_the_field((5.0, 25.0), (5, 8), _STRAIGHT, 0.25)
+
+
+_Maker = Callable[[_Drawn], Scene]
+ODD: dict[str, _Maker] = {
+    "few points": _few_points,
+    "few line points": _few_line_points,
+    "points and few line points": _points_and_few_line_points,
+    "parallel lines": _parallel,
+    "frontal": _frontal,
+    "one curve": _one_curve,
+    "one board": partial(_boards, most=1),
+    "two boards": partial(_boards, most=2),
+}
+BESIDE: dict[str, _Maker] = {"5 to 8 points beside lines": _points_beside_lines}
+
+
+def odd_problem(make: _Maker, lens: str, seed: int) -> Problem:
+    """The same maker, lens and seed give the same problem; each prior's value is the true one."""
+    rng = np.random.default_rng([seed, 13])
+    phi, model = LENSES[lens](rng)
+    free_centre = bool(rng.random() < 0.7)
+    centre = (639.5 + rng.uniform(-15.0, 15.0), 479.5 + rng.uniform(-15.0, 15.0)) if free_centre else (639.5, 479.5)
+    options = Options(lens=lens, free_principal_point=free_centre)
+    scene = make(_Drawn(rng, Camera((1280, 960), phi, centre, model)))
+    priors: tuple[Prior, ...] = ()
+    if len(scene.placements) == 0 and rng.random() < 0.25:
+        height_m = float(scene.camera_at("a").position[2])
+        priors = (Prior("station", "a", "height_m", (height_m,), (0.01,)),)
+    return Problem(scene, options, priors)
+
+
+# ---- what came out --------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """One scene's calibration.
+
+    Attributes:
+        refused: the message where there was none. sigmas: how many standard deviations the farthest "known" number is
+            off, and which. radii: how many stated 95 % radii the farthest located place is off.
+    """
+
+    kind: str
+    lens: str
+    seed: int
+    refused: str = ""
+    sigmas: float = 0.0
+    which: str = ""
+    radii: float = 0.0
+
+    def __str__(self) -> str:
+        return f"{self.kind} / {self.lens} / {self.seed}: {self.sigmas:.1f} sd ({self.which}), {self.radii:.2f} radii"
+
+
+def outcome(kind: str, make: _Maker, lens: str, seed: int) -> Outcome:
+    """Calibrate one scene."""
+    problem = odd_problem(make, lens, seed)
+    rng = np.random.default_rng([seed, 14])
+    priors = [replace(p, value=tuple(rng.normal(p.value, p.sigma).tolist())) for p in problem.priors]
+    sigma_px = float(rng.choice(NOISES_PX))
+    try:
+        seen = simulate(problem.scene, Disturbance(sigma_px, sigma_px), seed).observations
+        calibration = calibrate(replace(seen, priors=tuple(priors)), problem.options)
+    except CalibrationError as error:
+        return Outcome(kind, lens, seed, refused=str(error))
+    return Outcome(kind, lens, seed, "", *farthest(calibration, problem.scene))
+
+
+def farthest(calibration: Calibration, scene: Scene) -> tuple[float, str, float]:
+    """How many standard deviations the farthest "known" number is off, and which; how many stated 95 % radii the
+    farthest located place is off.
+    """
+    stations = {name: Station(place.camera, place.cam_from_world) for name, place in scene.stations.items()}
+    truth = Estimate(scene.cameras, stations, scene.placements, calibration.estimate.structure)
+    return *_farthest_known(calibration, truth), _farthest_place(calibration, truth)
+
+
+def _farthest_known(calibration: Calibration, truth: Estimate) -> tuple[float, str]:
+    known = [one for one in calibration.uncertainty.verdicts if one.verdict == "known"]
+    farthest = (0.0, "")
+    for one in known:
+        kind, owner, quantity, _ = one.key
+        if kind == "camera" and quantity != "phi" and not _is_within(truth, calibration, owner):
+            continue
+        if (kind, quantity) == ("camera", "phi"):
+            off = truth.cameras[owner].phi - calibration.cameras[owner].phi
+        else:
+            off = float(difference(truth, calibration.estimate, [one.key])[0])
+        farthest = max(farthest, (abs(off) / one.sd, quantity))
+    return farthest
+
+
+def _is_within(truth: Estimate, calibration: Calibration, camera: str) -> bool:
+    """Whether the lens that was solved for can be the true one: otherwise its principal point is the middle of another
+    distortion, and its coefficients are other numbers.
+    """
+    lens, solved = truth.cameras[camera].lens, calibration.cameras[camera].lens
+    if lens.kind != solved.kind or lens.names != solved.names:
+        return False
+    free = {key.quantity for key in calibration.uncertainty.posterior.keys if key[:2] == ("camera", camera)}
+    return all(name in free or value == 0.0 for name, value in lens.coefficients.items())
+
+
+def _farthest_place(calibration: Calibration, truth: Estimate) -> float:
+    farthest = 0.0
+    for station in calibration.stations:
+        if not calibration.uncertainty.posterior.knows_station(station):
+            continue
+        for height_m in HEIGHTS_M:
+            pixels = visible_pixels(truth, station, _PLACES, height_m)
+            shown = np.isfinite(pixels[:, 0])
+            points = calibration.uncertainty.located(pixels[shown], height_m, station)
+            off: Array = np.linalg.norm(points.located - _PLACES[shown], axis=1)
+            with np.errstate(invalid="ignore"):
+                farthest = max(farthest, float(np.nanmax(off / points.radius_95_m, initial=0.0)))
+    return farthest
+
+
+def _one(kinds: Mapping[str, _Maker], seed: int) -> Outcome:
+    """Kinds and lenses in turns."""
+    every = [(kind, lens) for lens in LENSES for kind in kinds]
+    kind, lens = every[seed % len(every)]
+    return outcome(kind, kinds[kind], lens, seed)
+
+
+def summary(title: str, found: Sequence[Outcome], worst: int) -> None:
+    """Print what came out, by kind and lens, and the worst."""
+    print(f"{title}: {len(found)} scenes, {sum(bool(o.refused) for o in found)} refused")
+    print(f"  {'':30}{'scenes':>8}{'refused':>9}{'known > 5 sd':>14}{'places > 2.5':>14}")
+    for kind, lens in Counter((o.kind, o.lens) for o in found):
+        own = [o for o in found if (o.kind, o.lens) == (kind, lens)]
+        counts = [len(own), *(sum(test(o) for o in own) for test in (_is_refused, _is_wrong, _is_misplaced))]
+        print(f"  {kind + ', ' + lens:44}" + "".join(f"{count:>9}" for count in counts))
+    for o in sorted(found, key=lambda o: -max(o.sigmas / MOST_SIGMAS, o.radii / MOST_RADII))[:worst]:
+        print(f"  {o}")
+
+
+def _is_refused(o: Outcome) -> bool:
+    return bool(o.refused)
+
+
+def _is_wrong(o: Outcome) -> bool:
+    return o.sigmas > MOST_SIGMAS
+
+
+def _is_misplaced(o: Outcome) -> bool:
+    return o.radii > MOST_RADII
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    options = parser(__doc__, (2000, "scenes"))
+    options.add_argument("--first", type=int, default=0, help="seed of the first one (default 0)")
+    options.add_argument("--beside", action="store_true", help="only 5 to 8 points beside the lines of a field")
+    options.add_argument("--kind", nargs="+", choices=list(ODD), default=list(ODD), help="only these")
+    options.add_argument("--worst", type=int, default=12, help="how many of the worst are printed (default 12)")
+    given = options.parse_args(arguments)
+    kinds = BESIDE if given.beside else {kind: ODD[kind] for kind in given.kind}
+    found = []
+    with over_processes(given.jobs):
+        for one in over(partial(_one, kinds), range(given.first, given.first + given.runs)):
+            found.append(one)
+            if _is_wrong(one) or _is_misplaced(one):
+                print(one, file=sys.stderr, flush=True)
+    title = "points beside lines" if given.beside else "odd scenes"
+    if given.json != "-":
+        summary(title, found, given.worst)
+    most = 0 if given.beside else MOST_WRONG_PLACES
+    rows = [
+        Row(title, "known numbers over 5 sd off", sum(map(_is_wrong, found)), most=MOST_WRONG_KNOWN),
+        Row(title, "places over 2.5 radii off", sum(map(_is_misplaced, found)), most=most),
+    ]
+    return finished(rows, given)

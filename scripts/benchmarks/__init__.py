@@ -1,0 +1,1 @@
+"""Parts of benchmark.py, and other scripts that measure time."""

@@ -1,0 +1,1 @@
+"""What makes the sample data, pictures, schemas and outputs in the documents."""

@@ -1,0 +1,188 @@
+"""Runs what documents say to type and compares what is printed: python scripts/run.py documents [--write] [FILE...]
+
+All commands of a document (```console, after "$ ") and its Python (```python) run in the order in which they stand, one
+shell for all, in a copy of the sample data and scripts beside a .venv that leads to this interpreter. A command must
+end with 0. What stands below it is compared, where anything does, with what it prints: text as it is, whole numbers
+exactly (but of iterations), others to one unit of their last digit, as two machines agree to nine digits or so and may
+still round differently. --write puts what was printed in its place.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import zip_longest
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+COPIED = ("data", "examples", "scripts", "pyproject.toml")
+_BLOCK = re.compile(r"^```(console|python)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
+_NUMBER = re.compile(r"(?<![\w.])[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?(?![\w])")
+_EFFORT = re.compile(r"\d+ (?=(solve|iteration))")
+_MARK = "=== end of command"
+
+
+@dataclass(frozen=True)
+class Step:
+    """One command, or one piece of Python, of a document; `shown` is what stands below it."""
+
+    command: str
+    shown: tuple[str, ...] = ()
+
+    @property
+    def text(self) -> str:
+        return "\n".join((f"$ {self.command}", *self.shown))
+
+
+@dataclass(frozen=True)
+class Run:
+    """What a step printed, and how it ended."""
+
+    step: Step
+    printed: tuple[str, ...]
+    exit_code: int
+    errors: str
+
+    @property
+    def differences(self) -> list[str]:
+        """What the document says otherwise, a line each; none where it is right."""
+        if self.exit_code:
+            return [f"exit code {self.exit_code}: {self.errors.strip()}"]
+        if not self.step.shown:
+            return []
+        pairs = zip_longest(self.step.shown, self.printed, fillvalue="")
+        return [f"  document: {said}\n  printed:  {now}" for said, now in pairs if not agree(said, now)]
+
+
+def agree(said: str, now: str) -> bool:
+    """Whether two lines say the same: see above."""
+    said, now = (_EFFORT.sub("", line) for line in (said, now))  # what an answer took is not what it is
+    if " ".join(_NUMBER.sub("#", said).split()) != " ".join(_NUMBER.sub("#", now).split()):
+        return False
+    pairs = zip(_NUMBER.findall(said), _NUMBER.findall(now), strict=True)
+    return all(abs(float(a) - float(b)) <= 1.01 * max(_unit(a), _unit(b)) for a, b in pairs)
+
+
+def _unit(number: str) -> float:
+    """One of a number's last digit; 0 of whole numbers."""
+    digits, _, power = number.partition("e")
+    places = len(digits.partition(".")[2])
+    return 10.0 ** (int(power or 0) - places) if places or power else 0.0
+
+
+# ---- documents ------------------------------------------------------------------------------------------------------
+
+
+def steps_of(text: str) -> list[Step]:
+    """Everything in a document that is to be run, in order."""
+    return [step for kind, body in _BLOCK.findall(text) for step in _steps_in(kind, body)]
+
+
+def _steps_in(kind: str, body: str) -> list[Step]:
+    if kind == "python":
+        return [Step(body)]
+    found: list[Step] = []
+    for line in body.splitlines():
+        if line.startswith("$ "):
+            found.append(Step(line[2:]))
+        elif found and found[-1].command.endswith("\\"):
+            found[-1] = Step(f"{found[-1].command}\n{line}")
+        else:
+            found[-1] = Step(found[-1].command, (*found[-1].shown, line))
+    return found
+
+
+def rewritten(text: str, runs: Sequence[Run]) -> str:
+    """The document with what was printed below each command that has something there."""
+    rest = iter(runs)
+
+    def block(found: re.Match[str]) -> str:
+        steps = _steps_in(*found.groups())
+        ran = [next(rest) for _ in steps]
+        if found[1] == "python":
+            return found[0]
+        lines = [Step(run.step.command, run.printed if run.step.shown else ()).text for run in ran]
+        return "\n".join(("```console", *lines, "```"))
+
+    return _BLOCK.sub(block, text)
+
+
+# ---- running --------------------------------------------------------------------------------------------------------
+
+
+def run(text: str, folder: Path) -> list[Run]:
+    """Run all of a document in a folder that `prepare` made; stops at the first command that fails."""
+    steps = steps_of(text)
+    script = [f"exec 2>{folder}/errors"]
+    for number, step in enumerate(steps):
+        if "\n" in step.command and not step.command.partition("\n")[0].endswith("\\"):
+            (folder / f"{number}.py").write_text(step.command, encoding="utf-8")
+            script.append(f"python {number}.py")
+        else:
+            script.append(step.command)
+        script.append(f'code=$?; echo; echo "{_MARK} $code"; [ $code = 0 ] || exit')
+    done = subprocess.run(
+        ["bash", "-c", "\n".join(script)], cwd=folder, env=_environment(folder), stdout=subprocess.PIPE, text=True,
+        check=False,
+    )  # fmt: skip
+    errors = (folder / "errors").read_text(encoding="utf-8")
+    parts = re.findall(rf"(.*?)\n{_MARK} (\d+)\n", done.stdout, re.DOTALL)
+    return [
+        Run(step, tuple(printed.rstrip("\n").splitlines()), int(code), errors)
+        for step, (printed, code) in zip(steps, parts, strict=False)
+    ]
+
+
+def _environment(folder: Path) -> dict[str, str]:
+    """A user's: `ceres-cal` is found once .venv is activated."""
+    import os
+
+    return {**os.environ, "PYTHONPATH": str(ROOT / "src"), "COLUMNS": "100"}
+
+
+def prepare(folder: Path) -> Path:
+    """A copy of what a fresh clone has, and a .venv as `scripts/setup` leaves it."""
+    for name in COPIED:
+        if (ROOT / name).is_dir():
+            shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
+        elif (ROOT / name).exists():
+            shutil.copy(ROOT / name, folder / name)
+    bin_folder = folder / ".venv/bin"
+    bin_folder.mkdir(parents=True)
+    program = "import sys; from ceres_cal.cli import main; sys.exit(main())"
+    for name, call in (("python", '"$@"'), ("ceres-cal", f"-c '{program}' \"$@\"")):
+        (bin_folder / name).write_text(f'#!/usr/bin/env bash\nexec "{sys.executable}" {call}\n', encoding="utf-8")
+        (bin_folder / name).chmod(0o755)
+    (bin_folder / "activate").write_text(f'export PATH="{bin_folder}:$PATH"\n', encoding="utf-8")
+    stamp = f"{folder.resolve()}\n{(ROOT / 'pyproject.toml').read_text(encoding='utf-8')}"
+    (folder / ".venv/installed").write_text(stamp, encoding="utf-8")
+    return folder
+
+
+def differences(path: Path, *, write: bool = False) -> list[str]:
+    """What a document says otherwise than its commands do, after putting that right with `write`."""
+    text = path.read_text(encoding="utf-8")
+    with tempfile.TemporaryDirectory() as folder:
+        runs = run(text, prepare(Path(folder)))
+    failed = [each for each in runs if each.exit_code]
+    if write and not failed:
+        path.write_text(rewritten(text, runs), encoding="utf-8")
+        return []
+    return [f"{path.name}: $ {each.step.command}\n{line}" for each in runs for line in each.differences]
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("files", nargs="*", type=Path, default=DOCUMENTS, help="default: README and docs")
+    parser.add_argument("--write", action="store_true", help="put what is printed now into the document")
+    given = parser.parse_args(arguments)
+    found = [line for path in given.files for line in differences(path, write=given.write)]
+    print("\n".join(found) if found else "every command runs, and prints what is said")
+    return 1 if found else 0

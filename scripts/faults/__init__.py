@@ -1,0 +1,1 @@
+"""Damaged files, killed writers, full disks, a week of watching."""

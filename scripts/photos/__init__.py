@@ -1,0 +1,1 @@
+"""The same from photographs, rendered and real."""
