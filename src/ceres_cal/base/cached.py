@@ -17,7 +17,7 @@ else:
         """
 
         def __init__(self, function: Callable[[Any], Any]) -> None:
-            self._function, self.__doc__ = function, function.__doc__
+            self.func, self.__doc__ = function, function.__doc__
 
         def __set_name__(self, owner: type, name: str) -> None:
             self._name = name
@@ -25,4 +25,4 @@ else:
         def __get__(self, instance: Any, owner: type | None = None) -> Any:
             if instance is None:
                 return self
-            return instance.__dict__.setdefault(self._name, self._function(instance))
+            return instance.__dict__.setdefault(self._name, self.func(instance))

@@ -159,7 +159,8 @@ def _of_place(station: str, observations: Observations) -> Range:
 
 
 def _require_tolerance(tolerance: Tolerance, target: str, observations: Observations) -> None:
-    size_m = float(np.max(np.diff(observations.targets[target].box, axis=0)))
+    sizes_m = {name: float(np.max(np.diff(one.box, axis=0))) for name, one in observations.targets.items()}
+    size_m = sizes_m[target] or max(sizes_m.values()) or np.inf  # a pole's top is placed on the field
     bounds = Range(0.0, _BUILT * size_m, "m", 0.0, f"the target is {size_m:.3g} m long")
     plain: Mapping[str, float] = {name: value for name, value in vars(tolerance).items() if name != "curve_m"}
     for name, value in {**plain, **tolerance.curve_m}.items():
