@@ -11,7 +11,8 @@ from documents import DOCUMENTS, Step, agree, differences, rewritten, run, steps
 from ceres_cal import InputError
 from ceres_cal.cli import chosen
 
-RUN = ("README.md", "docs/cron.md")  # `python scripts/documents.py` runs the others, too, which hold little else
+# `python scripts/documents.py` runs the others, too, which hold little else
+RUN = ("README.md", "docs/cron.md", "docs/lens.md")
 CODE = re.compile(r"^```(?:console|text)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 INLINE = re.compile(r"`(ceres-cal [^`]+)`")
 

@@ -42,7 +42,6 @@ FLOORS = {
 # Library: who may import it, at the top or inside a function.
 DOORS = {
     "pyceres": {"solve"},
-    "numba": {"kernels"},
     "cv2": {"detect", "simulate", "pictures", "formats"},
     "pycolmap": {"start", "formats"},
     "matplotlib": {"report"},
