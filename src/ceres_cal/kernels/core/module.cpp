@@ -245,10 +245,10 @@ void sight_normals(int64_t first, int64_t last, const nb::tuple& optics, const n
             const int64_t sight = first + static_cast<int64_t>(v);
             costs.data()[v] = sums.normal_equations(sight, poses.data() + 12 * sight, of_points, of_curves, seen.loss,
                                                     newton, normal);
-            for (size_t i = 0; i < size; ++i)
-                for (size_t j = 0; j <= i; ++j)
-                    normal[size * i + j] = normal[size * j + i] =
-                        units.data()[i] * units.data()[j] * normal[size * i + j];
+            for (size_t i = 0; i < size; ++i) {
+                for (size_t j = 0; j <= i; ++j) normal[size * i + j] *= units.data()[i] * units.data()[j];
+                for (size_t j = 0; j < i; ++j) normal[size * j + i] = normal[size * i + j];
+            }
         }
     });
 }

@@ -13,7 +13,9 @@ constexpr double NO_ANSWER = std::numeric_limits<double>::quiet_NaN();
 
 class Sums {
   public:
-    Sums(const Optics& optics, const Unknowns& unknowns) : unknowns_(unknowns), shown_(optics) {
+    Sums(const Optics& optics, const Unknowns& unknowns)
+        : unknowns_(unknowns), shown_(optics),
+          products_(static_cast<size_t>(unknowns.size() + 3) * static_cast<size_t>(unknowns.size() + 3)) {
         own_.reserve(unknowns.size()), places_.reserve(unknowns.size());
     }
 
@@ -137,7 +139,7 @@ class Sums {
     // normal += P P^T over the rows' first n places, lower triangle; four rows by three, to read each one less. (Of
     // more sums at once than the processor has registers for each takes longer.)
     void add_products(int n, double* normal) {
-        const int count = static_cast<int>(own_.size()), last = count - 1, size = unknowns_.size(),
+        const int count = static_cast<int>(own_.size()), last = count - 1, size = unknowns_.size(), stride = size + 3,
                   end = n & ~(LANES - 1);
         for (int k = 0; k < count; k += 4) {
             const double *a = own_[k], *b = own_[std::min(k + 1, last)], *c = own_[std::min(k + 2, last)],
@@ -153,10 +155,14 @@ class Sums {
                     dx += d[i] * x[i], dy += d[i] * y[i], dz += d[i] * z[i];
                 }
                 const double sums[4][3] = {{ax, ay, az}, {bx, by, bz}, {cx, cy, cz}, {dx, dy, dz}};
-                for (int row = k; row < std::min(k + 4, count); ++row)
-                    for (int column = j; column < std::min(j + 3, row + 1); ++column)
-                        normal[size * places_[row] + places_[column]] += sums[row - k][column - j];
+                double* first = products_.data() + stride * k + j;
+                for (int row = 0; row < 4; ++row)
+                    for (int column = 0; column < 3; ++column) first[stride * row + column] = sums[row][column];
             }
+        }
+        for (int k = 0; k < count; ++k) {
+            double* own = normal + size * places_[k];
+            for (int j = 0; j <= k; ++j) own[places_[j]] += products_[stride * k + j];
         }
     }
 
@@ -224,6 +230,7 @@ class Sums {
     double directions_[3 * BUILT];
     std::vector<double*> own_;
     std::vector<int> places_;
+    std::vector<double> products_;  // room for three rows and columns more
 };
 
 }  // namespace ceres_cal
