@@ -401,7 +401,7 @@ def print_growth(title: str, rows: Sequence[Mapping[str, Any]]) -> None:
 
 
 def environment() -> dict[str, Any]:
-    names = ("ceres-cal", "numpy", "numba", "pyceres", "pycolmap", "opencv-python-headless")
+    names = ("ceres-cal", "numpy", "pyceres", "pycolmap", "opencv-python-headless")
     return {
         "cores": os.cpu_count(),
         "machine": platform.machine(),

@@ -103,7 +103,7 @@ DECIDING: tuple[Constant, ...] = (
     *_of("solve.costs", "_LEFT_TO_THE_COMPLEMENT", "calibrate"),
     *_of("start.initialise", "USUAL_PHI", "calibrate", "verdicts"),
     *_of("start.planes", "_ROUGH_PX _SUSPICIOUS _NO_FIT", "calibrate"),
-    *_of("kernels.planes", "_WRONG", "calibrate"),
+    *_of("start.closed_forms", "_WRONG", "calibrate"),
     *_of("uncertainty.assess", "_BENT", "verdicts"),
     *_of("uncertainty.between", "_LEAST_LEFT", "verdicts"),
     *_of("uncertainty.profile", "_FAR _BOUNDED _SHRINKING", "verdicts"),
@@ -166,8 +166,6 @@ def measured(
     setting = [] if constant is None else ["--set", str(constant), json.dumps(value)]
     command = [sys.executable, __file__, "--measure", figures, str(folder), "--runs", str(runs), *setting]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    if constant is not None and constant.module.startswith("kernels"):  # it is part of the machine code
-        environment["NUMBA_CACHE_DIR"] = str(folder / f"kernels {constant} {value}")
     done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
     if done.returncode:
         return {"error": done.stderr.strip().rpartition("\n")[2]}
@@ -206,13 +204,9 @@ def _measure(figures: str, folder: Path, runs: int, setting: Sequence[str] | Non
     """In the process that `measured` starts: set the constant, then measure; the last line printed is the answer."""
     from accuracy.constants_figures import FIGURES  # with it, everything that copies constants
 
-    from ceres_cal.kernels import library
-
     if setting is not None:
         constant = next(one for one in DECIDING if str(one) == setting[0])
         value: Any = json.loads(setting[1])
-        if constant.module.startswith("kernels"):  # what came with the package has its own
-            vars(library)["library_path"] = Path
         constant.set(tuple(value) if isinstance(value, list) else value)
     print(json.dumps(FIGURES[figures](runs, folder)))
     return 0

@@ -11,7 +11,8 @@ from ceres_cal import InputError
 from ceres_cal.cli import chosen
 from data import documents
 
-RUN = ("README.md", "docs/cron.md")  # `python scripts/run.py documents` runs the others, too, which hold little else
+# `python scripts/run.py documents` runs the others, too, which hold little else
+RUN = ("README.md", "docs/cron.md", "docs/lens.md")
 CODE = re.compile(r"^```(?:console|text)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 INLINE = re.compile(r"`(ceres-cal [^`]+)`")
 

@@ -43,7 +43,6 @@ FLOORS = {
 # Library: who may import it, at the top or inside a function.
 DOORS = {
     "pyceres": {"solve"},
-    "numba": {"kernels"},
     "cv2": {"detect", "pictures", "formats"},
     "pycolmap": {"start", "formats"},
     "matplotlib": {"report"},

@@ -19,10 +19,7 @@ from ceres_cal import kernels
 from ceres_cal.base.arrays import Array, Indices, Indices32
 from ceres_cal.base.transforms import Pose, rotation_exp
 from ceres_cal.kernels import CurveColumns, Loss, PointColumns, Unknowns
-from ceres_cal.kernels.lenses import prepared
-from ceres_cal.kernels.panel import order_of_rows
-from ceres_cal.kernels.sight import normal_equations as sum_up
-from ceres_cal.kernels.workspace import working_space
+from ceres_cal.kernels.calls import core
 from ceres_cal.model.parameters import intrinsic_names, intrinsics_vector, with_intrinsics
 from ceres_cal.model.residuals import camera_optics
 from ceres_cal.model.structure import EXACT
@@ -70,8 +67,9 @@ def shown(
 
 
 def take(seen: Shown, points: Any = slice(0, 0), curves: Any = slice(0, 0)) -> Shown:
-    """Some of the points and some of the curve observations of one frame on which nothing moves."""
-    columns = {name: getattr(seen[0], name)[points] for name in ("places", "pixels", "weights")}
+    """Some of the points and some of the curve observations of one frame."""
+    moving = ("slots", "bends") if len(seen[0].slots) else ()
+    columns = {name: getattr(seen[0], name)[points] for name in ("places", "pixels", "weights", *moving)}
     lines = {name: getattr(seen[1], name)[curves] for name in ("track", "pixels", "weights", "feet")}
     return (
         seen[0]._replace(bounds=np.array([0, len(columns["pixels"])]), **columns),
@@ -132,16 +130,14 @@ def normal_equations(
 ) -> tuple[float, Array]:
     """Sum of rho, and A over [intrinsics | structure | 6 pose | residual], whole."""
     optics = camera_optics(camera)
-    optics = prepared(optics, optics.intrinsics)
     count = len(optics.intrinsics)
-    order = order_of_rows(Unknowns(np.arange(count), structure), count)
-    normal = np.zeros((count + structure + 7, count + structure + 7))
-    cost = sum_up(
-        0, optics, matrix(camera.cam_from_world), seen[0], fresh(seen[1]), Loss(kernels.LOSS_CODES[loss], scale),
-        newton, order, normal, working_space(optics, count + 7),
+    size = count + structure + 7
+    normals, costs, poses = np.empty((1, size, size)), np.empty(1), matrix(camera.cam_from_world)[None]
+    core().sight_normals(
+        0, 1, optics, Unknowns(np.arange(count), structure), seen[0], fresh(seen[1]),
+        Loss(kernels.LOSS_CODES[loss], scale), newton, poses, np.ones(size), costs, normals,
     )  # fmt: skip
-    lower = np.tril(normal)
-    return float(cost), lower + np.tril(lower, -1).T
+    return float(costs[0]), normals[0]
 
 
 def point_residuals(camera: Camera, seen: Shown) -> Array:
@@ -561,11 +557,15 @@ def test_a_point_on_the_axis_moves_as_through_a_pinhole(lens: str) -> None:
 def everything_moves(seen: Shown) -> tuple[Shown, int]:
     """A number for x and y of each point, two bows that all share, the offset of each segment, x, y, radius of arcs."""
     points = len(TARGET.points)
-    slots = np.column_stack([np.arange(2 * points).reshape(-1, 2), np.tile([2 * points, 2 * points + 1], (points, 1))])
+    slots = np.full((points, kernels.BUILT), -1)
+    slots[:, :4] = np.column_stack(
+        [np.arange(2 * points).reshape(-1, 2), np.tile([2 * points, 2 * points + 1], (points, 1))]
+    )
     first = 2 * points + 2
     tracks = np.array([[0, -1, -1], [1, -1, -1], [2, 3, 4], [5, 6, 7]])
     tracks = np.tile(np.where(tracks < 0, -1, tracks + first), (3, 1)).astype(np.int32)
-    bends = np.random.default_rng(2).uniform(-1.0, 1.0, (points, 2))
+    bends = np.zeros((points, kernels.BUILT - 2))
+    bends[:, :2] = np.random.default_rng(2).uniform(-1.0, 1.0, (points, 2))
     moving = seen[0]._replace(slots=slots.astype(np.int32), bends=bends), seen[1]._replace(slots=tracks)
     return moving, first + 8
 
@@ -573,7 +573,8 @@ def everything_moves(seen: Shown) -> tuple[Shown, int]:
 def as_built(seen: Shown, values: Array) -> Shown:
     """The target with the structure numbers put in: points along x and y, their bows along z, segments to the left."""
     slots = seen[0].slots
-    shift = np.column_stack([values[slots[:, :2]], np.sum(seen[0].bends * values[slots[:, 2:]], axis=1)])
+    bowed = np.sum(seen[0].bends[:, :2] * values[slots[:, 2:4]], axis=1)
+    shift = np.column_stack([values[slots[:, :2]], bowed])
     tracks = seen[1].tracks.copy()
     for k, (first, second, third) in enumerate(seen[1].slots):
         if seen[1].is_arc[k]:
@@ -631,9 +632,7 @@ def test_what_a_chunk_says_nothing_of_is_left_out_of_it_alone() -> None:
         return normal_equations(camera, one, structure=structure)[1]
 
     parts = [take(seen, curves=slice(k, k + 1)) for k in range(len(curves.pixels))]
-    for k in range(len(points.pixels)):
-        own = slice(k, k + 1)
-        parts.append(with_points(take(seen, points=own), slots=points.slots[own], bends=points.bends[own]))
+    parts += [take(seen, points=slice(k, k + 1)) for k in range(len(points.pixels))]
     whole, total = alone(seen), np.sum([alone(part) for part in parts], axis=0)
     size = np.sqrt(np.diag(total))
     shown = size > 0.0

@@ -85,7 +85,7 @@ def test_a_folder_is_watched(place: Path) -> None:
     try:
         time.sleep(0.5)
         (incoming / "new.json").write_bytes((place / "after.json").read_bytes())
-        deadline = time.monotonic() + 120.0  # kernels may have to be compiled first
+        deadline = time.monotonic() + 120.0  # other tests are at work, too
         while time.monotonic() < deadline and not (log.exists() and log.read_text().count("\n") >= 2):
             (incoming / "new.json").touch()  # it may have come before the watch began
             time.sleep(0.3)

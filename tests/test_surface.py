@@ -8,12 +8,16 @@ import numpy as np
 import pytest
 import scenes
 
+from ceres_cal import kernels
 from ceres_cal.base.arrays import Array
-from ceres_cal.model.parameters import Options, make_layout, unit_px
+from ceres_cal.base.transforms import Pose
+from ceres_cal.model.parameters import Options, make_layout
+from ceres_cal.model.residuals import camera_optics
+from ceres_cal.model.slopes import pixel_slopes
+from ceres_cal.model.structure import EXACT
 from ceres_cal.observations.sights import gather_sights
 from ceres_cal.scene.lens import Spline, make_lens
-from ceres_cal.scene.lens.surface import NODES, Surface, roughness
-from ceres_cal.scene.lens.surface_kernel import COLUMNS, ROWS
+from ceres_cal.scene.lens.surface import COLUMNS, NODES, ROWS, Surface, roughness
 from ceres_cal.simulate import Disturbance, simulate
 from ceres_cal.solve import Problem, solve
 from ceres_cal.start.initialise import initialise
@@ -31,16 +35,16 @@ def rays() -> Array:
 
 def by_kernel(lens: Spline) -> tuple[Array, Array]:
     """Offsets (N, 2) px, and their derivatives (numbers of the lens, 2, N) in the units of the files."""
-    unit, seen = unit_px(CAMERA), np.ascontiguousarray(rays().T)
-    scales = lens.scales(unit)
-    intrinsics = np.array([CAMERA.phi, 1.0, 0.0, 0.0, *(np.array(lens.values) * scales)])
-    state, count = lens.state, seen.shape[1]
-    image, work = np.zeros((8, count)), np.zeros((lens.work_rows, count))
-    jacobian = np.zeros((len(intrinsics) + 6, 2, count))
-    lens.prepare(intrinsics, unit, state)
-    assert lens.distort_chunk(count, intrinsics, unit, state, seen, image, work)
-    lens.differentiate_chunk(count, intrinsics, unit, state, image, work, jacobian)
-    return image[:2].T, jacobian[4 : len(intrinsics)] * scales[:, None, None]
+    camera = replace(CAMERA, lens=lens, aspect=1.0, skew=0.0, principal_point=(0.0, 0.0)).at(Pose.exp(np.zeros(6)))
+    seen = rays()
+    slopes = pixel_slopes(camera, seen).intrinsics[:, :, 4:-1]
+    points = kernels.PointColumns(
+        np.array([0, len(seen)]), seen, np.zeros((len(seen), 2)), kernels.NOTHING, EXACT.point_slots, EXACT.bends
+    )
+    found = np.empty((len(seen), 2))
+    pose = camera.cam_from_world.matrix[None]
+    kernels.point_residuals(0, 1, camera_optics(camera), pose, points, np.arange(len(seen)), found)
+    return found, np.moveaxis(slopes, 2, 0).transpose(0, 2, 1)
 
 
 def test_kernel_and_arrays_are_one_map() -> None:

@@ -316,7 +316,7 @@ print(*(b - a for a, b in zip(marks, marks[1:])))
 
 
 def time_case(runs: int) -> Iterator[Row]:
-    """`ceres-cal refit` from a cold process to the written file, with the kernels compiled before; and its parts."""
+    """`ceres-cal refit` from a cold process to the written file, and its parts."""
     count = int(np.clip(runs, 2, 9))
     with tempfile.TemporaryDirectory() as folder:
         old, new, out = (str(Path(folder) / name) for name in ("old.json", "new.json", "out.json"))

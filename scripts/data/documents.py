@@ -22,7 +22,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-COPIED = ("data", "examples", "scripts", "pyproject.toml")
+COPIED = ("data", "examples", "scripts", "pyproject.toml", "CMakeLists.txt", "src/ceres_cal/kernels/core")
 _BLOCK = re.compile(r"^```(console|python)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 _NUMBER = re.compile(r"(?<![\w.])[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?(?![\w])")
 _EFFORT = re.compile(r"\d+ (?=(solve|iteration))")
@@ -161,8 +161,8 @@ def prepare(folder: Path) -> Path:
         (bin_folder / name).write_text(f'#!/usr/bin/env bash\nexec "{sys.executable}" {call}\n', encoding="utf-8")
         (bin_folder / name).chmod(0o755)
     (bin_folder / "activate").write_text(f'export PATH="{bin_folder}:$PATH"\n', encoding="utf-8")
-    stamp = f"{folder.resolve()}\n{(ROOT / 'pyproject.toml').read_text(encoding='utf-8')}"
-    (folder / ".venv/installed").write_text(stamp, encoding="utf-8")
+    stamp = subprocess.run([folder / "scripts/setup", "--wanted"], stdout=subprocess.PIPE, check=True).stdout
+    (folder / ".venv/installed").write_bytes(stamp)
     return folder
 
 

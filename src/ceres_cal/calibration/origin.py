@@ -8,7 +8,6 @@ from functools import cache
 import numpy as np
 
 from ceres_cal.base.version import __version__
-from ceres_cal.kernels import numba_version
 from ceres_cal.model.priors import GaussianPrior
 from ceres_cal.solve import solver_version
 
@@ -171,4 +170,4 @@ class Refitted:
 @cache
 def package_versions() -> dict[str, str]:
     """Versions of what the numbers depend on."""
-    return {"ceres-cal": __version__, "pyceres": solver_version, "numpy": np.__version__, "numba": numba_version()}
+    return {"ceres-cal": __version__, "pyceres": solver_version, "numpy": np.__version__}

@@ -13,19 +13,16 @@ class Optics(NamedTuple):
     """A camera's optics.
 
     Attributes:
-        prepare, distort, differentiate: addresses of the lens's compiled functions, see `library.lens_functions`.
+        lens: a `scene.lens.Lens` of the camera's kind; only one that is not compiled is asked for anything.
+        kind: its name, by which the compiled one is known. form: (F,) what that one is chosen by, see `Lens.form`.
         intrinsics: phi, aspect, cx, cy, scaled coefficients, skew. unit: half the image diagonal, px.
-        state: what the lens is chosen by, and room for what it derives from its intrinsics, see `lenses.prepared`.
-        work_rows: how many numbers per observation the lens keeps for its derivatives.
     """
 
-    prepare: int
-    distort: int
-    differentiate: int
+    lens: Any
+    kind: str
+    form: Array
     intrinsics: Array
     unit: float
-    state: Array
-    work_rows: int
 
 
 BUILT = 7

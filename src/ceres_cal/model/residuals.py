@@ -15,6 +15,7 @@ from ceres_cal.model.structure import Structure
 from ceres_cal.observations.files import Content
 from ceres_cal.observations.sights import Sights, nearest_feet
 from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.lens import LENSES
 
 _POINT_NS = 10.0
 # Share of observations that may be anywhere in the image: as many as are wrong in the simulated days of
@@ -72,13 +73,8 @@ class Residuals:
 def camera_optics(camera: Camera) -> kernels.Optics:
     """A camera's optics as the kernels take them."""
     lens = camera.lens
-    return kernels.Optics(
-        *kernels.lens_functions(lens.prepare, lens.distort_chunk, lens.differentiate_chunk),
-        intrinsics_vector(camera),
-        unit_px(camera),
-        lens.state,
-        lens.work_rows,
-    )
+    kind = lens.kind if LENSES.get(lens.kind) is type(lens) else ""  # another's formulas may be others
+    return kernels.Optics(lens, kind, lens.form, intrinsics_vector(camera), unit_px(camera))
 
 
 def point_columns(sights: Sights, structure: Structure, noise_scale: float | None = None) -> kernels.PointColumns:

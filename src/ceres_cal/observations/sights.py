@@ -76,11 +76,6 @@ class Sights(Sequence["Sights"]):
     tracks: Array
     is_arc: Mask
 
-    def __post_init__(self) -> None:
-        # Kernels are compiled once for arrays that may be written and once for others: these are always the others.
-        for pixels in (self.pixels, self.curve_pixels):
-            pixels.setflags(write=False)
-
     def __len__(self) -> int:
         return len(self.keys)
 

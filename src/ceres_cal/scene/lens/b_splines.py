@@ -10,8 +10,10 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.cached import cached_property
-from ceres_cal.scene.lens.spline_kernel import DEGREE, END, INTERVALS
 
+INTERVALS, DEGREE = 8, 5
+COUNT = INTERVALS + DEGREE - 2  # of the B-splines: value and slope at the axis are 0
+END = 2.0  # rims: nothing is observed farther out
 _SAMPLES = 100  # radii up to the end, between which nothing turns
 _REFINED = 8  # steps to where growth ends
 

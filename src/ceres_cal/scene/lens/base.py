@@ -5,7 +5,8 @@ the camera frame (x right, y down, z forward; any length), offsets are (N, 2) me
 on a sensor with square pixels, and phi is the focal length in pixels. Where a model has no answer (behind the camera,
 past its monotone radius) the array functions return NaN.
 
-Every model has its map twice: in arrays, as one reads it, and as loops with derivatives, for the solve.
+The package's own models have their map twice: in arrays, as one reads it, and in C++ with derivatives, for the solve
+(`kernels/core`). The solve asks any other model's arrays.
 """
 
 from __future__ import annotations
@@ -25,6 +26,10 @@ from ceres_cal.base.errors import InputError
 
 LinearEquations = tuple[dict[str, Array], Array]
 _BLOCK = 16384  # rows at a time, so that what is worked on stays in the cache
+# Central differences of fourth order: their own error and that of rounding are both some 1e-12 of a slope at this step.
+_STEP, _STENCIL, _WEIGHTS = 3e-4, np.array([-2.0, -1.0, 1.0, 2.0]), np.array([1.0, -8.0, 8.0, -1.0]) / 12.0
+_PLACES = np.vstack([np.zeros(3), np.kron(np.eye(3), _STENCIL[:, None])])  # the ray's, and steps along x, y and z
+_DIFFERENCES = np.vstack([np.eye(13)[0], np.pad(np.kron(np.eye(3), _WEIGHTS), ((0, 0), (1, 0)))])
 
 
 def _in_blocks(function: Callable[[Array, float], Array], rows: ArrayLike, phi: float, columns: int) -> Array:
@@ -81,7 +86,6 @@ class Lens(ABC):
         more_terms: what it may have besides, by name, with the coefficients of each.
         set_at_start: names of numbers that say where the model, or a term of it, is defined: they are chosen, not
             solved for.
-        work_rows: how many numbers per observation `distort_chunk` keeps for `differentiate_chunk`.
     """
 
     values: tuple[float, ...] = ()
@@ -93,7 +97,6 @@ class Lens(ABC):
     trial_powers: ClassVar[tuple[tuple[int, ...], ...]] = ()
     missing_powers: ClassVar[tuple[int, ...]] = (3, 5, 7, 9, 11)
     more_terms: ClassVar[Mapping[str, tuple[str, ...]]] = MappingProxyType({})
-    work_rows: ClassVar[int] = 5
     set_at_start: ClassVar[tuple[str, ...]] = ()
 
     def __post_init__(self) -> None:
@@ -248,42 +251,38 @@ class Lens(ABC):
         """(N,) px by which offsets (N, 2) grow with one more term of the power, of a size of order one."""
         return np.asarray(unit_px * (np.hypot(offsets[:, 0], offsets[:, 1]) / unit_px) ** power)
 
-    # ---- for the solve: a chunk of rays at a time; the kernels compile these and the plain functions that they call
+    # ---- for the solve -----------------------------------------------------------------------------------------------
 
     @property
-    @abstractmethod
-    def state(self) -> Array:
-        """Working numbers of `distort_chunk`: what the model is chosen by, and room for what `prepare` derives."""
+    def form(self) -> Array:
+        """(F,) what the compiled formulas of its kind are chosen by; nothing where there are none."""
+        return np.empty(0)
 
-    @staticmethod
-    @abstractmethod
-    def prepare(intrinsics: Any, unit: float, state: Any) -> None:
-        """Fill the state.
+    def with_scaled(self, scaled: Array, unit_px: float) -> Lens:
+        """The same model with other coefficients, times their `scales`."""
+        return self.with_values(scaled / self.scales(unit_px))
 
-        Args:
-            intrinsics: phi, aspect, cx, cy, then the coefficients times their `scales`. unit: half the image diagonal,
-                px, for which these are.
+    def slopes_by_ray(self, rays: Array, phi: float) -> Array:
+        """(N, 2, 4) offsets of rays (N, 3), px, and their derivatives by the ray's x, y and z; NaN where there is no
+        answer. By differences, to some 12 digits; a model may have formulas instead.
         """
+        step = _STEP * np.sqrt(np.sum(rays * rays, axis=1))
+        there = rays + step[:, None] * _PLACES[:, None]
+        seen = self.distort(there.reshape(-1, 3), phi).reshape(len(_PLACES), -1)
+        slopes = (_DIFFERENCES @ seen).reshape(4, -1, 2)
+        slopes[1:] /= step[:, None]
+        return np.ascontiguousarray(np.moveaxis(slopes, 0, 2))
 
-    @staticmethod
-    @abstractmethod
-    def distort_chunk(n: int, intrinsics: Any, unit: float, state: Any, rays: Any, image: Any, work: Any) -> bool:
-        """Fill the first n columns of `image` and `work`; False where any ray has no answer.
-
-        Args:
-            rays: (3, n). image: (8, n) the offset in px, x and y, its derivatives xx, xy, yy with respect to the ray's
-                x and y, and xz, yz with respect to its z; yx - xy, which is 0 before the call. work: (work_rows, n).
+    def slopes_by_number(self, rays: Array, phi: float, unit_px: float) -> Array:
+        """(N, 2, 1 + K) derivatives of the offsets of rays (N, 3) by phi, and by each coefficient times its scale; in
+        the same way.
         """
-
-    @staticmethod
-    @abstractmethod
-    def differentiate_chunk(
-        n: int, intrinsics: Any, unit: float, state: Any, image: Any, work: Any, jacobian: Any
-    ) -> None:
-        """Fill rows 4 and on of `jacobian` (intrinsics + 6, 2, n): derivatives of the pixel's x and y (its y is aspect
-        times the offset's) with respect to each coefficient as the solver has it, and row 0, phi's, where the offset is
-        not proportional to phi.
-        """
+        steps, values = _STEP / self.scales(unit_px), np.array(self.values)
+        moved = [[self.distort(rays, phi + k * _STEP * phi) for k in _STENCIL]]
+        for own in np.diag(steps):
+            moved.append([self.with_values(values + k * own).distort(rays, phi) for k in _STENCIL])
+        sizes = np.array([_STEP * phi, *[_STEP] * len(values)])
+        return np.asarray(np.einsum("akni,k->nia", np.array(moved), _WEIGHTS) / sizes)
 
 
 @cache

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 
@@ -13,7 +13,6 @@ from ceres_cal.base.arrays import Array
 from ceres_cal.base.cached import cached_property
 
 STEPS = 60  # a safeguard: Newton needs 4 to 8, bisection 53
-_FAR_STEPS = 96
 _SHORT = 1e-9  # of a pole: the map is finite before it
 
 
@@ -139,33 +138,3 @@ def dense_polynomial(values: Sequence[float], powers: Sequence[int]) -> Array:
     polynomial[1] = 1.0
     polynomial[list(powers)] = values
     return polynomial
-
-
-# ---- for the solve: plain numbers and loops, which the kernels compile ----------------------------------------------
-
-
-def radial_slope(dense: Any, x: float) -> float:
-    """d/dx of x (d_0 + d_1 x + d_2 x^2 ...)."""
-    total = 0.0
-    for k in range(len(dense) - 1, -1, -1):
-        total = total * x + (k + 1) * dense[k]
-    return total
-
-
-def growing_until(dense: Any, far: float) -> float:
-    """Where x (d_0 + d_1 x + d_2 x^2 ...) first stops growing, or `far`, the end of what can be observed."""
-    step = far / _FAR_STEPS
-    low, high = 0.0, far
-    for i in range(1, _FAR_STEPS + 1):
-        if radial_slope(dense, i * step) <= 0.0:
-            low, high = (i - 1) * step, i * step
-            break
-        low = i * step
-    if high < far or radial_slope(dense, far) <= 0.0:
-        for _ in range(50):
-            middle = 0.5 * (low + high)
-            if radial_slope(dense, middle) > 0.0:
-                low = middle
-            else:
-                high = middle
-    return low

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,10 +13,8 @@ from ceres_cal.base.arrays import Array
 from ceres_cal.base.cached import cached_property
 from ceres_cal.base.errors import InputError
 from ceres_cal.scene.lens.base import Lens, LinearEquations, ahead, unit_rays
-from ceres_cal.scene.lens.polynomials import Ratio, dense_polynomial, growing_until, horner, invert_increasing
+from ceres_cal.scene.lens.polynomials import Ratio, dense_polynomial, horner, invert_increasing
 
-_FAR = 6.0  # half image diagonals: nothing is observed farther out
-_TINY = 1e-150  # its square is still a number
 _MOST_POWER = 30  # 100,000 px to this power has a square that a computer holds
 
 
@@ -133,82 +131,6 @@ class Radial(Lens):
         return np.asarray(unit_px * radius**power / np.maximum(slope, 0.05))
 
     @property
-    def state(self) -> Array:
-        """The limit, the powers, then the map s (d_0 + d_1 s + ...) of the radius s in half image diagonals."""
-        return np.array([0.0, *self.powers, *[0.0] * max(self.powers)])
-
-    @staticmethod
-    def prepare(intrinsics: Any, unit: float, state: Any) -> None:
-        count = len(intrinsics) - 4
-        dense = state[1 + count :]
-        dense[:] = 0.0
-        dense[0] = 1.0
-        for k in range(count):
-            dense[int(state[1 + k]) - 1] += intrinsics[4 + k]
-        state[0] = growing_until(dense, _FAR)
-
-    @staticmethod
-    def distort_chunk(n: int, intrinsics: Any, unit: float, state: Any, rays: Any, image: Any, work: Any) -> bool:
-        """s (1 + c_2 s + ...) = phi |u| / unit solved for the radius s, in half image diagonals."""
-        limit, dense = state[0], state[len(intrinsics) - 3 :]
-        phi = intrinsics[0]
-        ideal, value, slope = image[0], image[1], image[2]
-        for i in range(n):
-            u, v = rays[0, i] / rays[2, i], rays[1, i] / rays[2, i]
-            m = np.sqrt(u * u + v * v) + _TINY
-            work[0, i], work[1, i], work[2, i] = u, v, m
-            ideal[i] = phi * m / unit
-            work[3, i] = min(ideal[i], limit)
-        worst = 1.0
-        for _ in range(25):
-            worst = _newton_step(n, dense, limit, ideal, work[3], value, slope)
-            if worst < 1e-8:  # the step just taken has squared this
-                break
-        good = worst < 1e-8
-        for i in range(n):
-            work[4, i] = 1.0 / slope[i]
-            good &= (rays[2, i] > 0.0) & (slope[i] > 0.0) & (work[3, i] < limit)
-        for i in range(n):
-            u, v, m, iz = work[0, i], work[1, i], work[2, i], 1.0 / rays[2, i]
-            stretch = unit * work[3, i] / m  # px per unit of the ideal point
-            bend = (phi * work[4, i] - stretch) / (m * m)
-            xx, xy, yy = (stretch + bend * u * u) * iz, bend * u * v * iz, (stretch + bend * v * v) * iz
-            image[0, i], image[1, i] = stretch * u, stretch * v
-            image[2, i], image[3, i], image[4, i] = xx, xy, yy
-            image[5, i], image[6, i] = -(xx * u + xy * v), -(xy * u + yy * v)
-        return good
-
-    @staticmethod
-    def differentiate_chunk(
-        n: int, intrinsics: Any, unit: float, state: Any, image: Any, work: Any, jacobian: Any
-    ) -> None:
-        aspect = intrinsics[1]
-        for i in range(n):
-            jacobian[0, 0, i], jacobian[0, 1, i] = work[0, i] * work[4, i], aspect * work[1, i] * work[4, i]
-        for k in range(len(intrinsics) - 4):
-            row = 4 + k
-            for i in range(n):
-                jacobian[row, 0, i] = -unit * work[4, i] / work[2, i]
-            for _ in range(int(state[1 + k])):
-                for i in range(n):
-                    jacobian[row, 0, i] *= work[3, i]
-            for i in range(n):
-                d = jacobian[row, 0, i]
-                jacobian[row, 0, i], jacobian[row, 1, i] = d * work[0, i], aspect * d * work[1, i]
-
-
-def _newton_step(n: int, dense: Any, limit: float, ideal: Any, s: Any, value: Any, slope: Any) -> float:
-    """One Newton step from s towards s (d_0 + d_1 s + ...) = ideal for a chunk; how far the farthest one went."""
-    top = len(dense) - 1
-    for i in range(n):
-        value[i], slope[i] = dense[top], (top + 1) * dense[top]
-    for k in range(top - 1, -1, -1):
-        for i in range(n):
-            value[i] = value[i] * s[i] + dense[k]
-            slope[i] = slope[i] * s[i] + (k + 1) * dense[k]
-    worst = 0.0
-    for i in range(n):
-        moved = max(0.0, min(s[i] - (value[i] * s[i] - ideal[i]) / slope[i], limit))
-        worst = max(worst, abs(moved - s[i]))
-        s[i] = moved
-    return worst
+    def form(self) -> Array:
+        """The powers."""
+        return np.array(self.powers, dtype=float)

@@ -13,14 +13,14 @@ import numpy as np
 from ceres_cal.base.arrays import AnyArray, Array, Mask
 from ceres_cal.base.cached import cached_property
 from ceres_cal.base.errors import InputError
-from ceres_cal.scene.lens import spline_kernel
-from ceres_cal.scene.lens.b_splines import Growth, bending, first_falls, pieces, profile_columns
+from ceres_cal.scene.lens.b_splines import COUNT, Growth, bending, first_falls, pieces, profile_columns
 from ceres_cal.scene.lens.base import Lens, LinearEquations, Roughness
 from ceres_cal.scene.lens.planar import Planar
-from ceres_cal.scene.lens.spline_kernel import CONRADY, COUNT, DEGREE, INTERVALS, MOST, TINY, WORK_ROWS
-from ceres_cal.scene.lens.surface import EXTENTS, NODES, Surface, roughness
-from ceres_cal.scene.lens.surface_kernel import COLUMNS, ROWS
+from ceres_cal.scene.lens.surface import COLUMNS, EXTENTS, NODES, ROWS, Surface, roughness
 
+_CONRADY = 3  # terms of the decentring
+_MOST = 9  # powers across the radius
+_TINY = 1e-150
 _TURNS = 48  # directions, between which nothing turns
 _STEPS = 8  # of rims, from one to its double: half of a step is less than they are beyond the image
 _START_WEIGHT = 1e-4  # of the roughness of a start beside its equations
@@ -53,7 +53,7 @@ def _monomials(powers: tuple[int, ...]) -> tuple[_Monomial, ...]:
     """
     every = []
     for power in powers:
-        for k in range(CONRADY if power == 2 else 0):
+        for k in range(_CONRADY if power == 2 else 0):
             names = (f"p{2 * k + 2}", f"p{2 * k + 1}")
             every.append(_Monomial(names, False, k + 1, k + 1, 2.0 / 3.0))
             every.append(_Monomial(names, True, k + 2, k, 1.0 / 3.0))
@@ -97,13 +97,12 @@ class Spline(Planar):
     missing_powers: ClassVar[tuple[int, ...]] = ()
     more_terms: ClassVar[Mapping[str, tuple[str, ...]]] = MappingProxyType({"surface": (*EXTENTS, *NODES)})
     set_at_start: ClassVar[tuple[str, ...]] = ("rim", *EXTENTS)
-    work_rows: ClassVar[int] = WORK_ROWS
 
     def __post_init__(self) -> None:
         powers = tuple(int(p) for p in self.powers)
-        if len(set(powers)) != len(powers) or powers != tuple(self.powers) or not all(2 <= p <= MOST for p in powers):
+        if len(set(powers)) != len(powers) or powers != tuple(self.powers) or not all(2 <= p <= _MOST for p in powers):
             raise InputError(
-                f"powers of the spline lens must be different whole numbers from 2 to {MOST}, not {powers}"
+                f"powers of the spline lens must be different whole numbers from 2 to {_MOST}, not {powers}"
             )
         object.__setattr__(self, "powers", powers)
         object.__setattr__(self, "values", tuple(self.values) or (0.0,) * len(self.names))
@@ -268,7 +267,7 @@ class Spline(Planar):
         return _shorter(offsets, self._unit(phi) * self._rims)
 
     def _map(self, flat: Array) -> Array:
-        u = np.maximum(np.hypot(flat[:, 0], flat[:, 1]), TINY)
+        u = np.maximum(np.hypot(flat[:, 0], flat[:, 1]), _TINY)
         outward = 1.0 + self._profile.bent(u)[0] / u
         answer = flat * outward[:, None]
         q, conjugate = self._raised(flat[:, 0] + 1j * flat[:, 1])
@@ -286,7 +285,7 @@ class Spline(Planar):
 
     def _jacobian(self, flat: Array) -> tuple[Array, Array, Array, Array]:
         x, y = flat[:, 0], flat[:, 1]
-        u = np.maximum(np.hypot(x, y), TINY)
+        u = np.maximum(np.hypot(x, y), _TINY)
         value, slope = self._profile.bent(u)
         stretch = value / u
         bend = (slope - stretch) / (u * u)
@@ -308,8 +307,10 @@ class Spline(Planar):
     # ---- for the solve -----------------------------------------------------------------------------------------------
 
     @property
-    def state(self) -> Array:
-        """See `spline_kernel`."""
+    def form(self) -> Array:
+        """Where among the intrinsics Conrady's decentring and the surface are, 0 for nowhere; the B-splines' pieces on
+        each interval, by power; of each monomial the place of its coefficient, m and n.
+        """
         names = self.names
         rows = [
             (4.0 + names.index(one.names[0]), float(one.m), float(one.n))
@@ -318,10 +319,4 @@ class Spline(Planar):
         ]
         conrady = 4.0 + names.index("p2") if 2 in self.powers else 0.0
         surface = 4.0 + names.index(EXTENTS[0]) if self.terms else 0.0
-        head = [0.0, float(len(rows)), float(max(self.powers, default=0)), conrady, surface]
-        room = np.zeros(INTERVALS * (DEGREE + 1))
-        return np.concatenate([head, np.swapaxes(pieces(), 1, 2).ravel(), room, np.array(rows).ravel()])
-
-    prepare = staticmethod(spline_kernel.prepare)
-    distort_chunk = staticmethod(spline_kernel.distort)
-    differentiate_chunk = staticmethod(spline_kernel.differentiate)
+        return np.concatenate([[conrady, surface], np.swapaxes(pieces(), 1, 2).ravel(), np.array(rows).ravel()])

@@ -14,8 +14,8 @@ from functools import cache, lru_cache
 import numpy as np
 
 from ceres_cal.base.arrays import Array
-from ceres_cal.scene.lens.surface_kernel import COLUMNS, ROWS
 
+COLUMNS, ROWS = 16, 12  # of nodes
 EXTENTS = ("wide", "high")
 NODES = tuple(f"{axis}{i:02d}{j:02d}" for i in range(COLUMNS) for j in range(ROWS) for axis in "xy")
 """Names of the coefficients: axis, column, row."""

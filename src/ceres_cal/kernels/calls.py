@@ -1,0 +1,188 @@
+"""The kernels as everybody calls them. They work on what they are handed, fill what is there for it, and release
+Python's lock.
+
+Arrays that are read may be laid out in any way: what is not contiguous, or of another kind of number, is copied. Arrays
+that are filled must be contiguous and of the right kind. A shape or a row number that does not fit is a TypeError or a
+ValueError that says what is needed.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from importlib import import_module
+from typing import Any
+
+import numpy as np
+
+from ceres_cal.base.arrays import Array, Indices
+from ceres_cal.kernels.arguments import Blocks, CurveColumns, Loss, Optics, PointColumns, Sweep, Unknowns
+
+
+@cache
+def core() -> Any:
+    """The module that was compiled for this machine: for every processor of its kind, or for those with AVX2."""
+    try:
+        every = import_module("ceres_cal.kernels._core")
+    except ModuleNotFoundError as error:
+        raise ImportError(f"{error}: the kernels are not compiled here: run scripts/setup, or pip install .") from error
+    return import_module("ceres_cal.kernels._core_v3") if every.has_avx2() else every
+
+
+# ---- the start ------------------------------------------------------------------------------------------------------
+
+
+def normalised_planes(bounds: Indices, plane: Array, x: Array, lifts: Array) -> None:
+    """x (2, N): each sight's plane points (N, 2) with their centroid at 0 and unit spread; lifts (S, 3) these two.
+
+    Args:
+        bounds: (S + 1,) where each sight begins.
+    """
+    core().normalised_planes(bounds, plane, x, lifts)
+
+
+def align_sights(
+    bounds: Indices, x: Array, p: Array, weights: Array, h12: Array, shares: Array, reduced: Array
+) -> None:
+    """h1 and h2 (S, 6) of every sight, and the equations of the profile that are left, `reduced`, added up.
+
+    Args:
+        bounds: (S + 1,) where each sight begins. x: (2, N) plane points, p: (N, 2) offsets, of unit size each.
+        shares: (S, 3, terms + 1), filled: h3 is (shares @ (-c, 1)). reduced: (terms + 1,) squared, q's row last.
+    """
+    core().align_sights(bounds, x, p, weights, h12, shares, reduced)
+
+
+def alignment_errors(bounds: Indices, x: Array, p: Array, h12: Array, h3: Array, profile: Array, errors: Array) -> None:
+    """Distance (N,) of each point from where its sight's h12 (S, 6) and h3 (S, 3) send it under the profile c_k."""
+    core().alignment_errors(bounds, x, p, h12, h3, profile, errors)
+
+
+def usual_by_radius(errors: Array, radius: Array, usual: Array) -> None:
+    """The median error at each point's distance from the centre, to `usual` (N,): profiles fit worst where lenses bend
+    most.
+    """
+    core().usual_by_radius(errors, radius, usual)
+
+
+def plane_homographies(
+    bounds: Indices, plane: Array, offsets: Array, profile: Array, unit: float, wrong: float, homographies: Array,
+    errors: Array,
+) -> None:  # fmt: skip
+    """H (S, 3, 3) of each sight with q ~ H (x, y, 1), sign by most of its points, and each point's error (N,).
+
+    Args:
+        bounds: (S + 1,) where each sight begins. plane: (N, 2) m. offsets: (N, 2) px. unit: px.
+        profile: c_k of w = 1 + sum c_k r^2k, which makes q = (p, w); p and r are offsets and their lengths over `unit`.
+        wrong: of the median error, how much more than it no clean point has.
+    """
+    core().plane_homographies(bounds, plane, offsets, profile, unit, wrong, homographies, errors)
+
+
+def grouped_scatter(values: Array, bounds: Indices, scatter: Array) -> None:
+    """Mean of (v - mean)(v - mean)^T over values[bounds[g]:bounds[g + 1]] for every group g, to `scatter`, (groups, k,
+    k).
+    """
+    core().grouped_scatter(values, bounds, scatter)
+
+
+# ---- residuals and their derivatives --------------------------------------------------------------------------------
+
+
+def point_residuals(
+    first: int, last: int, optics: Optics, poses: Array, points: PointColumns, rows: Indices, residuals: Array
+) -> None:
+    """project(X) - p in px of the sights first to last at poses (S, 3, 4), to `rows` of `residuals`; NaN where there is
+    none.
+    """
+    core().point_residuals(first, last, optics, poses, points, rows, residuals)
+
+
+def curve_residuals(optics: Optics, poses: Array, curves: CurveColumns, residuals: Array) -> None:
+    """Signed distance from each pixel to its curve in px, (M,), and s moved to the foot; NaN where there is none."""
+    core().curve_residuals(optics, poses, curves, residuals)
+
+
+def point_rows(optics: Optics, poses: Array, points: PointColumns, rows: Array) -> None:
+    """d project(X) / d [intrinsics | 6 pose | x, y, the warp's numbers] into `rows` (N, 2, intrinsics + 6 + BUILT); NaN
+    where a sight has points that cannot be projected.
+
+    Args:
+        See `point_residuals`. The pose columns are left perturbations in the camera frame: (dw x R X) + dt.
+    """
+    core().point_rows(optics, poses, points, rows)
+
+
+def curve_rows(optics: Optics, poses: Array, curves: CurveColumns, rows: Array, normals: Array) -> bool:
+    """The same of the signed distance to the curve, into `rows` (M, intrinsics + 6 + BUILT), by the envelope theorem;
+    the last columns are of a segment's offset to the left, or of an arc's x, y and radius, and 0. False where a curve
+    cannot be projected.
+
+    Args:
+        See `curve_residuals`; s is moved to the foot. normals: (M, 2), filled with the image normal there: the foot
+            lies at the pixel plus the signed distance along it.
+    """
+    return bool(core().curve_rows(optics, poses, curves, rows, normals))
+
+
+def loss_weights(loss: Loss, squared: Array, weights: Array) -> None:
+    """rho' at each squared residual, to `weights` (N,): what an observation has in the solve."""
+    core().loss_weights(loss, squared, weights)
+
+
+# ---- the solve ------------------------------------------------------------------------------------------------------
+
+
+def cholesky(normal: Array, upper: Array) -> None:
+    """U with U^T U = A from A's lower triangle; where A is singular the row of U is zero."""
+    core().cholesky(normal, upper)
+
+
+def evaluate_block(
+    optics: Optics, unknowns: Unknowns, points: PointColumns, curves: CurveColumns, loss: Loss, at: Blocks,
+    residuals: Array, jacobians: Blocks,
+) -> bool:  # fmt: skip
+    """What Ceres asks of the block of one sight (design, section 6); False where an observation cannot be projected.
+
+    Args:
+        optics: `at.camera` replaces the free entries of its intrinsics. points, curves: of this sight alone.
+        at: the free intrinsics, and the 6-vectors of cam_from_world and world_from_target; its structure is already in
+            the columns.
+        residuals: (free + structure + 7,): the rows of U, then what is missing from the robust cost.
+        jacobians: row-major, as many rows x the block's size.
+    """
+    return bool(core().evaluate_block(optics, unknowns, points, curves, loss, at, residuals, jacobians))
+
+
+def eliminate_placements(
+    first: int, last: int, optics: Optics, unknowns: Unknowns, points: PointColumns, curves: CurveColumns, loss: Loss,
+    newton: bool, tolerance: float, change: Array, sweep: Sweep,
+) -> None:  # fmt: skip
+    """The sights first to last at their best poses: their costs, and what they say of the free intrinsics.
+
+    Args:
+        newton: whether the equations take rho'' along, for a step, or rho' alone.
+        tolerance: how much of a sight's cost a step of its pose may still promise when it is left to the complement.
+        change: (free + structure,) by how much these have moved since the poses and gains of `sweep` were made.
+        sweep: poses, moved (left alone where an observation cannot be projected), gains, renewed, costs, filled, and
+            reduced, the complement, added up.
+    """
+    core().eliminate_placements(
+        first, last, optics, unknowns, points, curves, loss, newton, tolerance, change, sweep
+    )  # fmt: skip
+
+
+def sight_normals(
+    first: int, last: int, optics: Optics, unknowns: Unknowns, points: PointColumns, curves: CurveColumns, loss: Loss,
+    poses: Array, units: Array, normals: Array,
+) -> bool:  # fmt: skip
+    """False where an observation cannot be projected; else J^T W J of the sights first to last, each by itself.
+
+    Args:
+        poses: (S, 3, 4) [R t] of cam_from_frame.
+        normals: (last - first, n, n) with n = free + structure + 7: free intrinsics, structure, left perturbation of
+            the pose and residual, each multiplied with its one of `units` (n,); an observation has its robust weight
+            rho'.
+    """
+    costs = np.empty(last - first)
+    core().sight_normals(first, last, optics, unknowns, points, curves, loss, False, poses, units, costs, normals)
+    return bool(np.isfinite(costs).all())

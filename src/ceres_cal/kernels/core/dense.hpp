@@ -1,0 +1,83 @@
+// Small dense matrices, row-major.
+#pragma once
+
+#include <algorithm>
+#include <cmath>
+
+namespace ceres_cal {
+
+constexpr int MANY = 64;        // numbers from which on rounding in what observations leave open adds up
+constexpr double LIFT = 1e-12;  // and the share of the diagonal that is added against it: that changes no slope
+
+// U with U^T U = A from A's lower triangle; where A is singular the row of U is zero. Row i of A begins at i * stride.
+inline void cholesky(int size, const double* normal, int stride, double* upper) {
+    const double whole = 1.0 + (size > MANY ? LIFT : 0.0);
+    std::fill_n(upper, static_cast<size_t>(size) * size, 0.0);
+    for (int k = 0; k < size; ++k) {
+        double* own = upper + static_cast<size_t>(size) * k;
+        const double diagonal = normal[static_cast<size_t>(stride) * k + k];
+        own[k] = whole * diagonal;
+        for (int i = k + 1; i < size; ++i) own[i] = normal[static_cast<size_t>(stride) * i + k];
+        for (int j = 0; j < k; ++j) {
+            const double *above = upper + static_cast<size_t>(size) * j, factor = above[k];
+            if (factor == 0.0) continue;
+            for (int i = k; i < size; ++i) own[i] -= factor * above[i];
+        }
+        if (!(own[k] > 1e-15 * diagonal)) {
+            std::fill(own + k, own + size, 0.0);
+            continue;
+        }
+        const double root = std::sqrt(own[k]);
+        own[k] = root;
+        for (int i = k + 1; i < size; ++i) own[i] /= root;
+    }
+}
+
+// x <- (U^T U)^-1 x by forward and back substitution; U of full rank.
+inline void substitute(int size, const double* upper, double* x) {
+    for (int k = 0; k < size; ++k) {
+        for (int j = 0; j < k; ++j) x[k] -= upper[size * j + k] * x[j];
+        x[k] /= upper[size * k + k];
+    }
+    for (int k = size - 1; k >= 0; --k) {
+        for (int j = k + 1; j < size; ++j) x[k] -= upper[size * k + j] * x[j];
+        x[k] /= upper[size * k + k];
+    }
+}
+
+// Squared angle of a rotation vector, sin a / a, (1 - cos a) / a^2, (a - sin a) / a^3, also where a is tiny.
+struct SineSeries {
+    double angle2, sine, versine, rest;
+    explicit SineSeries(const double* w) : angle2(w[0] * w[0] + w[1] * w[1] + w[2] * w[2]) {
+        const double angle = std::sqrt(angle2);
+        if (angle < 1e-4) {
+            sine = 1.0 - angle2 / 6.0, versine = 0.5 - angle2 / 24.0, rest = 1.0 / 6.0 - angle2 / 120.0;
+            return;
+        }
+        const double half = std::sin(0.5 * angle) / angle;
+        sine = std::sin(angle) / angle, versine = 2.0 * half * half;
+        rest = (angle - std::sin(angle)) / (angle * angle2);
+    }
+};
+
+// diagonal 1 + outer w w^T + cross [w]x, (3, 3).
+inline void turn(const double* w, double diagonal, double outer, double cross, double* out) {
+    for (int j = 0; j < 3; ++j)
+        for (int k = 0; k < 3; ++k) out[3 * j + k] = outer * w[j] * w[k] + (j == k ? diagonal : 0.0);
+    const double x = cross * w[0], y = cross * w[1], z = cross * w[2];
+    out[1] -= z, out[3] += z, out[2] += y, out[6] -= y, out[5] -= x, out[7] += x;
+}
+
+// Rodrigues' formula, (3, 3).
+inline void rotation(const double* w, double* out) {
+    const SineSeries series(w);
+    turn(w, 1.0 - series.versine * series.angle2, series.versine, series.sine, out);
+}
+
+// J with exp(w + dw) = exp(J dw) exp(w), (3, 3).
+inline void left_jacobian(const double* w, double* out) {
+    const SineSeries series(w);
+    turn(w, 1.0 - series.rest * series.angle2, series.rest, series.versine, out);
+}
+
+}  // namespace ceres_cal

@@ -1,0 +1,152 @@
+// Many placements that only one station sees each: their poses are eliminated from the problem (variable projection).
+//
+// For given intrinsics each pose is brought to its own best value, and what is left of the normal equations, the Schur
+// complement A_cc - A_cp A_pp^-1 A_pc, speaks of what all sights share: the free intrinsics and the structure. Near the
+// best pose one evaluation per sight is enough: the complement takes the rest of the step, and its cost, along.
+#pragma once
+
+#include "dense.hpp"
+#include "sums.hpp"
+
+namespace ceres_cal {
+
+// Placements at their best for given shared numbers: see `Sweep` in arguments.py.
+struct Sweep {
+    double *poses, *gains, *costs, *reduced;
+};
+
+class Elimination {
+  public:
+    Elimination(const Optics& optics, const Unknowns& unknowns, const Points& points, const Curves& curves,
+                const Loss& loss, bool newton)
+        : sums_(optics, unknowns),
+          points_(points),
+          curves_(curves),
+          loss_(loss),
+          newton_(newton),
+          count_(unknowns.shared()),
+          size_(unknowns.size()),
+          normal_(static_cast<size_t>(size_) * size_),
+          trial_(normal_.size()),
+          gain_(6 * static_cast<size_t>(count_ + 1)) {}
+
+    // One sight at its best pose: its cost, and what it says of the shared numbers.
+    void eliminate(int64_t sight, double tolerance, const double* change, const Sweep& sweep) {
+        double *kept = sweep.poses + 12 * sight, *gains = sweep.gains + 6 * static_cast<int64_t>(count_) * sight;
+        double pose[12] = {}, moved[12], step[6];
+        for (int k = 0; k < 6; ++k) {
+            step[k] = 0.0;
+            for (int j = 0; j < count_; ++j) step[k] -= gains[count_ * k + j] * change[j];
+        }
+        move(kept, step, moved);
+        double cost = INFINITY, promise = INFINITY, damping = 0.0;
+        for (int trial = 0; trial < MOST_STEPS; ++trial) {
+            const double found = sums_.normal_equations(sight, moved, points_, curves_, loss_, newton_, trial_.data());
+            if (found <= cost) {
+                std::copy_n(moved, 12, pose), normal_.swap(trial_);
+                cost = found, damping *= 0.1;
+            } else if (!std::isfinite(cost) || promise <= 1e-12 * cost) {
+                break;  // nothing to be seen from where it starts; rounding
+            } else {
+                damping = std::max(1e-3, 10.0 * damping);
+            }
+            promise = solve_pose(damping);
+            if (promise <= std::max(tolerance * cost, NOTHING_LEFT)) break;
+            for (int k = 0; k < 6; ++k) step[k] = -gain(k)[count_];
+            move(pose, step, moved);
+        }
+        if (!std::isfinite(cost)) {
+            sweep.costs[sight] = INFINITY;
+            return;
+        }
+        bool whole = true;
+        if (damping > 0.0) promise = solve_pose(0.0), whole = promise <= 1e-2 * cost;
+        for (int k = 0; k < 6; ++k) step[k] = whole ? -gain(k)[count_] : 0.0;
+        move(pose, step, kept);
+        for (int k = 0; k < 6; ++k) std::copy_n(gain(k), count_, gains + static_cast<int64_t>(count_) * k);
+        add_complement(sweep.reduced);
+        sweep.costs[sight] = cost - std::max(promise, 0.0);
+    }
+
+  private:
+    static constexpr int MOST_STEPS = 50;
+    static constexpr double NOTHING_LEFT = 1e-14;  // squared standard deviations
+
+    const double* normal(int row) const { return normal_.data() + static_cast<size_t>(size_) * row; }
+    double* gain(int row) { return gain_.data() + static_cast<size_t>(count_ + 1) * row; }
+
+    // moved = the pose after a left perturbation: R <- exp(dw) R, t <- t + dt.
+    static void move(const double* pose, const double* step, double* moved) {
+        double turned[9];
+        rotation(step, turned);
+        for (int j = 0; j < 3; ++j) {
+            for (int k = 0; k < 3; ++k)
+                moved[4 * j + k] =
+                    turned[3 * j] * pose[k] + turned[3 * j + 1] * pose[4 + k] + turned[3 * j + 2] * pose[8 + k];
+            moved[4 * j + 3] = pose[4 * j + 3] + step[3 + j];
+        }
+    }
+
+    // gain (6, count + 1) = A_pp^-1 [A_pc A_pe] by Cholesky; a direction that nothing fixes is left where it is. The
+    // answer is what the step, -gain's last column, promises of the cost.
+    double solve_pose(double damping) {
+        double lower[6][6];  // its diagonal inverted: a product is cheaper than a quotient
+        for (int k = 0; k < 6; ++k)
+            for (int i = k; i < 6; ++i) {
+                double total = normal(count_ + i)[count_ + k] * (i == k ? 1.0 + damping : 1.0);
+                for (int j = 0; j < k; ++j) total -= lower[i][j] * lower[k][j];
+                const bool held = !(total > 1e-13 * normal(count_ + k)[count_ + k]);
+                lower[i][k] = i == k ? (held ? 0.0 : 1.0 / std::sqrt(total)) : total * lower[k][k];
+            }
+        for (int k = 0; k < 6; ++k) {
+            std::copy_n(normal(count_ + k), count_, gain(k));
+            gain(k)[count_] = normal(count_ + 6)[count_ + k];
+            for (int j = 0; j < k; ++j) add_multiple(-lower[k][j], gain(j), gain(k));
+            scale(lower[k][k], gain(k));
+        }
+        for (int k = 5; k >= 0; --k) {
+            for (int j = k + 1; j < 6; ++j) add_multiple(-lower[j][k], gain(j), gain(k));
+            scale(lower[k][k], gain(k));
+        }
+        double promise = 0.0;
+        for (int k = 0; k < 6; ++k) promise += gain(k)[count_] * normal(count_ + 6)[count_ + k];
+        return promise;
+    }
+
+    void add_multiple(double factor, const double* row, double* own) const {
+        CERES_CAL_INDEPENDENT
+        for (int i = 0; i <= count_; ++i) own[i] += factor * row[i];
+    }
+
+    void scale(double factor, double* own) const {
+        for (int i = 0; i <= count_; ++i) own[i] *= factor;
+    }
+
+    // reduced += A_cc - A_cp A_pp^-1 A_pc, lower triangle, the residual's row last.
+    void add_complement(double* reduced) {
+        const double *p[6], *last = normal(count_ + 6);
+        for (int k = 0; k < 6; ++k) p[k] = normal(count_ + k);
+        for (int i = 0; i <= count_; ++i) {
+            double *own = reduced + static_cast<size_t>(count_ + 1) * i, g[6];
+            const double* row = i == count_ ? last : normal(i);
+            for (int k = 0; k < 6; ++k) g[k] = gain(k)[i];
+            CERES_CAL_INDEPENDENT
+            for (int j = 0; j < std::min(i + 1, count_); ++j)
+                own[j] += row[j] - (g[0] * p[0][j] + g[1] * p[1][j] + g[2] * p[2][j] + g[3] * p[3][j] + g[4] * p[4][j] +
+                                    g[5] * p[5][j]);
+        }
+        double left = last[count_ + 6];
+        for (int k = 0; k < 6; ++k) left -= gain(k)[count_] * last[count_ + k];
+        reduced[static_cast<size_t>(count_ + 1) * (count_ + 1) - 1] += left;
+    }
+
+    Sums sums_;
+    const Points& points_;
+    const Curves& curves_;
+    const Loss& loss_;
+    const bool newton_;
+    const int count_, size_;
+    std::vector<double> normal_, trial_, gain_;
+};
+
+}  // namespace ceres_cal

@@ -1,0 +1,137 @@
+// Homographies of very many sights of points at once, each reweighted against its own wrong labels.
+#pragma once
+
+#include <cstdint>
+#include <vector>
+
+#include "chunk.hpp"
+#include "dense.hpp"
+
+namespace ceres_cal {
+
+// Of at least one number, which it orders.
+inline double median(std::vector<double>& values) {
+    const auto half = values.begin() + static_cast<std::ptrdiff_t>(values.size() / 2);
+    const auto before = [](double a, double b) { return a < b || (b != b && a == a); };  // what is no number comes last
+    std::nth_element(values.begin(), half, values.end(), before);
+    return values.size() % 2 == 1 ? *half : 0.5 * (*std::max_element(values.begin(), half, before) + *half);
+}
+
+// x and y: the points (n, 2) with their centroid at 0 and unit spread; lift (3): centroid and 1 / spread.
+inline void normalise(int64_t n, const double* plane, double* x, double* y, double* lift) {
+    double sums[2] = {}, spread = 0.0;
+    for (int64_t i = 0; i < n; ++i) sums[0] += plane[2 * i], sums[1] += plane[2 * i + 1];
+    lift[0] = sums[0] / static_cast<double>(n), lift[1] = sums[1] / static_cast<double>(n);
+    for (int64_t i = 0; i < n; ++i) {
+        x[i] = plane[2 * i] - lift[0], y[i] = plane[2 * i + 1] - lift[1];
+        spread += x[i] * x[i] + y[i] * y[i];
+    }
+    lift[2] = 1.0 / (std::sqrt(spread / static_cast<double>(n)) + 1e-12);
+    for (int64_t i = 0; i < n; ++i) x[i] *= lift[2], y[i] *= lift[2];
+}
+
+// The unit vector that `normal` (lower triangle) shrinks most, by inverse iteration from h.
+template <int SIZE>
+inline void least_direction(double* normal, double* h) {
+    double upper[SIZE * SIZE], trace = 0.0;
+    for (int i = 0; i < SIZE; ++i) trace += normal[(SIZE + 1) * i];
+    for (int i = 0; i < SIZE; ++i) normal[(SIZE + 1) * i] += 1e-13 * trace;
+    cholesky(SIZE, normal, SIZE, upper);
+    for (int round = 0; round < 4; ++round) {
+        substitute(SIZE, upper, h);
+        double squared = 0.0;
+        for (int i = 0; i < SIZE; ++i) squared += h[i] * h[i];
+        for (int i = 0; i < SIZE; ++i) h[i] /= std::sqrt(squared);
+    }
+}
+
+class Homographies {
+  public:
+    // profile: c_k of w = 1 + sum c_k r^2k, which makes q = (p, w); p and r are offsets and their lengths over `unit`.
+    // wrong: medians of the errors beyond which one is a wrong label's.
+    Homographies(const double* profile, int terms, double unit, double wrong)
+        : profile_(profile), terms_(terms), unit_(unit), wrong_(wrong) {}
+
+    // H (3, 3) of one sight with q ~ H (x, y, 1), sign by most of its points, and each point's error (n).
+    void fit(int64_t n, const double* plane, const double* offsets, double* homography, double* errors) {
+        constexpr int PATIENCE = 8;  // rounds of reweighting where some points do not fit
+        for (std::vector<double>* one : {&x_, &y_, &a_, &b_, &c_}) one->resize(static_cast<size_t>(n));
+        weights_.assign(static_cast<size_t>(n), 1.0);
+        double lift[3], normal[81], h[9];
+        lift_offsets(n, offsets);
+        normalise(n, plane, x_.data(), y_.data(), lift);
+        for (int i = 0; i < 9; ++i) h[i] = 1.0 + 0.1 * i;  // anything: what the moments shrink more vanishes soon
+        for (int round = 0; round < PATIENCE; ++round) {
+            add_moments(n, normal);
+            least_direction<9>(normal, h);
+            judge(n, h, errors);
+            ordered_.assign(errors, errors + n);
+            const double usual = median(ordered_), worst = *std::max_element(errors, errors + n);
+            if (worst <= wrong_ * usual) break;
+            for (int64_t i = 0; i < n; ++i) {
+                const double far = errors[i] / (1.5 * usual + 1e-12);
+                weights_[i] /= 1.0 + far * far;
+            }
+        }
+        for (int j = 0; j < 3; ++j) {
+            const double a = h[3 * j] * lift[2], b = h[3 * j + 1] * lift[2];
+            homography[3 * j] = a, homography[3 * j + 1] = b;
+            homography[3 * j + 2] = h[3 * j + 2] - a * lift[0] - b * lift[1];
+        }
+    }
+
+  private:
+    void lift_offsets(int64_t n, const double* offsets) {
+        for (int64_t i = 0; i < n; ++i) {
+            a_[i] = offsets[2 * i] / unit_, b_[i] = offsets[2 * i + 1] / unit_;
+            const double squared = a_[i] * a_[i] + b_[i] * b_[i];
+            double w = 0.0;
+            for (int k = terms_ - 1; k >= 0; --k) w = (w + profile_[k]) * squared;
+            c_[i] = 1.0 + w;
+        }
+    }
+
+    // normal (9, 9), lower triangle: of q_w (h1 . X) - q_x (h3 . X) = 0 and q_w (h2 . X) - q_y (h3 . X) = 0.
+    void add_moments(int64_t n, double* normal) const {
+        constexpr int PLACES[5][2] = {{0, 0}, {3, 3}, {6, 0}, {6, 3}, {6, 6}};
+        double sums[5][6] = {};
+        const double *x = x_.data(), *y = y_.data(), *qa = a_.data(), *qb = b_.data(), *qc = c_.data();
+        for (int64_t i = 0; i < n; ++i) {
+            const double w = weights_[i], a = qa[i], b = qb[i], c = qc[i], ww = w * c * c;
+            const double factor[5] = {ww, ww, -w * c * a, -w * c * b, w * (a * a + b * b)};
+            const double product[6] = {x[i] * x[i], x[i] * y[i], y[i] * y[i], x[i], y[i], 1.0};
+            for (int f = 1; f < 5; ++f)
+                for (int p = 0; p < 6; ++p) sums[f][p] += factor[f] * product[p];
+        }
+        std::copy_n(sums[1], 6, sums[0]);
+        std::fill_n(normal, 81, 0.0);
+        for (int f = 0; f < 5; ++f) {
+            const double xx = sums[f][0], xy = sums[f][1], yy = sums[f][2], own_x = sums[f][3], own_y = sums[f][4];
+            double *first = normal + 9 * PLACES[f][0] + PLACES[f][1], *second = first + 9, *third = first + 18;
+            first[0] = xx, first[1] = xy, first[2] = own_x;
+            second[0] = xy, second[1] = yy, second[2] = own_y;
+            third[0] = own_x, third[1] = own_y, third[2] = sums[f][5];
+        }
+    }
+
+    // Distance of each measured point from where h sends it, in q's unit, and 1 / depth^2 as weights.
+    void judge(int64_t n, double* h, double* errors) {
+        int64_t agree = 0;
+        for (int64_t i = 0; i < n; ++i) {
+            const double x = x_[i], y = y_[i], u = h[0] * x + h[1] * y + h[2], v = h[3] * x + h[4] * y + h[5];
+            const double depth = h[6] * x + h[7] * y + h[8], away = std::abs(depth) > 1e-9 ? depth : 1e-9;
+            agree += u * a_[i] + v * b_[i] + depth * c_[i] > 0.0 ? 1 : -1;
+            const double dx = u * c_[i] / away - a_[i], dy = v * c_[i] / away - b_[i];
+            errors[i] = std::sqrt(dx * dx + dy * dy);
+            weights_[i] = 1.0 / (away * away);
+        }
+        for (int i = 0; i < 9 && agree < 0; ++i) h[i] = -h[i];
+    }
+
+    const double* profile_;
+    int terms_;
+    double unit_, wrong_;
+    std::vector<double> x_, y_, a_, b_, c_, weights_, ordered_;
+};
+
+}  // namespace ceres_cal

@@ -1,0 +1,243 @@
+// A lens without a formula: see spline.py. Places, radii and displacements are in rims, or in the solver's unit.
+//
+// Form: where among the intrinsics Conrady's decentring and the surface are, 0 for nowhere; the table of the B-splines'
+// pieces (see b_splines.py), coefficients by power, those of all pieces of an interval side by side; of each monomial
+// c q^m conj(q)^n the place of c among the intrinsics, m and n.
+#pragma once
+
+#include <algorithm>
+#include <cmath>
+#include <memory>
+#include <vector>
+
+#include "lens.hpp"
+#include "surface.hpp"
+
+namespace ceres_cal {
+
+class Spline final : public Lens {
+  public:
+    explicit Spline(const Making& from)
+        : unit_(from.unit),
+          phi_(from.intrinsics[0]),
+          aspect_(from.intrinsics[1]),
+          rim_(from.intrinsics[4] > 0.0 ? from.intrinsics[4] : 1.0),
+          conrady_(static_cast<int>(from.form[0])) {
+        const Numbers &form = from.form, &intrinsics = from.intrinsics;
+        for (int k = 0; k < 2 * CONRADY && conrady_ > 0; ++k) c_[k] = intrinsics[conrady_ + k] / 3.0;
+        if (form[1] > 0.0) surface_ = std::make_unique<Surface>(static_cast<int>(form[1]), intrinsics);
+        std::copy_n(form.from(HEAD, TABLE), TABLE, pieces_);
+        for (int place = HEAD + TABLE; place < form.count; place += 3) {
+            const int at = static_cast<int>(form[place]), m = static_cast<int>(form[place + 1]),
+                      n = static_cast<int>(form[place + 2]);
+            if (m < 0 || n < 0 || m > MOST || n > MOST) throw std::invalid_argument("spline: powers are 0 to 9");
+            monomials_.push_back({at, m, n, intrinsics[at], intrinsics[at + 1]});
+            highest_ = std::max({highest_, m, n});
+        }
+        for (int j = 0; j < INTERVALS; ++j)
+            for (int d = 0; d < ORDER; ++d)
+                for (int a = j == 0 ? 2 : (j == 1 ? 1 : 0); a < ORDER; ++a)  // value and slope at the axis are 0
+                    profile_[j][d] += intrinsics[3 + j + a] * pieces_[(j * ORDER + d) * ORDER + a];
+        for (int k = 1; k <= 8 * INTERVALS && limit_ == END; ++k) {
+            const double u = k / (8.0 * INTERVALS);
+            if (rim_ + along_radius(u).slope <= 0.0) limit_ = u;
+        }
+    }
+
+    bool distort(int n, const Rays& rays, Image& image) override {
+        const double scale = 2.0 * phi_ / (unit_ * rim_), per_scale = 1.0 / scale, unit = unit_, rim = rim_;
+        each(n, [&](int i) {
+            const double x = rays.x[i], y = rays.y[i], z = rays.z[i], length = std::sqrt(x * x + y * y + z * z);
+            const double s = scale / (length + z), u = s * x, v = s * y;
+            length_[i] = length, s_[i] = s, u_[i] = u, v_[i] = v, radius_[i] = std::sqrt(u * u + v * v);
+        });
+        add_conrady(n);
+        if (!monomials_.empty()) add_monomials(n);
+        if (surface_) add_surface(n);
+        for (int i = 0; i < n; ++i) {  // by itself: its look-up keeps the rest from SIMD registers
+            const Along along = along_radius(radius_[i]);
+            value_[i] = along.value, slope_[i] = along.slope;
+        }
+        int bad = 0;
+        each(n, [&](int i) {
+            const double x = rays.x[i], y = rays.y[i], z = rays.z[i], u = u_[i], v = v_[i], s = s_[i];
+            const double length = length_[i], per_radius = 1.0 / (radius_[i] + TINY), per_length = 1.0 / length;
+            const double stretch = value_[i] * per_radius, bend = (slope_[i] - stretch) * per_radius * per_radius;
+            // Derivatives by q and by its conjugate become those by x and y.
+            const double first_x = first_x_[i] + second_x_[i], first_y = first_y_[i] + second_y_[i];
+            const double other_x = first_x_[i] - second_x_[i], other_y = first_y_[i] - second_y_[i];
+            const double jxx = rim + stretch + bend * u * u + first_x, jyy = rim + stretch + bend * v * v + other_x;
+            const double jxy = bend * u * v - other_y, jyx = bend * u * v + first_y;
+            const double f = s * s * per_scale * per_length, ax = s - f * x * x, ab = -f * x * y, by = s - f * y * y;
+            image.x[i] = unit * ((rim + stretch) * u + moved_x_[i]),
+            image.y[i] = unit * ((rim + stretch) * v + moved_y_[i]);
+            image.xx[i] = unit * (jxx * ax + jxy * ab), image.xy[i] = unit * (jxx * ab + jxy * by);
+            image.yx[i] = unit * (jyx * ax + jyy * ab), image.yy[i] = unit * (jyx * ab + jyy * by);
+            const double along_x = unit * (jxx * u + jxy * v), along_y = unit * (jyx * u + jyy * v);
+            image.xz[i] = -along_x * per_length, image.yz[i] = -along_y * per_length;
+            along_x_[i] = along_x, along_y_[i] = along_y;
+            bad +=
+                !((length + z > 1e-9 * length) & (radius_[i] < limit_) & (jxx * jyy > jxy * jyx) & (jxx + jyy > 0.0));
+        });
+        return bad == 0;
+    }
+
+    void differentiate(const Rows& rows) override {
+        const double unit = unit_, aspect = aspect_, rim = rim_, per_phi = 1.0 / phi_;
+        const int n = rows.n;
+        double *x = rows.x(0), *y = rows.y(0), *rim_x = rows.x(4), *rim_y = rows.y(4);
+        rows.shown[4] = true;
+        each(n, [&](int i) {
+            x[i] = along_x_[i] * per_phi, y[i] = aspect * along_y_[i] * per_phi;
+            rim_x[i] = unit * u_[i] - along_x_[i] / rim, rim_y[i] = aspect * (unit * v_[i] - along_y_[i] / rim);
+        });
+        weigh_pieces(rows);
+        each(n, [&](int i) {
+            const double outward = unit / (radius_[i] + TINY);
+            along_x_[i] = outward * u_[i], along_y_[i] = aspect * outward * v_[i];
+        });
+        for (int row = 5; row < 5 + COUNT; ++row) {
+            if (!rows.shown[row]) continue;
+            x = rows.x(row), y = rows.y(row);
+            each(n, [&](int i) {
+                const double value = x[i];
+                x[i] = value * along_x_[i], y[i] = value * along_y_[i];
+            });
+        }
+        if (conrady_ > 0) differentiate_conrady(rows);
+        for (const Monomial& one : monomials_) {
+            const Lane &a_ = power_x_[one.m], &b_ = power_y_[one.m], &c_ = power_x_[one.n], &d_ = power_y_[one.n];
+            double *p = rows.x(one.at), *q = rows.x(one.at + 1);
+            rows.shown[one.at] = rows.shown[one.at + 1] = true;
+            each(n, [&](int i) {
+                const double re = unit * (a_[i] * c_[i] + b_[i] * d_[i]), im = unit * (b_[i] * c_[i] - a_[i] * d_[i]);
+                p[i] = re, p[n + i] = aspect * im, q[i] = -im, q[n + i] = aspect * re;
+            });
+        }
+        if (surface_) surface_->differentiate(n, unit, aspect, rows);
+    }
+
+  private:
+    static constexpr int INTERVALS = 8, DEGREE = 5, ORDER = DEGREE + 1, COUNT = INTERVALS + DEGREE - 2;
+    static constexpr int CONRADY = 3, MOST = 9, HEAD = 2, TABLE = INTERVALS * ORDER * ORDER;
+    static constexpr double END = 2.0;  // rims: nothing is observed farther out
+
+    struct Along {
+        double value, slope;
+    };
+    struct Monomial {
+        int at, m, n;
+        double re, im;
+    };
+
+    // The interval of a radius, and how far into it that lies.
+    static int interval(double u, double& t) {
+        const double inside = std::min(1.0, u) * INTERVALS;  // a number, whatever the radius
+        const int j = std::min(static_cast<int>(inside), INTERVALS - 1);
+        t = inside - j;
+        return j;
+    }
+
+    // G and its slope, straight on beyond the last knot.
+    Along along_radius(double u) const {
+        double t = 0.0, slope = 0.0;
+        const double* own = profile_[interval(u, t)];
+        double value = own[DEGREE];
+        for (int d = DEGREE - 1; d >= 0; --d) slope = slope * t + value, value = value * t + own[d];
+        slope *= INTERVALS;
+        return {value + slope * std::max(u - 1.0, 0.0), slope};
+    }
+
+    // (2 s C(s) + q^2 conj(C(s))) / 3 with s = |q|^2 and C its three terms, and its derivatives by q and its conjugate.
+    void add_conrady(int n) {
+        const double a0 = c_[0], b0 = c_[1], a1 = c_[2], b1 = c_[3], a2 = c_[4], b2 = c_[5];
+        each(n, [&](int i) {
+            const double u = u_[i], v = v_[i], s = u * u + v * v, x = u * u - v * v, y = 2.0 * u * v;
+            const double a = a0 + s * (a1 + s * a2), b = b0 + s * (b1 + s * b2);
+            const double da = a1 + 2.0 * s * a2, db = b1 + 2.0 * s * b2;
+            const double c = 2.0 * (a + s * da), d = 2.0 * (b + s * db);
+            const double e = c + da * x + db * y, f = d + da * y - db * x;
+            moved_x_[i] = 2.0 * s * a + a * x + b * y, moved_y_[i] = 2.0 * s * b + a * y - b * x;
+            first_x_[i] = c * u + d * v + s * (da * u + db * v) + 2.0 * (a * u + b * v);
+            first_y_[i] = d * u - c * v + s * (da * v - db * u) + 2.0 * (a * v - b * u);
+            second_x_[i] = e * u - f * v, second_y_[i] = e * v + f * u;
+        });
+    }
+
+    void differentiate_conrady(const Rows& rows) const {
+        const int n = rows.n;
+        for (int k = 0; k < CONRADY; ++k) {
+            double *p = rows.x(conrady_ + 2 * k), *q = rows.x(conrady_ + 2 * k + 1);
+            rows.shown[conrady_ + 2 * k] = rows.shown[conrady_ + 2 * k + 1] = true;
+            each(n, [&](int i) {
+                const double u = u_[i], v = v_[i], x = u * u - v * v, y = 2.0 * u * v, s = u * u + v * v;
+                const double size = unit_ / 3.0 * (k > 0 ? s : 1.0) * (k > 1 ? s : 1.0);
+                p[i] = size * (2.0 * s + x), p[n + i] = aspect_ * size * y;
+                q[i] = size * y, q[n + i] = aspect_ * size * (2.0 * s - x);
+            });
+        }
+    }
+
+    void add_monomials(int n) {
+        each(n, [&](int i) { power_x_[0][i] = 1.0, power_y_[0][i] = 0.0; });
+        for (int k = 1; k <= highest_; ++k) {
+            const Lane &a = power_x_[k - 1], &b = power_y_[k - 1];
+            Lane &x = power_x_[k], &y = power_y_[k];
+            each(n, [&](int i) { x[i] = a[i] * u_[i] - b[i] * v_[i], y[i] = a[i] * v_[i] + b[i] * u_[i]; });
+        }
+        for (const Monomial& one : monomials_) {
+            add_product(n, 1.0, one, one.m, one.n, moved_x_, moved_y_);
+            if (one.m > 0) add_product(n, one.m, one, one.m - 1, one.n, first_x_, first_y_);
+            if (one.n > 0) add_product(n, one.n, one, one.m, one.n - 1, second_x_, second_y_);
+        }
+    }
+
+    // along + i across += factor c q^m conj(q)^p.
+    void add_product(int n, double factor, const Monomial& one, int m, int p, Lane& along, Lane& across) const {
+        const Lane &a = power_x_[m], &b = power_y_[m], &c = power_x_[p], &d = power_y_[p];
+        const double re = factor * one.re, im = factor * one.im;
+        each(n, [&](int i) {
+            const double x = a[i] * c[i] + b[i] * d[i], y = b[i] * c[i] - a[i] * d[i];
+            along[i] += re * x - im * y, across[i] += re * y + im * x;
+        });
+    }
+
+    void add_surface(int n) {
+        for (int i = 0; i < n; ++i) {
+            const Surface::Displacement one = surface_->look_up(i, u_[i], v_[i]);
+            moved_x_[i] += one.x, moved_y_[i] += one.y;
+            first_x_[i] += 0.5 * (one.xu + one.yv), first_y_[i] += 0.5 * (one.yu - one.xv);
+            second_x_[i] += 0.5 * (one.xu - one.yv), second_y_[i] += 0.5 * (one.yu + one.xv);
+        }
+    }
+
+    // The B-splines at each radius, straight on beyond the last knot, to the x components of their rows.
+    void weigh_pieces(const Rows& rows) const {
+        for (int i = 0; i < rows.n; ++i) {
+            double t, value[ORDER], slope[ORDER] = {};
+            const int j = interval(radius_[i], t);
+            const double *own = pieces_ + j * ORDER * ORDER, beyond = INTERVALS * std::max(radius_[i] - 1.0, 0.0);
+            for (int a = 0; a < ORDER; ++a) value[a] = own[DEGREE * ORDER + a];
+            for (int d = DEGREE - 1; d >= 0; --d)
+                for (int a = 0; a < ORDER; ++a) {
+                    slope[a] = slope[a] * t + value[a];
+                    value[a] = value[a] * t + own[d * ORDER + a];
+                }
+            for (int a = std::max(2 - j, 0); a < ORDER; ++a) {
+                rows.open(3 + j + a);
+                rows.x(3 + j + a)[i] = value[a] + beyond * slope[a];
+            }
+        }
+    }
+
+    double unit_, phi_, aspect_, rim_, limit_ = END, c_[2 * CONRADY] = {}, profile_[INTERVALS][ORDER] = {},
+                                       pieces_[TABLE];
+    int conrady_, highest_ = 0;
+    std::vector<Monomial> monomials_;
+    std::unique_ptr<Surface> surface_;
+    Lane length_, s_, u_, v_, radius_, value_, slope_, along_x_, along_y_;
+    Lane moved_x_, moved_y_, first_x_, first_y_, second_x_, second_y_;
+    Lane power_x_[MOST + 1], power_y_[MOST + 1];
+};
+
+}  // namespace ceres_cal

@@ -1,0 +1,236 @@
+// The normal equations of one sight: robust weights, weighted rows, their products (design, section 6).
+#pragma once
+
+#include <limits>
+#include <vector>
+
+#include "losses.hpp"
+#include "projection.hpp"
+
+namespace ceres_cal {
+
+constexpr double NO_ANSWER = std::numeric_limits<double>::quiet_NaN();
+
+class Sums {
+  public:
+    Sums(const Optics& optics, const Unknowns& unknowns)
+        : unknowns_(unknowns), shown_(optics),
+          products_(static_cast<size_t>(unknowns.size() + 3) * static_cast<size_t>(unknowns.size() + 3)) {
+        own_.reserve(unknowns.size()), places_.reserve(unknowns.size());
+    }
+
+    // Sum of rho over a sight, NaN where an observation cannot be projected; A is added up in the lower triangle of
+    // `normal`, of the unknowns' size squared.
+    //
+    // newton: whether A takes rho'' along, for a step, or rho' alone, as the weight that each observation has.
+    double normal_equations(int64_t sight, const double* pose, const Points& points, const Curves& curves,
+                            const Loss& loss, bool newton, double* normal) {
+        std::fill_n(normal, static_cast<size_t>(unknowns_.size()) * unknowns_.size(), 0.0);
+        return with_loss(loss.code, [&](auto code) {
+            const Task task{pose, loss, newton, normal};
+            double cost = 0.0;
+            for (int64_t start = points.bounds[sight], end = points.bounds[sight + 1]; start < end && cost == cost;) {
+                const int n = chunk_from(start, end);
+                cost += add_points<decltype(code)::value>(start, n, task, points);
+                start += n;
+            }
+            for (int64_t start = curves.bounds[sight], end = curves.bounds[sight + 1]; start < end && cost == cost;) {
+                const int n = chunk_from(start, end);
+                cost += add_curves<decltype(code)::value>(start, n, task, curves);
+                start += n;
+            }
+            return cost;
+        });
+    }
+
+  private:
+    struct Task {
+        const double* pose;
+        const Loss& loss;
+        bool newton;
+        double* normal;
+    };
+
+    template <LossCode code>
+    double add_points(int64_t start, int n, const Task& task, const Points& points) {
+        if (!shown_.show_points(start, n, task.pose, points)) return NO_ANSWER;
+        choose_rows();
+        const Rows& rows = shown_.rows;
+        const int filled = rows.n;
+        for (int i = 0; i < filled; ++i) {
+            const int64_t j = start + std::min(i, n - 1);
+            weight_[i] = i < n ? points.weights[j] : 0.0;
+            pixel_x_[i] = points.pixels[2 * j], pixel_y_[i] = points.pixels[2 * j + 1];
+        }
+        const Optics& optics = shown_.optics;
+        double *error = rows.x(shown_.last_row), cost = 0.0;
+        each(filled, [&](int i) {
+            const double w = weight_[i], dx = w * (optics.cx + shown_.image.x[i] - pixel_x_[i]);
+            const double dy = w * (optics.cy + optics.aspect * shown_.image.y[i] - pixel_y_[i]);
+            const double squared = dx * dx + dy * dy;
+            const Robust one = robust<code>(task.loss.scale, squared);
+            const double root = std::sqrt(one.slope);
+            cost += one.rho, squared_[i] = squared;
+            factor_[i] = factor_[filled + i] = root * w;
+            error[i] = root * dx, error[filled + i] = root * dy;
+        });
+        const int last = static_cast<int>(own_.size()) - 1;
+        for (int k = 0; k < last; ++k) {
+            double* own = own_[k];
+            each(2 * filled, [=](int i) { own[i] *= factor_[i]; });
+        }
+        if (task.newton) bend_rows<code>(n, 2, task.loss);
+        add_products(2 * filled, task.normal);
+        for (int i = 0; i < n && points.slots != nullptr; ++i) {
+            point_directions(points.bends + (BUILT - 2) * (start + i), directions_);
+            add_structure(i, 2, BUILT, points.slots + BUILT * (start + i), task);
+        }
+        return cost;
+    }
+
+    // One residual each, the distance along the image normal at the foot. By the envelope theorem its derivative is
+    // that of the projected foot with s held, along the normal.
+    template <LossCode code>
+    double add_curves(int64_t start, int n, const Task& task, const Curves& curves) {
+        if (!shown_.show_feet(start, n, task.pose, curves)) return NO_ANSWER;
+        choose_rows();
+        const Rows& rows = shown_.rows;
+        const int filled = rows.n;
+        for (int i = 0; i < filled; ++i) weight_[i] = i < n ? curves.weights[start + i] : 0.0;
+        double *error = rows.x(shown_.last_row), cost = 0.0;
+        each(filled, [&](int i) {
+            const double length = std::sqrt(shown_.length2[i]);
+            const double nx = -shown_.tau_y[i] / length, ny = shown_.tau_x[i] / length;
+            const double e = weight_[i] * (nx * shown_.off_x[i] + ny * shown_.off_y[i]);
+            const Robust one = robust<code>(task.loss.scale, e * e);
+            const double root = std::sqrt(one.slope), factor = root * weight_[i];
+            cost += one.rho, squared_[i] = e * e;
+            factor_[i] = factor * nx, factor_[filled + i] = factor * ny;
+            error[i] = root * e;
+        });
+        const int last = static_cast<int>(own_.size()) - 1;
+        for (int k = 0; k < last; ++k) {
+            double* own = own_[k];
+            each(filled, [=](int i) { own[i] = factor_[i] * own[i] + factor_[filled + i] * own[filled + i]; });
+        }
+        if (task.newton) bend_rows<code>(n, 1, task.loss);
+        add_products(filled, task.normal);
+        for (int i = 0; i < n && curves.slots != nullptr; ++i) {
+            const int64_t k = curves.track[start + i];
+            curve_directions(curves, k, shown_.tangent_x[i], shown_.tangent_y[i], directions_);
+            add_structure(i, 1, ON_TRACK, curves.slots + ON_TRACK * k, task);
+        }
+        return cost;
+    }
+
+    // The chunk's rows that take part, and where they stand in A; what the chunk shows nothing of, most of a lens that
+    // has its numbers place by place, is left out.
+    void choose_rows() {
+        shown_.differentiate(unknowns_.count == 0);
+        own_.clear(), places_.clear();
+        for (int k = 0; k < unknowns_.count; ++k) {
+            if (!shown_.rows.shown[unknowns_.free[k]]) continue;
+            own_.push_back(shown_.rows.x(static_cast<int>(unknowns_.free[k]))), places_.push_back(k);
+        }
+        for (int k = 0; k < 7; ++k)
+            own_.push_back(shown_.rows.x(shown_.pose_row + k)), places_.push_back(unknowns_.shared() + k);
+    }
+
+    // normal += P P^T over the rows' first n places, lower triangle; four rows by three, to read each one less. (Of
+    // more sums at once than the processor has registers for each takes longer.)
+    void add_products(int n, double* normal) {
+        const int count = static_cast<int>(own_.size()), last = count - 1, size = unknowns_.size(), stride = size + 3,
+                  end = n & ~(LANES - 1);
+        for (int k = 0; k < count; k += 4) {
+            const double *a = own_[k], *b = own_[std::min(k + 1, last)], *c = own_[std::min(k + 2, last)],
+                         *d = own_[std::min(k + 3, last)];
+            for (int j = 0; j < std::min(k + 4, count); j += 3) {
+                const double *x = own_[j], *y = own_[std::min(j + 1, last)], *z = own_[std::min(j + 2, last)];
+                double ax = 0.0, ay = 0.0, az = 0.0, bx = 0.0, by = 0.0, bz = 0.0;
+                double cx = 0.0, cy = 0.0, cz = 0.0, dx = 0.0, dy = 0.0, dz = 0.0;
+                for (int i = 0; i < end; ++i) {
+                    ax += a[i] * x[i], ay += a[i] * y[i], az += a[i] * z[i];
+                    bx += b[i] * x[i], by += b[i] * y[i], bz += b[i] * z[i];
+                    cx += c[i] * x[i], cy += c[i] * y[i], cz += c[i] * z[i];
+                    dx += d[i] * x[i], dy += d[i] * y[i], dz += d[i] * z[i];
+                }
+                const double sums[4][3] = {{ax, ay, az}, {bx, by, bz}, {cx, cy, cz}, {dx, dy, dz}};
+                double* first = products_.data() + stride * k + j;
+                for (int row = 0; row < 4; ++row)
+                    for (int column = 0; column < 3; ++column) first[stride * row + column] = sums[row][column];
+            }
+        }
+        for (int k = 0; k < count; ++k) {
+            double* own = normal + size * places_[k];
+            for (int j = 0; j <= k; ++j) own[places_[j]] += products_[stride * k + j];
+        }
+    }
+
+    // Take the second derivative of rho into the rows: Newton's step on the loss, its gradient unchanged.
+    template <LossCode code>
+    void bend_rows(int n, int components, const Loss& loss) {
+        constexpr double FLAT = 0.7, MOSTLY_FLAT = 0.5;  // a bend; share beyond which it says nothing of the minimum
+        if constexpr (code != LossCode::huber && code != LossCode::soft_l1) return;
+        const int filled = shown_.rows.n, last = static_cast<int>(own_.size()) - 1;
+        int flat = 0;
+        for (int i = 0; i < n; ++i) flat += bend(loss, squared_[i]) < FLAT;
+        if (flat > MOSTLY_FLAT * n) return;
+        for (int i = 0; i < n; ++i) {
+            const double left = bend(loss, squared_[i]);
+            if (left == 1.0) continue;
+            double length2 = 0.0;
+            for (int c = 0; c < components; ++c) length2 += own_[last][c * filled + i] * own_[last][c * filled + i];
+            for (int k = 0; k < last; ++k) {
+                double along = 0.0;
+                for (int c = 0; c < components; ++c) along += own_[last][c * filled + i] * own_[k][c * filled + i];
+                for (int c = 0; c < components; ++c)
+                    own_[k][c * filled + i] -= (1.0 - left) * along / length2 * own_[last][c * filled + i];
+            }
+            for (int c = 0; c < components; ++c) own_[last][c * filled + i] /= left;
+        }
+    }
+
+    // The share of the chunk's observation i in the rows of the structure numbers `slots` (-1: none) that move it.
+    //
+    // Moving the target along one of the directions, a slot each, moves the point by R times it in the camera frame:
+    // the pose's translation rows say what that does.
+    void add_structure(int i, int components, int many, const int32_t* slots, const Task& task) {
+        const int filled = shown_.rows.n, count = static_cast<int>(own_.size()), size = unknowns_.size();
+        double column[BUILT][2];
+        for (int a = 0; a < many; ++a) {
+            if (slots[a] < 0) continue;
+            const int place = unknowns_.count + slots[a];
+            for (int c = 0; c < components; ++c) {
+                column[a][c] = 0.0;
+                for (int j = 0; j < 3; ++j) {
+                    double turned = 0.0;
+                    for (int k = 0; k < 3; ++k) turned += task.pose[4 * j + k] * directions_[3 * a + k];
+                    column[a][c] += own_[count - 4 + j][c * filled + i] * turned;
+                }
+            }
+            for (int k = 0; k < count; ++k) {
+                double value = 0.0;
+                for (int c = 0; c < components; ++c) value += column[a][c] * own_[k][c * filled + i];
+                task.normal[size * std::max(place, places_[k]) + std::min(place, places_[k])] += value;
+            }
+            for (int b = 0; b <= a; ++b) {
+                if (slots[b] < 0) continue;
+                const int other = unknowns_.count + slots[b];
+                double value = 0.0;
+                for (int c = 0; c < components; ++c) value += column[a][c] * column[b][c];
+                task.normal[size * std::max(place, other) + std::min(place, other)] += value;
+            }
+        }
+    }
+
+    const Unknowns unknowns_;
+    Projection shown_;
+    Lane weight_, pixel_x_, pixel_y_, squared_;
+    alignas(64) double factor_[2 * CHUNK];
+    double directions_[3 * BUILT];
+    std::vector<double*> own_;
+    std::vector<int> places_;
+    std::vector<double> products_;  // room for three rows and columns more
+};
+
+}  // namespace ceres_cal
