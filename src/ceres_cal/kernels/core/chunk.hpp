@@ -16,7 +16,7 @@
 namespace ceres_cal {
 
 constexpr int CHUNK = 128;  // observations at most: what is worked on stays in the first cache
-constexpr int LANES = 4;   // a chunk is filled up to a multiple of it, by its last observation without a weight
+constexpr int LANES = 4;    // a chunk is filled up to a multiple of it, by its last observation without a weight
 
 struct alignas(64) Lane {
     double value[CHUNK];

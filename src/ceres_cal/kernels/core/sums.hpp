@@ -14,7 +14,8 @@ constexpr double NO_ANSWER = std::numeric_limits<double>::quiet_NaN();
 class Sums {
   public:
     Sums(const Optics& optics, const Unknowns& unknowns)
-        : unknowns_(unknowns), shown_(optics),
+        : unknowns_(unknowns),
+          shown_(optics),
           products_(static_cast<size_t>(unknowns.size() + 3) * static_cast<size_t>(unknowns.size() + 3)) {
         own_.reserve(unknowns.size()), places_.reserve(unknowns.size());
     }
