@@ -88,7 +88,7 @@ def test_a_sigma_that_decides_alone_is_named(factor: float) -> None:
         calibrate(odd, RADIAL)
 
 
-@pytest.mark.parametrize("place_m", [1e6, 1e9])
+@pytest.mark.parametrize("place_m", [1e6, 9e6])
 def test_targets_far_away_are_answered_or_refused(place_m: float) -> None:
     """Points in coordinates of the earth, and boards that look as if they were there."""
     from ceres_cal.scene.targets import custom
@@ -124,7 +124,7 @@ def test_an_image_size_that_no_observation_fills_is_named() -> None:
     ],
 )
 def test_options_of_another_kind_are_refused(given: dict[str, Any]) -> None:
-    with pytest.raises(InputError, match="must be"):
+    with pytest.raises(InputError, match=r"Options\("):
         Options(**given)
 
 

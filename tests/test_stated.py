@@ -96,7 +96,7 @@ def test_a_valley_ends_where_the_prior_does() -> None:
     stated = Information.of_sigmas({KEYS[0]: 20.0, KEYS[2]: 0.5})
     posterior = Posterior(Information(KEYS, np.eye(5)) + stated, profiles={"a": valley}, stated=stated)
     assert np.ptp(posterior.bounds, axis=1)[[0, 2]] == pytest.approx(2.0 * NORMAL_95 * np.array([20.0, 0.5]))
-    back = PosteriorFile.of(posterior).posterior()
+    back = PosteriorFile.of(posterior).posterior(KEYS)
     assert np.array_equal(back.bounds, posterior.bounds) and np.array_equal(back.sd, posterior.sd)
 
 

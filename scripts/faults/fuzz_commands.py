@@ -36,7 +36,7 @@ from ceres_cal.simulate import built_in_scene, load_scene, simulate
 from ceres_cal.simulate.files import scene_to_json
 from faults.fuzz_mutations import NUMBERS, OTHERS, TEXTS, Rng, mutated, one_of, tree_changed, word_changed
 
-DATA = Path(__file__).resolve().parents[1] / "data"
+DATA = Path(__file__).resolve().parents[2] / "data"
 Reader = Callable[[Path], object]
 
 
@@ -332,7 +332,7 @@ PLAUSIBLE: dict[str, tuple[str, ...]] = {
     "--powers": ("2,3", "3", "3,5", "2,3,4,5"),
     "--lens": ("auto", "radial", "brown", "kannala-brandt", "?"),  # a spline takes seconds
     "--terms": ("rational", "prism", "tangential", "surface"),
-    "--jobs": ("1", "-1"),  # processes of their own are another tool's (scripts/week.py)
+    "--jobs": ("1", "-1"),  # processes of their own are another tool's (scripts/faults/week.py)
     "--scheduler": ("tcp://127.0.0.1:1", "x"),
     "--same-frame": ("index", "within:0.01", "left*,right*", "*"),
     "--corner": ("TopLeftCorner=102,88", "CenterMark=10,10"),

@@ -120,6 +120,8 @@ class Options:
                 raise InputError(f"cannot fix {name!r}: {self._which} has {', '.join(names)}")
             if not np.isfinite(value):
                 raise InputError(f"cannot fix {name} at {value}: give a finite number")
+        if self.reject_sigma == np.inf:  # as far as anything counts, which files can hold
+            object.__setattr__(self, "reject_sigma", _SIGMAS[1])
         for name in ("loss_scale", "reject_sigma"):
             if not _SIGMAS[0] <= getattr(self, name) <= _SIGMAS[1]:
                 least, most = _SIGMAS

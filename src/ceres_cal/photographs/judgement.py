@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 
 from ceres_cal.detect.courses import predict
+from ceres_cal.model.ranges import PHI_RANGE
 from ceres_cal.photographs.candidates import FieldSearch
 from ceres_cal.photographs.followed import LEAST_SHARE, Followed
 from ceres_cal.photographs.matching import divergence
 from ceres_cal.photographs.painted import BY_CHANCE
 from ceres_cal.scene.targets import Target
-from ceres_cal.start.initialise import PHI_RANGE
 
 _COURSE_PX = 3.0
 # Of the target: a stroke that lies on it. Wide paint's edge is that far from its middle. Nothing changes from half to
