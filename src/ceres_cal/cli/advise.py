@@ -2,23 +2,23 @@
 
 from __future__ import annotations
 
-from argparse import ArgumentParser, Namespace
 from collections.abc import Iterator
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ceres_cal.base.errors import InputError, naming
 from ceres_cal.cli.arguments import (
-    add_calibration,
-    add_height,
-    add_quiet,
-    add_station,
-    height_m,
+    calibration_argument,
+    height_option,
     length,
+    metres,
     parse_board,
+    station_option,
 )
 from ceres_cal.cli.command import Answer, Command
 from ceres_cal.cli.inputs import read_calibration, station_of
+from ceres_cal.cli.options import Quiet, option
 from ceres_cal.cli.outputs import section, wrapped
 from ceres_cal.cli.progress import progress_bar
 
@@ -26,28 +26,24 @@ if TYPE_CHECKING:
     from ceres_cal.advice import Advice, Measurement, Promise
 
 
-def _add_arguments(parser: ArgumentParser) -> None:
-    add = parser.add_argument
-    add_calibration(parser)
-    add_height(parser, "height of what is to be located; default: 150, a robot's top", 150.0)
-    add_station(parser, "whose map; may be left out where there is only one")
-    add(
-        "--good-enough-mm",
-        type=length("mm"),
-        metavar="MM",
-        help="the worst error that will do; nothing is advised where it is reached",
+@dataclass(frozen=True, kw_only=True)
+class AdviseArguments(Quiet):
+    """What is to be reached, and by which means."""
+
+    calibration: Path = calibration_argument()
+    height_mm: float = height_option("height of what is to be located; default: 150, a robot's top", 150.0)
+    station: str | None = station_option("whose map; may be left out where there is only one")
+    good_enough_mm: float | None = option(
+        "the worst error that will do; nothing is advised where it is reached", "MM", read=length("mm")
     )
-    add(
-        "--board",
-        metavar="COLUMNSxROWSxMM",
-        help="the board that could be shown: inner corners and size of a square, such as 9x6x100; default: the "
+    board: str | None = option(
+        "the board that could be shown: inner corners and size of a square, such as 9x6x100; default: the "
         "calibration's own, or that one",
+        "COLUMNSxROWSxMM",
     )
-    add_quiet(parser)
 
 
-def _run(args: Namespace) -> Answer:
-    height = height_m(args)
+def _run(args: AdviseArguments) -> Answer:
     enough = args.good_enough_mm
     if enough is not None and not enough > 0.0:
         raise InputError(f"--good-enough-mm {enough:g}: give a number of millimetres above 0")
@@ -55,11 +51,11 @@ def _run(args: Namespace) -> Answer:
     from ceres_cal.advice import advise
     from ceres_cal.scene.targets import checkerboard
 
-    calibration = read_calibration(args)
-    station = station_of(args, calibration)
+    calibration = read_calibration(args.calibration)
+    station = station_of(args.calibration, args.station, calibration)
     with naming(args.calibration), progress_bar(args) as bar:
         board = None if shown is None else checkerboard(*shown)
-        advice = advise(calibration, station, height, enough, board, bar.update)
+        advice = advise(calibration, station, metres(args.height_mm), enough, board, bar.update)
     weak = [direction.words for direction in calibration.uncertainty.weak_directions]
     return Answer(_data(advice, weak), lambda: _text(advice, weak))
 
@@ -68,7 +64,7 @@ COMMANDS = (
     Command(
         "advise",
         "what to measure next, and what it would bring in mm",
-        _add_arguments,
+        AdviseArguments,
         _run,
         ("calibration.json --good-enough-mm 2", "calibration.json --board 9x6x50mm --height-mm 150"),
     ),

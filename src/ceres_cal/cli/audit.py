@@ -2,41 +2,47 @@
 
 from __future__ import annotations
 
-from argparse import ArgumentParser, Namespace
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ceres_cal.cli.command import Answer, Command
-from ceres_cal.cli.export import add_format_options, format_options
+from ceres_cal.cli.export import format_options
 from ceres_cal.cli.inputs import read_observations
+from ceres_cal.cli.options import REQUIRED, Arguments, argument, option, options_of
 from ceres_cal.cli.outputs import section, wrapped
 
 if TYPE_CHECKING:
+    from ceres_cal.formats import ImportFormat
     from ceres_cal.moves import StationAudit
 
 
-def _add_arguments(parser: ArgumentParser) -> None:
+@dataclass(frozen=True, kw_only=True)
+class AuditArguments(Arguments):
+    """A calibration, and what is held against it."""
+
+    file: Path = argument("FILE", "a calibration of ours or of another program")
+    form: str | None = option(lambda: f"default: by content; {', '.join(_forms())}", "FORMAT", flags=("--from",))
+    observations: tuple[str, ...] = option("of its stations", "FILE", REQUIRED, repeatable=True)
+    options: Mapping[str, str] = options_of(lambda: _forms().values())
+
+
+def _forms() -> Mapping[str, ImportFormat]:
     from ceres_cal.formats import IMPORT_FORMATS
 
-    parser.add_argument("file", metavar="FILE", type=Path, help="a calibration of ours or of another program")
-    parser.add_argument(
-        "--from", dest="form", metavar="FORMAT", help=f"default: by content; {', '.join(IMPORT_FORMATS)}"
-    )
-    parser.add_argument(
-        "--observations", metavar="FILE", action="append", required=True, help="of its stations; repeatable"
-    )
-    add_format_options(parser, IMPORT_FORMATS.values())
+    return IMPORT_FORMATS
 
 
-def _run(args: Namespace) -> Answer:
+def _run(args: AuditArguments) -> Answer:
     from ceres_cal.calibration import Calibration
-    from ceres_cal.formats import IMPORT_FORMATS, import_calibration
+    from ceres_cal.formats import import_calibration
     from ceres_cal.moves import audit
 
     if args.form is None and args.file.suffix == ".json" and _is_ours(args.file):
         given = Calibration.load(args.file)
     else:
-        given = import_calibration(args.file, args.form, **format_options(args, list(IMPORT_FORMATS.values())))
+        given = import_calibration(args.file, args.form, **format_options(args.options, list(_forms().values())))
     stations = audit(given, read_observations(args.observations))
     trusted = all(one.trusted for one in stations.values())
     data = {"trusted": trusted, "stations": {name: _data(one) for name, one in stations.items()}}
@@ -82,7 +88,7 @@ COMMANDS = (
     Command(
         "audit",
         "may another program's calibration be trusted? exit code 0 yes, 1 no",
-        _add_arguments,
+        AuditArguments,
         _run,
         ("opencv.yml --observations field.json", "geometry.yml --observations field.json --observations more.json"),
     ),

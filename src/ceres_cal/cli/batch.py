@@ -6,19 +6,19 @@ import glob
 import math
 import shlex
 import sys
-from argparse import ArgumentParser, Namespace
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.words import plural
-from ceres_cal.cli.arguments import add_jobs, add_quiet
+from ceres_cal.cli.arguments import jobs_option, output_option
 from ceres_cal.cli.calibrate import COMMANDS as CALIBRATE
 from ceres_cal.cli.check import COMMANDS as CHECK
 from ceres_cal.cli.command import Answer, Command
+from ceres_cal.cli.options import Quiet, argument, option, switch
 from ceres_cal.cli.outputs import section
 from ceres_cal.cli.refit import COMMANDS as REFIT
 
@@ -33,32 +33,27 @@ _EXIT_CODES = {"failed": 3, "no": 1}
 _MOST_REASONS = 4
 
 
-def _add_arguments(parser: ArgumentParser) -> None:
-    add = parser.add_argument
-    add(
-        "plan",
-        type=Path,
-        metavar="PLAN",
-        help="a table (.jsonl, .csv, .toml) with name, command (calibrate, check or refit) and arguments of each job, "
+@dataclass(frozen=True, kw_only=True)
+class BatchArguments(Quiet):
+    """The jobs, and where their results go."""
+
+    plan: Path = argument(
+        "PLAN",
+        "a table (.jsonl, .csv, .toml) with name, command (calibrate, check or refit) and arguments of each job, "
         "files named from its folder; or a folder: each file of observations in it is calibrated, those of a folder "
         "inside it together",
     )
-    add(
-        "-o",
-        "--output",
-        type=Path,
-        required=True,
-        metavar="DIR",
-        help=f"folder for results.jsonl, what jobs write, and {_SUMMARY}; made if missing. Jobs with a result there, "
+    output: Path = output_option(
+        f"results.jsonl, what jobs write, and {_SUMMARY}; made if missing. Jobs with a result there, "
         "and unchanged inputs, are not done again",
+        metavar="DIR",
     )
-    add("--options", default="", metavar="'...'", help="arguments that every calibrate job gets besides")
-    add_jobs(parser, "jobs", 0)
-    add("--reports", action="store_true", help="a report of each calibrate and refit, too")
-    add_quiet(parser)
+    options: str = option("arguments that every calibrate job gets besides", "'...'", "")
+    jobs: int = jobs_option("jobs", 0)
+    reports: bool = switch("a report of each calibrate and refit, too")
 
 
-def _run(args: Namespace) -> Answer:
+def _run(args: BatchArguments) -> Answer:
     from ceres_cal.base.executing import processes
     from ceres_cal.base.files import make_folder, write_bytes
     from ceres_cal.batch import run_jobs
@@ -84,7 +79,7 @@ COMMANDS = (
     Command(
         "batch",
         "many calibrations, checks and refits, resumable, with one page that ranks them",
-        _add_arguments,
+        BatchArguments,
         _run,
         (
             "plan.toml -o results/ --jobs 4",
@@ -134,13 +129,13 @@ def _job(name: str, command: str, arguments: Sequence[str], base: Path, to: Path
 
 
 def _every(value: Any) -> list[Any]:
-    return [] if value is None else list(value) if isinstance(value, list) else [value]
+    return [] if value is None else list(value) if isinstance(value, tuple) else [value]
 
 
 def _written(outputs: Sequence[Path]) -> Iterator[str]:
     """The options for what a job writes: a calibration and, where there is one, a report."""
-    for option, file in zip(("-o", "--report"), outputs, strict=False):
-        yield from (option, str(file))
+    for name, file in zip(("-o", "--report"), outputs, strict=False):
+        yield from (name, str(file))
 
 
 def _files(path: Path) -> list[Path]:
@@ -192,12 +187,12 @@ def _line(outcome: Outcome, number: int, total: int, is_old: bool) -> str:
     return f"{outcome.level:10}{number:{width}} of {total}  {outcome.job}: {outcome.line}{before}"
 
 
-def _data(args: Namespace, outcomes: Sequence[Outcome], again: int) -> dict[str, Any]:
+def _data(args: BatchArguments, outcomes: Sequence[Outcome], again: int) -> dict[str, Any]:
     ranked = sorted(outcomes, key=lambda one: one.order)
     return {"jobs": [asdict(one) for one in ranked], "from_before": again, "output": str(args.output / _SUMMARY)}
 
 
-def _text(args: Namespace, outcomes: Sequence[Outcome], again: int) -> str:
+def _text(args: BatchArguments, outcomes: Sequence[Outcome], again: int) -> str:
     count = Counter(one.level for one in outcomes)
     levels = ", ".join(f"{count[level]} {level}" for level in ("good", "care", "no", "failed") if count[level])
     before = f"; {again} from before" if again else ""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from argparse import ArgumentParser, Namespace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,8 +11,9 @@ from ceres_cal.base.errors import InputError
 from ceres_cal.cli.arguments import parse_names, parse_number
 from ceres_cal.cli.command import Answer, Command
 from ceres_cal.cli.inputs import read_calibration, read_observations
+from ceres_cal.cli.options import option
 from ceres_cal.cli.outputs import section
-from ceres_cal.cli.photographs import add_inputs, photographs_data, photographs_in, photographs_text
+from ceres_cal.cli.photographs import Seen, photographs_data, photographs_in, photographs_text
 from ceres_cal.cli.progress import progress_bar
 from ceres_cal.scene.heights import at_height
 
@@ -21,47 +22,51 @@ if TYPE_CHECKING:
     from ceres_cal.photographs import KnownDetections
 
 
-def _add_arguments(parser: ArgumentParser) -> None:
-    add_inputs(parser)
-    parser.add_argument(
-        "--false-alarms",
-        default="0.01",
-        metavar="SHARE",
-        help="how often unmoved cameras may be said to have moved, such as 0.01 or 1%%; default: 0.01",
+def _share(text: str) -> float:
+    where = f"--false-alarms {text!r}"
+    value = parse_number(text.rstrip("%"), where) / (100.0 if text.endswith("%") else 1.0)
+    if not 0.0 < value < 1.0:
+        raise InputError(f"{where}: give a share between 0 and 1, such as 0.01")
+    return value
+
+
+@dataclass(frozen=True, kw_only=True)
+class CheckArguments(Seen):
+    """What is held against a calibration, and how sure the answer is to be."""
+
+    false_alarms: float = option(
+        "how often unmoved cameras may be said to have moved, such as 0.01 or 1%", "SHARE", 0.01, read=_share
     )
-    parser.add_argument(
-        "--checks",
-        type=int,
-        default=1,
-        metavar="N",
-        help="that is at least once in N checks of this calibration: 720 for an hourly check over a month; default: 1",
+    checks: int = option(
+        "that is at least once in N checks of this calibration: 720 for an hourly check over a month", "N", 1
     )
 
 
-def _run(args: Namespace) -> Answer:
-    level = _share(args.false_alarms)
+def _run(args: CheckArguments) -> Answer:
     images = photographs_in(args)
     detections = None
     if images:
-        answer, detections = _photographed(args, images, level)
+        answer, detections = _photographed(args, images)
     else:
         from ceres_cal.moves import check
 
-        answer = check(read_calibration(args), read_observations(args.inputs), level, args.checks)
+        answer = check(
+            read_calibration(args.calibration), read_observations(args.inputs), args.false_alarms, args.checks
+        )
     data = _data(answer) | photographs_data(detections)
     return Answer(data, lambda: _text(answer, detections), 0 if answer.holds else 1)
 
 
-def _photographed(args: Namespace, images: list[Path], level: float) -> tuple[Check, KnownDetections]:
+def _photographed(args: CheckArguments, images: list[Path]) -> tuple[Check, KnownDetections]:
     from ceres_cal.photographs import check_photographs
 
-    calibration, not_painted = read_calibration(args), parse_names(args.not_painted)
+    calibration, not_painted = read_calibration(args.calibration), parse_names(args.not_painted)
     with progress_bar(args) as bar:
         return check_photographs(
             calibration,
             images,
             args.station,
-            level,
+            args.false_alarms,
             checks=args.checks,
             not_painted=not_painted,
             progress=bar.update,
@@ -72,19 +77,11 @@ COMMANDS = (
     Command(
         "check",
         "does a calibration still hold? exit code 0 yes, 1 no",
-        _add_arguments,
+        CheckArguments,
         _run,
         ("calibration.json now.png", "calibration.json incoming/ --checks 720 --json"),
     ),
 )
-
-
-def _share(text: str) -> float:
-    where = f"--false-alarms {text!r}"
-    value = parse_number(text.rstrip("%"), where) / (100.0 if text.endswith("%") else 1.0)
-    if not 0.0 < value < 1.0:
-        raise InputError(f"{where}: give a share between 0 and 1, such as 0.01")
-    return value
 
 
 def _data(answer: Check) -> dict[str, Any]:

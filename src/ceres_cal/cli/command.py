@@ -12,6 +12,7 @@ from typing import Any, NoReturn
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.words import printable, sentence
 from ceres_cal.cli.colour import coloured, in_colour
+from ceres_cal.cli.options import Arguments, add_options, filled
 
 
 class Parser(argparse.ArgumentParser):
@@ -47,22 +48,22 @@ class Command:
     Attributes:
         name: as it is typed, such as "detect board".
         summary: one line for the help.
-        add_arguments: adds the command's own; --json comes from here.
-        run: does the work; raises CalibrationError.
+        arguments: the frozen dataclass of what it takes.
+        run: does the work with one; raises CalibrationError.
         examples: of its use, without "ceres-cal" and the name, for the help.
     """
 
     name: str
     summary: str
-    add_arguments: Callable[[argparse.ArgumentParser], None]
-    run: Callable[[argparse.Namespace], Answer]
+    arguments: type[Arguments]
+    run: Callable[[Any], Answer]
     examples: tuple[str, ...] = ()
 
-    def parse(self, arguments: Sequence[str]) -> argparse.Namespace:
-        """The command's options; InputError for wrong usage. Positional arguments may stand between options."""
+    def parse(self, arguments: Sequence[str]) -> Any:
+        """What is typed, as `arguments`; InputError for wrong usage. Positional ones may stand between options."""
         parser = Parser(**self.about, prog=f"ceres-cal {self.name}")
         self.fill(parser)
-        return parser.parse_intermixed_args(arguments)
+        return filled(self.arguments, parser.parse_intermixed_args(arguments))
 
     @property
     def about(self) -> dict[str, Any]:
@@ -76,8 +77,7 @@ class Command:
 
     def fill(self, parser: argparse.ArgumentParser) -> None:
         """Add all of its arguments to a parser."""
-        self.add_arguments(parser)
-        parser.add_argument("--json", action="store_true", help="print one JSON object")
+        add_options(parser, self.arguments)
         parser.add_argument("--version", action="store_true", help="print the version, and those of the libraries")
 
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from argparse import ArgumentParser, Namespace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ceres_cal.base.errors import InputError
-from ceres_cal.cli.arguments import add_height, add_station, height_m
+from ceres_cal.cli.arguments import height_option, metres, station_option
 from ceres_cal.cli.command import Answer, Command
+from ceres_cal.cli.options import Arguments, argument, option, switch
 from ceres_cal.cli.outputs import finishing, require_output, section
 
 if TYPE_CHECKING:
@@ -19,29 +20,30 @@ if TYPE_CHECKING:
 _COLUMNS, _ROWS = 9, 7
 
 
-def _add_arguments(parser: ArgumentParser) -> None:
-    add = parser.add_argument
-    add("a", metavar="A", type=Path, help="one calibration")
-    add("b", metavar="B", type=Path, help="the other")
-    add_height(parser, "of the map above the floor; default: 0")
-    add_station(parser, "only this one; default: all that both have")
-    add("--picture", metavar="SVG", type=Path, help="draw the map there (of one station)")
-    add("--over-image", action="store_true", help="intrinsics, over the image in px; default where there is no field")
-    add("--without-turn", action="store_true", help="the same without the turn that brings them nearest to each other")
+@dataclass(frozen=True, kw_only=True)
+class CompareArguments(Arguments):
+    """Two calibrations, and where to compare them."""
+
+    a: Path = argument("A", "one calibration")
+    b: Path = argument("B", "the other")
+    height_mm: float | None = height_option("of the map above the floor; default: 0")
+    station: str | None = station_option("only this one; default: all that both have")
+    picture: Path | None = option("draw the map there (of one station)", "SVG")
+    over_image: bool = switch("intrinsics, over the image in px; default where there is no field")
+    without_turn: bool = switch("the same without the turn that brings them nearest to each other")
 
 
-def _run(args: Namespace) -> Answer:
+def _run(args: CompareArguments) -> Answer:
     require_output(args.picture, [args.a, args.b])
-    height = height_m(args)
     from ceres_cal.calibration import Calibration
 
     first, second = Calibration.load(args.a), Calibration.load(args.b)
     if args.over_image or args.without_turn or all(target.movable for target in first.targets.values()):
         return _over_image(args, first, second)
-    return _over_field(args, first, second, height)
+    return _over_field(args, first, second)
 
 
-def _over_image(args: Namespace, first: Calibration, second: Calibration) -> Answer:
+def _over_image(args: CompareArguments, first: Calibration, second: Calibration) -> Answer:
     if args.picture is not None or args.station is not None:
         raise InputError("--picture and --station are for maps of a field: leave them out where images are compared")
     from ceres_cal.moves import compare_cameras
@@ -51,11 +53,11 @@ def _over_image(args: Namespace, first: Calibration, second: Calibration) -> Ans
     return Answer(data, lambda: "\n".join(map(_camera_text, comparisons)))
 
 
-def _over_field(args: Namespace, first: Calibration, second: Calibration, height: float) -> Answer:
+def _over_field(args: CompareArguments, first: Calibration, second: Calibration) -> Answer:
     from ceres_cal.base.files import write_bytes
     from ceres_cal.moves import compare
 
-    comparisons = compare(first, second, height, args.station)
+    comparisons = compare(first, second, metres(args.height_mm), args.station)
     if args.picture is not None:
         if len(comparisons) > 1:
             names = " or ".join(one.station for one in comparisons)
@@ -73,7 +75,7 @@ COMMANDS = (
     Command(
         "compare",
         "where two calibrations differ, on the field in mm or over the image in px",
-        _add_arguments,
+        CompareArguments,
         _run,
         ("old.json new.json --height-mm 150", "old.json new.json --over-image --without-turn"),
     ),

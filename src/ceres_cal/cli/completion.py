@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import argparse
-from argparse import ArgumentParser, Namespace
+from argparse import ArgumentParser
 from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.cli.command import Answer, Command, Parser
+from ceres_cal.cli.options import Arguments, argument
 
-_SHELLS = ("bash", "zsh", "tcsh")
 _FILE = {"bash": "_shtab_compgen_files", "zsh": "_files", "tcsh": "f"}
 _EXAMPLES = (
     "bash > ~/.local/share/bash-completion/completions/ceres-cal",
@@ -17,11 +19,14 @@ _EXAMPLES = (
 )
 
 
-def _add_arguments(parser: ArgumentParser) -> None:
-    parser.add_argument("shell", choices=_SHELLS, help="whose; what is printed goes into a file that it reads")
+@dataclass(frozen=True, kw_only=True)
+class CompletionArguments(Arguments):
+    """Whose."""
+
+    shell: Literal["bash", "zsh", "tcsh"] = argument("SHELL", "whose; what is printed goes into a file that it reads")
 
 
-def _run(args: Namespace) -> Answer:
+def _run(args: CompletionArguments) -> Answer:
     try:
         import shtab
     except ImportError:
@@ -52,6 +57,6 @@ def whole_parser(commands: Mapping[str, Command]) -> ArgumentParser:
 
 COMMANDS = (
     Command(
-        "completion", "what a shell needs to complete commands, options and files", _add_arguments, _run, _EXAMPLES
+        "completion", "what a shell needs to complete commands, options and files", CompletionArguments, _run, _EXAMPLES
     ),
 )

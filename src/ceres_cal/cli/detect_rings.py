@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from argparse import ArgumentParser, Namespace
+from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from ceres_cal.base.errors import InputError
-from ceres_cal.cli.arguments import add_detection, parse_length, parse_lengths
+from ceres_cal.cli.arguments import Detecting, parse_length, parse_lengths
 from ceres_cal.cli.command import Answer, Command
 from ceres_cal.cli.detection import detected
+from ceres_cal.cli.options import REQUIRED, argument, option
 from ceres_cal.cli.outputs import finishing, require_observations_output
 
 if TYPE_CHECKING:
@@ -18,25 +19,25 @@ if TYPE_CHECKING:
 _MOST_RINGS = 10_000
 
 
-def _add_arguments(parser: ArgumentParser) -> None:
-    add = parser.add_argument
-    add("image", metavar="IMAGE", help="photograph of the rings, taken about from the front")
-    add(
-        "--radii",
-        required=True,
-        metavar="M,M,...",
-        help="radii in metres of all edges between dark and bright, from the inside out; FROM:TO:STEP for even ones, "
+@dataclass(frozen=True, kw_only=True)
+class RingsArguments(Detecting):
+    """A photograph of rings, and the rings."""
+
+    image: str = argument("IMAGE", "photograph of the rings, taken about from the front")
+    radii: str = option(
+        "radii in metres of all edges between dark and bright, from the inside out; FROM:TO:STEP for even ones, "
         "such as 0.01:0.36:0.01",
+        "M,M,...",
+        REQUIRED,
     )
-    add_detection(parser)
 
 
-def _run(args: Namespace) -> Answer:
+def _run(args: RingsArguments) -> Answer:
     require_observations_output(args.output, [args.image])
     radii = _radii(args.radii)
     from ceres_cal.detect.rings import detect_rings
 
-    detection = detected(args, partial(detect_rings, args.image, radii, args.camera, args.station))
+    detection = detected(args.timeout, partial(detect_rings, args.image, radii, args.camera, args.station))
     with finishing():
         detection.observations.save(args.output)
     data = _data(detection, args, len(radii))
@@ -47,7 +48,7 @@ COMMANDS = (
     Command(
         "detect rings",
         "edges of concentric rings in a photograph",
-        _add_arguments,
+        RingsArguments,
         _run,
         ("rings.png --radii 10mm:360mm:10mm -o rings.json",),
     ),
@@ -67,7 +68,7 @@ def _radii(text: str) -> tuple[float, ...]:
     return tuple(first + i * step for i in range(round((last - first) / step) + 1))
 
 
-def _data(detection: RingsDetection, args: Namespace, given: int) -> dict[str, Any]:
+def _data(detection: RingsDetection, args: RingsArguments, given: int) -> dict[str, Any]:
     a1, a2, a3 = detection.polynomial.tolist()
     return {
         "image": args.image,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from argparse import Namespace
 from collections.abc import Callable
 from typing import TypeVar
 
@@ -12,13 +11,13 @@ from ceres_cal.base.native import interruptibly
 _T = TypeVar("_T")
 
 
-def detected(args: Namespace, detect: Callable[[], _T]) -> _T:
+def detected(timeout: float | None, detect: Callable[[], _T]) -> _T:
     """What `detect` returns; InputError where it takes longer than --timeout."""
-    if args.timeout is not None and not args.timeout > 0.0:
-        raise InputError(f"--timeout must be above 0 seconds, not {args.timeout:g}")
+    if timeout is not None and not timeout > 0.0:
+        raise InputError(f"--timeout must be above 0 seconds, not {timeout:g}")
     try:
-        return interruptibly(detect, args.timeout)
+        return interruptibly(detect, timeout)
     except TimeoutError:
         raise InputError(
-            f"--timeout: not done after {args.timeout:g} s, nothing was written: give fewer images, or more time"
+            f"--timeout: not done after {timeout:g} s, nothing was written: give fewer images, or more time"
         ) from None

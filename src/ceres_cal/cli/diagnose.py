@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
-from argparse import ArgumentParser, Namespace
+from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ceres_cal.base.errors import InputError
-from ceres_cal.cli.arguments import add_calibration, add_jobs, add_output, add_quiet, add_report, parse_number
+from ceres_cal.cli.arguments import (
+    Reporting,
+    calibration_argument,
+    jobs_option,
+    observations_argument,
+    output_option,
+    parse_number,
+)
 from ceres_cal.cli.command import Answer, Command
 from ceres_cal.cli.inputs import read_calibration, read_observations
+from ceres_cal.cli.options import option, switch
 from ceres_cal.cli.outputs import report_page, report_photographs, require_ending, require_outputs, write_results
 from ceres_cal.cli.progress import progress_bar
 
@@ -16,39 +25,32 @@ if TYPE_CHECKING:
     from ceres_cal.diagnostics import Diagnosis
 
 
-def _add_arguments(parser: ArgumentParser) -> None:
-    add_calibration(parser)
-    add = parser.add_argument
-    add("observations", nargs="+", metavar="OBS", help="the observations it was made from, in the same order")
-    add_output(parser, "the residual of every observation (.csv, .json or .npz)", required=False)
-    add_report(parser)
-    add("--new-data", action="store_true", help="the observations are others than those it was made from")
-    add(
-        "--held-out",
-        action="store_true",
-        help="also calibrate with other powers or coefficients, on some frames to predict the others, and say which "
+@dataclass(frozen=True, kw_only=True)
+class DiagnoseArguments(Reporting):
+    """A calibration, observations, and how they are tested."""
+
+    calibration: Path = calibration_argument()
+    observations: tuple[str, ...] = observations_argument("the observations it was made from, in the same order")
+    output: Path | None = output_option("the residual of every observation (.csv, .json or .npz)", None)
+    new_data: bool = switch("the observations are others than those it was made from")
+    held_out: bool = switch(
+        "also calibrate with other powers or coefficients, on some frames to predict the others, and say which "
         "lens predicts best",
     )
-    add_quiet(parser)
-    add("--strict", action="store_true", help="exit with 1 for any finding, also one that does no harm")
-    add("--folds", type=int, default=5, metavar="K", help="parts into which frames go for --held-out; default: 5")
-    add_jobs(parser, "folds, for --held-out,", 1)
-    add(
-        "--false-alarms",
-        default="0.01",
-        metavar="P",
-        help="probability of any finding where nothing is wrong; default: 0.01",
-    )
+    strict: bool = switch("exit with 1 for any finding, also one that does no harm")
+    folds: int = option("parts into which frames go for --held-out", "K", 5)
+    jobs: int = jobs_option("folds, for --held-out,", 1)
+    false_alarms: str = option("probability of any finding where nothing is wrong", "P", "0.01")
 
 
-def _run(args: Namespace) -> Answer:
+def _run(args: DiagnoseArguments) -> Answer:
     rate = _require_fitting(args)
     from ceres_cal.base.executing import processes
     from ceres_cal.cli.diagnosis import diagnosis_data, diagnosis_text
     from ceres_cal.diagnostics import diagnose
     from ceres_cal.diagnostics.held_out import choose
 
-    calibration, observations = read_calibration(args), read_observations(args.observations)
+    calibration, observations = read_calibration(args.calibration), read_observations(args.observations)
     photographs = report_photographs(args, observations)
     diagnosis = diagnose(calibration, observations, new_data=args.new_data, false_alarm_rate=rate)
     choice = None
@@ -69,7 +71,7 @@ COMMANDS = (
     Command(
         "diagnose",
         "what the residuals say: faults by name, noise, outliers",
-        _add_arguments,
+        DiagnoseArguments,
         _run,
         (
             "calibration.json field.json board.json",
@@ -87,7 +89,7 @@ def _is_no(diagnosis: Diagnosis, *, strict: bool) -> bool:
     return bool(against or diagnosis.conflicts)
 
 
-def _require_fitting(args: Namespace) -> float:
+def _require_fitting(args: DiagnoseArguments) -> float:
     """The rate of false alarms; InputError for options that do not fit."""
     require_outputs(args, [args.calibration, *args.observations])
     require_ending(args.output, "the table is", ".csv", ".json", ".npz")

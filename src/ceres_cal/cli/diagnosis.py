@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from argparse import Namespace
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict
@@ -12,6 +11,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.words import chance, plural
+from ceres_cal.cli.arguments import Reporting
 from ceres_cal.cli.outputs import WIDTH, section, wrapped, written, written_data
 from ceres_cal.diagnostics import Diagnosis, Finding, Noise, ResidualTable, Summary
 from ceres_cal.diagnostics.held_out import Choice, HeldOut
@@ -25,7 +25,7 @@ _MODEL_ERROR = (
 )
 
 
-def diagnosis_data(diagnosis: Diagnosis, choice: Choice | None, args: Namespace) -> dict[str, Any]:
+def diagnosis_data(diagnosis: Diagnosis, choice: Choice | None, args: Reporting) -> dict[str, Any]:
     """Everything but the table of single observations, for --json."""
     summaries = diagnosis.summaries
     return {
@@ -55,7 +55,7 @@ def _choice_data(choice: Choice) -> dict[str, Any]:
     }
 
 
-def diagnosis_text(diagnosis: Diagnosis, choice: Choice | None, args: Namespace) -> str:
+def diagnosis_text(diagnosis: Diagnosis, choice: Choice | None, args: Reporting) -> str:
     """A page: the verdict, the findings by size, then tables."""
     table, summaries = diagnosis.table, diagnosis.summaries
     sections = [section("verdict", wrapped(*_verdict(diagnosis)))]

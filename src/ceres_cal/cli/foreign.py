@@ -2,45 +2,54 @@
 
 from __future__ import annotations
 
-from argparse import ArgumentParser, Namespace
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ceres_cal.base.errors import InputError
-from ceres_cal.cli.arguments import add_calibration, add_output, length
+from ceres_cal.cli.arguments import calibration_argument, length, output_option
 from ceres_cal.cli.command import Answer, Command
-from ceres_cal.cli.export import add_format_options, format_options, losses_text
+from ceres_cal.cli.export import format_options, listed, losses_text
 from ceres_cal.cli.inputs import read_calibration
+from ceres_cal.cli.options import Arguments, argument, option, options_of, switch
 from ceres_cal.cli.outputs import finishing, require_output, section
 
 if TYPE_CHECKING:
-    from ceres_cal.formats import Group
+    from ceres_cal.formats import Group, ImportFormat
     from ceres_cal.scene.targets import Target
 
 
 # ---- import ---------------------------------------------------------------------------------------------------------
 
 
-def _add_import(parser: ArgumentParser) -> None:
+@dataclass(frozen=True, kw_only=True)
+class ImportArguments(Arguments):
+    """A file of another program."""
+
+    file: Path = argument("FILE", "of another program")
+    form: str | None = option(
+        lambda: f"default: by ending and content. {listed(_forms().values())}", "FORMAT", flags=("--from",)
+    )
+    output: Path = output_option("the calibration or the observations (.json; observations also .npz)")
+    options: Mapping[str, str] = options_of(lambda: _forms().values())
+
+
+def _forms() -> Mapping[str, ImportFormat]:
     from ceres_cal.formats import IMPORT_FORMATS
 
-    forms = IMPORT_FORMATS.values()
-    listed = "; ".join(f"{one.name}: {one.description} ({', '.join(one.endings) or 'a folder'})" for one in forms)
-    parser.add_argument("file", metavar="FILE", type=Path, help="of another program")
-    parser.add_argument("--from", dest="form", metavar="FORMAT", help=f"default: by ending and content. {listed}")
-    add_output(parser, "the calibration or the observations (.json; observations also .npz)", required=True)
-    add_format_options(parser, forms)
+    return IMPORT_FORMATS
 
 
-def _import(args: Namespace) -> Answer:
-    from ceres_cal.formats import IMPORT_FORMATS, read_foreign
+def _import(args: ImportArguments) -> Answer:
+    from ceres_cal.formats import read_foreign
     from ceres_cal.observations import Observations
 
     require_output(args.output, [args.file])
-    if args.form is not None and args.form not in IMPORT_FORMATS:
-        raise InputError(f"there is no format {args.form!r} to read: choose one of {', '.join(IMPORT_FORMATS)}")
-    forms = list(IMPORT_FORMATS.values()) if args.form is None else [IMPORT_FORMATS[args.form]]
-    given = read_foreign(args.file, args.form, **format_options(args, forms))
+    if args.form is not None and args.form not in _forms():
+        raise InputError(f"there is no format {args.form!r} to read: choose one of {', '.join(_forms())}")
+    forms = list(_forms().values()) if args.form is None else [_forms()[args.form]]
+    given = read_foreign(args.file, args.form, **format_options(args.options, forms))
     with finishing():
         given.save(args.output)
     if isinstance(given, Observations):
@@ -59,41 +68,41 @@ def _import(args: Namespace) -> Answer:
 # ---- over the network -----------------------------------------------------------------------------------------------
 
 
-def _add_group(parser: ArgumentParser) -> None:
-    add = parser.add_argument
-    add("--address", default="224.5.23.2", metavar="IP", help="multicast group; default: 224.5.23.2")
-    add("--port", type=int, default=10006, metavar="PORT", help="default: 10006")
-    add("--interface", default="0.0.0.0", metavar="IP", help="of the own network card; default: the system's choice")
+@dataclass(frozen=True, kw_only=True)
+class GroupArguments(Arguments):
+    """Where the league's messages are."""
+
+    address: str = option("multicast group", "IP", "224.5.23.2")
+    port: int = option("", "PORT", 10006)
+    interface: str = option("of the own network card; default: the system's choice", "IP", "0.0.0.0")
 
 
-def _group(args: Namespace) -> Group:
+def _group(args: GroupArguments) -> Group:
     from ceres_cal.formats import Group
 
     return Group(args.address, args.port, args.interface)
 
 
-def _add_publish(parser: ArgumentParser) -> None:
-    add_calibration(parser)
-    add = parser.add_argument
-    add("--station", metavar="NAME", action="append", help="default: all; repeatable")
-    add("--camera-id", default="", metavar="ID,...", help="of the stations; default: the number that each name ends in")
-    add("--geometry", metavar="FILE", type=Path, help="with the field, and other cameras: .pb or geometry.yml")
-    add("--once", action="store_true", help="one packet, not one every 3 s until Ctrl-C")
-    add(
-        "--max-loss-mm",
-        type=length("mm"),
-        metavar="MM",
-        help="refuse what the message would get wrong by more on the field",
+@dataclass(frozen=True, kw_only=True)
+class PublishArguments(GroupArguments):
+    """What is sent, and how often."""
+
+    calibration: Path = calibration_argument()
+    station: tuple[str, ...] = option("default: all", "NAME", repeatable=True)
+    camera_id: str = option("of the stations; default: the number that each name ends in", "ID,...", "")
+    geometry: Path | None = option("with the field, and other cameras: .pb or geometry.yml", "FILE")
+    once: bool = switch("one packet, not one every 3 s until Ctrl-C")
+    max_loss_mm: float | None = option(
+        "refuse what the message would get wrong by more on the field", "MM", read=length("mm")
     )
-    _add_group(parser)
 
 
-def _publish(args: Namespace) -> Answer:
+def _publish(args: PublishArguments) -> Answer:
     from ceres_cal.base.files import read_bytes
     from ceres_cal.formats import publish, ssl_packet
 
     before = None if args.geometry is None else read_bytes(args.geometry)
-    packet, exported = ssl_packet(read_calibration(args), args.station, args.camera_id, before)
+    packet, exported = ssl_packet(read_calibration(args.calibration), args.station or None, args.camera_id, before)
     exported.require_loss_mm(args.max_loss_mm)
     sent = publish(packet, _group(args), 1 if args.once else None)
     words = f"{exported.words}, {len(packet)} bytes, {sent} times to {args.address}:{args.port}"
@@ -104,13 +113,15 @@ def _publish(args: Namespace) -> Answer:
     return Answer(data, lambda: "\n".join([section("published", [words]), *losses_text(exported)]))
 
 
-def _add_listen(parser: ArgumentParser) -> None:
-    add_output(parser, "the field as a target (.json), or the whole geometry (.pb, .yml)", required=True)
-    parser.add_argument("--seconds", type=float, default=10.0, metavar="S", help="how long to wait; default: 10")
-    _add_group(parser)
+@dataclass(frozen=True, kw_only=True)
+class ListenArguments(GroupArguments):
+    """What is written, and how long to wait for it."""
+
+    output: Path = output_option("the field as a target (.json), or the whole geometry (.pb, .yml)")
+    seconds: float = option("how long to wait", "S", 10.0)
 
 
-def _listen(args: Namespace) -> Answer:
+def _listen(args: ListenArguments) -> Answer:
     from ceres_cal.formats import geometry_content, received_geometry, ssl_target
 
     require_output(args.output, [])
@@ -131,12 +142,15 @@ def _listen(args: Namespace) -> Answer:
 # ---- targets --------------------------------------------------------------------------------------------------------
 
 
-def _add_targets_import(parser: ArgumentParser) -> None:
-    parser.add_argument("file", metavar="FILE", type=Path, help="geometry.yml, a packet (.pb), or robocup-ssl.xml")
-    add_output(parser, "the target (.json), as `detect field --target` takes it", required=True)
+@dataclass(frozen=True, kw_only=True)
+class TargetsImportArguments(Arguments):
+    """A file with a field in it."""
+
+    file: Path = argument("FILE", "geometry.yml, a packet (.pb), or robocup-ssl.xml")
+    output: Path = output_option("the target (.json), as `detect field --target` takes it")
 
 
-def _targets_import(args: Namespace) -> Answer:
+def _targets_import(args: TargetsImportArguments) -> Answer:
     from ceres_cal.formats import read_ssl_target
 
     require_output(args.output, [args.file])
@@ -156,28 +170,28 @@ COMMANDS = (
     Command(
         "import",
         "a calibration, or observations, out of a file of another program",
-        _add_import,
+        ImportArguments,
         _import,
         ("camera.yml -o calibration.json", "corners.csv --from csv -o observations.json"),
     ),
     Command(
         "publish",
         "send a calibration to those who see the field, by the league's multicast",
-        _add_publish,
+        PublishArguments,
         _publish,
         ("calibration.json --camera-id 0", "calibration.json --geometry geometry.yml --once"),
     ),
     Command(
         "listen",
         "the field, or all geometry, out of the league's multicast",
-        _add_listen,
+        ListenArguments,
         _listen,
         ("-o field.json", "-o geometry.yml --seconds 30"),
     ),
     Command(
         "targets import",
         "a field out of ssl-vision's or vision-processor's files",
-        _add_targets_import,
+        TargetsImportArguments,
         _targets_import,
         ("geometry.yml -o field.json",),
     ),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import glob
 import os
-from argparse import Namespace
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -99,11 +98,11 @@ def require_different(files: Iterable[str | Path]) -> None:
         given.add(place)
 
 
-def read_calibration(args: Namespace) -> Calibration:
-    """The calibration that `add_calibration` names."""
+def read_calibration(path: Path) -> Calibration:
+    """The calibration of a file."""
     from ceres_cal.calibration import Calibration
 
-    return Calibration.load(args.calibration)
+    return Calibration.load(path)
 
 
 def read_observations(paths: Iterable[str]) -> Observations:
@@ -113,11 +112,9 @@ def read_observations(paths: Iterable[str]) -> Observations:
     return combine([Observations.load(path) for path in paths])
 
 
-def station_of(args: Namespace, calibration: Calibration) -> str:
-    """Name of the station in --station, or of the only one there is."""
-    if args.station is None and len(calibration.stations) > 1:
-        raise InputError(
-            f"{args.calibration} has several stations, name one: --station {' or '.join(calibration.stations)}"
-        )
-    calibration.station(args.station)  # or says which there are
-    return args.station or next(iter(calibration.stations))
+def station_of(path: Path, station: str | None, calibration: Calibration) -> str:
+    """Name of the station in --station, or of the only one there is in a calibration out of a file."""
+    if station is None and len(calibration.stations) > 1:
+        raise InputError(f"{path} has several stations, name one: --station {' or '.join(calibration.stations)}")
+    calibration.station(station)  # or says which there are
+    return station or next(iter(calibration.stations))

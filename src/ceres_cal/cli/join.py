@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from argparse import ArgumentParser, Namespace
 from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ceres_cal.cli.arguments import add_output
+from ceres_cal.cli.arguments import observations_argument, output_option
 from ceres_cal.cli.command import Answer, Command
 from ceres_cal.cli.inputs import read_observations, require_different
+from ceres_cal.cli.options import Arguments, option
 from ceres_cal.cli.outputs import finishing, require_observations_output, section, wrapped
 
 if TYPE_CHECKING:
@@ -16,18 +18,20 @@ if TYPE_CHECKING:
     from ceres_cal.start.same_labels import Labels
 
 
-def _add_arguments(parser: ArgumentParser) -> None:
-    parser.add_argument("observations", nargs="+", metavar="OBS", help="files of observations, of all cameras")
-    parser.add_argument(
-        "--same-frame",
-        metavar="RULE",
-        help="which frames are one moment: 'left*,right*' (what * stands for names it), index (the n-th of each "
+@dataclass(frozen=True, kw_only=True)
+class JoinArguments(Arguments):
+    """What goes together."""
+
+    observations: tuple[str, ...] = observations_argument("files of observations, of all cameras")
+    same_frame: str | None = option(
+        "which frames are one moment: 'left*,right*' (what * stands for names it), index (the n-th of each "
         "camera), or within:0.01 (frames are named by time stamps); default: those of one name",
+        "RULE",
     )
-    add_output(parser, "the joined observations (.json or .npz)", required=True)
+    output: Path = output_option("the joined observations (.json or .npz)")
 
 
-def _run(args: Namespace) -> Answer:
+def _run(args: JoinArguments) -> Answer:
     require_different(args.observations)
     require_observations_output(args.output, args.observations)
     observations = read_observations(args.observations)
@@ -46,7 +50,7 @@ COMMANDS = (
     Command(
         "join",
         "a rig's observations as one: same frames, same labels",
-        _add_arguments,
+        JoinArguments,
         _run,
         ("left.json right.json --same-frame 'left*,right*' -o rig.json",),
     ),
@@ -61,7 +65,7 @@ def _moments(observations: Observations) -> Counter[int]:
     return Counter(len(seen) for seen in cameras.values())
 
 
-def _data(labels: Labels, args: Namespace) -> dict[str, Any]:
+def _data(labels: Labels, args: JoinArguments) -> dict[str, Any]:
     return {
         "output": str(args.output),
         "moments_by_cameras": {str(count): number for count, number in sorted(_moments(labels.observations).items())},
@@ -70,7 +74,7 @@ def _data(labels: Labels, args: Namespace) -> dict[str, Any]:
     }
 
 
-def _text(labels: Labels, args: Namespace) -> str:
+def _text(labels: Labels, args: JoinArguments) -> str:
     by_count = sorted(_moments(labels.observations).items(), reverse=True)
     rule = "of one name" if args.same_frame is None else f"by {args.same_frame!r}"
     moments = ", ".join(f"{number} seen by {count} camera{'s' * (count > 1)}" for count, number in by_count)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from argparse import ArgumentParser
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,16 +15,6 @@ if TYPE_CHECKING:
     from ceres_cal.detect.median import Merged
 
 _MOST_NAMED = 3
-
-
-def add_median(parser: ArgumentParser) -> None:
-    """The option --median."""
-    parser.add_argument(
-        "--median",
-        action="store_true",
-        help="one picture of all of them (25 at most, evenly), as of a video always: robots and people, who are "
-        "elsewhere in each, are gone; what is blurred, or taken after the camera was moved, is left out and named",
-    )
 
 
 def median_path(output: Path, inputs: Sequence[Path]) -> Path:

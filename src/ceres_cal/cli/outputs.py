@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import signal
 import threading
-from argparse import Namespace
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,6 +12,7 @@ from textwrap import wrap
 from typing import TYPE_CHECKING
 
 from ceres_cal.base.errors import InputError
+from ceres_cal.cli.arguments import Reporting
 from ceres_cal.cli.inputs import image_files
 from ceres_cal.cli.progress import progress_bar
 
@@ -50,13 +50,13 @@ def wrapped(*texts: str) -> list[str]:
     return [line for text in texts for line in wrap(text, WIDTH)]
 
 
-def written(args: Namespace) -> list[str]:
+def written(args: Reporting) -> list[str]:
     """The section that names the files which were asked for, or none."""
     files = [str(path) for path in (args.output, args.report) if path is not None]
     return [section("written", files)] if files else []
 
 
-def written_data(args: Namespace) -> dict[str, str | None]:
+def written_data(args: Reporting) -> dict[str, str | None]:
     """The same for --json."""
     paths = {"output": args.output, "report": args.report}
     return {name: None if path is None else str(path) for name, path in paths.items()}
@@ -90,7 +90,7 @@ def require_ending(path: Path | None, what: str, *endings: str) -> None:
         raise InputError(f"{path}: {what} written as {known}: give one of these endings")
 
 
-def require_outputs(args: Namespace, inputs: Sequence[str | Path]) -> None:
+def require_outputs(args: Reporting, inputs: Sequence[str | Path]) -> None:
     """`require_output` of output and report, and that they are two files."""
     require_output(args.output, inputs)
     require_output(args.report, inputs)
@@ -116,14 +116,14 @@ def finishing() -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def write_results(args: Namespace, save: Callable[[Path], None], page: str | None) -> None:
+def write_results(args: Reporting, save: Callable[[Path], None], page: str | None) -> None:
     """Write what was asked for: the output by `save`, and the page of the report."""
     from ceres_cal.base.files import write_bytes
 
     with finishing():
         if args.output is not None:
             save(args.output)
-        if page is not None:
+        if page is not None and args.report is not None:
             write_bytes(args.report, page.encode())
 
 
@@ -131,7 +131,7 @@ def write_results(args: Namespace, save: Callable[[Path], None], page: str | Non
 
 
 def report_photographs(
-    args: Namespace, observations: Observations, before: Calibration | None = None, detected_in: Sequence[Path] = ()
+    args: Reporting, observations: Observations, before: Calibration | None = None, detected_in: Sequence[Path] = ()
 ) -> FramePhotographs | None:
     """The photographs of `--report PAGE --images FOLDER` that belong to the observations' frames; None without any.
 
@@ -161,7 +161,7 @@ def report_photographs(
 
 
 def report_page(
-    args: Namespace,
+    args: Reporting,
     calibration: Calibration,
     observations: Observations,
     photographs: FramePhotographs | None,

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from argparse import ArgumentParser, Namespace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.words import plural
-from ceres_cal.cli.arguments import add_calibration, add_quiet, add_station
+from ceres_cal.cli.arguments import calibration_argument, not_painted_option, station_option
 from ceres_cal.cli.inputs import image_files, require_different
+from ceres_cal.cli.options import Quiet, argument
 from ceres_cal.cli.outputs import section
 
 if TYPE_CHECKING:
@@ -18,23 +19,19 @@ if TYPE_CHECKING:
 _OBSERVATIONS = (".json", ".npz")
 
 
-def add_inputs(parser: ArgumentParser) -> None:
+@dataclass(frozen=True, kw_only=True)
+class Seen(Quiet):
     """A calibration, files of observations or photographs, and what is to be said of photographs."""
-    add_calibration(parser, "the calibration from before")
-    parser.add_argument(
-        "inputs",
-        nargs="+",
-        metavar="OBS|IMAGE",
-        help="files of new observations (.json, .npz), taken together; or photographs, or folders of them",
+
+    calibration: Path = calibration_argument("the calibration from before")
+    inputs: tuple[str, ...] = argument(
+        "OBS|IMAGE", "files of new observations (.json, .npz), taken together; or photographs, or folders of them"
     )
-    add_station(parser, "station that took the photographs; default: the only one")
-    parser.add_argument(
-        "--not-painted", default="", metavar="NAME,...", help="lines that the photographed field does not have"
-    )
-    add_quiet(parser)
+    station: str | None = station_option("station that took the photographs; default: the only one")
+    not_painted: str = not_painted_option("lines that the photographed field does not have")
 
 
-def photographs_in(args: Namespace) -> list[Path]:
+def photographs_in(args: Seen) -> list[Path]:
     """The photographs that are named, each once; none where observations are."""
     observed = [name for name in args.inputs if Path(name).suffix.lower() in _OBSERVATIONS]
     if len(observed) == len(args.inputs):

@@ -5,10 +5,11 @@ from __future__ import annotations
 import os
 import sys
 import time
-from argparse import Namespace
 from collections.abc import Callable
 from types import TracebackType
 from typing import TextIO
+
+from ceres_cal.cli.options import Quiet
 
 _REDRAW_S = 0.1
 _FIRST_LINE_S = 3.0  # where there is no terminal; each further line waits twice as long
@@ -16,7 +17,7 @@ _BAR_COLUMNS = 24
 _CLEAR = "\r\x1b[K"
 
 
-def progress_bar(args: Namespace) -> ProgressBar:
+def progress_bar(args: Quiet) -> ProgressBar:
     """The bar of a command: nothing with --quiet or --json."""
     return ProgressBar(silent=args.quiet or args.json)
 

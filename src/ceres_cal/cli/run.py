@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shlex
-from argparse import ArgumentParser, Namespace
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,15 +11,22 @@ from typing import Any
 from ceres_cal.base.errors import InputError, NothingShownError
 from ceres_cal.base.words import plural
 from ceres_cal.cli.advise import COMMANDS as ADVISE
-from ceres_cal.cli.arguments import add_prior, add_quiet, parse_board
+from ceres_cal.cli.arguments import (
+    estimate_option,
+    frames_option,
+    not_painted_option,
+    output_option,
+    parse_board,
+    prior_option,
+)
 from ceres_cal.cli.calibrate import COMMANDS as CALIBRATE
 from ceres_cal.cli.command import Answer, Command
 from ceres_cal.cli.detect import COMMANDS as DETECT_BOARD
 from ceres_cal.cli.detect_field import COMMANDS as DETECT_FIELD
-from ceres_cal.cli.estimate import add_estimate
 from ceres_cal.cli.export import COMMANDS as EXPORT
-from ceres_cal.cli.frames import add_frames, frames_of_videos
+from ceres_cal.cli.frames import frames_of_videos
 from ceres_cal.cli.inputs import IMAGE_ENDINGS, images_and_videos
+from ceres_cal.cli.options import Quiet, argument, option
 from ceres_cal.cli.outputs import section, sections_of
 from ceres_cal.cli.progress import progress_bar
 
@@ -28,25 +34,24 @@ _SHOWN = ("fit", "lens", "located", "widened", "weak", "unknown", "warning", "ve
 _MOST_NAMES = 3
 
 
-def _add_arguments(parser: ArgumentParser) -> None:
-    add = parser.add_argument
-    add("images", nargs="+", metavar="IMAGE", help="photographs of one camera, a folder of them, or a video")
-    add("-o", "--output", metavar="FOLDER", type=Path, required=True, help="for everything that is made")
-    add("--target", metavar="TARGET", help="the field: its name, such as ssl-b, or a file, as of `detect field`")
-    add("--facing", metavar="NAME=SIDE", action="append", default=[], help="which way round it is, likewise")
-    add("--not-painted", metavar="NAME,...", help="lines that this field does not have")
-    add(
-        "--board",
-        metavar="COLUMNSxROWSxMM",
-        help="a chessboard by its inner corners and the side of a square, such as 9x6x25mm",
+@dataclass(frozen=True, kw_only=True)
+class RunArguments(Quiet):
+    """What there is, and what is to come of it."""
+
+    images: tuple[str, ...] = argument("IMAGE", "photographs of one camera, a folder of them, or a video")
+    output: Path = output_option("everything that is made", metavar="FOLDER")
+    target: str | None = option("the field: its name, such as ssl-b, or a file, as of `detect field`", "TARGET")
+    facing: tuple[str, ...] = option("which way round it is, likewise", "NAME=SIDE", repeatable=True)
+    not_painted: str = not_painted_option("lines that this field does not have")
+    board: str | None = option(
+        "a chessboard by its inner corners and the side of a square, such as 9x6x25mm", "COLUMNSxROWSxMM"
     )
-    add("--lens", metavar="KIND", default="auto", help="as of `calibrate`; default: auto")
-    add_prior(parser)
-    add_estimate(parser)
-    add("--camera", default="camera", metavar="NAME", help="name of the camera; default: camera")
-    add("--to", metavar="FORMAT", action="append", default=[], help="export it, too, as of `export`; repeatable")
-    add_frames(parser)
-    add_quiet(parser)
+    lens: str = option("as of `calibrate`", "KIND", "auto")
+    prior: tuple[str, ...] = prior_option()
+    estimate: tuple[str, ...] = estimate_option()
+    camera: str = option("name of the camera", "NAME", "camera")
+    to: tuple[str, ...] = option("export it, too, as of `export`", "FORMAT", repeatable=True)
+    frames: int = frames_option()
 
 
 @dataclass(frozen=True)
@@ -58,7 +63,7 @@ class _Step:
     data: dict[str, Any]
 
 
-def _run(args: Namespace) -> Answer:
+def _run(args: RunArguments) -> Answer:
     if args.target is None and args.board is None:
         raise InputError("say what the photographs show: --target ssl-b, --board 9x6x25mm, or both")
     if args.board is not None:
@@ -87,7 +92,7 @@ COMMANDS = (
     Command(
         "run",
         "from photographs or a video to a calibration, its report and its exports",
-        _add_arguments,
+        RunArguments,
         _run,
         (
             "photographs/ --target ssl-b --facing LeftGoalLine=top --board 9x6x25mm -o camera/",
@@ -101,7 +106,7 @@ COMMANDS = (
 # ---- the steps ------------------------------------------------------------------------------------------------------
 
 
-def _step(args: Namespace, command: Command, arguments: Sequence[str], most: int | None = None) -> _Step:
+def _step(args: RunArguments, command: Command, arguments: Sequence[str], most: int | None = None) -> _Step:
     """Run a command and keep the first lines of what it says, and the images that showed nothing."""
     quiet = ["--quiet"] if (args.quiet or args.json) and command is not EXPORT[0] else []
     answer = command.run(command.parse([*arguments, *quiet]))
@@ -114,15 +119,15 @@ def _typed(command: Command, arguments: Sequence[str]) -> str:
     return shlex.join(["ceres-cal", *command.name.split(), *arguments])
 
 
-def _photographs(args: Namespace) -> list[Path]:
+def _photographs(args: RunArguments) -> list[Path]:
     """The photographs that were given, and those taken out of a video."""
     images, videos = images_and_videos(args.images)
     with progress_bar(args) as bar:
-        images += frames_of_videos(args, videos, args.output, bar)
+        images += frames_of_videos(videos, args.frames, args.output, bar)
     return images
 
 
-def _observed(args: Namespace, images: list[Path]) -> Iterator[_Step]:
+def _observed(args: RunArguments, images: list[Path]) -> Iterator[_Step]:
     """Boards first; what shows none may show the field."""
     rest = [str(path) for path in images]
     if args.board is not None:
@@ -150,7 +155,7 @@ def _observed(args: Namespace, images: list[Path]) -> Iterator[_Step]:
         yield _step(args, DETECT_FIELD[0], asked, most=1)
 
 
-def _calibrated(args: Namespace, detected: Sequence[dict[str, Any]]) -> _Step:
+def _calibrated(args: RunArguments, detected: Sequence[dict[str, Any]]) -> _Step:
     observations = [data["output"] for data in detected]
     stretched = ["--free-aspect"] if any(data.get("stretched") for data in detected) else []
     priors = [word for prior in args.prior for word in ("--prior", prior)]
@@ -159,7 +164,7 @@ def _calibrated(args: Namespace, detected: Sequence[dict[str, Any]]) -> _Step:
     return replace(step, lines=tuple(sections_of("\n".join(step.lines), _SHOWN)))
 
 
-def _exported(args: Namespace, form: str, goal: str) -> _Step:
+def _exported(args: RunArguments, form: str, goal: str) -> _Step:
     """The step of an export, without data where the format cannot hold the calibration."""
     arguments = [str(args.output / "calibration.json"), "--to", form, "-o", goal]
     try:
@@ -171,7 +176,7 @@ def _exported(args: Namespace, form: str, goal: str) -> _Step:
 # ---- for people -----------------------------------------------------------------------------------------------------
 
 
-def _text(args: Namespace, images: Sequence[Path], steps: Sequence[_Step], level: str) -> str:
+def _text(args: RunArguments, images: Sequence[Path], steps: Sequence[_Step], level: str) -> str:
     parts = [section("read", [f"{plural(len(images), 'photograph')} in {', '.join(args.images[:_MOST_NAMES])}"])]
     for number, step in enumerate(steps, start=1):
         parts += ["", section(f"step {number}", [_short(step.command)]), *step.lines]
@@ -181,7 +186,7 @@ def _text(args: Namespace, images: Sequence[Path], steps: Sequence[_Step], level
     return "\n".join(parts)
 
 
-def _made(args: Namespace, steps: Sequence[_Step]) -> set[str]:
+def _made(args: RunArguments, steps: Sequence[_Step]) -> set[str]:
     files = {str(step.data[name]) for step in steps for name in ("output", "report") if step.data.get(name)}
     return {str(Path(path).relative_to(args.output)) for path in files}
 

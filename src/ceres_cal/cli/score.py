@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from argparse import ArgumentParser, Namespace
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ceres_cal.cli.arguments import add_calibration
+from ceres_cal.cli.arguments import Loss, calibration_argument, observations_argument
 from ceres_cal.cli.command import Answer, Command
 from ceres_cal.cli.inputs import read_calibration, read_observations, require_different
+from ceres_cal.cli.options import Arguments, option, switch
 from ceres_cal.cli.outputs import section
 
 if TYPE_CHECKING:
@@ -17,32 +18,30 @@ if TYPE_CHECKING:
 _MOST_VIEWS = 3  # shown
 
 
-def _add_arguments(parser: ArgumentParser) -> None:
-    add_calibration(parser)
-    add = parser.add_argument
-    add("observations", nargs="+", metavar="OBS", help="files of new observations (.json or .npz), taken together")
-    add(
-        "--hold-stations",
-        action="store_true",
-        help="stations stand where the calibration has them, boards alone are posed: tests the poses of a rig, too",
+@dataclass(frozen=True, kw_only=True)
+class ScoreArguments(Arguments):
+    """A calibration, new observations, and how they are weighed."""
+
+    calibration: Path = calibration_argument()
+    observations: tuple[str, ...] = observations_argument("files of new observations (.json or .npz), taken together")
+    hold_stations: bool = switch(
+        "stations stand where the calibration has them, boards alone are posed: tests the poses of a rig, too",
     )
-    add("--loss", choices=("trivial", "huber", "soft_l1", "cauchy", "tukey"), help="default: the calibration's")
-    add(
-        "--reject-sigma",
-        type=float,
-        metavar="SIGMA",
-        help="observations farther off do not take part; default: the calibration's. inf keeps all, and with --loss "
+    loss: Loss | None = option("default: the calibration's")
+    reject_sigma: float | None = option(
+        "observations farther off do not take part; default: the calibration's. inf keeps all, and with --loss "
         "trivial the rms is the one that other programs state",
+        "SIGMA",
     )
 
 
-def _run(args: Namespace) -> Answer:
+def _run(args: ScoreArguments) -> Answer:
     require_different(args.observations)
     from dataclasses import replace
 
     from ceres_cal.moves import score
 
-    calibration = read_calibration(args)
+    calibration = read_calibration(args.calibration)
     asked = {name: value for name in ("loss", "reject_sigma") if (value := getattr(args, name)) is not None}
     options = replace(calibration.options, **asked)
     observations = read_observations(args.observations)
@@ -54,7 +53,7 @@ COMMANDS = (
     Command(
         "score",
         "how well a calibration predicts new boards or fields: intrinsics held",
-        _add_arguments,
+        ScoreArguments,
         _run,
         ("calibration.json new.json", "rig.json boards.json --hold-stations --loss trivial --reject-sigma inf"),
     ),

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from argparse import ArgumentParser, Namespace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.words import plural
-from ceres_cal.cli.arguments import add_quiet
+from ceres_cal.cli.arguments import output_option
 from ceres_cal.cli.command import Answer, Command
+from ceres_cal.cli.options import Quiet, argument, option, switch
 from ceres_cal.cli.outputs import finishing
 from ceres_cal.cli.progress import progress_bar
 
@@ -17,21 +18,20 @@ if TYPE_CHECKING:
     from ceres_cal.simulate import Simulation
 
 
-def _add_arguments(parser: ArgumentParser) -> None:
-    add = parser.add_argument
-    add("scene", nargs="?", metavar="SCENE", help="name of a built-in scene, or a scene file (.json)")
-    add("-o", "--output", metavar="DIR", type=Path, help="folder for observations.json and truth.json; made if missing")
-    add("--seed", type=int, default=0, metavar="N", help="the same seed gives the same observations; default: 0")
-    add(
-        "--images",
-        choices=("png", "jpg"),
-        help="take photographs too, into photographs/ beside the observations; what robots hide there is not observed",
+@dataclass(frozen=True, kw_only=True)
+class SimulateArguments(Quiet):
+    """A scene, and where its observations go."""
+
+    scene: str | None = argument("SCENE", "name of a built-in scene, or a scene file (.json)", None)
+    output: Path | None = output_option("observations.json and truth.json; made if missing", None, "DIR")
+    seed: int = option("the same seed gives the same observations", "N", 0)
+    images: Literal["png", "jpg"] | None = option(
+        "take photographs too, into photographs/ beside the observations; what robots hide there is not observed"
     )
-    add_quiet(parser)
-    add("--list", action="store_true", help="list the built-in scenes")
+    list: bool = switch("list the built-in scenes")
 
 
-def _run(args: Namespace) -> Answer:
+def _run(args: SimulateArguments) -> Answer:
     from ceres_cal.simulate import built_in_scene, load_scene, scene_names, simulate, write_simulation
 
     scenes = scene_names()
@@ -69,7 +69,7 @@ COMMANDS = (
     Command(
         "simulate",
         "make observations of a scene, with noise and errors, and their truth",
-        _add_arguments,
+        SimulateArguments,
         _run,
         ("ssl-field -o try/", "photographs -o try/ --images png --seed 3", "--list"),
     ),

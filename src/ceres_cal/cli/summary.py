@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from argparse import Namespace
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
@@ -13,6 +12,7 @@ import numpy as np
 from ceres_cal.base.transforms import euler_from_rotation
 from ceres_cal.base.words import at_precision, bounds_text, plural, two_digits
 from ceres_cal.calibration import Calibration
+from ceres_cal.cli.arguments import Reporting
 from ceres_cal.cli.outputs import section, wrapped, written, written_data
 from ceres_cal.model.parameters import Options, anchored_stations
 from ceres_cal.observations import Observations
@@ -35,7 +35,7 @@ _PHI_FROM = {
 }
 
 
-def calibration_data(quality: Quality, inputs: Sequence[str], args: Namespace) -> dict[str, Any]:
+def calibration_data(quality: Quality, inputs: Sequence[str], args: Reporting) -> dict[str, Any]:
     """Everything, for --json."""
     calibration, observations, judged = quality.calibration, quality.observations, judge_quality(quality)
     findings = () if quality.diagnosis is None else quality.diagnosis.findings
@@ -58,7 +58,7 @@ def calibration_data(quality: Quality, inputs: Sequence[str], args: Namespace) -
     }
 
 
-def calibration_text(quality: Quality, inputs: Sequence[str], args: Namespace) -> str:
+def calibration_text(quality: Quality, inputs: Sequence[str], args: Reporting) -> str:
     """A short table for people; the verdict comes last."""
     calibration, observations = quality.calibration, quality.observations
     anchored = anchored_stations(observations)

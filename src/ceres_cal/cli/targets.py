@@ -2,37 +2,40 @@
 
 from __future__ import annotations
 
-from argparse import ArgumentParser, Namespace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ceres_cal.base.errors import InputError
-from ceres_cal.cli.arguments import add_output
+from ceres_cal.cli.arguments import output_option
 from ceres_cal.cli.command import Answer, Command
 from ceres_cal.cli.inputs import spelled_target
+from ceres_cal.cli.options import Arguments, argument, option
 from ceres_cal.cli.outputs import finishing, require_ending, require_output, section
 
 if TYPE_CHECKING:
     from ceres_cal.scene.targets import Curve, Target, TargetKind
 
 
-def _add_arguments(parser: ArgumentParser) -> None:
+def _help() -> str:
     from ceres_cal.scene.targets import TARGET_KINDS, targets_by_name
 
-    parser.add_argument(
-        "target",
-        nargs="?",
-        metavar="TARGET",
-        help=f"list the features of a kind ({', '.join(TARGET_KINDS)}), of {' or '.join(targets_by_name())}, of one "
+    return (
+        f"list the features of a kind ({', '.join(TARGET_KINDS)}), of {' or '.join(targets_by_name())}, of one "
         "that is spelled out as in files ('{\"kind\": ...}'), or of the targets in a file of observations; without it "
-        "the kinds are listed",
-    )
-    parser.add_argument(
-        "--picture", metavar="SVG", type=Path, help="draw the target there, with the names of its lines"
+        "the kinds are listed"
     )
 
 
-def _run(args: Namespace) -> Answer:
+@dataclass(frozen=True, kw_only=True)
+class TargetsArguments(Arguments):
+    """What to list."""
+
+    target: str | None = argument("TARGET", _help, None)
+    picture: Path | None = option("draw the target there, with the names of its lines", "SVG")
+
+
+def _run(args: TargetsArguments) -> Answer:
     from ceres_cal.scene.targets import TARGET_KINDS
 
     if args.picture is not None:
@@ -63,12 +66,15 @@ def _draw(targets: dict[str, Target], wanted: str, picture: Path) -> None:
         write_bytes(picture, content)
 
 
-def _add_print(parser: ArgumentParser) -> None:
-    parser.add_argument("target", metavar="BOARD", help='as `ceres-cal targets` has it, or {"kind": ...} as in files')
-    add_output(parser, "the sheet (.pdf)", required=True)
+@dataclass(frozen=True, kw_only=True)
+class PrintArguments(Arguments):
+    """What to print."""
+
+    target: str = argument("BOARD", 'as `ceres-cal targets` has it, or {"kind": ...} as in files')
+    output: Path = output_option("the sheet (.pdf)")
 
 
-def _print(args: Namespace) -> Answer:
+def _print(args: PrintArguments) -> Answer:
     require_output(args.output, [])
     require_ending(args.output, "sheets are", ".pdf")
     import json
@@ -90,14 +96,14 @@ COMMANDS = (
     Command(
         "targets",
         "the kinds of targets and the names of their features",
-        _add_arguments,
+        TargetsArguments,
         _run,
         ("", "vss-3 --picture vss-3.svg", "observations.json"),
     ),
     Command(
         "targets print",
         "a board as a PDF to print to scale, with a ruler on it",
-        _add_print,
+        PrintArguments,
         _print,
         ('\'{"kind": "checkerboard", "columns": 9, "rows": 6, "square_m": 0.025}\' -o board.pdf',),
     ),

@@ -2,26 +2,26 @@
 
 from __future__ import annotations
 
-from argparse import ArgumentParser, Namespace
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.words import frame_of
 from ceres_cal.cli.arguments import (
-    add_calibration,
-    add_height,
-    add_quiet,
-    add_station,
-    height_m,
+    calibration_argument,
+    height_option,
     length,
+    metres,
+    output_option,
     parse_lengths,
     parse_number,
+    station_option,
 )
 from ceres_cal.cli.command import Answer, Command
 from ceres_cal.cli.inputs import image_files, read_calibration
+from ceres_cal.cli.options import Quiet, argument, flag, option, switch
 from ceres_cal.cli.outputs import finishing
 from ceres_cal.cli.progress import progress_bar
 
@@ -34,49 +34,52 @@ if TYPE_CHECKING:
 _MARGIN_M = 0.3  # around the field in a top view
 _JPEG_QUALITY = 95
 _FORMAT, _VERSION = "ceres-cal/pictures", 1
+_STRAIGHT = "straight images (default)"
+_TOP = "the field from above"
+_OVERLAY = "the model in the photograph"
 _OF_STRAIGHT = ("whole", "crop", "size", "phi", "angle")
 _OF_TOP = ("mm_per_px", "area")
 _OF_OVERLAY = ("before", "observations")
 
 
-def _add_arguments(parser: ArgumentParser) -> None:
-    add = parser.add_argument
-    add_calibration(parser)
-    add("images", nargs="+", metavar="IMAGE", help="photographs of one camera, or folders of them")
-    add("-o", "--output", metavar="FOLDER", type=Path, required=True, help="for the pictures; made if missing")
-    add("--camera", metavar="NAME", help="which camera; may be left out where there is only one")
-    add_station(parser)
-    add("--format", choices=("png", "jpg"), default="png", help="default: png, which loses nothing")
-    add_quiet(parser)
-    group = parser.add_argument_group("straight images (default)")
-    either = group.add_mutually_exclusive_group()
-    either.add_argument("--crop", action="store_true", help="the largest rectangle without black (default)")
-    either.add_argument("--whole", action="store_true", help="everything that the photograph shows, black around it")
-    scale = group.add_mutually_exclusive_group()
-    scale.add_argument("--size", metavar="WxH", help="size of the straight image, px; default: the photograph's")
-    scale.add_argument("--phi", metavar="PX", help="its focal length instead; the camera's own keeps the scale")
-    group.add_argument(
-        "--angle", metavar="DEG", help="widest angle of view; default: 150 with --whole, else as far as detail goes"
+@dataclass(frozen=True, kw_only=True)
+class UndistortArguments(Quiet):
+    """Photographs, and what is made of each."""
+
+    calibration: Path = calibration_argument()
+    images: tuple[str, ...] = argument("IMAGE", "photographs of one camera, or folders of them")
+    output: Path = output_option("the pictures; made if missing", metavar="FOLDER")
+    camera: str | None = option("which camera; may be left out where there is only one", "NAME")
+    station: str | None = station_option()
+    format: Literal["png", "jpg"] = option("default: png, which loses nothing", default="png")
+    crop: bool = switch("the largest rectangle without black (default)", group=_STRAIGHT, alone="shape")
+    whole: bool = switch("everything that the photograph shows, black around it", group=_STRAIGHT, alone="shape")
+    size: str | None = option(
+        "size of the straight image, px; default: the photograph's", "WxH", group=_STRAIGHT, alone="scale"
     )
-    group = parser.add_argument_group("the field from above")
-    group.add_argument("--top-view", action="store_true", help="the field from straight above, to scale")
-    group.add_argument("--mm-per-px", type=length("mm"), metavar="MM", help="scale of the top view; default: 5")
-    group.add_argument("--area", metavar="X0,Y0,X1,Y1", help="area in metres; default: the field and 0.3 m around it")
-    group = parser.add_argument_group("the model in the photograph")
-    group.add_argument("--overlay", action="store_true", help="draw the calibrated lines and boards into photographs")
-    group.add_argument("--before", metavar="CALIBRATION", type=Path, help="draw an earlier calibration too")
-    group.add_argument("--observations", metavar="OBS", type=Path, help="say what each frame shows, and draw them too")
-    add_height(parser, "plane of the top view, or of a second drawing in an overlay")
+    phi: str | None = option(
+        "its focal length instead; the camera's own keeps the scale", "PX", group=_STRAIGHT, alone="scale"
+    )
+    angle: str | None = option(
+        "widest angle of view; default: 150 with --whole, else as far as detail goes", "DEG", group=_STRAIGHT
+    )
+    top_view: bool = switch("the field from straight above, to scale", group=_TOP)
+    mm_per_px: float | None = option("scale of the top view; default: 5", "MM", read=length("mm"), group=_TOP)
+    area: str | None = option("area in metres; default: the field and 0.3 m around it", "X0,Y0,X1,Y1", group=_TOP)
+    overlay: bool = switch("draw the calibrated lines and boards into photographs", group=_OVERLAY)
+    before: Path | None = option("draw an earlier calibration too", "CALIBRATION", group=_OVERLAY)
+    observations: Path | None = option("say what each frame shows, and draw them too", "OBS", group=_OVERLAY)
+    height_mm: float | None = height_option("plane of the top view, or of a second drawing in an overlay")
 
 
-def _run(args: Namespace) -> Answer:
+def _run(args: UndistortArguments) -> Answer:
     require_fitting(args)
     images = image_files(args.images)
     kind = "top" if args.top_view else "overlay" if args.overlay else "straight"
     outputs = _outputs(images, args.output, f"-{kind}.{args.format}", f"{kind}.json")
     from ceres_cal.base.files import write_json
 
-    calibration = read_calibration(args)
+    calibration = read_calibration(args.calibration)
     make = {"top": _top_view, "overlay": _overlay, "straight": _straight}[kind](args, calibration)
     args.output.mkdir(parents=True, exist_ok=True)
     lines: list[str] = []
@@ -101,7 +104,7 @@ COMMANDS = (
     Command(
         "undistort",
         "straight images, top views to scale, the model in a photograph",
-        _add_arguments,
+        UndistortArguments,
         _run,
         (
             "calibration.json photographs/ -o straight/",
@@ -115,7 +118,7 @@ COMMANDS = (
 # ---- options --------------------------------------------------------------------------------------------------------
 
 
-def require_fitting(args: Namespace) -> None:
+def require_fitting(args: UndistortArguments) -> None:
     """Raise InputError where options of different pictures are mixed."""
     if args.top_view and args.overlay:
         raise InputError("--top-view and --overlay are two kinds of pictures: make one at a time")
@@ -128,7 +131,7 @@ def require_fitting(args: Namespace) -> None:
     for names, chosen, what in groups:
         given = [name for name in names if getattr(args, name) not in (None, False)]
         if given and not chosen:
-            raise InputError(f"--{given[0].replace('_', '-')} is for {what}: leave it out, or ask for that")
+            raise InputError(f"{flag(given[0])} is for {what}: leave it out, or ask for that")
 
 
 def _outputs(images: list[Path], folder: Path, ending: str, about: str) -> dict[Path, Path]:
@@ -161,7 +164,7 @@ def _area(text: str) -> tuple[float, float, float, float]:
     return numbers[0], numbers[1], numbers[2], numbers[3]
 
 
-def _station(args: Namespace, calibration: Calibration) -> str:
+def _station(args: UndistortArguments, calibration: Calibration) -> str:
     """The station that took the photographs; --camera is enough where it stood at one only."""
     stations = calibration.estimate.stations
     if args.station is not None:
@@ -174,13 +177,14 @@ def _station(args: Namespace, calibration: Calibration) -> str:
         if args.station in (None, name) and args.camera in (None, station.camera)
     ]
     if not fitting:
-        raise InputError(f"station {args.station!r} is of camera {stations[args.station].camera!r}: leave out --camera")
+        owner = stations[str(args.station)].camera
+        raise InputError(f"station {args.station!r} is of camera {owner!r}: leave out --camera")
     if len(fitting) > 1:
         raise InputError(f"there are several stations, name one: --station {' or '.join(fitting)}")
     return fitting[0]
 
 
-def _camera(args: Namespace, calibration: Calibration) -> tuple[str, str | None, Camera]:
+def _camera(args: UndistortArguments, calibration: Calibration) -> tuple[str, str | None, Camera]:
     """Names of the camera and of its station, where that is one, and the camera, posed in that case."""
     owners = {name: station.camera for name, station in calibration.estimate.stations.items()}
     wanted = set(calibration.cameras) if args.camera is None else {args.camera}
@@ -219,7 +223,7 @@ def _write(path: Path, picture: Image) -> None:
         write_bytes(path, content)
 
 
-def _straight(args: Namespace, calibration: Calibration) -> _PictureMaker:
+def _straight(args: UndistortArguments, calibration: Calibration) -> _PictureMaker:
     from ceres_cal.pictures.straight import straighten
     from ceres_cal.scene.files import camera_to_json
 
@@ -272,14 +276,14 @@ def _black(size: tuple[int, int], count: int) -> str:
     return "nothing black" if count == 0 else f"{count} px ({100.0 * count / (size[0] * size[1]):.1f} %) black"
 
 
-def _top_view(args: Namespace, calibration: Calibration) -> _PictureMaker:
+def _top_view(args: UndistortArguments, calibration: Calibration) -> _PictureMaker:
     from ceres_cal.pictures.top_view import make_grid, top_view
 
     station = _station(args, calibration)
     camera, name = calibration.stations[station], calibration.estimate.stations[station].camera
     area = _field(calibration) if args.area is None else _area(args.area)
     mm_per_px = 5.0 if args.mm_per_px is None else args.mm_per_px
-    grid = make_grid(area, mm_per_px / 1000.0, height_m(args))
+    grid = make_grid(area, mm_per_px / 1000.0, metres(args.height_mm))
     warp = top_view(camera, grid)
     x0, y0, x1, y1 = grid.area_m
     facts = {
@@ -313,13 +317,13 @@ def _field(calibration: Calibration) -> tuple[float, float, float, float]:
     return x0, y0, x1, y1
 
 
-def _overlay(args: Namespace, calibration: Calibration) -> _PictureMaker:
+def _overlay(args: UndistortArguments, calibration: Calibration) -> _PictureMaker:
     from ceres_cal.calibration import Calibration as File
     from ceres_cal.observations import Observations
     from ceres_cal.pictures.frames import Frame, frame_by_name, frames_of, marks_of, model_of
     from ceres_cal.pictures.overlay import AFTER, BEFORE, LIFTED, Layer, draw_overlay
 
-    station, height = _station(args, calibration), height_m(args)
+    station, height = _station(args, calibration), metres(args.height_mm)
     camera, name = calibration.stations[station], calibration.estimate.stations[station].camera
     before = None if args.before is None else File.load(args.before)
     observations = None if args.observations is None else Observations.load(args.observations)
@@ -327,7 +331,7 @@ def _overlay(args: Namespace, calibration: Calibration) -> _PictureMaker:
 
     def layers(frame: Frame) -> Iterator[Layer]:
         if before is not None:
-            yield Layer(model_of(before, frame), f"before: {args.before.name}", BEFORE)
+            yield Layer(model_of(before, frame), f"before: {Path(args.before or '').name}", BEFORE)
         if height:
             yield Layer(model_of(calibration, frame, height), f"{1e3 * height:g} mm above", LIFTED)
         yield Layer(model_of(calibration, frame), args.calibration.name, AFTER)
