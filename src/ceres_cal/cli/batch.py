@@ -8,24 +8,22 @@ import shlex
 import sys
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.words import plural
 from ceres_cal.cli.arguments import jobs_option, output_option
-from ceres_cal.cli.calibrate import COMMANDS as CALIBRATE
-from ceres_cal.cli.check import COMMANDS as CHECK
-from ceres_cal.cli.command import Answer, Command
+from ceres_cal.cli.command import command
+from ceres_cal.cli.commands import COMMANDS
 from ceres_cal.cli.options import Quiet, argument, option, switch
-from ceres_cal.cli.outputs import section
-from ceres_cal.cli.refit import COMMANDS as REFIT
+from ceres_cal.report.document import Document, Section
 
 if TYPE_CHECKING:
     from ceres_cal.batch import Job, Outcome
 
-_COMMANDS: Mapping[str, Command] = {command.name: command for command in (*CALIBRATE, *CHECK, *REFIT)}
+_COMMANDS = ("calibrate", "check", "refit")
 _READ = ("observations", "calibration", "inputs", "images")  # arguments that name files
 _OWN = {"-o", "--output", "--report", "--json"}
 _SUMMARY = "summary.html"
@@ -53,7 +51,13 @@ class BatchArguments(Quiet):
     reports: bool = switch("a report of each calibrate and refit, too")
 
 
-def _run(args: BatchArguments) -> Answer:
+@command(
+    "batch",
+    "many calibrations, checks and refits, resumable, with one page that ranks them",
+    "plan.toml -o results/ --jobs 4",
+    "rooms/ -o results/ --options '--lens auto --prior height_m=4.02:20mm' --reports",
+)
+def _run(args: BatchArguments) -> Document:
     from ceres_cal.base.executing import processes
     from ceres_cal.base.files import make_folder, write_bytes
     from ceres_cal.batch import run_jobs
@@ -72,21 +76,7 @@ def _run(args: BatchArguments) -> Answer:
     title = args.plan.resolve().name
     write_bytes(args.output / _SUMMARY, summary_page(title, outcomes, pages).encode())
     worst = min(outcomes, key=lambda one: one.order).level
-    return Answer(_data(args, outcomes, again), lambda: _text(args, outcomes, again), _EXIT_CODES.get(worst, 0))
-
-
-COMMANDS = (
-    Command(
-        "batch",
-        "many calibrations, checks and refits, resumable, with one page that ranks them",
-        BatchArguments,
-        _run,
-        (
-            "plan.toml -o results/ --jobs 4",
-            "rooms/ -o results/ --options '--lens auto --prior height_m=4.02:20mm' --reports",
-        ),
-    ),
-)
+    return Document(_sections(args, outcomes, again), _EXIT_CODES.get(worst, 0))
 
 
 # ---- jobs -----------------------------------------------------------------------------------------------------------
@@ -122,7 +112,7 @@ def _job(name: str, command: str, arguments: Sequence[str], base: Path, to: Path
     if not _OWN.isdisjoint(argument.partition("=")[0] for argument in arguments):
         raise InputError(f"leave out {', '.join(sorted(_OWN))}: what jobs write goes into the folder of the batch")
     outputs = () if command == "check" else (to / f"{name}.json", *([to / f"{name}.html"] if reports else []))
-    parsed = _COMMANDS[command].parse([*arguments, *_written(outputs)])
+    parsed = COMMANDS[command].parse([*arguments, *_written(outputs)])
     named = [str(one) for what in _READ for one in _every(getattr(parsed, what, None))]
     placed = tuple(str(base / one) if one in named else one for one in arguments)
     return Job(name, command, placed, tuple(file for one in named for file in _files(base / one)), outputs)
@@ -149,7 +139,7 @@ def work(job: Job) -> Outcome:
     Raises:
         CalibrationError: as the command has it.
     """
-    command = _COMMANDS[job.command]
+    command = COMMANDS[job.command]
     data = command.run(command.parse([*job.arguments, *_written(job.outputs), "--quiet"])).data
     return _of_check(job, data) if job.command == "check" else _of_calibration(job, data)
 
@@ -187,16 +177,14 @@ def _line(outcome: Outcome, number: int, total: int, is_old: bool) -> str:
     return f"{outcome.level:10}{number:{width}} of {total}  {outcome.job}: {outcome.line}{before}"
 
 
-def _data(args: BatchArguments, outcomes: Sequence[Outcome], again: int) -> dict[str, Any]:
-    ranked = sorted(outcomes, key=lambda one: one.order)
-    return {"jobs": [asdict(one) for one in ranked], "from_before": again, "output": str(args.output / _SUMMARY)}
-
-
-def _text(args: BatchArguments, outcomes: Sequence[Outcome], again: int) -> str:
+def _sections(args: BatchArguments, outcomes: Sequence[Outcome], again: int) -> tuple[Section, ...]:
     count = Counter(one.level for one in outcomes)
     levels = ", ".join(f"{count[level]} {level}" for level in ("good", "care", "no", "failed") if count[level])
     before = f"; {again} from before" if again else ""
-    return "\n".join(
-        [section("jobs", [f"{plural(len(outcomes), 'job')}: {levels}{before}"]),
-         section("written", [str(args.output / _SUMMARY)])]
-    )  # fmt: skip
+    ranked = sorted(outcomes, key=lambda one: one.order)
+    said = f"{plural(len(outcomes), 'job')}: {levels}{before}"
+    page = str(args.output / _SUMMARY)
+    return (
+        Section("jobs", [said], {"jobs": ranked, "from_before": again}),
+        Section("written", [page], {"output": page}),
+    )

@@ -24,11 +24,12 @@ from ceres_cal.cli.arguments import (
     parse_prior,
     prior_option,
 )
-from ceres_cal.cli.command import Answer, Command
+from ceres_cal.cli.command import command
 from ceres_cal.cli.inputs import read_observations, require_different
 from ceres_cal.cli.options import option, switch
-from ceres_cal.cli.outputs import report_page, report_photographs, require_outputs, write_results
-from ceres_cal.cli.progress import ProgressBar, progress_bar
+from ceres_cal.cli.outputs import report_page, report_photographs, require_outputs, write_results, written
+from ceres_cal.cli.terminal import ProgressBar, progress_bar
+from ceres_cal.report.document import Document
 
 if TYPE_CHECKING:
     from ceres_cal.model.parameters import Options
@@ -123,12 +124,18 @@ class CalibrateArguments(Reporting):
     )
 
 
-def _run(args: CalibrateArguments) -> Answer:
+@command(
+    "calibrate",
+    "calibrate cameras from observations of fields and boards",
+    "field.json board.json -o calibration.json --report report.html",
+    "field.json --lens auto --prior height_m=4.02:10mm -o calibration.json",
+    "field.json --powers 3 --tolerance field.lines_m=10mm -o calibration.json",
+    "field.json --estimate length,width=5.50:20mm -o calibration.json",
+)
+def _run(args: CalibrateArguments) -> Document:
     require_outputs(args, args.observations)
     require_different(args.observations)
     fixed, powers = _fixed(args.fix), _powers(args)  # wrong usage is said before anything is read
-    from ceres_cal.cli.summary import calibration_data, calibration_text
-
     observations = read_observations(args.observations)
     photographs = report_photographs(args, observations)
     options = _options(args, observations, fixed=fixed, powers=powers)
@@ -141,9 +148,9 @@ def _run(args: CalibrateArguments) -> Answer:
     page = report_page(args, calibration, observations, photographs)
     quality = quality_of(calibration, observations)
     write_results(args, calibration.save, page)
-    return Answer(
-        calibration_data(quality, args.observations, args), lambda: calibration_text(quality, args.observations, args)
-    )
+    from ceres_cal.report.summary import calibration_sections
+
+    return Document((*calibration_sections(quality, args.observations), written(args)))
 
 
 def _client(address: str | None) -> AbstractContextManager[Any]:
@@ -159,22 +166,6 @@ def _client(address: str | None) -> AbstractContextManager[Any]:
     except (OSError, ValueError) as error:
         raise InputError(f"--scheduler {address}: no scheduler answers there ({str(error).splitlines()[0]})") from None
     return client
-
-
-COMMANDS = (
-    Command(
-        "calibrate",
-        "calibrate cameras from observations of fields and boards",
-        CalibrateArguments,
-        _run,
-        (
-            "field.json board.json -o calibration.json --report report.html",
-            "field.json --lens auto --prior height_m=4.02:10mm -o calibration.json",
-            "field.json --powers 3 --tolerance field.lines_m=10mm -o calibration.json",
-            "field.json --estimate length,width=5.50:20mm -o calibration.json",
-        ),
-    ),
-)
 
 
 def _solve_progress(bar: ProgressBar) -> Callable[[Progress], None]:

@@ -5,16 +5,16 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.cli.arguments import parse_names, parse_number
-from ceres_cal.cli.command import Answer, Command
+from ceres_cal.cli.command import command
 from ceres_cal.cli.inputs import read_calibration, read_observations
 from ceres_cal.cli.options import option
-from ceres_cal.cli.outputs import section
-from ceres_cal.cli.photographs import Seen, photographs_data, photographs_in, photographs_text
-from ceres_cal.cli.progress import progress_bar
+from ceres_cal.cli.photographs import Seen, photographs_in, shown
+from ceres_cal.cli.terminal import progress_bar
+from ceres_cal.report.document import Document, Section
 from ceres_cal.scene.heights import at_height
 
 if TYPE_CHECKING:
@@ -42,7 +42,13 @@ class CheckArguments(Seen):
     )
 
 
-def _run(args: CheckArguments) -> Answer:
+@command(
+    "check",
+    "does a calibration still hold? exit code 0 yes, 1 no",
+    "calibration.json now.png",
+    "calibration.json incoming/ --checks 720 --json",
+)
+def _run(args: CheckArguments) -> Document:
     images = photographs_in(args)
     detections = None
     if images:
@@ -53,8 +59,11 @@ def _run(args: CheckArguments) -> Answer:
         answer = check(
             read_calibration(args.calibration), read_observations(args.inputs), args.false_alarms, args.checks
         )
-    data = _data(answer) | photographs_data(detections)
-    return Answer(data, lambda: _text(answer, detections), 0 if answer.holds else 1)
+    often = "" if answer.checks == 1 else f", any in {answer.checks} checks"
+    holds = f"{'yes' if answer.holds else 'no'} ({100.0 * answer.false_alarms:g} % false alarms{often})"
+    stated = {name: getattr(answer, name) for name in ("holds", "false_alarms", "checks")}
+    stations = map(_station, answer.stations.values())
+    return Document((Section("check", [holds], stated), shown(detections), *stations), 0 if answer.holds else 1)
 
 
 def _photographed(args: CheckArguments, images: list[Path]) -> tuple[Check, KnownDetections]:
@@ -73,46 +82,17 @@ def _photographed(args: CheckArguments, images: list[Path]) -> tuple[Check, Know
         )
 
 
-COMMANDS = (
-    Command(
-        "check",
-        "does a calibration still hold? exit code 0 yes, 1 no",
-        CheckArguments,
-        _run,
-        ("calibration.json now.png", "calibration.json incoming/ --checks 720 --json"),
-    ),
-)
-
-
-def _data(answer: Check) -> dict[str, Any]:
-    stations = {name: _station_data(one) for name, one in answer.stations.items()}
-    stated = {"false_alarms": answer.false_alarms, "checks": answer.checks}
-    return {"holds": answer.holds, **stated, "stations": stations}
-
-
-def _station_data(one: StationCheck) -> dict[str, Any]:
-    maps = [{"height_m": h, "mean_mm": mean, "worst_mm": worst} for h, (mean, worst) in one.shift_mm.items()]
-    return {**vars(one), "shift_mm": maps}
-
-
-def _text(answer: Check, detections: KnownDetections | None) -> str:
-    often = "" if answer.checks == 1 else f", any in {answer.checks} checks"
-    holds = f"{'yes' if answer.holds else 'no'} ({100.0 * answer.false_alarms:g} % false alarms{often})"
-    stations = (section("station", _station_lines(one)) for one in answer.stations.values())
-    return "\n".join([section("check", [holds]), *photographs_text(detections), *stations])
-
-
-def _station_lines(one: StationCheck) -> list[str]:
-    first = f"{one.station} {one.words}"
-    if not math.isfinite(one.statistic) and not one.degrees:
-        return [first]
-    size = f"picture {one.shift_px:.3g} px rms, phi {100.0 * one.phi_change:+.3f} %"
-    return [
-        first,
-        f"{one.used} observations, {one.outliers} outliers, noise {one.noise:.2f} times as before",
-        f"moved {one.moved_mm:.3g} mm, turned {one.turned_deg:.3g} deg, {size}",
-        *(
+def _station(one: StationCheck) -> Section:
+    lines = [f"{one.station} {one.words}"]
+    if math.isfinite(one.statistic) or one.degrees:
+        size = f"picture {one.shift_px:.3g} px rms, phi {100.0 * one.phi_change:+.3f} %"
+        lines += [
+            f"{one.used} observations, {one.outliers} outliers, noise {one.noise:.2f} times as before",
+            f"moved {one.moved_mm:.3g} mm, turned {one.turned_deg:.3g} deg, {size}",
+        ]
+        lines += [
             f"map {at_height(height_m)}: {mean:.3g} mm on average, {worst:.3g} mm at most"
             for height_m, (mean, worst) in one.shift_mm.items()
-        ),
-    ]
+        ]
+    maps = [{"height_m": h, "mean_mm": mean, "worst_mm": worst} for h, (mean, worst) in one.shift_mm.items()]
+    return Section("station", lines, {"stations": {one.station: {**vars(one), "shift_mm": maps}}})

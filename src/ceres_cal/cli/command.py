@@ -1,18 +1,19 @@
-"""What every command has: a name, arguments, and an answer for people or for scripts."""
+"""What every command has: a name, arguments, and a document that it answers, for people or for scripts."""
 
 from __future__ import annotations
 
 import argparse
 import re
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, NoReturn
+from typing import Any, NoReturn, get_type_hints
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.words import printable, sentence
-from ceres_cal.cli.colour import coloured, in_colour
 from ceres_cal.cli.options import Arguments, add_options, filled
+from ceres_cal.cli.terminal import coloured, in_colour
+from ceres_cal.report.document import Document
 
 
 class Parser(argparse.ArgumentParser):
@@ -27,37 +28,26 @@ class Parser(argparse.ArgumentParser):
 
 
 @dataclass(frozen=True)
-class Answer:
-    """What a command found.
-
-    Attributes:
-        data: everything, for --json; numbers at full precision, null for what is infinite or not a number.
-        text: makes the text for people.
-        exit_code: 0, or 1 where the answer is no.
-    """
-
-    data: Mapping[str, Any]
-    text: Callable[[], str]
-    exit_code: int = 0
-
-
-@dataclass(frozen=True)
 class Command:
     """One command.
 
     Attributes:
         name: as it is typed, such as "detect board".
         summary: one line for the help.
-        arguments: the frozen dataclass of what it takes.
-        run: does the work with one; raises CalibrationError.
+        run: does the work; raises CalibrationError. Its argument `args` is annotated with the dataclass that it takes.
         examples: of its use, without "ceres-cal" and the name, for the help.
     """
 
     name: str
     summary: str
-    arguments: type[Arguments]
-    run: Callable[[Any], Answer]
+    run: Callable[[Any], Document]
     examples: tuple[str, ...] = ()
+
+    @property
+    def arguments(self) -> type[Arguments]:
+        """The dataclass that it takes."""
+        kind: type[Arguments] = get_type_hints(self.run)["args"]
+        return kind
 
     def parse(self, arguments: Sequence[str]) -> Any:
         """What is typed, as `arguments`; InputError for wrong usage. Positional ones may stand between options."""
@@ -81,6 +71,11 @@ class Command:
         parser.add_argument("--version", action="store_true", help="print the version, and those of the libraries")
 
 
+def command(name: str, summary: str, *examples: str) -> Callable[[Callable[[Any], Document]], Command]:
+    """Makes a command of the function that does its work."""
+    return lambda run: Command(name, summary, run, examples)
+
+
 def _all_printable(data: Any) -> Any:
     if isinstance(data, dict):
         return {_all_printable(name): _all_printable(value) for name, value in data.items()}
@@ -89,7 +84,7 @@ def _all_printable(data: Any) -> Any:
     return printable(data) if isinstance(data, str) else data
 
 
-def print_answer(answer: Answer, *, as_json: bool) -> None:
+def print_answer(answer: Document, *, as_json: bool) -> None:
     """Print an answer; BrokenPipeError here, not at the program's end, when nobody reads on."""
     if as_json:
         import msgspec
@@ -102,5 +97,6 @@ def print_answer(answer: Answer, *, as_json: bool) -> None:
             encoded = msgspec.json.encode(_all_printable(plain))
         print(msgspec.json.format(encoded, indent=1).decode())
     else:
-        print(coloured(answer.text()) if in_colour(sys.stdout) else answer.text())
+        text = answer.text()
+        print(coloured(text) if in_colour(sys.stdout) else text)
     sys.stdout.flush()

@@ -41,8 +41,7 @@ _MODULES = {
 class _Commands(Mapping[str, Command]):
     def __getitem__(self, name: str) -> Command:
         module = import_module(f"ceres_cal.cli.{_MODULES[name]}")
-        found: dict[str, Command] = {command.name: command for command in module.COMMANDS}
-        return found[name]
+        return next(one for one in vars(module).values() if isinstance(one, Command) and one.name == name)
 
     def __contains__(self, name: object) -> bool:
         return name in _MODULES

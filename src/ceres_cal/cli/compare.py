@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.cli.arguments import height_option, metres, station_option
-from ceres_cal.cli.command import Answer, Command
+from ceres_cal.cli.command import command
 from ceres_cal.cli.options import Arguments, argument, option, switch
-from ceres_cal.cli.outputs import finishing, require_output, section
+from ceres_cal.cli.outputs import finishing, require_output
+from ceres_cal.report.document import Document, Section
 
 if TYPE_CHECKING:
     from ceres_cal.base.arrays import Array
@@ -33,7 +35,13 @@ class CompareArguments(Arguments):
     without_turn: bool = switch("the same without the turn that brings them nearest to each other")
 
 
-def _run(args: CompareArguments) -> Answer:
+@command(
+    "compare",
+    "where two calibrations differ, on the field in mm or over the image in px",
+    "old.json new.json --height-mm 150",
+    "old.json new.json --over-image --without-turn",
+)
+def _run(args: CompareArguments) -> Document:
     require_output(args.picture, [args.a, args.b])
     from ceres_cal.calibration import Calibration
 
@@ -43,17 +51,16 @@ def _run(args: CompareArguments) -> Answer:
     return _over_field(args, first, second)
 
 
-def _over_image(args: CompareArguments, first: Calibration, second: Calibration) -> Answer:
+def _over_image(args: CompareArguments, first: Calibration, second: Calibration) -> Document:
     if args.picture is not None or args.station is not None:
         raise InputError("--picture and --station are for maps of a field: leave them out where images are compared")
     from ceres_cal.moves import compare_cameras
 
     comparisons = compare_cameras(first, second, without_turn=args.without_turn)
-    data = {"cameras": {one.camera: _camera_data(one) for one in comparisons}}
-    return Answer(data, lambda: "\n".join(map(_camera_text, comparisons)))
+    return Document(tuple(section for one in comparisons for section in _camera(one)))
 
 
-def _over_field(args: CompareArguments, first: Calibration, second: Calibration) -> Answer:
+def _over_field(args: CompareArguments, first: Calibration, second: Calibration) -> Document:
     from ceres_cal.base.files import write_bytes
     from ceres_cal.moves import compare
 
@@ -67,37 +74,40 @@ def _over_field(args: CompareArguments, first: Calibration, second: Calibration)
         svg = comparison_svg(comparisons[0], first)
         with finishing():
             write_bytes(args.picture, svg.encode())
-    data = {"stations": {one.station: _data(one) for one in comparisons}}
-    return Answer(data, lambda: "\n".join(map(_text, comparisons)))
+    return Document(tuple(section for one in comparisons for section in _station(one)))
 
 
-COMMANDS = (
-    Command(
-        "compare",
-        "where two calibrations differ, on the field in mm or over the image in px",
-        CompareArguments,
-        _run,
-        ("old.json new.json --height-mm 150", "old.json new.json --over-image --without-turn"),
-    ),
-)
+def _station(one: StationComparison) -> Iterator[Section]:
+    phi = f"phi {one.phi_px[0]:.3f} -> {one.phi_px[1]:.3f} px"
+    size = f"{one.mean_mm:.2f} mm on average, {one.worst_mm:.2f} mm at most"
+    yield Section(
+        "station", [one.station], {"stations": {one.station: _data(one, mean_mm=one.mean_mm, worst_mm=one.worst_mm)}}
+    )
+    yield Section("camera", [f"moved {one.moved_mm:.2f} mm, turned {one.turned_deg:.4f} deg, {phi}"])
+    yield Section("map", [f"{size}, {1e3 * one.height_m:.0f} mm above the floor", _explained(one)])
+    yield Section("", _grid_table(one.errors_mm[::-1], one.x_m, one.y_m[::-1], ("mm", "x, m")))
 
 
-def _data(one: StationComparison) -> dict[str, Any]:
-    """Everything; the map's places that are not shown are null."""
-    return {
-        "moved_mm": one.moved_mm,
-        "turned_deg": one.turned_deg,
-        "phi_px": one.phi_px,
-        "height_m": one.height_m,
-        "mean_mm": one.mean_mm,
-        "worst_mm": one.worst_mm,
-        "explained_by_uncertainty": one.explained,
-        "probability": one.probability,
-        "x_m": one.x_m,
-        "y_m": one.y_m,
-        "difference_mm": one.difference_mm,
-        "expected_mm": one.expected_mm,
-    }
+def _camera(one: CameraComparison) -> Iterator[Section]:
+    import numpy as np
+
+    pixels, angles = one.errors_px[np.isfinite(one.errors_px)], one.angles_deg[np.isfinite(one.angles_deg)]
+    turned = f", {one.turn_deg:.4f} deg of turn taken out" if one.turn_deg else ""
+    title = f"{one.camera}, phi {one.phi_px[0]:.3f} -> {one.phi_px[1]:.3f} px{turned}"
+    yield Section("camera", [title], {"cameras": {one.camera: _data(one)}})
+    lines = [
+        f"{np.mean(pixels):.3f} px on average, {np.max(pixels):.3f} px at most",
+        f"{np.mean(angles):.4f} deg on average, {np.max(angles):.4f} deg at most, between directions",
+        _explained(one),
+    ]
+    yield Section("image", lines)
+    yield Section("", _grid_table(one.errors_px, one.x_px, one.y_px, ("px", "x, px")))
+
+
+def _data(one: StationComparison | CameraComparison, **more: float) -> dict[str, Any]:
+    """Everything; places of a map that are not shown are null."""
+    own = {name: value for name, value in vars(one).items() if name not in ("station", "camera")}
+    return {**own, **more, "explained_by_uncertainty": one.explained}
 
 
 def _explained(one: StationComparison | CameraComparison) -> str:
@@ -106,21 +116,6 @@ def _explained(one: StationComparison | CameraComparison) -> str:
         False: f"more than their uncertainties explain (probability {one.probability or 0.0:.1g})",
         None: "nothing can be said of uncertainty: it is not told of both",
     }[one.explained]
-
-
-def _text(one: StationComparison) -> str:
-    phi = f"phi {one.phi_px[0]:.3f} -> {one.phi_px[1]:.3f} px"
-    size = f"{one.mean_mm:.2f} mm on average, {one.worst_mm:.2f} mm at most"
-    lines = [
-        section("station", [one.station]),
-        section("camera", [f"moved {one.moved_mm:.2f} mm, turned {one.turned_deg:.4f} deg, {phi}"]),
-        section("map", [f"{size}, {1e3 * one.height_m:.0f} mm above the floor", _explained(one)]),
-    ]
-    return "\n".join([*lines, *_table(one)])
-
-
-def _table(one: StationComparison) -> list[str]:
-    return _grid_table(one.errors_mm[::-1], one.x_m, one.y_m[::-1], ("mm", "x, m"))
 
 
 def _grid_table(values: Array, x: Array, y: Array, units: tuple[str, str]) -> list[str]:
@@ -136,36 +131,3 @@ def _grid_table(values: Array, x: Array, y: Array, units: tuple[str, str]) -> li
         cells = "".join(f"{v:8.2f}" if np.isfinite(v) else f"{'.':>8}" for v in values[row, columns])
         lines.append(f"{y[row]:10.{places}f}{cells}")
     return lines
-
-
-def _camera_data(one: CameraComparison) -> dict[str, Any]:
-    """Everything; pixels without an answer are null."""
-    return {
-        "phi_px": one.phi_px,
-        "turn_deg": one.turn_deg,
-        "explained_by_uncertainty": one.explained,
-        "probability": one.probability,
-        "x_px": one.x_px,
-        "y_px": one.y_px,
-        "difference_px": one.difference_px,
-        "angles_deg": one.angles_deg,
-    }
-
-
-def _camera_text(one: CameraComparison) -> str:
-    import numpy as np
-
-    pixels, angles = one.errors_px[np.isfinite(one.errors_px)], one.angles_deg[np.isfinite(one.angles_deg)]
-    turned = f", {one.turn_deg:.4f} deg of turn taken out" if one.turn_deg else ""
-    lines = [
-        section("camera", [f"{one.camera}, phi {one.phi_px[0]:.3f} -> {one.phi_px[1]:.3f} px{turned}"]),
-        section(
-            "image",
-            [
-                f"{np.mean(pixels):.3f} px on average, {np.max(pixels):.3f} px at most",
-                f"{np.mean(angles):.4f} deg on average, {np.max(angles):.4f} deg at most, between directions",
-                _explained(one),
-            ],
-        ),
-    ]
-    return "\n".join([*lines, *_grid_table(one.errors_px, one.x_px, one.y_px, ("px", "x, px"))])

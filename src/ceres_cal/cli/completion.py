@@ -9,8 +9,9 @@ from dataclasses import dataclass
 from typing import Literal
 
 from ceres_cal.base.errors import InputError
-from ceres_cal.cli.command import Answer, Command, Parser
+from ceres_cal.cli.command import Command, Parser, command
 from ceres_cal.cli.options import Arguments, argument
+from ceres_cal.report.document import Document, Section
 
 _FILE = {"bash": "_shtab_compgen_files", "zsh": "_files", "tcsh": "f"}
 _EXAMPLES = (
@@ -26,7 +27,8 @@ class CompletionArguments(Arguments):
     shell: Literal["bash", "zsh", "tcsh"] = argument("SHELL", "whose; what is printed goes into a file that it reads")
 
 
-def _run(args: CompletionArguments) -> Answer:
+@command("completion", "what a shell needs to complete commands, options and files", *_EXAMPLES)
+def _run(args: CompletionArguments) -> Document:
     try:
         import shtab
     except ImportError:
@@ -34,7 +36,7 @@ def _run(args: CompletionArguments) -> Answer:
     from ceres_cal.cli import commands
 
     script = shtab.complete(whole_parser(commands.COMMANDS), shell=args.shell)
-    return Answer({"shell": args.shell, "script": script}, lambda: script)
+    return Document((Section("", [script], {"shell": args.shell, "script": script}),))
 
 
 def whole_parser(commands: Mapping[str, Command]) -> ArgumentParser:
@@ -53,10 +55,3 @@ def whole_parser(commands: Mapping[str, Command]) -> ArgumentParser:
             if action.nargs != 0 and action.choices is None and not isinstance(action, argparse._SubParsersAction):
                 action.complete = _FILE  # type: ignore[attr-defined]
     return root
-
-
-COMMANDS = (
-    Command(
-        "completion", "what a shell needs to complete commands, options and files", CompletionArguments, _run, _EXAMPLES
-    ),
-)

@@ -5,18 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.cli.arguments import Detecting, frames_option, length
-from ceres_cal.cli.command import Answer, Command
-from ceres_cal.cli.detection import detected
-from ceres_cal.cli.frames import frames_of_videos
+from ceres_cal.cli.command import command
 from ceres_cal.cli.inputs import images_and_videos, read_target
 from ceres_cal.cli.options import Quiet, argument, flag, option, switch
 from ceres_cal.cli.outputs import finishing, require_observations_output
-from ceres_cal.cli.photographs import missed_data, missed_text
-from ceres_cal.cli.progress import progress_bar
+from ceres_cal.cli.photographs import detected, frames_of_videos, missed_section
+from ceres_cal.cli.terminal import progress_bar
+from ceres_cal.report.document import Document, Section
 
 if TYPE_CHECKING:
     from ceres_cal.detect.boards import BoardDetections
@@ -54,7 +53,16 @@ class BoardArguments(Quiet, Detecting):
     frames: int = frames_option()
 
 
-def _run_board(args: BoardArguments) -> Answer:
+@command(
+    "detect board",
+    "chessboards, ChArUco, AprilGrid and circle boards, and markers, in images",
+    "photographs/ --columns 9 --rows 6 --square 25mm -o board.json",
+    "photographs/ --columns 9 --rows 6 --square 40mm --charuco DICT_4X4_50 --marker 30mm -o board.json",
+    "photographs/ --columns 6 --rows 6 --april-grid 88mm --gap 0.3 -o april.json",
+    "photographs/ --columns 7 --rows 5 --circles 30mm --diameter 20mm -o circles.json",
+    "0001.png --target markers.json -o floor.json",
+)
+def _run_board(args: BoardArguments) -> Document:
     images, videos = images_and_videos(args.images)
     require_observations_output(args.output, [*images, *videos])
     from ceres_cal.detect.boards import detect_boards
@@ -73,7 +81,7 @@ def _run_board(args: BoardArguments) -> Answer:
         detections = detected(args.timeout, found)
     with finishing():
         detections.observations.save(args.output)
-    return Answer(_data(detections, args.output), lambda: _text(detections, args.output))
+    return _document(detections, args.output)
 
 
 _OF_A_BOARD = ("columns", "rows", "square", "april_grid", "gap", "circles", "diameter")
@@ -103,33 +111,13 @@ def _board(args: BoardArguments) -> Target:
     return circle_grid(args.columns, args.rows, args.circles, args.diameter, asymmetric=args.asymmetric)
 
 
-COMMANDS = (
-    Command(
-        "detect board",
-        "chessboards, ChArUco, AprilGrid and circle boards, and markers, in images",
-        BoardArguments,
-        _run_board,
+def _document(detections: BoardDetections, output: Path) -> Document:
+    corners, found, missed = len(detections.observations.points), detections.found, detections.missed
+    said = f"{len(found)} of {len(found) + len(missed)} images show the board, {corners} corners in all"
+    return Document(
         (
-            "photographs/ --columns 9 --rows 6 --square 25mm -o board.json",
-            "photographs/ --columns 9 --rows 6 --square 40mm --charuco DICT_4X4_50 --marker 30mm -o board.json",
-            "photographs/ --columns 6 --rows 6 --april-grid 88mm --gap 0.3 -o april.json",
-            "photographs/ --columns 7 --rows 5 --circles 30mm --diameter 20mm -o circles.json",
-            "0001.png --target markers.json -o floor.json",
-        ),
-    ),
-)
-
-
-def _data(detections: BoardDetections, output: Path) -> dict[str, Any]:
-    return {
-        "output": str(output),
-        "corners": len(detections.observations.points),
-        "found": detections.found,
-        "missed": missed_data(detections.missed),
-    }
-
-
-def _text(detections: BoardDetections, output: Path) -> str:
-    number, every = len(detections.found), len(detections.found) + len(detections.missed)
-    first = f"{number} of {every} images show the board, {len(detections.observations.points)} corners in all"
-    return "\n".join([first, *missed_text(detections.missed), f"written to {output}"])
+            Section("", [said], {"corners": corners, "found": found}),
+            missed_section(missed),
+            Section("", [f"written to {output}"], {"output": str(output)}),
+        )
+    )

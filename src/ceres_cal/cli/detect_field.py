@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -20,14 +20,13 @@ from ceres_cal.cli.arguments import (
     station_option,
     timeout_option,
 )
-from ceres_cal.cli.command import Answer, Command
-from ceres_cal.cli.detection import detected
+from ceres_cal.cli.command import command
 from ceres_cal.cli.inputs import images_and_videos, json_object, read_target
-from ceres_cal.cli.median import median_path, median_text, write_median
 from ceres_cal.cli.options import Quiet, argument, option, switch
 from ceres_cal.cli.outputs import finishing, require_observations_output
-from ceres_cal.cli.photographs import missed_data
-from ceres_cal.cli.progress import progress_bar
+from ceres_cal.cli.photographs import detected, median_path, median_text, missed_section, write_median
+from ceres_cal.cli.terminal import progress_bar
+from ceres_cal.report.document import Document, Section
 
 if TYPE_CHECKING:
     from ceres_cal.photographs import Auto, Clicks, Facing, FieldDetections, SearchResult
@@ -85,7 +84,16 @@ class FieldArguments(Quiet):
     timeout: float | None = timeout_option()
 
 
-def _run(args: FieldArguments) -> Answer:
+@command(
+    "detect field",
+    "painted lines and crossings of a field in photographs",
+    "photographs/ --target ssl-b --auto --facing LeftGoalLine=top -o field.json",
+    "game.mp4 --target ssl-b --auto --facing LeftGoalLine=top -o field.json",
+    "0001.png --start calibration.json -o field.json",
+    "0001.png --target ssl-b --auto --facing LeftGoalLine=top --estimate length,width -o field.json",
+    "0001.png --target ssl-a --start corners.json -o field.json",
+)
+def _run(args: FieldArguments) -> Document:
     images, videos = images_and_videos(args.images)
     require_observations_output(args.output, [*images, *videos, *([args.start] if args.start else [])])
     one = median_path(args.output, [*images, *videos]) if videos or args.median else None
@@ -121,25 +129,7 @@ def _run(args: FieldArguments) -> Answer:
         detections = detected(args.timeout, found)
     with finishing():
         detections.observations.save(args.output)
-    data = {**_data(detections, args.output), **({"median": merged} if merged else {})}
-    return Answer(data, lambda: _text(data))
-
-
-COMMANDS = (
-    Command(
-        "detect field",
-        "painted lines and crossings of a field in photographs",
-        FieldArguments,
-        _run,
-        (
-            "photographs/ --target ssl-b --auto --facing LeftGoalLine=top -o field.json",
-            "game.mp4 --target ssl-b --auto --facing LeftGoalLine=top -o field.json",
-            "0001.png --start calibration.json -o field.json",
-            "0001.png --target ssl-b --auto --facing LeftGoalLine=top --estimate length,width -o field.json",
-            "0001.png --target ssl-a --start corners.json -o field.json",
-        ),
-    ),
-)
+    return Document(tuple(_sections(detections, merged, args.output)))
 
 
 def _drawing(picture: Path | None, target: Target) -> Callable[[Path, SearchResult], None] | None:
@@ -239,16 +229,23 @@ def _corners(specs: Sequence[str]) -> Clicks:
 # ---- the answer -----------------------------------------------------------------------------------------------------
 
 
-def _data(detections: FieldDetections, output: Path) -> dict[str, Any]:
-    return {
-        "output": str(output),
-        "points": len(detections.observations.points),
-        "curves": len(detections.observations.curves),
-        "lengths_m": {prior.quantity: prior.value[0] for prior in detections.observations.priors if prior.dimension},
-        "found": [_image_data(path, detections) for path in detections.found],
-        "stretched": any(_stretched(one.camera) for one in detections.found.values()),
-        "missed": missed_data(detections.missed),
-    }
+def _sections(detections: FieldDetections, merged: dict[str, Any] | None, output: Path) -> Iterator[Section]:
+    observations, images = detections.observations, [_image_data(path, detections) for path in detections.found]
+    points, curves = len(observations.points), len(observations.curves)
+    every, missed = len(images) + len(detections.missed), missed_section(detections.missed)
+    lengths = {prior.quantity: prior.value[0] for prior in observations.priors if prior.dimension}
+    stretched = any(_stretched(one.camera) for one in detections.found.values())
+    seen = f"{len(images)} of {every} images show the field"
+    first = f"{seen}: {plural(curves, 'line observation')}, {plural(points, 'corner')} and crossings"
+    yield Section("", [first], {"points": points, "curves": curves, "found": images, "stretched": stretched})
+    said = ", ".join(f"{name} {length:.3f}" for name, length in lengths.items())
+    rough = [f"lengths, roughly, for `calibrate` to solve for: {said} m"] if lengths else []
+    yield Section("", rough, {"lengths_m": lengths})
+    if merged is not None:
+        yield Section("", [median_text(merged)], {"median": merged})
+    yield Section("", tuple(_image_lines(images)))
+    yield missed
+    yield Section("", [f"written to {output}"], {"output": str(output)})
 
 
 def _image_data(path: str, detections: FieldDetections) -> dict[str, Any]:
@@ -277,34 +274,23 @@ def _stretched(camera: Camera) -> bool:
     return abs(camera.aspect - 1.0) > _SQUARE
 
 
-def _text(data: dict[str, Any]) -> str:
-    number, every = len(data["found"]), len(data["found"]) + len(data["missed"])
-    lines = [
-        f"{number} of {every} images show the field: {plural(data['curves'], 'line observation')}, "
-        f"{plural(data['points'], 'corner')} and crossings"
-    ]
-    if data["lengths_m"]:
-        found = ", ".join(f"{name} {length:.3f}" for name, length in data["lengths_m"].items())
-        lines.append(f"lengths, roughly, for `calibrate` to solve for: {found} m")
-    lines += [median_text(data["median"])] if "median" in data else []
-    lines += [
-        f"{one['image']}: paint at {one['found']} of {one['places']} places, good to {one['sigma_px']:.3f} px; "
-        f"blur {one['blur_px']:.2f} px, lines {one['width_factor']:.2f} times as wide as the target says"
-        for one in data["found"]
-    ]
-    lines += [
-        f"{one['image']}: found without a start, {_ways(one['searched'])}" for one in data["found"] if "searched" in one
-    ]
-    lines += [
-        f"{one['image']}: its pixels are not square, fy / fx is {one['aspect']:.3f}: was the picture stretched? Give "
-        "the original, or let it be solved for (`calibrate --free-aspect`)"
-        for one in data["found"]
-        if "aspect" in one
-    ]
-    lines += [f"{one['image']}: {words}" for one in data["found"] for words in one["not_as_drawn"]]
-    lines += [f"{one['image']}: no {', '.join(one['lacking'])} to be seen" for one in data["found"] if one["lacking"]]
-    lines += [f"{one['image']}: {one['reason']}" for one in data["missed"]]
-    return "\n".join([*lines, f"written to {data['output']}"])
+def _image_lines(images: Sequence[dict[str, Any]]) -> Iterator[str]:
+    for one in images:
+        yield (
+            f"{one['image']}: paint at {one['found']} of {one['places']} places, good to {one['sigma_px']:.3f} px; "
+            f"blur {one['blur_px']:.2f} px, lines {one['width_factor']:.2f} times as wide as the target says"
+        )
+    for one in images:
+        if "searched" in one:
+            yield f"{one['image']}: found without a start, {_ways(one['searched'])}"
+    for one in images:
+        if "aspect" in one:
+            yield (
+                f"{one['image']}: its pixels are not square, fy / fx is {one['aspect']:.3f}: was the picture "
+                "stretched? Give the original, or let it be solved for (`calibrate --free-aspect`)"
+            )
+    yield from (f"{one['image']}: {words}" for one in images for words in one["not_as_drawn"])
+    yield from (f"{one['image']}: no {', '.join(one['lacking'])} to be seen" for one in images if one["lacking"])
 
 
 def _ways(searched: dict[str, Any]) -> str:

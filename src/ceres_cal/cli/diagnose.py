@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.cli.arguments import (
@@ -15,14 +14,19 @@ from ceres_cal.cli.arguments import (
     output_option,
     parse_number,
 )
-from ceres_cal.cli.command import Answer, Command
+from ceres_cal.cli.command import command
 from ceres_cal.cli.inputs import read_calibration, read_observations
 from ceres_cal.cli.options import option, switch
-from ceres_cal.cli.outputs import report_page, report_photographs, require_ending, require_outputs, write_results
-from ceres_cal.cli.progress import progress_bar
-
-if TYPE_CHECKING:
-    from ceres_cal.diagnostics import Diagnosis
+from ceres_cal.cli.outputs import (
+    report_page,
+    report_photographs,
+    require_ending,
+    require_outputs,
+    write_results,
+    written,
+)
+from ceres_cal.cli.terminal import progress_bar
+from ceres_cal.report.document import Document
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,10 +47,15 @@ class DiagnoseArguments(Reporting):
     false_alarms: str = option("probability of any finding where nothing is wrong", "P", "0.01")
 
 
-def _run(args: DiagnoseArguments) -> Answer:
+@command(
+    "diagnose",
+    "what the residuals say: faults by name, noise, outliers",
+    "calibration.json field.json board.json",
+    "calibration.json field.json board.json --held-out --report report.html",
+)
+def _run(args: DiagnoseArguments) -> Document:
     rate = _require_fitting(args)
     from ceres_cal.base.executing import processes
-    from ceres_cal.cli.diagnosis import diagnosis_data, diagnosis_text
     from ceres_cal.diagnostics import diagnose
     from ceres_cal.diagnostics.held_out import choose
 
@@ -60,33 +69,13 @@ def _run(args: DiagnoseArguments) -> Answer:
             choice = choose(observations, options, args.folds, progress=bar.update, executor=executor)
     page = report_page(args, calibration, observations, photographs, diagnosis, choice)
     write_results(args, diagnosis.table.save, page)
-    return Answer(
-        diagnosis_data(diagnosis, choice, args),
-        lambda: diagnosis_text(diagnosis, choice, args),
-        1 if _is_no(diagnosis, strict=args.strict) else 0,
-    )
-
-
-COMMANDS = (
-    Command(
-        "diagnose",
-        "what the residuals say: faults by name, noise, outliers",
-        DiagnoseArguments,
-        _run,
-        (
-            "calibration.json field.json board.json",
-            "calibration.json field.json board.json --held-out --report report.html",
-        ),
-    ),
-)
-
-
-def _is_no(diagnosis: Diagnosis, *, strict: bool) -> bool:
-    """Whether the answer is no: wrong labels that were taken out do no harm, and a noise is estimated."""
+    from ceres_cal.report.findings import diagnosis_sections
     from ceres_cal.report.grounds import is_against
 
-    against = [finding for finding in diagnosis.findings if strict or is_against(finding)]
-    return bool(against or diagnosis.conflicts)
+    # Wrong labels that were taken out do no harm, and a noise is estimated.
+    against = [finding for finding in diagnosis.findings if args.strict or is_against(finding)]
+    sections = (*diagnosis_sections(diagnosis, choice), written(args))
+    return Document(sections, 1 if against or diagnosis.conflicts else 0)
 
 
 def _require_fitting(args: DiagnoseArguments) -> float:

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.cli.arguments import calibration_argument, length, output_option, parse_length
-from ceres_cal.cli.command import Answer, Command
+from ceres_cal.cli.command import command
 from ceres_cal.cli.inputs import read_calibration
 from ceres_cal.cli.options import REQUIRED, Arguments, flag, option, options_of
-from ceres_cal.cli.outputs import finishing, require_output, section
+from ceres_cal.cli.outputs import finishing, require_output
+from ceres_cal.report.document import Document, Section
 
 if TYPE_CHECKING:
     from ceres_cal.formats import Exported, ExportFormat, ImportFormat
@@ -65,7 +66,23 @@ class ExportArguments(TableArguments):
         return self.to
 
 
-def _run(args: TableArguments) -> Answer:
+@command(
+    "export",
+    "a calibration in a format that others read, and what that loses",
+    "calibration.json --to vision-processor -o geometry.yml --camera-id 0",
+    "calibration.json --to opencv -o camera.yml",
+    "calibration.json --to table -o table.npz --error-mm 0.05",
+)
+def _export(args: ExportArguments) -> Document:
+    return _exported(args)
+
+
+@command("export-table", "a look-up table from pixels to the field (NPZ)", "calibration.json -o table.npz")
+def _export_table(args: TableArguments) -> Document:
+    return _exported(args)
+
+
+def _exported(args: TableArguments) -> Document:
     from ceres_cal.formats import export_format, prepare_export
 
     form = export_format(args.form)
@@ -76,7 +93,9 @@ def _run(args: TableArguments) -> Answer:
     exported.require_loss_mm(args.max_loss_mm)
     with finishing():
         exported.save(args.output)
-    return Answer(_data(exported, args), lambda: _text(exported, args))
+    about = {"format": form.name, "output": str(args.output), **exported.facts}
+    first = Section(form.name, [f"{exported.words}, written to {args.output}"], about)
+    return Document((first, *losses(exported)))
 
 
 def format_options(given: Mapping[str, str], forms: Sequence[ExportFormat] | Sequence[ImportFormat]) -> dict[str, Any]:
@@ -98,54 +117,18 @@ def format_options(given: Mapping[str, str], forms: Sequence[ExportFormat] | Seq
     return options
 
 
-def _data(exported: Exported, args: TableArguments) -> dict[str, Any]:
-    return {
-        "format": args.form,
-        "output": str(args.output),
-        **exported.facts,
-        "errors": [
-            {"station": loss.station, "height_m": height_m, "rms_mm": rms, "worst_mm": worst}
-            for loss in exported.losses
-            for height_m, (rms, worst) in loss.field_mm.items()
-        ],
-        "errors_px": [
-            {"station": loss.station, "rms_px": loss.image_px[0], "worst_px": loss.image_px[1]}
-            for loss in exported.losses
-            if loss.image_px is not None
-        ],
-        "warnings": list(exported.warnings),
-    }
-
-
-def _text(exported: Exported, args: TableArguments) -> str:
-    return "\n".join([f"{args.form:9} {exported.words}, written to {args.output}", *losses_text(exported)])
-
-
-def losses_text(exported: Exported) -> list[str]:
+def losses(exported: Exported) -> Iterator[Section]:
     """What is lost, in px and mm, and what else to know."""
     from ceres_cal.formats import loss_words
 
-    lines = [section("error", [text]) for loss in exported.losses for text in loss_words(loss)]
-    return lines + [section("warning", [text]) for text in exported.warnings]
-
-
-COMMANDS = (
-    Command(
-        "export",
-        "a calibration in a format that others read, and what that loses",
-        ExportArguments,
-        _run,
-        (
-            "calibration.json --to vision-processor -o geometry.yml --camera-id 0",
-            "calibration.json --to opencv -o camera.yml",
-            "calibration.json --to table -o table.npz --error-mm 0.05",
-        ),
-    ),
-    Command(
-        "export-table",
-        "a look-up table from pixels to the field (NPZ)",
-        TableArguments,
-        _run,
-        ("calibration.json -o table.npz",),
-    ),
-)
+    every = exported.losses
+    errors = [
+        {"station": loss.station, "height_m": height_m, "rms_mm": rms, "worst_mm": worst}
+        for loss in every
+        for height_m, (rms, worst) in loss.field_mm.items()
+    ]
+    shown = [(loss.station, loss.image_px) for loss in every if loss.image_px is not None]
+    errors_px = [{"station": name, "rms_px": rms, "worst_px": worst} for name, (rms, worst) in shown]
+    yield Section(data={"errors": errors, "errors_px": errors_px, "warnings": list(exported.warnings)})
+    yield from (Section("error", [text]) for loss in every for text in loss_words(loss))
+    yield from (Section("warning", [text]) for text in exported.warnings)

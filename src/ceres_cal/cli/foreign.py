@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.cli.arguments import calibration_argument, length, output_option
-from ceres_cal.cli.command import Answer, Command
-from ceres_cal.cli.export import format_options, listed, losses_text
+from ceres_cal.cli.command import command
+from ceres_cal.cli.export import format_options, listed, losses
 from ceres_cal.cli.inputs import read_calibration
 from ceres_cal.cli.options import Arguments, argument, option, options_of, switch
-from ceres_cal.cli.outputs import finishing, require_output, section
+from ceres_cal.cli.outputs import finishing, require_output
+from ceres_cal.report.document import Document, Section
 
 if TYPE_CHECKING:
     from ceres_cal.formats import Group, ImportFormat
@@ -41,7 +42,13 @@ def _forms() -> Mapping[str, ImportFormat]:
     return IMPORT_FORMATS
 
 
-def _import(args: ImportArguments) -> Answer:
+@command(
+    "import",
+    "a calibration, or observations, out of a file of another program",
+    "camera.yml -o calibration.json",
+    "corners.csv --from csv -o observations.json",
+)
+def _import(args: ImportArguments) -> Document:
     from ceres_cal.formats import read_foreign
     from ceres_cal.observations import Observations
 
@@ -52,17 +59,15 @@ def _import(args: ImportArguments) -> Answer:
     given = read_foreign(args.file, args.form, **format_options(args.options, forms))
     with finishing():
         given.save(args.output)
+    path, place = str(args.output), f"written to {args.output}"
     if isinstance(given, Observations):
-        counts = f"{len(given.points)} points and {len(given.curves)} curve observations in {len(given.views)} views"
-        sizes = {"points": len(given.points), "curves": len(given.curves), "views": len(given.views)}
-        return Answer(
-            {"output": str(args.output), **sizes}, lambda: section("import", [counts, f"written to {args.output}"])
-        )
+        sizes = {name: len(getattr(given, name)) for name in ("points", "curves", "views")}
+        counts = "{points} points and {curves} curve observations in {views} views".format(**sizes)
+        return Document((Section("import", [counts, place], {"output": path, **sizes}),))
     lines = [f"{name}: {camera!r}" for name, camera in given.stations.items()]
-    text = [section("import", [*lines, f"written to {args.output}"]), section("warning", given.warnings)]
     stations = {name: camera.position.tolist() for name, camera in given.stations.items()}
-    data = {"output": str(args.output), "positions_m": stations, "warnings": list(given.warnings)}
-    return Answer(data, lambda: "\n".join(part for part in text if part))
+    data = {"output": path, "positions_m": stations, "warnings": list(given.warnings)}
+    return Document((Section("import", [*lines, place], data), Section("warning", given.warnings)))
 
 
 # ---- over the network -----------------------------------------------------------------------------------------------
@@ -97,7 +102,13 @@ class PublishArguments(GroupArguments):
     )
 
 
-def _publish(args: PublishArguments) -> Answer:
+@command(
+    "publish",
+    "send a calibration to those who see the field, by the league's multicast",
+    "calibration.json --camera-id 0",
+    "calibration.json --geometry geometry.yml --once",
+)
+def _publish(args: PublishArguments) -> Document:
     from ceres_cal.base.files import read_bytes
     from ceres_cal.formats import publish, ssl_packet
 
@@ -106,11 +117,11 @@ def _publish(args: PublishArguments) -> Answer:
     exported.require_loss_mm(args.max_loss_mm)
     sent = publish(packet, _group(args), 1 if args.once else None)
     words = f"{exported.words}, {len(packet)} bytes, {sent} times to {args.address}:{args.port}"
-    losses = [
+    lost = [
         {"station": loss.station, "field_mm": {str(h): e for h, e in loss.field_mm.items()}} for loss in exported.losses
     ]
-    data = {"sent": sent, "bytes": len(packet), "losses": losses, "warnings": list(exported.warnings)}
-    return Answer(data, lambda: "\n".join([section("published", [words]), *losses_text(exported)]))
+    data = {"sent": sent, "bytes": len(packet), "losses": lost}
+    return Document((Section("published", [words], data), *losses(exported)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -121,7 +132,13 @@ class ListenArguments(GroupArguments):
     seconds: float = option("how long to wait", "S", 10.0)
 
 
-def _listen(args: ListenArguments) -> Answer:
+@command(
+    "listen",
+    "the field, or all geometry, out of the league's multicast",
+    "-o field.json",
+    "-o geometry.yml --seconds 30",
+)
+def _listen(args: ListenArguments) -> Document:
     from ceres_cal.formats import geometry_content, received_geometry, ssl_target
 
     require_output(args.output, [])
@@ -136,7 +153,7 @@ def _listen(args: ListenArguments) -> Answer:
         write_bytes(args.output, geometry_content(geometry, args.output.suffix))
     ids = [entry["camera_id"] for entry in geometry.get("calib", [])]
     words = f"a field and cameras {ids}, written to {args.output}"
-    return Answer({"output": str(args.output), "camera_ids": ids}, lambda: section("heard", [words]))
+    return Document((Section("heard", [words], {"output": str(args.output), "camera_ids": ids}),))
 
 
 # ---- targets --------------------------------------------------------------------------------------------------------
@@ -150,49 +167,18 @@ class TargetsImportArguments(Arguments):
     output: Path = output_option("the target (.json), as `detect field --target` takes it")
 
 
-def _targets_import(args: TargetsImportArguments) -> Answer:
+@command("targets import", "a field out of ssl-vision's or vision-processor's files", "geometry.yml -o field.json")
+def _targets_import(args: TargetsImportArguments) -> Document:
     from ceres_cal.formats import read_ssl_target
 
     require_output(args.output, [args.file])
     return _write_target(read_ssl_target(args.file), args.output)
 
 
-def _write_target(target: Target, path: Path) -> Answer:
+def _write_target(target: Target, path: Path) -> Document:
     from ceres_cal.base.files import write_json
 
     with finishing():
         write_json(path, target.spec)
     words = f"{target.kind} with {len(target.points)} points and {len(target.curves)} curves, written to {path}"
-    return Answer({"output": str(path), "spec": target.spec}, lambda: section("target", [words]))
-
-
-COMMANDS = (
-    Command(
-        "import",
-        "a calibration, or observations, out of a file of another program",
-        ImportArguments,
-        _import,
-        ("camera.yml -o calibration.json", "corners.csv --from csv -o observations.json"),
-    ),
-    Command(
-        "publish",
-        "send a calibration to those who see the field, by the league's multicast",
-        PublishArguments,
-        _publish,
-        ("calibration.json --camera-id 0", "calibration.json --geometry geometry.yml --once"),
-    ),
-    Command(
-        "listen",
-        "the field, or all geometry, out of the league's multicast",
-        ListenArguments,
-        _listen,
-        ("-o field.json", "-o geometry.yml --seconds 30"),
-    ),
-    Command(
-        "targets import",
-        "a field out of ssl-vision's or vision-processor's files",
-        TargetsImportArguments,
-        _targets_import,
-        ("geometry.yml -o field.json",),
-    ),
-)
+    return Document((Section("target", [words], {"output": str(path), "spec": target.spec}),))

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+from ceres_cal.base.words import plural
 from ceres_cal.cli.arguments import observations_argument, output_option
-from ceres_cal.cli.command import Answer, Command
+from ceres_cal.cli.command import command
 from ceres_cal.cli.inputs import read_observations, require_different
 from ceres_cal.cli.options import Arguments, option
-from ceres_cal.cli.outputs import finishing, require_observations_output, section, wrapped
+from ceres_cal.cli.outputs import finishing, require_observations_output
+from ceres_cal.report.document import Document, Section, wrapped
 
 if TYPE_CHECKING:
     from ceres_cal.observations import Observations
@@ -31,7 +34,12 @@ class JoinArguments(Arguments):
     output: Path = output_option("the joined observations (.json or .npz)")
 
 
-def _run(args: JoinArguments) -> Answer:
+@command(
+    "join",
+    "a rig's observations as one: same frames, same labels",
+    "left.json right.json --same-frame 'left*,right*' -o rig.json",
+)
+def _run(args: JoinArguments) -> Document:
     require_different(args.observations)
     require_observations_output(args.output, args.observations)
     observations = read_observations(args.observations)
@@ -43,18 +51,7 @@ def _run(args: JoinArguments) -> Answer:
     labels = with_same_labels(observations)
     with finishing():
         labels.observations.save(args.output)
-    return Answer(_data(labels, args), lambda: _text(labels, args))
-
-
-COMMANDS = (
-    Command(
-        "join",
-        "a rig's observations as one: same frames, same labels",
-        JoinArguments,
-        _run,
-        ("left.json right.json --same-frame 'left*,right*' -o rig.json",),
-    ),
-)
+    return Document(tuple(_sections(labels, args)))
 
 
 def _moments(observations: Observations) -> Counter[int]:
@@ -65,31 +62,19 @@ def _moments(observations: Observations) -> Counter[int]:
     return Counter(len(seen) for seen in cameras.values())
 
 
-def _data(labels: Labels, args: JoinArguments) -> dict[str, Any]:
-    return {
-        "output": str(args.output),
-        "moments_by_cameras": {str(count): number for count, number in sorted(_moments(labels.observations).items())},
-        "turned": labels.turned,
-        "open": labels.open,
-    }
-
-
-def _text(labels: Labels, args: JoinArguments) -> str:
-    by_count = sorted(_moments(labels.observations).items(), reverse=True)
+def _sections(labels: Labels, args: JoinArguments) -> Iterator[Section]:
+    by_count = sorted(_moments(labels.observations).items())
     rule = "of one name" if args.same_frame is None else f"by {args.same_frame!r}"
-    moments = ", ".join(f"{number} seen by {count} camera{'s' * (count > 1)}" for count, number in by_count)
-    lines = [section("moments", wrapped(f"{moments} (frames {rule})"))]
-    if labels.turned:
-        which = ", ".join(f"{placement!r} of {station!r}" for station, placement in labels.turned)
-        lines.append(section("labels", wrapped(f"turned, to be those of the first camera: {which}")))
+    seen = ", ".join(f"{number} seen by {plural(count, 'camera')}" for count, number in reversed(by_count))
+    moments = {str(count): number for count, number in by_count}
+    yield Section("moments", wrapped(f"{seen} (frames {rule})"), {"moments_by_cameras": moments})
+    which = ", ".join(f"{placement!r} of {station!r}" for station, placement in labels.turned)
+    turned = wrapped(f"turned, to be those of the first camera: {which}") if which else []
+    yield Section("labels", turned, {"turned": labels.turned, "open": labels.open})
     for station in labels.open:
-        lines.append(
-            section(
-                "warning",
-                wrapped(
-                    f"station {station!r}: nothing tells which way round its boards are labelled: show the board to it "
-                    "and to the first camera at once in more poses, or take a board of odd columns + rows"
-                ),
-            )
+        text = (
+            f"station {station!r}: nothing tells which way round its boards are labelled: show the board to it "
+            "and to the first camera at once in more poses, or take a board of odd columns + rows"
         )
-    return "\n".join([*lines, section("written", [str(args.output)])])
+        yield Section("warning", wrapped(text))
+    yield Section("written", [str(args.output)], {"output": str(args.output)})

@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING, Any
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.cli.arguments import calibration_argument, height_option, metres, parse_number, station_option
-from ceres_cal.cli.command import Answer, Command
+from ceres_cal.cli.command import command
 from ceres_cal.cli.inputs import read_calibration, station_of
 from ceres_cal.cli.options import Arguments, argument, option
+from ceres_cal.report.document import Document, Section
 
 if TYPE_CHECKING:
     from ceres_cal.base.arrays import Array
@@ -44,7 +45,13 @@ class LocateArguments(ProjectArguments):
     )
 
 
-def _locate(args: LocateArguments) -> Answer:
+@command(
+    "locate",
+    "where on the field, or at a height above it, pixels lie (m)",
+    "calibration.json 640,480 100,100 --height-mm 150",
+    "calibration.json --file pixels.csv --json",
+)
+def _locate(args: LocateArguments) -> Document:
     import numpy as np
 
     from ceres_cal.scene.camera import in_image
@@ -59,31 +66,14 @@ def _locate(args: LocateArguments) -> Answer:
     return _answer({**data, "points_m": _or_null(points)}, points, lost)
 
 
-def _project(args: ProjectArguments) -> Answer:
+@command("project", "where points of the world appear in the image (px)", "calibration.json -2.5,1.0 -2.5,1.0,0.15")
+def _project(args: ProjectArguments) -> Document:
     points = _read_rows(args, (2, 3))
     name, camera = _station(args)
     pixels = camera.project(points)
     lost = {row: _why_not_projected(camera, points[row]) for row in _rows_without_answer(pixels)}
     data = {"station": name, "points_m": points.tolist()}
     return _answer({**data, "pixels": _or_null(pixels)}, pixels, lost)
-
-
-COMMANDS = (
-    Command(
-        "locate",
-        "where on the field, or at a height above it, pixels lie (m)",
-        LocateArguments,
-        _locate,
-        ("calibration.json 640,480 100,100 --height-mm 150", "calibration.json --file pixels.csv --json"),
-    ),
-    Command(
-        "project",
-        "where points of the world appear in the image (px)",
-        ProjectArguments,
-        _project,
-        ("calibration.json -2.5,1.0 -2.5,1.0,0.15",),
-    ),
-)
 
 
 def _station(args: ProjectArguments) -> tuple[str, Camera]:
@@ -171,12 +161,9 @@ def _why_not_projected(camera: Camera, point: Array) -> str:
     return "it lies outside of what the lens can show"
 
 
-def _answer(data: dict[str, Any], values: Array, lost: dict[int, str]) -> Answer:
-    def text() -> str:
-        lines = [f"{x:.4f} {y:.4f}" for x, y in values.tolist()]
-        for row, reason in lost.items():
-            lines[row] = f"no answer: {reason}"
-        return "\n".join(lines)
-
-    data["no_answer"] = [{"row": row, "reason": reason} for row, reason in lost.items()]
-    return Answer(data, text, 1 if lost else 0)
+def _answer(data: dict[str, Any], values: Array, lost: dict[int, str]) -> Document:
+    lines = [f"{x:.4f} {y:.4f}" for x, y in values.tolist()]
+    for row, reason in lost.items():
+        lines[row] = f"no answer: {reason}"
+    reasons = [{"row": row, "reason": reason} for row, reason in lost.items()]
+    return Document((Section("", lines, {**data, "no_answer": reasons}),), 1 if lost else 0)

@@ -1,20 +1,20 @@
-"""What commands write: files, checked before any long work and written all or none, and the text for people."""
+"""What commands write: files, checked before any long work and written all or none."""
 
 from __future__ import annotations
 
 import os
 import signal
 import threading
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from textwrap import wrap
 from typing import TYPE_CHECKING
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.cli.arguments import Reporting
 from ceres_cal.cli.inputs import image_files
-from ceres_cal.cli.progress import progress_bar
+from ceres_cal.cli.terminal import progress_bar
+from ceres_cal.report.document import Section
 
 if TYPE_CHECKING:
     from ceres_cal.calibration import Calibration
@@ -22,44 +22,13 @@ if TYPE_CHECKING:
     from ceres_cal.diagnostics.held_out import Choice
     from ceres_cal.observations import Observations
     from ceres_cal.report import FramePhotographs
-
-WIDTH = 100
-"""Of a text for people, in letters."""
+_WRITTEN = ("output", "report")
 
 
-# ---- text -----------------------------------------------------------------------------------------------------------
-
-
-def section(title: str, lines: Iterable[str]) -> str:
-    """A title beside its lines."""
-    return "\n".join(f"{'' if number else title:10}{line}" for number, line in enumerate(lines))
-
-
-def sections_of(text: str, titles: Collection[str]) -> list[str]:
-    """The lines of those sections of a text that have one of these titles."""
-    kept, title = [], ""
-    for line in text.splitlines():
-        title = line[:10].strip() or title
-        if title in titles:
-            kept.append(line)
-    return kept
-
-
-def wrapped(*texts: str) -> list[str]:
-    """The texts in lines of WIDTH letters."""
-    return [line for text in texts for line in wrap(text, WIDTH)]
-
-
-def written(args: Reporting) -> list[str]:
-    """The section that names the files which were asked for, or none."""
-    files = [str(path) for path in (args.output, args.report) if path is not None]
-    return [section("written", files)] if files else []
-
-
-def written_data(args: Reporting) -> dict[str, str | None]:
-    """The same for --json."""
-    paths = {"output": args.output, "report": args.report}
-    return {name: None if path is None else str(path) for name, path in paths.items()}
+def written(args: Reporting) -> Section:
+    """The section that names the files which were asked for."""
+    paths = {name: None if path is None else str(path) for name, path in vars(args).items() if name in _WRITTEN}
+    return Section("written", [path for path in paths.values() if path is not None], paths)
 
 
 # ---- files ----------------------------------------------------------------------------------------------------------

@@ -4,20 +4,20 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 from ceres_cal.cli.arguments import PriorNames, Reporting, output_option, parse_names, parse_prior, prior_option
-from ceres_cal.cli.command import Answer, Command
+from ceres_cal.cli.command import command
 from ceres_cal.cli.inputs import read_calibration, read_observations
 from ceres_cal.cli.options import option, switch
-from ceres_cal.cli.outputs import report_page, report_photographs, require_outputs, section, write_results
-from ceres_cal.cli.photographs import Seen, photographs_data, photographs_in, photographs_text
-from ceres_cal.cli.progress import progress_bar
+from ceres_cal.cli.outputs import report_page, report_photographs, require_outputs, write_results, written
+from ceres_cal.cli.photographs import Seen, photographs_in, shown
+from ceres_cal.cli.terminal import progress_bar
+from ceres_cal.report.document import Document, Section
 
 if TYPE_CHECKING:
     from ceres_cal.calibration import Calibration
     from ceres_cal.photographs import KnownDetections
-    from ceres_cal.report.quality import Quality
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,14 +41,20 @@ class RefitArguments(Seen, Reporting):
     prior: tuple[str, ...] = prior_option("STATION.height_m=VALUE:SIGMA", "a height measured after the move")
 
 
-def _run(args: RefitArguments) -> Answer:
+@command(
+    "refit",
+    "after a move: poses anew, everything else under what was known",
+    "calibration.json now.png -o calibration.json",
+    "calibration.json new.json --what zoom -o calibration.json --report report.html",
+)
+def _run(args: RefitArguments) -> Document:
     images = photographs_in(args)
     # To replace the old calibration is what many want.
     require_outputs(args, images or args.inputs)
     calibration = read_calibration(args.calibration)
     detections = _photographed(args, calibration, images) if images else None
     observations = read_observations(args.inputs) if detections is None else detections.require()
-    from ceres_cal.moves import RefitOptions, refit
+    from ceres_cal.moves import RefitOptions, movements, refit
     from ceres_cal.report.quality import quality_of
 
     photographs = report_photographs(args, observations, calibration, images)
@@ -62,8 +68,14 @@ def _run(args: RefitArguments) -> Answer:
     )
     write_results(args, result.save, report_page(args, result, observations, photographs))
     quality = quality_of(result, observations)
-    data = _data(quality, calibration, args) | photographs_data(detections)
-    return Answer(data, lambda: _text(quality, detections, args))
+    from ceres_cal.report.summary import calibration_sections
+
+    about = result.refitted
+    assert about is not None
+    moves = {name: {"mm": 1e3 * shift_m, "deg": deg} for name, (shift_m, deg) in movements(calibration, result).items()}
+    explained = {"what": about.what, "explanation": about.explanation, "moved": moves}
+    first = Section("refit", about.explanation.split("; "), explained)
+    return Document((first, shown(detections), *calibration_sections(quality, args.inputs), written(args)))
 
 
 def _photographed(args: RefitArguments, calibration: Calibration, images: list[Path]) -> KnownDetections:
@@ -72,39 +84,3 @@ def _photographed(args: RefitArguments, calibration: Calibration, images: list[P
     not_painted = parse_names(args.not_painted)
     with progress_bar(args) as bar:
         return detect_known(calibration, images, args.station, not_painted=not_painted, progress=bar.update)
-
-
-COMMANDS = (
-    Command(
-        "refit",
-        "after a move: poses anew, everything else under what was known",
-        RefitArguments,
-        _run,
-        (
-            "calibration.json now.png -o calibration.json",
-            "calibration.json new.json --what zoom -o calibration.json --report report.html",
-        ),
-    ),
-)
-
-
-def _data(quality: Quality, before: Calibration, args: RefitArguments) -> dict[str, Any]:
-    from ceres_cal.cli.summary import calibration_data
-    from ceres_cal.moves import movements
-
-    result = quality.calibration
-    moves = {name: {"mm": 1e3 * shift_m, "deg": deg} for name, (shift_m, deg) in movements(before, result).items()}
-    refitted = result.refitted
-    assert refitted is not None
-    summary = calibration_data(quality, args.inputs, args)
-    return {**summary, "what": refitted.what, "explanation": refitted.explanation, "moved": moves}
-
-
-def _text(quality: Quality, detections: KnownDetections | None, args: RefitArguments) -> str:
-    from ceres_cal.cli.summary import calibration_text
-
-    refitted = quality.calibration.refitted
-    assert refitted is not None
-    explanation = section("refit", refitted.explanation.split("; "))
-    summary = calibration_text(quality, args.inputs, args)
-    return "\n".join([explanation, *photographs_text(detections), summary])

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from ceres_cal.base.errors import InputError, NothingShownError
 from ceres_cal.base.words import plural
-from ceres_cal.cli.advise import COMMANDS as ADVISE
 from ceres_cal.cli.arguments import (
     estimate_option,
     frames_option,
@@ -19,19 +18,17 @@ from ceres_cal.cli.arguments import (
     parse_board,
     prior_option,
 )
-from ceres_cal.cli.calibrate import COMMANDS as CALIBRATE
-from ceres_cal.cli.command import Answer, Command
-from ceres_cal.cli.detect import COMMANDS as DETECT_BOARD
-from ceres_cal.cli.detect_field import COMMANDS as DETECT_FIELD
-from ceres_cal.cli.export import COMMANDS as EXPORT
-from ceres_cal.cli.frames import frames_of_videos
+from ceres_cal.cli.command import command
+from ceres_cal.cli.commands import COMMANDS
 from ceres_cal.cli.inputs import IMAGE_ENDINGS, images_and_videos
 from ceres_cal.cli.options import Quiet, argument, option
-from ceres_cal.cli.outputs import section, sections_of
-from ceres_cal.cli.progress import progress_bar
+from ceres_cal.cli.photographs import frames_of_videos
+from ceres_cal.cli.terminal import progress_bar
+from ceres_cal.report.document import Document, Section
 
 _SHOWN = ("fit", "lens", "located", "widened", "weak", "unknown", "warning", "verdict")
 _MOST_NAMES = 3
+_BLANK = Section("", [""])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,14 +53,21 @@ class RunArguments(Quiet):
 
 @dataclass(frozen=True)
 class _Step:
-    """A command that was run, as one would type it, and what is worth showing of its answer."""
+    """A command that was run, as one would type it, what it answered, and what is worth showing of that."""
 
     command: str
-    lines: tuple[str, ...]
+    lines: Sequence[str]
     data: dict[str, Any]
 
 
-def _run(args: RunArguments) -> Answer:
+@command(
+    "run",
+    "from photographs or a video to a calibration, its report and its exports",
+    "photographs/ --target ssl-b --facing LeftGoalLine=top --board 9x6x25mm -o camera/",
+    "photographs/ --target ssl-b --facing LeftGoalLine=top --prior height_m=4.02:20mm --to opencv -o camera/",
+    "boards.mp4 --board 9x6x25mm -o camera/",
+)
+def _run(args: RunArguments) -> Document:
     if args.target is None and args.board is None:
         raise InputError("say what the photographs show: --target ssl-b, --board 9x6x25mm, or both")
     if args.board is not None:
@@ -79,44 +83,34 @@ def _run(args: RunArguments) -> Answer:
     level = calibrated.data["verdict"]["level"]
     steps.append(calibrated)
     if level != "good" and args.target is not None:
-        steps.append(_step(args, ADVISE[0], [str(args.output / "calibration.json")], most=2))
+        steps.append(_step(args, "advise", [str(args.output / "calibration.json")], most=2))
     if level != "no":
         steps += [_exported(args, name, f"{args.output / name}{ending}") for name, ending in endings.items()]
     data = {"images": len(images), "verdict": calibrated.data["verdict"]}
     data["steps"] = [{"command": step.command, "answer": step.data} for step in steps]
     made = level != "no" and all(step.data for step in steps[-len(endings) :])
-    return Answer(data, lambda: _text(args, images, steps, level), 0 if made else 1)
-
-
-COMMANDS = (
-    Command(
-        "run",
-        "from photographs or a video to a calibration, its report and its exports",
-        RunArguments,
-        _run,
-        (
-            "photographs/ --target ssl-b --facing LeftGoalLine=top --board 9x6x25mm -o camera/",
-            "photographs/ --target ssl-b --facing LeftGoalLine=top --prior height_m=4.02:20mm --to opencv -o camera/",
-            "boards.mp4 --board 9x6x25mm -o camera/",
-        ),
-    ),
-)
+    return Document((Section(data=data), *_sections(args, images, steps, level)), 0 if made else 1)
 
 
 # ---- the steps ------------------------------------------------------------------------------------------------------
 
 
-def _step(args: RunArguments, command: Command, arguments: Sequence[str], most: int | None = None) -> _Step:
+def _step(
+    args: RunArguments,
+    name: str,
+    arguments: Sequence[str],
+    most: int | None = None,
+    titles: Collection[str] | None = None,
+) -> _Step:
     """Run a command and keep the first lines of what it says, and the images that showed nothing."""
-    quiet = ["--quiet"] if (args.quiet or args.json) and command is not EXPORT[0] else []
-    answer = command.run(command.parse([*arguments, *quiet]))
+    quiet = ["--quiet"] if (args.quiet or args.json) and name != "export" else []
+    answer = COMMANDS[name].run(COMMANDS[name].parse([*arguments, *quiet]))
     missed = [f"{one['image']}: {one['reason']}" for one in answer.data.get("missed", ())]
-    lines = [*answer.text().splitlines()[:most], *missed]
-    return _Step(_typed(command, arguments), tuple(lines), dict(answer.data))
+    return _Step(_typed(name, arguments), [*answer.text(titles).splitlines()[:most], *missed], answer.data)
 
 
-def _typed(command: Command, arguments: Sequence[str]) -> str:
-    return shlex.join(["ceres-cal", *command.name.split(), *arguments])
+def _typed(name: str, arguments: Sequence[str]) -> str:
+    return shlex.join(["ceres-cal", *name.split(), *arguments])
 
 
 def _photographs(args: RunArguments) -> list[Path]:
@@ -136,13 +130,13 @@ def _observed(args: RunArguments, images: list[Path]) -> Iterator[_Step]:
         board = ["--columns", columns, "--rows", rows, "--square", square]
         goal = ["--camera", args.camera, "-o", str(args.output / "board.json")]
         try:
-            found = _step(args, DETECT_BOARD[0], [*rest, *board, *goal], most=1)
+            found = _step(args, "detect board", [*rest, *board, *goal], most=1)
             rest = [path for path in rest if path not in found.data["found"]]
             yield found if args.target is None else replace(found, lines=found.lines[:1])  # the rest may be the field
         except NothingShownError as error:
             if args.target is None:
                 raise
-            yield _Step(_typed(DETECT_BOARD[0], [*rest, *board, *goal]), (str(error),), {})
+            yield _Step(_typed("detect board", [*rest, *board, *goal]), (str(error),), {})
     if args.target is not None:
         if not rest:
             raise InputError("every photograph shows the board, and none is left for the field: take one without it")
@@ -152,7 +146,7 @@ def _observed(args: RunArguments, images: list[Path]) -> Iterator[_Step]:
         goal = ["--camera", args.camera, "-o", str(args.output / "field.json")]
         still = [] if images_and_videos(args.images)[0] else ["--median"]  # of videos alone
         asked = [*rest, *still, "--target", args.target, "--auto", *facing, *missing, *lengths, *goal]
-        yield _step(args, DETECT_FIELD[0], asked, most=1)
+        yield _step(args, "detect field", asked, most=1)
 
 
 def _calibrated(args: RunArguments, detected: Sequence[dict[str, Any]]) -> _Step:
@@ -160,30 +154,32 @@ def _calibrated(args: RunArguments, detected: Sequence[dict[str, Any]]) -> _Step
     stretched = ["--free-aspect"] if any(data.get("stretched") for data in detected) else []
     priors = [word for prior in args.prior for word in ("--prior", prior)]
     goal = ["-o", str(args.output / "calibration.json"), "--report", str(args.output / "report.html")]
-    step = _step(args, CALIBRATE[0], [*observations, "--lens", args.lens, *stretched, *priors, *goal])
-    return replace(step, lines=tuple(sections_of("\n".join(step.lines), _SHOWN)))
+    asked = [*observations, "--lens", args.lens, *stretched, *priors, *goal]
+    return _step(args, "calibrate", asked, titles=_SHOWN)
 
 
 def _exported(args: RunArguments, form: str, goal: str) -> _Step:
     """The step of an export, without data where the format cannot hold the calibration."""
     arguments = [str(args.output / "calibration.json"), "--to", form, "-o", goal]
     try:
-        return _step(args, EXPORT[0], arguments)
+        return _step(args, "export", arguments)
     except InputError as error:
-        return _Step(_typed(EXPORT[0], arguments), (section("error", [str(error)]),), {})
+        return _Step(_typed("export", arguments), tuple(Section("error", [str(error)]).shown()), {})
 
 
 # ---- for people -----------------------------------------------------------------------------------------------------
 
 
-def _text(args: RunArguments, images: Sequence[Path], steps: Sequence[_Step], level: str) -> str:
-    parts = [section("read", [f"{plural(len(images), 'photograph')} in {', '.join(args.images[:_MOST_NAMES])}"])]
+def _sections(args: RunArguments, images: Sequence[Path], steps: Sequence[_Step], level: str) -> Iterator[Section]:
+    yield Section("read", [f"{plural(len(images), 'photograph')} in {', '.join(args.images[:_MOST_NAMES])}"])
     for number, step in enumerate(steps, start=1):
-        parts += ["", section(f"step {number}", [_short(step.command)]), *step.lines]
-    parts += ["", section("written", [f"{args.output}/: {', '.join(sorted(_made(args, steps)))}"])]
+        yield _BLANK
+        yield Section(f"step {number}", [_short(step.command)])
+        yield Section("", step.lines)
+    yield _BLANK
+    yield Section("written", [f"{args.output}/: {', '.join(sorted(_made(args, steps)))}"])
     if args.to and level == "no":
-        parts.append(section("warning", ["a calibration that is not to be trusted was not exported"]))
-    return "\n".join(parts)
+        yield Section("warning", ["a calibration that is not to be trusted was not exported"])
 
 
 def _made(args: RunArguments, steps: Sequence[_Step]) -> set[str]:

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from ceres_cal.cli.arguments import Loss, calibration_argument, observations_argument
-from ceres_cal.cli.command import Answer, Command
+from ceres_cal.cli.command import command
 from ceres_cal.cli.inputs import read_calibration, read_observations, require_different
 from ceres_cal.cli.options import Arguments, option, switch
-from ceres_cal.cli.outputs import section
+from ceres_cal.report.document import Document, Section
 
 if TYPE_CHECKING:
     from ceres_cal.moves import Part, Score
@@ -35,7 +35,13 @@ class ScoreArguments(Arguments):
     )
 
 
-def _run(args: ScoreArguments) -> Answer:
+@command(
+    "score",
+    "how well a calibration predicts new boards or fields: intrinsics held",
+    "calibration.json new.json",
+    "rig.json boards.json --hold-stations --loss trivial --reject-sigma inf",
+)
+def _run(args: ScoreArguments) -> Document:
     require_different(args.observations)
     from dataclasses import replace
 
@@ -45,45 +51,25 @@ def _run(args: ScoreArguments) -> Answer:
     asked = {name: value for name in ("loss", "reject_sigma") if (value := getattr(args, name)) is not None}
     options = replace(calibration.options, **asked)
     observations = read_observations(args.observations)
-    answer = score(calibration, observations, options=options, hold_stations=args.hold_stations)
-    return Answer(_data(answer), lambda: _text(answer))
+    return _document(score(calibration, observations, options=options, hold_stations=args.hold_stations))
 
 
-COMMANDS = (
-    Command(
-        "score",
-        "how well a calibration predicts new boards or fields: intrinsics held",
-        ScoreArguments,
-        _run,
-        ("calibration.json new.json", "rig.json boards.json --hold-stations --loss trivial --reject-sigma inf"),
-    ),
-)
-
-
-def _data(answer: Score) -> dict[str, Any]:
-    return {
-        "fit": asdict(answer.fit),
+def _document(answer: Score) -> Document:
+    ratios = dict(zip(("points", "curves"), answer.noise_ratios, strict=True))
+    known = [f"noise of {kind} {ratio:.2f} times the calibration's" for kind, ratio in ratios.items() if ratio == ratio]
+    numbers = {
+        "fit": answer.fit,
         "rms_px": answer.fit.rms_px,
         "calibration_rms_px": answer.before.rms_px,
-        "noise_ratios": dict(zip(("points", "curves"), answer.noise_ratios, strict=True)),
-        "cameras": [asdict(part) for part in answer.cameras],
-        "views": [asdict(part) for part in answer.views],
+        "noise_ratios": ratios,
     }
-
-
-def _text(answer: Score) -> str:
-    ratios = [
-        f"noise of {kind} {ratio:.2f} times the calibration's"
-        for kind, ratio in zip(("points", "curves"), answer.noise_ratios, strict=True)
-        if ratio == ratio
-    ]
-    shown = [f"{part.name}: {_left(part)}" for part in answer.views[:_MOST_VIEWS]]
-    return "\n".join(
-        [
-            section("score", ["intrinsics held, poses alone solved for", *ratios]),
-            *(section("camera", [f"{part.name}: {_left(part)}"]) for part in answer.cameras),
-            section("worst", shown),
-        ]
+    worst = [f"{part.name}: {_left(part)}" for part in answer.views[:_MOST_VIEWS]]
+    return Document(
+        (
+            Section("score", ["intrinsics held, poses alone solved for", *known], numbers),
+            *(Section("camera", [f"{part.name}: {_left(part)}"]) for part in answer.cameras),
+            Section("worst", worst, {"cameras": answer.cameras, "views": answer.views}),
+        )
     )
 
 

@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING, Any, Literal
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.words import plural
 from ceres_cal.cli.arguments import output_option
-from ceres_cal.cli.command import Answer, Command
+from ceres_cal.cli.command import command
 from ceres_cal.cli.options import Quiet, argument, option, switch
 from ceres_cal.cli.outputs import finishing
-from ceres_cal.cli.progress import progress_bar
+from ceres_cal.cli.terminal import progress_bar
+from ceres_cal.report.document import Document, Section
 
 if TYPE_CHECKING:
     from ceres_cal.simulate import Simulation
@@ -31,13 +32,21 @@ class SimulateArguments(Quiet):
     list: bool = switch("list the built-in scenes")
 
 
-def _run(args: SimulateArguments) -> Answer:
+@command(
+    "simulate",
+    "make observations of a scene, with noise and errors, and their truth",
+    "ssl-field -o try/",
+    "photographs -o try/ --images png --seed 3",
+    "--list",
+)
+def _run(args: SimulateArguments) -> Document:
     from ceres_cal.simulate import built_in_scene, load_scene, scene_names, simulate, write_simulation
 
     scenes = scene_names()
     if args.list:
         width = max(map(len, scenes))
-        return Answer({"scenes": scenes}, lambda: "\n".join(f"{name:{width}}  {text}" for name, text in scenes.items()))
+        lines = [f"{name:{width}}  {text}" for name, text in scenes.items()]
+        return Document((Section("", lines, {"scenes": scenes}),))
     if args.scene is None or args.output is None:
         raise InputError(
             "name a scene and a folder, as in `ceres-cal simulate ssl-field -o DIR`; --list shows the scenes"
@@ -62,18 +71,7 @@ def _run(args: SimulateArguments) -> Answer:
         else:
             write_simulation(simulation, args.output)
     data = _data(simulation, args.scene, args.output) | {"images": images}
-    return Answer(data, lambda: _text(data))
-
-
-COMMANDS = (
-    Command(
-        "simulate",
-        "make observations of a scene, with noise and errors, and their truth",
-        SimulateArguments,
-        _run,
-        ("ssl-field -o try/", "photographs -o try/ --images png --seed 3", "--list"),
-    ),
-)
+    return Document((Section("", _lines(data), data),))
 
 
 def _data(simulation: Simulation, scene: str, folder: Path) -> dict[str, Any]:
@@ -93,11 +91,9 @@ def _data(simulation: Simulation, scene: str, folder: Path) -> dict[str, Any]:
     }
 
 
-def _text(data: dict[str, Any]) -> str:
-    return (
-        f"{data['observations']}: {plural(data['views'], 'view')}, {plural(data['points'], 'point observation')}, "
-        f"{plural(data['curves'], 'curve observation')}, of them {plural(data['outliers'], 'outlier')} and "
-        f"{plural(data['wrong_labels'], 'wrong label')}\n"
-        f"{data['truth']}: what is true of them"
-        + (f"\n{Path(data['images'][0]).parent}: {plural(len(data['images']), 'photograph')}" if data["images"] else "")
-    )
+def _lines(data: dict[str, Any]) -> list[str]:
+    kinds = (("views", "view"), ("points", "point observation"), ("curves", "curve observation"))
+    seen = ", ".join(plural(data[name], word) for name, word in kinds)
+    wrong = f"{plural(data['outliers'], 'outlier')} and {plural(data['wrong_labels'], 'wrong label')}"
+    taken = [f"{Path(name).parent}: {plural(len(data['images']), 'photograph')}" for name in data["images"][:1]]
+    return [f"{data['observations']}: {seen}, of them {wrong}", f"{data['truth']}: what is true of them", *taken]

@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING, Any
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.cli.arguments import output_option
-from ceres_cal.cli.command import Answer, Command
+from ceres_cal.cli.command import command
 from ceres_cal.cli.inputs import spelled_target
 from ceres_cal.cli.options import Arguments, argument, option
-from ceres_cal.cli.outputs import finishing, require_ending, require_output, section
+from ceres_cal.cli.outputs import finishing, require_ending, require_output
+from ceres_cal.report.document import Document, Section
 
 if TYPE_CHECKING:
     from ceres_cal.scene.targets import Curve, Target, TargetKind
@@ -35,7 +36,14 @@ class TargetsArguments(Arguments):
     picture: Path | None = option("draw the target there, with the names of its lines", "SVG")
 
 
-def _run(args: TargetsArguments) -> Answer:
+@command(
+    "targets",
+    "the kinds of targets and the names of their features",
+    "",
+    "vss-3 --picture vss-3.svg",
+    "observations.json",
+)
+def _run(args: TargetsArguments) -> Document:
     from ceres_cal.scene.targets import TARGET_KINDS
 
     if args.picture is not None:
@@ -44,14 +52,14 @@ def _run(args: TargetsArguments) -> Answer:
         if args.target is None:
             raise InputError("--picture draws one target: name it, such as vss-3")
     if args.target is None:
-        return Answer({"kinds": {name: _kind_data(kind) for name, kind in TARGET_KINDS.items()}}, _kinds_text)
+        kinds = {name: _kind_data(kind) for name, kind in TARGET_KINDS.items()}
+        return Document((Section("", _kinds_text().splitlines(), {"kinds": kinds}),))
     targets = _targets(args.target)
     if args.picture is not None:
         _draw(targets, args.target, args.picture)
-    return Answer(
-        {"targets": {name: _target_data(target) for name, target in targets.items()}},
-        lambda: "\n\n".join(_target_text(name, target) for name, target in targets.items()),
-    )
+    data = {"targets": {name: _target_data(target) for name, target in targets.items()}}
+    text = "\n\n".join(_target_text(name, target) for name, target in targets.items())
+    return Document((Section("", text.splitlines(), data),))
 
 
 def _draw(targets: dict[str, Target], wanted: str, picture: Path) -> None:
@@ -74,7 +82,12 @@ class PrintArguments(Arguments):
     output: Path = output_option("the sheet (.pdf)")
 
 
-def _print(args: PrintArguments) -> Answer:
+@command(
+    "targets print",
+    "a board as a PDF to print to scale, with a ruler on it",
+    '\'{"kind": "checkerboard", "columns": 9, "rows": 6, "square_m": 0.025}\' -o board.pdf',
+)
+def _print(args: PrintArguments) -> Document:
     require_output(args.output, [])
     require_ending(args.output, "sheets are", ".pdf")
     import json
@@ -89,25 +102,7 @@ def _print(args: PrintArguments) -> Answer:
     content = sheet_pdf(target, json.dumps(target.spec))
     with finishing():
         write_bytes(args.output, content)
-    return Answer({"output": str(args.output), "spec": target.spec}, lambda: section("written", [str(args.output)]))
-
-
-COMMANDS = (
-    Command(
-        "targets",
-        "the kinds of targets and the names of their features",
-        TargetsArguments,
-        _run,
-        ("", "vss-3 --picture vss-3.svg", "observations.json"),
-    ),
-    Command(
-        "targets print",
-        "a board as a PDF to print to scale, with a ruler on it",
-        PrintArguments,
-        _print,
-        ('\'{"kind": "checkerboard", "columns": 9, "rows": 6, "square_m": 0.025}\' -o board.pdf',),
-    ),
-)
+    return Document((Section("written", [str(args.output)], {"output": str(args.output), "spec": target.spec}),))
 
 
 def _targets(wanted: str) -> dict[str, Target]:

@@ -19,11 +19,12 @@ from ceres_cal.cli.arguments import (
     parse_number,
     station_option,
 )
-from ceres_cal.cli.command import Answer, Command
+from ceres_cal.cli.command import command
 from ceres_cal.cli.inputs import image_files, read_calibration
 from ceres_cal.cli.options import Quiet, argument, flag, option, switch
 from ceres_cal.cli.outputs import finishing
-from ceres_cal.cli.progress import progress_bar
+from ceres_cal.cli.terminal import progress_bar
+from ceres_cal.report.document import Document, Section
 
 if TYPE_CHECKING:
     from ceres_cal.base.arrays import Image
@@ -72,7 +73,14 @@ class UndistortArguments(Quiet):
     height_mm: float | None = height_option("plane of the top view, or of a second drawing in an overlay")
 
 
-def _run(args: UndistortArguments) -> Answer:
+@command(
+    "undistort",
+    "straight images, top views to scale, the model in a photograph",
+    "calibration.json photographs/ -o straight/",
+    "calibration.json photographs/ -o top/ --top-view --mm-per-px 5 --height-mm 150",
+    "calibration.json photographs/ -o look/ --overlay --before old.json",
+)
+def _run(args: UndistortArguments) -> Document:
     require_fitting(args)
     images = image_files(args.images)
     kind = "top" if args.top_view else "overlay" if args.overlay else "straight"
@@ -95,24 +103,8 @@ def _run(args: UndistortArguments) -> Answer:
     data = {"format": _FORMAT, "version": _VERSION, "calibration": str(args.calibration), "kind": kind, **make.facts}
     with finishing():
         write_json(about, {**data, "pictures": written})
-    return Answer(
-        {**data, "pictures": written, "output": str(about)}, lambda: "\n".join([*lines, f"{about}: {make.about}"])
-    )
-
-
-COMMANDS = (
-    Command(
-        "undistort",
-        "straight images, top views to scale, the model in a photograph",
-        UndistortArguments,
-        _run,
-        (
-            "calibration.json photographs/ -o straight/",
-            "calibration.json photographs/ -o top/ --top-view --mm-per-px 5 --height-mm 150",
-            "calibration.json photographs/ -o look/ --overlay --before old.json",
-        ),
-    ),
-)
+    said = {**data, "pictures": written, "output": str(about)}
+    return Document((Section("", [*lines, f"{about}: {make.about}"], said),))
 
 
 # ---- options --------------------------------------------------------------------------------------------------------

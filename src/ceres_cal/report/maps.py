@@ -14,9 +14,9 @@ from ceres_cal.calibration import Calibration
 from ceres_cal.moves import StationComparison
 from ceres_cal.report import canvas
 from ceres_cal.report.canvas import INK, OUTLIER, QUIET, Drawing, Hover
+from ceres_cal.report.document import Figure, Table
 from ceres_cal.report.grounds import worst_radius
 from ceres_cal.report.material import Material, image_border, paint_of
-from ceres_cal.report.page import Figure, Table
 from ceres_cal.report.scale import COLORS, MM, PX, Scale, spoken
 from ceres_cal.scene.heights import at_height
 from ceres_cal.uncertainty import FieldMap, image_grid

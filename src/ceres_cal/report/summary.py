@@ -1,17 +1,22 @@
-"""The first chapter: may this calibration be trusted, for what, to how many mm."""
+"""What a calibration says of itself: its verdict, beside its numbers and how well each is known."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ceres_cal.base.words import counted, fixed, metres, mm, sentence, short
+from ceres_cal.base.words import counted, fixed, metres, mm, plural, sentence, short
+from ceres_cal.report.accuracy import accuracy_sections
+from ceres_cal.report.document import BulletList, Chapter, Piece, Section, Text, Tile, Tiles, wrapped
 from ceres_cal.report.grounds import (
     CARE_MM,
     GOOD_MM,
+    disputed,
     focal,
+    is_against,
     judge_quality,
     level_of,
     level_of_verdict,
@@ -19,17 +24,52 @@ from ceres_cal.report.grounds import (
     worst,
     worst_radius,
 )
-from ceres_cal.report.material import Material
-from ceres_cal.report.numbers import bounds
-from ceres_cal.report.page import BulletList, Chapter, Piece, Text, Tile, Tiles
+from ceres_cal.report.numbers import bounds, number_sections, observed, outliers, stopped, warnings
+from ceres_cal.report.quality import Quality
 from ceres_cal.scene.heights import at_height
 from ceres_cal.uncertainty import FieldMap, Verdict
 
+if TYPE_CHECKING:
+    from ceres_cal.report.material import Material
+
+_MOST_FINDINGS = 3
 _MEANING = (
     "The headline holds for 95 % of the points located at the worst place that a camera sees; ± is a standard "
     "deviation. Both are the calibration's own share: the noise of the pixel that is asked about comes on top. Green: "
     f"up to {GOOD_MM:g} mm, a painted line's width; amber: up to {CARE_MM:g} mm."
 )
+
+
+def calibration_sections(quality: Quality, inputs: Sequence[str]) -> Iterator[Section]:
+    """The answer of `calibrate` and `refit`; `inputs`: the files of observations."""
+    calibration, observations = quality.calibration, quality.observations
+    read = {"inputs": list(inputs), "counts": observations.counts, "calibration": calibration.to_file()}
+    yield Section("read", [", ".join(map(str, inputs)), *observed(observations)], read)
+    yield from number_sections(quality)
+    yield from accuracy_sections(quality, tuple(quality.each_seam()))
+    yield outliers(calibration)
+    yield stopped(calibration)
+    warned = list(warnings(calibration))
+    yield Section(data={"warnings": warned})
+    yield from (Section("warning", wrapped(text)) for text in warned)
+    yield _verdict(quality)
+
+
+def _verdict(quality: Quality) -> Section:
+    """The headline of the report, and what stands behind it and was not said yet."""
+    judged, findings = judge_quality(quality), () if quality.diagnosis is None else quality.diagnosis.findings
+    cause = disputed(quality)
+    named = [one for one in findings if is_against(one) and not cause][:_MOST_FINDINGS]
+    lines = wrapped(judged.headline, *(f"{one.kind}: {one.sentence}" for one in named))
+    if findings:
+        whence = " may follow from that" if cause else ": `ceres-cal diagnose` says what to do"
+        lines.append(f"{plural(len(findings), 'finding')}{whence}")
+    reasons = [{"level": level, "text": text} for level, text in judged.reasons]
+    data = {"level": judged.level, "headline": judged.headline, "reasons": reasons, "findings": findings}
+    return Section("verdict", lines, {"verdict": data})
+
+
+# ---- on a page ------------------------------------------------------------------------------------------------------
 
 
 def verdict_chapter(material: Material) -> Chapter:

@@ -1,0 +1,194 @@
+"""What is said of a result: a document of sections, made once, rendered as text, as JSON or as a page (`report.page`).
+
+A section holds one subject in the three ways in which it is shown: lines for a terminal, data for scripts, and pieces
+of a page. So what is said of one thing stands in one place.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from textwrap import wrap
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from ceres_cal.report.canvas import Drawing, Hover
+
+WIDTH = 100
+"""Of a text for people, in letters."""
+
+
+def wrapped(*texts: str) -> list[str]:
+    """The texts in lines of WIDTH letters."""
+    return [line for text in texts for line in wrap(text, WIDTH)]
+
+
+# ---- pieces of a page -----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Text:
+    """A paragraph; `kind` is a class of the style sheet."""
+
+    text: str
+    kind: str = ""
+
+
+@dataclass(frozen=True)
+class BulletList:
+    """A list; each line begins with a mark that its level has: "good", "care", "no" or ""."""
+
+    lines: tuple[tuple[str, str], ...]
+
+
+@dataclass(frozen=True)
+class Table:
+    """Columns under their heads, which say the unit; the first column names its row.
+
+    Of more than `most` rows the first are shown, and how many there are. `stacked`: on a phone each row becomes a card.
+    """
+
+    head: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    caption: str = ""
+    stacked: bool = False
+    most: int = 200
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A picture with a title, a sentence that says how to read it, and the table behind it.
+
+    A wide one is drawn twice, for a wide and for a narrow window. `hover` is what is said beside the pointer; whoever
+    has none finds it in the table.
+    """
+
+    name: str
+    title: str
+    reading: str
+    drawing: Drawing
+    table: Table
+    wide: bool = False
+    narrow_drawing: Drawing | None = None
+    hover: Hover | None = None
+
+
+@dataclass(frozen=True)
+class PhotoFigure:
+    """A picture that is an image (JPEG), across both columns, and a sentence on what it shows."""
+
+    name: str
+    title: str
+    reading: str
+    jpeg: bytes
+    wide: bool = True
+
+
+@dataclass(frozen=True)
+class Gallery:
+    """Pictures, two beside one another where there is room; one that is left over has its words beside it."""
+
+    pictures: tuple[Figure | PhotoFigure, ...]
+
+
+@dataclass(frozen=True)
+class Folded:
+    """Pieces that are there when somebody asks for them."""
+
+    title: str
+    pieces: tuple[Piece, ...]
+
+
+@dataclass(frozen=True)
+class Tile:
+    """One large number: what it is, the number, its unit, and what to know about it."""
+
+    label: str
+    value: str
+    unit: str
+    note: str
+    level: str = ""
+
+
+@dataclass(frozen=True)
+class Tiles:
+    """Tiles in a row."""
+
+    tiles: tuple[Tile, ...]
+
+
+@dataclass(frozen=True)
+class Card:
+    """One finding: a sentence, what to do where that is known, small facts, and a file beside the page to look at."""
+
+    level: str
+    sentence: str
+    advice: str
+    facts: tuple[str, ...]
+    link: str = ""
+
+
+Piece = Text | BulletList | Table | Gallery | Folded | Tiles | Card
+
+
+@dataclass(frozen=True)
+class Chapter:
+    """A part of a page under a title; `level` colours it where it is a verdict."""
+
+    name: str
+    title: str
+    pieces: tuple[Piece, ...]
+    level: str = ""
+
+
+# ---- the document ---------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Section:
+    """One subject.
+
+    Attributes:
+        title: what stands beside its lines in a terminal; without it they stand alone.
+        lines: for people. data: the same for scripts, numbers at full precision; pieces: the same on a page.
+    """
+
+    title: str = ""
+    lines: Iterable[str] = ()
+    data: Mapping[str, Any] = field(default_factory=dict)
+    pieces: tuple[Piece, ...] = ()
+
+    def shown(self) -> Iterator[str]:
+        """Its lines, the title beside the first."""
+        for number, line in enumerate(self.lines):
+            yield f"{'' if number else self.title:9} {line}" if self.title else line
+
+
+@dataclass(frozen=True)
+class Document:
+    """What a command answers: sections in the order in which they are read.
+
+    Attributes:
+        exit_code: 0, or 1 where the answer is no.
+    """
+
+    sections: tuple[Section, ...]
+    exit_code: int = 0
+
+    def text(self, titles: Collection[str] | None = None) -> str:
+        """For people; of the sections with one of these titles, by default of all."""
+        kept = (one for one in self.sections if titles is None or one.title in titles)
+        return "\n".join(line for one in kept for line in one.shown())
+
+    @property
+    def data(self) -> dict[str, Any]:
+        """For scripts: what infinite or not a number is, becomes null in JSON."""
+        joined: dict[str, Any] = {}
+        for one in self.sections:
+            joined = _joined(joined, one.data)
+        return joined
+
+
+def _joined(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, Any]:
+    both = {name for name in first.keys() & second.keys() if isinstance(first[name], Mapping)}
+    return {**first, **second, **{name: _joined(first[name], second[name]) for name in both}}
