@@ -36,10 +36,11 @@ class AdviseArguments(Quiet):
     good_enough_mm: float | None = option(
         "the worst error that will do; nothing is advised where it is reached", "MM", read=length("mm")
     )
-    board: str | None = option(
+    board: tuple[int, int, float] | None = option(
         "the board that could be shown: inner corners and size of a square, such as 9x6x100; default: the "
         "calibration's own, or that one",
         "COLUMNSxROWSxMM",
+        read=parse_board,
     )
 
 
@@ -53,14 +54,13 @@ def _run(args: AdviseArguments) -> Document:
     enough = args.good_enough_mm
     if enough is not None and not enough > 0.0:
         raise InputError(f"--good-enough-mm {enough:g}: give a number of millimetres above 0")
-    shown = None if args.board is None else parse_board(args.board)
     from ceres_cal.advice import advise
     from ceres_cal.scene.targets import checkerboard
 
     calibration = read_calibration(args.calibration)
     station = station_of(args.calibration, args.station, calibration)
     with naming(args.calibration), progress_bar(args) as bar:
-        board = None if shown is None else checkerboard(*shown)
+        board = None if args.board is None else checkerboard(*args.board)
         advice = advise(calibration, station, metres(args.height_mm), enough, board, bar.update)
     weak = [direction.words for direction in calibration.uncertainty.weak_directions]
     return Document(tuple(_sections(advice, weak)))

@@ -6,6 +6,7 @@ import re
 from argparse import ArgumentTypeError
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -27,11 +28,6 @@ _LENGTH = re.compile(r"\s*(.*?)\s*(mm|cm|m)\s*")
 def calibration_argument(what: str = "file that `ceres-cal calibrate` or `refit` wrote") -> Any:
     """The argument CALIBRATION."""
     return argument("CALIBRATION", what)
-
-
-def observations_argument(what: str) -> Any:
-    """The argument OBS, of files."""
-    return argument("OBS", what)
 
 
 def station_option(what: str = "which station; may be left out where there is only one") -> Any:
@@ -155,6 +151,11 @@ def length(unit: str) -> Callable[[str], float]:
             raise ArgumentTypeError(f"{text!r} is no length: write a number of {unit}, or 5m, 150mm") from None
 
     return parse
+
+
+def number(where: str) -> Callable[[str], float]:
+    """The type of an argument that is a finite number; `where`: its name."""
+    return partial(parse_number, where=where)
 
 
 def parse_board(text: str) -> tuple[int, int, float]:

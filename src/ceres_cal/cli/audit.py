@@ -8,13 +8,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ceres_cal.cli.command import command
-from ceres_cal.cli.export import format_options
+from ceres_cal.cli.export import format_options, import_forms
 from ceres_cal.cli.inputs import read_observations
 from ceres_cal.cli.options import REQUIRED, Arguments, argument, option, options_of
 from ceres_cal.report.document import Document, Section, wrapped
 
 if TYPE_CHECKING:
-    from ceres_cal.formats import ImportFormat
     from ceres_cal.moves import StationAudit
 
 
@@ -23,15 +22,9 @@ class AuditArguments(Arguments):
     """A calibration, and what is held against it."""
 
     file: Path = argument("FILE", "a calibration of ours or of another program")
-    form: str | None = option(lambda: f"default: by content; {', '.join(_forms())}", "FORMAT", flags=("--from",))
+    form: str | None = option(lambda: f"default: by content; {', '.join(import_forms())}", "FORMAT", flags=("--from",))
     observations: tuple[str, ...] = option("of its stations", "FILE", REQUIRED, repeatable=True)
-    options: Mapping[str, str] = options_of(lambda: _forms().values())
-
-
-def _forms() -> Mapping[str, ImportFormat]:
-    from ceres_cal.formats import IMPORT_FORMATS
-
-    return IMPORT_FORMATS
+    options: Mapping[str, str] = options_of(lambda: import_forms().values())
 
 
 @command(
@@ -48,7 +41,7 @@ def _run(args: AuditArguments) -> Document:
     if args.form is None and args.file.suffix == ".json" and _is_ours(args.file):
         given = Calibration.load(args.file)
     else:
-        given = import_calibration(args.file, args.form, **format_options(args.options, list(_forms().values())))
+        given = import_calibration(args.file, args.form, **format_options(args.options, list(import_forms().values())))
     stations = audit(given, read_observations(args.observations))
     trusted = all(one.trusted for one in stations.values())
     return Document(

@@ -15,7 +15,6 @@ from ceres_cal.cli.arguments import (
     PriorNames,
     Reporting,
     estimate_option,
-    observations_argument,
     output_option,
     parse_estimates,
     parse_length,
@@ -26,7 +25,7 @@ from ceres_cal.cli.arguments import (
 )
 from ceres_cal.cli.command import command
 from ceres_cal.cli.inputs import read_observations, require_different
-from ceres_cal.cli.options import option, switch
+from ceres_cal.cli.options import argument, option, switch
 from ceres_cal.cli.outputs import report_page, report_photographs, require_outputs, write_results, written
 from ceres_cal.cli.terminal import ProgressBar, progress_bar
 from ceres_cal.report.document import Document
@@ -57,8 +56,8 @@ def _lens_kind(name: str) -> str:
 class CalibrateArguments(Reporting):
     """What is to be solved for and how; what is named as in `Options` goes there as it is."""
 
-    observations: tuple[str, ...] = observations_argument(
-        "files of observations (.json or .npz, or one folder .columns), taken together"
+    observations: tuple[str, ...] = argument(
+        "OBS", "files of observations (.json or .npz, or one folder .columns), taken together"
     )
     output: Path | None = output_option("the calibration", None)
     lens: str | None = option(

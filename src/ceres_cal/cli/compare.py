@@ -15,11 +15,10 @@ from ceres_cal.cli.outputs import finishing, require_output
 from ceres_cal.report.document import Document, Section
 
 if TYPE_CHECKING:
-    from ceres_cal.base.arrays import Array
     from ceres_cal.calibration import Calibration
     from ceres_cal.moves import CameraComparison, StationComparison
 
-_COLUMNS, _ROWS = 9, 7
+_TABLE_SIZE = 9, 7
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,6 +77,8 @@ def _over_field(args: CompareArguments, first: Calibration, second: Calibration)
 
 
 def _station(one: StationComparison) -> Iterator[Section]:
+    from ceres_cal.report.maps import grid_table
+
     phi = f"phi {one.phi_px[0]:.3f} -> {one.phi_px[1]:.3f} px"
     size = f"{one.mean_mm:.2f} mm on average, {one.worst_mm:.2f} mm at most"
     yield Section(
@@ -85,11 +86,14 @@ def _station(one: StationComparison) -> Iterator[Section]:
     )
     yield Section("camera", [f"moved {one.moved_mm:.2f} mm, turned {one.turned_deg:.4f} deg, {phi}"])
     yield Section("map", [f"{size}, {1e3 * one.height_m:.0f} mm above the floor", _explained(one)])
-    yield Section("", _grid_table(one.errors_mm[::-1], one.x_m, one.y_m[::-1], ("mm", "x, m")))
+    table = grid_table("mm at y \\ x", one.errors_mm[::-1], one.x_m, one.y_m[::-1], "{:.2f} m", _TABLE_SIZE)
+    yield Section("", table.lines(), pieces=(table,))
 
 
 def _camera(one: CameraComparison) -> Iterator[Section]:
     import numpy as np
+
+    from ceres_cal.report.maps import grid_table
 
     pixels, angles = one.errors_px[np.isfinite(one.errors_px)], one.angles_deg[np.isfinite(one.angles_deg)]
     turned = f", {one.turn_deg:.4f} deg of turn taken out" if one.turn_deg else ""
@@ -101,7 +105,8 @@ def _camera(one: CameraComparison) -> Iterator[Section]:
         _explained(one),
     ]
     yield Section("image", lines)
-    yield Section("", _grid_table(one.errors_px, one.x_px, one.y_px, ("px", "x, px")))
+    table = grid_table("px at y \\ x", one.errors_px, one.x_px, one.y_px, "{:.0f} px", _TABLE_SIZE)
+    yield Section("", table.lines(), pieces=(table,))
 
 
 def _data(one: StationComparison | CameraComparison, **more: float) -> dict[str, Any]:
@@ -116,18 +121,3 @@ def _explained(one: StationComparison | CameraComparison) -> str:
         False: f"more than their uncertainties explain (probability {one.probability or 0.0:.1g})",
         None: "nothing can be said of uncertainty: it is not told of both",
     }[one.explained]
-
-
-def _grid_table(values: Array, x: Array, y: Array, units: tuple[str, str]) -> list[str]:
-    """Some of the values (Y, X), the first row at the top."""
-    import numpy as np
-
-    from ceres_cal.report.maps import evenly
-
-    columns, rows = evenly(len(x), _COLUMNS), evenly(len(y), _ROWS)
-    places = 2 if units[0] == "mm" else 0
-    lines = [f"{units[0]:>10}" + "".join(f"{x[c]:8.{places}f}" for c in columns) + f"  {units[1]}"]
-    for row in rows:
-        cells = "".join(f"{v:8.2f}" if np.isfinite(v) else f"{'.':>8}" for v in values[row, columns])
-        lines.append(f"{y[row]:10.{places}f}{cells}")
-    return lines

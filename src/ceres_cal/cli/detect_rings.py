@@ -20,31 +20,6 @@ if TYPE_CHECKING:
 _MOST_RINGS = 10_000
 
 
-@dataclass(frozen=True, kw_only=True)
-class RingsArguments(Detecting):
-    """A photograph of rings, and the rings."""
-
-    image: str = argument("IMAGE", "photograph of the rings, taken about from the front")
-    radii: str = option(
-        "radii in metres of all edges between dark and bright, from the inside out; FROM:TO:STEP for even ones, "
-        "such as 0.01:0.36:0.01",
-        "M,M,...",
-        REQUIRED,
-    )
-
-
-@command("detect rings", "edges of concentric rings in a photograph", "rings.png --radii 10mm:360mm:10mm -o rings.json")
-def _run(args: RingsArguments) -> Document:
-    require_observations_output(args.output, [args.image])
-    radii = _radii(args.radii)
-    from ceres_cal.detect.rings import detect_rings
-
-    detection = detected(args.timeout, partial(detect_rings, args.image, radii, args.camera, args.station))
-    with finishing():
-        detection.observations.save(args.output)
-    return _document(detection, args, len(radii))
-
-
 def _radii(text: str) -> tuple[float, ...]:
     where = f"--radii {text!r}"
     if ":" not in text:
@@ -58,11 +33,36 @@ def _radii(text: str) -> tuple[float, ...]:
     return tuple(first + i * step for i in range(round((last - first) / step) + 1))
 
 
-def _document(detection: RingsDetection, args: RingsArguments, given: int) -> Document:
+@dataclass(frozen=True, kw_only=True)
+class RingsArguments(Detecting):
+    """A photograph of rings, and the rings."""
+
+    image: str = argument("IMAGE", "photograph of the rings, taken about from the front")
+    radii: tuple[float, ...] = option(
+        "radii in metres of all edges between dark and bright, from the inside out; FROM:TO:STEP for even ones, "
+        "such as 0.01:0.36:0.01",
+        "M,M,...",
+        REQUIRED,
+        read=_radii,
+    )
+
+
+@command("detect rings", "edges of concentric rings in a photograph", "rings.png --radii 10mm:360mm:10mm -o rings.json")
+def _run(args: RingsArguments) -> Document:
+    require_observations_output(args.output, [args.image])
+    from ceres_cal.detect.rings import detect_rings
+
+    detection = detected(args.timeout, partial(detect_rings, args.image, args.radii, args.camera, args.station))
+    with finishing():
+        detection.observations.save(args.output)
+    return _document(detection, args)
+
+
+def _document(detection: RingsDetection, args: RingsArguments) -> Document:
     a1, a2, a3 = detection.polynomial.tolist()
     (x, y), edges, lens = detection.centre.tolist(), len(detection.observations.curves), {"a2": a2 / a1, "a3": a3 / a1}
     lines = [
-        f"{detection.rings} of {given} rings around ({x:.1f}, {y:.1f}), "
+        f"{detection.rings} of {len(args.radii)} rings around ({x:.1f}, {y:.1f}), "
         f"{edges} edges, blurred by {detection.blur_px:.2f} px",
         "the paper's polynomial r' = a1 r + a2 r^2 + a3 r^3, px, the first ring being as large as it is seen:",
         *(f"    {name} {value!r}" for name, value in (("a1", a1), ("a2", a2), ("a3", a3))),
@@ -73,7 +73,7 @@ def _document(detection: RingsDetection, args: RingsArguments, given: int) -> Do
         "image": args.image,
         "output": str(args.output),
         "rings": detection.rings,
-        "radii_given": given,
+        "radii_given": len(args.radii),
         "observations": edges,
         "centre": [x, y],
         "polynomial": {"a1": a1, "a2": a2, "a3": a3},

@@ -10,13 +10,12 @@ from ceres_cal.cli.arguments import (
     Reporting,
     calibration_argument,
     jobs_option,
-    observations_argument,
+    number,
     output_option,
-    parse_number,
 )
 from ceres_cal.cli.command import command
 from ceres_cal.cli.inputs import read_calibration, read_observations
-from ceres_cal.cli.options import option, switch
+from ceres_cal.cli.options import argument, option, switch
 from ceres_cal.cli.outputs import (
     report_page,
     report_photographs,
@@ -34,7 +33,7 @@ class DiagnoseArguments(Reporting):
     """A calibration, observations, and how they are tested."""
 
     calibration: Path = calibration_argument()
-    observations: tuple[str, ...] = observations_argument("the observations it was made from, in the same order")
+    observations: tuple[str, ...] = argument("OBS", "the observations it was made from, in the same order")
     output: Path | None = output_option("the residual of every observation (.csv, .json or .npz)", None)
     new_data: bool = switch("the observations are others than those it was made from")
     held_out: bool = switch(
@@ -44,7 +43,9 @@ class DiagnoseArguments(Reporting):
     strict: bool = switch("exit with 1 for any finding, also one that does no harm")
     folds: int = option("parts into which frames go for --held-out", "K", 5)
     jobs: int = jobs_option("folds, for --held-out,", 1)
-    false_alarms: str = option("probability of any finding where nothing is wrong", "P", "0.01")
+    false_alarms: float = option(
+        "probability of any finding where nothing is wrong", "P", 0.01, read=number("--false-alarms")
+    )
 
 
 @command(
@@ -54,14 +55,14 @@ class DiagnoseArguments(Reporting):
     "calibration.json field.json board.json --held-out --report report.html",
 )
 def _run(args: DiagnoseArguments) -> Document:
-    rate = _require_fitting(args)
+    _require_fitting(args)
     from ceres_cal.base.executing import processes
     from ceres_cal.diagnostics import diagnose
     from ceres_cal.diagnostics.held_out import choose
 
     calibration, observations = read_calibration(args.calibration), read_observations(args.observations)
     photographs = report_photographs(args, observations)
-    diagnosis = diagnose(calibration, observations, new_data=args.new_data, false_alarm_rate=rate)
+    diagnosis = diagnose(calibration, observations, new_data=args.new_data, false_alarm_rate=args.false_alarms)
     choice = None
     if args.held_out:
         with progress_bar(args) as bar, processes(args.jobs) as executor:
@@ -78,15 +79,13 @@ def _run(args: DiagnoseArguments) -> Document:
     return Document(sections, 1 if against or diagnosis.conflicts else 0)
 
 
-def _require_fitting(args: DiagnoseArguments) -> float:
-    """The rate of false alarms; InputError for options that do not fit."""
+def _require_fitting(args: DiagnoseArguments) -> None:
+    """Raise InputError for options that do not fit."""
     require_outputs(args, [args.calibration, *args.observations])
     require_ending(args.output, "the table is", ".csv", ".json", ".npz")
-    rate = parse_number(args.false_alarms, "--false-alarms")
-    if not 0.0 < rate < 1.0:
-        raise InputError(f"--false-alarms must lie between 0 and 1, not {args.false_alarms}")
+    if not 0.0 < args.false_alarms < 1.0:
+        raise InputError(f"--false-alarms must lie between 0 and 1, not {args.false_alarms:g}")
     if args.folds < 2:
         raise InputError(f"--folds must be at least 2, not {args.folds}")
     if args.held_out and args.new_data:
         raise InputError("--held-out calibrates the observations anew: leave out --new-data")
-    return rate

@@ -31,6 +31,13 @@ def _table() -> Iterable[ExportFormat]:
     return [export_format("table")]
 
 
+def import_forms() -> Mapping[str, ImportFormat]:
+    """The formats that are read, by name."""
+    from ceres_cal.formats import IMPORT_FORMATS
+
+    return IMPORT_FORMATS
+
+
 def listed(forms: Iterable[ExportFormat | ImportFormat]) -> str:
     """What there is to choose from."""
     return "; ".join(f"{one.name}: {one.description} ({', '.join(one.endings) or 'a folder'})" for one in forms)

@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING
 from ceres_cal.base.errors import InputError
 from ceres_cal.cli.arguments import calibration_argument, length, output_option
 from ceres_cal.cli.command import command
-from ceres_cal.cli.export import format_options, listed, losses
+from ceres_cal.cli.export import format_options, import_forms, listed, losses
 from ceres_cal.cli.inputs import read_calibration
 from ceres_cal.cli.options import Arguments, argument, option, options_of, switch
 from ceres_cal.cli.outputs import finishing, require_output
 from ceres_cal.report.document import Document, Section
 
 if TYPE_CHECKING:
-    from ceres_cal.formats import Group, ImportFormat
+    from ceres_cal.formats import Group
     from ceres_cal.scene.targets import Target
 
 
@@ -30,16 +30,10 @@ class ImportArguments(Arguments):
 
     file: Path = argument("FILE", "of another program")
     form: str | None = option(
-        lambda: f"default: by ending and content. {listed(_forms().values())}", "FORMAT", flags=("--from",)
+        lambda: f"default: by ending and content. {listed(import_forms().values())}", "FORMAT", flags=("--from",)
     )
     output: Path = output_option("the calibration or the observations (.json; observations also .npz)")
-    options: Mapping[str, str] = options_of(lambda: _forms().values())
-
-
-def _forms() -> Mapping[str, ImportFormat]:
-    from ceres_cal.formats import IMPORT_FORMATS
-
-    return IMPORT_FORMATS
+    options: Mapping[str, str] = options_of(lambda: import_forms().values())
 
 
 @command(
@@ -53,9 +47,9 @@ def _import(args: ImportArguments) -> Document:
     from ceres_cal.observations import Observations
 
     require_output(args.output, [args.file])
-    if args.form is not None and args.form not in _forms():
-        raise InputError(f"there is no format {args.form!r} to read: choose one of {', '.join(_forms())}")
-    forms = list(_forms().values()) if args.form is None else [_forms()[args.form]]
+    if args.form is not None and args.form not in import_forms():
+        raise InputError(f"there is no format {args.form!r} to read: choose one of {', '.join(import_forms())}")
+    forms = list(import_forms().values()) if args.form is None else [import_forms()[args.form]]
     given = read_foreign(args.file, args.form, **format_options(args.options, forms))
     with finishing():
         given.save(args.output)

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ceres_cal.base.words import plural
-from ceres_cal.cli.arguments import observations_argument, output_option
+from ceres_cal.cli.arguments import output_option
 from ceres_cal.cli.command import command
 from ceres_cal.cli.inputs import read_observations, require_different
-from ceres_cal.cli.options import Arguments, option
+from ceres_cal.cli.options import Arguments, argument, option
 from ceres_cal.cli.outputs import finishing, require_observations_output
 from ceres_cal.report.document import Document, Section, wrapped
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 class JoinArguments(Arguments):
     """What goes together."""
 
-    observations: tuple[str, ...] = observations_argument("files of observations, of all cameras")
+    observations: tuple[str, ...] = argument("OBS", "files of observations, of all cameras")
     same_frame: str | None = option(
         "which frames are one moment: 'left*,right*' (what * stands for names it), index (the n-th of each "
         "camera), or within:0.01 (frames are named by time stamps); default: those of one name",

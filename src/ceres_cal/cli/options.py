@@ -108,6 +108,15 @@ def flag(name: str) -> str:
     return f"--{name.replace('_', '-')}"
 
 
+def given_of(args: Arguments, group: str) -> list[str]:
+    """The options of a group that were given, as they are typed."""
+    return [
+        flag(one.name)
+        for one in fields(args)
+        if one.metadata.get("group") == group and getattr(args, one.name) != one.default
+    ]
+
+
 def _frozen(value: Any) -> Any:
     return tuple(value) if isinstance(value, list) else value
 

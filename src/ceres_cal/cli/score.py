@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ceres_cal.cli.arguments import Loss, calibration_argument, observations_argument
+from ceres_cal.cli.arguments import Loss, calibration_argument
 from ceres_cal.cli.command import command
 from ceres_cal.cli.inputs import read_calibration, read_observations, require_different
-from ceres_cal.cli.options import Arguments, option, switch
+from ceres_cal.cli.options import Arguments, argument, option, switch
 from ceres_cal.report.document import Document, Section
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ class ScoreArguments(Arguments):
     """A calibration, new observations, and how they are weighed."""
 
     calibration: Path = calibration_argument()
-    observations: tuple[str, ...] = observations_argument("files of new observations (.json or .npz), taken together")
+    observations: tuple[str, ...] = argument("OBS", "files of new observations (.json or .npz), taken together")
     hold_stations: bool = switch(
         "stations stand where the calibration has them, boards alone are posed: tests the poses of a rig, too",
     )

@@ -14,14 +14,14 @@ from ceres_cal.cli.arguments import (
     height_option,
     length,
     metres,
+    number,
     output_option,
     parse_lengths,
-    parse_number,
     station_option,
 )
 from ceres_cal.cli.command import command
 from ceres_cal.cli.inputs import image_files, read_calibration
-from ceres_cal.cli.options import Quiet, argument, flag, option, switch
+from ceres_cal.cli.options import Quiet, argument, given_of, option, switch
 from ceres_cal.cli.outputs import finishing
 from ceres_cal.cli.terminal import progress_bar
 from ceres_cal.report.document import Document, Section
@@ -38,9 +38,22 @@ _FORMAT, _VERSION = "ceres-cal/pictures", 1
 _STRAIGHT = "straight images (default)"
 _TOP = "the field from above"
 _OVERLAY = "the model in the photograph"
-_OF_STRAIGHT = ("whole", "crop", "size", "phi", "angle")
-_OF_TOP = ("mm_per_px", "area")
-_OF_OVERLAY = ("before", "observations")
+Area = tuple[float, float, float, float]
+"""x0, y0, x1 and y1 in metres."""
+
+
+def _size(text: str) -> tuple[int, int]:
+    across, by, down = text.lower().partition("x")
+    if not (by and across.isdecimal() and down.isdecimal()):
+        raise InputError(f"--size {text!r}: write WIDTHxHEIGHT in px, such as 1280x960")
+    return int(across), int(down)
+
+
+def _area(text: str) -> Area:
+    numbers = parse_lengths(text, f"--area {text!r}")
+    if len(numbers) != 4:
+        raise InputError(f"--area {text!r}: write X0,Y0,X1,Y1 in metres, such as -4.5,-3,0,3")
+    return numbers[0], numbers[1], numbers[2], numbers[3]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,18 +68,27 @@ class UndistortArguments(Quiet):
     format: Literal["png", "jpg"] = option("default: png, which loses nothing", default="png")
     crop: bool = switch("the largest rectangle without black (default)", group=_STRAIGHT, alone="shape")
     whole: bool = switch("everything that the photograph shows, black around it", group=_STRAIGHT, alone="shape")
-    size: str | None = option(
-        "size of the straight image, px; default: the photograph's", "WxH", group=_STRAIGHT, alone="scale"
+    size: tuple[int, int] | None = option(
+        "size of the straight image, px; default: the photograph's", "WxH", read=_size, group=_STRAIGHT, alone="scale"
     )
-    phi: str | None = option(
-        "its focal length instead; the camera's own keeps the scale", "PX", group=_STRAIGHT, alone="scale"
+    phi: float | None = option(
+        "its focal length instead; the camera's own keeps the scale",
+        "PX",
+        read=number("--phi"),
+        group=_STRAIGHT,
+        alone="scale",
     )
-    angle: str | None = option(
-        "widest angle of view; default: 150 with --whole, else as far as detail goes", "DEG", group=_STRAIGHT
+    angle: float | None = option(
+        "widest angle of view; default: 150 with --whole, else as far as detail goes",
+        "DEG",
+        read=number("--angle"),
+        group=_STRAIGHT,
     )
     top_view: bool = switch("the field from straight above, to scale", group=_TOP)
     mm_per_px: float | None = option("scale of the top view; default: 5", "MM", read=length("mm"), group=_TOP)
-    area: str | None = option("area in metres; default: the field and 0.3 m around it", "X0,Y0,X1,Y1", group=_TOP)
+    area: Area | None = option(
+        "area in metres; default: the field and 0.3 m around it", "X0,Y0,X1,Y1", read=_area, group=_TOP
+    )
     overlay: bool = switch("draw the calibrated lines and boards into photographs", group=_OVERLAY)
     before: Path | None = option("draw an earlier calibration too", "CALIBRATION", group=_OVERLAY)
     observations: Path | None = option("say what each frame shows, and draw them too", "OBS", group=_OVERLAY)
@@ -115,15 +137,14 @@ def require_fitting(args: UndistortArguments) -> None:
     if args.top_view and args.overlay:
         raise InputError("--top-view and --overlay are two kinds of pictures: make one at a time")
     groups = (
-        (_OF_STRAIGHT, not (args.top_view or args.overlay), "straight images"),
-        (_OF_TOP, args.top_view, "--top-view"),
-        (_OF_OVERLAY, args.overlay, "--overlay"),
-        (("height_mm",), args.top_view or args.overlay, "--top-view and --overlay"),
+        (given_of(args, _STRAIGHT), not (args.top_view or args.overlay), "straight images"),
+        (given_of(args, _TOP), args.top_view, "--top-view"),
+        (given_of(args, _OVERLAY), args.overlay, "--overlay"),
+        ([] if args.height_mm is None else ["--height-mm"], args.top_view or args.overlay, "--top-view and --overlay"),
     )
-    for names, chosen, what in groups:
-        given = [name for name in names if getattr(args, name) not in (None, False)]
+    for given, chosen, what in groups:
         if given and not chosen:
-            raise InputError(f"{flag(given[0])} is for {what}: leave it out, or ask for that")
+            raise InputError(f"{given[0]} is for {what}: leave it out, or ask for that")
 
 
 def _outputs(images: list[Path], folder: Path, ending: str, about: str) -> dict[Path, Path]:
@@ -140,20 +161,6 @@ def _outputs(images: list[Path], folder: Path, ending: str, about: str) -> dict[
         if output.exists() and any(output.samefile(image) for image in images):
             raise InputError(f"{output}: is an input, and the output would replace it: name another folder")
     return outputs
-
-
-def _size(text: str) -> tuple[int, int]:
-    across, by, down = text.lower().partition("x")
-    if not (by and across.isdecimal() and down.isdecimal()):
-        raise InputError(f"--size {text!r}: write WIDTHxHEIGHT in px, such as 1280x960")
-    return int(across), int(down)
-
-
-def _area(text: str) -> tuple[float, float, float, float]:
-    numbers = parse_lengths(text, f"--area {text!r}")
-    if len(numbers) != 4:
-        raise InputError(f"--area {text!r}: write X0,Y0,X1,Y1 in metres, such as -4.5,-3,0,3")
-    return numbers[0], numbers[1], numbers[2], numbers[3]
 
 
 def _station(args: UndistortArguments, calibration: Calibration) -> str:
@@ -223,9 +230,9 @@ def _straight(args: UndistortArguments, calibration: Calibration) -> _PictureMak
     straight = straighten(
         camera,
         whole=args.whole,
-        size=None if args.size is None else _size(args.size),
-        phi=None if args.phi is None else parse_number(args.phi, "--phi"),
-        angle_deg=None if args.angle is None else parse_number(args.angle, "--angle"),
+        size=args.size,
+        phi=args.phi,
+        angle_deg=args.angle,
     )
     facts = {
         "camera": name,
@@ -273,7 +280,7 @@ def _top_view(args: UndistortArguments, calibration: Calibration) -> _PictureMak
 
     station = _station(args, calibration)
     camera, name = calibration.stations[station], calibration.estimate.stations[station].camera
-    area = _field(calibration) if args.area is None else _area(args.area)
+    area = args.area or _field(calibration)
     mm_per_px = 5.0 if args.mm_per_px is None else args.mm_per_px
     grid = make_grid(area, mm_per_px / 1000.0, metres(args.height_mm))
     warp = top_view(camera, grid)
@@ -297,7 +304,7 @@ def _top_view(args: UndistortArguments, calibration: Calibration) -> _PictureMak
     )
 
 
-def _field(calibration: Calibration) -> tuple[float, float, float, float]:
+def _field(calibration: Calibration) -> Area:
     from ceres_cal.uncertainty.uncertainty import field_grid
 
     try:

@@ -54,6 +54,15 @@ class Table:
     stacked: bool = False
     most: int = 200
 
+    def lines(self) -> list[str]:
+        """The same for a terminal, the first column to the left."""
+        columns = list(zip(self.head, *self.rows, strict=True))
+        widths = [max(map(len, column)) for column in columns]
+        every = (self.head, *self.rows)
+        return [
+            "  ".join(f"{cell:{'>' if n else '<'}{widths[n]}}" for n, cell in enumerate(row)).rstrip() for row in every
+        ]
+
 
 @dataclass(frozen=True)
 class Figure:

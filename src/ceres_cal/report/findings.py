@@ -7,11 +7,10 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array
 from ceres_cal.base.words import DASH, chance, counted, fixed, grouped, mm, plural, powered, sentence, short
 from ceres_cal.diagnostics import Diagnosis, Finding, Noise, ResidualTable, Summary
-from ceres_cal.diagnostics.held_out import Choice, HeldOut
-from ceres_cal.report.document import WIDTH, Card, Chapter, Piece, Section, Table, Text, wrapped
+from ceres_cal.diagnostics.held_out import Choice
+from ceres_cal.report.document import Card, Chapter, Piece, Section, Table, Text, wrapped
 from ceres_cal.report.grounds import is_against
 
 _MOST_CARDS, _MOST_ROWS = 8, 8
@@ -84,7 +83,8 @@ def _verdict(diagnosis: Diagnosis) -> list[str]:
 
 def _finding(finding: Finding) -> list[str]:
     lines = wrapped(finding.sentence, f"-> {finding.advice}")
-    size = f"{finding.effect_px:.2f} px, {_fixed(finding.effect_mm)} mm; {plural(finding.observations, 'observation')}"
+    moved = plural(finding.observations, "observation")
+    size = f"{finding.effect_px:.2f} px, {fixed(finding.effect_mm, 2)} mm; {moved}"
     lines.append(f"   {size}; false alarm: {chance(finding.log10_p)}")
     if len(finding.amounts) > _MOST_SAID:
         lines += [f"   {one.name:28}{one.value:9.3f} ± {one.sd:.3f} {one.unit}" for one in finding.amounts]
@@ -144,33 +144,46 @@ def _held_out(choice: Choice) -> Section:
     """Which lens predicts parts that it was not fitted to best."""
     chosen, current, best = (choice.candidates[i].label for i in (choice.chosen, choice.current, choice.best))
     take = "the calibration's lens is the one to take" if choice.chosen == choice.current else f"take {chosen}"
-    lines, rows = [f"{'':24}held-out px      mm   fit px"], []
+    rows = []
     for number, one in enumerate(choice.candidates):
         kinds = (("now", choice.current), ("least error", choice.best), ("chosen", choice.chosen))
         marks = ", ".join(word for word, index in kinds if index == number)
-        lines.append(f"{one.label:24}{_errors(one)}  {marks}".rstrip())
+        if one.failed_folds:
+            marks = f"{marks} without {plural(one.failed_folds, 'part')} that failed".strip()
         cells = (fixed(one.rms_px, 4), fixed(one.rms_mm, 3), fixed(one.fit_rms_px, 4), marks)
         rows.append((one.label, *((DASH, DASH, DASH, one.failed) if one.failed else cells)))
     thinned = f"on {100.0 * choice.thinned:.0f} % of the observations" if choice.thinned < 1.0 else ""
     parts = max(one.folds for one in choice.candidates)
     rule = f"{parts} parts of the frames; chosen: {_CHOSEN_BY}"
-    lines += [f"{rule}; {thinned}" if thinned else rule, take]
     head = ("lens", "held-out px", "mm", "fit px", "")
     table = Table(head, tuple(rows), "Frames held out: how well others predict them", stacked=True)
+    lines = [*table.lines(), f"{rule}; {thinned}" if thinned else rule, take]
     text = f"{sentence(take)}: {_CHOSEN_BY}." + (f" {sentence(thinned)}." if thinned else "")
     labels = {"best": best, "chosen": chosen, "current": current}
     data = {"candidates": choice.candidates, **labels, "share_of_observations": choice.thinned}
     return Section("held out", lines, {"held_out": data}, (table, Text(text)))
 
 
-def _errors(one: HeldOut) -> str:
-    if one.failed:
-        return f"none: {one.failed}"[: WIDTH - 24]
-    text = f"{one.rms_px:11.4f}{one.rms_mm:9.3f}{one.fit_rms_px:9.4f}"
-    return text + (f" without {plural(one.failed_folds, 'part')} that failed" if one.failed_folds else "")
-
-
 # ---- tables ---------------------------------------------------------------------------------------------------------
+
+
+def summary_table(head: str, summary: Summary, rows: Sequence[int], names: Sequence[str] = ()) -> Table:
+    """Some groups of observations, by their numbers; `names`: of them, where the summary's own are not shown."""
+    of_points, of_curves = summary.points_rms_px, summary.curves_rms_px
+    cells = tuple(
+        (
+            name,
+            grouped(int(summary.points[i])),
+            fixed(float(of_points[i]), 3),
+            grouped(int(summary.curves[i])),
+            fixed(float(of_curves[i]), 3),
+            fixed(float(summary.rms_mm[i]), 2),
+            fixed(float(summary.rms_sigma[i]), 3),
+            grouped(int(summary.rejected[i])),
+        )
+        for i, name in zip(rows, names or [summary.names[i] for i in rows], strict=True)
+    )
+    return Table((head, "points", "rms px", "curves", "rms px", "mm", "sigma", "out"), cells)
 
 
 def _summary(summary: Summary, *, by_size: bool) -> list[str]:
@@ -178,24 +191,9 @@ def _summary(summary: Summary, *, by_size: bool) -> list[str]:
     order: Sequence[int] = range(len(summary.names))
     if by_size:
         order = np.argsort(-np.nan_to_num(summary.rms_sigma), kind="stable")[:_MOST_ROWS].tolist()
-    width = max(24, *(len(summary.names[i]) + 2 for i in order))
-    lines = [f"{'':{width}}points     px  curves     px      mm  sigma   out"]
-    for i in order:
-        numbers = (
-            f"{summary.points[i]:6}{_px(summary.points_rms_px, i)}{summary.curves[i]:8}{_px(summary.curves_rms_px, i)}"
-        )
-        rest = f"{_fixed(float(summary.rms_mm[i])):>8}{_px(summary.rms_sigma, i)}{summary.rejected[i]:6}"
-        lines.append(f"{summary.names[i]:{width}}{numbers}{rest}")
-    rest_count = len(summary.names) - len(order)
-    return [*lines, f"and {rest_count} more with smaller residuals"] if rest_count else lines
-
-
-def _fixed(value: float) -> str:
-    return "-" if not np.isfinite(value) else f"{value:.2f}"
-
-
-def _px(values: Array, number: int) -> str:
-    return f"{'-':>7}" if not np.isfinite(values[number]) else f"{values[number]:7.3f}"
+    rest = len(summary.names) - len(order)
+    more = [f"and {rest} more with smaller residuals"] if rest else []
+    return [*summary_table("", summary, order).lines(), *more]
 
 
 def _leverage(table: ResidualTable) -> Iterator[str]:

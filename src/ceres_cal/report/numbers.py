@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -25,9 +25,8 @@ from ceres_cal.base.words import (
 from ceres_cal.calibration import Calibration, LensChoice
 from ceres_cal.model.parameters import anchored_stations
 from ceres_cal.observations import Observations
-from ceres_cal.report.accuracy import accuracy_sections
-from ceres_cal.report.document import Chapter, Piece, Section, Table, Text, wrapped
-from ceres_cal.report.quality import Quality, Seam
+from ceres_cal.report.document import Piece, Section, Table, Text, wrapped
+from ceres_cal.report.quality import Quality
 from ceres_cal.scene.camera import Camera
 from ceres_cal.solve import words_of
 from ceres_cal.uncertainty import Verdict
@@ -46,16 +45,6 @@ _PHI_FROM = {
 }
 _ANCHORED = "held as the world: boards alone do not tell where it stands"
 _Row = tuple[str, ...]
-
-
-def chapter(quality: Quality, seams: Sequence[Seam]) -> Chapter:
-    """The numbers on a page."""
-    intro = (
-        "In the paper's units; coefficients with its a1 = 1 (another a1 goes with a1 a2, a1 a3 and a1 phi). Known "
-        "means to 1 % or better, weak to 30 %."
-    )
-    every = (*number_sections(quality), *accuracy_sections(quality, seams))
-    return Chapter("numbers", "The numbers", (Text(intro), *(piece for one in every for piece in one.pieces)))
 
 
 def number_sections(quality: Quality) -> Iterator[Section]:

@@ -17,6 +17,7 @@ from ceres_cal.diagnostics.summaries import RadiusTrend
 from ceres_cal.report import canvas
 from ceres_cal.report.canvas import CURVE, INK, OUTLIER, PAINT, POINT, QUIET, Drawing, Hover
 from ceres_cal.report.document import Figure, Table
+from ceres_cal.report.findings import summary_table
 from ceres_cal.report.material import Material, paint_of
 from ceres_cal.report.scale import spoken
 from ceres_cal.scene.camera import Camera
@@ -193,21 +194,8 @@ def _scale_bar(axes: Axes, camera: Camera, enlarged: int, typical: float) -> Non
 
 def _region_table(summary: Summary, camera: str) -> Table:
     rows = [i for i, name in enumerate(summary.names) if name.rpartition(" ")[0] == camera]
-    return Table(
-        ("part of the image (column, row)", "points", "rms px", "curves", "rms px", "out"),
-        tuple(_summary_row(summary, i, summary.names[i].rpartition(" ")[2]) for i in rows),
-    )
-
-
-def _summary_row(summary: Summary, number: int, name: str) -> tuple[str, ...]:
-    return (
-        name,
-        grouped(int(summary.points[number])),
-        fixed(float(summary.points_rms_px[number]), 3),
-        grouped(int(summary.curves[number])),
-        fixed(float(summary.curves_rms_px[number]), 3),
-        grouped(int(summary.rejected[number])),
-    )
+    parts = [summary.names[i].rpartition(" ")[2] for i in rows]
+    return summary_table("part of the image (column, row)", summary, rows, parts)
 
 
 # ---- against the radius ---------------------------------------------------------------------------------------------
@@ -292,10 +280,7 @@ def by_frame(material: Material) -> Figure:
         "Root mean square residual of each frame over its expected noise: 1 is as everywhere. A frame that stands out "
         "has wrong labels, motion blur or a bumped camera; a step that stays means that the camera moved then.",
         Drawing(draw, 0.66),
-        Table(
-            ("frame", "points", "rms px", "curves", "rms px", "out"),
-            tuple(_summary_row(frames, i, frames.names[i]) for i in range(len(frames.names))),
-        ),
+        summary_table("frame", frames, range(len(frames.names))),
         hover=Hover.of(number, np.zeros(1), spoken(frames.rms_sigma), "{x}: {value} sigma").named(frames.names),
     )
 

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ceres_cal.base.words import counted, fixed, metres, mm, plural, sentence, short
-from ceres_cal.report.accuracy import accuracy_sections
-from ceres_cal.report.document import BulletList, Chapter, Piece, Section, Text, Tile, Tiles, wrapped
+from ceres_cal.base.words import DASH, at_precision, counted, fixed, metres, mm, plural, sentence, short, two_digits
+from ceres_cal.report.document import BulletList, Chapter, Piece, Section, Table, Text, Tile, Tiles, wrapped
 from ceres_cal.report.grounds import (
     CARE_MM,
     GOOD_MM,
@@ -25,14 +24,15 @@ from ceres_cal.report.grounds import (
     worst_radius,
 )
 from ceres_cal.report.numbers import bounds, number_sections, observed, outliers, stopped, warnings
-from ceres_cal.report.quality import Quality
-from ceres_cal.scene.heights import at_height
-from ceres_cal.uncertainty import FieldMap, Verdict
+from ceres_cal.report.quality import Quality, Seam
+from ceres_cal.scene.heights import HEIGHTS_M, at_height
+from ceres_cal.uncertainty import FieldMap, Uncertainty, Verdict
+from ceres_cal.uncertainty.rig import RigPair
 
 if TYPE_CHECKING:
     from ceres_cal.report.material import Material
 
-_MOST_FINDINGS = 3
+_MOST_FINDINGS, _MOST_DIRECTIONS = 3, 4
 _MEANING = (
     "The headline holds for 95 % of the points located at the worst place that a camera sees; ± is a standard "
     "deviation. Both are the calibration's own share: the noise of the pixel that is asked about comes on top. Green: "
@@ -67,6 +67,97 @@ def _verdict(quality: Quality) -> Section:
     reasons = [{"level": level, "text": text} for level, text in judged.reasons]
     data = {"level": judged.level, "headline": judged.headline, "reasons": reasons, "findings": findings}
     return Section("verdict", lines, {"verdict": data})
+
+
+# ---- how well places are known --------------------------------------------------------------------------------------
+
+
+def accuracy_sections(quality: Quality, seams: Sequence[Seam]) -> Iterator[Section]:
+    """How well cameras and places are known; `seams`: those that are said."""
+    uncertainty, maps = quality.uncertainty, quality.maps
+    if uncertainty is None:
+        yield Section(data={"uncertainty": None})
+        return
+    yield Section("rig", [_rig_line(pair) for pair in uncertainty.rig])
+    yield Section("located", [f"{name}: {_sd_at_heights(every)}" for name, every in maps.items()])
+    yield _seams(seams)
+    yield Section("widened", [uncertainty.widening] if uncertainty.widening else [])
+    yield from _unknown(uncertainty)
+    known = {
+        "numbers": [{**vars(one), "key": one.key._asdict()} for one in uncertainty.verdicts],
+        "widening": uncertainty.widening,
+        "rig": uncertainty.rig,
+        "dependence": uncertainty.posterior.dependence,
+        "unknown_placements": uncertainty.unknown_placements,
+        "maps": {name: [_map_data(one) for one in every] for name, every in maps.items()},
+    }
+    yield Section(data={"uncertainty": known})
+
+
+def _rig_line(pair: RigPair) -> str:
+    """Baseline and angle of two stations, each with its standard deviation."""
+    baseline = 1e3 * np.array([pair.baseline_m, pair.baseline_sd_m])
+    turn = np.degrees([pair.angle_rad, pair.angle_sd_rad])
+    apart, turned = (
+        f"{at_precision(value, sd)} ± {two_digits(sd) if np.isfinite(sd) else 'unknown'}"
+        for value, sd in (baseline, turn)
+    )
+    return f"{' - '.join(pair.stations)}: baseline {apart} mm, angle {turned} deg"
+
+
+def _sd_at_heights(maps: Sequence[FieldMap]) -> str:
+    parts = []
+    for m in maps:
+        x, y = m.worst_place_m
+        mean = f"± {two_digits(m.mean_mm)} mm" if np.isfinite(m.mean_mm) else "unknown"
+        worst = f" (worst {two_digits(m.worst_mm)} at {x:.1f}, {y:.1f} m)" if np.isfinite(m.worst_mm) else ""
+        parts.append(f"{mean} {at_height(m.height_m)}{worst}")
+    return ", ".join(parts)
+
+
+def _map_data(m: FieldMap) -> dict[str, Any]:
+    own = {name: getattr(m, name) for name in ("height_m", "worst_place_m", "x_m", "y_m", "sd_mm", "radius_95_mm")}
+    return {**own, "mean_sd_mm": m.mean_mm, "worst_sd_mm": m.worst_mm}
+
+
+def _seams(seams: Sequence[Seam]) -> Section:
+    """By how much two cameras disagree about what both see."""
+    lines, data, rows = [], [], []
+    for seam in seams:
+        rms, expected, count = seam.measured.rms_mm, seam.measured.expected_rms_mm, len(seam.measured.what)
+        lines.append(f"{' - '.join(seam.stations)}: {_sd_at_heights(seam.predicted)}")
+        if count:
+            found = f"found {two_digits(rms)} mm where {two_digits(expected)} were expected"
+            lines.append(f"{found} (rms of {count} points and stretches that both observed)")
+        measured = {"found_mm": rms, "expected_mm": expected, "compared": count}
+        predicted = [_map_data(one) for one in seam.predicted]
+        data.append({"stations": seam.stations, "predicted": predicted, **measured})
+        means = (f"± {mm(one.mean_mm)}" for one in seam.predicted)
+        over = f" rms of {count}" if count else ""
+        rows.append((f" {DASH} ".join(seam.stations), *means, f"{mm(rms)}{over}", mm(expected)))
+    head = ("stations", *map(at_height, HEIGHTS_M), "found", "expected")
+    table = Table(head, tuple(rows), "Where two cameras see the same: by how much they disagree", stacked=True)
+    return Section("seam", lines, {"uncertainty": {"seams": data}}, (table,) if rows else ())
+
+
+def _unknown(uncertainty: Uncertainty) -> Iterator[Section]:
+    """What the observations hardly tell."""
+    weak = uncertainty.weak_directions
+    lines = [one.words for one in weak[:_MOST_DIRECTIONS]]
+    if len(weak) > _MOST_DIRECTIONS:
+        lines.append(f"and {len(weak) - _MOST_DIRECTIONS} more (--json)")
+    data = [
+        {"words": one.words, "relative": one.relative, "shares": [[*key[:3], share] for key, share in one.shares]}
+        for one in weak
+    ]
+    bullets = BulletList(tuple(("care", one.words) for one in weak))
+    pieces = (Text("What the observations hardly tell, weakest first:"), bullets) if weak else ()
+    yield Section("weak", lines, {"uncertainty": {"weak_directions": data}}, pieces)
+    unknown = uncertainty.unknown_placements
+    if unknown:
+        name, quantities = next(iter(unknown.items()))
+        rest = f", and of {len(unknown) - 1} more placements" if len(unknown) > 1 else ""
+        yield Section("unknown", [f"{', '.join(quantities)} of placement {name!r}{rest}"])
 
 
 # ---- on a page ------------------------------------------------------------------------------------------------------
@@ -126,3 +217,13 @@ def _focal_tile(verdict: Verdict) -> Tile:
     value = f"± {short(100.0 * verdict.relative)}" if known else "unknown"
     note = f"{fixed(verdict.value, 1)} px, 95 %: {bounds(verdict)}"
     return Tile(f"phi of {verdict.key.owner}", value, "%" if known else "", note, level_of_verdict(verdict))
+
+
+def numbers_chapter(quality: Quality, seams: Sequence[Seam]) -> Chapter:
+    """The numbers on a page."""
+    intro = (
+        "In the paper's units; coefficients with its a1 = 1 (another a1 goes with a1 a2, a1 a3 and a1 phi). Known "
+        "means to 1 % or better, weak to 30 %."
+    )
+    every = (*number_sections(quality), *accuracy_sections(quality, seams))
+    return Chapter("numbers", "The numbers", (Text(intro), *(piece for one in every for piece in one.pieces)))
