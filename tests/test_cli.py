@@ -28,8 +28,7 @@ from ceres_cal.base.errors import InputError
 from ceres_cal.calibration import Calibration
 from ceres_cal.cli import main
 from ceres_cal.cli.arguments import length, parse_length
-from ceres_cal.cli.command import Command
-from ceres_cal.cli.commands import COMMANDS
+from ceres_cal.cli.command import COMMANDS, Command
 from ceres_cal.cli.terminal import ProgressBar, coloured, in_colour
 from ceres_cal.detect.boards import CORNER_FITS
 from ceres_cal.model.parameters import LOSSES, Options

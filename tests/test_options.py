@@ -9,14 +9,13 @@ from typing import Any, Literal
 import pytest
 
 from ceres_cal.base.errors import InputError
-from ceres_cal.cli.arguments import Reporting, length
+from ceres_cal.cli.arguments import ReportArguments, length
 from ceres_cal.cli.calibrate import CalibrateArguments
-from ceres_cal.cli.command import Parser
-from ceres_cal.cli.commands import COMMANDS
+from ceres_cal.cli.command import COMMANDS, Parser
 from ceres_cal.cli.options import (
     REQUIRED,
     Arguments,
-    Quiet,
+    QuietArguments,
     add_options,
     argument,
     filled,
@@ -44,7 +43,7 @@ class Form:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Every(Quiet):
+class Every(QuietArguments):
     """One field of each kind."""
 
     first: Path = argument("FIRST", "a file")
@@ -142,6 +141,6 @@ def test_what_calibrate_hands_on_has_the_same_defaults_as_in_python() -> None:
 
 
 def test_commands_that_write_a_report_say_where() -> None:
-    assert [name for name in COMMANDS if issubclass(COMMANDS[name].arguments, Reporting)] == [
+    assert [name for name in COMMANDS if issubclass(COMMANDS[name].arguments, ReportArguments)] == [
         "calibrate", "diagnose", "refit",
     ]  # fmt: skip

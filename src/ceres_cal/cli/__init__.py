@@ -15,8 +15,7 @@ from ceres_cal.base.errors import CalibrationError, InputError, SolutionError
 from ceres_cal.base.words import first_of
 from ceres_cal.base.written import noting
 from ceres_cal.cli import terminal
-from ceres_cal.cli.command import Command, print_answer
-from ceres_cal.cli.commands import COMMANDS
+from ceres_cal.cli.command import COMMANDS, Command, print_answer
 from ceres_cal.cli.program import TERMINATED, Terminated, as_a_program, ended
 
 _BEGINNINGS = {"", *(name.partition(" ")[0] for name in COMMANDS if " " in name)}

@@ -17,8 +17,8 @@ from ceres_cal.cli.arguments import (
     station_option,
 )
 from ceres_cal.cli.command import command
-from ceres_cal.cli.inputs import read_calibration, station_of
-from ceres_cal.cli.options import Quiet, option
+from ceres_cal.cli.files import read_calibration, station_of
+from ceres_cal.cli.options import QuietArguments, option
 from ceres_cal.cli.terminal import progress_bar
 from ceres_cal.report.document import Document, Section, wrapped
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class AdviseArguments(Quiet):
+class AdviseArguments(QuietArguments):
     """What is to be reached, and by which means."""
 
     calibration: Path = calibration_argument()

@@ -8,10 +8,10 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from ceres_cal.base.errors import InputError
-from ceres_cal.cli.options import REQUIRED, Arguments, Quiet, argument, option
+from ceres_cal.cli.options import REQUIRED, QuietArguments, argument, option
 
 if TYPE_CHECKING:
     from ceres_cal.observations import Observations, Prior
@@ -87,7 +87,7 @@ def frames_option() -> Any:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Reporting(Quiet):
+class ReportArguments(QuietArguments):
     """Of a command that may write what it made, and a page."""
 
     output: Path | None
@@ -97,16 +97,6 @@ class Reporting(Quiet):
         "PHOTOGRAPH",
         repeatable=True,
     )
-
-
-@dataclass(frozen=True, kw_only=True)
-class Detecting(Arguments):
-    """What `detect board` and `detect rings` share."""
-
-    timeout: float | None = timeout_option()
-    camera: str = option("name of the camera", "NAME", "camera")
-    station: str | None = station_option("name of the station; default: that of the camera")
-    output: Path = output_option("the observations (.json or .npz)")
 
 
 # ---- values ---------------------------------------------------------------------------------------------------------
@@ -176,8 +166,7 @@ def metres(height_mm: float | None) -> float:
     return 0.0 if height_mm is None else height_mm / 1000.0
 
 
-@dataclass(frozen=True)
-class PriorNames:
+class PriorNames(NamedTuple):
     """The quantities that a `--prior` may name: of a station, and of a camera."""
 
     station: Sequence[str]

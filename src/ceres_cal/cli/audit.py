@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from ceres_cal.cli.command import command
 from ceres_cal.cli.export import format_options, import_forms
-from ceres_cal.cli.inputs import read_observations
+from ceres_cal.cli.files import read_observations
 from ceres_cal.cli.options import REQUIRED, Arguments, argument, option, options_of
 from ceres_cal.report.document import Document, Section, wrapped
 

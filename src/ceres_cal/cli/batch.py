@@ -15,9 +15,8 @@ from typing import TYPE_CHECKING, Any
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.words import plural
 from ceres_cal.cli.arguments import jobs_option, output_option
-from ceres_cal.cli.command import command
-from ceres_cal.cli.commands import COMMANDS
-from ceres_cal.cli.options import Quiet, argument, option, switch
+from ceres_cal.cli.command import COMMANDS, command
+from ceres_cal.cli.options import QuietArguments, argument, option, switch
 from ceres_cal.report.document import Document, Section
 
 if TYPE_CHECKING:
@@ -32,7 +31,7 @@ _MOST_REASONS = 4
 
 
 @dataclass(frozen=True, kw_only=True)
-class BatchArguments(Quiet):
+class BatchArguments(QuietArguments):
     """The jobs, and where their results go."""
 
     plan: Path = argument(

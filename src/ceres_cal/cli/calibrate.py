@@ -13,7 +13,7 @@ from ceres_cal.base.errors import InputError
 from ceres_cal.cli.arguments import (
     Loss,
     PriorNames,
-    Reporting,
+    ReportArguments,
     estimate_option,
     output_option,
     parse_estimates,
@@ -24,9 +24,16 @@ from ceres_cal.cli.arguments import (
     prior_option,
 )
 from ceres_cal.cli.command import command
-from ceres_cal.cli.inputs import read_observations, require_different
+from ceres_cal.cli.files import (
+    read_observations,
+    report_page,
+    report_photographs,
+    require_different,
+    require_outputs,
+    write_results,
+    written,
+)
 from ceres_cal.cli.options import argument, option, switch
-from ceres_cal.cli.outputs import report_page, report_photographs, require_outputs, write_results, written
 from ceres_cal.cli.terminal import ProgressBar, progress_bar
 from ceres_cal.report.document import Document
 
@@ -53,7 +60,7 @@ def _lens_kind(name: str) -> str:
 
 
 @dataclass(frozen=True, kw_only=True)
-class CalibrateArguments(Reporting):
+class CalibrateArguments(ReportArguments):
     """What is to be solved for and how; what is named as in `Options` goes there as it is."""
 
     observations: tuple[str, ...] = argument(

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 from ceres_cal.base.errors import InputError
 from ceres_cal.cli.arguments import parse_names, parse_number
 from ceres_cal.cli.command import command
-from ceres_cal.cli.inputs import read_calibration, read_observations
+from ceres_cal.cli.files import read_calibration, read_observations
 from ceres_cal.cli.options import option
-from ceres_cal.cli.photographs import Seen, photographs_in, shown
+from ceres_cal.cli.photographs import InputArguments, photographs_in, shown
 from ceres_cal.cli.terminal import progress_bar
 from ceres_cal.report.document import Document, Section
 from ceres_cal.scene.heights import at_height
@@ -31,7 +31,7 @@ def _share(text: str) -> float:
 
 
 @dataclass(frozen=True, kw_only=True)
-class CheckArguments(Seen):
+class CheckArguments(InputArguments):
     """What is held against a calibration, and how sure the answer is to be."""
 
     false_alarms: float = option(

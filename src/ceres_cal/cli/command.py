@@ -5,8 +5,9 @@ from __future__ import annotations
 import argparse
 import re
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from importlib import import_module
 from typing import Any, NoReturn, get_type_hints
 
 from ceres_cal.base.errors import InputError
@@ -100,3 +101,58 @@ def print_answer(answer: Document, *, as_json: bool) -> None:
         text = answer.text()
         print(coloured(text) if in_colour(sys.stdout) else text)
     sys.stdout.flush()
+
+
+# ---- the table ------------------------------------------------------------------------------------------------------
+
+
+_MODULES = {
+    "run": "run",
+    "detect board": "detect",
+    "detect rings": "detect_rings",
+    "detect field": "detect_field",
+    "join": "join",
+    "calibrate": "calibrate",
+    "diagnose": "diagnose",
+    "advise": "advise",
+    "refit": "refit",
+    "check": "check",
+    "score": "score",
+    "compare": "compare",
+    "audit": "audit",
+    "batch": "batch",
+    "locate": "locate",
+    "project": "locate",
+    "undistort": "undistort",
+    "export": "export",
+    "export-table": "export",
+    "import": "foreign",
+    "publish": "foreign",
+    "listen": "foreign",
+    "targets import": "foreign",
+    "simulate": "simulate",
+    "targets": "targets",
+    "targets print": "targets",
+    "completion": "completion",
+}
+
+
+class _Commands(Mapping[str, Command]):
+    """Each command's module is imported when it is asked for: a start with all of them takes longer."""
+
+    def __getitem__(self, name: str) -> Command:
+        module = import_module(f"ceres_cal.cli.{_MODULES[name]}")
+        return next(one for one in vars(module).values() if isinstance(one, Command) and one.name == name)
+
+    def __contains__(self, name: object) -> bool:
+        return name in _MODULES
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(_MODULES)
+
+    def __len__(self) -> int:
+        return len(_MODULES)
+
+
+COMMANDS: Mapping[str, Command] = _Commands()
+"""Every command by its name."""

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from ceres_cal.base.errors import InputError
-from ceres_cal.cli.command import Command, Parser, command
+from ceres_cal.cli.command import COMMANDS, Command, Parser, command
 from ceres_cal.cli.options import Arguments, argument
 from ceres_cal.report.document import Document, Section
 
@@ -33,9 +33,7 @@ def _run(args: CompletionArguments) -> Document:
         import shtab
     except ImportError:
         raise InputError("completion needs shtab: pip install 'ceres-cal[completion]'") from None
-    from ceres_cal.cli import commands
-
-    script = shtab.complete(whole_parser(commands.COMMANDS), shell=args.shell)
+    script = shtab.complete(whole_parser(COMMANDS), shell=args.shell)
     return Document((Section("", [script], {"shell": args.shell, "script": script}),))
 
 

@@ -8,12 +8,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from ceres_cal.base.errors import InputError
-from ceres_cal.cli.arguments import Detecting, frames_option, length
+from ceres_cal.cli.arguments import frames_option, length
 from ceres_cal.cli.command import command
-from ceres_cal.cli.inputs import images_and_videos, read_target
-from ceres_cal.cli.options import Quiet, argument, flag, option, switch
-from ceres_cal.cli.outputs import finishing, require_observations_output
-from ceres_cal.cli.photographs import detected, frames_of_videos, missed_section
+from ceres_cal.cli.files import finishing, images_and_videos, read_target, require_observations_output
+from ceres_cal.cli.options import QuietArguments, argument, flag, option, switch
+from ceres_cal.cli.photographs import DetectArguments, detected, frames_of_videos, missed_section
 from ceres_cal.cli.terminal import progress_bar
 from ceres_cal.report.document import Document, Section
 
@@ -23,7 +22,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class BoardArguments(Quiet, Detecting):
+class BoardArguments(QuietArguments, DetectArguments):
     """Photographs, and the board in them."""
 
     images: tuple[str, ...] = argument("IMAGE", "images of one camera, folders of them, or videos")

@@ -21,9 +21,8 @@ from ceres_cal.cli.arguments import (
     timeout_option,
 )
 from ceres_cal.cli.command import command
-from ceres_cal.cli.inputs import images_and_videos, json_object, read_target
-from ceres_cal.cli.options import Quiet, argument, option, switch
-from ceres_cal.cli.outputs import finishing, require_observations_output
+from ceres_cal.cli.files import finishing, images_and_videos, json_object, read_target, require_observations_output
+from ceres_cal.cli.options import QuietArguments, argument, option, switch
 from ceres_cal.cli.photographs import detected, median_path, median_text, missed_section, write_median
 from ceres_cal.cli.terminal import progress_bar
 from ceres_cal.report.document import Document, Section
@@ -39,7 +38,7 @@ _SQUARE = 0.005  # of fy / fx: those of cameras are nearer to 1
 
 
 @dataclass(frozen=True, kw_only=True)
-class FieldArguments(Quiet):
+class FieldArguments(QuietArguments):
     """Photographs, the field in them, and where to start."""
 
     images: tuple[str, ...] = argument(

@@ -7,11 +7,11 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from ceres_cal.base.errors import InputError
-from ceres_cal.cli.arguments import Detecting, parse_length, parse_lengths
+from ceres_cal.cli.arguments import parse_length, parse_lengths
 from ceres_cal.cli.command import command
+from ceres_cal.cli.files import finishing, require_observations_output
 from ceres_cal.cli.options import REQUIRED, argument, option
-from ceres_cal.cli.outputs import finishing, require_observations_output
-from ceres_cal.cli.photographs import detected
+from ceres_cal.cli.photographs import DetectArguments, detected
 from ceres_cal.report.document import Document, Section
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ def _radii(text: str) -> tuple[float, ...]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class RingsArguments(Detecting):
+class RingsArguments(DetectArguments):
     """A photograph of rings, and the rings."""
 
     image: str = argument("IMAGE", "photograph of the rings, taken about from the front")

@@ -7,16 +7,16 @@ from pathlib import Path
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.cli.arguments import (
-    Reporting,
+    ReportArguments,
     calibration_argument,
     jobs_option,
     number,
     output_option,
 )
 from ceres_cal.cli.command import command
-from ceres_cal.cli.inputs import read_calibration, read_observations
-from ceres_cal.cli.options import argument, option, switch
-from ceres_cal.cli.outputs import (
+from ceres_cal.cli.files import (
+    read_calibration,
+    read_observations,
     report_page,
     report_photographs,
     require_ending,
@@ -24,12 +24,13 @@ from ceres_cal.cli.outputs import (
     write_results,
     written,
 )
+from ceres_cal.cli.options import argument, option, switch
 from ceres_cal.cli.terminal import progress_bar
 from ceres_cal.report.document import Document
 
 
 @dataclass(frozen=True, kw_only=True)
-class DiagnoseArguments(Reporting):
+class DiagnoseArguments(ReportArguments):
     """A calibration, observations, and how they are tested."""
 
     calibration: Path = calibration_argument()

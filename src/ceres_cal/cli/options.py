@@ -65,7 +65,7 @@ class Arguments:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Quiet(Arguments):
+class QuietArguments(Arguments):
     """Of a command that shows how far it is."""
 
     quiet: bool = switch("no progress")
@@ -74,7 +74,7 @@ class Quiet(Arguments):
 def add_options(parser: argparse.ArgumentParser, kind: type[Arguments]) -> None:
     """Add everything that a command takes to a parser."""
     types, places = get_type_hints(kind), {"": parser}
-    common = {one.name for one in fields(Quiet)}
+    common = {one.name for one in fields(QuietArguments)}
     for one in sorted(fields(kind), key=lambda one: one.name in common):
         about = one.metadata
         if "forms" in about:

@@ -10,10 +10,15 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.native import interruptibly
 from ceres_cal.base.words import plural
-from ceres_cal.cli.arguments import calibration_argument, not_painted_option, station_option
-from ceres_cal.cli.inputs import image_files, require_different
-from ceres_cal.cli.options import Quiet, argument
-from ceres_cal.cli.outputs import finishing, require_output
+from ceres_cal.cli.arguments import (
+    calibration_argument,
+    not_painted_option,
+    output_option,
+    station_option,
+    timeout_option,
+)
+from ceres_cal.cli.files import finishing, image_files, require_different, require_output
+from ceres_cal.cli.options import Arguments, QuietArguments, argument, option
 from ceres_cal.cli.terminal import ProgressBar
 from ceres_cal.report.document import Section
 
@@ -28,7 +33,7 @@ _MOST_NAMED = 3
 
 
 @dataclass(frozen=True, kw_only=True)
-class Seen(Quiet):
+class InputArguments(QuietArguments):
     """A calibration, files of observations or photographs, and what is to be said of photographs."""
 
     calibration: Path = calibration_argument("the calibration from before")
@@ -39,7 +44,17 @@ class Seen(Quiet):
     not_painted: str = not_painted_option("lines that the photographed field does not have")
 
 
-def photographs_in(args: Seen) -> list[Path]:
+@dataclass(frozen=True, kw_only=True)
+class DetectArguments(Arguments):
+    """What `detect board` and `detect rings` share."""
+
+    timeout: float | None = timeout_option()
+    camera: str = option("name of the camera", "NAME", "camera")
+    station: str | None = station_option("name of the station; default: that of the camera")
+    output: Path = output_option("the observations (.json or .npz)")
+
+
+def photographs_in(args: InputArguments) -> list[Path]:
     """The photographs that are named, each once; none where observations are."""
     observed = [name for name in args.inputs if Path(name).suffix.lower() in _OBSERVATIONS]
     if len(observed) == len(args.inputs):

@@ -6,12 +6,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from ceres_cal.cli.arguments import PriorNames, Reporting, output_option, parse_names, parse_prior, prior_option
+from ceres_cal.cli.arguments import PriorNames, ReportArguments, output_option, parse_names, parse_prior, prior_option
 from ceres_cal.cli.command import command
-from ceres_cal.cli.inputs import read_calibration, read_observations
+from ceres_cal.cli.files import (
+    read_calibration,
+    read_observations,
+    report_page,
+    report_photographs,
+    require_outputs,
+    write_results,
+    written,
+)
 from ceres_cal.cli.options import option, switch
-from ceres_cal.cli.outputs import report_page, report_photographs, require_outputs, write_results, written
-from ceres_cal.cli.photographs import Seen, photographs_in, shown
+from ceres_cal.cli.photographs import InputArguments, photographs_in, shown
 from ceres_cal.cli.terminal import progress_bar
 from ceres_cal.report.document import Document, Section
 
@@ -21,7 +28,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class RefitArguments(Seen, Reporting):
+class RefitArguments(InputArguments, ReportArguments):
     """What was seen after a move, and what may have changed."""
 
     output: Path | None = output_option("the new calibration", None)

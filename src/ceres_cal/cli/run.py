@@ -18,10 +18,9 @@ from ceres_cal.cli.arguments import (
     parse_board,
     prior_option,
 )
-from ceres_cal.cli.command import command
-from ceres_cal.cli.commands import COMMANDS
-from ceres_cal.cli.inputs import IMAGE_ENDINGS, images_and_videos
-from ceres_cal.cli.options import Quiet, argument, option
+from ceres_cal.cli.command import COMMANDS, command
+from ceres_cal.cli.files import IMAGE_ENDINGS, images_and_videos
+from ceres_cal.cli.options import QuietArguments, argument, option
 from ceres_cal.cli.photographs import frames_of_videos
 from ceres_cal.cli.terminal import progress_bar
 from ceres_cal.report.document import Document, Section
@@ -32,7 +31,7 @@ _BLANK = Section("", [""])
 
 
 @dataclass(frozen=True, kw_only=True)
-class RunArguments(Quiet):
+class RunArguments(QuietArguments):
     """What there is, and what is to come of it."""
 
     images: tuple[str, ...] = argument("IMAGE", "photographs of one camera, a folder of them, or a video")

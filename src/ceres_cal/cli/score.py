@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from ceres_cal.cli.arguments import Loss, calibration_argument
 from ceres_cal.cli.command import command
-from ceres_cal.cli.inputs import read_calibration, read_observations, require_different
+from ceres_cal.cli.files import read_calibration, read_observations, require_different
 from ceres_cal.cli.options import Arguments, argument, option, switch
 from ceres_cal.report.document import Document, Section
 

@@ -10,8 +10,8 @@ from ceres_cal.base.errors import InputError
 from ceres_cal.base.words import plural
 from ceres_cal.cli.arguments import output_option
 from ceres_cal.cli.command import command
-from ceres_cal.cli.options import Quiet, argument, option, switch
-from ceres_cal.cli.outputs import finishing
+from ceres_cal.cli.files import finishing
+from ceres_cal.cli.options import QuietArguments, argument, option, switch
 from ceres_cal.cli.terminal import progress_bar
 from ceres_cal.report.document import Document, Section
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SimulateArguments(Quiet):
+class SimulateArguments(QuietArguments):
     """A scene, and where its observations go."""
 
     scene: str | None = argument("SCENE", "name of a built-in scene, or a scene file (.json)", None)

@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Any
 from ceres_cal.base.errors import InputError
 from ceres_cal.cli.arguments import output_option
 from ceres_cal.cli.command import command
-from ceres_cal.cli.inputs import spelled_target
+from ceres_cal.cli.files import finishing, require_ending, require_output, spelled_target
 from ceres_cal.cli.options import Arguments, argument, option
-from ceres_cal.cli.outputs import finishing, require_ending, require_output
 from ceres_cal.report.document import Document, Section
 
 if TYPE_CHECKING:

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from types import TracebackType
 from typing import TextIO
 
-from ceres_cal.cli.options import Quiet
+from ceres_cal.cli.options import QuietArguments
 
 _BOLD, _RED, _GREEN, _YELLOW, _PLAIN = "\x1b[1m", "\x1b[31m", "\x1b[32m", "\x1b[33m", "\x1b[0m"
 _REDRAW_S = 0.1
@@ -56,7 +56,7 @@ def _title(found: re.Match[str]) -> str:
 # ---- progress -------------------------------------------------------------------------------------------------------
 
 
-def progress_bar(args: Quiet) -> ProgressBar:
+def progress_bar(args: QuietArguments) -> ProgressBar:
     """The bar of a command: nothing with --quiet or --json."""
     return ProgressBar(silent=args.quiet or args.json)
 

@@ -20,9 +20,8 @@ from ceres_cal.cli.arguments import (
     station_option,
 )
 from ceres_cal.cli.command import command
-from ceres_cal.cli.inputs import image_files, read_calibration
-from ceres_cal.cli.options import Quiet, argument, given_of, option, switch
-from ceres_cal.cli.outputs import finishing
+from ceres_cal.cli.files import finishing, image_files, read_calibration
+from ceres_cal.cli.options import QuietArguments, argument, given_of, option, switch
 from ceres_cal.cli.terminal import progress_bar
 from ceres_cal.report.document import Document, Section
 
@@ -57,7 +56,7 @@ def _area(text: str) -> Area:
 
 
 @dataclass(frozen=True, kw_only=True)
-class UndistortArguments(Quiet):
+class UndistortArguments(QuietArguments):
     """Photographs, and what is made of each."""
 
     calibration: Path = calibration_argument()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -168,7 +167,7 @@ def verdict_chapter(material: Material) -> Chapter:
     judged = judge_quality(material)
     tiles = tuple(_tiles(material))
     if not promises(material):  # the verdict's colour, not that of a number nobody vouches for
-        tiles = tuple(replace(tile, level=worst(judged.level, tile.level)) if tile.level else tile for tile in tiles)
+        tiles = tuple(tile._replace(level=worst(judged.level, tile.level)) if tile.level else tile for tile in tiles)
     pieces: list[Piece] = [Tiles(tiles), BulletList(judged.reasons)]
     if material.maps:
         pieces.append(Text(_MEANING, "note"))
