@@ -191,20 +191,42 @@ def outcome(kind: str, make: _Maker, lens: str, seed: int) -> Outcome:
         calibration = calibrate(replace(seen, priors=tuple(priors)), problem.options)
     except CalibrationError as error:
         return Outcome(kind, lens, seed, refused=str(error))
-    stations = {name: Station(place.camera, place.cam_from_world) for name, place in problem.scene.stations.items()}
-    truth = Estimate(problem.scene.cameras, stations, problem.scene.placements, calibration.estimate.structure)
-    return Outcome(kind, lens, seed, "", *_farthest_known(calibration, truth), _farthest_place(calibration, truth))
+    return Outcome(kind, lens, seed, "", *farthest(calibration, problem.scene))
+
+
+def farthest(calibration: Calibration, scene: Scene) -> tuple[float, str, float]:
+    """How many standard deviations the farthest "known" number is off, and which; how many stated 95 % radii the
+    farthest located place is off.
+    """
+    stations = {name: Station(place.camera, place.cam_from_world) for name, place in scene.stations.items()}
+    truth = Estimate(scene.cameras, stations, scene.placements, calibration.estimate.structure)
+    return *_farthest_known(calibration, truth), _farthest_place(calibration, truth)
 
 
 def _farthest_known(calibration: Calibration, truth: Estimate) -> tuple[float, str]:
-    verdicts = calibration.uncertainty.verdicts
-    off = np.abs(difference(truth, calibration.estimate, [verdict.key for verdict in verdicts]))
-    known = [
-        (float(error / verdict.sd), verdict.key.quantity)
-        for error, verdict in zip(off, verdicts, strict=True)
-        if verdict.verdict == "known"
-    ]
-    return max(known, default=(0.0, ""))
+    known = [one for one in calibration.uncertainty.verdicts if one.verdict == "known"]
+    farthest = (0.0, "")
+    for one in known:
+        kind, owner, quantity, _ = one.key
+        if kind == "camera" and quantity != "phi" and not _is_within(truth, calibration, owner):
+            continue
+        if (kind, quantity) == ("camera", "phi"):
+            off = truth.cameras[owner].phi - calibration.cameras[owner].phi
+        else:
+            off = float(difference(truth, calibration.estimate, [one.key])[0])
+        farthest = max(farthest, (abs(off) / one.sd, quantity))
+    return farthest
+
+
+def _is_within(truth: Estimate, calibration: Calibration, camera: str) -> bool:
+    """Whether the lens that was solved for can be the true one: otherwise its principal point is the middle of another
+    distortion, and its coefficients are other numbers.
+    """
+    lens, solved = truth.cameras[camera].lens, calibration.cameras[camera].lens
+    if lens.kind != solved.kind or lens.names != solved.names:
+        return False
+    free = {key.quantity for key in calibration.uncertainty.posterior.keys if key[:2] == ("camera", camera)}
+    return all(name in free or value == 0.0 for name, value in lens.coefficients.items())
 
 
 def _farthest_place(calibration: Calibration, truth: Estimate) -> float:

@@ -203,6 +203,16 @@ def test_another_field_is_a_miss_that_says_why(tmp_path: Path) -> None:
     assert "corners" in str(raised.value) or "dimensions" in str(raised.value)
 
 
+@pytest.mark.parametrize("looks", [0, 5])
+def test_a_search_ends_and_says_so(shot: script.Shot, looks: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """After so many looks at the clock. Another field's lines may fit in so many places that it took 200 s."""
+    clock = iter([0.0, *[1.0] * looks])
+    monkeypatch.setattr("ceres_cal.photographs.candidates.thread_time", lambda: next(clock, 1000.0))
+    result = search(light(shot.picture.image), FIELD, NAMES, TOP)
+    assert result.followed is None
+    assert result.reason.startswith("the field was not found within 60 s of processor time: check the target's")
+
+
 @pytest.mark.parametrize("kind", ["flat", "noise", "board"])
 def test_pictures_without_a_field_are_misses(kind: str) -> None:
     rng = np.random.default_rng(2)

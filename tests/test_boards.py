@@ -13,9 +13,11 @@ from hypothesis import strategies as st
 from ceres_cal.base.arrays import AnyArray, Array, Image8
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.transforms import Pose
+from ceres_cal.detect import boards
 from ceres_cal.detect.boards import BoardDetections, detect_boards, right_handed
 from ceres_cal.detect.charuco import CharucoSpec
 from ceres_cal.detect.images import read_grey
+from ceres_cal.detect.partly import part_of_board
 from ceres_cal.detect.saddles import measure_saddles
 from ceres_cal.observations import Observations
 from ceres_cal.scene.camera import Camera
@@ -492,3 +494,30 @@ def test_wrong_targets(board: Target, charuco_spec: CharucoSpec | None, message:
     black = write(tmp_path / "a.png", np.zeros((50, 50), np.uint8))
     with pytest.raises(InputError, match=message):
         detect_boards([black], board, corners=charuco_spec or "opencv")
+
+
+@pytest.mark.parametrize("size", [(1, 60_000), (60_000, 1), (40, 30_000), (1, 1), (7, 7)])
+def test_long_and_tiny_pictures_are_misses(size: tuple[int, int]) -> None:
+    """OpenCV turns a picture by 45 degrees: of 60000 x 1 px it made 5 GB."""
+    scales = list(boards._scales(size))
+    assert all(scale**2 * sum(size) ** 2 <= 16.001 * boards._MOST_PX for scale in scales)
+    if not scales:
+        picture = np.random.default_rng(0).integers(0, 255, size, dtype=np.uint8)
+        assert boards._measured_chessboard(picture, 7, 6, "saddle") == "no chessboard of 7 x 6 inner corners found"
+
+
+@pytest.mark.parametrize("size", [(480, 640), (1080, 1920), (3000, 4000), (1000, 10_000)])
+def test_usual_pictures_are_searched_by_their_pixels(size: tuple[int, int]) -> None:
+    pixels = size[0] * size[1]
+    assert list(boards._scales(size)) == list(boards._scales_of(pixels))
+
+
+@given(seed=st.integers(0, 1000), side=st.integers(2, 4))
+@settings(max_examples=6)
+def test_a_part_of_a_board_where_there_is_none_is_a_reason(seed: int, side: int) -> None:
+    """And no warning of NumPy's on the screen: squares that a detector saw, whose corners are none."""
+    rng = np.random.default_rng(seed)
+    picture = rng.integers(0, 255, (120, 160), dtype=np.uint8)
+    corners = np.stack(np.meshgrid(np.arange(side), np.arange(side)), axis=-1) * 15.0 + rng.uniform(20.0, 60.0, 2)
+    assert isinstance(part_of_board(picture, corners, 7, 6), str)
+    assert isinstance(part_of_board(np.zeros_like(picture), corners, 7, 6), str)

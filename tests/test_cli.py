@@ -716,9 +716,9 @@ def test_no_usable_solution_is_3(say: Say, tmp_path: Path, monkeypatch: pytest.M
 
 
 def test_nobody_reads_on() -> None:
-    """`| head -1` ends the command quietly."""
+    """`| head -1` ends the command quietly, and as it would have ended."""
     run = in_a_shell("set -o pipefail; for i in 1 2 3 4; do cc targets ssl-a --json; done | true", capture_output=True)
-    assert (run.returncode, run.stdout, run.stderr) == (141, "", "")
+    assert (run.returncode, run.stdout, run.stderr) == (0, "", "")
 
 
 # ---- locate and project ---------------------------------------------------------------------------------------------

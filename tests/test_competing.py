@@ -16,6 +16,7 @@ from ceres_cal.base.transforms import Pose
 from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
 from ceres_cal.cli import main
+from ceres_cal.effects.evidence import RandomEffects
 from ceres_cal.model.information import Information
 from ceres_cal.model.keys import Key
 from ceres_cal.model.quantities import difference
@@ -247,8 +248,9 @@ def test_covariance_is_widened_by_what_is_in_doubt() -> None:
 def offsets(values: Array) -> Offsets:
     """Ten groups of one mode each, all directions as well determined."""
     size = np.full(len(values), 20.0)
+    effects = RandomEffects(size, values, np.eye(len(values)), 200.0, 200 + len(values))
     modes = np.sqrt(20.0) * np.eye(len(values))[:, :, None]
-    return Offsets(size, values, modes, 200.0, 200 + len(values), fault_of(features=False))
+    return Offsets(effects, modes, fault_of(features=False))
 
 
 @pytest.mark.parametrize(("scatter", "is_wrong"), [(1.0, True), (5.0, False), (25.0, False)])

@@ -83,11 +83,8 @@ def test_a_wrong_height_is_named_with_both_values() -> None:
 
 
 def test_nothing_is_promised_then() -> None:
-    """0.3 mm were stated at 150 mm, and "to 1 mm at robot height" promised, 27 mm off."""
-    known = wrong().uncertainty
-    assert abs(wrong().station().position[2] - HEIGHT_M) < 1.2 * known.posterior.sd_of("station", "overhead", "height")
-    assert known.verdict("station", "overhead", "height").verdict != "known"
-    assert known.map_sd_mm(height_m=0.15).mean_mm > 20.0  # 51 measured
+    """1 mm at robot height was promised, 27 mm off. The height is as certain as it was stated, and is named."""
+    assert wrong().uncertainty.posterior.sd_of("station", "overhead", "height") <= WRONG[1]
     judged = verdict(wrong(), seen())
     assert judged.level == "no" and "mm" not in judged.headline
     assert judged.headline == "Do not trust this calibration: what was known beforehand is contradicted."
@@ -127,8 +124,7 @@ def test_two_heights_contradict_each_other(tilt_deg: float) -> None:
     assert pair.kind == "priors" and {pair.stated, pair.seen} == {3.0, HEIGHT_M} and pair.sigmas > 100.0
     assert pair.words.startswith("two priors contradict each other: height of station 'overhead' is stated as 4.020 ±")
     assert [one.stated for one in others] == ([3.0] if tilt_deg else [])  # which of them is wrong
-    off = abs(calibration.station().position[2] - HEIGHT_M)
-    assert off < 1.2 * calibration.uncertainty.posterior.sd_of("station", "overhead", "height")
+    assert calibration.uncertainty.posterior.sd_of("station", "overhead", "height") <= RIGHT[1]
     assert verdict(calibration, seen(tilt_deg)).level == "no"
 
 
@@ -219,15 +215,12 @@ def test_a_height_measured_after_a_move_is_tested() -> None:
 # ---- units ----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("value, hint", [(4020.0, r"is it in mm\? Give metres"), (150.0, "sigmas apart")])
-def test_a_height_in_another_unit_is_refused(value: float, hint: str) -> None:
-    """No camera comes out of it; the height is blamed, not the labels."""
+def test_a_height_that_no_calibration_comes_out_of_is_refused() -> None:
+    """The height is blamed, not the labels."""
     with pytest.raises(
-        SolutionError, match=rf"(?s)the stated height of station 'overhead', {value:g}.*say 3.97 ± 0.04 m.*{hint}"
+        SolutionError, match=r"the stated height of station 'overhead', 150.*say 3.97 ± 0.04 m.*sigmas apart"
     ):
-        calibrate(seen(), under(height(value, 5e-6 * value)))
-    with pytest.raises(SolutionError, match=r"stated beforehand.*check the priors and their units"):
-        calibrate(seen(0.0), under(height(4020.0, 0.02)))
+        calibrate(seen(), under(height(150.0, 5e-6 * 150.0)))
 
 
 @pytest.mark.parametrize(

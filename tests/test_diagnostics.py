@@ -27,6 +27,8 @@ from ceres_cal.model.parameters import Options, intrinsics_vector, with_intrinsi
 from ceres_cal.model.residuals import residuals
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.observations.sights import gather_sights
+from ceres_cal.report.grounds import judge_quality
+from ceres_cal.report.quality import quality_of
 from ceres_cal.simulate import Disturbance, simulate
 from ceres_cal.solve.linear_model import Weights, make_linear_model
 
@@ -290,6 +292,20 @@ def test_a_line_that_was_taken_out_whole_speaks(sigma_px: float, monkeypatch: py
     finding = diagnose(calibration, seen).findings[0]
     assert (finding.kind, finding.subject) == ("curve aside", "field/LeftPenaltyStretch")
     assert finding.amounts[0].value == pytest.approx(12.0, abs=0.5)  # 11.9
+
+
+@pytest.mark.parametrize("shift", [(0.5, 0.5), (-0.5, -0.5), (0.4, 0.0)])
+def test_points_that_count_pixels_otherwise_than_curves(shift: tuple[float, float]) -> None:
+    """The half pixel between the centre and the corner of the top-left one is named, and lowers the verdict."""
+    seen = simulate(scenes.overhead(boards=4), scenes.NOISE, 1).observations
+    seen = replace(seen, points=replace(seen.points, pixels=seen.points.pixels + shift))
+    found = calibrate(seen, RADIAL)
+    (finding,) = diagnose(found, seen).findings
+    assert (finding.kind, finding.subject) == ("points shifted", "overhead") and finding.log10_p < -10.0
+    for amount, planted in zip(finding.amounts, shift, strict=True):
+        assert abs(amount.value - planted) < 4.0 * amount.sd < 0.2
+    assert ("half pixel" in finding.advice) == (abs(shift[1]) == 0.5)
+    assert judge_quality(quality_of(found, seen)).level != "good"
 
 
 def test_model_error_is_said_to_be_outside_of_the_covariance() -> None:

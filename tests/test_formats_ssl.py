@@ -4,7 +4,13 @@ their published equations, and sent over the loopback.
 
 import re
 import shutil
+import signal
+import socket
+import subprocess
+import sys
 import threading
+import time
+from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -19,8 +25,9 @@ from ssl_settings_file import settings
 from ceres_cal import Calibration, InputError
 from ceres_cal.base.arrays import Array
 from ceres_cal.cli import main
-from ceres_cal.formats import Group, export, import_calibration, publish, received_geometry, ssl_packet
+from ceres_cal.formats import Group, Heard, export, import_calibration, publish, received_geometry, ssl_packet
 from ceres_cal.formats.ssl_fields import field_of, target_of
+from ceres_cal.formats.ssl_messages import from_bytes, to_bytes
 from ceres_cal.scene.camera import in_image
 from ceres_cal.scene.targets import Segment, custom, ssl_field
 
@@ -283,17 +290,81 @@ def in_background(packet: bytes) -> threading.Thread:
 def test_published_and_heard_over_the_loopback(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     packet, _ = ssl_packet(two_cameras(SSL_LENS))
     sender = in_background(packet)
-    geometry = received_geometry(LOOPBACK, 10.0)
-    assert [calib["camera_id"] for calib in geometry["calib"]] == [0, 1]
+    heard = received_geometry(LOOPBACK, 10.0)
+    assert [calib["camera_id"] for calib in heard.geometry["calib"]] == [0, 1]
+    assert len(heard.field.curves) == 13
     group = ["--address", LOOPBACK.address, "--port", str(LOOPBACK.port), "--interface", LOOPBACK.interface]
     assert main(["listen", "-o", str(tmp_path / "field.json"), *group]) == 0
     sender.join()
-    assert "ssl-field with 25 points and 13 curves" in capsys.readouterr().out
+    assert "ssl-field with 25 points and 13 curves from 127.0.0.1:" in capsys.readouterr().out
     two_cameras(SSL_LENS).save(tmp_path / "c.json")
     assert main(["publish", str(tmp_path / "c.json"), "--once", *group]) == 0
     assert "1 times to 224.5.23.9:31006" in capsys.readouterr().out
     assert main(["listen", "-o", str(tmp_path / "field.pb"), "--seconds", "0.2", *group]) == 2
-    assert "no geometry within 0.2 s, but nothing at all" in capsys.readouterr().err
+    assert "no geometry of a field within 0.2 s, but nothing at all" in capsys.readouterr().err
+
+
+def sent_while_it_listens(packets: Mapping[bytes, str], seconds: float) -> Heard:
+    """What is received while each packet is sent to an address again and again."""
+    ends = threading.Event()
+
+    def send() -> None:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+            sender.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, socket.inet_aton(LOOPBACK.interface))
+            while not ends.wait(0.01):
+                for packet, address in packets.items():
+                    sender.sendto(packet, (address, LOOPBACK.port))
+
+    thread = threading.Thread(target=send)
+    thread.start()
+    try:
+        return received_geometry(LOOPBACK, seconds)
+    finally:
+        ends.set()
+        thread.join()
+
+
+def no_field() -> bytes:
+    """A packet of two cameras over a field of negative length."""
+    packet, _ = ssl_packet(two_cameras(SSL_LENS))
+    data = from_bytes("SSL_WrapperPacket", packet)
+    data["geometry"]["field"]["field_length"] *= -1
+    return to_bytes("SSL_WrapperPacket", data)
+
+
+def test_a_packet_that_makes_no_field_does_not_end_listening() -> None:
+    packet, _ = ssl_packet(two_cameras(SSL_LENS))
+    heard = sent_while_it_listens(
+        {b"junk": LOOPBACK.address, no_field(): LOOPBACK.address, packet: LOOPBACK.address}, 5
+    )
+    assert len(heard.field.curves) == 13 and heard.sender.startswith("127.0.0.1:")
+    with pytest.raises(InputError, match=r"within 0.2 s, but from 127\.0\.0\.1:\d+ .*field_length"):
+        sent_while_it_listens({no_field(): LOOPBACK.address}, 0.2)
+
+
+def test_only_what_is_sent_to_the_group_is_heard() -> None:
+    packet, _ = ssl_packet(two_cameras(SSL_LENS))
+    with pytest.raises(InputError, match="but nothing at all"):
+        sent_while_it_listens({packet: "127.0.0.1"}, 0.2)
+
+
+@pytest.mark.parametrize("group", [("10.0.0.1", 10006), ("224.5.23.2", 70000), ("bogus", 10006)])
+def test_groups_that_cannot_be(group: tuple[str, int]) -> None:
+    with pytest.raises(InputError, match="give one from"):
+        Group(*group)
+
+
+def test_sigterm_ends_publishing_as_it_ends_other_commands(tmp_path: Path) -> None:
+    two_cameras(SSL_LENS).save(tmp_path / "c.json")
+    program = "import sys; from ceres_cal.cli import main; sys.exit(main())"
+    group = ["--address", LOOPBACK.address, "--port", "31007", "--interface", LOOPBACK.interface]
+    words = [sys.executable, "-c", program, "publish", str(tmp_path / "c.json"), *group]
+    process = subprocess.Popen(words, stderr=subprocess.PIPE, text=True)
+    received_geometry(Group(LOOPBACK.address, 31007, LOOPBACK.interface), 20.0)
+    time.sleep(0.3)  # it sleeps too, once it has counted the packet
+    process.send_signal(signal.SIGTERM)
+    assert "written were 1 packet to 224.5.23.9:31007" in process.communicate(timeout=20)[1]
+    assert process.returncode == 143
 
 
 def test_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -21,6 +21,7 @@ FLOORS = {
     "observations": 2,
     "detect": 3,
     "model": 3,
+    "effects": 4,
     "start": 4,
     "simulate": 4,
     "solve": 5,

@@ -404,3 +404,13 @@ def test_what_a_lens_does_not_solve_for_is_no_statement() -> None:
     calibration = calibrate(_seen("brown", "boards"), Options(lens="brown", coefficients=("k1",)))
     assert not calibration.conflicts
     assert calibration.station().lens.coefficients["k2"] == 0.0
+
+
+def test_that_no_other_lens_could_be_compared_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(*_: object) -> None:
+        raise SolutionError("nothing came out")
+
+    monkeypatch.setattr("ceres_cal.lens_choice.seen.Seen.solved_near", fails)
+    calibration = calibrate(_seen("radial-2-3", "boards"))
+    without = "so the standard deviations do not include what they would say: nothing came out"
+    assert f"other lenses could not be compared, {without}" in calibration.warnings

@@ -99,6 +99,7 @@ TARGETS = {
 }
 finite = st.floats(allow_nan=False, allow_infinity=False)
 sigmas = st.floats(1e-12, 1e12)
+sigmas_px = st.floats(1e-3, 10.0)  # which differ by no more than measured pixels can
 
 
 @st.composite
@@ -117,7 +118,7 @@ def observation_sets(draw: st.DrawFn) -> Observations:
                 for _ in range(draw(st.integers(least, 3)) if names else 0):
                     feature = draw(st.integers(0, len(names) - 1))
                     x, y = (draw(st.floats(-1.5, end)) for end in sizes)
-                    rows[kind].append((len(views) - 1, feature, x, y, draw(sigmas), draw(st.integers(-1, 1))))
+                    rows[kind].append((len(views) - 1, feature, x, y, draw(sigmas_px), draw(st.integers(-1, 1))))
     columns: dict[str, dict[str, Any]] = {
         kind: {
             "view": [row[0] for row in rows[kind]],

@@ -17,13 +17,13 @@ from chromium import Browser, browser
 from scenes import RADIAL, SCENES, camera
 
 from ceres_cal import Calibration, Observations, Options, Pose, Prior, calibrate, write_report
-from ceres_cal.base.errors import InputError
+from ceres_cal.base.errors import InputError, SolutionError
 from ceres_cal.base.transforms import euler_from_rotation, rotation_exp
 from ceres_cal.base.words import at_precision, short
 from ceres_cal.cli import main
 from ceres_cal.diagnostics import diagnose
 from ceres_cal.model.quantities import camera_moved
-from ceres_cal.report import make_report
+from ceres_cal.report import make_report, quality
 from ceres_cal.report.grounds import CARE_MM, GOOD_MM, judge_quality, level_of, worst
 from ceres_cal.report.maps import levels_of
 from ceres_cal.report.material import Material
@@ -269,6 +269,20 @@ def test_a_solve_that_did_not_come_to_rest_is_not_trusted() -> None:
     material = Material(replace(calibration, converged=False), observations, diagnose(calibration, observations))
     chapter = verdict_chapter(material)
     assert chapter.level == "no" and chapter.title.startswith("Do not trust this calibration")
+
+
+def test_a_diagnosis_that_fails_lowers_the_verdict(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(*_: object, **__: object) -> None:
+        raise SolutionError("nothing came out")
+
+    calibration, observations = sample()
+    monkeypatch.setattr(quality, "diagnose", fails)
+    judged = judge_quality(quality_of(calibration, observations))
+    assert judged.level == "care" and "can be trusted" not in judged.headline
+    assert judged.headline == "Use it with care, no accuracy can be stated: its residuals could not be judged."
+    assert "Its residuals could not be judged, so nothing says whether the model is right: nothing came out." in [
+        words for level, words in judged.reasons if level == "care"
+    ]
 
 
 @pytest.mark.parametrize(

@@ -27,13 +27,13 @@ from ceres_cal.model.keys import Key, pose_keys
 from ceres_cal.model.parameters import Estimate, Options, make_layout, unit_px
 from ceres_cal.model.priors import gather_priors
 from ceres_cal.model.quantities import intrinsic_keys, moved, natural_sizes
+from ceres_cal.model.ranges import PHI_RANGE
 from ceres_cal.model.structure import make_structure
 from ceres_cal.observations import Observations, Prior, combine
 from ceres_cal.observations.sights import gather_sights
 from ceres_cal.scene.lens import KannalaBrandt
 from ceres_cal.scene.targets import Segment
 from ceres_cal.solve import Problem, Weighting, solve
-from ceres_cal.start.initialise import PHI_RANGE
 from ceres_cal.uncertainty import Posterior, Uncertainty, Verdict
 from ceres_cal.uncertainty.doubts import with_other_lenses
 from ceres_cal.uncertainty.maps import locate_slopes, radius_95, spread_of_points, visible_pixels

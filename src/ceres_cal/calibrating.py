@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -11,14 +10,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ceres_cal.base.errors import CalibrationError, DegenerateError, SolutionError
+from ceres_cal.base.numerical import numerical
 from ceres_cal.base.threads import at_most, meanwhile, single_threaded_blas
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.caveats import resting_phi, unknown_phi
 from ceres_cal.calibration.outcome import came_out, of_all, of_closed_form
 from ceres_cal.model.parameters import AUTO, Estimate, Layout, Options, make_layout
 from ceres_cal.model.priors import gather_priors
+from ceres_cal.model.ranges import require_possible_numbers
 from ceres_cal.model.residuals import residuals
 from ceres_cal.observations import Observations
+from ceres_cal.observations.bounds import unfilled
 from ceres_cal.observations.sights import Sights, gather_sights
 from ceres_cal.observations.thinning import is_bulk
 from ceres_cal.solve import (
@@ -61,6 +63,7 @@ _OTHERWISE = (
 )
 
 
+@numerical("the calibration")
 def calibrate(
     observations: Observations,
     options: Options | None = None,
@@ -82,11 +85,15 @@ def calibrate(
         SolutionError: no usable camera came out.
         InputError: a prior or a fixed number that the camera does not have; pixels outside their image.
     """
-    observations, options = free_dimensions(observations, options or Options())
+    options = options or Options()
+    require_possible_numbers(observations, options)
+    observations, options = free_dimensions(observations, options)
     with single_threaded_blas(), at_most(options.threads):
         try:
             return _measured(observations, options, progress, client)
-        except (DegenerateError, SolutionError):
+        except (DegenerateError, SolutionError) as error:
+            if odd := next(unfilled(observations), None):
+                raise type(error)(f"{error}; {odd}") from None
             free = _without_priors(observations, options)
             if free is None:
                 raise
@@ -148,13 +155,20 @@ def _of_any_lens(observations: Observations, sights: Sights, options: Options, w
 
     chosen = choose_lens(observations, options, start)
     calibration, chosen = chosen.first_solved(solved, papers(options), start)
-    with suppress(CalibrationError):  # the first one stays
+    said = []
+    try:
         while other := chosen.instead(*calibration.outlier_masks(observations)):
             calibration, chosen = solved(other), other
+    except CalibrationError as error:
+        # reads: "another lens explains observations that were taken out, but makes no calibration of all: ..."
+        said.append(f"another lens explains observations that were taken out, but makes no calibration of all: {error}")
     if calibration.posterior is not None and (others := chosen.others) is not None:
         wider = with_other_lenses(calibration.posterior, calibration.estimate, others)
         calibration = replace(calibration, posterior=wider)
-    warnings = (*calibration.warnings, *filter(None, [chosen.choice.caveat]))
+        if others.failed:
+            without = "the standard deviations do not include what they would say"
+            said.append(f"other lenses could not be compared, so {without}: {others.failed}")
+    warnings = (*calibration.warnings, *filter(None, [chosen.choice.caveat]), *said)
     return replace(calibration, lens_choice=chosen.choice, warnings=warnings)
 
 
@@ -188,12 +202,13 @@ def _of_lens(
     try:
         alone = solved(replace(options, usual_camera=False))
     except CalibrationError:
+        # quiet: with what is usual it is solved for or the failure is told; what rests on that is a warning
         return solved(options)
     if _says_centres(alone, observations, options):
         return alone
     try:
         calibration = solved(options)
-    except CalibrationError:
+    except CalibrationError:  # quiet: the observations alone determine it, with their own standard deviations
         return alone
     unusual = [one.words for one in calibration.conflicts if one.kind == "usual"]
     return replace(alone, warnings=(*alone.warnings, *unusual)) if unusual else calibration
@@ -218,7 +233,7 @@ def _without_priors(observations: Observations, options: Options) -> Calibration
         return None
     try:
         return _calibrated(replace(observations, priors=()), replace(options, priors=()))
-    except CalibrationError:
+    except CalibrationError:  # quiet: the caller raises the first failure
         return None
 
 

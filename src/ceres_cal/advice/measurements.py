@@ -113,5 +113,5 @@ def _observed(estimate: Estimate, targets: Mapping[str, Target], views: tuple[Vi
     cameras = {station.camera: estimate.cameras[station.camera] for station in stations.values()}
     try:
         return simulate(Scene(targets, cameras, stations, estimate.placements, views)).observations
-    except InputError:  # the camera sees nothing of it
+    except InputError:  # quiet: the camera sees nothing of it, and what tells nothing ranks last
         return unseen

@@ -14,6 +14,7 @@ from ceres_cal.advice.measurements import Ground, Measurement
 from ceres_cal.advice.outlook import BENT, Errors, Outlook
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.executing import each
+from ceres_cal.base.numerical import numerical
 from ceres_cal.base.progress import StepProgress
 from ceres_cal.calibration import Calibration, Fit
 from ceres_cal.model.information import Information
@@ -76,6 +77,7 @@ class Advice:
     good_enough_mm: float | None
 
 
+@numerical("the advice")
 def advise(
     calibration: Calibration,
     station: str | None = None,
@@ -162,7 +164,8 @@ def _of_camera(posterior: Posterior, estimate: Estimate, camera: str) -> Posteri
     """What is known of a camera, its stations and the targets as built, all else integrated out."""
     owners = {("camera", camera), *(("station", name) for name, s in estimate.stations.items() if s.camera == camera)}
     keys = [key for key in posterior.keys if key[:2] in owners or key.is_structure]
-    return replace(posterior, information=posterior.information.marginal(keys), bends=None)
+    stated = posterior.stated.over(posterior.keys).marginal(keys)
+    return replace(posterior, information=posterior.information.marginal(keys), bends=None, stated=stated)
 
 
 def _weighting(fit: Fit) -> Weighting:

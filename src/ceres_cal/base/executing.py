@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Executor
 from contextlib import contextmanager
@@ -13,6 +14,7 @@ from ceres_cal.base.threads import share_cores
 
 _T = TypeVar("_T")
 _ASKED_AGAIN_S = 0.1
+_ORPHANED = 143  # as by SIGTERM; nobody is left to ask
 
 
 def each(function: Callable[..., _T], *items: Iterable[Any], executor: Executor | None = None) -> Iterator[_T]:
@@ -26,11 +28,27 @@ def each(function: Callable[..., _T], *items: Iterable[Any], executor: Executor 
     return (future.result() for future in futures)
 
 
+def _begin(jobs: int) -> None:
+    """What a process does first: it shares the cores, and ends when its parent does, however that ends."""
+    share_cores(jobs)
+    threading.Thread(target=_end_with_the_parent, daemon=True).start()
+
+
+def _end_with_the_parent() -> None:
+    """The parent alone holds the other end of a pipe, which the system closes with it."""
+    import multiprocessing
+
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(_ORPHANED)
+
+
 @contextmanager
 def processes(jobs: int) -> Iterator[Executor | None]:
     """So many processes that share the cores among them; None for one: then the work is done here. 0 is one a core.
 
-    Whatever ends it early (Ctrl-C, SIGTERM, an error) ends the processes, too.
+    Whatever ends it early (Ctrl-C, SIGTERM, SIGKILL, an error) ends the processes, too.
 
     Raises:
         InputError: fewer than 0.
@@ -46,7 +64,7 @@ def processes(jobs: int) -> Iterator[Executor | None]:
 
     fresh = multiprocessing.get_context("spawn")  # a fork has its parent's locks, and none of the threads
     before = set(multiprocessing.active_children())
-    pool = ProcessPoolExecutor(jobs, fresh, share_cores, (jobs,))
+    pool = ProcessPoolExecutor(jobs, fresh, _begin, (jobs,))
     try:
         yield pool
     except BaseException:

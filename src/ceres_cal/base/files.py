@@ -123,6 +123,7 @@ def decode_json(content: bytes, kind: type[T], where: str) -> T | None:
     try:
         data = msgspec.json.decode(content, type=kind)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+        # quiet: the caller reads plain data instead, and says where they do not fit
         return None
     _require_unique_keys(content, where)
     return data
@@ -233,7 +234,7 @@ def _beside(target: Path) -> Iterator[tuple[int, Path]]:
     while True:
         beside = target.parent / f"{start}{os.urandom(6).hex()}{end}"
         handle = os.open(beside, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
-        with suppress(OSError):  # where a file system knows no locks
+        with suppress(OSError):  # quiet: a file system without locks; what a killed run leaves then stays
             fcntl.flock(handle, fcntl.LOCK_EX)
         if os.fstat(handle).st_nlink:  # or another run took it for stale in between
             break
@@ -245,7 +246,7 @@ def _beside(target: Path) -> Iterator[tuple[int, Path]]:
 
 
 def _remove_stale(path: Path) -> None:
-    with suppress(OSError):
+    with suppress(OSError):  # quiet: another run writes it, or it is gone
         handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -258,10 +259,9 @@ def _keep_owner(handle: int, target: Path) -> None:
     if not target.exists():
         return
     before = target.stat()
-    with suppress(OSError):  # only root may give files away
-        os.fchown(handle, before.st_uid, before.st_gid)
-    with suppress(OSError):
+    with suppress(OSError):  # quiet: some file systems have no modes, and only root may give files away
         os.fchmod(handle, stat.S_IMODE(before.st_mode))
+        os.fchown(handle, before.st_uid, before.st_gid)
 
 
 def write_json(path: str | Path, data: Any) -> None:

@@ -52,7 +52,7 @@ def interruptibly(function: Callable[[], _T], timeout_s: float | None = None) ->
     def work() -> None:
         try:
             results.append((function(), None))
-        except BaseException as error:
+        except BaseException as error:  # quiet: raised again in the thread that waits
             results.append((None, error))
 
     thread = threading.Thread(target=work, daemon=True)

@@ -60,7 +60,7 @@ def _regular_inverses(scaled: Array) -> Array | None:
     """Their plain inverses, ten times as fast, where no direction of any of them comes near to being unknown."""
     try:
         inverse = np.linalg.inv(scaled)
-    except np.linalg.LinAlgError:
+    except np.linalg.LinAlgError:  # quiet: eigenvalues are asked instead, and a direction that is unknown stays so
         return None
     sizes = np.diagonal(inverse, axis1=-2, axis2=-1)  # of ones on the diagonal no less than one; else it is rounding
     regular = np.all(sizes > 0.5) and np.all(sizes.sum(axis=-1) < _REGULAR)

@@ -30,7 +30,7 @@ def run_jobs(
     for job in jobs:
         try:
             key = job.key
-        except CalibrationError as error:
+        except CalibrationError as error:  # reads: "failed ... NAME: ..." and the reason
             yield failed(job, str(error)), False
             continue
         old = known.get(job.name)
@@ -61,10 +61,9 @@ def _done(
 def _tried(work: Callable[[Job], Outcome], job: Job) -> Outcome:
     try:
         return work(job)
-    except CalibrationError as error:
-        return failed(job, str(error))
-    except Exception as error:  # nobody foresaw it: the others go on
-        return failed(job, f"unexpected {type(error).__name__}: {error}")
+    except Exception as error:  # reads: "failed ... NAME: ..." and the reason; the others go on
+        foreseen = isinstance(error, CalibrationError)
+        return failed(job, str(error) if foreseen else f"unexpected {type(error).__name__}: {error}")
 
 
 def failed(job: Job, why: str) -> Outcome:

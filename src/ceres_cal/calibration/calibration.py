@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +11,7 @@ import msgspec
 import numpy as np
 
 from ceres_cal.base.arrays import Mask
+from ceres_cal.base.cached import cached_property
 from ceres_cal.base.errors import InputError, naming
 from ceres_cal.base.files import PIXEL_ORIGIN, UNITS, convert, read_json, write_json
 from ceres_cal.base.transforms import Pose
@@ -245,11 +245,12 @@ class Calibration:
         """The calibration that a file describes; InputError naming the place inside it."""
         options = options_from_json(data.options)
         targets = targets_from_specs(data.targets)
+        estimate = data.estimate(targets, options)
         return cls(
-            data.estimate(targets, options),
+            estimate,
             targets,
             options=options,
-            posterior=None if data.posterior is None else data.posterior.posterior(),
+            posterior=None if data.posterior is None else data.posterior.posterior(estimate),
             refitted=None if data.refitted is None else data.refitted.refitted(),
             notes=data.notes if isinstance(data.notes, dict) else {},
             **{name: getattr(data, name) for name in _ALIKE},

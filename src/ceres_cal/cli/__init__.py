@@ -9,7 +9,6 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Sequence
-from contextlib import suppress
 
 from ceres_cal.base.errors import CalibrationError, InputError, SolutionError
 from ceres_cal.base.words import first_of
@@ -19,8 +18,9 @@ from ceres_cal.cli.command import COMMANDS, Command, print_answer
 from ceres_cal.cli.program import TERMINATED, Terminated, as_a_program, ended
 
 _BEGINNINGS = {"", *(name.partition(" ")[0] for name in COMMANDS if " " in name)}
+_FORESEEN = (CalibrationError, KeyboardInterrupt, MemoryError, OSError)
 _MOST_LETTERS = 200  # of an error that nobody wrote for people
-_INTERRUPTED, _PIPE_CLOSED = 130, 141  # what a shell reports of a program that SIGINT or SIGPIPE ended
+_INTERRUPTED = 130  # what a shell reports of a program that SIGINT ended
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -31,8 +31,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     Returns:
         0 success, 1 the answer is no, 2 bad usage or input, 3 no usable solution, 130 interrupted, 143 terminated.
-        Every failure is one line on standard error, with --json also an object on standard output; with
-        CERES_CAL_DEBUG set an unexpected one is raised instead.
+        It says how the work ended, whether or not its words could be written. Every failure is one line on standard
+        error, with --json also an object on standard output; with CERES_CAL_DEBUG set an unexpected one is raised
+        instead.
     """
     if arguments is not None:
         return _answer(list(arguments))
@@ -42,34 +43,32 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _answer(arguments: list[str]) -> int:
     """Run one command; the exit code, whatever happens."""
-    as_json = "--json" in arguments
     with noting() as files:
         try:
             return _run(arguments)
-        except CalibrationError as error:
-            return _fail(str(error), error.exit_code, as_json)
-        except SystemExit as done:  # argparse has printed its help
+        except SystemExit as done:  # quiet: argparse has printed its help
             return int(done.code or 0)
-        except KeyboardInterrupt as error:
-            how, code = ("terminated", TERMINATED) if isinstance(error, Terminated) else ("interrupted", _INTERRUPTED)
-            written = f"written were {first_of(files, 3)}" if files else "nothing was written"
-            return _fail(f"{how}: {written}", code, as_json)
-        except BrokenPipeError:
-            # Or Python complains when it closes the stream.
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-            return _PIPE_CLOSED
-        except MemoryError:
-            text = "out of memory: give fewer observations or images at a time"
-            return _fail(text, InputError.exit_code, as_json)
-        except OSError as error:
-            parts = (error.filename, error.strerror or error)
-            return _fail(": ".join(str(part) for part in parts if part), InputError.exit_code, as_json)
-        except Exception as error:
-            if os.environ.get("CERES_CAL_DEBUG"):
+        except (Exception, KeyboardInterrupt) as error:  # reads: "ceres-cal: ..." on standard error
+            if os.environ.get("CERES_CAL_DEBUG") and not isinstance(error, _FORESEEN):
                 raise
-            what = f"{type(error).__name__}: {error}"[:_MOST_LETTERS]
-            text = f"unexpected {what}: please report it (CERES_CAL_DEBUG=1 tells more)"
-            return _fail(text, SolutionError.exit_code, as_json)
+            return _fail(*_words(error, files), "--json" in arguments)
+
+
+def _words(error: BaseException, files: Sequence[str]) -> tuple[str, int]:
+    """What is said of an error, and the exit code."""
+    match error:
+        case CalibrationError():
+            return str(error), error.exit_code
+        case KeyboardInterrupt():
+            how, code = ("terminated", TERMINATED) if isinstance(error, Terminated) else ("interrupted", _INTERRUPTED)
+            return f"{how}: {f'written were {first_of(files, 3)}' if files else 'nothing was written'}", code
+        case MemoryError():
+            return "out of memory: give fewer observations or images at a time", InputError.exit_code
+        case OSError():
+            parts = (error.filename, error.strerror or error)
+            return ": ".join(str(part) for part in parts if part), InputError.exit_code
+    what = f"{type(error).__name__}: {error}"[:_MOST_LETTERS]
+    return f"unexpected {what}: please report it (CERES_CAL_DEBUG=1 tells more)", SolutionError.exit_code
 
 
 def _fail(message: str, exit_code: int, as_json: bool) -> int:
@@ -79,8 +78,7 @@ def _fail(message: str, exit_code: int, as_json: bool) -> int:
     if as_json:
         import json
 
-        with suppress(OSError):
-            print(json.dumps({"error": line, "exit_code": exit_code}), flush=True)
+        print(json.dumps({"error": line, "exit_code": exit_code}), flush=True)
     return exit_code
 
 

@@ -86,21 +86,20 @@ def _all_printable(data: Any) -> Any:
 
 
 def print_answer(answer: Document, *, as_json: bool) -> None:
-    """Print an answer; BrokenPipeError here, not at the program's end, when nobody reads on."""
+    """Print an answer."""
     if as_json:
         import msgspec
 
         # What is infinite or NaN becomes null; arrays and numbers of NumPy's what they hold.
         try:
             encoded = msgspec.json.encode(answer.data, enc_hook=lambda value: value.tolist())
-        except UnicodeEncodeError:  # a file's name that is no UTF-8
+        except UnicodeEncodeError:  # quiet: a file's name that is no UTF-8 is printed with its bytes spelt out
             plain = msgspec.to_builtins(answer.data, enc_hook=lambda value: value.tolist())
             encoded = msgspec.json.encode(_all_printable(plain))
         print(msgspec.json.format(encoded, indent=1).decode())
     else:
         text = answer.text()
         print(coloured(text) if in_colour(sys.stdout) else text)
-    sys.stdout.flush()
 
 
 # ---- the table ------------------------------------------------------------------------------------------------------

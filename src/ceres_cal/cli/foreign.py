@@ -132,21 +132,22 @@ class ListenArguments(GroupArguments):
     "-o geometry.yml --seconds 30",
 )
 def _listen(args: ListenArguments) -> Document:
-    from ceres_cal.formats import geometry_content, received_geometry, ssl_target
+    from ceres_cal.formats import geometry_content, received_geometry
 
     require_output(args.output, [])
     if args.output.suffix not in (".json", ".pb", ".yml", ".yaml"):
         raise InputError(f"{args.output}: a field is written as .json, .pb or .yml: give one of these endings")
-    geometry = received_geometry(_group(args), args.seconds)
+    heard = received_geometry(_group(args), args.seconds)
     if args.output.suffix == ".json":
-        return _write_target(ssl_target(geometry), args.output)
+        return _write_target(heard.field, args.output, heard.sender)
     from ceres_cal.base.files import write_bytes
 
     with finishing():
-        write_bytes(args.output, geometry_content(geometry, args.output.suffix))
-    ids = [entry["camera_id"] for entry in geometry.get("calib", [])]
-    words = f"a field and cameras {ids}, written to {args.output}"
-    return Document((Section("heard", [words], {"output": str(args.output), "camera_ids": ids}),))
+        write_bytes(args.output, geometry_content(heard.geometry, args.output.suffix))
+    ids = [entry["camera_id"] for entry in heard.geometry.get("calib", [])]
+    words = f"a field and cameras {ids} from {heard.sender}, written to {args.output}"
+    data = {"output": str(args.output), "camera_ids": ids, "sender": heard.sender}
+    return Document((Section("heard", [words], data),))
 
 
 # ---- targets --------------------------------------------------------------------------------------------------------
@@ -168,10 +169,13 @@ def _targets_import(args: TargetsImportArguments) -> Document:
     return _write_target(read_ssl_target(args.file), args.output)
 
 
-def _write_target(target: Target, path: Path) -> Document:
+def _write_target(target: Target, path: Path, sender: str = "") -> Document:
     from ceres_cal.base.files import write_json
 
     with finishing():
         write_json(path, target.spec)
-    words = f"{target.kind} with {len(target.points)} points and {len(target.curves)} curves, written to {path}"
-    return Document((Section("target", [words], {"output": str(path), "spec": target.spec}),))
+    whence = f" from {sender}" if sender else ""
+    counts = f"{len(target.points)} points and {len(target.curves)} curves"
+    words = f"{target.kind} with {counts}{whence}, written to {path}"
+    data = {"output": str(path), "spec": target.spec, **({"sender": sender} if sender else {})}
+    return Document((Section("target", [words], data),))

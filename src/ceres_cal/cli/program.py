@@ -8,9 +8,9 @@ import io
 import os
 import signal
 import sys
-from contextlib import suppress
+from select import select
 from types import FrameType
-from typing import NoReturn
+from typing import Any, NoReturn, TextIO, cast
 
 _OBJECTS = 50_000  # between collections: what is imported is no garbage, and to look it through takes time
 TERMINATED = 143
@@ -21,16 +21,53 @@ class Terminated(KeyboardInterrupt):
     """SIGTERM came: everything is left as by Ctrl-C."""
 
 
+class _Kept(io.FileIO):
+    """A standard stream that never fails: what cannot be written is lost, and `lost` says why.
+
+    So the exit code of a command is that of its work, wherever its words go.
+    """
+
+    lost: OSError | None = None
+
+    def write(self, content: Any) -> int:
+        try:
+            while self.lost is None:
+                if (written := super().write(content)) is not None:
+                    return written
+                select([], [self], [])  # a pipe that does not block, and is full
+        except OSError as error:  # reads: "the answer is not on standard output: ..."
+            self.lost = error
+        return len(content)
+
+
 def as_a_program() -> None:
-    """Take SIGTERM like Ctrl-C, print whatever a name holds, and let nobody but us write on standard error."""
+    """Take SIGTERM like Ctrl-C, print whatever a name holds wherever it goes, and let nobody but us write on standard
+    error.
+    """
     signal.signal(signal.SIGTERM, _terminate)
     gc.set_threshold(_OBJECTS)
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # to begin threads that are not used (base.threads) takes time
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")
+    _open_what_is_closed()
+    error = 2
     if not os.environ.get("CERES_CAL_DEBUG"):
+        error = os.dup(2)
         _silence_libraries()
+    sys.stdout, sys.stderr = _stream(1, sys.stdout), _stream(error, sys.stderr)
+
+
+def _open_what_is_closed() -> None:
+    """Or the next file that is opened is written on as standard output, or standard error."""
+    while (number := os.open(os.devnull, os.O_RDWR)) <= 2:
+        os.set_inheritable(number, True)
+    os.close(number)
+
+
+def _stream(number: int, before: TextIO | None) -> TextIO:
+    """A descriptor as a stream like the one before, or like any where there was none."""
+    encoding = "utf-8" if before is None else before.encoding
+    buffered = io.BufferedWriter(_Kept(number, "w", closefd=False))
+    by_lines = number != 1 or os.isatty(number)
+    return io.TextIOWrapper(buffered, encoding, "backslashreplace", line_buffering=by_lines)
 
 
 def _terminate(number: int, frame: FrameType | None) -> NoReturn:
@@ -38,14 +75,10 @@ def _terminate(number: int, frame: FrameType | None) -> NoReturn:
 
 
 def _silence_libraries() -> None:
-    """What image libraries and solvers print on descriptor 2 goes nowhere; `sys.stderr` has one of its own."""
-    if sys.stderr is None:
-        return
-    own = os.dup(2)
+    """What image libraries and solvers print on descriptor 2 goes nowhere."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 2)
     os.close(nowhere)
-    sys.stderr = open(own, "w", buffering=1, errors="backslashreplace")  # noqa: PTH123, SIM115 until the end
 
 
 def ended(exit_code: int) -> int:
@@ -57,7 +90,9 @@ def ended(exit_code: int) -> int:
     native = sys.modules.get("ceres_cal.base.native")
     if native is None or not native.is_busy():
         atexit._run_exitfuncs()
-    for stream in (sys.stdout, sys.stderr):
-        with suppress(AttributeError, OSError, ValueError):  # there is none, nobody reads, it is closed
-            stream.flush()
+    sys.stdout.flush()
+    lost = cast(_Kept, cast(io.BufferedWriter, sys.stdout.buffer).raw).lost
+    if lost is not None and not isinstance(lost, BrokenPipeError):  # who closes a pipe wants no more
+        print(f"ceres-cal: the answer is not on standard output: {lost.strerror}", file=sys.stderr)
+    sys.stderr.flush()
     os._exit(exit_code)

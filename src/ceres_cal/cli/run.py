@@ -132,7 +132,7 @@ def _observed(args: RunArguments, images: list[Path]) -> Iterator[_Step]:
             found = _step(args, "detect board", [*rest, *board, *goal], most=1)
             rest = [path for path in rest if path not in found.data["found"]]
             yield found if args.target is None else replace(found, lines=found.lines[:1])  # the rest may be the field
-        except NothingShownError as error:
+        except NothingShownError as error:  # reads: "..." below the command of this step
             if args.target is None:
                 raise
             yield _Step(_typed("detect board", [*rest, *board, *goal]), (str(error),), {})
@@ -162,7 +162,7 @@ def _exported(args: RunArguments, form: str, goal: str) -> _Step:
     arguments = [str(args.output / "calibration.json"), "--to", form, "-o", goal]
     try:
         return _step(args, "export", arguments)
-    except InputError as error:
+    except InputError as error:  # reads: "error ..." in place of the export
         return _Step(_typed("export", arguments), tuple(Section("error", [str(error)]).shown()), {})
 
 

@@ -35,6 +35,10 @@ _HINTS = {
     "checkerboard": " (count the corners between squares, not the squares)",
     **dict.fromkeys(("circle-grid", "april-grid", "markers"), ""),
 }
+# Of (width + height)^2, the share that counts as pixels: more than there are from sides of 1 : 14 on, longer than any
+# camera's picture.
+_LONG = 16
+_LEAST_SIDE_PX = 8  # three squares of less than 3 px show no corner
 _LARGE_PX = 2e6  # larger images are searched at this size first: faster, and with less of noise and blur
 _MOST_PX = 1.6e7  # and at this size at most: on noise OpenCV takes minutes, and 50 MB for every megapixel
 _SUBPIX_HALF_WINDOW_PX = 5  # at most; a third of the spacing keeps the neighbouring corners out of it
@@ -208,7 +212,7 @@ def right_handed(grid: Array) -> Array:
 def _find_chessboard(image: Image8, columns: int, rows: int) -> Array | None:
     """Roughly where the corners are, (rows, columns, 2) px, by OpenCV's two detectors at several scales."""
     legacy = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
-    for scale in _scales(image.size):
+    for scale in _scales(image.shape):
         scaled = _resized(image, scale)
         # The newer detector is the better one, but blind where it is dark.
         shown, corners = cv2.findChessboardCornersSB(scaled, (columns, rows))
@@ -221,7 +225,7 @@ def _find_chessboard(image: Image8, columns: int, rows: int) -> Array | None:
 
 def _find_squares(image: Image8) -> Array | None:
     """Roughly where the corners of neighbouring squares are, (h, w, 2) px, right-handed: three each way or more."""
-    for scale in _scales(image.size):
+    for scale in _scales(image.shape):
         scaled = _resized(image, scale)
         shown, corners, meta = cv2.findChessboardCornersSBWithMeta(scaled, (3, 3), cv2.CALIB_CB_LARGER)
         if shown and _is_even(grid := _places_in(image, scaled, corners).reshape(*meta.shape, 2)):
@@ -247,7 +251,15 @@ def _places_in(image: Image8, scaled: Image8, corners: AnyArray) -> Array:
     return np.asarray((corners.reshape(-1, 2).astype(float) + 0.5) * ratio - 0.5)
 
 
-def _scales(pixels: int) -> Iterator[float]:
+def _scales(shape: tuple[int, ...]) -> Iterator[float]:
+    height, width = shape
+    # OpenCV turns the picture by 45 degrees, into a square that a long one hardly fills.
+    pixels = max(height * width, (height + width) ** 2 // _LONG)
+    every = _scales_of(pixels)
+    yield from (scale for scale in every if scale * min(shape) >= _LEAST_SIDE_PX)
+
+
+def _scales_of(pixels: int) -> Iterator[float]:
     if pixels > _LARGE_PX:
         yield float(np.sqrt(_LARGE_PX / pixels))
     yield min(1.0, float(np.sqrt(_MOST_PX / pixels)))

@@ -14,7 +14,7 @@ def claimed_size(content: bytes) -> tuple[int, int] | None:
     """(width, height) of a PNG, JPEG, BMP, TIFF, WebP, JPEG 2000 or PNM file; None where it is none of them."""
     try:
         return _size(content)
-    except struct.error:  # cut short
+    except struct.error:  # reads: "not an image that OpenCV can read (cut short?)"
         return None
 
 

@@ -63,7 +63,7 @@ def _decoded(path: str | Path, channels: int) -> Image:
     flags = channels | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
     try:
         image = None if size is None else cv2.imdecode(np.frombuffer(content, np.uint8), flags)
-    except cv2.error:
+    except cv2.error:  # reads: "not an image that OpenCV can read (cut short?)"
         image = None
     if image is None:
         raise InputError(f"{path}: not an image that OpenCV can read (cut short?): convert it to PNG or leave it out")

@@ -31,6 +31,8 @@ def part_of_board(image: Image, seed: Array, columns: int, rows: int) -> Array |
         seed: (h, w, 2) px, right-handed: some neighbouring corners of the board, about where they are.
     """
     grown = _grown(image, seed, max(columns, rows))
+    if np.isnan(_steps(grown.grid)).all():
+        return f"no chessboard of {columns} x {rows} inner corners found, but squares without neighbours"
     places = list(_places(grown, image.shape, columns, rows))
     if len({missing for missing, _ in places}) != 1:
         height, width = grown.contrast.shape
@@ -148,5 +150,11 @@ def _places(seen: Saddles, shape: tuple[int, ...], columns: int, rows: int) -> I
 def _ends(grid: Array, shape: tuple[int, ...], axis: int, end: int) -> bool:
     """Whether the next line of corners on a side would be well in the picture: there is none, so the board ends."""
     wider = np.pad(grid, ((1, 1), (1, 1), (0, 0)), constant_values=np.nan)
-    steps = np.linalg.norm(np.concatenate([np.diff(grid, axis=n).reshape(-1, 2) for n in (0, 1)]), axis=1)
-    return bool(np.any(_inside(np.take(_foreseen(wider), end, axis=axis), shape, _CLEAR * float(np.nanmedian(steps)))))
+    clear_px = _CLEAR * float(np.nanmedian(_steps(grid)))
+    return bool(np.any(_inside(np.take(_foreseen(wider), end, axis=axis), shape, clear_px)))
+
+
+def _steps(grid: Array) -> Array:
+    """(K,) px between neighbouring corners, NaN where one is not seen."""
+    steps: Array = np.linalg.norm(np.concatenate([np.diff(grid, axis=n).reshape(-1, 2) for n in (0, 1)]), axis=1)
+    return steps

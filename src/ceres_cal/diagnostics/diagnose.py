@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.numerical import numerical
 from ceres_cal.calibration import Calibration
 from ceres_cal.diagnostics.alternatives import Sums
 from ceres_cal.diagnostics.diagnostic import Case, Tested
@@ -61,6 +62,10 @@ class Diagnosis:
         return any(finding.is_model_error for finding in self.findings)
 
 
+_FIRST = "correct first what was stated beforehand and is contradicted: this may come from it"
+
+
+@numerical("the diagnosis")
 def diagnose(
     calibration: Calibration,
     observations: Observations,
@@ -86,6 +91,8 @@ def diagnose(
     case = _case(calibration, observations, new_data)
     tested = _tested(case, false_alarm_rate)
     findings = [finding for one in DIAGNOSTICS.values() for finding in one.findings(tested)]
+    if any(conflict.kind != "tolerance" for conflict in calibration.conflicts):  # which bends the rest to itself
+        findings = [replace(f, advice=f"{_FIRST}; {f.advice}") if f.is_model_error else f for f in findings]
     return Diagnosis(
         tuple(sorted(findings, key=lambda finding: -finding.effect_px)),
         case.table,

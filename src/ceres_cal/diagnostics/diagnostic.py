@@ -5,12 +5,12 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cached_property
 from typing import ClassVar, NamedTuple
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask, distinct
+from ceres_cal.base.cached import cached_property
 from ceres_cal.base.words import first_of, two_digits
 from ceres_cal.calibration import Calibration
 from ceres_cal.diagnostics.alternatives import Family

@@ -184,7 +184,7 @@ def choose(
             continue
         try:
             errors.append(cross_validate(few, one, k, calibration=whole, counted=counted, executor=executor))
-        except CalibrationError as error:
+        except CalibrationError as error:  # reads: "..." in the row of that lens
             errors.append(HeldOut(label_of(one), coefficients_of(one), failed=str(error)))
     best, chosen = _decide(errors, tried)
     share = (len(few.points) + len(few.curves)) / (len(observations.points) + len(observations.curves))
@@ -195,7 +195,7 @@ def choose(
 def _attempt(observations: Observations, options: Options) -> Calibration | str:
     try:
         return calibrate(observations, options)
-    except CalibrationError as error:
+    except CalibrationError as error:  # reads: "..." in the row of that lens
         return str(error)
 
 
@@ -217,7 +217,7 @@ def _without(
     """Errors (n, 2), px and mm, of a part's rows that count, by a calibration without it; or why there is none."""
     try:
         trained = calibrate(_part(observations, ~part), options)
-    except CalibrationError as error:
+    except CalibrationError as error:  # reads: "..." in the row of that lens, where too many parts fail
         return error
     held = part & kept
     return _predicted(observations, held, trained, whole)[held]

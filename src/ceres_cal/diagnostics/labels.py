@@ -7,12 +7,13 @@ any other feature, for each observation; for several of one frame and label that
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cache
 
 import numpy as np
 
 from ceres_cal import kernels
 from ceres_cal.base.arrays import Array, Indices, Mask, distinct
+from ceres_cal.base.cached import cached_property
 from ceres_cal.base.tails import log_binomial_tail
 from ceres_cal.model.parameters import Estimate
 from ceres_cal.model.residuals import camera_optics

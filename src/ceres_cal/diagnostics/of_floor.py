@@ -42,12 +42,16 @@ class FloorBowed(_Floor):
     def words(self, evidence: Evidence) -> Words:
         mm, sd = 1e3 * evidence.score.amount, 1e3 * evidence.score.sd
         return Words(
-            f"{evidence.score.subject}: its floor is not flat: at its edges it rises by {mm[0]:+.1f} ± {sd[0]:.1f} "
-            f"mm along x, {mm[1]:+.1f} ± {sd[1]:.1f} mm along y, and is twisted by {mm[2]:+.1f} ± {sd[2]:.1f} mm "
+            f"{evidence.score.subject}: its floor appears {_lower(mm[0])} ± {sd[0]:.1f} mm at its edges along x than "
+            f"in the middle, {_lower(mm[1])} ± {sd[1]:.1f} mm along y, and twisted by {mm[2]:+.1f} ± {sd[2]:.1f} mm "
             f"({evidence.size})",
             "measure its height at some points, and give them as points of a custom target with their z",
             amounts(("x", "y", "twist"), mm, sd, "mm"),
         )
+
+
+def _lower(mm: float) -> str:
+    return f"{'higher' if mm > 0.0 else 'lower'} by {abs(mm):.1f}"
 
 
 class FloorUneven(_Floor):

@@ -1,4 +1,4 @@
-"""Diagnostics of the observations: wrong labels, noise larger than stated, neighbours that agree."""
+"""Diagnostics of the observations: wrong labels, shifted points, noise larger than stated, neighbours that agree."""
 
 from __future__ import annotations
 
@@ -10,12 +10,16 @@ from typing import ClassVar
 import numpy as np
 
 from ceres_cal.base.arrays import Array
-from ceres_cal.diagnostics.diagnostic import Case, Diagnostic, Tested, Words
-from ceres_cal.diagnostics.findings import Amount, Finding, Wrong
+from ceres_cal.diagnostics.alternatives import Family
+from ceres_cal.diagnostics.diagnostic import Case, Diagnostic, Evidence, ScoreTest, Tested, Words
+from ceres_cal.diagnostics.findings import Amount, Finding, Wrong, amounts
 from ceres_cal.diagnostics.labels import Mislabelled
 from ceres_cal.diagnostics.leftover import Noise
 
 _MOST_NAMED = 5
+# How near to half a pixel a shift must be to be called that: in standard deviations, and px.
+_HALF_SD, _HALF_PX = 3.0, 0.1
+_HALF = "this is the half pixel between counting from the centre and from the corner of the top-left pixel: "
 
 
 class WrongLabel(Diagnostic):
@@ -61,6 +65,29 @@ class WrongLabel(Diagnostic):
 def _mean(values: Array) -> float:
     known = values[np.isfinite(values)]
     return float(np.mean(known)) if len(known) else float("nan")
+
+
+class PointsShifted(ScoreTest):
+    """A camera's points lie aside of its curves: two detectors that count pixels from different places."""
+
+    kind = "points shifted"
+    absorbed = True
+
+    def families(self, case: Case) -> Iterator[Family]:
+        is_curve, camera = case.equations.is_curve, case.camera
+        both = np.isin(camera, camera[is_curve & case.model.used])
+        group = np.where(~is_curve & both, camera, -1)
+        yield Family(self.kind, case.equations.direction * ~is_curve[:, None], group, case.cameras)
+
+    def words(self, evidence: Evidence) -> Words:
+        px, sd = evidence.score.amount, evidence.score.sd
+        half = bool(np.all(np.abs(np.abs(px) - 0.5) < np.maximum(_HALF_SD * sd, _HALF_PX)))
+        return Words(
+            f"camera {evidence.score.subject!r}: its points are shifted against its curves by ({px[0]:+.2f} ± "
+            f"{sd[0]:.2f}, {px[1]:+.2f} ± {sd[1]:.2f}) px ({evidence.size})",
+            f"{_HALF if half else ''}let both detectors count from the centre of the top-left pixel",
+            amounts(("x", "y"), px, sd, "px"),
+        )
 
 
 class _OfNoise(Diagnostic):

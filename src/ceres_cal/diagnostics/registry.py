@@ -8,15 +8,15 @@ from ceres_cal.diagnostics.of_floor import FloorBowed, FloorUneven
 from ceres_cal.diagnostics.of_lens import Aspect, Decentring, Phi, PrincipalPoint, Prism, Radius, Skew
 from ceres_cal.diagnostics.of_motion import MovedAfter, MovedIn
 from ceres_cal.diagnostics.of_new_data import DoesNotHold
-from ceres_cal.diagnostics.of_observations import Correlated, LargerNoise, WrongLabel
+from ceres_cal.diagnostics.of_observations import Correlated, LargerNoise, PointsShifted, WrongLabel
 from ceres_cal.diagnostics.of_target import BoardBent, CurveAside, PointAside
 
 DIAGNOSTICS: dict[str, Diagnostic] = {
     one.kind: one
     for one in (
         Radius(), Decentring(), Prism(), Aspect(), Skew(), PrincipalPoint(), Phi(), CurveAside(), PointAside(),
-        BoardBent(), FloorBowed(), FloorUneven(), MovedAfter(), MovedIn(), WrongLabel(), LargerNoise(), Correlated(),
-        DoesNotHold(),
+        BoardBent(), FloorBowed(), FloorUneven(), MovedAfter(), MovedIn(), WrongLabel(), PointsShifted(),
+        LargerNoise(), Correlated(), DoesNotHold(),
     )
 }  # fmt: skip
 

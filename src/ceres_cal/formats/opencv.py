@@ -211,7 +211,7 @@ def _matrix(node: Any) -> Array | None:
     try:
         fits = rows > 0.0 and cols > 0.0 and rows * cols == node.getNode("data").size()
         return np.asarray(node.mat(), dtype=float) if fits else None
-    except cv2.error:
+    except cv2.error:  # quiet: the caller refuses a matrix that is none, by its name
         return None
 
 

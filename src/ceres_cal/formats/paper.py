@@ -57,7 +57,7 @@ def _read(request: ImportRequest) -> Any:
     def numbers(name: str, count: int) -> Array:
         try:
             values = np.array([float(v) for v in given[name].replace(";", " ").split()])
-        except (KeyError, ValueError):
+        except (KeyError, ValueError):  # reads: "NAME must be N finite numbers, not ..."
             values = np.empty(0)
         if len(values) != count or not np.all(np.abs(values) < LARGEST):
             raise InputError(f"{name} must be {count} finite numbers, not {given.get(name, 'missing')!r}")

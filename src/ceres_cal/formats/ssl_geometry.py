@@ -128,7 +128,7 @@ def _recognises_yaml(content: bytes) -> bool:
 def _recognises_packet(content: bytes) -> bool:
     try:
         geometry_from_bytes(content)
-    except InputError:
+    except InputError:  # quiet: it is asked which format the file has
         return False
     return True
 

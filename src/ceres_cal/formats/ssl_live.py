@@ -41,11 +41,6 @@ def ssl_packet(
     return wrapped(data), exported
 
 
-def ssl_target(geometry: Mapping[str, Any]) -> Target:
-    """The field of an SSL_GeometryData as plain data."""
-    return target_of(geometry["field"])
-
-
 def geometry_content(geometry: Mapping[str, Any], ending: str) -> bytes:
     """An SSL_GeometryData as plain data, as a file of it."""
     return to_bytes("SSL_GeometryData", geometry) if ending == ".pb" else yaml_text(geometry).encode()
@@ -59,4 +54,4 @@ def read_ssl_target(path: str | Path) -> Target:
     """
     content = read_bytes(path)
     with naming(path):
-        return settings_field(content) if b"<VarXML" in content else ssl_target(read_geometry(content))
+        return settings_field(content) if b"<VarXML" in content else target_of(read_geometry(content)["field"])

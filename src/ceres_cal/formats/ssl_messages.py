@@ -123,7 +123,7 @@ def geometry_from_bytes(content: bytes) -> dict[str, Any]:
     """
     try:
         return from_bytes("SSL_GeometryData", content)
-    except InputError:
+    except InputError:  # quiet: the other message is tried, whose failure is told
         packet = from_bytes("SSL_WrapperPacket", content)
     if "geometry" not in packet:
         raise InputError("the packet holds no geometry")

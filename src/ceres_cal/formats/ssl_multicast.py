@@ -2,18 +2,28 @@
 
 from __future__ import annotations
 
+import re
 import socket
 import struct
+import sys
 import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from select import select
 from typing import Any
 
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.words import first_of, plural
+from ceres_cal.base.written import note
+from ceres_cal.formats.ssl_fields import target_of
 from ceres_cal.formats.ssl_messages import from_bytes, to_bytes
+from ceres_cal.scene.targets import Target
 
 _LARGEST = 65536
 _TTL = 1  # stays in the local network
+_LOOK_S = 60.0  # longest wait at a time: select does not take any number
+_MOST_SENDERS = 3
+_IP_MULTICAST_ALL = 49  # of Linux; Python has no name for it
 
 
 @dataclass(frozen=True)
@@ -21,12 +31,21 @@ class Group:
     """Where vision is published.
 
     Attributes:
-        interface: address of the own network card, 0.0.0.0 for the system's choice.
+        address: of a multicast group. interface: address of the own network card, 0.0.0.0 for the system's choice.
+
+    Raises:
+        InputError: the address or the port cannot be.
     """
 
     address: str = "224.5.23.2"
     port: int = 10006
     interface: str = "0.0.0.0"
+
+    def __post_init__(self) -> None:
+        if not 0 < self.port < 65536:
+            raise InputError(f"port {self.port}: give one from 1 to 65535")
+        if not re.fullmatch(r"2(2[4-9]|3\d)(\.\d{1,3}){3}", self.address):
+            raise InputError(f"{self.address} is no multicast group: give one from 224.0.0.0 to 239.255.255.255")
 
 
 def wrapped(geometry: Mapping[str, Any]) -> bytes:
@@ -35,7 +54,8 @@ def wrapped(geometry: Mapping[str, Any]) -> bytes:
 
 
 def publish(packet: bytes, group: Group, times: int | None = None, period_s: float = 3.0) -> int:
-    """Send a packet so many times, or until it is interrupted; how often it was sent.
+    """Send a packet so many times, without end where None; how often it was sent. What ends it early learns of it by
+    `base.written`.
 
     Raises:
         InputError: the network does not take it.
@@ -52,45 +72,62 @@ def publish(packet: bytes, group: Group, times: int | None = None, period_s: flo
                 sent += 1
                 if sent != times:
                     time.sleep(period_s)
-    except KeyboardInterrupt:
-        pass
     except OSError as error:
         raise InputError(f"{group.address}:{group.port}: cannot be sent to: {error.strerror or error}") from None
+    finally:
+        if sent:
+            note(f"{plural(sent, 'packet')} to {group.address}:{group.port}")
     return sent
 
 
-def received_geometry(group: Group, seconds: float) -> dict[str, Any]:
-    """The first geometry that comes within a time, as plain data.
+@dataclass(frozen=True)
+class Heard:
+    """A geometry that came over the network.
+
+    Attributes:
+        geometry: as plain data. field: what it describes. sender: address and port that it came from.
+    """
+
+    geometry: dict[str, Any]
+    field: Target
+    sender: str
+
+
+def received_geometry(group: Group, seconds: float) -> Heard:
+    """The first geometry of a field that can be that comes within a time; other packets are passed over.
 
     Raises:
-        InputError: none comes, or the network cannot be listened to.
+        InputError: none comes (it says from whom others came, and what is wrong with the last), the address is no
+            multicast group, or the network cannot be listened to.
     """
-    count = 0
-    for content in _packets(group, seconds):
-        count += 1
+    refused: dict[str, str] = {}
+    for content, sender in _packets(group, seconds):
         try:
             packet = from_bytes("SSL_WrapperPacket", content)
-        except InputError:
-            continue
-        if "geometry" in packet:
-            return dict(packet["geometry"])
-    heard = f"{count} packets without it" if count else "nothing at all: is vision running, and on this network card?"
-    raise InputError(f"{group.address}:{group.port}: no geometry within {seconds:g} s, but {heard}")
+            if "geometry" not in packet:
+                raise InputError("a packet without geometry")
+            return Heard(dict(packet["geometry"]), target_of(packet["geometry"]["field"]), sender)
+        except InputError as error:  # reads: "no geometry of a field within 10 s, but from 10.0.0.7:10006 ..."
+            refused[sender] = str(error)
+    heard = first_of([f"from {sender} {why}" for sender, why in refused.items()], _MOST_SENDERS)
+    heard = heard or "nothing at all: is vision running, and on this network card?"
+    raise InputError(f"{group.address}:{group.port}: no geometry of a field within {seconds:g} s, but {heard}")
 
 
-def _packets(group: Group, seconds: float) -> Iterator[bytes]:
+def _packets(group: Group, seconds: float) -> Iterator[tuple[bytes, str]]:
+    """Packets to the group alone, none of those to an address of this computer, and who sent each."""
     try:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
             receiver.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            receiver.bind(("", group.port))
+            if sys.platform == "linux":  # or what other programs joined on other network cards comes, too
+                receiver.setsockopt(socket.IPPROTO_IP, _IP_MULTICAST_ALL, 0)
+            receiver.bind((group.address, group.port))
             member = struct.pack("4s4s", socket.inet_aton(group.address), socket.inet_aton(group.interface))
             receiver.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, member)
             ends = time.monotonic() + seconds
             while (left := ends - time.monotonic()) > 0.0:
-                receiver.settimeout(left)
-                try:
-                    yield receiver.recv(_LARGEST)
-                except TimeoutError:
-                    return
+                if select([receiver], [], [], min(left, _LOOK_S))[0]:
+                    content, sender = receiver.recvfrom(_LARGEST)
+                    yield content, f"{sender[0]}:{sender[1]}"
     except OSError as error:
         raise InputError(f"{group.address}:{group.port}: cannot be listened to: {error.strerror or error}") from None

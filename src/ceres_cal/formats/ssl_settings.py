@@ -121,7 +121,7 @@ def _beside(values: list[_Var], first: int, last: int) -> dict[str, _Var]:
 
 
 def _number(one: _Var) -> float:
-    with suppress(ValueError):
+    with suppress(ValueError):  # reads: "NAME is no number, but ..."
         number = float(one.text.replace(",", "."))  # some locales' printf
         if abs(number) < LARGEST:
             return number

@@ -82,7 +82,7 @@ def numbers_at(values: Any, where: str, count: int | None = None) -> Array:
     """
     try:
         numbers = np.array(values, dtype=float).ravel()
-    except (TypeError, ValueError, OverflowError):
+    except (TypeError, ValueError, OverflowError):  # reads: "NAME must be N finite numbers, not ..."
         numbers = np.full(1, np.nan)
     if not np.all(np.abs(numbers) < LARGEST) or (count is not None and len(numbers) != count):
         raise InputError(f"{where} must be {count if count is not None else 'some'} finite numbers, not {values}")

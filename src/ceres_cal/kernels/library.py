@@ -11,13 +11,14 @@ import ctypes
 import platform
 import sys
 from collections.abc import Callable
-from functools import cache, cached_property
+from functools import cache
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from ceres_cal.base.cached import cached_property
 from ceres_cal.kernels.arguments import Blocks, CurveColumns, Loss, Optics, PointColumns, Sweep, Unknowns
 from ceres_cal.kernels.sources import digest
 

@@ -11,12 +11,13 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import partial
 from typing import TypeVar
 
 import numpy as np
 
 from ceres_cal.base.arrays import Mask
+from ceres_cal.base.cached import cached_property
 from ceres_cal.base.errors import CalibrationError, DegenerateError
 from ceres_cal.base.transforms import Poses
 from ceres_cal.calibration import LensChoice, TriedLens
@@ -64,7 +65,7 @@ class Chosen:
         """
         try:
             return solved(self), self
-        except CalibrationError as error:
+        except CalibrationError as error:  # reads: "..." beside that lens, why it failed
             if self.among is None:
                 raise
             other = self.among.without_kind(str(error)) or self._papers(str(error), options, start)
@@ -131,14 +132,16 @@ class Comparison:
         found = OtherLenses(self.there, (), (), self.chosen.of.reach_px)
         if self.chosen.form.blank.roughness or self.share < _LEAST_SHARE:
             return found
-        with suppress(CalibrationError):
+        try:
             found = replace(found, near=self.seen.solved_near(self.chosen))
-            for one, likely in zip(self.tried, self.probabilities, strict=True):
-                if one is self.chosen or likely < _LEAST_PROBABILITY or one.form.blank.roughness or one.fault:
-                    continue
-                with suppress(CalibrationError):
-                    others, weights = (*found.others, self.seen.solved_near(one)), (*found.weights, likely)
-                    found = replace(found, others=others, weights=weights)
+        except CalibrationError as error:  # reads: "other lenses could not be compared, so the standard deviations ..."
+            return replace(found, failed=str(error))
+        for one, likely in zip(self.tried, self.probabilities, strict=True):
+            if one is self.chosen or likely < _LEAST_PROBABILITY or one.form.blank.roughness or one.fault:
+                continue
+            with suppress(CalibrationError):  # quiet: a lens that cannot be solved for says nothing of the numbers
+                others, weights = (*found.others, self.seen.solved_near(one)), (*found.weights, likely)
+                found = replace(found, others=others, weights=weights)
         # What they say by chance is less by as much as there are more observations than took part.
         return replace(found, weights=tuple(self.share * one for one in found.weights))
 
@@ -159,27 +162,23 @@ class Comparison:
             return None
         if not explained_by_another(self.seen, self.tried, self.chosen, points, curves):
             return None
-        with suppress(CalibrationError):
-            return self._excluding(lambda one: one is self.chosen, _EXPLAINED).outcome
-        return None
+        found = self._excluding(lambda one: one is self.chosen, _EXPLAINED)
+        return None if found is None else found.outcome
 
     def without_kind(self, failure: str) -> Chosen | None:
         """The best of the other kinds, how much worse it predicts said with it; None where none gives an answer."""
-        with suppress(CalibrationError):
-            found = self._excluding(lambda one: one.of is self.chosen.of, failure)
-            return replace(found, passed=self.passed or self.chosen).outcome
-        return None
+        found = self._excluding(lambda one: one.of is self.chosen.of, failure)
+        return None if found is None else replace(found, passed=self.passed or self.chosen).outcome
 
-    def _excluding(self, is_out: Callable[[Candidate], bool], why: str) -> Comparison:
-        """Without some lenses, of which it is said why.
-
-        Raises:
-            DegenerateError: no other one gives an answer.
-        """
+    def _excluding(self, is_out: Callable[[Candidate], bool], why: str) -> Comparison | None:
+        """Without some lenses, of which it is said why; None where no other one gives an answer."""
         known = {one.form.label for one in self.tried}
         every = [*self.tried, *(one for one in _shorter(self.tried, None) if one.form.label not in known)]
         others = [replace(one, squares=None, failed=one.failed or why) if is_out(one) else one for one in every]
-        return _compared(self.seen, self.share, self.as_good, self.start, others)
+        try:
+            return _compared(self.seen, self.share, self.as_good, self.start, others)
+        except CalibrationError:  # quiet: the lens stays, or its own failure is told
+            return None
 
 
 def choose_lens(observations: Observations, options: Options, start: Start) -> Chosen:
@@ -192,7 +191,7 @@ def choose_lens(observations: Observations, options: Options, start: Start) -> C
     try:
         seen, kinds, share = compared_kinds(observations, options, start.estimate)
         return _among(seen, share, as_good, start, kinds).outcome
-    except CalibrationError as error:
+    except CalibrationError as error:  # reads: "..." beside the paper's lens, why no other was compared
         failed = "" if isinstance(error, FewGroupsError) else str(error)
         return Chosen(papers(options), start, LensChoice(PAPER, (TriedLens(PAPER, 2, failed=failed),), 0, 0.0))
 
@@ -209,7 +208,7 @@ def _among(seen: Seen, share: float, as_good: float, start: Start, kinds: Sequen
     tried = [one for kind in kinds for one in kind.candidates(first=True)]
     found: Comparison | None = None
     if any(one.form.label == PAPER and one.squares is not None for one in tried):
-        with suppress(DegenerateError):  # all of these fold, which shorter ones need not
+        with suppress(DegenerateError):  # quiet: all of these fold; the shorter ones that follow need not
             found = _compared(seen, share, as_good, start, tried)
     if found is None:
         found = _compared(seen, share, as_good, start, [*tried, *_shorter(tried, None)])

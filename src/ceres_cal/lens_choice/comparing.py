@@ -72,7 +72,7 @@ def _solved(
             problem = problem_of(observations, sights, own, near)
             most_rounds = MOST_ROUNDS if from_nothing else 1
             end = solve_robustly(problem, observations, near, most_rounds=most_rounds)
-        except CalibrationError as error:
+        except CalibrationError as error:  # quiet: the next lens is tried, and the failure raised where none is left
             failure = error
             continue
         if _noise_px(end) < _SOUND_PX:

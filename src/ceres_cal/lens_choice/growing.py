@@ -38,7 +38,7 @@ def grown(
     longer = replace(options, terms=tuple(options.blank_lens.more_terms))
     may_grow = bool(options.blank_lens.roughness) and options.coefficients is None and not options.terms
     if may_grow and agreement(end, observations.cameras) > AGREES:
-        with suppress(CalibrationError):
+        with suppress(CalibrationError):  # quiet: the lens without these terms stays; what it leaves is diagnosed
             near = _seen_longer(end.solution.estimate, longer)
             try_of = problem_of(observations, problem.sights, longer, near)
             found = solve_robustly(try_of, observations, near, progress=progress)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array
+from ceres_cal.base.cached import cached_property
 from ceres_cal.base.errors import CalibrationError
 from ceres_cal.base.tails import upper_tail
 from ceres_cal.lens_choice.forms import PAPER, Form
@@ -158,7 +158,7 @@ class Candidate:
         """Why it cannot be used, "" where it can."""
         try:
             cameras = self.estimate.cameras
-        except CalibrationError as error:
+        except CalibrationError as error:  # reads: "..." beside that lens, why it failed
             return str(error)
         for name, reach_px in self.of.reach_px.items():
             camera = cameras[name]

@@ -38,7 +38,7 @@ def explained_by_another(seen: Seen, tried: Sequence[Candidate], chosen: Candida
     for other in tried:
         if other is chosen or other.squares is None:
             continue
-        with suppress(CalibrationError):
+        with suppress(CalibrationError):  # quiet: a lens that cannot be solved for explains nothing
             explained = _explained(seen, seen.solved_near(other), out)
             if _PRICE * explained > price * max(other.form.size - chosen.form.size, 0):
                 return True

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Mask, distinct
+from ceres_cal.base.cached import cached_property
 from ceres_cal.base.errors import CalibrationError, DegenerateError
 from ceres_cal.lens_choice.forms import Form
 from ceres_cal.lens_choice.kinds import Candidate, Kind
@@ -86,7 +86,7 @@ class Seen:
                 self._shown(estimate)
                 estimate = solve(problem, estimate, precision=_PRECISION, is_near=False).estimate
             return self._near_best(forms, problem, estimate)
-        except CalibrationError as error:
+        except CalibrationError as error:  # reads: "..." beside that lens, why it failed
             return Kind(forms, estimate, failed=str(error))
 
     def solved(self, forms: tuple[Form, ...], near: Estimate) -> Kind:
@@ -99,7 +99,7 @@ class Seen:
             estimate = end.solution.estimate
             problem = replace(self._problem(options, estimate), smoothness=end.problem.smoothness)
             return self._near_best(forms, problem, estimate)
-        except CalibrationError as error:
+        except CalibrationError as error:  # reads: "..." beside that lens, why it failed
             return Kind(forms, estimate, failed=str(error))
 
     @property
@@ -119,7 +119,7 @@ class Seen:
 
     def reached(self, candidate: Candidate) -> Estimate | None:
         """Where a lens leaves no more than the normal equations of a longer one promised, at once or when solved."""
-        with suppress(CalibrationError):
+        with suppress(CalibrationError):  # quiet: the lens does not reach what was promised, and gives no answer
             points, curves = self.in_sigmas(candidate.estimate)
             if np.sum(points**2) + curves @ curves <= _KEPT * candidate.least:
                 return candidate.estimate

@@ -8,14 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices
+from ceres_cal.base.cached import cached_property
 from ceres_cal.base.spread import Spread, known_inverses, without
 from ceres_cal.model.keys import Key, sigma_limits
 
+_VISIBLE = 1e-12  # share of what is known of a number that can be told from rounding
 _DETERMINED = 1e-11  # eigenvalue, at unit diagonal, from which on a direction counts as determined
 
 
@@ -94,6 +95,12 @@ class Information:
         along, sizes, _ = np.linalg.svd(root @ shifts.T, full_matrices=False)
         left = root - (along * (1.0 - 1.0 / np.hypot(1.0, sizes))) @ (along.T @ root)
         return Information(self.keys, left.T @ left)
+
+    def less(self, other: Information) -> Information:
+        """What is left without a part of it; nothing of numbers of which that part says all but rounding."""
+        left = self.matrix - other.over(self.keys).matrix
+        visible = np.diagonal(left) > _VISIBLE * np.diagonal(self.matrix)
+        return Information(self.keys, np.where(visible[:, None] & visible, left, 0.0))
 
     def __add__(self, other: Information) -> Information:
         """Both together, over the keys of either."""

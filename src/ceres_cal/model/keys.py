@@ -67,6 +67,18 @@ def pose_keys(kind: str, name: str) -> list[Key]:
     return [Key(kind, name, q, unit) for q, unit in zip(quantities, _POSE_UNITS, strict=True)]
 
 
+def over(values: Array, keys: Sequence[Key], wanted: Sequence[Key]) -> Array:
+    """(..., W) values (..., K) of the keys (K), in the order of the wanted keys (W): 0 of what is not among the keys.
+
+    What is known of one camera says nothing of another: whoever takes a part of the keys takes it by this.
+    """
+    column = {key: number for number, key in enumerate(keys)}
+    whole = np.zeros((*np.shape(values)[:-1], len(wanted)))
+    at = [number for number, key in enumerate(wanted) if key in column]
+    whole[..., at] = np.asarray(values)[..., [column[wanted[number]] for number in at]]
+    return whole
+
+
 def columns_by_owner(keys: Sequence[Key]) -> dict[tuple[str, str], list[int]]:
     """(kind, owner) -> where its keys are."""
     columns: dict[tuple[str, str], list[int]] = {}

@@ -9,11 +9,12 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from numbers import Integral, Real
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices
+from ceres_cal.base.cached import cached_property
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.transforms import Pose, Poses, chained, inverted
 from ceres_cal.model.structure import Structure, Tolerance
@@ -91,6 +92,7 @@ class Options:
     threads: int = 0
 
     def __post_init__(self) -> None:
+        self._require_types()
         if self.lens == AUTO and self.powers:
             object.__setattr__(self, "lens", _OF_POWERS)
         if self.lens != AUTO:
@@ -120,6 +122,23 @@ class Options:
                 raise InputError(f"{name} must be above 0, not {getattr(self, name)}")
         if self.threads < 0:
             raise InputError(f"threads must be 0 (to choose) or above, not {self.threads}")
+
+    def _require_types(self) -> None:
+        """Raise InputError where an option is of another kind than it says."""
+        parts = {"priors": Prior, "powers": Integral, "terms": str, "coefficients": str, "dimensions": str}
+        for name, kind in parts.items():
+            given = getattr(self, name)
+            if given is not None and (
+                isinstance(given, str) or not all(isinstance(one, kind) for one in _listed(given))
+            ):
+                raise InputError(f"{name} must be a sequence of {kind.__name__}, not {given!r}")
+        for name, kind in {"fixed": Real, "tolerances": Tolerance}.items():
+            given = getattr(self, name)
+            if not isinstance(given, Mapping) or not all(isinstance(one, kind) for one in given.values()):
+                raise InputError(f"{name} must be a mapping from names to {kind.__name__}, not {given!r}")
+        for name in ("loss_scale", "reject_sigma", "max_iterations", "threads"):
+            if not isinstance(getattr(self, name), Real):
+                raise InputError(f"{name} must be a number, not {getattr(self, name)!r}")
 
     @property
     def _which(self) -> str:
@@ -156,6 +175,11 @@ class Options:
     def _unset(self) -> Lens:
         """The chosen lens with all coefficients 0."""
         return make_lens(self.lens, self.powers or PAPERS_POWERS, terms=self.terms)
+
+
+def _listed(given: object) -> Iterable[object]:
+    """What is in a sequence; of anything else itself, which is no part."""
+    return given if isinstance(given, Iterable) else (given, None)
 
 
 def intrinsic_names(lens: Lens) -> tuple[str, ...]:

@@ -10,12 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from typing import Literal
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Indices32, Mask, distinct
+from ceres_cal.base.cached import cached_property
 from ceres_cal.base.errors import InputError
 from ceres_cal.model.dimensions import dimension_slopes
 from ceres_cal.model.keys import Key

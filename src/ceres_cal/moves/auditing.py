@@ -16,6 +16,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import CalibrationError, InputError
+from ceres_cal.base.numerical import numerical
 from ceres_cal.base.tails import upper_tail
 from ceres_cal.base.transforms import Pose
 from ceres_cal.calibrating import calibrate
@@ -63,6 +64,7 @@ class StationAudit:
     ours: Calibration
 
 
+@numerical("the audit")
 def audit(foreign: Calibration, observations: Observations) -> dict[str, StationAudit]:
     """Hold a calibration, ours or another program's, against observations of its stations.
 
@@ -106,7 +108,7 @@ class _Case:
             problem = replace(self.problem, layout=layout)
             try:
                 estimate = solve(problem, estimate, precision=1e-10, is_near=False).estimate
-            except CalibrationError:
+            except CalibrationError:  # quiet: a change that cannot be solved for costs more than any other
                 return np.inf, camera
         return self._cost(estimate), estimate.camera_at(self.name)
 
@@ -162,7 +164,7 @@ def _case(observations: Observations, given: Camera) -> _Case:
     for kind, powers in dict.fromkeys([*_LENSES, (given.lens.kind, given.lens.powers or (2, 3))]):
         try:
             ours = calibrate(observations, Options(lens=kind, powers=powers, free_aspect=given.aspect != 1.0))
-        except CalibrationError as error:
+        except CalibrationError as error:  # quiet: the next lens is tried, and the failure raised where none is left
             failure = failure or error
             continue
         count = ours.fit.points * 2 + ours.fit.curves

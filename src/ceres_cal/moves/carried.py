@@ -15,6 +15,7 @@ from ceres_cal.model.keys import Key
 from ceres_cal.model.parameters import Estimate, Layout, Options, Station, intrinsic_names
 from ceres_cal.model.priors import GaussianPrior, gather_priors
 from ceres_cal.model.quantities import intrinsic_keys
+from ceres_cal.model.ranges import require_possible_numbers
 from ceres_cal.model.structure import make_structure
 from ceres_cal.moves.labels import TURNED, relabelled
 from ceres_cal.observations import Observations, Prior
@@ -125,6 +126,7 @@ def make_plan(
     observed = replace(given, targets={**calibration.targets, **observations.targets})
     same = calibration.digest == observations.digest  # then the question is the same, too
     options = replace(calibration.options, priors=asked.priors or (calibration.options.priors if same else ()))
+    require_possible_numbers(observed, replace(options, fixed={}, tolerances={}))  # which are the old calibration's
     scales = calibration.refitted.scales if same and calibration.refitted else calibration.fit.scales
     prior = carried_prior(calibration, observations, stays)
     placed = {name: old[name] for name in old if name in stays}

@@ -15,6 +15,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.errors import CalibrationError, InputError
+from ceres_cal.base.numerical import numerical
 from ceres_cal.base.transforms import Pose
 from ceres_cal.calibration import Calibration
 from ceres_cal.model.information import Information
@@ -107,6 +108,7 @@ class Check:
         return all(station.holds for station in self.stations.values())
 
 
+@numerical("the check")
 def check(
     calibration: Calibration, observations: Observations, false_alarms: float = FALSE_ALARMS, checks: int = 1
 ) -> Check:
@@ -186,7 +188,7 @@ class _Case:
         start = replace(self.estimate, stations={self.name: station})
         try:
             solution = solve(self.problem(used, freed), start)
-        except CalibrationError:
+        except CalibrationError:  # reads: "check no ..." that nothing explains the observations
             return None
         return None if solution.failed else (2.0 * solution.cost, solution.estimate)
 
@@ -262,7 +264,7 @@ def _apart(case: _Case, used: Sights, least: float, estimate: Estimate) -> tuple
     best = seen.inverse @ (earlier.matrix @ offsets) / noise**2
     scatter = measure_scatter(case.observed, problem, residuals(case.observed, used, estimate), estimate, reduced)
     if scatter is not None:
-        seen = scatter.widened_alone(seen, reduced.shared)
+        seen = scatter.widened(seen)
         freedom = 1.0 / (1.0 / freedom + scatter.dependence.inverse_freedom)
     before = case.calibration.uncertainty.posterior.degrees_of_freedom
     old = Statement(*case.known(used, (), estimate, keys), before)

@@ -11,6 +11,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, median
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.numerical import numerical
 from ceres_cal.base.tails import upper_tail
 from ceres_cal.base.transforms import nearest_rotation, rotation_log
 from ceres_cal.calibration import Calibration
@@ -61,6 +62,7 @@ class StationComparison(ErrorMap):
         return None if self.probability is None else self.probability >= _DOUBTFUL
 
 
+@numerical("the comparison")
 def compare(
     a: Calibration, b: Calibration, height_m: float = 0.0, station: str | None = None
 ) -> list[StationComparison]:

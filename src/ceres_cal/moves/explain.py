@@ -122,7 +122,7 @@ def _others(plan: RefitPlan, search: PoseSearch) -> Iterator[str]:
         yield f"with phi {phi:.0f} px in place of {before:.0f} they do: {WORDS['zoom']}: refit with --what zoom"
     try:
         fresh = calibrate(search.observations.of_station(search.sight.key.station), replace(plan.options, priors=()))
-    except CalibrationError:
+    except CalibrationError:  # quiet: one hint less in a refusal
         return
     noise = max(fresh.fit.point_scale / search.scales[0], fresh.fit.curve_scale / search.scales[1])
     if noise < _NOISIER and len(fresh.outliers) < _FEW * (fresh.fit.points + fresh.fit.curves):
@@ -208,6 +208,7 @@ def require_supported(plan: RefitPlan, result: Calibration, attempt: Callable[[s
         try:
             results[what] = attempt(what, result.estimate)
         except CalibrationError:
+            # quiet: another freedom that is no explanation; what was asked for is judged by itself
             continue
     quiet = {w: r for w, r in results.items() if judged(plan, w, r).noise < _TOO_NOISY or w == plan.what}
     scores = _scores(plan, quiet)

@@ -84,6 +84,12 @@ class PoseSearch:
         near = float(np.hypot(x, y)) < _FARTHEST_M and abs(float(height)) < _FARTHEST_M
         return near and (self.sight.key.placement is not None or height > 0.0)
 
+    @property
+    def drawn(self) -> Sights:
+        """The sight of points as drawn: on a plane, also where a board was built bent."""
+        every = np.concatenate([target.point_array for target in self.observations.targets.values()])
+        return replace(self.sight, points=every[self.sight.point_index])
+
     def with_camera(self, camera: Camera) -> PoseSearch:
         """The same through another lens."""
         cameras = {**self.estimate.cameras, self.sight.key.camera: camera}
@@ -125,10 +131,10 @@ def equations(sight: Sights) -> int:
 
 
 def closed_form(search: PoseSearch) -> Pose | None:
-    """The pose by a homography between the lens's rays and the floor, from points and straight lines; None where they
-    are too few (a point gives two equations, a line two) or cannot fix it.
+    """The pose by a homography between the lens's rays and the plane of the drawing, from points and straight lines;
+    None where they are too few (a point gives two equations, a line two) or cannot fix it.
     """
-    plane = plane_sight(search.sight, height_m=0.0)
+    plane = plane_sight(search.drawn, height_m=0.0)
     rays = search.camera.rays(plane.pixels)
     known = np.isfinite(rays[:, 0])
     if plane.equations < 8 or np.count_nonzero(known) < 8:

@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from ceres_cal.base.errors import DegenerateError, SolutionError
+from ceres_cal.base.numerical import numerical
 from ceres_cal.base.transforms import Pose
 from ceres_cal.calibrating import Again, Watched, solved_from
 from ceres_cal.calibration import Calibration, Refitted
@@ -39,6 +40,7 @@ _UNIQUE = 8
 _SMALL = (0.3, np.deg2rad(15.0))
 
 
+@numerical("the refit")
 def refit(
     calibration: Calibration,
     observations: Observations,

@@ -9,6 +9,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.errors import DegenerateError, InputError
+from ceres_cal.base.numerical import numerical
 from ceres_cal.base.transforms import Pose
 from ceres_cal.calibrating import Again, solved_from
 from ceres_cal.calibration import Calibration, Fit
@@ -68,6 +69,7 @@ class Score:
         return ratios[0], ratios[1]
 
 
+@numerical("the score")
 def score(
     calibration: Calibration,
     observations: Observations,

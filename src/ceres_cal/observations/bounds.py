@@ -1,4 +1,4 @@
-"""Pixels outside their camera's image: a few are strays, many mean that the image size is another one."""
+"""Pixels outside their camera's image: a few are strays, many mean that the image size is another one. And sigmas."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Mask
+from ceres_cal.base.arrays import Array, Mask, median
 from ceres_cal.base.errors import InputError
 from ceres_cal.observations.columns import Alone, Columns, Curves, each_block, view_label
 from ceres_cal.observations.files import Content
@@ -15,8 +15,36 @@ from ceres_cal.observations.files import Content
 _MARGIN_PX = 1.5
 # Of a camera's observations: more of them outside, and its image has another size.
 _FEW = 0.01
+_CORNER = 0.25  # of either side: a board that is always held so far from the middle of the image is rare
+_LONG = 1e6  # px: printed with an exponent
+_FAR = 10.0  # image diagonals: a pixel farther off was not measured, and its square swamps what was
 # The largest playing fields end at 60 m; the smallest board in millimetres reaches as far.
 _LARGE_M = 100.0
+# Of the largest sigma over the smallest: from ten pixels by a click to a thousandth of a pixel by a large target in the
+# image. Beyond it one observation decides alone, and nothing contradicts it.
+_SIGMA_RATIO = 1e4
+
+
+def require_alike(content: Content) -> None:
+    """Raise InputError where a sigma is so far from the others that its observation, or they, decide nothing."""
+    columns = {"point": content.points, "curve": content.curves}
+    ends = [end for column in columns.values() for end in each_block(_extremes, Alone(column.sigma_px))]
+    if max(high for _, high in ends) <= _SIGMA_RATIO * min(low for low, _ in ends):
+        return
+    sigmas = np.concatenate([column.sigma_px for column in columns.values()])
+    usual_px = median(sigmas)
+    row = int(np.argmax(np.abs(np.log(sigmas / usual_px))))
+    kind, number = ("point", row) if row < len(content.points) else ("curve", row - len(content.points))
+    raise InputError(
+        f"{view_label(columns[kind].view[number], content.views)}, {kind} {content.feature_name(kind, number)!r}: its "
+        f"sigma_px is {sigmas[row]:g} where {usual_px:g} is usual: sigmas may differ by a factor of {_SIGMA_RATIO:.0f} "
+        "at most: correct it, or leave the observation out"
+    )
+
+
+def _extremes(_: int, block: Alone) -> tuple[float, float]:
+    """The smallest and the largest of a block."""
+    return (float(block.values.min()), float(block.values.max())) if len(block.values) else (np.inf, 0.0)
 
 
 def stray_pixels(content: Content) -> tuple[str, ...]:
@@ -39,9 +67,18 @@ def stray_pixels(content: Content) -> tuple[str, ...]:
         if not count:
             continue
         first = _first(content, points & mine[0], curves & mine[1])
+        pixels = np.concatenate([content.points.pixels[mine[0]], content.curves.pixels[mine[1]]])
+        if not np.all(np.abs(pixels) <= _FAR * float(np.hypot(*size))):
+            far = [
+                np.any(np.abs(column.pixels) > _FAR * float(np.hypot(*size)), axis=1) & here
+                for column, here in zip((content.points, content.curves), mine, strict=True)
+            ]
+            raise InputError(
+                f"camera {camera!r}: its image is {size[0]} x {size[1]} px, but {_first(content, *far)} lies "
+                f"{_FAR:.0f} images away: correct or remove it"
+            )
         text = f"camera {camera!r}: {count} of {total} observations lie outside its image"
         if count > max(1.0, _FEW * total):
-            pixels = np.concatenate([content.points.pixels[mine[0]], content.curves.pixels[mine[1]]])
             raise InputError(f"{text}: {_cause(pixels, size)}; the first is {first}")
         lines.append(f"{text} of {size[0]} x {size[1]} px, the first is {first}: correct or remove what lies outside")
     return tuple(lines)
@@ -86,7 +123,22 @@ def _first(content: Content, points: Mask, curves: Mask) -> str:
     row = int(np.argmax(points if points.any() else curves))
     kind = "curve" if isinstance(column, Curves) else "point"
     feature, (x, y) = content.feature_name(kind, row), column.pixels[row]
-    return f"{view_label(column.view[row], content.views)}, {kind} {feature!r}: pixel ({x:.1f}, {y:.1f})"
+    at = ", ".join(f"{value:.1f}" if abs(value) < _LONG else f"{value:g}" for value in (x, y))
+    return f"{view_label(column.view[row], content.views)}, {kind} {feature!r}: pixel ({at})"
+
+
+def unfilled(content: Content) -> Iterator[str]:
+    """A line for each camera whose observations all lie in a small corner of its image."""
+    owners = np.array([view.camera for view in content.views])
+    for camera, size in content.cameras.items():
+        own = owners == camera
+        pixels = np.concatenate([column.pixels[own[column.view]] for column in (content.points, content.curves)])
+        if len(pixels) and np.all(pixels.max(axis=0) < _CORNER * np.array(size)):
+            reach = "{:.0f} x {:.0f}".format(*pixels.max(axis=0))
+            yield (
+                f"camera {camera!r}: observations reach {reach} px of an image of {size[0]} x {size[1]}: is image_size "
+                "that of the pictures?"
+            )
 
 
 def odd_sizes(content: Content) -> Iterator[str]:

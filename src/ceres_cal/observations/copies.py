@@ -12,12 +12,12 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Hashable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ceres_cal.base.arrays import Indices, Mask
+from ceres_cal.base.cached import cached_property
 from ceres_cal.observations.columns import Columns, Curves, Points, View, each_block
 
 Hashes = NDArray[np.uint64]

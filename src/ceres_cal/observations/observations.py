@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import partial
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
@@ -18,8 +18,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ceres_cal.base.arrays import Indices, Mask
+from ceres_cal.base.cached import cached_property
 from ceres_cal.base.errors import InputError, naming
-from ceres_cal.observations.bounds import odd_sizes, stray_pixels
+from ceres_cal.observations.bounds import odd_sizes, require_alike, stray_pixels
 from ceres_cal.observations.columns import (
     Alone,
     Columns,
@@ -282,12 +283,14 @@ class Observations(Content):
         """A line for each camera of which a few observations lie outside its image.
 
         Raises:
-            InputError: more than a few do; naming the likely cause, and view, feature and pixel of the first.
+            InputError: more than a few do, or one by far; naming the likely cause, and view, feature and pixel of the
+                first. Or a sigma is so far from the others that one observation would decide alone.
         """
         return self._strays
 
     @cached_property
     def _strays(self) -> tuple[str, ...]:
+        require_alike(self)
         return stray_pixels(self)
 
     def require_owner(self, prior: Prior) -> None:

@@ -17,7 +17,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Container, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from operator import itemgetter
 from typing import NamedTuple, TypeAlias
 
@@ -25,6 +24,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ceres_cal.base.arrays import AnyArray, Array, Indices, Indices32, Mask
+from ceres_cal.base.cached import cached_property
 from ceres_cal.observations import Columns, Observations
 from ceres_cal.observations.files import Content
 from ceres_cal.scene.camera import Camera

@@ -16,6 +16,7 @@ import numpy as np
 from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.errors import SolutionError
 from ceres_cal.detect.lines import Lines
+from ceres_cal.effects.evidence import RandomEffects
 from ceres_cal.model.dimensions import dimension_slopes, dimensions_of
 from ceres_cal.model.equations import whole_structure, write_equations
 from ceres_cal.model.parameters import intrinsic_names
@@ -33,6 +34,7 @@ _BEAM, _MOST = 24, 9
 # Of a dimension, another field; what a tape measure, a strange lens and a floor that is not flat make of one is less.
 _OTHER_FIELD = 0.02
 _SURELY = 10.0  # standard deviations of it, which take lines to be taped independently of each other
+_DETERMINED = 1e-12  # of what the curves' numbers are known to in all: below is rounding
 _FARTHEST_M = 0.12  # of all curves that lie aside, root sum of squares: farther, they are others
 # Of what neither offsets nor dimensions explain, mean square over what is stated: below 0.5 of other lenses, motion,
 # wear and sun, 2 of tape that wanders by pixels, 8 to 29 of fields of other widths whose lines bend the camera.
@@ -51,7 +53,7 @@ class AsBuilt:
         dimensions: name of a dimension -> its most likely value, m, where it is another one than the target's.
         sd_m: name of each of those -> its standard deviation, m.
         drawn: name of a dimension -> its value by the target, m. curves: how many there are to tell.
-        misfit: mean square, over what is stated, of what none of that explains.
+        misfit: mean square, over what is stated, of what none of that explains; infinite where the camera shows none.
     """
 
     aside_m: Mapping[str, float]
@@ -118,8 +120,8 @@ def as_built(lines: Lines, camera: Camera, target: Target, priors: tuple[Prior, 
     problem, estimate = problem_of(camera, seen, free, priors)
     try:
         equations = write_equations(seen, problem.sights, estimate, residuals(seen, problem.sights, estimate))
-    except SolutionError:
-        return AS_DRAWN
+    except SolutionError:  # reads: "..." of `AsBuilt.words`: this is another field
+        return replace(AS_DRAWN, misfit=np.inf)
     every = np.ones(len(equations), dtype=bool)
     weights = Weights(1.0 / sigma[equations.observation], every, np.ones(len(equations)))
     model = make_linear_model(problem, estimate, equations, weights)
@@ -133,7 +135,8 @@ def as_built(lines: Lines, camera: Camera, target: Target, priors: tuple[Prior, 
     names = tuple(dimensions_of(seen.targets))
     drawn_m, moves = dimension_slopes(structure.names, seen.targets, names)
     owner = np.array([_curve_of(structure.names[row]) for row in there])
-    shape = _Shape(normal / noise, slope / noise, owner, moves[there], names, drawn_m)
+    effects = RandomEffects.of(normal / noise, slope / noise, _DETERMINED * float(np.trace(normal)) / noise)
+    shape = _Shape(effects, owner, moves[there], names, drawn_m)
     return replace(shape.explained(), misfit=misfit)
 
 
@@ -157,15 +160,14 @@ def _curve_of(name: str) -> str:
 
 @dataclass(frozen=True, eq=False)
 class _Shape:
-    """What is left of the curves' Q numbers once the camera followed: their normal equations, and what moves them.
+    """What is left of the curves' Q numbers once the camera followed, and what moves them.
 
     Attributes:
-        normal: (Q, Q). slope: (Q,). owner: (Q,) names of curves. moves: (Q, D) of the dimensions, whose values (D,) are
-            `lengths`.
+        effects: these numbers as random effects. owner: (Q,) names of curves. moves: (Q, D) of the dimensions, whose
+            values (D,) are `lengths`.
     """
 
-    normal: Array
-    slope: Array
+    effects: RandomEffects
     owner: Array
     moves: Array
     names: tuple[str, ...]
@@ -178,7 +180,8 @@ class _Shape:
         roots = [ASIDE_M * np.eye(len(self.owner))[:, self.owner == name] for name in curves]
         roots += [_OTHER * self.lengths[d] * self.moves[:, d : d + 1] for d in moving]
         chosen, scatter_m = self._searched(roots)
-        mean, sd = self._amounts(np.hstack([np.empty((len(self.owner), 0)), *(roots[n] for n in chosen)]), scatter_m)
+        together = np.hstack([np.empty((len(self.owner), 0)), *(roots[n] for n in chosen)])
+        mean, sd = self.effects.amounts(together, scatter_m)
         aside, dimensions, sds, at = {}, {}, {}, 0
         for number in chosen:
             size = roots[number].shape[1]
@@ -198,11 +201,14 @@ class _Shape:
 
     def _searched(self, roots: Sequence[Array]) -> tuple[list[int], float]:
         """The best set of the parts, each a root (Q, Z) of a covariance, and the scatter of paint, m, beside it."""
-        evidence_of = _Evidence.of(self.normal, self.slope, roots)
+        width = max((root.shape[1] for root in roots), default=1)
+        padded = [np.pad(root, ((0, 0), (0, width - root.shape[1]))) for root in roots]
+        modes = self.effects.modes(np.array(padded).reshape(len(roots), len(self.owner), width))
         beam: list[frozenset[int]] = [frozenset()]
         best, most, scatter_m = frozenset[int](), -np.inf, float(_SCATTER_M[0])
         for _ in range(_MOST + 1):
-            evidence = evidence_of.sets([sorted(one) for one in beam])
+            sets = np.swapaxes(modes[np.array([sorted(one) for one in beam], dtype=int)], 1, 2)
+            evidence = self.effects.log_evidence(sets.reshape(*sets.shape[:2], len(beam[0]) * width), _SCATTER_M)
             score = evidence.max(axis=1) + _LOG_ODDS * len(beam[0])
             order = np.argsort(-score)
             if score[order[0]] > most:
@@ -213,50 +219,3 @@ class _Shape:
             if not beam:
                 break
         return sorted(best), scatter_m
-
-    def _amounts(self, root: Array, scatter_m: float) -> tuple[Array, Array]:
-        """Posterior mean and sd (Z,) of what moves the curves by `root` (Q, Z), each of one beforehand."""
-        one = np.eye(len(self.slope))
-        covariance = root @ root.T + scatter_m**2 * one
-        taken = np.linalg.solve(one + covariance @ self.normal, covariance)  # posterior covariance of the numbers
-        mixed = np.linalg.solve(covariance, root)
-        posterior = np.eye(root.shape[1]) - root.T @ mixed + mixed.T @ taken @ mixed
-        return -mixed.T @ taken @ self.slope, np.sqrt(np.maximum(np.diag(posterior), 0.0))
-
-
-@dataclass(frozen=True, eq=False)
-class _Evidence:
-    """Log evidence of sets of parts, from what is left of their columns once the scatter of paint is integrated out.
-
-    Attributes:
-        base: (S,) of no part, for each scatter. columns: (P, Z) which of the V columns below are a part's; those that
-            it lacks are the last one, which is 0. normal: (S, V, V). slope: (S, V).
-    """
-
-    base: Array
-    columns: Indices
-    normal: Array
-    slope: Array
-
-    @classmethod
-    def of(cls, normal: Array, slope: Array, roots: Sequence[Array]) -> _Evidence:
-        """Of normal equations (Q, Q) and (Q,) of the curves' numbers."""
-        sizes = [root.shape[1] for root in roots]
-        ends = np.cumsum([0, *sizes])
-        columns = np.full((len(roots), max(sizes, default=1)), ends[-1])
-        for number, size in enumerate(sizes):
-            columns[number, :size] = np.arange(ends[number], ends[number + 1])
-        every = np.hstack([*roots, np.zeros((len(slope), 1))])
-        wide = np.eye(len(slope)) + _SCATTER_M[:, None, None] ** 2 * normal
-        left = np.linalg.solve(wide, np.broadcast_to(normal, wide.shape))  # (N^-1 + s^2)^-1
-        right = np.linalg.solve(wide, np.broadcast_to(slope[:, None], (*wide.shape[:2], 1)))[..., 0]
-        base = 0.5 * _SCATTER_M**2 * (right @ slope) - 0.5 * np.linalg.slogdet(wide)[1]
-        return cls(base, columns, every.T @ left @ every, np.asarray(right @ every, dtype=float))
-
-    def sets(self, parts: Sequence[Sequence[int]]) -> Array:
-        """(K, S) of sets of parts, all of one size, with each scatter besides."""
-        columns = self.columns[np.array(parts, dtype=int)].reshape(len(parts), -1)
-        slope = self.slope[:, columns]
-        normal = self.normal[:, columns[:, :, None], columns[:, None, :]] + np.eye(columns.shape[1])
-        explained = np.sum(slope * np.linalg.solve(normal, slope[..., None])[..., 0], axis=-1)
-        return np.asarray((self.base[:, None] + 0.5 * explained - 0.5 * np.linalg.slogdet(normal)[1]).T)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
+from time import thread_time
 
 import numpy as np
 
@@ -37,6 +38,9 @@ _MOST, _MOST_ALIKE = 4, 60
 # Share of a length that is not known by which it is drawn longer and shorter, too: a match is nearly as good up to half
 # of that beside it.
 _LENGTH_STEP = 0.06
+BUDGET_S = 60.0
+"""Of processor time for one photograph: ten times what one takes that shows the field (6 s on two cores). Where another
+field is asked for, whose lines fit in ever more places, the search took more than 200 s."""
 _SAME_PLACE, _SAME_TURN = 0.08, 0.1  # in heights, rad
 
 
@@ -47,6 +51,7 @@ class FieldSearch:
     Attributes:
         turns: of the target that put its painted curves onto themselves; the first is none.
         others: the target drawn with other lengths, where some are not known.
+        until_s: of this thread's processor time, after which no further camera is looked at.
     """
 
     grey: Array32
@@ -54,6 +59,11 @@ class FieldSearch:
     grid: Grid
     turns: tuple[Pose, ...]
     others: tuple[Grid, ...] = ()
+    until_s: float = np.inf
+
+    @property
+    def is_out_of_time(self) -> bool:
+        return thread_time() > self.until_s
 
     @property
     def target(self) -> Target:
@@ -77,9 +87,8 @@ def prepare_search(
         InputError: the target has too few straight lines.
     """
     grid, *others = (grid_of(drawn, curves) for drawn in _drawings(target, curves, lengths))
-    return FieldSearch(
-        grey, _stroke_map(grey, find_strokes(grey)), grid, tuple(turns_of(target, curves)), tuple(others)
-    )
+    until_s, turns = thread_time() + BUDGET_S, tuple(turns_of(target, curves))
+    return FieldSearch(grey, _stroke_map(grey, find_strokes(grey)), grid, turns, tuple(others), until_s)
 
 
 def narrowed(search: FieldSearch) -> FieldSearch:
@@ -150,9 +159,10 @@ def alike(search: FieldSearch, camera: Camera, detected: Collection[str]) -> lis
 
 def _likely(search: FieldSearch, cameras: Sequence[tuple[Camera, Grid]]) -> list[tuple[Camera, Grid]]:
     """Those by which the target's own lines are seen in the picture about as well as by the best, the best first."""
-    likelihood = [likelihood_of_place(search.grey, grid.target, camera, search.curves) for camera, grid in cameras]
+    in_time = (one for one in cameras if not search.is_out_of_time)  # who asks says that it ended early
+    likelihood = [likelihood_of_place(search.grey, grid.target, camera, search.curves) for camera, grid in in_time]
     order = np.argsort(-np.array(likelihood), kind="stable")[:_MOST]
-    best = likelihood[order[0]] if cameras else 0.0
+    best = likelihood[order[0]] if likelihood else 0.0
     return [cameras[row] for row in order if likelihood[row] >= min(_LIKELY * best, best)]
 
 

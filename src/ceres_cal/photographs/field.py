@@ -199,7 +199,7 @@ def _is_worn(grey: Array32, followed: Followed) -> bool:
     """Whether this is the field, its lines worn to dashes: of a target without a grid of lines it cannot be told."""
     try:
         return followed.may_be_worn and is_shown(prepare_search(grey, followed.target, followed.curves), followed)
-    except InputError:
+    except InputError:  # reads: "its lines were not found ..."
         return False
 
 

@@ -295,6 +295,7 @@ class _Tracker:
                 options = Options(lens=kind, powers=powers, priors=known, free_aspect=stretched)
                 calibration = calibrate(observations, options)
             except CalibrationError:
+                # quiet: a lens of several that does not fit these lines; where none does, they are judged as found
                 continue
             fits.append((calibration.fit.curve_scale * len(lines.found) / calibration.fit.curves, calibration))
         if not fits:

@@ -99,7 +99,7 @@ def detect_known(
         try:
             detected, missed = _searched(paths, target, posed, names, not_painted, report)
             parts.append(_renamed(detected, what))
-        except NothingShownError as error:
+        except NothingShownError as error:  # reads: "..." beside each photograph that shows nothing
             missed = error.missed
         shown[what] = len(paths) - len(missed)
         for path, reason in missed:

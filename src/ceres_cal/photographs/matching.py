@@ -9,12 +9,12 @@ floor whose z points up, and a rotation mirrors nothing.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 from math import gcd
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array
+from ceres_cal.base.cached import cached_property
 from ceres_cal.detect.registration import Nearness
 from ceres_cal.detect.strokes import Strokes, alone
 from ceres_cal.photographs.grid import Grid, Places, places_along

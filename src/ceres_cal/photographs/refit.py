@@ -102,7 +102,7 @@ def refit_camera(
     try:
         solution = solve(problem, estimate, precision=1e-6)
         refitted = solution.estimate.camera_at(STATION)
-    except CalibrationError:
+    except CalibrationError:  # reads: "its lines were not found ..." where no start leads to a camera
         return None
     finite = np.all(np.isfinite(refitted.position))
     usable = not solution.failed and not refitted.folds and finite and refitted.position[2] > 0.0

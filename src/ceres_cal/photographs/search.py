@@ -10,7 +10,7 @@ import numpy as np
 from ceres_cal.base.arrays import Array32
 from ceres_cal.base.errors import InputError
 from ceres_cal.observations import Prior
-from ceres_cal.photographs.candidates import FieldSearch, alike, candidates, narrowed, prepare_search
+from ceres_cal.photographs.candidates import BUDGET_S, FieldSearch, alike, candidates, narrowed, prepare_search
 from ceres_cal.photographs.clicks import SIGMA_PX, unknown_optics
 from ceres_cal.photographs.facing import (
     Facing,
@@ -100,12 +100,16 @@ def search(grey: Array32, target: Target, curves: Collection[str], auto: Auto) -
         good, other, against = _looked(problem, narrowed(problem), auto)
         if seen is None or (other is not None and other.share > seen.share):
             seen, reason = other, against
+    if problem.is_out_of_time:
+        return _given_up(seen)
     if not good:
         return SearchResult(None, reason, seen=seen)
     best = max(good, key=likelihood)
     problem = replace(problem, grid=grid_of(best.target, curves))
     similar = alike(problem, best.camera, detected_curves(problem, best))
     others = [_followed(problem, auto, _turned(problem, auto, camera)) for camera in similar]
+    if problem.is_out_of_time:  # it may look alike in ways that nobody looked at
+        return _given_up(best)
     distinct = [best]
     for other in (*good, *(one for one in others if not objection(problem, one))):
         as_good = likelihood(other) >= _AS_GOOD * likelihood(best)
@@ -120,6 +124,8 @@ def _looked(problem: FieldSearch, among: FieldSearch, auto: Auto) -> tuple[list[
     seen: Followed | None = None
     reason = _NO_LINES
     for camera, grid in candidates(among):
+        if problem.is_out_of_time:
+            break
         own = replace(problem, grid=grid)
         followed = _followed(own, auto, _turned(problem, auto, camera))
         against = objection(problem, followed)
@@ -134,6 +140,11 @@ def _looked(problem: FieldSearch, among: FieldSearch, auto: Auto) -> tuple[list[
         if good and explained(problem, good[-1]) > _SURE:
             break
     return good, seen, reason
+
+
+def _given_up(seen: Followed | None) -> SearchResult:
+    why = f"the field was not found within {BUDGET_S:g} s of processor time"
+    return SearchResult(None, f"{why}: check the target's dimensions, or start from corners", seen=seen)
 
 
 def _turned(problem: FieldSearch, auto: Auto, camera: Camera) -> Camera:

@@ -23,6 +23,7 @@ GOOD_MM, CARE_MM = 10.0, 50.0
 care, beyond it not to be used."""
 LARGE_NOISE = 3.0
 """Times the stated sigmas, from which on something else than noise is in it: no number of mm is promised."""
+_UNJUDGED = "its residuals could not be judged"
 _MANY_OUTLIERS = 0.3
 _MOST_LINES = 6
 _ORDER = ("good", "care", "no")
@@ -101,6 +102,8 @@ def grounds(quality: Quality) -> Iterator[tuple[str, str]]:
         yield "good", "The solve came to rest."
     elif calibration.rounds:
         yield "no", "The solve did not come to rest: raise --max-iterations."
+    if quality.undiagnosed:
+        yield "care", f"{sentence(_UNJUDGED)}, so nothing says whether the model is right: {quality.undiagnosed}."
     yield from _of_findings(quality)
     yield from (("", f"{sentence(words)}.") for words in words_of(calibration.as_built))
     for conflict in calibration.conflicts:
@@ -241,6 +244,8 @@ def promises(quality: Quality) -> bool:
 
 def _doubt(quality: Quality) -> str:
     """What keeps a headline from promising anything; "" where nothing does."""
+    if quality.undiagnosed:
+        return _UNJUDGED
     if disputed(quality):
         return "what was known beforehand is contradicted"
     if noise_ratio(quality) >= LARGE_NOISE:

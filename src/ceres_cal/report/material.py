@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
 from itertools import islice, pairwise
 from pathlib import Path
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Mask
+from ceres_cal.base.cached import cached_property
 from ceres_cal.base.errors import CalibrationError
 from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
@@ -101,7 +101,7 @@ class Material(Quality):
             return "this calibration is the closed form itself"
         try:
             calibration = calibrate(self.observations, replace(self.calibration.options, closed_form_only=True))
-        except CalibrationError as error:
+        except CalibrationError as error:  # reads: "..." in place of the paper's method
             return str(error)
         remaining = residuals(self.observations, gather_sights(self.observations), calibration.estimate)
         lengths = np.concatenate([np.linalg.norm(remaining.points, axis=1), np.abs(remaining.curves)])

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cached_property
 from itertools import combinations
 
 import numpy as np
 
+from ceres_cal.base.cached import cached_property
 from ceres_cal.base.errors import CalibrationError
 from ceres_cal.calibration import Calibration
 from ceres_cal.diagnostics import Diagnosis, diagnose
@@ -31,15 +31,18 @@ class Seam:
 
 
 def quality_of(calibration: Calibration, observations: Observations, diagnosis: Diagnosis | None = None) -> Quality:
-    """A calibration diagnosed on its own observations, on a sample of very many; not where nothing was minimised."""
+    """A calibration diagnosed on its own observations, on a sample of very many; not where nothing was minimised. Where
+    that fails, the verdict says so.
+    """
     observations = calibration.drawn_alike(observations)
     if not calibration.rounds:
         return Quality(calibration, observations, diagnosis)
     try:
         few = thinned(observations, _DIAGNOSED)
         diagnosis = diagnosis or diagnose(calibration, few, new_data=few is not observations)
-    except CalibrationError:
-        diagnosis = None
+    except CalibrationError as error:
+        # reads: "Its residuals could not be judged, so nothing says whether the model is right: ..."
+        return Quality(calibration, observations, None, str(error))
     return Quality(calibration, observations, diagnosis)
 
 
@@ -48,12 +51,14 @@ class Quality:
     """A calibration, the observations beside it, and how well it is known.
 
     Attributes:
-        diagnosis: what the residuals say; None where they cannot be read.
+        diagnosis: what the residuals say; None where they cannot be read, or nothing was minimised.
+        undiagnosed: why they cannot be read.
     """
 
     calibration: Calibration
     observations: Observations
     diagnosis: Diagnosis | None
+    undiagnosed: str = ""
 
     @cached_property
     def uncertainty(self) -> Uncertainty | None:

@@ -54,7 +54,7 @@ def make_report(
             be read.
     """
     diagnosis = diagnose(calibration, observations) if diagnosis is None else diagnosis
-    material = Material(calibration, observations, diagnosis, choice, photographs)
+    material = Material(calibration, observations, diagnosis, choice=choice, photographs=photographs)
     chapters = []
     for number, chapter in enumerate(_chapters(material), start=1):
         chapters.append(chapter)

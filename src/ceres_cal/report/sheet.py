@@ -3,23 +3,23 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Iterator
+from itertools import groupby
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ceres_cal.base.arrays import Image8
 from ceres_cal.base.errors import InputError
 from ceres_cal.scene.targets import Target
-from ceres_cal.scene.targets.paper import Footprints, Paper
+from ceres_cal.scene.targets.paper import Disc, Paper
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from matplotlib.patches import PathPatch
 
 _INCH_M = 0.0254
-_PER_INCH = 400
-_MOST_PX = 4e8
-_BAND = 64  # rows at a time
+_MOST_M = 14400 / 72.0 * _INCH_M  # of a page, by PDF's own limit
 _MARGIN_M, _FOOT_M = 0.008, 0.022
 
 
@@ -32,7 +32,7 @@ def sheet_pdf(target: Target, title: str) -> bytes:
     if target.paper is None:
         raise InputError(f"a target of kind {target.kind!r} is not printed on paper: print a board, circles or rings")
     file = io.BytesIO()
-    _page(target.paper, title).savefig(file, format="pdf", dpi=_PER_INCH, metadata={"CreationDate": None})
+    _page(target.paper, title).savefig(file, format="pdf", metadata={"CreationDate": None})
     return file.getvalue()
 
 
@@ -42,33 +42,35 @@ def _page(paper: Paper, title: str) -> Figure:
     low, high = np.array(paper.low_m), np.array(paper.high_m)
     width, height = high - low
     page = np.array([width + 2.0 * _MARGIN_M, height + 2.0 * _MARGIN_M + _FOOT_M])
+    if page.max() > _MOST_M:
+        raise InputError(f"a sheet of {width:.2f} x {height:.2f} m is too large for one page, at most {_MOST_M:.2f} m")
     figure = Figure(figsize=tuple(page / _INCH_M))
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     axes.set(xlim=(0.0, page[0]), ylim=(0.0, page[1]))  # metres from the bottom left
     axes.set_axis_off()
-    extent = (_MARGIN_M, _MARGIN_M + width, _FOOT_M + _MARGIN_M, _FOOT_M + _MARGIN_M + height)
-    axes.imshow(_levels(paper), cmap="gray", vmin=0, vmax=255, extent=extent, interpolation="none", aspect="auto")
+    for patch in _patches(paper):
+        axes.add_patch(patch)
     _draw_ruler(axes, page[0], title)
     return figure
 
 
-def _levels(paper: Paper) -> Image8:
-    """The paper in grey levels, x to the right and y down, as the target's own axes are seen from the front."""
-    step = _INCH_M / _PER_INCH
-    low, high = np.array(paper.low_m), np.array(paper.high_m)
-    columns, rows = np.rint((high - low) / step).astype(int)
-    if columns * rows > _MOST_PX:
-        raise InputError(f"a sheet of {high[0] - low[0]:.2f} x {high[1] - low[1]:.2f} m is too large for one page")
-    steps = (high - low) / (columns, rows)
-    x = low[0] + (np.arange(columns) + 0.5) * steps[0]
-    levels = np.empty((rows, columns), np.uint8)
-    for first in range(0, rows, _BAND):
-        y = low[1] + (np.arange(first, min(first + _BAND, rows)) + 0.5) * steps[1]
-        plane = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-        along = [np.tile(direction, (len(plane), 1)) for direction in np.diag(steps)]
-        dark = paper.dark(Footprints(plane, along[0], along[1]))
-        levels[first : first + len(y)] = np.rint(255.0 * (1.0 - dark)).reshape(len(y), columns)
-    return levels
+def _patches(paper: Paper) -> Iterator[PathPatch]:
+    """The shapes of one colour after another as one path, x to the right and y down, as the target's own axes are seen
+    from the front.
+    """
+    from matplotlib.patches import PathPatch
+    from matplotlib.path import Path
+
+    left, top = _MARGIN_M - paper.low_m[0], _FOOT_M + _MARGIN_M + paper.high_m[1]
+    for is_dark, shapes in groupby(paper.shapes(), lambda shape: shape.is_dark):
+        paths = []
+        for shape in shapes:
+            if isinstance(shape, Disc):
+                (x, y), size, path = shape.centre_m, shape.radius_m, Path.unit_circle()
+            else:
+                (x, y), size, path = shape.corner_m, shape.side_m, Path.unit_rectangle()
+            paths.append(Path(np.asarray(path.vertices) * (size, -size) + (left + x, top - y), path.codes))
+        yield PathPatch(Path.make_compound_path(*paths), facecolor="black" if is_dark else "white", linewidth=0.0)
 
 
 def _draw_ruler(axes: Axes, width_m: float, title: str) -> None:

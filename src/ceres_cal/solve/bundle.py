@@ -169,7 +169,7 @@ class _Watcher(pyceres.IterationCallback):
                 self._accepted.append(float(summary.cost))
             if self._progress is not None:
                 self._progress(Progress(int(summary.iteration), float(summary.cost), float(summary.step_norm)))
-        except BaseException as error:
+        except BaseException as error:  # quiet: raised again when Ceres has returned
             self._run.failure = self._run.failure or error
         if self._run.failure is not None:
             return pyceres.CallbackReturnType.SOLVER_ABORT

@@ -42,7 +42,7 @@ class CachedCost(pyceres.CostFunction):
             # Ceres asks for the cost of a step first, then for the Jacobian in the same place: once is enough.
             if self._known is None or not np.array_equal(self._known.at, at):
                 self._known = self._evaluated(at, parameters)
-        except BaseException as error:
+        except BaseException as error:  # quiet: raised again when Ceres has returned
             self._run.failure = self._run.failure or error
             return False
         if self._known is None:

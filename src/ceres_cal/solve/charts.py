@@ -73,7 +73,7 @@ class ChartedCost(pyceres.CostFunction):
             for chart, jacobian, block in zip(self._charts, jacobians or (), numbers, strict=False):
                 if chart:
                     jacobian[:] = chart.chained(jacobian.reshape(len(residuals), -1), block).reshape(-1)
-        except BaseException as error:  # see `CachedCost`
+        except BaseException as error:  # quiet: raised again when Ceres has returned
             self._run.failure = self._run.failure or error
             return False
         return True

@@ -53,13 +53,15 @@ def compete(
     every = Asked(problem, observations, end, list(wholes_of(observations, problem.sights)))
     if not every.kinds:
         return end, ()
-    some = _freed(asked(every), solver)
+    part = asked(every)
+    some = _freed(part, solver)
     trials, explanations = _Competition(some, solver).decided(), list[Explanation]()
     taking_part = np.ones(len(observations.points) + len(observations.curves), dtype=bool)
     for trial in trials:
         wholes = every.kinds[some.kinds.index(trial.suspects.wholes)]
         own = [wholes.among(np.array([number])) & taking_part for number in trial.suspects.numbers]
-        explanations += [replace(one, rows=rows) for one, rows in zip(trial.explanations, own, strict=True)]
+        found = trial.explanations if some is part else [_as_stated(one, part, solver) for one in trial.explanations]
+        explanations += [replace(one, rows=rows) for one, rows in zip(found, own, strict=True)]
         if trial.log_odds >= 0.0:
             taking_part &= ~np.any(own, axis=0)
             end = trial.end
@@ -76,9 +78,20 @@ def _freed(every: Asked, solver: Solver) -> Asked:
         return every
     try:
         end = solver(freed, every)
-    except CalibrationError:
+    except CalibrationError:  # quiet: they are competed with as stated; what contradicts them is tested afterwards
         return every
     return every if end.solution.failed else replace(every, problem=freed, end=end)
+
+
+def _as_stated(one: Explanation, part: Asked, solver: Solver) -> Explanation:
+    """With the other estimate under all that is stated: what moves without that is no doubt about a whole."""
+    if not one.is_doubtful:
+        return one
+    try:
+        other = part.end if one.is_taken else solver(part.without(one.rows), part)
+    except CalibrationError:
+        return one
+    return one if other.solution.failed else replace(one, other=other.solution.estimate)
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,7 +228,7 @@ class _Competition:
         gone = wholes.among(np.array(numbers))
         try:
             end = self._solver(self._some.without(gone | ~self._taking_part), self._some)
-        except CalibrationError:
+        except CalibrationError:  # quiet: what determines nothing without the suspects is no explanation
             return None
         if wholes.of_features:
             return end

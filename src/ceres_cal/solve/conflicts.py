@@ -13,6 +13,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import CalibrationError
+from ceres_cal.base.numerical import numerical
 from ceres_cal.model.information import Information
 from ceres_cal.model.keys import Key
 from ceres_cal.model.parameters import Estimate
@@ -45,6 +46,7 @@ class Conflicts:
     shifts: tuple[Array, ...] = ()
 
 
+@numerical("the test of what was stated")
 def find_conflicts(
     problem: Problem, observations: Observations, end: RobustSolution, usual: tuple[float, float] | None = None
 ) -> Conflicts:
@@ -167,7 +169,7 @@ class _Search:
         """The problem solved from where the last one ended; None where it cannot be."""
         try:
             after = solve_robustly(problem, self.observations, self.end.solution.estimate, self.usual)
-        except CalibrationError:
+        except CalibrationError:  # quiet: the linear test decides
             return None
         return None if after.solution.failed else after
 
@@ -181,10 +183,10 @@ class _Search:
         bound = replace(without, priors=self.problem.priors, layout=self.problem.layout)
         try:
             least, most = solve(without, rest.estimate), solve(bound, self.end.solution.estimate)
-        except CalibrationError:
+        except CalibrationError:  # quiet: the linear test decides
             return test
-        rise = 2.0 * (most.cost - least.cost)
+        rise = max(2.0 * (most.cost - least.cost), 0.0)  # of exact observations it is rounding
         if rise >= test.squared or len(statement.priors) > 1:
             return test
-        share = float(np.sqrt(max(rise, 0.0) / test.squared))
+        share = float(np.sqrt(rise / test.squared))
         return test._replace(squared=rise, log_p=log_probability(rise, rest), sigmas=test.sigmas * share)

@@ -70,7 +70,7 @@ def _elsewhere(problem: Problem, estimate: Estimate) -> Iterator[Solution]:
         for factor in _FACTORS:
             camera = estimate.cameras[name]
             start = replace(estimate, cameras={**estimate.cameras, name: replace(camera, phi=factor * camera.phi)})
-            with suppress(CalibrationError):  # nothing is seen from there
+            with suppress(CalibrationError):  # quiet: nothing is seen from there, so no minimum is
                 solution = solve(replace(problem, options=short), start, is_near=False)
                 if not solution.failed:
                     yield solution

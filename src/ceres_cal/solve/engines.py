@@ -164,15 +164,20 @@ async def _answered(
     here = dask_worker.address
     try:
         answers = await dask_worker.loop.run_in_executor(dask_worker.executor, all_of_them)
-    except MemoryError:
-        return SolutionError(f"{_NO_MEMORY} ({here})")
-    except InputError as error:  # of a file
-        return InputError(f"{error} (worker {here})")
-    except OSError as error:
-        full = error.errno in (errno.ENOSPC, errno.EDQUOT)
-        where, what = error.filename or dask_worker.local_directory, _NO_ROOM if full else error.strerror
-        return SolutionError(f"{where}: {what} (worker {here})")
+    except (MemoryError, InputError, OSError) as error:  # quiet: who asked raises it
+        return _named(error, here, dask_worker.local_directory)
     return dict(zip(keys, answers, strict=True))
+
+
+def _named(error: Exception, worker: str, folder: str) -> CalibrationError:
+    """What a worker ran into, with its name."""
+    if isinstance(error, InputError):  # of a file
+        return InputError(f"{error} (worker {worker})")
+    if isinstance(error, OSError):
+        full = error.errno in (errno.ENOSPC, errno.EDQUOT)
+        what = _NO_ROOM if full else error.strerror
+        return SolutionError(f"{error.filename or folder}: {what} (worker {worker})")
+    return SolutionError(f"{_NO_MEMORY} ({worker})")
 
 
 def _in_words(error: BaseException) -> BaseException:

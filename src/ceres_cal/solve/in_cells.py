@@ -11,6 +11,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices
+from ceres_cal.effects.evidence import agreement as agreement_of
 from ceres_cal.observations.sights import Sights
 from ceres_cal.solve.robust import RobustSolution
 
@@ -73,11 +74,8 @@ def _agreement(place: Indices, sight: Indices, left: Array) -> float:
     """By how many standard deviations the sums of residuals (N,) by place (N,) agree between sights (N,)."""
     count = int(np.max(sight, initial=0)) + 1
     size = count * (int(np.max(place, initial=0)) + 1)
-    sums = np.bincount(place * count + sight, left, size).reshape(-1, count) ** 2
-    squares = sums.sum(axis=1)
-    total = np.bincount(place, left, len(sums)) ** 2
-    variance = 2.0 * float(np.sum(squares**2) - np.sum(sums**2))
-    return float(np.sum(total - squares)) / np.sqrt(variance) if variance > 0.0 else 0.0
+    sums = np.bincount(place * count + sight, left, size).reshape(-1, count)
+    return agreement_of(np.asarray(sums.T, dtype=float))
 
 
 def cells_of(sights: Sights, sizes: Mapping[str, tuple[int, int]], most: int = _MOST_CELLS) -> Indices:

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, reduce
+from functools import reduce
 from operator import add
 
 import numpy as np
 
 from ceres_cal import kernels
 from ceres_cal.base.arrays import Array, Indices
+from ceres_cal.base.cached import cached_property
 from ceres_cal.base.errors import SolutionError
 from ceres_cal.base.spread import known_inverses
 from ceres_cal.base.threads import parts_of, run_parts
@@ -59,6 +60,7 @@ class ReducedInformation:
 
     Attributes:
         points, curves: what the observations of either kind say. priors: what was known before.
+        stated: that part of the priors which somebody stated, or an earlier calibration found.
         eliminated: the private placements, by station.
         point_leverage, curve_leverage: equations of either kind that private placements take up by themselves.
     """
@@ -66,6 +68,7 @@ class ReducedInformation:
     points: Information
     curves: Information
     priors: Information
+    stated: Information
     eliminated: tuple[Eliminated, ...]
     point_leverage: float
     curve_leverage: float
@@ -174,7 +177,9 @@ class _Sums:
         points, curves = (Information(self._keys, 0.5 * (matrix + matrix.T)) for matrix in self._matrices)
         priors = [prior.information for prior in self._problem.priors_at(self._estimate)]
         known = reduce(add, priors, Information.nothing(self._keys))
-        return ReducedInformation(points, curves, known, tuple(eliminated), *self._leverages.tolist())
+        every = self._problem.stated_at(self._estimate)
+        stated = reduce(add, (prior.information for prior in every if not prior.is_usual), Information.nothing())
+        return ReducedInformation(points, curves, known, stated, tuple(eliminated), *self._leverages.tolist())
 
     def _owned(self, kind: str, name: str) -> Indices:
         return self._columns.get((kind, name), np.empty(0, dtype=np.int64))

@@ -9,11 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Set
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices
+from ceres_cal.base.cached import cached_property
 from ceres_cal.base.spread import known_inverses
 from ceres_cal.model.keys import Key
 from ceres_cal.model.parameters import Estimate

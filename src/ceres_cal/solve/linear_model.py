@@ -10,11 +10,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask
+from ceres_cal.base.cached import cached_property
 from ceres_cal.model.equations import Equations, of_observations
 from ceres_cal.model.keys import Key, columns_by_owner
 from ceres_cal.model.parameters import Estimate, intrinsic_names, intrinsics_scales

@@ -15,11 +15,12 @@ the wrong offset and the noise integrated out: nothing is a fault that the scatt
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, median
+from ceres_cal.effects.evidence import RandomEffects, logsum
 from ceres_cal.solve.linear_model import LinearModel
 
 # Probability, before anything was seen, that some feature does not belong (lines are painted by hand), or some view.
@@ -31,6 +32,7 @@ _INDEPENDENT = 0.5
 # Standard deviations of offsets in those of one observation's noise: of what belongs; of what does not; of features
 # that do not, besides.
 _SCATTER = np.concatenate([[0.0], np.geomspace(0.1, 60.0, 14)])
+_SCATTER_PRIOR = np.where(_SCATTER == 0.0, _INDEPENDENT, (1.0 - _INDEPENDENT) / (len(_SCATTER) - 1))
 _ASIDE = (10.0, 40.0, 160.0)
 _LEAST_ASIDE = 3.0
 _LEAST_PX = 1e-3  # noise that nothing is measured better than: of exact observations rounding is no offset
@@ -57,19 +59,15 @@ def fault_of(features: bool) -> Fault:
 
 @dataclass(frozen=True, eq=False)
 class Offsets:
-    """What residuals say of the offsets of G groups, in R directions that are independent where errors are.
+    """What residuals say of the offsets of G groups.
 
     Attributes:
-        size: (R,) S of each direction. value: (R,) w. modes: (G, R, M) what an offset of each group does to w.
-        rest: squared residuals that no offset explains. spare: equations left over in all.
+        effects: their modes as random effects. modes: (G, R, M) what an offset of each group does to them.
         fault: of groups that do not belong.
     """
 
-    size: Array
-    value: Array
+    effects: RandomEffects
     modes: Array
-    rest: float
-    spare: int
     fault: Fault
 
     def log_evidence(self, wrong: Sequence[int] = ()) -> float:
@@ -85,28 +83,16 @@ class Offsets:
 
     def _together(self, groups: Sequence[int]) -> Array:
         """(R, K) modes of some groups side by side."""
-        return np.concatenate([np.zeros((len(self.size), 0)), *self.modes[list(groups)]], axis=1)
+        return np.concatenate([np.zeros((self.modes.shape[1], 0)), *self.modes[list(groups)]], axis=1)
 
     def _log_evidence(self, modes: Array, count: int) -> Array:
         """(H,) of hypotheses with so many wrong groups, whose modes (H, R, K) have offsets of their own."""
-        precision = 1.0 / (1.0 + np.multiply.outer(_SCATTER**2, self.size))  # (T, R)
-        total = precision @ self.value**2
-        width = modes.shape[2]
-        pairs = (modes[:, :, :, None] * modes[:, :, None, :]).reshape(*modes.shape[:2], width * width)
-        normal = (precision @ pairs).reshape(len(modes), len(_SCATTER), width, width)
-        slope = precision @ (modes * self.value[:, None])
-        prior = np.log(np.where(_SCATTER == 0.0, _INDEPENDENT, (1.0 - _INDEPENDENT) / (len(_SCATTER) - 1)))
-        prior = prior + 0.5 * np.sum(np.log(precision), axis=1)
-        logs = []
-        for aside in self.fault.sizes[: None if count else 1]:
-            wider = np.eye(width) + aside**2 * normal
-            explained = aside**2 * np.sum(slope * np.linalg.solve(wider, slope[..., None])[..., 0], axis=-1)
-            left = np.log((self.rest + total - explained) / max(self.spare, 1))
-            logs.append(prior - 0.5 * np.linalg.slogdet(wider)[1] - 0.5 * self.spare * left)
-        every = np.concatenate(logs, axis=1)
-        most = np.max(every, axis=1)
-        summed = np.log(np.sum(np.exp(every - most[:, None]), axis=1) / len(logs))
-        return np.asarray(most + summed + count * np.log(self.fault.probability / len(self.modes)))
+        sizes = self.fault.sizes[: None if count else 1]
+        logs = np.stack([self.effects.log_evidence(aside * modes, _SCATTER) for aside in sizes], axis=1)
+        every = logs.reshape(len(modes), -1)
+        priors = np.tile(_SCATTER_PRIOR / len(sizes), len(sizes))
+        total = logsum(every + np.log(priors))
+        return np.asarray(total + count * np.log(self.fault.probability / len(self.modes)))
 
 
 def measure_offsets(model: LinearModel, columns: Array, group: Indices, fault: Fault) -> Offsets:
@@ -123,13 +109,9 @@ def measure_offsets(model: LinearModel, columns: Array, group: Indices, fault: F
     flat = every.reshape(len(group), -1)
     there = np.flatnonzero(np.any(flat != 0.0, axis=0))
     normal, slope = model.left_of(flat[:, there])
-    size, turns = np.linalg.eigh(normal)
-    kept = size > _DETERMINED * float(np.bincount(group[rows]).max())
-    size, turns = size[kept], turns[:, kept]
-    value = (turns.T @ slope) / np.sqrt(size)
-    modes = np.zeros((groups * width, len(size)))
-    modes[there] = turns * np.sqrt(size)
-    modes = np.swapaxes(modes.reshape(groups, width, -1), 1, 2)
-    rest = float(np.sum(model.left_over[model.used] ** 2) - value @ value)
+    effects = RandomEffects.of(normal, slope, _DETERMINED * float(np.bincount(group[rows]).max()))
+    rest = float(np.sum(model.left_over[model.used] ** 2) - effects.value @ effects.value)
     least = model.spare * (_LEAST_PX * median(model.weight[rows])) ** 2
-    return Offsets(size, value, modes, max(rest, least), model.spare, fault)
+    modes = effects.modes(np.eye(groups * width)[there]).reshape(-1, groups, width)
+    effects = replace(effects, rest=max(rest, least), freedom=float(model.spare))
+    return Offsets(effects, np.swapaxes(modes, 0, 1), fault)

@@ -16,7 +16,6 @@ from ceres_cal.model.residuals import Residuals
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights
 from ceres_cal.scene.camera import Camera
-from ceres_cal.scene.targets import Target
 
 # The principal point decides where it lies so much nearer to one centre than to the other, that of the image turned
 # over its diagonal; it is a tenth of their distance from its own in the tests' scenes.
@@ -51,7 +50,7 @@ def require_possible(observations: Observations, sights: Sights, estimate: Estim
 def _require_handy(observations: Observations) -> None:
     """Raise SolutionError where nobody could hold a target before a camera: boards alone fit in any unit."""
     for name, target in observations.targets.items():
-        reach_m = float(np.max(np.linalg.norm(_places_on(target), axis=1)))
+        reach_m = float(np.max(np.linalg.norm(target.places, axis=1)))
         if target.movable and reach_m > _LARGEST_M:
             raise SolutionError(
                 f"target {name!r} reaches {reach_m:.0f} m from its origin: give its dimensions in metres"
@@ -62,17 +61,12 @@ def _require_above(least_m: float, observations: Observations, estimate: Estimat
     """Raise SolutionError where most placements of a target lie so deep under the floor that its size is wrong."""
     for name, target in observations.targets.items():
         placed = dict.fromkeys(v.placement for v in observations.shown_views if v.target == name and v.placement)
-        tops = [float(np.max(estimate.placements[one].transform(_places_on(target))[:, 2])) for one in placed]
+        tops = [float(np.max(estimate.placements[one].transform(target.places)[:, 2])) for one in placed]
         if target.movable and 2 * np.count_nonzero(np.array(tops) < least_m) > len(tops):
             raise SolutionError(
                 f"target {name!r} lies up to {-min(tops):.0f} m under the floor: its dimensions are too large, or not "
                 "in metres"
             )
-
-
-def _places_on(target: Target) -> Array:
-    """(P, 3) m: its points, and where its curves begin."""
-    return np.concatenate([target.point_array, target.tracks[0, :, 0] + target.tracks[0, :, 1]])
 
 
 def _require_ahead(station: str, sight: Sights, residuals: Residuals) -> None:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from typing import Any, Protocol
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask
+from ceres_cal.base.cached import cached_property
 from ceres_cal.model.information import Information
 from ceres_cal.model.parameters import OF_PIXELS, Estimate, Layout, Options
 from ceres_cal.model.priors import GaussianPrior

@@ -20,6 +20,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, median
 from ceres_cal.base.words import two_digits
+from ceres_cal.effects.evidence import RandomEffects, agreement
 from ceres_cal.model.equations import Equations, equations_of, whole_structure
 from ceres_cal.model.parameters import Estimate, unit_px
 from ceres_cal.model.structure import Kind, Structure, make_structure, numbers_by_kind
@@ -83,7 +84,7 @@ def estimate_as_built(
         return (), as_stated
     screened = _Columns.of(structure, stated, observations, end, _some(end.problem.sights, _MOST_SCREENED))
     scores = screened.by_sight(screened.score)
-    loud = {of: numbers for of, numbers in kinds.items() if _repeating(scores[:, numbers]) > _REPEATS}
+    loud = {of: numbers for of, numbers in kinds.items() if agreement(scores[:, numbers]) > _REPEATS}
     if not loud:
         return (), as_stated
     repeats = _Repeats.of(structure, stated, observations, end)
@@ -167,13 +168,6 @@ def _weights(observations: Observations, end: RobustSolution, equations: Equatio
     return equation_weights(observations, end.problem.weighting, equations, end.residuals, taking_part)
 
 
-def _repeating(scores: Array) -> float:
-    """Whether the scores (S, Q) of different sights agree, in standard deviations of what they do by chance."""
-    total, squares = scores.sum(axis=0), np.sum(scores**2, axis=0)
-    variance = 2.0 * float(np.sum(squares**2) - np.sum(scores**4))
-    return float(np.sum(total**2 - squares)) / np.sqrt(variance) if variance > 0.0 else 0.0
-
-
 # ---- what is said of them -------------------------------------------------------------------------------------------
 
 
@@ -247,8 +241,8 @@ class _Repeats:
 
     def offsets(self, numbers: Indices, sigmas_m: Array) -> Array:
         """(K,) m, the likeliest of some numbers that scatter by sigmas (K,)."""
-        precision = self.information[np.ix_(numbers, numbers)] + self.noise * np.diag(sigmas_m**-2.0)
-        return np.asarray(-np.linalg.solve(precision, self.score[numbers]))
+        normal, score = self.information[np.ix_(numbers, numbers)] / self.noise, self.score[numbers] / self.noise
+        return np.asarray(sigmas_m * RandomEffects.of(normal, score, 0.0).amounts(np.diag(sigmas_m))[0])
 
 
 def _placed(model: LinearModel, column: Array) -> Array:
@@ -308,13 +302,11 @@ def _estimated(repeats: _Repeats, score: Array, information: Array, within: floa
     Few numbers leave their variance open: its mean then goes far beyond the likeliest, and what is solved for is held
     by little.
     """
-    values, vectors = np.linalg.eigh(information)
-    kept = values > _DETERMINED * values[-1]
-    values, squares = values[kept], (vectors.T @ score)[kept] ** 2 / values[kept] / within
-    growth = 1.0 + np.append(0.0, sizes**2)[:, None] * values / (within * repeats.noise)
-    left = np.log(repeats.rest + np.sum(squares / growth, axis=1))
-    log = -0.5 * ((repeats.spare + len(values)) * left + np.sum(np.log(growth), axis=1))
+    least = _DETERMINED * float(np.linalg.eigvalsh(information)[-1]) / within
+    effects = RandomEffects.of(information / within, score / within, least, repeats.rest)
+    effects = replace(effects, freedom=repeats.spare + len(effects.size))
+    logs = effects.log_evidence(scatter=np.append(0.0, sizes) / np.sqrt(repeats.noise))[0]
     prior = np.append(_AS_DRAWN, np.full(len(sizes), (1.0 - _AS_DRAWN) / len(sizes)))
-    weight = prior * np.exp(log - log.max())
+    weight = prior * np.exp(logs - logs.max())
     probability = 1.0 - weight[0] / weight.sum()
     return float(np.sqrt(weight[1:] @ sizes**2 / weight[1:].sum())), float(probability)

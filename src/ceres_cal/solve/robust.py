@@ -9,6 +9,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import Indices
 from ceres_cal.base.errors import DegenerateError
+from ceres_cal.base.numerical import numerical
 from ceres_cal.model.parameters import Estimate
 from ceres_cal.model.residuals import Residuals, residuals, residuals_alone
 from ceres_cal.observations import Observations
@@ -69,6 +70,7 @@ class RobustSolution:
         return replace(self, solution=replace(self.solution, estimate=estimate), residuals=there)
 
 
+@numerical("the solve")
 def solve_robustly(
     problem: Problem,
     observations: Observations,

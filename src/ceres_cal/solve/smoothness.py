@@ -1,10 +1,4 @@
-"""How smooth a lens without a formula is: the variance of its roughness, by the likelihood of the data (MacKay 1992).
-
-Of a quadratic form R with prior R / sigma^2, and A what the data say of its numbers c, sigma^2 = c^T R c / gamma with
-gamma = rank - tr((A + R / sigma^2)^-1 R) / sigma^2, the number of directions that the data determine: the fixed point
-is the restricted maximum of the likelihood. One more direction of the least size counts along (an inverse gamma
-distribution beforehand), so that few data do not make a lens perfect.
-"""
+"""How smooth a lens without a formula is: the likeliest size of its roughness (`effects.evidence`)."""
 
 from __future__ import annotations
 
@@ -15,7 +9,7 @@ from operator import add
 
 import numpy as np
 
-from ceres_cal.base.spread import known_inverses
+from ceres_cal.effects.evidence import likeliest_sizes
 from ceres_cal.model.information import Information
 from ceres_cal.model.keys import Key
 from ceres_cal.model.parameters import Estimate
@@ -24,9 +18,7 @@ from ceres_cal.scene.lens.base import Roughness
 from ceres_cal.solve.information import ReducedInformation
 from ceres_cal.solve.problem import Problem
 
-_STEPS = 200
 _AT_REST = 1e-3  # relative change of a standard deviation
-_ONE = 1.0  # directions of the least size
 
 
 def with_smoothness(
@@ -72,19 +64,7 @@ def _sigmas(
     whole = reduced.shared.marginal(own).matrix
     data = whole - sum(form / sigma**2 for form, sigma in zip(every, before, strict=True))
     here = values_of(estimate, own)
-    pulled = whole @ here
-    sigmas = np.array(before)
     least = np.array([form.least for form in forms])
-    ranks = np.array([np.linalg.matrix_rank(form.matrix, hermitian=True) for form in forms])
-    for _ in range(_STEPS):
-        posterior = data + sum(form / sigma**2 for form, sigma in zip(every, sigmas, strict=True))
-        covariance = known_inverses(posterior, np.full(len(own), np.inf))
-        values = covariance @ pulled
-        known = ranks - np.array([np.sum(covariance * form) for form in every]) / sigmas**2
-        sizes = np.array([values @ form @ values for form in every])
-        moved = np.sqrt((np.maximum(sizes, 0.0) + _ONE * least**2) / (np.maximum(known, 0.0) + _ONE))
-        done = np.max(np.abs(np.log(moved / sigmas))) < _AT_REST
-        sigmas = moved
-        if done:
-            break
-    return tuple(sigmas.tolist()), float((values - here) @ posterior @ (values - here))
+    sizes = likeliest_sizes(data, whole @ here, every, np.array(before), least, _AT_REST)
+    away = sizes.amount - here
+    return tuple(sizes.sigmas.tolist()), float(away @ sizes.precision @ away)

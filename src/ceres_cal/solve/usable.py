@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import SolutionError
 from ceres_cal.observations.sights import Sights
 from ceres_cal.scene.camera import Camera
@@ -19,6 +20,11 @@ from ceres_cal.solve.robust import RobustSolution
 _NO_FIT = 0.015
 # Of the image's diagonal, 240 px of 1600: lenses are mounted within some hundredths, unless a picture was cropped.
 _OFF_CENTRE = 0.15
+# Share of a side that observations of an image usually reach beyond.
+_UNFILLED = 0.9
+# Of the image's diagonal: three standard deviations of usual principal points (`priors.USUAL_CENTRE`).
+_UNUSUAL = 0.045
+_NEARER = 0.5  # of the distance from the stated middle, to the other: as it is of swapped axes (`possible`)
 
 
 def require_fits(end: RobustSolution, problem: Problem) -> None:
@@ -50,9 +56,12 @@ def require_usable(end: RobustSolution, problem: Problem, explanations: Sequence
     for name, camera in end.solution.estimate.cameras.items():
         width, height = camera.image_size
         off_px = float(np.hypot(*(camera.principal_point - 0.5 * (np.array(camera.image_size) - 1.0))))
-        if off_px > _OFF_CENTRE * np.hypot(width, height):
+        own = end.problem.sights.of_camera(name)
+        reach = np.concatenate([own.pixels, own.curve_pixels]).max(axis=0, initial=0.0)
+        if off_px > _OFF_CENTRE * np.hypot(width, height) or _is_of_smaller(camera, reach, off_px):
             warnings.append(
-                f"camera {name!r}: its principal point lies {off_px:.0f} px from the middle of its image: "
+                f"camera {name!r}: its principal point lies {off_px:.0f} px from the middle of its image of {width} x "
+                f"{height} px, of which observations reach {reach[0]:.0f} x {reach[1]:.0f}: "
                 "is image_size that of the pictures, and are pixels counted from their top-left corner?"
             )
         if not camera.folds:
@@ -70,6 +79,15 @@ def require_usable(end: RobustSolution, problem: Problem, explanations: Sequence
             f"observations reach {observed.reach_px:.0f} px"
         )
     return (*warnings, *_lost(end.inliers, problem, explanations))
+
+
+def _is_of_smaller(camera: Camera, reach: Array, off_px: float) -> bool:
+    """Whether the principal point suits an image that ends where the observations do, not the stated one."""
+    size = np.array(camera.image_size, dtype=float)
+    other_px = float(np.hypot(*(camera.principal_point - 0.5 * reach)))
+    return bool(
+        np.any(reach < _UNFILLED * size) and off_px > _UNUSUAL * np.hypot(*size) and other_px < _NEARER * off_px
+    )
 
 
 def _lost(inliers: Inliers, problem: Problem, explanations: Sequence[Explanation]) -> Iterator[str]:

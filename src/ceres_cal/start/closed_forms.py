@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ceres_cal.base.arrays import Array, Indices, median, medians
+from ceres_cal.base.arrays import Array, Indices, median
 from ceres_cal.base.errors import DegenerateError
 from ceres_cal.base.threads import parts_of, run_parts
 from ceres_cal.base.transforms import Pose
@@ -23,6 +23,7 @@ from ceres_cal.kernels import align_sights, alignment_errors, normalised_planes,
 _POINT_NS = 100.0  # that a point's share of a homography takes
 _NO_SECOND = 1e-6  # root of the second least eigenvalue: as small, and the null vector is one of many
 _SINGULAR = 1e-12
+_OF_A_PLANE = 8  # numbers of a homography
 
 
 @dataclass(frozen=True)
@@ -264,7 +265,7 @@ class _LineFit:
 
     Attributes:
         plane_scale: (3, 3) and image_scale: (C, 3, 3) of the units of the fit. inverse: (C, 3, 3) G in these.
-        second: (C,) the second least eigenvalue. sent: (C, N, 3) G d. typical: (C,) median distance on the plane.
+        second: (C,) the second least eigenvalue. sent: (C, N, 3) G d. typical: (C,) middle distance on the plane.
     """
 
     plane_scale: Array
@@ -283,12 +284,14 @@ class _LineFit:
         lines, image_points = lines * plane_scale, image_points * image_scale[:, None]
         rows = (lines[:, :, None] * image_points[:, :, None, :]).reshape(*image_points.shape[:2], 9)
         weights = np.ones(image_points.shape[:2])
+        # The middle of those that G's eight numbers cannot fit exactly: the median itself may be 0 beside what decides.
+        middle = min((len(lines) + _OF_A_PLANE) // 2, len(lines) - 1)
         for _ in range(rounds):
             values, vectors = np.linalg.eigh(np.swapaxes(rows * weights[:, :, None], 1, 2) @ rows / len(lines))
             inverse = vectors[:, :, 0].reshape(-1, 3, 3)
             sent = image_points @ np.swapaxes(inverse, 1, 2)
             distance = np.abs(np.sum(lines * sent, axis=2)) / np.maximum(np.abs(sent[:, :, 2]), 1e-9)
-            typical = medians(distance)
+            typical = np.partition(distance, middle, axis=1)[:, middle]
             bound = np.maximum(3.0 * typical, 1e-9)[:, None]
             weights = 1.0 / (np.maximum(sent[:, :, 2] ** 2, 1e-9) * (1.0 + (distance / bound) ** 2))
             weights /= weights.mean(axis=1, keepdims=True)

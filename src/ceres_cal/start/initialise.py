@@ -13,8 +13,10 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, distinct
 from ceres_cal.base.errors import DegenerateError
+from ceres_cal.base.numerical import numerical
 from ceres_cal.base.transforms import Pose, Poses, chained, inverted
 from ceres_cal.model.parameters import Estimate, Options, Station, anchored_stations, unit_px
+from ceres_cal.model.ranges import PHI_RANGE
 from ceres_cal.model.structure import make_structure
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.observations.sights import Sights
@@ -24,8 +26,6 @@ from ceres_cal.start.closed_forms import orthogonality_error, poses_from_homogra
 from ceres_cal.start.few_features import pose_of_few
 from ceres_cal.start.planes import Homographies, profile_and_homographies
 
-PHI_RANGE = (0.15, 15.0)
-"""In half image diagonals: 163 to 8 degrees across the image's diagonal. What lies beyond is no lens over a field."""
 USUAL_PHI, USUAL_PHI_FACTOR = 1.1, 1.4
 """In half image diagonals: 85 degrees across the diagonal; 66 to 104 within the factor either way, a standard deviation
 of log phi. It decides where the image cannot, so it is that of usual cameras over a field or before a board."""
@@ -50,6 +50,7 @@ class Start:
     is_near: bool = False
 
 
+@numerical("the initial estimate")
 def initialise(observations: Observations, sights: Sights, options: Options) -> Start:
     """A start for everything the observations show.
 

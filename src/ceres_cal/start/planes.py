@@ -339,5 +339,5 @@ def consensus_homography(plane: Array, lifted: Array, limit_px: float) -> Array 
     inliers = np.asarray(consensus["inlier_mask"], dtype=bool)
     try:
         return homography_from_points(plane[inliers], lifted[inliers])
-    except DegenerateError:
+    except DegenerateError:  # quiet: these points make no homography; the caller keeps the one of all
         return None

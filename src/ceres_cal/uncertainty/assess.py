@@ -7,11 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 
+from ceres_cal.base.numerical import numerical
 from ceres_cal.model.information import Information
 from ceres_cal.model.parameters import Estimate, unit_px
+from ceres_cal.model.ranges import PHI_RANGE
 from ceres_cal.scene.camera import Camera
 from ceres_cal.solve import Problem, ReducedInformation, information
-from ceres_cal.start.initialise import PHI_RANGE, USUAL_PHI, USUAL_PHI_FACTOR
+from ceres_cal.start.initialise import USUAL_PHI, USUAL_PHI_FACTOR
 from ceres_cal.uncertainty.bent import bends
 from ceres_cal.uncertainty.dependence import Scatter
 from ceres_cal.uncertainty.posterior import Posterior, make_posterior, widths_over
@@ -21,6 +23,7 @@ from ceres_cal.uncertainty.profile import Node, PhiProfile, profile, valley
 _BENT = 0.05
 
 
+@numerical("the uncertainty")
 def assess(
     problem: Problem,
     estimate: Estimate,
@@ -70,31 +73,40 @@ def _with_bends(posterior: Posterior, problem: Problem, estimate: Estimate) -> P
     by_model = posterior.by_model or posterior.information
     for name in posterior.profiles:
         problem = problem.holding(name, 0)
-    bent = bends(problem, estimate, posterior.information.given(held), by_model.given(held), posterior.half_width)
+    known = posterior.information.given(held)
+    bent = bends(problem, estimate, known, by_model.given(held), posterior.half_width)
     if bent is None:
         return posterior
     profiles = {
-        name: replace(profile, across=tuple(map(bent.widened, profile.across)))
+        name: replace(profile, across=tuple(posterior.wider(one, bent.widened) for one in profile.across))
         for name, profile in posterior.profiles.items()
     }
+    bent = bent.beside(known, posterior.stated.over(posterior.keys).marginal(held))
     return replace(posterior, profiles=profiles, bends=bent)
 
 
 def _inflation(posterior: Posterior, camera: str) -> float:
-    """Factor on the variance along a camera's valley: that of phi."""
-    return float(posterior.factors[posterior.column("camera", camera, "phi")] ** 2)
+    """Factor on the variance of the observations along a camera's valley: that of phi by them alone."""
+    if posterior.by_model is None:
+        return 1.0
+    spreads = (one.less(posterior.stated).spread for one in (posterior.information, posterior.by_model))
+    return float(widths_over(*spreads)[posterior.column("camera", camera, "phi")] ** 2)
 
 
 def _profile(camera: str, nodes: Sequence[Node], estimate: Estimate, posterior: Posterior) -> PhiProfile:
     """The valley as seen from the estimate, across it as wide as the data scatter with phi held."""
-    along = profile(camera, nodes, estimate, posterior.half_width)
+    stated_sd = dict(zip(posterior.keys, posterior.stated_sd.tolist(), strict=True))
+    along = profile(camera, nodes, estimate, posterior.half_width, stated_sd)
     if posterior.by_model is None:
         return along
     others = [key for key in posterior.keys if key != along.keys[0]]
-    held, by_model = (i.given(others).marginal(along.keys[1:]) for i in (posterior.information, posterior.by_model))
-    factors = widths_over(held.spread, by_model.spread)
-    across = [Information(i.keys, i.matrix / factors[:, None] / factors) for i in along.across]
-    return replace(along, across=tuple(across))
+    held = (i.less(posterior.stated).given(others) for i in (posterior.information, posterior.by_model))
+    factors = widths_over(*(one.marginal(along.keys[1:]).spread for one in held))
+
+    def scattered(seen: Information) -> Information:
+        return Information(seen.keys, seen.matrix / factors[:, None] / factors)
+
+    return replace(along, across=tuple(posterior.wider(one, scattered) for one in along.across))
 
 
 def _is_lens(camera: Camera) -> bool:

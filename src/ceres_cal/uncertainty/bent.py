@@ -18,7 +18,7 @@ import numpy as np
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import CalibrationError, InputError
 from ceres_cal.model.information import Information
-from ceres_cal.model.keys import Key
+from ceres_cal.model.keys import Key, over
 from ceres_cal.model.parameters import Estimate
 from ceres_cal.model.priors import GaussianPrior
 from ceres_cal.model.quantities import difference, moved, natural_sizes
@@ -55,7 +55,24 @@ class Bends:
 
     def widened(self, information: Information) -> Information:
         """Information about some of the keys with the excesses as variances of their own."""
-        return information.widened(self.excesses[:, [self.keys.index(key) for key in information.keys]])
+        return information.widened(over(self.excesses, self.keys, information.keys))
+
+    def beside(self, information: Information, stated: Information) -> Bends:
+        """With ends no farther than what was stated lets them be.
+
+        With L what the observations say, P what was stated, C = (L + P)^-1 and E the excesses, the covariance of L + P
+        with L widened by E is C + G^T N^-1 G, where G = E L C and N = 1 + E L C P E^T: N^-1/2 G takes the place of E.
+
+        Args:
+            information: L + P of the keys.
+        """
+        if not np.any(stated.matrix):
+            return self
+        moved = self.excesses @ information.less(stated).matrix @ information.inverse
+        left = moved @ stated.matrix @ self.excesses.T
+        values, vectors = np.linalg.eigh(np.eye(len(left)) + 0.5 * (left + left.T))
+        excesses = (vectors / np.sqrt(np.maximum(values, 1.0))) @ vectors.T @ moved
+        return replace(self, ends=self.steps + self.half_width * excesses)
 
 
 def weak_axes(information: Information, estimate: Estimate, keys: Sequence[Key]) -> Array:
@@ -131,7 +148,7 @@ def _end(problem: Problem, estimate: Estimate, keys: tuple[Key, ...], step: Arra
     """The least cost where the part of the numbers along a step is as long as it; None where it is not found."""
     sizes = natural_sizes(estimate, keys)
     row = step / sizes**2 / float(np.sum((step / sizes) ** 2)) / _HELD
-    with suppress(InputError):  # no camera there
+    with suppress(InputError):  # quiet: no camera there; the end counts as far away as any
         held = GaussianPrior.about(Information(keys, np.outer(row, row)), moved(estimate, keys, step))
         solution = _solved(replace(problem, priors=(*problem.priors, held)), estimate)
         if solution is not None:
@@ -145,7 +162,7 @@ def _solved(problem: Problem, start: Estimate) -> Solution | None:
     short = replace(problem.options, max_iterations=min(_MOST_ITERATIONS, problem.options.max_iterations))
     try:
         solution = solve(replace(problem, options=short), start)
-    except CalibrationError:
+    except CalibrationError:  # quiet: the end counts as far away as any
         return None
     return None if solution.failed else solution
 

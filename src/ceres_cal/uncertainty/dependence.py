@@ -1,8 +1,9 @@
 """What the residuals say of the errors' dependence, as one covariance of everything shared (a sandwich).
 
 First what goes together within a view (`correlation`), then whether views scatter as that says (`between`). In
-directions in which the model knows everything shared to one (root root^T its covariance) the covariance becomes root M
-root^T, so the information gains T^T (M^-1 - 1) T with T = root^T information. What nothing tells stays unknown.
+directions in which the model knows everything shared to one (root root^T its covariance) the observations, of
+information A, have a score of covariance C = M - P with P the priors: with S = root^T A and B = S root they say
+A + S^T (C^-1 - B^-1) S instead of A. Priors are as certain as they were; what nothing tells stays unknown.
 """
 
 from __future__ import annotations
@@ -73,26 +74,20 @@ class Scatter:
     matrix: Array
     dependence: Dependence
 
-    def widened(self, information: Information) -> Information:
-        """What is known of the shared numbers, as the data scatter."""
-        back = self.root.T @ information.matrix
-        change = back.T @ (np.linalg.inv(self.matrix) - np.eye(len(self.matrix))) @ back
-        return Information(information.keys, information.matrix + 0.5 * (change + change.T))
-
-    def widened_alone(self, seen: Information, information: Information) -> Information:
+    def widened(self, seen: Information) -> Information:
         """What the observations say without any prior, as they scatter.
 
-        A^T C^-1 A with A what they say by the model and C the covariance of their score: what is left of the whole
-        without its priors need not be positive, where errors that go together weigh as much as a prior does.
-
         Args:
-            seen: A. information: of everything, priors and all.
+            seen: what they say by the model.
         """
-        back, own = self.root.T @ information.matrix, self.root.T @ seen.matrix @ self.root
-        values, vectors = np.linalg.eigh(own + self.matrix - np.eye(len(own)))
+        along = self.root.T @ seen.matrix
+        own = along @ self.root
+        values, vectors = np.linalg.eigh(0.5 * (own + own.T))
         determined = values > _DETERMINED * values[-1]
-        half = (vectors[:, determined] / np.sqrt(values[determined])).T @ own @ back
-        return Information(seen.keys, half.T @ half)
+        white = vectors[:, determined] / np.sqrt(values[determined])
+        scores = np.eye(white.shape[1]) + white.T @ (self.matrix - np.eye(len(own))) @ white
+        change = (along.T @ white) @ (np.linalg.inv(scores) - np.eye(len(scores))) @ (white.T @ along)
+        return Information(seen.keys, seen.matrix + 0.5 * (change + change.T))
 
 
 def measure_scatter(
@@ -111,8 +106,9 @@ def measure_scatter(
     whole = _whole(sample, within.scores)
     lasting = sample.is_shared and any(kind.lasting for kind in within.kinds)
     between, inverse = None, within.inverse_freedom
-    if sample.groups >= FEWEST_GROUPS and not lasting:
-        between, whole = compare_groups(sample, within.scores, whole)
+    compared = compare_groups(sample, within.scores, whole) if sample.groups >= FEWEST_GROUPS and not lasting else None
+    if compared is not None:
+        between, whole = compared
         inverse += between.probability / between.degrees_of_freedom
     return Scatter(sample.root, whole, Dependence(within.kinds, between, within.private, inverse))
 

@@ -6,10 +6,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ceres_cal.model.information import Information
 from ceres_cal.model.parameters import Estimate
 from ceres_cal.model.quantities import difference, moved
 from ceres_cal.observations import Observations
@@ -60,14 +62,16 @@ def with_other_lenses(posterior: Posterior, estimate: Estimate, lenses: OtherLen
     from ceres_cal.uncertainty.other_lenses import shifts_to_lenses
 
     followed = {profile.keys[0] for profile in posterior.profiles.values()}
-    keys = [key for key in posterior.keys if key not in followed]
+    # A lens shows nothing of how targets are built or lie, and was compared with these as drawn and as seen in part.
+    keys = [key for key in posterior.keys if key.kind in ("camera", "station") and key not in followed]
     wider = posterior.in_doubt(keys, shifts_to_lenses(lenses, keys, lenses.near))
     profiles = dict(posterior.profiles)
     for name, valley in profiles.items():
         nodes = [moved(estimate, valley.keys, step) for step in valley.steps]
+        shifts = [np.array(shifts_to_lenses(lenses, valley.keys[1:], node)) for node in nodes]
         across = [
-            known.widened(np.array(shifts_to_lenses(lenses, known.keys, node)))
-            for known, node in zip(valley.across, nodes, strict=True)
+            posterior.wider(known, partial(Information.widened, shifts=here))
+            for known, here in zip(valley.across, shifts, strict=True)
         ]
         profiles[name] = replace(valley, across=tuple(across))
     return replace(wider, profiles=profiles)

@@ -12,6 +12,8 @@ from ceres_cal.base.arrays import Indices
 from ceres_cal.base.errors import InputError
 from ceres_cal.model.information import Information
 from ceres_cal.model.keys import Key, pose_keys
+from ceres_cal.model.parameters import Estimate
+from ceres_cal.model.quantities import intrinsic_keys
 from ceres_cal.uncertainty.bent import Bends
 from ceres_cal.uncertainty.dependence import Dependence
 from ceres_cal.uncertainty.posterior import Posterior
@@ -81,6 +83,8 @@ class PosteriorFile(msgspec.Struct, forbid_unknown_fields=True):
     by_model: list[float] | None = None
     dependence: Dependence | None = None
     bends: BendsFile | None = None
+    stated_keys: list[Key] = []
+    stated: list[float] = []
 
     @classmethod
     def of(cls, posterior: Posterior) -> PosteriorFile:
@@ -95,10 +99,19 @@ class PosteriorFile(msgspec.Struct, forbid_unknown_fields=True):
             None if posterior.by_model is None else lower_triangle(posterior.by_model),
             posterior.dependence,
             None if posterior.bends is None else BendsFile.of(posterior.bends),
+            list(posterior.stated.keys),
+            lower_triangle(posterior.stated),
         )
 
-    def posterior(self) -> Posterior:
-        """The posterior; InputError where a matrix has the wrong size."""
+    def posterior(self, estimate: Estimate) -> Posterior:
+        """The posterior; InputError where a matrix has the wrong size, or a number is none of the estimate's."""
+        for key in (*self.keys, *(key for profile in self.profiles.values() for key in profile.keys)):
+            if key not in _keys_of(estimate, key.kind, key.owner):
+                raise InputError(
+                    f"posterior names {key.quantity!r} of {key.whose}, which is not there: calibrate again"
+                )
+        for name in (*self.profiles.keys() - estimate.cameras.keys(), *self.placements.keys() - {*estimate.placements}):
+            raise InputError(f"posterior: {name!r} is not there: calibrate again")
         placements = {
             name: information_from(row, pose_keys("placement", name), f"posterior.placements.{name}")
             for name, row in self.placements.items()
@@ -108,7 +121,19 @@ class PosteriorFile(msgspec.Struct, forbid_unknown_fields=True):
         by_model = self.by_model and information_from(self.by_model, self.keys, "posterior.by_model")
         freedom = np.inf if self.freedom is None else self.freedom
         bends = None if self.bends is None else self.bends.bends(self.keys)
-        return Posterior(information, placements, freedom, profiles, by_model or None, self.dependence, bends)
+        if not set(self.stated_keys) <= set(self.keys):
+            raise InputError("posterior.stated_keys names keys that the posterior does not have: calibrate again")
+        stated = information_from(self.stated, self.stated_keys, "posterior.stated")
+        return Posterior(information, placements, freedom, profiles, by_model or None, self.dependence, bends, stated)
+
+
+def _keys_of(estimate: Estimate, kind: str, owner: str) -> Sequence[Key]:
+    """The keys of the estimate that one owner has; none where it is not there."""
+    if kind == "camera" and owner in estimate.cameras:
+        return intrinsic_keys(owner, estimate.cameras[owner].lens)
+    if kind == "station" and owner in estimate.stations:
+        return pose_keys("station", owner)
+    return estimate.structure.keys if kind in ("structure", "dimension") else ()
 
 
 def lower_triangle(information: Information) -> list[float]:

@@ -10,15 +10,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Mask
+from ceres_cal.base.cached import cached_property
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.tails import NORMAL_95
 from ceres_cal.base.transforms import Pose
-from ceres_cal.model.keys import Key
+from ceres_cal.model.keys import Key, over
 from ceres_cal.model.parameters import Estimate, intrinsic_names
 from ceres_cal.model.quantities import moved
 from ceres_cal.model.slopes import PixelSlopes, pixel_slopes
@@ -83,7 +83,7 @@ class Picture:
         """(N, 2, K) px per unit of some intrinsics, turned as well as can be; 0 where the lens shows nothing."""
         names = intrinsic_names(self.camera.lens)
         moving = np.nan_to_num(self._by.intrinsics[:, :, [names.index(name) for name in quantities]])
-        flat = moving.reshape(-1, len(quantities))
+        flat = moving.reshape(2 * len(moving), len(quantities))
         turn = np.linalg.lstsq(self._turns, flat, rcond=None)[0]
         return np.asarray((flat - self._turns @ turn).reshape(moving.shape))
 
@@ -116,10 +116,8 @@ def image_map(estimate: Estimate, posterior: Posterior, camera: str) -> ImageMap
 
 def picture_slopes(picture: Picture, keys: Sequence[Key], camera: str) -> Array:
     """(N, 2, K) px per unit of each of the keys: 0 of what is not this camera's."""
-    own = [column for column, key in enumerate(keys) if key[:2] == ("camera", camera)]
-    slopes = np.zeros((*picture.pixels.shape, len(keys)))
-    slopes[:, :, own] = picture.slopes([keys[column].quantity for column in own])
-    return slopes
+    own = [key for key in keys if key[:2] == ("camera", camera)]
+    return over(picture.slopes([key.quantity for key in own]), own, keys)
 
 
 def _by_covariance(picture: Picture, estimate: Estimate, posterior: Posterior, camera: str) -> Array:
@@ -128,12 +126,12 @@ def _by_covariance(picture: Picture, estimate: Estimate, posterior: Posterior, c
     covariance, width = posterior.spread.through(slopes), posterior.half_width
     bends = posterior.bends
     if bends is not None:
-        at = posterior.information.columns(bends.keys)
-        for step, end in zip(bends.steps, bends.ends, strict=True):
+        taken = over(bends.steps, bends.keys, posterior.keys)
+        for step, end in zip(taken, bends.ends, strict=True):
             off = np.full(picture.pixels.shape, np.inf)
-            with suppress(InputError):  # no camera there
+            with suppress(InputError):  # reads: "unknown" at these places of the map
                 there = moved(estimate, bends.keys, end).cameras[camera].at(Pose.identity())
-                off = np.nan_to_num(picture.shift(there) - slopes[:, :, at] @ step, nan=np.inf)
+                off = np.nan_to_num(picture.shift(there) - slopes @ step, nan=np.inf)
             lost = np.isinf(off).any(axis=1)
             off[lost] = 0.0
             covariance += off[:, :, None] * off[:, None, :] / width**2

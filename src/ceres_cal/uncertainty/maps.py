@@ -16,7 +16,7 @@ import numpy as np
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.tails import NORMAL_95, NORMAL_95_ONE_SIDED
-from ceres_cal.model.keys import STATION_QUANTITIES, Key
+from ceres_cal.model.keys import STATION_QUANTITIES, Key, over
 from ceres_cal.model.parameters import Estimate, intrinsic_names
 from ceres_cal.model.quantities import moved
 from ceres_cal.model.slopes import pixel_slopes
@@ -101,13 +101,11 @@ def spread_of_points(
     if estimate.stations[station].camera in posterior.profiles:
         return _by_profile(estimate, posterior, station, pixels, height_m)
     located = estimate.camera_at(station).locate(pixels, height_m)
-    slopes, at = np.zeros((len(pixels), 2, len(posterior.keys))), posterior.information.columns(keys)
-    slopes[:, :, at] = locate_slopes(estimate, keys, station, pixels, height_m)
-    covariance = posterior.spread.through(slopes)
-    if posterior.bends is not None:
-        own = [posterior.bends.keys.index(key) for key in keys]
-        steps, ends = posterior.bends.steps[:, own], posterior.bends.ends[:, own]
-        bend = _bend(estimate, keys, (steps, ends), (station, pixels, height_m), slopes[:, :, at])
+    slopes = locate_slopes(estimate, keys, station, pixels, height_m)
+    covariance = posterior.spread.through(over(slopes, keys, posterior.keys))
+    if (bends := posterior.bends) is not None:
+        steps, ends = (over(values, bends.keys, keys) for values in (bends.steps, bends.ends))
+        bend = _bend(estimate, keys, (steps, ends), (station, pixels, height_m), slopes)
         covariance += bend / posterior.half_width**2
     variance = np.diagonal(covariance, axis1=1, axis2=2)
     reach = posterior.half_width * np.sqrt(variance)
@@ -133,7 +131,7 @@ def _bend(
     total = np.zeros((len(pixels), 2, 2))
     for step, end in zip(*steps, strict=True):
         off = np.full((len(pixels), 2), np.nan)
-        with suppress(InputError):  # no camera there
+        with suppress(InputError):  # reads: "unknown" at these places of the map
             off = moved(estimate, keys, end).camera_at(station).locate(pixels, height_m) - located - slopes @ step
         total += off[:, :, None] * off[:, None, :]
     lost = np.isnan(total).any(axis=(1, 2))

@@ -9,11 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array
+from ceres_cal.base.cached import cached_property
 from ceres_cal.base.transforms import Pose
 from ceres_cal.model.keys import Key
 from ceres_cal.model.parameters import Estimate
@@ -40,12 +40,14 @@ class OtherLenses:
     Attributes:
         near: with the chosen lens. others: with others. weights: of each, its probability or less.
         reach_px: camera -> how far from its principal point it was observed: farther out nothing is compared.
+        failed: why nothing could be compared; "" where it could.
     """
 
     near: Estimate
     others: tuple[Estimate, ...]
     weights: tuple[float, ...]
     reach_px: Mapping[str, float]
+    failed: str = ""
 
     @cached_property
     def pixels(self) -> dict[str, Array]:
@@ -64,10 +66,17 @@ class OtherLenses:
         return np.array([picture.shift(one.cameras[camera].at(Pose.identity())) for one in self.others])
 
     def offsets(self, station: str, height_m: float) -> Array:
-        """(L, N, 2) m by how much the others locate pixels elsewhere."""
-        pixels = self.pixels[self.near.stations[station].camera]
-        located = self.near.camera_at(station).locate(pixels, height_m)
-        return np.array([one.camera_at(station).locate(pixels, height_m) - located for one in self.others])
+        """(L, N, 2) m by how much the others locate pixels elsewhere; every node of a valley asks for the same."""
+        if (station, height_m) not in self._offsets:
+            pixels = self.pixels[self.near.stations[station].camera]
+            located = self.near.camera_at(station).locate(pixels, height_m)
+            every = [one.camera_at(station).locate(pixels, height_m) - located for one in self.others]
+            self._offsets[station, height_m] = np.array(every)
+        return self._offsets[station, height_m]
+
+    @cached_property
+    def _offsets(self) -> dict[tuple[str, float], Array]:
+        return {}
 
 
 def shifts_to_lenses(lenses: OtherLenses, keys: Sequence[Key], there: Estimate) -> list[Array]:
@@ -76,7 +85,10 @@ def shifts_to_lenses(lenses: OtherLenses, keys: Sequence[Key], there: Estimate) 
     Args:
         there: with the chosen lens, at its best or elsewhere in a valley along phi.
     """
-    slopes, offsets = zip(*_compared(lenses, keys, there), strict=True)
+    every = list(_compared(lenses, keys, there))
+    if not every:
+        return []
+    slopes, offsets = zip(*every, strict=True)
     slope = np.concatenate([one.reshape(-1, len(keys)) for one in slopes])
     sizes, shifts = natural_sizes(there, keys), []
     for number, weight in enumerate(lenses.weights):
@@ -88,9 +100,14 @@ def shifts_to_lenses(lenses: OtherLenses, keys: Sequence[Key], there: Estimate) 
 
 
 def _compared(lenses: OtherLenses, keys: Sequence[Key], there: Estimate) -> Iterator[tuple[Array, Array]]:
-    """Of each camera: (N, 2, K) slopes of what it shows, px, and (L, N, 2) by how much others show it elsewhere."""
+    """Of each camera that the keys say anything of: (N, 2, K) slopes of what it shows, px, and (L, N, 2) by how much
+    others show it elsewhere.
+    """
     known = dict.fromkeys(key.owner for key in keys if key.kind == "station")
+    spoken_of = {key.owner for key in keys if key.kind == "camera"} | {there.stations[name].camera for name in known}
     for name, pixels in lenses.pixels.items():
+        if name not in spoken_of:
+            continue
         camera = there.cameras[name]
         stations = [station for station in known if there.stations[station].camera == name]
         tells_phi = any(key[:3] == ("camera", name, "phi") for key in keys)

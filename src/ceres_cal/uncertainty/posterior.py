@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array
+from ceres_cal.base.cached import cached_property
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.spread import Spread, without
-from ceres_cal.base.tails import student_95
+from ceres_cal.base.tails import NORMAL_95, student_95
 from ceres_cal.model.information import Information
-from ceres_cal.model.keys import Key, pose_keys, sigma_limits
+from ceres_cal.model.keys import Key, over, pose_keys, sigma_limits
 from ceres_cal.model.parameters import Estimate, Layout
 from ceres_cal.model.quantities import layout_of
 from ceres_cal.solve import Eliminated, ReducedInformation
@@ -35,6 +35,7 @@ class Posterior:
         placements: name -> information about each placement that one station alone sees, all else integrated out.
         degrees_of_freedom: spare equations behind the estimated noise; infinite where the sigmas were taken as stated.
         profiles: camera -> the valley along its phi, where that is too little known for the quadratic picture.
+        stated: the part of the information that was known beforehand. Nothing widens it: see `wider`.
         by_model: what the model alone says of the shared numbers, were every error independent of the others; None
             where that is all there is. dependence: what the rest of it rests on; None where nobody asked.
         bends: what else leaves the quadratic picture, or None: it counts in sd, bounds and maps.
@@ -47,6 +48,7 @@ class Posterior:
     by_model: Information | None = None
     dependence: Dependence | None = None
     bends: Bends | None = None
+    stated: Information = field(default_factory=Information.nothing)
 
     @property
     def keys(self) -> tuple[Key, ...]:
@@ -55,16 +57,34 @@ class Posterior:
 
     def in_doubt(self, keys: Sequence[Key], shifts: Sequence[Array]) -> Posterior:
         """The posterior that holds what is in dispute: each shift d (K,) of some numbers, when something is left out,
-        goes into the covariance as d d^T, so that no number is stated better than to what it would move.
+        goes into the covariance of what the observations say as d d^T, so that they state no number better than to
+        what it would move.
         """
         if not len(shifts):
             return self
-        common, whole = self.information.among(keys), np.zeros((len(shifts), len(self.keys)))
-        whole[:, self.information.columns(common)] = np.array(shifts)[:, [list(keys).index(key) for key in common]]
-        information, placements = self.information.widened(whole), self.placements
+        whole = over(np.array(shifts), keys, self.keys)
+        information = self.wider(self.information, lambda seen: seen.widened(whole))
+        placements = self.placements
         if isinstance(placements, _Placements):
             placements = replace(placements, shared=information)
         return replace(self, information=information, placements=placements)
+
+    def wider(self, information: Information, how: Callable[[Information], Information]) -> Information:
+        """Information about some of the numbers, with what observations say of them made wider, beside what was stated
+        of them as it was: so nothing is known worse than it was stated, whatever widens.
+
+        Args:
+            information: of everything. how: what makes wider what the observations say by themselves.
+        """
+        stated = self.stated.over(self.keys).marginal(information.keys)
+        return how(information.less(stated)) + stated
+
+    @cached_property
+    def stated_sd(self) -> Array:
+        """(P,) standard deviations by what was stated alone, infinite where that says nothing."""
+        sd = np.full(len(self.keys), np.inf)
+        sd[self.information.columns(self.stated.keys)] = self.stated.spread.sd
+        return sd
 
     @property
     def spread(self) -> Spread:
@@ -81,8 +101,8 @@ class Posterior:
         """(P,) standard deviations in the units of the keys, infinite where unknown."""
         variance = self.spread.sd**2
         if self.bends is not None:
-            variance[self.information.columns(self.bends.keys)] += np.sum(self.bends.excesses**2, axis=0)
-        return np.asarray(np.sqrt(variance))
+            variance += over(np.sum(self.bends.excesses**2, axis=0), self.bends.keys, self.keys)
+        return np.minimum(np.sqrt(variance), self.stated_sd)
 
     @cached_property
     def factors(self) -> Array:
@@ -103,7 +123,8 @@ class Posterior:
     @cached_property
     def bounds(self) -> Array:
         """(P, 2) 95 % bounds of the shared numbers, from the estimate; infinite on a side that is open."""
-        return self.bounds_at(self.half_width)
+        limit = NORMAL_95 * self.stated_sd[:, None]  # what was stated rests on no estimated noise
+        return np.clip(self.bounds_at(self.half_width), -limit, limit)
 
     def bounds_at(self, width: float) -> Array:
         """(P, 2) the same so many standard deviations up, at most three."""
@@ -113,7 +134,8 @@ class Posterior:
             sds = np.column_stack([np.zeros(len(across)), across])
             at = self.information.columns(profile.keys)
             bounds[at] = np.column_stack(profile.bounds(profile.steps, sds, width))
-        return np.asarray(bounds)
+        limit = width * self.stated_sd[:, None]
+        return np.clip(bounds, -limit, limit)
 
     def layout(self, estimate: Estimate) -> Layout:
         """The layout of everything that it speaks of."""
@@ -174,12 +196,12 @@ def make_posterior(reduced: ReducedInformation, degrees_of_freedom: float, scatt
         degrees_of_freedom: spare equations behind the estimated noise, infinite where the sigmas were taken as stated.
         scatter: how the data scatter; without it errors are independent.
     """
-    model = reduced.shared
+    model, stated = reduced.shared, reduced.stated
     if scatter is None:
-        return Posterior(model, _Placements(reduced.eliminated, model), degrees_of_freedom)
-    shared, dependence = scatter.widened(model), scatter.dependence
+        return Posterior(model, _Placements(reduced.eliminated, model), degrees_of_freedom, stated=stated)
+    shared, dependence = scatter.widened(reduced.points + reduced.curves) + reduced.priors, scatter.dependence
     placements = _Placements(reduced.eliminated, shared, dependence.private)
-    return Posterior(shared, placements, degrees_of_freedom, by_model=model, dependence=dependence)
+    return Posterior(shared, placements, degrees_of_freedom, by_model=model, dependence=dependence, stated=stated)
 
 
 @dataclass(frozen=True, eq=False)

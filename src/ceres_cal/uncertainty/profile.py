@@ -8,7 +8,7 @@ valley exactly, across it by the quadratic picture.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -20,8 +20,8 @@ from ceres_cal.model.information import Information
 from ceres_cal.model.keys import Key
 from ceres_cal.model.parameters import Estimate, unit_px
 from ceres_cal.model.quantities import difference, moved
+from ceres_cal.model.ranges import PHI_RANGE
 from ceres_cal.solve import Problem, information, solve
-from ceres_cal.start.initialise import PHI_RANGE
 
 # Rise of twice the cost at which the valley is followed no further: three sigma, well beyond any 95 % bound. Nothing
 # changes from half to double.
@@ -47,7 +47,8 @@ class Node:
     """One point of the valley: phi held, everything else at its best.
 
     Attributes:
-        cost: twice the least cost there, with that of the priors on phi, over the factor on the variance.
+        cost: twice the least cost there, that of the observations over the factor on their variance; with that of the
+            priors, also of those on phi.
         information: about everything shared, phi too, though it was held.
     """
 
@@ -131,7 +132,7 @@ def valley(camera: str, problem: Problem, estimate: Estimate, inflation: float =
     """Follow the valley from the estimate both ways, until it is three sigma up or phi is no lens any more.
 
     Args:
-        inflation: factor on the variance along it: costs are divided by it.
+        inflation: factor on the variance of the observations along it: what they cost is divided by it.
 
     Raises:
         SolutionError: the solve does not find back to where it ended, or from there to a lens that fits.
@@ -158,24 +159,29 @@ def valley(camera: str, problem: Problem, estimate: Estimate, inflation: float =
     return (*down[::-1], first, *up)
 
 
-def profile(camera: str, nodes: Sequence[Node], estimate: Estimate, half_width: float) -> PhiProfile:
+def profile(
+    camera: str, nodes: Sequence[Node], estimate: Estimate, half_width: float, stated_sd: Mapping[Key, float]
+) -> PhiProfile:
     """The valley as seen from the estimate.
 
     Args:
         half_width: standard deviations from the middle to the end of a 95 % interval.
+        stated_sd: of numbers that were stated: a node is no nearer, in standard deviations, than any of them has it.
     """
     costs = np.array([node.cost for node in nodes])
     phi = estimate.cameras[camera].phi
     here = float(np.interp(phi, [node.estimate.cameras[camera].phi for node in nodes], costs))
     # Where the valley has a second, lower place, both count: the bound reaches as high over either.
     base = costs.min() if here - costs.min() <= half_width**2 else here
-    rises = np.maximum(costs - base, 0.0)
     keys = _keys_of(camera, estimate, nodes[0].information.keys)
+    steps = np.array([difference(node.estimate, estimate, keys) for node in nodes])
+    stated = (steps / [stated_sd.get(key, np.inf) for key in keys]) ** 2
+    rises = np.maximum(costs - base, np.max(stated, axis=1))
     return PhiProfile(
         camera,
         keys,
         estimate.cameras[camera].phi,
-        np.array([difference(node.estimate, estimate, keys) for node in nodes]),
+        steps,
         rises,
         tuple(_across(node.information, keys) for node in nodes),
         bool(rises[0] < half_width**2),
@@ -186,14 +192,17 @@ def profile(camera: str, nodes: Sequence[Node], estimate: Estimate, half_width: 
 def _node(camera: str, problem: Problem, start: Estimate, inflation: float) -> Node | None:
     """The least cost with phi held where the start has it; None where the solver does not get there."""
     try:
-        solution = solve(problem.holding(camera, 0), start)
+        held = problem.holding(camera, 0)
+        solution = solve(held, start)
         known = None if solution.failed else information(problem, solution.estimate).shared
-    except CalibrationError:
+    except CalibrationError:  # quiet: a smaller step is tried; a valley without an end stays open
         return None
     if known is None:
         return None
-    cost = 2.0 * solution.cost + _cost_of_phi(camera, problem, solution.estimate)
-    return Node(solution.estimate, cost / inflation, known)
+    there = solution.estimate
+    stated = float(sum(np.sum(prior.residuals(there) ** 2) for prior in held.stated_at(there)))
+    cost = (2.0 * solution.cost - stated) / inflation + stated + _cost_of_phi(camera, problem, there)
+    return Node(there, cost, known)
 
 
 def _cost_of_phi(camera: str, problem: Problem, estimate: Estimate) -> float:

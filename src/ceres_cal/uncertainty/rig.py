@@ -8,6 +8,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.transforms import rotation_log
+from ceres_cal.model.keys import over
 from ceres_cal.model.parameters import Estimate
 from ceres_cal.model.quantities import moved, natural_sizes
 from ceres_cal.uncertainty.posterior import Posterior
@@ -49,7 +50,7 @@ def _pair(estimate: Estimate, posterior: Posterior, first: str, second: str) -> 
         jacobian[:, column] = (there[0] - there[1]) / (2.0 * step)
     variance = np.diagonal(posterior.spread.through(jacobian))
     if posterior.bends is not None:
-        ends = posterior.bends.excesses @ jacobian[:, posterior.information.columns(posterior.bends.keys)].T
+        ends = over(posterior.bends.excesses, posterior.bends.keys, posterior.keys) @ jacobian.T
         variance = variance + np.sum(ends**2, axis=0)
     sd = np.sqrt(variance)
     baseline, angle = _numbers(estimate, first, second).tolist()

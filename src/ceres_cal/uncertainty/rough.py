@@ -17,7 +17,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ceres_cal.base.arrays import Array, Indices, Mask
+from ceres_cal.base.arrays import Array, Mask
+from ceres_cal.effects.evidence import likeliest_sizes
 from ceres_cal.model.equations import Equations, equations_of
 from ceres_cal.model.keys import Key
 from ceres_cal.observations import Observations
@@ -33,7 +34,7 @@ _ALONG, _OVER = (
     (6, 12, 24),
 )  # bumps from the middle to the farthest observation, or along the longer side of the image
 _LOOSE_PX, _LEAST_PX = 3.0, 1e-3  # of bumps, before the data have spoken, and what they cannot talk below
-_STEPS, _AT_REST = 40, 0.02  # relative change of a size
+_AT_REST = 0.02  # relative change of a size
 
 
 def shifts_by_roughness(end: RobustSolution, observations: Observations) -> tuple[Sequence[Key], Sequence[Array]]:
@@ -93,28 +94,13 @@ class _Left:
         rest = score - inside @ best + self.shared @ (moved @ best)
         scatter = np.add.reduceat(inside * rest[:, None], rows), np.add.reduceat(inside**2, rows)
         within = max(1.0, float(np.sum(scatter[0] ** 2) / np.sum(scatter[1])))
-        amount, covariance = _scattered(normal / within, slope / within, kind)
-        values, vectors = np.linalg.eigh(covariance + np.outer(amount, amount))
+        forms = [np.diag((kind == number).astype(float)) for number in range(len(every))]
+        loose, least = np.full((2, len(every)), [[_LOOSE_PX], [_LEAST_PX]])
+        sizes = likeliest_sizes(normal / within, slope / within, forms, loose, least, _AT_REST)
+        covariance = np.linalg.inv(sizes.precision)
+        values, vectors = np.linalg.eigh(covariance + np.outer(sizes.amount, sizes.amount))
         half = vectors * np.sqrt(np.maximum(values, 0.0))
         return np.asarray(np.linalg.qr((self.root @ moved @ half).T, mode="r"))
-
-
-def _scattered(normal: Array, slope: Array, kind: Indices) -> tuple[Array, Array]:
-    """(Q,) mean and (Q, Q) covariance of amounts, px, whose sizes are the likeliest of each kind (Q,).
-
-    The fixed point of MacKay (1992), as for the lens's own numbers (`solve/smoothness.py`).
-    """
-    sizes = np.full(int(kind.max()) + 1, _LOOSE_PX)
-    counts = np.bincount(kind)
-    for _ in range(_STEPS):
-        covariance = np.linalg.inv(normal + np.diag(sizes[kind] ** -2.0))
-        amount = covariance @ slope
-        known = counts - np.bincount(kind, np.diagonal(covariance)) / sizes**2
-        before, squares = sizes, np.bincount(kind, amount**2)
-        sizes = np.sqrt((squares + _LEAST_PX**2) / (np.maximum(known, 0.0) + 1.0))
-        if np.max(np.abs(np.log(sizes / before))) < _AT_REST:
-            break
-    return amount, np.asarray(covariance)
 
 
 def _bumps(equations: Equations, camera: Camera, own: Mask) -> Iterator[Array]:

@@ -7,11 +7,11 @@ length, a share, a variance) that hold for all of them.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
 from ceres_cal.base.arrays import AnyArray, Array, Indices, Mask
+from ceres_cal.base.cached import cached_property
 from ceres_cal.model.equations import Equations, equations_of
 from ceres_cal.model.information import Information
 from ceres_cal.model.parameters import Estimate

@@ -9,6 +9,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, distinct
 from ceres_cal.base.tails import NORMAL_95
+from ceres_cal.model.keys import over
 from ceres_cal.model.parameters import Estimate
 from ceres_cal.observations import Columns, Observations
 from ceres_cal.scene.camera import Camera
@@ -57,8 +58,7 @@ def predicted(estimate: Estimate, posterior: Posterior, pair: tuple[str, str], p
         keys = station_keys(estimate, posterior, station)
         pixels = visible_pixels(estimate, station, places, height_m)
         visible &= np.isfinite(pixels[:, 0])
-        at = posterior.information.columns(keys)
-        slopes[:, :, at] += sign * locate_slopes(estimate, keys, station, pixels, height_m)
+        slopes += sign * over(locate_slopes(estimate, keys, station, pixels, height_m), keys, posterior.keys)
     covariances[visible] = posterior.spread.through(slopes[visible])
     return covariances
 

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from itertools import pairwise
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask, distinct, median
+from ceres_cal.base.cached import cached_property
 from ceres_cal.model.equations import Equations
 from ceres_cal.observations.sights import bounds_of
 

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cache
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array
+from ceres_cal.base.cached import cached_property
 from ceres_cal.scene.lens.spline_kernel import DEGREE, END, INTERVALS
 
 _SAMPLES = 100  # radii up to the end, between which nothing turns

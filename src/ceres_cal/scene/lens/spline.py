@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cache
 from types import MappingProxyType
 from typing import ClassVar
 
 import numpy as np
 
 from ceres_cal.base.arrays import AnyArray, Array, Mask
+from ceres_cal.base.cached import cached_property
 from ceres_cal.base.errors import InputError
 from ceres_cal.scene.lens import spline_kernel
 from ceres_cal.scene.lens.b_splines import Growth, bending, first_falls, pieces, profile_columns

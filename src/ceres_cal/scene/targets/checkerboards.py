@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from functools import partial
+from itertools import product
 from typing import Any
 
 import msgspec
@@ -11,7 +13,7 @@ import numpy as np
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import convert
-from ceres_cal.scene.targets.paper import Footprints, Paper, share_inside
+from ceres_cal.scene.targets.paper import Footprints, Paper, Square, share_inside
 from ceres_cal.scene.targets.target import Grid, Target, TargetKind, require_size
 
 
@@ -33,6 +35,7 @@ def checkerboard(columns: int, rows: int, square_m: float) -> Target:
         (-2.0 * grid.spacing_m, -2.0 * grid.spacing_m),
         ((grid.columns + 1) * grid.spacing_m, (grid.rows + 1) * grid.spacing_m),
         partial(_dark_squares, grid),
+        partial(_squares, grid),
     )
     return Target(spec, points, {}, movable=True, bows=True, grid=grid, paper=paper)
 
@@ -48,6 +51,13 @@ def _dark_squares(grid: Grid, footprints: Footprints) -> Array:
         sign *= np.where(line % 2 == 0, wave, -wave)
         within *= share_inside(place + 1.0, step) * share_inside(count - place, step)
     return np.asarray(within * (0.5 + 0.5 * sign))
+
+
+def _squares(grid: Grid) -> Iterator[Square]:
+    """The dark ones of `_dark_squares`."""
+    for row, column in product(range(-1, grid.rows), range(-1, grid.columns)):
+        if (row + column) % 2 == 0:
+            yield Square((column * grid.spacing_m, row * grid.spacing_m), grid.spacing_m)
 
 
 class _Spec(msgspec.Struct, forbid_unknown_fields=True):

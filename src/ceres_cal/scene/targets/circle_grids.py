@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from functools import partial
 from typing import Any
 
@@ -11,7 +12,7 @@ import numpy as np
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import convert
-from ceres_cal.scene.targets.paper import Footprints, Paper, share_inside
+from ceres_cal.scene.targets.paper import Disc, Footprints, Paper, share_inside
 from ceres_cal.scene.targets.target import Grid, Target, TargetKind, require_size
 
 
@@ -45,6 +46,7 @@ def circle_grid(columns: int, rows: int, spacing_m: float, diameter_m: float, *,
         (-border, -border),
         (float(flat[:, 0].max() + border), float(flat[:, 1].max() + border)),
         partial(_dark_circles, given),
+        partial(_discs, places, 0.5 * float(diameter_m)),
     )
     grid = None if asymmetric else Grid(int(columns), int(rows), float(spacing_m))
     return Target(msgspec.to_builtins(given), places, {}, movable=True, bows=True, grid=grid, paper=paper)
@@ -63,6 +65,11 @@ def _dark_circles(grid: _Spec, footprints: Footprints) -> Array:
     off, nearest = np.where((away[0] <= away[1])[:, None], *offs), away.min(axis=0)
     direction = off / np.maximum(nearest, 1e-12)[:, None]
     return share_inside(0.5 * grid.diameter_m - nearest, footprints.step_m(direction))
+
+
+def _discs(places: Mapping[str, tuple[float, float, float]], radius_m: float) -> Iterator[Disc]:
+    for x, y, _ in places.values():
+        yield Disc((x, y), radius_m)
 
 
 class _Spec(msgspec.Struct, forbid_unknown_fields=True):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,15 +34,35 @@ def share_inside(distance: Array, step: Array) -> Array:
     return np.clip(distance / step + 0.5, 0.0, 1.0)
 
 
+@dataclass(frozen=True)
+class Square:
+    """A dark square by its corner of the least x and y, and its side, m."""
+
+    corner_m: tuple[float, float]
+    side_m: float
+    is_dark: bool = True
+
+
+@dataclass(frozen=True)
+class Disc:
+    """A disc by its centre and radius, m; a light one lies on a dark one."""
+
+    centre_m: tuple[float, float]
+    radius_m: float
+    is_dark: bool = True
+
+
 @dataclass(frozen=True, eq=False)
 class Paper:
     """The rectangular sheet that a target is printed on.
 
     Attributes:
         low_m, high_m: (x, y) of two opposite corners of the sheet.
-        dark: the share (M,) of each small square that is dark.
+        dark: the share (M,) of each small square that is dark, as a camera sees it.
+        shapes: what is printed, in this order, on white.
     """
 
     low_m: tuple[float, float]
     high_m: tuple[float, float]
     dark: Callable[[Footprints], Array]
+    shapes: Callable[[], Iterator[Square | Disc]]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 
 import msgspec
@@ -12,7 +12,7 @@ from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import convert
 from ceres_cal.scene.curves import Arc, Curve
-from ceres_cal.scene.targets.paper import Footprints, Paper, share_inside
+from ceres_cal.scene.targets.paper import Disc, Footprints, Paper, Square, share_inside
 from ceres_cal.scene.targets.target import Target, TargetKind
 
 
@@ -27,7 +27,9 @@ def rings(radii_m: Sequence[float]) -> Target:
         raise InputError(f"rings: radii_m must increase and be positive, not {radii}")
     arcs: dict[str, Curve] = {f"ring_{i}": Arc((0.0, 0.0, 0.0), r) for i, r in enumerate(radii, start=1)}
     border = 1.05 * radii[-1]
-    paper = Paper((-border, -border), (border, border), partial(_dark_rings, np.array(radii)))
+    paper = Paper(
+        (-border, -border), (border, border), partial(_dark_rings, np.array(radii)), partial(_shapes, radii, border)
+    )
     return Target({"kind": "rings", "radii_m": radii}, {"centre": (0.0, 0.0, 0.0)}, arcs, movable=True, paper=paper)
 
 
@@ -38,6 +40,14 @@ def _dark_rings(radii: Array, footprints: Footprints) -> Array:
     inner = np.searchsorted(0.5 * (radii[1:] + radii[:-1]), away)  # the nearest edge
     outside = share_inside(away - radii[inner], step)
     return np.where(inner % 2 == 0, 1.0 - outside, outside)
+
+
+def _shapes(radii: Sequence[float], border: float) -> Iterator[Square | Disc]:
+    """From the outside in, each on the one before; beyond the last of an even number of rings it is dark, too."""
+    if len(radii) % 2 == 0:
+        yield Square((-border, -border), 2.0 * border)
+    for number in reversed(range(len(radii))):
+        yield Disc((0.0, 0.0), radii[number], is_dark=number % 2 == 0)
 
 
 class _Spec(msgspec.Struct, forbid_unknown_fields=True):

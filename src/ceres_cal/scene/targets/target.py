@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Mask
+from ceres_cal.base.cached import cached_property
 from ceres_cal.base.errors import InputError
 from ceres_cal.scene.curves import Arc, Curve, along_curve
 from ceres_cal.scene.targets.crossings import aliases
@@ -121,6 +121,11 @@ class Target:
     def is_arc(self) -> Mask:
         """(C,) whether each curve is an arc."""
         return np.array([isinstance(curve, Arc) for curve in self.curves.values()], dtype=bool)
+
+    @cached_property
+    def places(self) -> Array:
+        """(P, 3) m: its points, and where its curves begin."""
+        return np.concatenate([self.point_array, self.tracks[0, :, 0] + self.tracks[0, :, 1]])
 
     @cached_property
     def box(self) -> Array:

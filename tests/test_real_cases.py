@@ -1,0 +1,117 @@
+"""Inputs that once ended badly: its README says what is right of each file of `cases` in the folder of real data."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ceres_cal.calibrating import calibrate
+from ceres_cal.calibration import Calibration
+from ceres_cal.cli import main
+from ceres_cal.model.parameters import Options
+from ceres_cal.model.structure import Tolerance
+from ceres_cal.moves import score
+from ceres_cal.observations import Observations, Prior
+
+HELD = ("--lens", "brown", *(part for name in ("k1", "k2", "k3", "p1", "p2") for part in ("--fix", f"{name}=0")))
+
+
+@pytest.fixture(scope="session")
+def case(real_data: Path) -> Callable[[str], Path]:
+    """Where a case lies, by the name of its file."""
+
+    def place(name: str) -> Path:
+        path = real_data / "cases" / name
+        if not path.is_file():
+            pytest.skip(f"{path} is not there")
+        return path
+
+    return place
+
+
+def test_two_cameras_above_know_neither_phi_nor_height(case: Callable[[str], Path]) -> None:
+    calibration = calibrate(Observations.load(case("two_cameras_above.json")))
+    known = calibration.uncertainty
+    for name in calibration.stations:
+        camera = calibration.estimate.stations[name].camera
+        assert known.verdict("camera", camera, "phi").verdict != "known"
+        assert known.verdict("station", name, "height").verdict != "known"
+        assert known.map_sd_mm(name).mean_mm < 5.0  # 3 measured
+
+
+def test_lens_none_field_keeps_its_stated_height(case: Callable[[str], Path]) -> None:
+    prior = Prior("station", "camera", "height_m", (5.0,), (0.02,))
+    calibration = calibrate(Observations.load(case("lens_none_field.json")), Options(lens="radial", priors=(prior,)))
+    assert calibration.uncertainty.verdict("station", "camera", "height").sd <= 0.02 * (1.0 + 1e-9)  # 1.049 before
+    assert 0.1 < calibration.uncertainty.map_sd_mm().mean_mm < 0.5  # 0.18 measured, 97 before; 0.25 off
+
+
+def test_stereo_left_is_solved_as_built(case: Callable[[str], Path]) -> None:
+    calibration = calibrate(Observations.load(case("stereo_left.json")), Options(as_built="estimate"))
+    assert calibration.as_built and calibration.fit.points_rms_px < 0.09  # 0.076 measured
+    assert np.all(np.isfinite(calibration.uncertainty.posterior.sd))
+
+
+def test_stereo_left_b_is_scored_by_a_warped_board(case: Callable[[str], Path]) -> None:
+    options = Options(tolerances={"board": Tolerance(warp_m=0.002)})
+    calibration = calibrate(Observations.load(case("stereo_left_a.json")), options)
+    scored = score(calibration, Observations.load(case("stereo_left_b.json")))
+    assert scored.fit.points_rms_px < 0.14  # 0.125 measured; 0.113 of the other half
+    assert scored.noise_ratios[0] == pytest.approx(1.0, abs=0.2)  # 1.10 measured
+
+
+def refused(capfd: pytest.CaptureFixture[str], *arguments: str) -> str:
+    """The one line that a refused command prints."""
+    assert main(["calibrate", *arguments, "--quiet"]) in (2, 3)
+    shown = capfd.readouterr()
+    assert shown.out == ""
+    (line,) = shown.err.splitlines()
+    assert "unexpected" not in line and "Warning" not in line
+    return line
+
+
+def calibrated(tmp_path: Path, *arguments: str) -> Calibration:
+    file = str(tmp_path / "calibration.json")
+    assert main(["calibrate", *arguments, "-o", file]) == 0
+    return Calibration.load(file)
+
+
+@pytest.mark.parametrize(
+    "name, words",
+    [
+        ("onesigma.json", "point 'TopHalfwayCrossing': its sigma_px is 1e-12 where 0.3 is usual"),
+        ("px1e7.json", "point 'BottomLeftCorner': pixel (96.2, 1e+07) lies"),
+        ("one_curve_pixel.json", "curve 'ring_32': pixel (1e+308, 65.6) lies"),
+        ("im1e5.json", "is image_size that of the pictures?"),
+    ],
+)
+def test_an_impossible_number_is_named(
+    case: Callable[[str], Path], capfd: pytest.CaptureFixture[str], name: str, words: str
+) -> None:
+    assert words in refused(capfd, str(case(name)))
+
+
+def test_as_many_equations_as_numbers(case: Callable[[str], Path], capfd: pytest.CaptureFixture[str]) -> None:
+    """soak48: four views of four corners are 32 equations for 32 numbers."""
+    assert "choose fewer or other coefficients" in refused(capfd, str(case("soak48.json")), "--lens", "brown")
+
+
+@pytest.mark.parametrize("name", ["zero_division.json", "no_agree.json"])
+def test_exact_data_gives_the_exact_camera(case: Callable[[str], Path], tmp_path: Path, name: str) -> None:
+    found = calibrated(tmp_path, str(case(name)), *HELD, "--hold-principal-point")
+    assert abs(found.cameras["c"].phi - 800.0) < 1e-6  # 1e-12 measured
+    assert abs(found.stations["c"].position[2] - 4.0) < 1e-6
+    assert not found.conflicts and np.isfinite(found.uncertainty.verdict("camera", "c", "phi").sd)
+
+
+def test_lines_in_two_directions_are_not_called_parallel(
+    case: Callable[[str], Path], capfd: pytest.CaptureFixture[str]
+) -> None:
+    """two_by_two_lines: a plane's pose follows from two lines in each of two directions."""
+    path = case("two_by_two_lines.json")
+    assert len(json.loads(path.read_text())["views"]) == 1
+    assert "parallel" not in refused(capfd, str(path))

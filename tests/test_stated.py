@@ -1,0 +1,200 @@
+"""Nothing is known worse than it was stated, whatever makes wider what the observations say."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scenes import camera, side_by_side
+
+from ceres_cal.base.arrays import Array
+from ceres_cal.base.tails import NORMAL_95
+from ceres_cal.calibrating import calibrate
+from ceres_cal.calibration import Calibration
+from ceres_cal.model.information import Information
+from ceres_cal.model.keys import Key, over
+from ceres_cal.model.parameters import AUTO, Options
+from ceres_cal.observations import Observations, Prior
+from ceres_cal.scene.targets import ssl_field
+from ceres_cal.simulate import Disturbance, Station, field_scene, overhead_pose, simulate
+from ceres_cal.uncertainty import Dependence, PhiProfile, Posterior, PosteriorFile, Scatter
+from ceres_cal.uncertainty.bent import Bends
+
+KEYS = tuple(Key("camera", "a", name, "px") for name in ("phi", "cx", "cy", "k1", "k2"))
+ROUNDING = 1.0 + 1e-6
+
+
+# ---- the algebra ----------------------------------------------------------------------------------------------------
+
+
+def known(seed: int) -> tuple[Information, Information, np.random.Generator]:
+    """What observations say, of some directions much and of others nothing, and what was stated of three numbers."""
+    rng = np.random.default_rng(seed)
+    units = 10.0 ** rng.uniform(-4.0, 4.0, len(KEYS))
+    rows = rng.standard_normal((int(rng.integers(1, 9)), len(KEYS))) * 10.0 ** rng.uniform(-3.0, 3.0) / units
+    stated = {KEYS[k]: float(units[k] * 10.0 ** rng.uniform(-3.0, 3.0)) for k in (0, 1, 3)}
+    return Information(KEYS, rows.T @ rows), Information.of_sigmas(stated), rng
+
+
+def own_sd(stated: Information, keys: tuple[Key, ...] = KEYS) -> Array:
+    sd = over(stated.spread.sd, stated.keys, keys)
+    return np.where(sd > 0.0, sd, np.inf)
+
+
+@given(st.integers(0, 2**31))
+@settings(max_examples=60)
+def test_no_doubt_and_no_scatter_widens_what_was_stated(seed: int) -> None:
+    """However far the shifts are; what was stated of nothing is as wide as the shifts have it."""
+    seen, stated, rng = known(seed)
+    size = rng.standard_normal(len(KEYS)) * own_sd(stated).min() * 10.0 ** rng.uniform(-2.0, 5.0)
+    posterior = Posterior(seen + stated, stated=stated).in_doubt(KEYS, list(size * rng.standard_normal((3, len(KEYS)))))
+    assert np.all(posterior.spread.sd <= ROUNDING * own_sd(stated))
+    assert np.all(np.abs(posterior.bounds) <= NORMAL_95 * ROUNDING * own_sd(stated)[:, None])
+
+
+@given(st.integers(0, 2**31), st.floats(-2.0, 4.0))
+@settings(max_examples=60)
+def test_errors_that_go_together_widen_no_prior(seed: int, strength: float) -> None:
+    """The score of the observations scatters as much as anything; what was stated stays."""
+    rng = np.random.default_rng(seed)
+    rows, half = rng.standard_normal((8, len(KEYS))), rng.standard_normal((len(KEYS), len(KEYS)))
+    seen, stated = Information(KEYS, rows.T @ rows), Information.of_sigmas({KEYS[1]: 0.1, KEYS[3]: 3.0})
+    root = np.linalg.inv(np.linalg.cholesky((seen + stated).matrix)).T
+    along = root.T @ seen.matrix @ root
+    score = 10.0**strength * along @ half @ half.T @ along
+    wide = Scatter(root, np.eye(len(KEYS)) + score, Dependence()).widened(seen) + stated
+    assert np.all(wide.spread.sd <= ROUNDING * own_sd(stated))
+    assert np.all(wide.spread.sd >= (seen + stated).spread.sd / ROUNDING)
+
+
+@given(st.integers(0, 2**31))
+@settings(max_examples=60)
+def test_ends_are_no_farther_than_stated(seed: int) -> None:
+    """sd with bends is that of the observations' information widened, beside what was stated."""
+    rng = np.random.default_rng(seed)
+    units = 10.0 ** rng.uniform(-3.0, 3.0, len(KEYS))
+    rows = rng.standard_normal((8, len(KEYS))) / units
+    seen, stated = Information(KEYS, rows.T @ rows), Information.of_sigmas({KEYS[1]: float(0.1 * units[1])})
+    excesses = 3.0 * units * rng.standard_normal((3, len(KEYS)))
+    raw = Bends(KEYS, np.zeros_like(excesses), 2.0 * excesses, 2.0)
+    assert raw.beside(seen + stated, Information.nothing(KEYS)) is raw
+    bends = raw.beside(seen + stated, stated.over(KEYS))
+    variance = (seen + stated).spread.sd ** 2 + np.sum(bends.excesses**2, axis=0)
+    expected = (seen.widened(raw.excesses) + stated).spread.sd
+    assert np.sqrt(variance) == pytest.approx(expected, rel=1e-5)
+    assert np.sqrt(variance[1]) <= ROUNDING * 0.1 * units[1]
+
+
+def test_a_valley_ends_where_the_prior_does() -> None:
+    steps = np.column_stack([np.linspace(-300.0, 300.0, 13), np.zeros((13, 4))])
+    across = tuple(Information(KEYS[1:], np.eye(4)) for _ in steps)
+    valley = PhiProfile("a", KEYS, 800.0, steps, np.zeros(13), across)
+    stated = Information.of_sigmas({KEYS[0]: 20.0, KEYS[2]: 0.5})
+    posterior = Posterior(Information(KEYS, np.eye(5)) + stated, profiles={"a": valley}, stated=stated)
+    assert np.ptp(posterior.bounds, axis=1)[[0, 2]] == pytest.approx(2.0 * NORMAL_95 * np.array([20.0, 0.5]))
+    back = PosteriorFile.of(posterior).posterior()
+    assert np.array_equal(back.bounds, posterior.bounds) and np.array_equal(back.sd, posterior.sd)
+
+
+@given(st.integers(0, 2**31))
+@settings(max_examples=30)
+def test_parts_add_up_again(seed: int) -> None:
+    seen, stated, _ = known(seed)
+    whole = seen + stated
+    again = whole.less(stated) + stated
+    unit = np.sqrt(np.maximum(np.diagonal(whole.matrix), 1e-300))
+    assert again.matrix / unit[:, None] / unit == pytest.approx(whole.matrix / unit[:, None] / unit, abs=2e-6)
+
+
+def test_absent_keys_are_zero() -> None:
+    values = np.arange(10.0).reshape(2, 5)
+    other = Key("camera", "b", "phi", "px")
+    assert over(values, KEYS, (KEYS[3], other, KEYS[0])).tolist() == [[3.0, 0.0, 0.0], [8.0, 0.0, 5.0]]
+    assert over(values[:, :0], (), KEYS).tolist() == [[0.0] * 5] * 2
+    assert over(values, KEYS, ()).shape == (2, 0)
+
+
+# ---- calibrations ---------------------------------------------------------------------------------------------------
+
+
+@cache
+def seen(tilt_deg: float, spacing_m: float = 0.2, aside_m: float = 0.0) -> Observations:
+    """A field, one line of it aside, from a camera at 4 m."""
+    pose = overhead_pose(0.1, -0.2, 4.0, tilt_x_deg=tilt_deg, yaw_deg=3.0)
+    stations = {"overhead": Station("overhead", pose)}
+    scene = field_scene(ssl_field("B"), {"overhead": camera("radial-2-3")}, stations, spacing_m=spacing_m)
+    observations = simulate(scene, Disturbance(0.3, 0.3), seed=1).observations
+    curves = observations.curves
+    line = curves.feature == ssl_field("B").curve_names.index("HalfwayLine")
+    return replace(observations, curves=replace(curves, pixels=curves.pixels + aside_m * 217.0 * line[:, None]))
+
+
+def stated(quantity: str, value: tuple[float, ...], sigma: float) -> Prior:
+    owner = "camera" if quantity in ("phi", "principal_point", "a3") else "station"
+    return Prior(owner, "overhead", quantity, value, (sigma,) * len(value))
+
+
+HEIGHT, PHI = stated("height_m", (4.0,), 0.02), stated("phi", (868.0,), 5.0)
+POSITION = stated("position_m", (0.1, -0.2, 4.0), 0.003)
+CENTRE, A3 = stated("principal_point", (651.3, 468.9), 0.2), stated("a3", (6.1e-7,), 1e-9)
+CASES: dict[str, tuple[Observations, Options]] = {
+    "a line in doubt": (seen(8.0, aside_m=0.006), Options(lens="radial", priors=(HEIGHT, CENTRE))),
+    "other lenses": (seen(8.0), Options(lens=AUTO, priors=(POSITION,))),
+    "a valley": (seen(0.0), Options(lens="radial", priors=(stated("height_m", (4.0,), 0.6), CENTRE))),
+    "a valley, phi stated": (seen(0.5), Options(lens="radial", priors=(stated("phi", (868.0,), 90.0), A3))),
+    "a valley, other lenses": (seen(0.5), Options(lens=AUTO, priors=(stated("height_m", (4.0,), 0.5),))),
+    "few observations": (seen(8.0, 2.0), Options(lens="brown", priors=(HEIGHT, PHI))),
+    "a conflict": (seen(8.0), Options(lens="radial", priors=(stated("height_m", (3.0,), 0.005), A3))),
+    "dimensions": (
+        seen(20.0),
+        Options(
+            lens="radial",
+            dimensions=("field/field_length_m",),
+            priors=(Prior("target", "field", "field_length_m", (9.0,), (0.001,)), HEIGHT),
+        ),
+    ),
+}
+
+
+def farthest_over(calibration: Calibration, priors: tuple[Prior, ...]) -> float:
+    """The largest standard deviation, or half 95 % interval, over that of its own prior."""
+    quantities = {"height_m": ("height",), "position_m": ("x", "y", "height"), "principal_point": ("cx", "cy")}
+    over_own = []
+    for prior in priors:
+        for number, quantity in enumerate(quantities.get(prior.quantity, (prior.quantity,))):
+            kind = "dimension" if prior.owner == "target" else prior.owner
+            one = calibration.uncertainty.verdict(kind, prior.name, quantity)
+            sd = calibration.uncertainty.posterior.sd_of(kind, prior.name, quantity)
+            half = 0.5 * (one.high - one.low) / NORMAL_95
+            over_own.append(max(one.sd, sd, half) / prior.sigma[number])
+    return max(over_own)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_no_sd_exceeds_its_own_priors(name: str) -> None:
+    observations, options = CASES[name]
+    calibration = calibrate(observations, options)
+    assert farthest_over(calibration, options.priors) <= ROUNDING
+    assert bool(calibration.posterior and calibration.posterior.profiles) == ("valley" in name)
+    assert bool(calibration.conflicts) == ("conflict" in name)
+
+
+def test_two_cameras_from_straight_above() -> None:
+    """In one camera's valley the other has no keys; a height stated for one of them says nothing of the other's."""
+    cameras, _ = side_by_side(camera("radial-2-3"))
+    stations = {
+        name: Station(name, overhead_pose(x_m, 0.0, 4.4, yaw_deg=90.0))
+        for name, x_m in (("left", -2.3), ("right", 2.3))
+    }
+    scene = field_scene(ssl_field("B"), cameras, stations, spacing_m=0.3)
+    observations = simulate(scene, Disturbance(0.3, 0.3), seed=2).observations
+    height = Prior("station", "left", "height_m", (4.4,), (0.01,))
+    calibration = calibrate(observations, Options(lens=AUTO, priors=(height,)))
+    verdicts = [calibration.uncertainty.verdict("station", name, "height") for name in ("left", "right")]
+    assert verdicts[0].sd <= 0.01 * ROUNDING and verdicts[1].verdict != "known"
+    assert calibration.posterior is not None and list(calibration.posterior.profiles) == ["right"]
+    assert all(calibration.uncertainty.map_px(name).radius_95_px.shape for name in ("left", "right"))
