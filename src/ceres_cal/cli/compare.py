@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.words import fixed
 from ceres_cal.cli.arguments import height_option, metres, station_option
 from ceres_cal.cli.command import command
 from ceres_cal.cli.files import finishing, require_output
@@ -15,6 +17,7 @@ from ceres_cal.cli.options import Arguments, argument, option, switch
 from ceres_cal.report.document import Document, Section
 
 if TYPE_CHECKING:
+    from ceres_cal.base.arrays import Array
     from ceres_cal.calibration import Calibration
     from ceres_cal.moves import CameraComparison, StationComparison
 
@@ -77,23 +80,17 @@ def _over_field(args: CompareArguments, first: Calibration, second: Calibration)
 
 
 def _station(one: StationComparison) -> Iterator[Section]:
-    from ceres_cal.report.maps import grid_table
-
     phi = f"phi {one.phi_px[0]:.3f} -> {one.phi_px[1]:.3f} px"
     size = f"{one.mean_mm:.2f} mm on average, {one.worst_mm:.2f} mm at most"
-    yield Section(
-        "station", [one.station], {"stations": {one.station: _data(one, mean_mm=one.mean_mm, worst_mm=one.worst_mm)}}
-    )
+    data = _data(one, mean_mm=one.mean_mm, worst_mm=one.worst_mm)
+    yield Section("station", [one.station], {"stations": {one.station: data}})
     yield Section("camera", [f"moved {one.moved_mm:.2f} mm, turned {one.turned_deg:.4f} deg, {phi}"])
     yield Section("map", [f"{size}, {1e3 * one.height_m:.0f} mm above the floor", _explained(one)])
-    table = grid_table("mm at y \\ x", one.errors_mm[::-1], one.x_m, one.y_m[::-1], "{:.2f} m", _TABLE_SIZE)
-    yield Section("", table.lines(), pieces=(table,))
+    yield _table("mm at y \\ x", one.errors_mm[::-1], one.x_m, one.y_m[::-1], "{:.2f} m")
 
 
 def _camera(one: CameraComparison) -> Iterator[Section]:
     import numpy as np
-
-    from ceres_cal.report.maps import grid_table
 
     pixels, angles = one.errors_px[np.isfinite(one.errors_px)], one.angles_deg[np.isfinite(one.angles_deg)]
     turned = f", {one.turn_deg:.4f} deg of turn taken out" if one.turn_deg else ""
@@ -105,8 +102,14 @@ def _camera(one: CameraComparison) -> Iterator[Section]:
         _explained(one),
     ]
     yield Section("image", lines)
-    table = grid_table("px at y \\ x", one.errors_px, one.x_px, one.y_px, "{:.0f} px", _TABLE_SIZE)
-    yield Section("", table.lines(), pieces=(table,))
+    yield _table("px at y \\ x", one.errors_px, one.x_px, one.y_px, "{:.0f} px")
+
+
+def _table(head: str, values: Array, x: Array, y: Array, place: str) -> Section:
+    from ceres_cal.report.maps import grid_table
+
+    table = grid_table(head, values, x, y, place, _TABLE_SIZE, partial(fixed, places=2))
+    return Section("", table.lines(), pieces=(table,))
 
 
 def _data(one: StationComparison | CameraComparison, **more: float) -> dict[str, Any]:

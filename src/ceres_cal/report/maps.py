@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -166,16 +166,26 @@ def _reading(one: FieldMap) -> str:
     return f"Darker is worse: 95 % of the points located at the worst place (ring) are within {mm(radius)}"
 
 
-def grid_table(head: str, values: Array, x: Array, y: Array, place: str, most: tuple[int, int] = _TABLE_SIZE) -> Table:
-    """Some of the values (Y, X) of a map, the first row at the top; `place`: how a place on its axes is written."""
+def grid_table(
+    head: str,
+    values: Array,
+    x: Array,
+    y: Array,
+    place: str,
+    most: tuple[int, int] = _TABLE_SIZE,
+    shown: Callable[[float], str] = short,
+) -> Table:
+    """Some of the values (Y, X) of a map, the first row at the top.
+
+    Args:
+        place: how a place on its axes is written. most: columns and rows. shown: how a value is written.
+    """
     columns, rows = _evenly(len(x), most[0]), _evenly(len(y), most[1])
-    cells = values[np.ix_(rows, columns)].tolist()
+    cells = [["∞" if np.isinf(value) else shown(value) for value in values[r, columns].tolist()] for r in rows]
+    names = (place.format(y[r]) for r in rows)
     return Table(
         (head, *(place.format(x[c]) for c in columns)),
-        tuple(
-            (place.format(y[r]), *("∞" if np.isinf(value) else short(value) for value in row))
-            for r, row in zip(rows, cells, strict=True)
-        ),
+        tuple((name, *row) for name, row in zip(names, cells, strict=True)),
     )
 
 
