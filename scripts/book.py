@@ -25,7 +25,7 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     """Called by mkdocs for each page: the page of commands gets a section for each of them."""
     if page.file.src_uri != "commands.md":
         return markdown
-    from ceres_cal.cli.commands import COMMANDS
+    from ceres_cal.cli.command import COMMANDS
 
     sections = [f"## {name}\n\n```text\n{help_of(name)}\n```" for name in COMMANDS]
     return "\n\n".join([markdown.rstrip(), *sections])

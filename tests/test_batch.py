@@ -23,7 +23,7 @@ from ceres_cal.base.threads import available
 from ceres_cal.batch import Job, Outcome, read_plan, run_jobs
 from ceres_cal.batch.jobs import RESULTS, remember, remembered
 from ceres_cal.cli import main
-from ceres_cal.cli.outputs import finishing
+from ceres_cal.cli.files import finishing
 from ceres_cal.diagnostics.held_out import cross_validate
 from ceres_cal.observations import Observations
 from ceres_cal.scene.heights import ROBOT_TOP_M

@@ -12,7 +12,7 @@ from urllib.parse import unquote, urlsplit
 import pytest
 
 import ceres_cal
-from ceres_cal.cli.commands import COMMANDS
+from ceres_cal.cli.command import COMMANDS
 
 ROOT = Path(__file__).resolve().parents[1]
 

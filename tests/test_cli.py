@@ -26,11 +26,10 @@ import ceres_cal.calibrating
 from ceres_cal import cli
 from ceres_cal.base.errors import InputError
 from ceres_cal.calibration import Calibration
-from ceres_cal.cli import commands, main
+from ceres_cal.cli import main
 from ceres_cal.cli.arguments import length, parse_length
-from ceres_cal.cli.colour import coloured, in_colour
-from ceres_cal.cli.commands import COMMANDS
-from ceres_cal.cli.progress import ProgressBar
+from ceres_cal.cli.command import COMMANDS, Command
+from ceres_cal.cli.terminal import ProgressBar, coloured, in_colour
 from ceres_cal.detect.boards import CORNER_FITS
 from ceres_cal.model.parameters import LOSSES, Options
 from ceres_cal.observations import Observations
@@ -96,9 +95,7 @@ def test_help_lists_every_command(say: Say) -> None:
     assert said.code == 0 and said.err == ""
     assert all(f"  {name:14}  {command.summary}\n" in said.out for name, command in COMMANDS.items())
     modules = [import_module(f"ceres_cal.cli.{one.stem}") for one in Path(cli.__file__).parent.glob("[!_]*.py")]
-    written = [
-        command.name for module in modules for command in getattr(module, "COMMANDS", ()) if module is not commands
-    ]
+    written = [one.name for module in modules for one in vars(module).values() if isinstance(one, Command)]
     assert set(COMMANDS) == {*written} and len(written) == len(COMMANDS)
     assert set(COMMANDS) == {
         "run",

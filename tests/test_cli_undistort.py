@@ -13,7 +13,7 @@ from test_cli import Say, refused, say
 
 from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
-from ceres_cal.cli.progress import ProgressBar
+from ceres_cal.cli.terminal import ProgressBar
 from ceres_cal.model.parameters import Station
 from ceres_cal.photographs import detect_field
 

@@ -17,7 +17,7 @@ from ceres_cal.base.errors import DegenerateError, InputError
 from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
 from ceres_cal.cli import main
-from ceres_cal.cli.estimate import parse_estimates
+from ceres_cal.cli.arguments import parse_estimates
 from ceres_cal.diagnostics import diagnose
 from ceres_cal.lens_choice.forms import PAPER
 from ceres_cal.lens_choice.rule import AS_GOOD_BESIDE_LENGTHS, decide, standard_errors

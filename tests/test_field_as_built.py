@@ -14,7 +14,7 @@ from ceres_cal.base.errors import NothingShownError
 from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
 from ceres_cal.cli import main
-from ceres_cal.cli.detect_field import _data
+from ceres_cal.cli.detect_field import _sections
 from ceres_cal.detect.courses import predict
 from ceres_cal.detect.images import filled, light
 from ceres_cal.detect.lines import Lines, measure
@@ -28,6 +28,7 @@ from ceres_cal.photographs.clicks import unknown_optics
 from ceres_cal.photographs.matching import StrokeMap
 from ceres_cal.photographs.refit import observations_of
 from ceres_cal.photographs.search import search
+from ceres_cal.report.document import Document
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Radial
 from ceres_cal.scene.targets import Segment, Target, custom, ssl_field
@@ -124,7 +125,7 @@ def test_an_offset_is_no_length() -> None:
     seen = observations_of(FIELD, CAMERA.image_size, np.zeros(1, int), np.full((1, 2), 99.0), np.ones(1))
     priors = (Prior.of_offset("field", "HalfwayLine", 0.04), Prior("target", "field", "field_width_m", (5.9,), (0.1,)))
     detections = FieldDetections(replace(seen, priors=priors), {}, (), {})
-    assert _data(detections, Path("field.json"))["lengths_m"] == {"field_width_m": 5.9}
+    assert Document(tuple(_sections(detections, None, Path("field.json")))).data["lengths_m"] == {"field_width_m": 5.9}
 
 
 @pytest.mark.parametrize("share", [0.92, 0.95, 0.97])

@@ -25,13 +25,13 @@ from ceres_cal.diagnostics import diagnose
 from ceres_cal.model.quantities import camera_moved
 from ceres_cal.report import make_report, quality
 from ceres_cal.report.grounds import CARE_MM, GOOD_MM, judge_quality, level_of, worst
-from ceres_cal.report.lens_picture import ideal_radii
 from ceres_cal.report.maps import levels_of
 from ceres_cal.report.material import Material
 from ceres_cal.report.quality import quality_of
 from ceres_cal.report.residual_pictures import significant_means
 from ceres_cal.report.scale import COLORS, MM, PX
-from ceres_cal.report.verdict import verdict_chapter
+from ceres_cal.report.solve_pictures import ideal_radii
+from ceres_cal.report.summary import verdict_chapter
 from ceres_cal.scene.lens import Radial
 from ceres_cal.scene.targets import ssl_field
 from ceres_cal.simulate import Disturbance, Scene, Station, built_in_scene, field_scene, overhead_pose, simulate

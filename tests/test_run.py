@@ -11,7 +11,7 @@ import pytest
 from ceres_cal.base.errors import InputError
 from ceres_cal.calibration import Calibration
 from ceres_cal.cli import main
-from ceres_cal.cli.commands import COMMANDS
+from ceres_cal.cli.command import COMMANDS
 from ceres_cal.cli.run import _short
 from ceres_cal.detect.video import sharpest_frames
 

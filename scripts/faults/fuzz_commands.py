@@ -17,6 +17,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from ceres_cal.cli.commands import COMMANDS
 from ssl_settings_file import settings
 
 from ceres_cal.base.errors import CalibrationError
@@ -25,7 +26,6 @@ from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
 from ceres_cal.cli import main as cli
 from ceres_cal.cli.command import Parser
-from ceres_cal.cli.commands import COMMANDS
 from ceres_cal.detect.images import read_colour, read_grey
 from ceres_cal.formats import LookupTable, export, make_lookup_table, read_foreign
 from ceres_cal.model.parameters import Options

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 
 from ceres_cal.base.words import DASH, counted, mm
 from ceres_cal.batch.jobs import LEVELS, Outcome
-from ceres_cal.report.page import Card, Chapter, Piece, Table, Text, Tile, Tiles, page
+from ceres_cal.report.document import Card, Chapter, Piece, Table, Text, Tile, Tiles
+from ceres_cal.report.page import page
 
 _MOST_CARDS = 40
 _WORDS = {"failed": "failed", "no": "not to be trusted, or moved", "care": "to be used with care", "good": "good"}

@@ -2,94 +2,93 @@
 
 from __future__ import annotations
 
-from argparse import ArgumentParser, Namespace
 from collections.abc import Iterator
-from dataclasses import asdict
+from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ceres_cal.base.errors import InputError, naming
 from ceres_cal.cli.arguments import (
-    add_calibration,
-    add_height,
-    add_quiet,
-    add_station,
-    height_m,
+    calibration_argument,
+    height_option,
     length,
+    metres,
     parse_board,
+    station_option,
 )
-from ceres_cal.cli.command import Answer, Command
-from ceres_cal.cli.inputs import read_calibration, station_of
-from ceres_cal.cli.outputs import section, wrapped
-from ceres_cal.cli.progress import progress_bar
+from ceres_cal.cli.command import command
+from ceres_cal.cli.files import read_calibration, station_of
+from ceres_cal.cli.options import QuietArguments, option
+from ceres_cal.cli.terminal import progress_bar
+from ceres_cal.report.document import Document, Section, wrapped
 
 if TYPE_CHECKING:
     from ceres_cal.advice import Advice, Measurement, Promise
 
 
-def _add_arguments(parser: ArgumentParser) -> None:
-    add = parser.add_argument
-    add_calibration(parser)
-    add_height(parser, "height of what is to be located; default: 150, a robot's top", 150.0)
-    add_station(parser, "whose map; may be left out where there is only one")
-    add(
-        "--good-enough-mm",
-        type=length("mm"),
-        metavar="MM",
-        help="the worst error that will do; nothing is advised where it is reached",
+@dataclass(frozen=True, kw_only=True)
+class AdviseArguments(QuietArguments):
+    """What is to be reached, and by which means."""
+
+    calibration: Path = calibration_argument()
+    height_mm: float = height_option("height of what is to be located; default: 150, a robot's top", 150.0)
+    station: str | None = station_option("whose map; may be left out where there is only one")
+    good_enough_mm: float | None = option(
+        "the worst error that will do; nothing is advised where it is reached", "MM", read=length("mm")
     )
-    add(
-        "--board",
-        metavar="COLUMNSxROWSxMM",
-        help="the board that could be shown: inner corners and size of a square, such as 9x6x100; default: the "
+    board: tuple[int, int, float] | None = option(
+        "the board that could be shown: inner corners and size of a square, such as 9x6x100; default: the "
         "calibration's own, or that one",
+        "COLUMNSxROWSxMM",
+        read=parse_board,
     )
-    add_quiet(parser)
 
 
-def _run(args: Namespace) -> Answer:
-    height = height_m(args)
+@command(
+    "advise",
+    "what to measure next, and what it would bring in mm",
+    "calibration.json --good-enough-mm 2",
+    "calibration.json --board 9x6x50mm --height-mm 150",
+)
+def _run(args: AdviseArguments) -> Document:
     enough = args.good_enough_mm
     if enough is not None and not enough > 0.0:
         raise InputError(f"--good-enough-mm {enough:g}: give a number of millimetres above 0")
-    shown = None if args.board is None else parse_board(args.board)
     from ceres_cal.advice import advise
     from ceres_cal.scene.targets import checkerboard
 
-    calibration = read_calibration(args)
-    station = station_of(args, calibration)
+    calibration = read_calibration(args.calibration)
+    station = station_of(args.calibration, args.station, calibration)
     with naming(args.calibration), progress_bar(args) as bar:
-        board = None if shown is None else checkerboard(*shown)
-        advice = advise(calibration, station, height, enough, board, bar.update)
+        board = None if args.board is None else checkerboard(*args.board)
+        advice = advise(calibration, station, metres(args.height_mm), enough, board, bar.update)
     weak = [direction.words for direction in calibration.uncertainty.weak_directions]
-    return Answer(_data(advice, weak), lambda: _text(advice, weak))
+    return Document(tuple(_sections(advice, weak)))
 
 
-COMMANDS = (
-    Command(
-        "advise",
-        "what to measure next, and what it would bring in mm",
-        _add_arguments,
-        _run,
-        ("calibration.json --good-enough-mm 2", "calibration.json --board 9x6x50mm --height-mm 150"),
-    ),
-)
+# ---- what is said ---------------------------------------------------------------------------------------------------
 
 
-# ---- for people -----------------------------------------------------------------------------------------------------
-
-
-def _text(advice: Advice, weak: list[str]) -> str:
+def _sections(advice: Advice, weak: list[str]) -> Iterator[Section]:
     x, y = advice.worst_place_m
-    before, height = advice.before, f"{1e3 * advice.height_m:.0f} mm"
+    before, height, verdict = advice.before, f"{1e3 * advice.height_m:.0f} mm", list(_verdict(advice))
     where = f" at ({x:.1f}, {y:.1f} m)" if before.worst_mm < float("inf") else ""
     today = f"station {advice.station!r} at {height}: worst {_mm(before.worst_mm)}{where}, mean {_mm(before.mean_mm)}"
-    lines = [section("advice", wrapped(*_verdict(advice))), section("today", wrapped(today, *weak[:1]))]
-    lines += ["", f"{'worst':>9}  {'mean':>9}  would be left at {height} if you"]
+    asked = {name: getattr(advice, name) for name in ("station", "height_m", "good_enough_mm")}
+    yield Section("advice", wrapped(*verdict), {**asked, "verdict": verdict})
+    known = {**vars(before), "worst_place_m": list(advice.worst_place_m), "weak_directions": weak}
+    yield Section("today", wrapped(today, *weak[:1]), {"today": known})
+    lines = ["", f"{'worst':>9}  {'mean':>9}  would be left at {height} if you"]
     for promise in advice.promises:
         after, words = promise.after, f"{promise.measurement.words}{_range(promise)}"
         lines.append(f"{_mm(after.worst_mm):>9}  {_mm(after.mean_mm):>9}  {words}")
         lines += [f"{'':24}{step}" for step in promise.measurement.steps]
-    return "\n".join(lines)
+    data = {
+        "best": None if advice.best is None else advice.promises.index(advice.best),
+        "then": None if advice.then is None else _promise_data(advice.then),
+        "promises": [_promise_data(promise) for promise in advice.promises],
+    }
+    yield Section("", lines, data)
 
 
 def _verdict(advice: Advice) -> Iterator[str]:
@@ -127,23 +126,6 @@ def _mm(value: float) -> str:
     return f"{value:.1f} mm" if value >= 0.95 else f"{value:.2f} mm"
 
 
-# ---- for scripts ----------------------------------------------------------------------------------------------------
-
-
-def _data(advice: Advice, weak: list[str]) -> dict[str, Any]:
-    """Everything; what is infinite, and so unknown, becomes null."""
-    return {
-        "station": advice.station,
-        "height_m": advice.height_m,
-        "good_enough_mm": advice.good_enough_mm,
-        "verdict": list(_verdict(advice)),
-        "today": {**vars(advice.before), "worst_place_m": list(advice.worst_place_m), "weak_directions": weak},
-        "best": None if advice.best is None else advice.promises.index(advice.best),
-        "then": None if advice.then is None else _promise_data(advice.then),
-        "promises": [_promise_data(promise) for promise in advice.promises],
-    }
-
-
 def _promise_data(promise: Promise) -> dict[str, Any]:
     return {
         **_measurement_data(promise.measurement),
@@ -164,10 +146,10 @@ def _measurement_data(measurement: Measurement) -> dict[str, Any]:
         "steps": list(measurement.steps),
         "priors": [prior_to_json(prior) for prior in measurement.priors],
         "targets": {name: target.spec for name, target in measurement.targets.items()},
-        "tolerances": {name: asdict(tolerance) for name, tolerance in measurement.tolerances.items()},
+        "tolerances": measurement.tolerances,
         "placements": {
             name: {"rotation": pose.rotation.tolist(), "translation_m": pose.translation.tolist()}
             for name, pose in measurement.placements.items()
         },
-        "views": [asdict(plan) for plan in measurement.views],
+        "views": measurement.views,
     }

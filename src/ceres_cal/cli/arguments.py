@@ -3,90 +3,100 @@
 from __future__ import annotations
 
 import re
-from argparse import ArgumentParser, ArgumentTypeError, Namespace
-from collections.abc import Callable, Sequence
+from argparse import ArgumentTypeError
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from ceres_cal.base.errors import InputError
+from ceres_cal.cli.options import REQUIRED, QuietArguments, argument, option
 
 if TYPE_CHECKING:
     from ceres_cal.observations import Observations, Prior
+    from ceres_cal.scene.targets import Target
 
 PRIOR_EXAMPLE = "overhead.height_m=4.02:0.01"
+_ESTIMATE_EXAMPLE = "length,width"
+_PLACES = {"FILE": "file ", "DIR": "folder "}
 _IN_A_METRE = {"mm": 1000.0, "cm": 100.0, "m": 1.0}
+Loss = Literal["trivial", "huber", "soft_l1", "cauchy", "tukey"]
 _LENGTH = re.compile(r"\s*(.*?)\s*(mm|cm|m)\s*")
 
 
-def add_calibration(parser: ArgumentParser, what: str = "file that `ceres-cal calibrate` or `refit` wrote") -> None:
+def calibration_argument(what: str = "file that `ceres-cal calibrate` or `refit` wrote") -> Any:
     """The argument CALIBRATION."""
-    parser.add_argument("calibration", metavar="CALIBRATION", type=Path, help=what)
+    return argument("CALIBRATION", what)
 
 
-def add_station(parser: ArgumentParser, what: str = "which station; may be left out where there is only one") -> None:
+def station_option(what: str = "which station; may be left out where there is only one") -> Any:
     """The option --station NAME."""
-    parser.add_argument("--station", metavar="NAME", help=what)
+    return option(what, "NAME")
 
 
-def add_quiet(parser: ArgumentParser) -> None:
-    """The option --quiet."""
-    parser.add_argument("--quiet", action="store_true", help="no progress")
-
-
-def add_jobs(parser: ArgumentParser, what: str, default: int) -> None:
+def jobs_option(what: str, default: int) -> Any:
     """The option --jobs: how many processes; 0 is one a core."""
-    shown = default or "one a core"
-    parser.add_argument("--jobs", type=int, default=default, metavar="N", help=f"{what} at a time; default: {shown}")
+    return option(f"{what} at a time; default: {default or 'one a core'}", "N", default)
 
 
-def add_output(parser: ArgumentParser, what: str, *, required: bool) -> None:
-    """The option -o FILE."""
-    parser.add_argument("-o", "--output", metavar="FILE", type=Path, required=required, help=f"file for {what}")
+def output_option(what: str, default: Any = REQUIRED, metavar: str = "FILE") -> Any:
+    """The option -o FILE, or FOLDER."""
+    return option(f"{_PLACES.get(metavar, '')}for {what}", metavar, default, flags=("-o", "--output"))
 
 
-def add_report(parser: ArgumentParser) -> None:
-    """The options --report PAGE and --images."""
-    parser.add_argument(
-        "--report",
-        metavar="PAGE",
-        type=Path,
-        help="file for a page (.html): may it be trusted, for what, to how many mm",
-    )
-    parser.add_argument(
-        "--images",
-        metavar="PHOTOGRAPH",
-        action="append",
-        default=[],
-        help="with --report: a photograph, or a folder of them, named like the frames: the model is drawn into them; "
-        "repeatable",
-    )
-
-
-def add_prior(parser: ArgumentParser) -> None:
+def prior_option(metavar: str = "OWNER.NAME=VALUE:SIGMA", what: str = "", group: str = "") -> Any:
     """The option --prior of observations' cameras and stations."""
-    parser.add_argument(
-        "--prior",
-        action="append",
-        default=[],
-        metavar="OWNER.NAME=VALUE:SIGMA",
-        help="what is known beforehand: height_m or position_m of a station, phi, principal_point, aspect or a "
+    every = (
+        "what is known beforehand: height_m or position_m of a station, phi, principal_point, aspect or a "
         f"coefficient of a camera, such as {PRIOR_EXAMPLE} or phi=812:5 (the owner may be left out where there is "
-        "only one); repeatable",
+        "only one)"
+    )
+    return option(what or every, metavar, repeatable=True, group=group)
+
+
+def estimate_option(group: str = "") -> Any:
+    """The option --estimate."""
+    return option(
+        f"dimensions of the field that are not known and solved for, such as {_ESTIMATE_EXAMPLE}: one length of it, or "
+        "a height, must be known; width=5.5 says where to start, width=5.50:20mm how well it is known",
+        "NAME,...",
+        repeatable=True,
+        group=group,
     )
 
 
-def add_timeout(parser: ArgumentParser) -> None:
+def not_painted_option(what: str) -> Any:
+    """The option --not-painted of lines."""
+    return option(what, "NAME,...", "")
+
+
+def height_option(what: str, default_mm: float | None = None) -> Any:
+    """The option --height-mm."""
+    return option(what, "MM", default_mm, read=length("mm"))
+
+
+def timeout_option() -> Any:
     """The option --timeout S."""
-    parser.add_argument("--timeout", type=float, metavar="S", help="give up after so many seconds; default: never")
+    return option("give up after so many seconds; default: never", "S")
 
 
-def add_detection(parser: ArgumentParser) -> None:
-    """What `detect board` and `detect rings` share: --timeout, and of what they write --camera, --station and -o."""
-    add_timeout(parser)
-    parser.add_argument("--camera", default="camera", metavar="NAME", help="name of the camera; default: camera")
-    add_station(parser, "name of the station; default: that of the camera")
-    add_output(parser, "the observations (.json or .npz)", required=True)
+def frames_option() -> Any:
+    """The option --frames N, of videos."""
+    return option("how many photographs to take out of a video, the sharpest of as many stretches", "N", 30)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReportArguments(QuietArguments):
+    """Of a command that may write what it made, and a page."""
+
+    output: Path | None
+    report: Path | None = option("file for a page (.html): may it be trusted, for what, to how many mm", "PAGE")
+    images: tuple[str, ...] = option(
+        "with --report: a photograph, or a folder of them, named like the frames: the model is drawn into them",
+        "PHOTOGRAPH",
+        repeatable=True,
+    )
 
 
 # ---- values ---------------------------------------------------------------------------------------------------------
@@ -133,6 +143,11 @@ def length(unit: str) -> Callable[[str], float]:
     return parse
 
 
+def number(where: str) -> Callable[[str], float]:
+    """The type of an argument that is a finite number; `where`: its name."""
+    return partial(parse_number, where=where)
+
+
 def parse_board(text: str) -> tuple[int, int, float]:
     """COLUMNSxROWSxMM: inner corners, and the side of a square in metres."""
     parts = text.split("x")
@@ -146,18 +161,12 @@ def parse_names(text: str) -> list[str]:
     return [name.strip() for name in text.split(",") if name.strip()]
 
 
-def add_height(parser: ArgumentParser, what: str, default_mm: float | None = None) -> None:
-    """The option --height-mm."""
-    parser.add_argument("--height-mm", type=length("mm"), metavar="MM", default=default_mm, help=what)
-
-
-def height_m(args: Namespace) -> float:
+def metres(height_mm: float | None) -> float:
     """--height-mm in metres; 0 where it was not given."""
-    return 0.0 if args.height_mm is None else float(args.height_mm) / 1000.0
+    return 0.0 if height_mm is None else height_mm / 1000.0
 
 
-@dataclass(frozen=True)
-class PriorNames:
+class PriorNames(NamedTuple):
     """The quantities that a `--prior` may name: of a station, and of a camera."""
 
     station: Sequence[str]
@@ -198,3 +207,42 @@ def parse_prior(spec: str, observations: Observations, names: PriorNames) -> Pri
         },
         where,
     )
+
+
+def parse_estimates(specs: Sequence[str], targets: Mapping[str, Target]) -> tuple[Prior, ...]:
+    """What is known of dimensions of targets by `--estimate` arguments: [TARGET.]NAME[=VALUE[:SIGMA]],...
+
+    Raises:
+        InputError: what no target has, several have, or is given twice.
+    """
+    every = [_parsed(part, targets) for spec in specs for part in parse_names(spec)]
+    for number, prior in enumerate(every):
+        if prior.dimension in {one.dimension for one in every[:number]}:
+            raise InputError(f"--estimate: {prior.quantity} is given twice")
+    return tuple(every)
+
+
+def _parsed(text: str, targets: Mapping[str, Target]) -> Prior:
+    from ceres_cal.observations import Prior
+
+    where = f"--estimate {text!r}"
+    left, equals, right = text.partition("=")
+    value, colon, sigma = right.partition(":")
+    owner, _, word = left.strip().rpartition(".")
+    found = [(name, one) for name in targets if owner in ("", name) for one in _meant(word, targets[name].dimensions)]
+    if len(found) != 1:
+        names = [one for name in targets if owner in ("", name) for one in targets[name].dimensions]
+        said = f"may be {' or '.join(one for _, one in found)}" if found else "is no dimension"
+        raise InputError(f"{where}: {word!r} {said}: there are {', '.join(names) or 'none'}")
+    ((name, dimension),) = found
+    length = parse_length(value, where) if equals else targets[name].dimensions[dimension]
+    sd = parse_length(sigma, f"{where}: sigma") if colon else float("inf")
+    return Prior("target", name, dimension, (length,), (sd,))
+
+
+def _meant(word: str, dimensions: Mapping[str, float]) -> Iterator[str]:
+    """The dimensions that a word may mean: itself, the field's own, else all that have it in their names."""
+    asked = word.strip().lower().replace("-", "_").removesuffix("_m")
+    own = [name for name in dimensions if name.removesuffix("_m") in (asked, f"field_{asked}")]
+    parts = set(asked.split("_"))
+    yield from own or (name for name in dimensions if asked and parts <= set(name.split("_")))

@@ -2,46 +2,56 @@
 
 from __future__ import annotations
 
-from argparse import ArgumentParser, Namespace
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from ceres_cal.cli.command import Answer, Command
-from ceres_cal.cli.export import add_format_options, format_options
-from ceres_cal.cli.inputs import read_observations
-from ceres_cal.cli.outputs import section, wrapped
+from ceres_cal.cli.command import command
+from ceres_cal.cli.export import format_options, import_forms
+from ceres_cal.cli.files import read_observations
+from ceres_cal.cli.options import REQUIRED, Arguments, argument, option, options_of
+from ceres_cal.report.document import Document, Section, wrapped
 
 if TYPE_CHECKING:
     from ceres_cal.moves import StationAudit
 
 
-def _add_arguments(parser: ArgumentParser) -> None:
-    from ceres_cal.formats import IMPORT_FORMATS
+@dataclass(frozen=True, kw_only=True)
+class AuditArguments(Arguments):
+    """A calibration, and what is held against it."""
 
-    parser.add_argument("file", metavar="FILE", type=Path, help="a calibration of ours or of another program")
-    parser.add_argument(
-        "--from", dest="form", metavar="FORMAT", help=f"default: by content; {', '.join(IMPORT_FORMATS)}"
-    )
-    parser.add_argument(
-        "--observations", metavar="FILE", action="append", required=True, help="of its stations; repeatable"
-    )
-    add_format_options(parser, IMPORT_FORMATS.values())
+    file: Path = argument("FILE", "a calibration of ours or of another program")
+    form: str | None = option(lambda: f"default: by content; {', '.join(import_forms())}", "FORMAT", flags=("--from",))
+    observations: tuple[str, ...] = option("of its stations", "FILE", REQUIRED, repeatable=True)
+    options: Mapping[str, str] = options_of(lambda: import_forms().values())
 
 
-def _run(args: Namespace) -> Answer:
+@command(
+    "audit",
+    "may another program's calibration be trusted? exit code 0 yes, 1 no",
+    "opencv.yml --observations field.json",
+    "geometry.yml --observations field.json --observations more.json",
+)
+def _run(args: AuditArguments) -> Document:
     from ceres_cal.calibration import Calibration
-    from ceres_cal.formats import IMPORT_FORMATS, import_calibration
+    from ceres_cal.formats import import_calibration
     from ceres_cal.moves import audit
 
     if args.form is None and args.file.suffix == ".json" and _is_ours(args.file):
         given = Calibration.load(args.file)
     else:
-        given = import_calibration(args.file, args.form, **format_options(args, list(IMPORT_FORMATS.values())))
+        given = import_calibration(args.file, args.form, **format_options(args.options, list(import_forms().values())))
     stations = audit(given, read_observations(args.observations))
     trusted = all(one.trusted for one in stations.values())
-    data = {"trusted": trusted, "stations": {name: _data(one) for name, one in stations.items()}}
-    data["warnings"] = list(given.warnings)
-    return Answer(data, lambda: _text(stations, given.warnings), 0 if trusted else 1)
+    return Document(
+        (
+            Section("audit", ["yes" if trusted else "no"], {"trusted": trusted, "warnings": list(given.warnings)}),
+            *(_station(name, one) for name, one in stations.items()),
+            *(Section("warning", wrapped(text)) for text in given.warnings),
+        ),
+        0 if trusted else 1,
+    )
 
 
 def _is_ours(path: Path) -> bool:
@@ -50,40 +60,13 @@ def _is_ours(path: Path) -> bool:
     return b"ceres-cal/calibration" in read_bytes(path)[:4096]
 
 
-def _data(one: StationAudit) -> dict[str, Any]:
-    maps = [{"height_m": h, "rms_mm": rms, "worst_mm": worst} for h, (rms, worst) in one.off_mm.items()]
-    known = [{"height_m": h, "sd_mm": sd} for h, sd in one.known_mm.items()]
+def _station(name: str, one: StationAudit) -> Section:
     camera = one.ours.station()
-    ours = {"phi_px": camera.phi, "lens": camera.lens.kind, "rms_px": one.ours.rms_px}
-    return {
-        "trusted": one.trusted,
-        "cause": one.cause,
-        "words": one.words,
-        "off_px": one.off_px,
-        "noise_px": one.noise_px,
-        "off_mm": maps,
-        "known_mm": known,
-        "posed": one.posed,
-        "ours": ours,
-    }
-
-
-def _text(stations: dict[str, StationAudit], warnings: tuple[str, ...]) -> str:
-    parts = [section("audit", ["yes" if all(one.trusted for one in stations.values()) else "no"])]
-    for name, one in stations.items():
-        known = ", ".join(f"{sd:.2g} mm at {1e3 * h:.0f} mm" for h, sd in one.known_mm.items())
-        ours = f"ours: {one.ours.station()!r}" + (f", known to {known}" if known else "")
-        off = f"its picture is off by {one.off_px:.3f} px rms beyond the noise of {one.noise_px:.3f} px"
-        parts.append(section("station", wrapped(f"{name} {one.words}", off, ours)))
-    return "\n".join([*parts, *(section("warning", wrapped(text)) for text in warnings)])
-
-
-COMMANDS = (
-    Command(
-        "audit",
-        "may another program's calibration be trusted? exit code 0 yes, 1 no",
-        _add_arguments,
-        _run,
-        ("opencv.yml --observations field.json", "geometry.yml --observations field.json --observations more.json"),
-    ),
-)
+    known = ", ".join(f"{sd:.2g} mm at {1e3 * h:.0f} mm" for h, sd in one.known_mm.items())
+    ours = f"ours: {camera!r}" + (f", known to {known}" if known else "")
+    off = f"its picture is off by {one.off_px:.3f} px rms beyond the noise of {one.noise_px:.3f} px"
+    data = {key: getattr(one, key) for key in ("trusted", "cause", "words", "off_px", "noise_px", "posed")}
+    data["off_mm"] = [{"height_m": h, "rms_mm": rms, "worst_mm": worst} for h, (rms, worst) in one.off_mm.items()]
+    data["known_mm"] = [{"height_m": h, "sd_mm": sd} for h, sd in one.known_mm.items()]
+    data["ours"] = {"phi_px": camera.phi, "lens": camera.lens.kind, "rms_px": one.ours.rms_px}
+    return Section("station", wrapped(f"{name} {one.words}", off, ours), {"stations": {name: data}})

@@ -6,26 +6,23 @@ import glob
 import math
 import shlex
 import sys
-from argparse import ArgumentParser, Namespace
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.words import plural, printable
-from ceres_cal.cli.arguments import add_jobs, add_quiet
-from ceres_cal.cli.calibrate import COMMANDS as CALIBRATE
-from ceres_cal.cli.check import COMMANDS as CHECK
-from ceres_cal.cli.command import Answer, Command
-from ceres_cal.cli.outputs import section
-from ceres_cal.cli.refit import COMMANDS as REFIT
+from ceres_cal.cli.arguments import jobs_option, output_option
+from ceres_cal.cli.command import COMMANDS, command
+from ceres_cal.cli.options import QuietArguments, argument, option, switch
+from ceres_cal.report.document import Document, Section
 
 if TYPE_CHECKING:
     from ceres_cal.batch import Job, Outcome
 
-_COMMANDS: Mapping[str, Command] = {command.name: command for command in (*CALIBRATE, *CHECK, *REFIT)}
+_COMMANDS = ("calibrate", "check", "refit")
 _READ = ("observations", "calibration", "inputs", "images")  # arguments that name files
 _OWN = {"-o", "--output", "--report", "--json"}
 _SUMMARY = "summary.html"
@@ -33,32 +30,33 @@ _EXIT_CODES = {"failed": 3, "no": 1}
 _MOST_REASONS = 4
 
 
-def _add_arguments(parser: ArgumentParser) -> None:
-    add = parser.add_argument
-    add(
-        "plan",
-        type=Path,
-        metavar="PLAN",
-        help="a table (.jsonl, .csv, .toml) with name, command (calibrate, check or refit) and arguments of each job, "
+@dataclass(frozen=True, kw_only=True)
+class BatchArguments(QuietArguments):
+    """The jobs, and where their results go."""
+
+    plan: Path = argument(
+        "PLAN",
+        "a table (.jsonl, .csv, .toml) with name, command (calibrate, check or refit) and arguments of each job, "
         "files named from its folder; or a folder: each file of observations in it is calibrated, those of a folder "
         "inside it together",
     )
-    add(
-        "-o",
-        "--output",
-        type=Path,
-        required=True,
-        metavar="DIR",
-        help=f"folder for results.jsonl, what jobs write, and {_SUMMARY}; made if missing. Jobs with a result there, "
+    output: Path = output_option(
+        f"results.jsonl, what jobs write, and {_SUMMARY}; made if missing. Jobs with a result there, "
         "and unchanged inputs, are not done again",
+        metavar="DIR",
     )
-    add("--options", default="", metavar="'...'", help="arguments that every calibrate job gets besides")
-    add_jobs(parser, "jobs", 0)
-    add("--reports", action="store_true", help="a report of each calibrate and refit, too")
-    add_quiet(parser)
+    options: str = option("arguments that every calibrate job gets besides", "'...'", "")
+    jobs: int = jobs_option("jobs", 0)
+    reports: bool = switch("a report of each calibrate and refit, too")
 
 
-def _run(args: Namespace) -> Answer:
+@command(
+    "batch",
+    "many calibrations, checks and refits, resumable, with one page that ranks them",
+    "plan.toml -o results/ --jobs 4",
+    "rooms/ -o results/ --options '--lens auto --prior height_m=4.02:20mm' --reports",
+)
+def _run(args: BatchArguments) -> Document:
     from ceres_cal.base.executing import processes
     from ceres_cal.base.files import make_folder, write_bytes
     from ceres_cal.batch import run_jobs
@@ -77,21 +75,7 @@ def _run(args: Namespace) -> Answer:
     title = printable(args.plan.resolve().name)
     write_bytes(args.output / _SUMMARY, summary_page(title, outcomes, pages).encode())
     worst = min(outcomes, key=lambda one: one.order).level
-    return Answer(_data(args, outcomes, again), lambda: _text(args, outcomes, again), _EXIT_CODES.get(worst, 0))
-
-
-COMMANDS = (
-    Command(
-        "batch",
-        "many calibrations, checks and refits, resumable, with one page that ranks them",
-        _add_arguments,
-        _run,
-        (
-            "plan.toml -o results/ --jobs 4",
-            "rooms/ -o results/ --options '--lens auto --prior height_m=4.02:20mm' --reports",
-        ),
-    ),
-)
+    return Document(_sections(args, outcomes, again), _EXIT_CODES.get(worst, 0))
 
 
 # ---- jobs -----------------------------------------------------------------------------------------------------------
@@ -131,20 +115,20 @@ def _job(name: str, command: str, arguments: Sequence[str], base: Path, to: Path
     if not _OWN.isdisjoint(argument.partition("=")[0] for argument in arguments):
         raise InputError(f"leave out {', '.join(sorted(_OWN))}: what jobs write goes into the folder of the batch")
     outputs = () if command == "check" else (to / f"{name}.json", *([to / f"{name}.html"] if reports else []))
-    parsed = _COMMANDS[command].parse([*arguments, *_written(outputs)])
+    parsed = COMMANDS[command].parse([*arguments, *_written(outputs)])
     named = [str(one) for what in _READ for one in _every(getattr(parsed, what, None))]
     placed = tuple(str(base / one) if one in named else one for one in arguments)
     return Job(name, command, placed, tuple(file for one in named for file in _files(base / one)), outputs)
 
 
 def _every(value: Any) -> list[Any]:
-    return [] if value is None else list(value) if isinstance(value, list) else [value]
+    return [] if value is None else list(value) if isinstance(value, tuple) else [value]
 
 
 def _written(outputs: Sequence[Path]) -> Iterator[str]:
     """The options for what a job writes: a calibration and, where there is one, a report."""
-    for option, file in zip(("-o", "--report"), outputs, strict=False):
-        yield from (option, str(file))
+    for name, file in zip(("-o", "--report"), outputs, strict=False):
+        yield from (name, str(file))
 
 
 def _files(path: Path) -> list[Path]:
@@ -158,7 +142,7 @@ def work(job: Job) -> Outcome:
     Raises:
         CalibrationError: as the command has it.
     """
-    command = _COMMANDS[job.command]
+    command = COMMANDS[job.command]
     data = command.run(command.parse([*job.arguments, *_written(job.outputs), "--quiet"])).data
     return _of_check(job, data) if job.command == "check" else _of_calibration(job, data)
 
@@ -196,16 +180,14 @@ def _line(outcome: Outcome, number: int, total: int, is_old: bool) -> str:
     return f"{outcome.level:10}{number:{width}} of {total}  {outcome.job}: {outcome.line}{before}"
 
 
-def _data(args: Namespace, outcomes: Sequence[Outcome], again: int) -> dict[str, Any]:
-    ranked = sorted(outcomes, key=lambda one: one.order)
-    return {"jobs": [asdict(one) for one in ranked], "from_before": again, "output": str(args.output / _SUMMARY)}
-
-
-def _text(args: Namespace, outcomes: Sequence[Outcome], again: int) -> str:
+def _sections(args: BatchArguments, outcomes: Sequence[Outcome], again: int) -> tuple[Section, ...]:
     count = Counter(one.level for one in outcomes)
     levels = ", ".join(f"{count[level]} {level}" for level in ("good", "care", "no", "failed") if count[level])
     before = f"; {again} from before" if again else ""
-    return "\n".join(
-        [section("jobs", [f"{plural(len(outcomes), 'job')}: {levels}{before}"]),
-         section("written", [str(args.output / _SUMMARY)])]
-    )  # fmt: skip
+    ranked = sorted(outcomes, key=lambda one: one.order)
+    said = f"{plural(len(outcomes), 'job')}: {levels}{before}"
+    page = str(args.output / _SUMMARY)
+    return (
+        Section("jobs", [said], {"jobs": ranked, "from_before": again}),
+        Section("written", [page], {"output": page}),
+    )

@@ -2,28 +2,40 @@
 
 from __future__ import annotations
 
-from argparse import ArgumentParser, ArgumentTypeError, Namespace
-from collections.abc import Callable, Mapping
+from argparse import ArgumentTypeError
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.cli.arguments import (
+    Loss,
     PriorNames,
-    add_output,
-    add_prior,
-    add_quiet,
-    add_report,
+    ReportArguments,
+    estimate_option,
+    output_option,
+    parse_estimates,
     parse_length,
     parse_names,
     parse_number,
     parse_prior,
+    prior_option,
 )
-from ceres_cal.cli.command import Answer, Command
-from ceres_cal.cli.estimate import add_estimate, parse_estimates
-from ceres_cal.cli.inputs import read_observations, require_different
-from ceres_cal.cli.outputs import report_page, report_photographs, require_outputs, write_results
-from ceres_cal.cli.progress import ProgressBar, progress_bar
+from ceres_cal.cli.command import command
+from ceres_cal.cli.files import (
+    read_observations,
+    report_page,
+    report_photographs,
+    require_different,
+    require_outputs,
+    write_results,
+    written,
+)
+from ceres_cal.cli.options import argument, option, switch
+from ceres_cal.cli.terminal import ProgressBar, progress_bar
+from ceres_cal.report.document import Document
 
 if TYPE_CHECKING:
     from ceres_cal.model.parameters import Options
@@ -34,10 +46,7 @@ if TYPE_CHECKING:
 
 _AUTO = "auto"
 _PATIENCE_S = 5.0  # with a scheduler
-_TERMS = (
-    "rational (OpenCV's k4 to k6) and prism (its s1 to s4) of brown, tangential (p1, p2) of kannala-brandt, "
-    "surface (nodes over the picture) of spline"
-)
+_CAMERA, _SOLVE = "the camera", "the solve"
 
 
 def _lens_kind(name: str) -> str:
@@ -50,99 +59,92 @@ def _lens_kind(name: str) -> str:
     return name
 
 
-def _add_arguments(parser: ArgumentParser) -> None:
-    parser.add_argument(
-        "observations",
-        nargs="+",
-        metavar="OBS",
-        help="files of observations (.json or .npz, or one folder .columns), taken together",
+@dataclass(frozen=True, kw_only=True)
+class CalibrateArguments(ReportArguments):
+    """What is to be solved for and how; what is named as in `Options` goes there as it is."""
+
+    observations: tuple[str, ...] = argument(
+        "OBS", "files of observations (.json or .npz, or one folder .columns), taken together"
     )
-    add_output(parser, "the calibration", required=False)
-    add_report(parser)
-    _add_camera(parser)
-    _add_solve(parser)
-    add_quiet(parser)
-
-
-def _add_camera(parser: ArgumentParser) -> None:
-    add = parser.add_argument_group("the camera").add_argument
-    kinds = (
+    output: Path | None = output_option("the calibration", None)
+    lens: str | None = option(
         "radial (the paper's), brown (OpenCV's), kannala-brandt (its fisheye), spline (no formula), ...: `--lens ?` "
-        "names all; default: auto, the simplest of all with a formula that predicts views as well as any other"
+        "names all; default: auto, the simplest of all with a formula that predicts views as well as any other",
+        "KIND",
+        read=_lens_kind,
+        group=_CAMERA,
     )
-    add("--lens", type=_lens_kind, metavar="KIND", help=kinds)
-    add(
-        "--powers",
-        metavar="2,3",
-        help="of a lens that leaves the choice; of one that is named default: 2,3, the paper's, of "
+    powers: str | None = option(
+        "of a lens that leaves the choice; of one that is named default: 2,3, the paper's, of "
         "spline then more as the residuals ask for",
+        "2,3",
+        group=_CAMERA,
     )
-    add("--terms", metavar="NAME,...", default="", help="terms that a lens may have besides: " + _TERMS)
-    add(
-        "--fix",
-        action="append",
-        default=[],
-        metavar="NAME=VALUE",
-        help="hold phi, aspect, cx, cy, skew or a coefficient, such as k3=0; repeatable",
+    terms: str = option(
+        "terms that a lens may have besides: rational (OpenCV's k4 to k6) and prism (its s1 to s4) of brown, "
+        "tangential (p1, p2) of kannala-brandt, surface (nodes over the picture) of spline",
+        "NAME,...",
+        "",
+        group=_CAMERA,
     )
-    add("--free-aspect", action="store_true", help="let fy / fx differ from 1")
-    add("--free-skew", action="store_true", help="let the pixels' columns lean against their rows")
-    add("--no-usual-camera", action="store_true", help="nothing is taken for usual of the principal point")
-    add("--hold-principal-point", action="store_true", help="hold it at the image's centre")
-    add(
-        "--tolerance",
-        metavar="SPEC",
-        action="append",
-        default=[],
-        help="solve for a target as built: field.lines_m=0.01, field.points_m=0.005 or board.warp_m=0.002 "
-        "(a sigma in metres, or such as 10mm; repeatable)",
+    fix: tuple[str, ...] = option(
+        "hold phi, aspect, cx, cy, skew or a coefficient, such as k3=0", "NAME=VALUE", repeatable=True, group=_CAMERA
     )
-    add(
-        "--as-built",
-        action="store_true",
-        help="solve for corners, bows and lines whose residuals repeat over the views, with a sigma from the data; "
+    free_aspect: bool = switch("let fy / fx differ from 1", group=_CAMERA)
+    free_skew: bool = switch("let the pixels' columns lean against their rows", group=_CAMERA)
+    usual_camera: bool = switch(
+        "nothing is taken for usual of the principal point", default=True, flags=("--no-usual-camera",), group=_CAMERA
+    )
+    free_principal_point: bool = switch(
+        "hold it at the image's centre", default=True, flags=("--hold-principal-point",), group=_CAMERA
+    )
+    tolerance: tuple[str, ...] = option(
+        "solve for a target as built: field.lines_m=0.01, field.points_m=0.005 or board.warp_m=0.002 "
+        "(a sigma in metres, or such as 10mm)",
+        "SPEC",
+        repeatable=True,
+        group=_CAMERA,
+    )
+    as_built: bool = switch(
+        "solve for corners, bows and lines whose residuals repeat over the views, with a sigma from the data; "
         "else targets without a tolerance are taken as drawn",
+        group=_CAMERA,
     )
-    add_prior(parser)
-    add_estimate(parser)
-
-
-def _add_solve(parser: ArgumentParser) -> None:
-    add = parser.add_argument_group("the solve").add_argument
-    add("--loss", choices=("trivial", "huber", "soft_l1", "cauchy", "tukey"), default="huber", help="default: huber")
-    add("--loss-scale", type=float, default=2.5, metavar="SIGMA", help="where the loss starts to bend; default: 2.5")
-    add(
-        "--reject-sigma",
-        type=float,
-        default=5.0,
-        metavar="SIGMA",
-        help="observations farther off are taken out and listed; default: 5",
-    )
-    add(
-        "--noise-scale",
-        choices=("estimate", "stated"),
+    prior: tuple[str, ...] = prior_option(group=_CAMERA)
+    estimate: tuple[str, ...] = estimate_option(group=_CAMERA)
+    loss: Loss = option(default="huber", group=_SOLVE)
+    loss_scale: float = option("where the loss starts to bend", "SIGMA", 2.5, group=_SOLVE)
+    reject_sigma: float = option("observations farther off are taken out and listed", "SIGMA", 5.0, group=_SOLVE)
+    noise_scale: Literal["estimate", "stated"] = option(
+        "estimate the noise of points and of curves from their residuals (default), or keep the stated sigmas",
         default="estimate",
-        help="estimate the noise of points and of curves from their residuals (default), or keep the stated sigmas",
+        group=_SOLVE,
     )
-    add(
-        "--closed-form-only",
-        action="store_true",
-        help="stop at the paper's own method: a baseline to compare with, not a calibration",
+    closed_form_only: bool = switch(
+        "stop at the paper's own method: a baseline to compare with, not a calibration", group=_SOLVE
     )
-    add("--max-iterations", type=int, default=100, metavar="N", help="of each solve; default: 100")
-    add("--threads", type=int, default=0, metavar="N", help="default: the solver chooses")
-    add("--scheduler", metavar="ADDRESS", help="of Dask, whose workers keep the observations, such as tcp://host:8786")
+    max_iterations: int = option("of each solve", "N", 100, group=_SOLVE)
+    threads: int = option("default: the solver chooses", "N", 0, group=_SOLVE)
+    scheduler: str | None = option(
+        "of Dask, whose workers keep the observations, such as tcp://host:8786", "ADDRESS", group=_SOLVE
+    )
 
 
-def _run(args: Namespace) -> Answer:
+@command(
+    "calibrate",
+    "calibrate cameras from observations of fields and boards",
+    "field.json board.json -o calibration.json --report report.html",
+    "field.json --lens auto --prior height_m=4.02:10mm -o calibration.json",
+    "field.json --powers 3 --tolerance field.lines_m=10mm -o calibration.json",
+    "field.json --estimate length,width=5.50:20mm -o calibration.json",
+)
+def _run(args: CalibrateArguments) -> Document:
     require_outputs(args, args.observations)
     require_different(args.observations)
-    fixed, powers = _fixed(args.fix), _powers(args)
-    from ceres_cal.cli.summary import calibration_data, calibration_text
-
+    fixed, powers = _fixed(args.fix), _powers(args)  # wrong usage is said before anything is read
     observations = read_observations(args.observations)
     photographs = report_photographs(args, observations)
-    options = _options(args, fixed, powers, observations)
+    options = _options(args, observations, fixed=fixed, powers=powers)
     with progress_bar(args) as bar, _client(args.scheduler) as client:
         from ceres_cal.calibrating import calibrate
         from ceres_cal.report.quality import quality_of
@@ -152,9 +154,9 @@ def _run(args: Namespace) -> Answer:
     page = report_page(args, calibration, observations, photographs)
     quality = quality_of(calibration, observations)
     write_results(args, calibration.save, page)
-    return Answer(
-        calibration_data(quality, args.observations, args), lambda: calibration_text(quality, args.observations, args)
-    )
+    from ceres_cal.report.summary import calibration_sections
+
+    return Document((*calibration_sections(quality, args.observations), written(args)))
 
 
 def _client(address: str | None) -> AbstractContextManager[Any]:
@@ -170,22 +172,6 @@ def _client(address: str | None) -> AbstractContextManager[Any]:
     except (OSError, ValueError) as error:
         raise InputError(f"--scheduler {address}: no scheduler answers there ({str(error).splitlines()[0]})") from None
     return client
-
-
-COMMANDS = (
-    Command(
-        "calibrate",
-        "calibrate cameras from observations of fields and boards",
-        _add_arguments,
-        _run,
-        (
-            "field.json board.json -o calibration.json --report report.html",
-            "field.json --lens auto --prior height_m=4.02:10mm -o calibration.json",
-            "field.json --powers 3 --tolerance field.lines_m=10mm -o calibration.json",
-            "field.json --estimate length,width=5.50:20mm -o calibration.json",
-        ),
-    ),
-)
 
 
 def _solve_progress(bar: ProgressBar) -> Callable[[Progress], None]:
@@ -204,7 +190,7 @@ def _solve_progress(bar: ProgressBar) -> Callable[[Progress], None]:
 # ---- options as they are typed --------------------------------------------------------------------------------------
 
 
-def _powers(args: Namespace) -> tuple[int, ...]:
+def _powers(args: CalibrateArguments) -> tuple[int, ...]:
     if args.powers is None:
         return ()
     from ceres_cal.scene.lens import LENSES
@@ -218,7 +204,7 @@ def _powers(args: Namespace) -> tuple[int, ...]:
         raise InputError(f"--powers {args.powers!r}: give whole numbers between commas, such as 2,3") from None
 
 
-def _fixed(specs: list[str]) -> dict[str, float]:
+def _fixed(specs: Sequence[str]) -> dict[str, float]:
     fixed: dict[str, float] = {}
     for spec in specs:
         name, equals, value = spec.partition("=")
@@ -230,44 +216,27 @@ def _fixed(specs: list[str]) -> dict[str, float]:
     return fixed
 
 
-def _options(
-    args: Namespace, fixed: Mapping[str, float], powers: tuple[int, ...], observations: Observations
-) -> Options:
+def _options(args: CalibrateArguments, observations: Observations, **parsed: Any) -> Options:
+    """The options; `parsed`: powers and what is fixed."""
     from ceres_cal.model.dimensions import dimensions_of
     from ceres_cal.model.parameters import Options
 
-    lens = args.lens or _AUTO  # which powers make radial
-    terms = tuple(parse_names(args.terms))
-    options = Options(lens=lens, powers=powers, terms=terms, fixed=fixed)
+    parsed |= {"lens": args.lens or _AUTO, "terms": tuple(parse_names(args.terms))}  # powers alone make radial
     lengths, drawn = parse_estimates(args.estimate, observations.targets), dimensions_of(observations.targets)
-    names = PriorNames(("height_m", "position_m"), (*options.intrinsic_names, "principal_point"))
-    return Options(
-        lens=lens,
-        powers=powers,
-        free_principal_point=not args.hold_principal_point,
-        free_aspect=args.free_aspect,
-        free_skew=args.free_skew,
-        terms=terms,
-        usual_camera=not args.no_usual_camera,
-        fixed=fixed,
-        priors=(
-            *(parse_prior(spec, observations, names) for spec in args.prior),
-            *(one for one in lengths if not one.is_open or one.value[0] != drawn[one.dimension]),
-        ),
-        dimensions=tuple(prior.dimension for prior in lengths),
-        tolerances=_tolerances(args.tolerance),
-        as_built="estimate" if args.as_built else "as drawn",
-        loss=args.loss,
-        loss_scale=args.loss_scale,
-        reject_sigma=args.reject_sigma,
-        noise_scale=args.noise_scale,
-        closed_form_only=args.closed_form_only,
-        max_iterations=args.max_iterations,
-        threads=args.threads,
-    )
+    names = PriorNames(("height_m", "position_m"), (*Options(**parsed).intrinsic_names, "principal_point"))
+    priors = [parse_prior(spec, observations, names) for spec in args.prior]
+    priors += [one for one in lengths if not one.is_open or one.value[0] != drawn[one.dimension]]
+    parsed |= {
+        "priors": tuple(priors),
+        "dimensions": tuple(prior.dimension for prior in lengths),
+        "tolerances": _tolerances(args.tolerance),
+        "as_built": "estimate" if args.as_built else "as drawn",
+    }
+    same = {one.name for one in fields(Options)} & vars(args).keys() - parsed.keys()
+    return Options(**{name: getattr(args, name) for name in same}, **parsed)
 
 
-def _tolerances(specs: list[str]) -> dict[str, Tolerance]:
+def _tolerances(specs: Sequence[str]) -> dict[str, Tolerance]:
     """The tolerances of `--tolerance` arguments: TARGET.lines_m|points_m|warp_m=SIGMA."""
     from ceres_cal.model.structure import Tolerance
 

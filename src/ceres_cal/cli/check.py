@@ -3,80 +3,23 @@
 from __future__ import annotations
 
 import math
-from argparse import ArgumentParser, Namespace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.cli.arguments import parse_names, parse_number
-from ceres_cal.cli.command import Answer, Command
-from ceres_cal.cli.inputs import read_calibration, read_observations
-from ceres_cal.cli.outputs import section
-from ceres_cal.cli.photographs import add_inputs, photographs_data, photographs_in, photographs_text
-from ceres_cal.cli.progress import progress_bar
+from ceres_cal.cli.command import command
+from ceres_cal.cli.files import read_calibration, read_observations
+from ceres_cal.cli.options import option
+from ceres_cal.cli.photographs import InputArguments, photographs_in, shown
+from ceres_cal.cli.terminal import progress_bar
+from ceres_cal.report.document import Document, Section
 from ceres_cal.scene.heights import at_height
 
 if TYPE_CHECKING:
     from ceres_cal.moves import Check, StationCheck
     from ceres_cal.photographs import KnownDetections
-
-
-def _add_arguments(parser: ArgumentParser) -> None:
-    add_inputs(parser)
-    parser.add_argument(
-        "--false-alarms",
-        default="0.01",
-        metavar="SHARE",
-        help="how often unmoved cameras may be said to have moved, such as 0.01 or 1%%; default: 0.01",
-    )
-    parser.add_argument(
-        "--checks",
-        type=int,
-        default=1,
-        metavar="N",
-        help="that is at least once in N checks of this calibration: 720 for an hourly check over a month; default: 1",
-    )
-
-
-def _run(args: Namespace) -> Answer:
-    level = _share(args.false_alarms)
-    images = photographs_in(args)
-    detections = None
-    if images:
-        answer, detections = _photographed(args, images, level)
-    else:
-        from ceres_cal.moves import check
-
-        answer = check(read_calibration(args), read_observations(args.inputs), level, args.checks)
-    data = _data(answer) | photographs_data(detections)
-    return Answer(data, lambda: _text(answer, detections), 0 if answer.holds else 1)
-
-
-def _photographed(args: Namespace, images: list[Path], level: float) -> tuple[Check, KnownDetections]:
-    from ceres_cal.photographs import check_photographs
-
-    calibration, not_painted = read_calibration(args), parse_names(args.not_painted)
-    with progress_bar(args) as bar:
-        return check_photographs(
-            calibration,
-            images,
-            args.station,
-            level,
-            checks=args.checks,
-            not_painted=not_painted,
-            progress=bar.update,
-        )
-
-
-COMMANDS = (
-    Command(
-        "check",
-        "does a calibration still hold? exit code 0 yes, 1 no",
-        _add_arguments,
-        _run,
-        ("calibration.json now.png", "calibration.json incoming/ --checks 720 --json"),
-    ),
-)
 
 
 def _share(text: str) -> float:
@@ -87,35 +30,69 @@ def _share(text: str) -> float:
     return value
 
 
-def _data(answer: Check) -> dict[str, Any]:
-    stations = {name: _station_data(one) for name, one in answer.stations.items()}
-    stated = {"false_alarms": answer.false_alarms, "checks": answer.checks}
-    return {"holds": answer.holds, **stated, "stations": stations}
+@dataclass(frozen=True, kw_only=True)
+class CheckArguments(InputArguments):
+    """What is held against a calibration, and how sure the answer is to be."""
+
+    false_alarms: float = option(
+        "how often unmoved cameras may be said to have moved, such as 0.01 or 1%", "SHARE", 0.01, read=_share
+    )
+    checks: int = option(
+        "that is at least once in N checks of this calibration: 720 for an hourly check over a month", "N", 1
+    )
 
 
-def _station_data(one: StationCheck) -> dict[str, Any]:
-    maps = [{"height_m": h, "mean_mm": mean, "worst_mm": worst} for h, (mean, worst) in one.shift_mm.items()]
-    return {**vars(one), "shift_mm": maps}
+@command(
+    "check",
+    "does a calibration still hold? exit code 0 yes, 1 no",
+    "calibration.json now.png",
+    "calibration.json incoming/ --checks 720 --json",
+)
+def _run(args: CheckArguments) -> Document:
+    images = photographs_in(args)
+    detections = None
+    if images:
+        answer, detections = _photographed(args, images)
+    else:
+        from ceres_cal.moves import check
 
-
-def _text(answer: Check, detections: KnownDetections | None) -> str:
+        answer = check(
+            read_calibration(args.calibration), read_observations(args.inputs), args.false_alarms, args.checks
+        )
     often = "" if answer.checks == 1 else f", any in {answer.checks} checks"
     holds = f"{'yes' if answer.holds else 'no'} ({100.0 * answer.false_alarms:g} % false alarms{often})"
-    stations = (section("station", _station_lines(one)) for one in answer.stations.values())
-    return "\n".join([section("check", [holds]), *photographs_text(detections), *stations])
+    stated = {name: getattr(answer, name) for name in ("holds", "false_alarms", "checks")}
+    stations = map(_station, answer.stations.values())
+    return Document((Section("check", [holds], stated), shown(detections), *stations), 0 if answer.holds else 1)
 
 
-def _station_lines(one: StationCheck) -> list[str]:
-    first = f"{one.station} {one.words}"
-    if not math.isfinite(one.statistic) and not one.degrees:
-        return [first]
-    size = f"picture {one.shift_px:.3g} px rms, phi {100.0 * one.phi_change:+.3f} %"
-    return [
-        first,
-        f"{one.used} observations, {one.outliers} outliers, noise {one.noise:.2f} times as before",
-        f"moved {one.moved_mm:.3g} mm, turned {one.turned_deg:.3g} deg, {size}",
-        *(
+def _photographed(args: CheckArguments, images: list[Path]) -> tuple[Check, KnownDetections]:
+    from ceres_cal.photographs import check_photographs
+
+    calibration, not_painted = read_calibration(args.calibration), parse_names(args.not_painted)
+    with progress_bar(args) as bar:
+        return check_photographs(
+            calibration,
+            images,
+            args.station,
+            args.false_alarms,
+            checks=args.checks,
+            not_painted=not_painted,
+            progress=bar.update,
+        )
+
+
+def _station(one: StationCheck) -> Section:
+    lines = [f"{one.station} {one.words}"]
+    if math.isfinite(one.statistic) or one.degrees:
+        size = f"picture {one.shift_px:.3g} px rms, phi {100.0 * one.phi_change:+.3f} %"
+        lines += [
+            f"{one.used} observations, {one.outliers} outliers, noise {one.noise:.2f} times as before",
+            f"moved {one.moved_mm:.3g} mm, turned {one.turned_deg:.3g} deg, {size}",
+        ]
+        lines += [
             f"map {at_height(height_m)}: {mean:.3g} mm on average, {worst:.3g} mm at most"
             for height_m, (mean, worst) in one.shift_mm.items()
-        ),
-    ]
+        ]
+    maps = [{"height_m": h, "mean_mm": mean, "worst_mm": worst} for h, (mean, worst) in one.shift_mm.items()]
+    return Section("station", lines, {"stations": {one.station: {**vars(one), "shift_mm": maps}}})

@@ -1,17 +1,20 @@
-"""What every command has: a name, arguments, and an answer for people or for scripts."""
+"""What every command has: a name, arguments, and a document that it answers, for people or for scripts."""
 
 from __future__ import annotations
 
 import argparse
 import re
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NoReturn
+from importlib import import_module
+from typing import Any, NoReturn, get_type_hints
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.words import printable, sentence
-from ceres_cal.cli.colour import coloured, in_colour
+from ceres_cal.cli.options import Arguments, add_options, filled
+from ceres_cal.cli.terminal import coloured, in_colour
+from ceres_cal.report.document import Document
 
 
 class Parser(argparse.ArgumentParser):
@@ -26,43 +29,32 @@ class Parser(argparse.ArgumentParser):
 
 
 @dataclass(frozen=True)
-class Answer:
-    """What a command found.
-
-    Attributes:
-        data: everything, for --json; numbers at full precision, null for what is infinite or not a number.
-        text: makes the text for people.
-        exit_code: 0, or 1 where the answer is no.
-    """
-
-    data: Mapping[str, Any]
-    text: Callable[[], str]
-    exit_code: int = 0
-
-
-@dataclass(frozen=True)
 class Command:
     """One command.
 
     Attributes:
         name: as it is typed, such as "detect board".
         summary: one line for the help.
-        add_arguments: adds the command's own; --json comes from here.
-        run: does the work; raises CalibrationError.
+        run: does the work; raises CalibrationError. Its argument `args` is annotated with the dataclass that it takes.
         examples: of its use, without "ceres-cal" and the name, for the help.
     """
 
     name: str
     summary: str
-    add_arguments: Callable[[argparse.ArgumentParser], None]
-    run: Callable[[argparse.Namespace], Answer]
+    run: Callable[[Any], Document]
     examples: tuple[str, ...] = ()
 
-    def parse(self, arguments: Sequence[str]) -> argparse.Namespace:
-        """The command's options; InputError for wrong usage. Positional arguments may stand between options."""
+    @property
+    def arguments(self) -> type[Arguments]:
+        """The dataclass that it takes."""
+        kind: type[Arguments] = get_type_hints(self.run)["args"]
+        return kind
+
+    def parse(self, arguments: Sequence[str]) -> Any:
+        """What is typed, as `arguments`; InputError for wrong usage. Positional ones may stand between options."""
         parser = Parser(**self.about, prog=f"ceres-cal {self.name}")
         self.fill(parser)
-        return parser.parse_intermixed_args(arguments)
+        return filled(self.arguments, parser.parse_intermixed_args(arguments))
 
     @property
     def about(self) -> dict[str, Any]:
@@ -76,9 +68,13 @@ class Command:
 
     def fill(self, parser: argparse.ArgumentParser) -> None:
         """Add all of its arguments to a parser."""
-        self.add_arguments(parser)
-        parser.add_argument("--json", action="store_true", help="print one JSON object")
+        add_options(parser, self.arguments)
         parser.add_argument("--version", action="store_true", help="print the version, and those of the libraries")
+
+
+def command(name: str, summary: str, *examples: str) -> Callable[[Callable[[Any], Document]], Command]:
+    """Makes a command of the function that does its work."""
+    return lambda run: Command(name, summary, run, examples)
 
 
 def _all_printable(data: Any) -> Any:
@@ -89,7 +85,7 @@ def _all_printable(data: Any) -> Any:
     return printable(data) if isinstance(data, str) else data
 
 
-def print_answer(answer: Answer, *, as_json: bool) -> None:
+def print_answer(answer: Document, *, as_json: bool) -> None:
     """Print an answer."""
     if as_json:
         import msgspec
@@ -102,4 +98,60 @@ def print_answer(answer: Answer, *, as_json: bool) -> None:
             encoded = msgspec.json.encode(_all_printable(plain))
         print(msgspec.json.format(encoded, indent=1).decode())
     else:
-        print(coloured(answer.text()) if in_colour(sys.stdout) else answer.text())
+        text = answer.text()
+        print(coloured(text) if in_colour(sys.stdout) else text)
+
+
+# ---- the table ------------------------------------------------------------------------------------------------------
+
+
+_MODULES = {
+    "run": "run",
+    "detect board": "detect",
+    "detect rings": "detect_rings",
+    "detect field": "detect_field",
+    "join": "join",
+    "calibrate": "calibrate",
+    "diagnose": "diagnose",
+    "advise": "advise",
+    "refit": "refit",
+    "check": "check",
+    "score": "score",
+    "compare": "compare",
+    "audit": "audit",
+    "batch": "batch",
+    "locate": "locate",
+    "project": "locate",
+    "undistort": "undistort",
+    "export": "export",
+    "export-table": "export",
+    "import": "foreign",
+    "publish": "foreign",
+    "listen": "foreign",
+    "targets import": "foreign",
+    "simulate": "simulate",
+    "targets": "targets",
+    "targets print": "targets",
+    "completion": "completion",
+}
+
+
+class _Commands(Mapping[str, Command]):
+    """Each command's module is imported when it is asked for: a start with all of them takes longer."""
+
+    def __getitem__(self, name: str) -> Command:
+        module = import_module(f"ceres_cal.cli.{_MODULES[name]}")
+        return next(one for one in vars(module).values() if isinstance(one, Command) and one.name == name)
+
+    def __contains__(self, name: object) -> bool:
+        return name in _MODULES
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(_MODULES)
+
+    def __len__(self) -> int:
+        return len(_MODULES)
+
+
+COMMANDS: Mapping[str, Command] = _Commands()
+"""Every command by its name."""

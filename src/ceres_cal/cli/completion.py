@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import argparse
-from argparse import ArgumentParser, Namespace
+from argparse import ArgumentParser
 from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
 
 from ceres_cal.base.errors import InputError
-from ceres_cal.cli.command import Answer, Command, Parser
+from ceres_cal.cli.command import COMMANDS, Command, Parser, command
+from ceres_cal.cli.options import Arguments, argument
+from ceres_cal.report.document import Document, Section
 
-_SHELLS = ("bash", "zsh", "tcsh")
 _FILE = {"bash": "_shtab_compgen_files", "zsh": "_files", "tcsh": "f"}
 _EXAMPLES = (
     "bash > ~/.local/share/bash-completion/completions/ceres-cal",
@@ -17,19 +20,21 @@ _EXAMPLES = (
 )
 
 
-def _add_arguments(parser: ArgumentParser) -> None:
-    parser.add_argument("shell", choices=_SHELLS, help="whose; what is printed goes into a file that it reads")
+@dataclass(frozen=True, kw_only=True)
+class CompletionArguments(Arguments):
+    """Whose."""
+
+    shell: Literal["bash", "zsh", "tcsh"] = argument("SHELL", "whose; what is printed goes into a file that it reads")
 
 
-def _run(args: Namespace) -> Answer:
+@command("completion", "what a shell needs to complete commands, options and files", *_EXAMPLES)
+def _run(args: CompletionArguments) -> Document:
     try:
         import shtab
     except ImportError:
         raise InputError("completion needs shtab: pip install 'ceres-cal[completion]'") from None
-    from ceres_cal.cli import commands
-
-    script = shtab.complete(whole_parser(commands.COMMANDS), shell=args.shell)
-    return Answer({"shell": args.shell, "script": script}, lambda: script)
+    script = shtab.complete(whole_parser(COMMANDS), shell=args.shell)
+    return Document((Section("", [script], {"shell": args.shell, "script": script}),))
 
 
 def whole_parser(commands: Mapping[str, Command]) -> ArgumentParser:
@@ -48,10 +53,3 @@ def whole_parser(commands: Mapping[str, Command]) -> ArgumentParser:
             if action.nargs != 0 and action.choices is None and not isinstance(action, argparse._SubParsersAction):
                 action.complete = _FILE  # type: ignore[attr-defined]
     return root
-
-
-COMMANDS = (
-    Command(
-        "completion", "what a shell needs to complete commands, options and files", _add_arguments, _run, _EXAMPLES
-    ),
-)

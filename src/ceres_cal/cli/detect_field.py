@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from argparse import ArgumentParser, Namespace
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -11,15 +10,22 @@ from typing import TYPE_CHECKING, Any
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.words import plural
-from ceres_cal.cli.arguments import add_output, add_quiet, add_station, add_timeout, parse_names, parse_numbers
-from ceres_cal.cli.command import Answer, Command
-from ceres_cal.cli.detection import detected
-from ceres_cal.cli.estimate import add_estimate, parse_estimates
-from ceres_cal.cli.inputs import images_and_videos, json_object, read_target
-from ceres_cal.cli.median import add_median, median_path, median_text, write_median
-from ceres_cal.cli.outputs import finishing, require_observations_output
-from ceres_cal.cli.photographs import missed_data
-from ceres_cal.cli.progress import progress_bar
+from ceres_cal.cli.arguments import (
+    estimate_option,
+    not_painted_option,
+    output_option,
+    parse_estimates,
+    parse_names,
+    parse_numbers,
+    station_option,
+    timeout_option,
+)
+from ceres_cal.cli.command import command
+from ceres_cal.cli.files import finishing, images_and_videos, json_object, read_target, require_observations_output
+from ceres_cal.cli.options import QuietArguments, argument, option, switch
+from ceres_cal.cli.photographs import detected, median_path, median_text, missed_section, write_median
+from ceres_cal.cli.terminal import progress_bar
+from ceres_cal.report.document import Document, Section
 
 if TYPE_CHECKING:
     from ceres_cal.photographs import Auto, Clicks, Facing, FieldDetections, SearchResult
@@ -31,69 +37,62 @@ _FACING = "LeftGoalLine=top"
 _SQUARE = 0.005  # of fy / fx: those of cameras are nearer to 1
 
 
-def _add_arguments(parser: ArgumentParser) -> None:
-    add = parser.add_argument
-    add(
-        "images",
-        nargs="+",
-        metavar="IMAGE",
-        help="photographs that one camera took at one station, folders of them, or a video",
-    )
-    add_median(parser)
-    _add_start(parser)
-    add_estimate(parser)
-    add("--not-painted", default="", metavar="NAME,...", help="lines of the target that this field does not have")
-    add(
-        "--mask",
-        metavar="FILE",
-        type=Path,
-        help="a picture of the same size: what is black in it is left out (hall, people)",
-    )
-    add("--picture", metavar="FILE", type=Path, help="draw what was seen in the first photograph that is refused")
-    add("--edges", action="store_true", help="both edges of each line instead of its middle")
-    add("--lines-only", action="store_true", help="no corners and crossings")
-    add("--camera", metavar="NAME", help="name of the camera; default: that of the calibration, or camera")
-    add_station(parser, "name of the station, to start from and to write; default: likewise")
-    add_output(parser, "the observations (.json or .npz)", required=True)
-    add_timeout(parser)
-    add_quiet(parser)
+@dataclass(frozen=True, kw_only=True)
+class FieldArguments(QuietArguments):
+    """Photographs, the field in them, and where to start."""
 
-
-def _add_start(parser: ArgumentParser) -> None:
-    add = parser.add_argument
-    add(
-        "--target",
-        metavar="TARGET",
-        help="a field by its name (such as ssl-b, vss-3: `ceres-cal targets`), spelled out "
+    images: tuple[str, ...] = argument(
+        "IMAGE", "photographs that one camera took at one station, folders of them, or a video"
+    )
+    median: bool = switch(
+        "one picture of all of them (25 at most, evenly), as of a video always: robots and people, who are "
+        "elsewhere in each, are gone; what is blurred, or taken after the camera was moved, is left out and named"
+    )
+    target: str | None = option(
+        "a field by its name (such as ssl-b, vss-3: `ceres-cal targets`), spelled out "
         '(\'{"kind": "vss-field", "size": "3v3", "field_length_m": 1.6}\'), or a JSON file with a target or with a '
         "target named 'field'; default: that of the calibration to start from",
+        "TARGET",
     )
-    add("--start", metavar="FILE", type=Path, help="a calibration of before, or a file of corners (ceres-cal/corners)")
-    add(
-        "--corner",
-        action="append",
-        default=[],
-        metavar="NAME=X,Y",
-        help=f"instead of --start: four points or more where they are seen, roughly, such as {_CORNER}; repeatable",
+    start: Path | None = option("a calibration of before, or a file of corners (ceres-cal/corners)", "FILE")
+    corner: tuple[str, ...] = option(
+        f"instead of --start: four points or more where they are seen, roughly, such as {_CORNER}",
+        "NAME=X,Y",
+        repeatable=True,
     )
-    add(
-        "--auto",
-        action="store_true",
-        help="without any start: find the field in the photograph; with --start CALIBRATION, however far it has moved",
+    auto: bool = switch(
+        "without any start: find the field in the photograph; with --start CALIBRATION, however far it has moved"
     )
-    add("--keep-start", action="store_true", help="the start is good to 12 px: nothing farther off is looked at")
-    add(
-        "--facing",
-        action="append",
-        default=[],
-        metavar="NAME=SIDE",
-        help="with --auto: which way round a field is that looks alike turned, by the side of the picture (left, "
+    keep_start: bool = switch("the start is good to 12 px: nothing farther off is looked at")
+    facing: tuple[str, ...] = option(
+        "with --auto: which way round a field is that looks alike turned, by the side of the picture (left, "
         f"right, top, bottom, top-left, ...) that a line or point lies towards, such as {_FACING}; it need not be in "
-        "the picture; repeatable",
+        "the picture",
+        "NAME=SIDE",
+        repeatable=True,
     )
+    estimate: tuple[str, ...] = estimate_option()
+    not_painted: str = not_painted_option("lines of the target that this field does not have")
+    mask: Path | None = option("a picture of the same size: what is black in it is left out (hall, people)", "FILE")
+    picture: Path | None = option("draw what was seen in the first photograph that is refused", "FILE")
+    edges: bool = switch("both edges of each line instead of its middle")
+    lines_only: bool = switch("no corners and crossings")
+    camera: str | None = option("name of the camera; default: that of the calibration, or camera", "NAME")
+    station: str | None = station_option("name of the station, to start from and to write; default: likewise")
+    output: Path = output_option("the observations (.json or .npz)")
+    timeout: float | None = timeout_option()
 
 
-def _run(args: Namespace) -> Answer:
+@command(
+    "detect field",
+    "painted lines and crossings of a field in photographs",
+    "photographs/ --target ssl-b --auto --facing LeftGoalLine=top -o field.json",
+    "game.mp4 --target ssl-b --auto --facing LeftGoalLine=top -o field.json",
+    "0001.png --start calibration.json -o field.json",
+    "0001.png --target ssl-b --auto --facing LeftGoalLine=top --estimate length,width -o field.json",
+    "0001.png --target ssl-a --start corners.json -o field.json",
+)
+def _run(args: FieldArguments) -> Document:
     images, videos = images_and_videos(args.images)
     require_observations_output(args.output, [*images, *videos, *([args.start] if args.start else [])])
     one = median_path(args.output, [*images, *videos]) if videos or args.median else None
@@ -122,32 +121,14 @@ def _run(args: Namespace) -> Answer:
     merged = None
     if one is not None:
         with progress_bar(args) as bar:
-            merged = detected(args, partial(write_median, one, images, videos, bar))
+            merged = detected(args.timeout, partial(write_median, one, images, videos, bar))
         images = [one]
     with progress_bar(args) as bar:
         found = partial(detect_field, images, target, start.start, painted, options, bar.update)
-        detections = detected(args, found)
+        detections = detected(args.timeout, found)
     with finishing():
         detections.observations.save(args.output)
-    data = {**_data(detections, args.output), **({"median": merged} if merged else {})}
-    return Answer(data, lambda: _text(data))
-
-
-COMMANDS = (
-    Command(
-        "detect field",
-        "painted lines and crossings of a field in photographs",
-        _add_arguments,
-        _run,
-        (
-            "photographs/ --target ssl-b --auto --facing LeftGoalLine=top -o field.json",
-            "game.mp4 --target ssl-b --auto --facing LeftGoalLine=top -o field.json",
-            "0001.png --start calibration.json -o field.json",
-            "0001.png --target ssl-b --auto --facing LeftGoalLine=top --estimate length,width -o field.json",
-            "0001.png --target ssl-a --start corners.json -o field.json",
-        ),
-    ),
-)
+    return Document(tuple(_sections(detections, merged, args.output)))
 
 
 def _drawing(picture: Path | None, target: Target) -> Callable[[Path, SearchResult], None] | None:
@@ -169,7 +150,7 @@ def _drawing(picture: Path | None, target: Target) -> Callable[[Path, SearchResu
     return draw
 
 
-def _require_fitting(args: Namespace) -> None:
+def _require_fitting(args: FieldArguments) -> None:
     """Raise InputError unless exactly one way to start was chosen."""
     if (args.start is not None) + bool(args.corner) != 1 and not (args.auto and not args.corner):
         raise InputError(f"say where to start: --start FILE, or --corner {_CORNER} four times, or --auto")
@@ -190,7 +171,7 @@ class _Start:
     target: Target | None
 
 
-def _start(args: Namespace) -> _Start:
+def _start(args: FieldArguments) -> _Start:
     camera = args.camera or "camera"
     if args.start is None:
         start = _auto(args.facing, None) if args.auto else _corners(args.corner)
@@ -213,7 +194,7 @@ def _start(args: Namespace) -> _Start:
     )
 
 
-def _auto(facing: list[str], before: Camera | None) -> Auto:
+def _auto(facing: Sequence[str], before: Camera | None) -> Auto:
     from ceres_cal.photographs import Auto
 
     return Auto(tuple(_facing(spec) for spec in facing), before)
@@ -228,7 +209,7 @@ def _facing(spec: str) -> Facing:
     return Facing(name, side)
 
 
-def _corners(specs: list[str]) -> Clicks:
+def _corners(specs: Sequence[str]) -> Clicks:
     from ceres_cal.photographs import Clicks
 
     points: dict[str, tuple[float, float]] = {}
@@ -247,16 +228,23 @@ def _corners(specs: list[str]) -> Clicks:
 # ---- the answer -----------------------------------------------------------------------------------------------------
 
 
-def _data(detections: FieldDetections, output: Path) -> dict[str, Any]:
-    return {
-        "output": str(output),
-        "points": len(detections.observations.points),
-        "curves": len(detections.observations.curves),
-        "lengths_m": {prior.quantity: prior.value[0] for prior in detections.observations.priors if prior.dimension},
-        "found": [_image_data(path, detections) for path in detections.found],
-        "stretched": any(_stretched(one.camera) for one in detections.found.values()),
-        "missed": missed_data(detections.missed),
-    }
+def _sections(detections: FieldDetections, merged: dict[str, Any] | None, output: Path) -> Iterator[Section]:
+    observations, images = detections.observations, [_image_data(path, detections) for path in detections.found]
+    points, curves = len(observations.points), len(observations.curves)
+    every, missed = len(images) + len(detections.missed), missed_section(detections.missed)
+    lengths = {prior.quantity: prior.value[0] for prior in observations.priors if prior.dimension}
+    stretched = any(_stretched(one.camera) for one in detections.found.values())
+    seen = f"{len(images)} of {every} images show the field"
+    first = f"{seen}: {plural(curves, 'line observation')}, {plural(points, 'corner')} and crossings"
+    yield Section("", [first], {"points": points, "curves": curves, "found": images, "stretched": stretched})
+    said = ", ".join(f"{name} {length:.3f}" for name, length in lengths.items())
+    rough = [f"lengths, roughly, for `calibrate` to solve for: {said} m"] if lengths else []
+    yield Section("", rough, {"lengths_m": lengths})
+    if merged is not None:
+        yield Section("", [median_text(merged)], {"median": merged})
+    yield Section("", tuple(_image_lines(images)))
+    yield missed
+    yield Section("", [f"written to {output}"], {"output": str(output)})
 
 
 def _image_data(path: str, detections: FieldDetections) -> dict[str, Any]:
@@ -285,34 +273,23 @@ def _stretched(camera: Camera) -> bool:
     return abs(camera.aspect - 1.0) > _SQUARE
 
 
-def _text(data: dict[str, Any]) -> str:
-    number, every = len(data["found"]), len(data["found"]) + len(data["missed"])
-    lines = [
-        f"{number} of {every} images show the field: {plural(data['curves'], 'line observation')}, "
-        f"{plural(data['points'], 'corner')} and crossings"
-    ]
-    if data["lengths_m"]:
-        found = ", ".join(f"{name} {length:.3f}" for name, length in data["lengths_m"].items())
-        lines.append(f"lengths, roughly, for `calibrate` to solve for: {found} m")
-    lines += [median_text(data["median"])] if "median" in data else []
-    lines += [
-        f"{one['image']}: paint at {one['found']} of {one['places']} places, good to {one['sigma_px']:.3f} px; "
-        f"blur {one['blur_px']:.2f} px, lines {one['width_factor']:.2f} times as wide as the target says"
-        for one in data["found"]
-    ]
-    lines += [
-        f"{one['image']}: found without a start, {_ways(one['searched'])}" for one in data["found"] if "searched" in one
-    ]
-    lines += [
-        f"{one['image']}: its pixels are not square, fy / fx is {one['aspect']:.3f}: was the picture stretched? Give "
-        "the original, or let it be solved for (`calibrate --free-aspect`)"
-        for one in data["found"]
-        if "aspect" in one
-    ]
-    lines += [f"{one['image']}: {words}" for one in data["found"] for words in one["not_as_drawn"]]
-    lines += [f"{one['image']}: no {', '.join(one['lacking'])} to be seen" for one in data["found"] if one["lacking"]]
-    lines += [f"{one['image']}: {one['reason']}" for one in data["missed"]]
-    return "\n".join([*lines, f"written to {data['output']}"])
+def _image_lines(images: Sequence[dict[str, Any]]) -> Iterator[str]:
+    for one in images:
+        yield (
+            f"{one['image']}: paint at {one['found']} of {one['places']} places, good to {one['sigma_px']:.3f} px; "
+            f"blur {one['blur_px']:.2f} px, lines {one['width_factor']:.2f} times as wide as the target says"
+        )
+    for one in images:
+        if "searched" in one:
+            yield f"{one['image']}: found without a start, {_ways(one['searched'])}"
+    for one in images:
+        if "aspect" in one:
+            yield (
+                f"{one['image']}: its pixels are not square, fy / fx is {one['aspect']:.3f}: was the picture "
+                "stretched? Give the original, or let it be solved for (`calibrate --free-aspect`)"
+            )
+    yield from (f"{one['image']}: {words}" for one in images for words in one["not_as_drawn"])
+    yield from (f"{one['image']}: no {', '.join(one['lacking'])} to be seen" for one in images if one["lacking"])
 
 
 def _ways(searched: dict[str, Any]) -> str:

@@ -2,56 +2,22 @@
 
 from __future__ import annotations
 
-from argparse import ArgumentParser, Namespace
+from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from ceres_cal.base.errors import InputError
-from ceres_cal.cli.arguments import add_detection, parse_length, parse_lengths
-from ceres_cal.cli.command import Answer, Command
-from ceres_cal.cli.detection import detected
-from ceres_cal.cli.outputs import finishing, require_observations_output
+from ceres_cal.cli.arguments import parse_length, parse_lengths
+from ceres_cal.cli.command import command
+from ceres_cal.cli.files import finishing, require_observations_output
+from ceres_cal.cli.options import REQUIRED, argument, option
+from ceres_cal.cli.photographs import DetectArguments, detected
+from ceres_cal.report.document import Document, Section
 
 if TYPE_CHECKING:
     from ceres_cal.detect.rings import RingsDetection
 
 _MOST_RINGS = 10_000
-
-
-def _add_arguments(parser: ArgumentParser) -> None:
-    add = parser.add_argument
-    add("image", metavar="IMAGE", help="photograph of the rings, taken about from the front")
-    add(
-        "--radii",
-        required=True,
-        metavar="M,M,...",
-        help="radii in metres of all edges between dark and bright, from the inside out; FROM:TO:STEP for even ones, "
-        "such as 0.01:0.36:0.01",
-    )
-    add_detection(parser)
-
-
-def _run(args: Namespace) -> Answer:
-    require_observations_output(args.output, [args.image])
-    radii = _radii(args.radii)
-    from ceres_cal.detect.rings import detect_rings
-
-    detection = detected(args, partial(detect_rings, args.image, radii, args.camera, args.station))
-    with finishing():
-        detection.observations.save(args.output)
-    data = _data(detection, args, len(radii))
-    return Answer(data, lambda: _text(data))
-
-
-COMMANDS = (
-    Command(
-        "detect rings",
-        "edges of concentric rings in a photograph",
-        _add_arguments,
-        _run,
-        ("rings.png --radii 10mm:360mm:10mm -o rings.json",),
-    ),
-)
 
 
 def _radii(text: str) -> tuple[float, ...]:
@@ -67,32 +33,52 @@ def _radii(text: str) -> tuple[float, ...]:
     return tuple(first + i * step for i in range(round((last - first) / step) + 1))
 
 
-def _data(detection: RingsDetection, args: Namespace, given: int) -> dict[str, Any]:
+@dataclass(frozen=True, kw_only=True)
+class RingsArguments(DetectArguments):
+    """A photograph of rings, and the rings."""
+
+    image: str = argument("IMAGE", "photograph of the rings, taken about from the front")
+    radii: tuple[float, ...] = option(
+        "radii in metres of all edges between dark and bright, from the inside out; FROM:TO:STEP for even ones, "
+        "such as 0.01:0.36:0.01",
+        "M,M,...",
+        REQUIRED,
+        read=_radii,
+    )
+
+
+@command("detect rings", "edges of concentric rings in a photograph", "rings.png --radii 10mm:360mm:10mm -o rings.json")
+def _run(args: RingsArguments) -> Document:
+    require_observations_output(args.output, [args.image])
+    from ceres_cal.detect.rings import detect_rings
+
+    detection = detected(args.timeout, partial(detect_rings, args.image, args.radii, args.camera, args.station))
+    with finishing():
+        detection.observations.save(args.output)
+    return _document(detection, args)
+
+
+def _document(detection: RingsDetection, args: RingsArguments) -> Document:
     a1, a2, a3 = detection.polynomial.tolist()
-    return {
+    (x, y), edges, lens = detection.centre.tolist(), len(detection.observations.curves), {"a2": a2 / a1, "a3": a3 / a1}
+    lines = [
+        f"{detection.rings} of {len(args.radii)} rings around ({x:.1f}, {y:.1f}), "
+        f"{edges} edges, blurred by {detection.blur_px:.2f} px",
+        "the paper's polynomial r' = a1 r + a2 r^2 + a3 r^3, px, the first ring being as large as it is seen:",
+        *(f"    {name} {value!r}" for name, value in (("a1", a1), ("a2", a2), ("a3", a3))),
+        f"    with a1 = 1, as a lens has it: a2 {lens['a2']!r}, a3 {lens['a3']!r}; rms {detection.rms_px:.3f} px",
+        f"written to {args.output}",
+    ]
+    data = {
         "image": args.image,
         "output": str(args.output),
         "rings": detection.rings,
-        "radii_given": given,
-        "observations": len(detection.observations.curves),
-        "centre": detection.centre.tolist(),
+        "radii_given": len(args.radii),
+        "observations": edges,
+        "centre": [x, y],
         "polynomial": {"a1": a1, "a2": a2, "a3": a3},
-        "lens": {"a2": a2 / a1, "a3": a3 / a1},
+        "lens": lens,
         "rms_px": detection.rms_px,
         "blur_px": detection.blur_px,
     }
-
-
-def _text(data: dict[str, Any]) -> str:
-    x, y = data["centre"]
-    return "\n".join(
-        [
-            f"{data['rings']} of {data['radii_given']} rings around ({x:.1f}, {y:.1f}), "
-            f"{data['observations']} edges, blurred by {data['blur_px']:.2f} px",
-            "the paper's polynomial r' = a1 r + a2 r^2 + a3 r^3, px, the first ring being as large as it is seen:",
-            *(f"    {name} {value!r}" for name, value in data["polynomial"].items()),
-            f"    with a1 = 1, as a lens has it: a2 {data['lens']['a2']!r}, a3 {data['lens']['a3']!r}; "
-            f"rms {data['rms_px']:.3f} px",
-            f"written to {data['output']}",
-        ]
-    )
+    return Document((Section("", lines, data),))

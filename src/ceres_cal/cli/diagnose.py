@@ -2,55 +2,68 @@
 
 from __future__ import annotations
 
-from argparse import ArgumentParser, Namespace
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from pathlib import Path
 
 from ceres_cal.base.errors import InputError
-from ceres_cal.cli.arguments import add_calibration, add_jobs, add_output, add_quiet, add_report, parse_number
-from ceres_cal.cli.command import Answer, Command
-from ceres_cal.cli.inputs import read_calibration, read_observations
-from ceres_cal.cli.outputs import report_page, report_photographs, require_ending, require_outputs, write_results
-from ceres_cal.cli.progress import progress_bar
+from ceres_cal.cli.arguments import (
+    ReportArguments,
+    calibration_argument,
+    jobs_option,
+    number,
+    output_option,
+)
+from ceres_cal.cli.command import command
+from ceres_cal.cli.files import (
+    read_calibration,
+    read_observations,
+    report_page,
+    report_photographs,
+    require_ending,
+    require_outputs,
+    write_results,
+    written,
+)
+from ceres_cal.cli.options import argument, option, switch
+from ceres_cal.cli.terminal import progress_bar
+from ceres_cal.report.document import Document
 
-if TYPE_CHECKING:
-    from ceres_cal.diagnostics import Diagnosis
 
+@dataclass(frozen=True, kw_only=True)
+class DiagnoseArguments(ReportArguments):
+    """A calibration, observations, and how they are tested."""
 
-def _add_arguments(parser: ArgumentParser) -> None:
-    add_calibration(parser)
-    add = parser.add_argument
-    add("observations", nargs="+", metavar="OBS", help="the observations it was made from, in the same order")
-    add_output(parser, "the residual of every observation (.csv, .json or .npz)", required=False)
-    add_report(parser)
-    add("--new-data", action="store_true", help="the observations are others than those it was made from")
-    add(
-        "--held-out",
-        action="store_true",
-        help="also calibrate with other powers or coefficients, on some frames to predict the others, and say which "
+    calibration: Path = calibration_argument()
+    observations: tuple[str, ...] = argument("OBS", "the observations it was made from, in the same order")
+    output: Path | None = output_option("the residual of every observation (.csv, .json or .npz)", None)
+    new_data: bool = switch("the observations are others than those it was made from")
+    held_out: bool = switch(
+        "also calibrate with other powers or coefficients, on some frames to predict the others, and say which "
         "lens predicts best",
     )
-    add_quiet(parser)
-    add("--strict", action="store_true", help="exit with 1 for any finding, also one that does no harm")
-    add("--folds", type=int, default=5, metavar="K", help="parts into which frames go for --held-out; default: 5")
-    add_jobs(parser, "folds, for --held-out,", 1)
-    add(
-        "--false-alarms",
-        default="0.01",
-        metavar="P",
-        help="probability of any finding where nothing is wrong; default: 0.01",
+    strict: bool = switch("exit with 1 for any finding, also one that does no harm")
+    folds: int = option("parts into which frames go for --held-out", "K", 5)
+    jobs: int = jobs_option("folds, for --held-out,", 1)
+    false_alarms: float = option(
+        "probability of any finding where nothing is wrong", "P", 0.01, read=number("--false-alarms")
     )
 
 
-def _run(args: Namespace) -> Answer:
-    rate = _require_fitting(args)
+@command(
+    "diagnose",
+    "what the residuals say: faults by name, noise, outliers",
+    "calibration.json field.json board.json",
+    "calibration.json field.json board.json --held-out --report report.html",
+)
+def _run(args: DiagnoseArguments) -> Document:
+    _require_fitting(args)
     from ceres_cal.base.executing import processes
-    from ceres_cal.cli.diagnosis import diagnosis_data, diagnosis_text
     from ceres_cal.diagnostics import diagnose
     from ceres_cal.diagnostics.held_out import choose
 
-    calibration, observations = read_calibration(args), read_observations(args.observations)
+    calibration, observations = read_calibration(args.calibration), read_observations(args.observations)
     photographs = report_photographs(args, observations)
-    diagnosis = diagnose(calibration, observations, new_data=args.new_data, false_alarm_rate=rate)
+    diagnosis = diagnose(calibration, observations, new_data=args.new_data, false_alarm_rate=args.false_alarms)
     choice = None
     if args.held_out:
         with progress_bar(args) as bar, processes(args.jobs) as executor:
@@ -58,44 +71,22 @@ def _run(args: Namespace) -> Answer:
             choice = choose(observations, options, args.folds, progress=bar.update, executor=executor)
     page = report_page(args, calibration, observations, photographs, diagnosis, choice)
     write_results(args, diagnosis.table.save, page)
-    return Answer(
-        diagnosis_data(diagnosis, choice, args),
-        lambda: diagnosis_text(diagnosis, choice, args),
-        1 if _is_no(diagnosis, strict=args.strict) else 0,
-    )
-
-
-COMMANDS = (
-    Command(
-        "diagnose",
-        "what the residuals say: faults by name, noise, outliers",
-        _add_arguments,
-        _run,
-        (
-            "calibration.json field.json board.json",
-            "calibration.json field.json board.json --held-out --report report.html",
-        ),
-    ),
-)
-
-
-def _is_no(diagnosis: Diagnosis, *, strict: bool) -> bool:
-    """Whether the answer is no: wrong labels that were taken out do no harm, and a noise is estimated."""
+    from ceres_cal.report.findings import diagnosis_sections
     from ceres_cal.report.grounds import is_against
 
-    against = [finding for finding in diagnosis.findings if strict or is_against(finding)]
-    return bool(against or diagnosis.conflicts)
+    # Wrong labels that were taken out do no harm, and a noise is estimated.
+    against = [finding for finding in diagnosis.findings if args.strict or is_against(finding)]
+    sections = (*diagnosis_sections(diagnosis, choice), written(args))
+    return Document(sections, 1 if against or diagnosis.conflicts else 0)
 
 
-def _require_fitting(args: Namespace) -> float:
-    """The rate of false alarms; InputError for options that do not fit."""
+def _require_fitting(args: DiagnoseArguments) -> None:
+    """Raise InputError for options that do not fit."""
     require_outputs(args, [args.calibration, *args.observations])
     require_ending(args.output, "the table is", ".csv", ".json", ".npz")
-    rate = parse_number(args.false_alarms, "--false-alarms")
-    if not 0.0 < rate < 1.0:
-        raise InputError(f"--false-alarms must lie between 0 and 1, not {args.false_alarms}")
+    if not 0.0 < args.false_alarms < 1.0:
+        raise InputError(f"--false-alarms must lie between 0 and 1, not {args.false_alarms:g}")
     if args.folds < 2:
         raise InputError(f"--folds must be at least 2, not {args.folds}")
     if args.held_out and args.new_data:
         raise InputError("--held-out calibrates the observations anew: leave out --new-data")
-    return rate

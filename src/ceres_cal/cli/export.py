@@ -2,158 +2,139 @@
 
 from __future__ import annotations
 
-from argparse import ArgumentParser, Namespace
-from collections.abc import Collection, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ceres_cal.base.errors import InputError
-from ceres_cal.cli.arguments import add_calibration, add_output, length, parse_length
-from ceres_cal.cli.command import Answer, Command
-from ceres_cal.cli.inputs import read_calibration
-from ceres_cal.cli.outputs import finishing, require_output, section
+from ceres_cal.cli.arguments import calibration_argument, length, output_option, parse_length
+from ceres_cal.cli.command import command
+from ceres_cal.cli.files import finishing, read_calibration, require_output
+from ceres_cal.cli.options import REQUIRED, Arguments, flag, option, options_of
+from ceres_cal.report.document import Document, Section
 
 if TYPE_CHECKING:
     from ceres_cal.formats import Exported, ExportFormat, ImportFormat
 
-_OPTION = "option "  # before the names of a format's options: theirs may be those of the command's own arguments
 
-
-def _add_arguments(parser: ArgumentParser) -> None:
+def _forms() -> Iterable[ExportFormat]:
     from ceres_cal.formats import EXPORT_FORMATS
 
-    forms = EXPORT_FORMATS.values()
-    listed = "; ".join(f"{one.name}: {one.description} ({', '.join(one.endings) or 'a folder'})" for one in forms)
-    parser.add_argument("--to", metavar="FORMAT", required=True, help=(listed or "there is none").replace("%", "%%"))
-    _add_shared_arguments(parser, forms)
+    return EXPORT_FORMATS.values()
 
 
-def _add_table_arguments(parser: ArgumentParser) -> None:
+def _table() -> Iterable[ExportFormat]:
     from ceres_cal.formats import export_format
 
-    parser.set_defaults(to="table")
-    _add_shared_arguments(parser, [export_format("table")])
+    return [export_format("table")]
 
 
-def _add_shared_arguments(parser: ArgumentParser, forms: Collection[ExportFormat]) -> None:
-    add = parser.add_argument
-    add_calibration(parser)
-    add_output(parser, "the export; its ending is one of the format's", required=True)
-    add(
-        "--station",
-        metavar="NAME",
-        action="append",
-        help="which station; may be left out where there is only one, or the format holds all; repeatable",
+def import_forms() -> Mapping[str, ImportFormat]:
+    """The formats that are read, by name."""
+    from ceres_cal.formats import IMPORT_FORMATS
+
+    return IMPORT_FORMATS
+
+
+def listed(forms: Iterable[ExportFormat | ImportFormat]) -> str:
+    """What there is to choose from."""
+    return "; ".join(f"{one.name}: {one.description} ({', '.join(one.endings) or 'a folder'})" for one in forms)
+
+
+@dataclass(frozen=True, kw_only=True)
+class TableArguments(Arguments):
+    """What is written of a calibration, and how much of it may be lost."""
+
+    calibration: Path = calibration_argument()
+    output: Path = output_option("the export; its ending is one of the format's")
+    station: tuple[str, ...] = option(
+        "which station; may be left out where there is only one, or the format holds all", "NAME", repeatable=True
     )
-    add("--max-loss-mm", type=length("mm"), metavar="MM", help="refuse what is wrong by more anywhere on the field")
-    add_format_options(parser, forms)
+    max_loss_mm: float | None = option("refuse what is wrong by more anywhere on the field", "MM", read=length("mm"))
+    options: Mapping[str, str] = options_of(_table)
+
+    @property
+    def form(self) -> str:
+        """The name of the format."""
+        return "table"
 
 
-def add_format_options(parser: ArgumentParser, forms: Collection[ExportFormat] | Collection[ImportFormat]) -> None:
-    """The options of the formats themselves."""
-    for name, helps in _options_of(forms).items():
-        parser.add_argument(_flag(name), dest=_OPTION + name, metavar="VALUE", help="; ".join(helps).replace("%", "%%"))
+@dataclass(frozen=True, kw_only=True)
+class ExportArguments(TableArguments):
+    """The same, of a format that is named."""
+
+    to: str = option(lambda: listed(_forms()) or "there is none", "FORMAT", REQUIRED)
+    options: Mapping[str, str] = options_of(_forms)
+
+    @property
+    def form(self) -> str:
+        return self.to
 
 
-def _options_of(forms: Collection[ExportFormat] | Collection[ImportFormat]) -> dict[str, list[str]]:
-    """Every option of the formats, with what it means to each of them."""
-    from dataclasses import fields
-
-    every: dict[str, list[str]] = {}
-    for form in forms:
-        for one in fields(form.options):
-            every.setdefault(one.name, []).append(f"{form.name}: {one.metadata.get('help', '')}")
-    return every
-
-
-def _flag(name: str) -> str:
-    return f"--{name.replace('_', '-')}"
+@command(
+    "export",
+    "a calibration in a format that others read, and what that loses",
+    "calibration.json --to vision-processor -o geometry.yml --camera-id 0",
+    "calibration.json --to opencv -o camera.yml",
+    "calibration.json --to table -o table.npz --error-mm 0.05",
+)
+def _export(args: ExportArguments) -> Document:
+    return _exported(args)
 
 
-def _run(args: Namespace) -> Answer:
+@command("export-table", "a look-up table from pixels to the field (NPZ)", "calibration.json -o table.npz")
+def _export_table(args: TableArguments) -> Document:
+    return _exported(args)
+
+
+def _exported(args: TableArguments) -> Document:
     from ceres_cal.formats import export_format, prepare_export
 
-    form = export_format(args.to)
+    form = export_format(args.form)
     if form.endings:
         require_output(args.output, [args.calibration])
-    options = format_options(args, [form])
-    exported = prepare_export(read_calibration(args), form.name, args.output, args.station, options)
+    options = format_options(args.options, [form])
+    exported = prepare_export(read_calibration(args.calibration), form.name, args.output, args.station or None, options)
     exported.require_loss_mm(args.max_loss_mm)
     with finishing():
         exported.save(args.output)
-    return Answer(_data(exported, args), lambda: _text(exported, args))
+    about = {"format": form.name, "output": str(args.output), **exported.facts}
+    first = Section(form.name, [f"{exported.words}, written to {args.output}"], about)
+    return Document((first, *losses(exported)))
 
 
-def format_options(args: Namespace, forms: Sequence[ExportFormat] | Sequence[ImportFormat]) -> dict[str, Any]:
+def format_options(given: Mapping[str, str], forms: Sequence[ExportFormat] | Sequence[ImportFormat]) -> dict[str, Any]:
     """What was given of the formats' options, of the types that they have."""
     from typing import get_type_hints
 
     import msgspec
 
-    given = {name.removeprefix(_OPTION): text for name, text in vars(args).items() if name.startswith(_OPTION)}
     types = {name: kind for form in forms for name, kind in get_type_hints(form.options).items()}
     options = {}
     for name, text in given.items():
-        if text is None:
-            continue
         if name not in types:
-            raise InputError(f"{_flag(name)} is no option of format {forms[0].name}")
+            raise InputError(f"{flag(name)} is no option of format {forms[0].name}")
         try:
-            if name.endswith("_mm"):
-                text = str(parse_length(text, _flag(name), "mm"))
-            options[name] = msgspec.convert(text, types[name], strict=False)
+            plain = str(parse_length(text, flag(name), "mm")) if name.endswith("_mm") else text
+            options[name] = msgspec.convert(plain, types[name], strict=False)
         except msgspec.ValidationError:
-            raise InputError(f"{_flag(name)}: {text!r} is not the number or word that it takes") from None
+            raise InputError(f"{flag(name)}: {text!r} is not the number or word that it takes") from None
     return options
 
 
-def _data(exported: Exported, args: Namespace) -> dict[str, Any]:
-    return {
-        "format": args.to,
-        "output": str(args.output),
-        **exported.facts,
-        "errors": [
-            {"station": loss.station, "height_m": height_m, "rms_mm": rms, "worst_mm": worst}
-            for loss in exported.losses
-            for height_m, (rms, worst) in loss.field_mm.items()
-        ],
-        "errors_px": [
-            {"station": loss.station, "rms_px": loss.image_px[0], "worst_px": loss.image_px[1]}
-            for loss in exported.losses
-            if loss.image_px is not None
-        ],
-        "warnings": list(exported.warnings),
-    }
-
-
-def _text(exported: Exported, args: Namespace) -> str:
-    return "\n".join([f"{args.to:9} {exported.words}, written to {args.output}", *losses_text(exported)])
-
-
-def losses_text(exported: Exported) -> list[str]:
+def losses(exported: Exported) -> Iterator[Section]:
     """What is lost, in px and mm, and what else to know."""
     from ceres_cal.formats import loss_words
 
-    lines = [section("error", [text]) for loss in exported.losses for text in loss_words(loss)]
-    return lines + [section("warning", [text]) for text in exported.warnings]
-
-
-COMMANDS = (
-    Command(
-        "export",
-        "a calibration in a format that others read, and what that loses",
-        _add_arguments,
-        _run,
-        (
-            "calibration.json --to vision-processor -o geometry.yml --camera-id 0",
-            "calibration.json --to opencv -o camera.yml",
-            "calibration.json --to table -o table.npz --error-mm 0.05",
-        ),
-    ),
-    Command(
-        "export-table",
-        "a look-up table from pixels to the field (NPZ)",
-        _add_table_arguments,
-        _run,
-        ("calibration.json -o table.npz",),
-    ),
-)
+    every = exported.losses
+    errors = [
+        {"station": loss.station, "height_m": height_m, "rms_mm": rms, "worst_mm": worst}
+        for loss in every
+        for height_m, (rms, worst) in loss.field_mm.items()
+    ]
+    shown = [(loss.station, loss.image_px) for loss in every if loss.image_px is not None]
+    errors_px = [{"station": name, "rms_px": rms, "worst_px": worst} for name, (rms, worst) in shown]
+    yield Section(data={"errors": errors, "errors_px": errors_px, "warnings": list(exported.warnings)})
+    yield from (Section("error", [text]) for loss in every for text in loss_words(loss))
+    yield from (Section("warning", [text]) for text in exported.warnings)

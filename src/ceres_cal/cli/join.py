@@ -2,32 +2,43 @@
 
 from __future__ import annotations
 
-from argparse import ArgumentParser, Namespace
 from collections import Counter
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
 
-from ceres_cal.cli.arguments import add_output
-from ceres_cal.cli.command import Answer, Command
-from ceres_cal.cli.inputs import read_observations, require_different
-from ceres_cal.cli.outputs import finishing, require_observations_output, section, wrapped
+from ceres_cal.base.words import plural
+from ceres_cal.cli.arguments import output_option
+from ceres_cal.cli.command import command
+from ceres_cal.cli.files import finishing, read_observations, require_different, require_observations_output
+from ceres_cal.cli.options import Arguments, argument, option
+from ceres_cal.report.document import Document, Section, wrapped
 
 if TYPE_CHECKING:
     from ceres_cal.observations import Observations
     from ceres_cal.start.same_labels import Labels
 
 
-def _add_arguments(parser: ArgumentParser) -> None:
-    parser.add_argument("observations", nargs="+", metavar="OBS", help="files of observations, of all cameras")
-    parser.add_argument(
-        "--same-frame",
-        metavar="RULE",
-        help="which frames are one moment: 'left*,right*' (what * stands for names it), index (the n-th of each "
+@dataclass(frozen=True, kw_only=True)
+class JoinArguments(Arguments):
+    """What goes together."""
+
+    observations: tuple[str, ...] = argument("OBS", "files of observations, of all cameras")
+    same_frame: str | None = option(
+        "which frames are one moment: 'left*,right*' (what * stands for names it), index (the n-th of each "
         "camera), or within:0.01 (frames are named by time stamps); default: those of one name",
+        "RULE",
     )
-    add_output(parser, "the joined observations (.json or .npz)", required=True)
+    output: Path = output_option("the joined observations (.json or .npz)")
 
 
-def _run(args: Namespace) -> Answer:
+@command(
+    "join",
+    "a rig's observations as one: same frames, same labels",
+    "left.json right.json --same-frame 'left*,right*' -o rig.json",
+)
+def _run(args: JoinArguments) -> Document:
     require_different(args.observations)
     require_observations_output(args.output, args.observations)
     observations = read_observations(args.observations)
@@ -39,18 +50,7 @@ def _run(args: Namespace) -> Answer:
     labels = with_same_labels(observations)
     with finishing():
         labels.observations.save(args.output)
-    return Answer(_data(labels, args), lambda: _text(labels, args))
-
-
-COMMANDS = (
-    Command(
-        "join",
-        "a rig's observations as one: same frames, same labels",
-        _add_arguments,
-        _run,
-        ("left.json right.json --same-frame 'left*,right*' -o rig.json",),
-    ),
-)
+    return Document(tuple(_sections(labels, args)))
 
 
 def _moments(observations: Observations) -> Counter[int]:
@@ -61,31 +61,19 @@ def _moments(observations: Observations) -> Counter[int]:
     return Counter(len(seen) for seen in cameras.values())
 
 
-def _data(labels: Labels, args: Namespace) -> dict[str, Any]:
-    return {
-        "output": str(args.output),
-        "moments_by_cameras": {str(count): number for count, number in sorted(_moments(labels.observations).items())},
-        "turned": labels.turned,
-        "open": labels.open,
-    }
-
-
-def _text(labels: Labels, args: Namespace) -> str:
-    by_count = sorted(_moments(labels.observations).items(), reverse=True)
+def _sections(labels: Labels, args: JoinArguments) -> Iterator[Section]:
+    by_count = sorted(_moments(labels.observations).items())
     rule = "of one name" if args.same_frame is None else f"by {args.same_frame!r}"
-    moments = ", ".join(f"{number} seen by {count} camera{'s' * (count > 1)}" for count, number in by_count)
-    lines = [section("moments", wrapped(f"{moments} (frames {rule})"))]
-    if labels.turned:
-        which = ", ".join(f"{placement!r} of {station!r}" for station, placement in labels.turned)
-        lines.append(section("labels", wrapped(f"turned, to be those of the first camera: {which}")))
+    seen = ", ".join(f"{number} seen by {plural(count, 'camera')}" for count, number in reversed(by_count))
+    moments = {str(count): number for count, number in by_count}
+    yield Section("moments", wrapped(f"{seen} (frames {rule})"), {"moments_by_cameras": moments})
+    which = ", ".join(f"{placement!r} of {station!r}" for station, placement in labels.turned)
+    turned = wrapped(f"turned, to be those of the first camera: {which}") if which else []
+    yield Section("labels", turned, {"turned": labels.turned, "open": labels.open})
     for station in labels.open:
-        lines.append(
-            section(
-                "warning",
-                wrapped(
-                    f"station {station!r}: nothing tells which way round its boards are labelled: show the board to it "
-                    "and to the first camera at once in more poses, or take a board of odd columns + rows"
-                ),
-            )
+        text = (
+            f"station {station!r}: nothing tells which way round its boards are labelled: show the board to it "
+            "and to the first camera at once in more poses, or take a board of odd columns + rows"
         )
-    return "\n".join([*lines, section("written", [str(args.output)])])
+        yield Section("warning", wrapped(text))
+    yield Section("written", [str(args.output)], {"output": str(args.output)})

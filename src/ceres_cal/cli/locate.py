@@ -4,45 +4,60 @@ from __future__ import annotations
 
 import re
 import sys
-from argparse import ArgumentParser, Namespace
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ceres_cal.base.errors import InputError
-from ceres_cal.cli.arguments import add_calibration, add_height, add_station, height_m, parse_number
-from ceres_cal.cli.command import Answer, Command
-from ceres_cal.cli.inputs import read_calibration, station_of
+from ceres_cal.cli.arguments import calibration_argument, height_option, metres, parse_number, station_option
+from ceres_cal.cli.command import command
+from ceres_cal.cli.files import read_calibration, station_of
+from ceres_cal.cli.options import Arguments, argument, option
+from ceres_cal.report.document import Document, Section
 
 if TYPE_CHECKING:
     from ceres_cal.base.arrays import Array
     from ceres_cal.scene.camera import Camera
 
 
-def _add_common(parser: ArgumentParser, rows: str, example: str) -> None:
-    add_calibration(parser)
-    parser.add_argument(
-        "rows", nargs="*", metavar=rows, help=f"such as {example}; - reads lines of these from standard input"
+def _rows_argument(rows: str, example: str) -> Any:
+    return argument(rows, f"such as {example}; - reads lines of these from standard input", ())
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProjectArguments(Arguments):
+    """A calibration, and places."""
+
+    calibration: Path = calibration_argument()
+    rows: tuple[str, ...] = _rows_argument("X,Y[,Z]", "-2.5,1.0 or -2.5,1.0,0.15 (m)")
+    file: str | None = option("read lines of these from a file instead", "CSV")
+    station: str | None = station_option()
+
+
+@dataclass(frozen=True, kw_only=True)
+class LocateArguments(ProjectArguments):
+    """The same of pixels, and the height of what they show."""
+
+    rows: tuple[str, ...] = _rows_argument("X,Y", "640.5,480.2 (px)")
+    height_mm: float | None = height_option(
+        "height of what is seen above the field, 150 or 0.15m; default: 0, the floor"
     )
-    parser.add_argument("--file", metavar="CSV", help="read lines of these from a file instead")
-    add_station(parser)
 
 
-def _add_locate(parser: ArgumentParser) -> None:
-    _add_common(parser, "X,Y", "640.5,480.2 (px)")
-    add_height(parser, "height of what is seen above the field, 150 or 0.15m; default: 0, the floor")
-
-
-def _add_project(parser: ArgumentParser) -> None:
-    _add_common(parser, "X,Y[,Z]", "-2.5,1.0 or -2.5,1.0,0.15 (m)")
-
-
-def _locate(args: Namespace) -> Answer:
+@command(
+    "locate",
+    "where on the field, or at a height above it, pixels lie (m)",
+    "calibration.json 640,480 100,100 --height-mm 150",
+    "calibration.json --file pixels.csv --json",
+)
+def _locate(args: LocateArguments) -> Document:
     import numpy as np
 
     from ceres_cal.scene.camera import in_image
 
     pixels = _read_rows(args, (2,))
-    height = height_m(args)
+    height = metres(args.height_mm)
     name, camera = _station(args)
     inside = in_image(pixels, camera.image_size)
     points = np.where(inside[:, None], camera.locate(pixels, height), np.nan)  # beyond nothing was ever measured
@@ -51,7 +66,8 @@ def _locate(args: Namespace) -> Answer:
     return _answer({**data, "points_m": _or_null(points)}, points, lost)
 
 
-def _project(args: Namespace) -> Answer:
+@command("project", "where points of the world appear in the image (px)", "calibration.json -2.5,1.0 -2.5,1.0,0.15")
+def _project(args: ProjectArguments) -> Document:
     points = _read_rows(args, (2, 3))
     name, camera = _station(args)
     pixels = camera.project(points)
@@ -60,34 +76,16 @@ def _project(args: Namespace) -> Answer:
     return _answer({**data, "pixels": _or_null(pixels)}, pixels, lost)
 
 
-COMMANDS = (
-    Command(
-        "locate",
-        "where on the field, or at a height above it, pixels lie (m)",
-        _add_locate,
-        _locate,
-        ("calibration.json 640,480 100,100 --height-mm 150", "calibration.json --file pixels.csv --json"),
-    ),
-    Command(
-        "project",
-        "where points of the world appear in the image (px)",
-        _add_project,
-        _project,
-        ("calibration.json -2.5,1.0 -2.5,1.0,0.15",),
-    ),
-)
-
-
-def _station(args: Namespace) -> tuple[str, Camera]:
-    calibration = read_calibration(args)
-    name = station_of(args, calibration)
+def _station(args: ProjectArguments) -> tuple[str, Camera]:
+    calibration = read_calibration(args.calibration)
+    name = station_of(args.calibration, args.station, calibration)
     return name, calibration.stations[name]
 
 
 # ---- reading --------------------------------------------------------------------------------------------------------
 
 
-def _read_rows(args: Namespace, sizes: tuple[int, ...]) -> Array:
+def _read_rows(args: ProjectArguments, sizes: tuple[int, ...]) -> Array:
     """(N, largest size) numbers from the arguments, a file or standard input; a number left out is 0."""
     import numpy as np
 
@@ -97,11 +95,11 @@ def _read_rows(args: Namespace, sizes: tuple[int, ...]) -> Array:
     return np.array([row + [0.0] * (max(sizes) - len(row)) for row in rows])
 
 
-def _texts(args: Namespace) -> Iterator[tuple[str, str]]:
+def _texts(args: ProjectArguments) -> Iterator[tuple[str, str]]:
     """What to read numbers from, each with how messages name it."""
     if args.file is not None and args.rows:
         raise InputError("give places as arguments or by --file, not both")
-    if args.file == "-" or args.rows == ["-"]:
+    if args.file == "-" or args.rows == ("-",):
         yield from _lines(sys.stdin, "standard input")
     elif args.file is not None:
         from ceres_cal.base.files import read_bytes
@@ -163,12 +161,9 @@ def _why_not_projected(camera: Camera, point: Array) -> str:
     return "it lies outside of what the lens can show"
 
 
-def _answer(data: dict[str, Any], values: Array, lost: dict[int, str]) -> Answer:
-    def text() -> str:
-        lines = [f"{x:.4f} {y:.4f}" for x, y in values.tolist()]
-        for row, reason in lost.items():
-            lines[row] = f"no answer: {reason}"
-        return "\n".join(lines)
-
-    data["no_answer"] = [{"row": row, "reason": reason} for row, reason in lost.items()]
-    return Answer(data, text, 1 if lost else 0)
+def _answer(data: dict[str, Any], values: Array, lost: dict[int, str]) -> Document:
+    lines = [f"{x:.4f} {y:.4f}" for x, y in values.tolist()]
+    for row, reason in lost.items():
+        lines[row] = f"no answer: {reason}"
+    reasons = [{"row": row, "reason": reason} for row, reason in lost.items()]
+    return Document((Section("", lines, {**data, "no_answer": reasons}),), 1 if lost else 0)

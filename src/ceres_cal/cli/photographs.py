@@ -1,40 +1,60 @@
-"""What `refit` and `check` take: a calibration and files of observations, or photographs of one of its stations."""
+"""What commands do with photographs and videos: take them beside observations, make one of many, and detect in time."""
 
 from __future__ import annotations
 
-from argparse import ArgumentParser, Namespace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from ceres_cal.base.errors import InputError
+from ceres_cal.base.native import interruptibly
 from ceres_cal.base.words import plural
-from ceres_cal.cli.arguments import add_calibration, add_quiet, add_station
-from ceres_cal.cli.inputs import image_files, require_different
-from ceres_cal.cli.outputs import section
+from ceres_cal.cli.arguments import (
+    calibration_argument,
+    not_painted_option,
+    output_option,
+    station_option,
+    timeout_option,
+)
+from ceres_cal.cli.files import finishing, image_files, require_different, require_output
+from ceres_cal.cli.options import Arguments, QuietArguments, argument, option
+from ceres_cal.cli.terminal import ProgressBar
+from ceres_cal.report.document import Section
 
 if TYPE_CHECKING:
+    from ceres_cal.base.arrays import Image
+    from ceres_cal.detect.median import Merged
     from ceres_cal.photographs import KnownDetections
 
+_T = TypeVar("_T")
 _OBSERVATIONS = (".json", ".npz")
+_MOST_NAMED = 3
 
 
-def add_inputs(parser: ArgumentParser) -> None:
+@dataclass(frozen=True, kw_only=True)
+class InputArguments(QuietArguments):
     """A calibration, files of observations or photographs, and what is to be said of photographs."""
-    add_calibration(parser, "the calibration from before")
-    parser.add_argument(
-        "inputs",
-        nargs="+",
-        metavar="OBS|IMAGE",
-        help="files of new observations (.json, .npz), taken together; or photographs, or folders of them",
+
+    calibration: Path = calibration_argument("the calibration from before")
+    inputs: tuple[str, ...] = argument(
+        "OBS|IMAGE", "files of new observations (.json, .npz), taken together; or photographs, or folders of them"
     )
-    add_station(parser, "station that took the photographs; default: the only one")
-    parser.add_argument(
-        "--not-painted", default="", metavar="NAME,...", help="lines that the photographed field does not have"
-    )
-    add_quiet(parser)
+    station: str | None = station_option("station that took the photographs; default: the only one")
+    not_painted: str = not_painted_option("lines that the photographed field does not have")
 
 
-def photographs_in(args: Namespace) -> list[Path]:
+@dataclass(frozen=True, kw_only=True)
+class DetectArguments(Arguments):
+    """What `detect board` and `detect rings` share."""
+
+    timeout: float | None = timeout_option()
+    camera: str = option("name of the camera", "NAME", "camera")
+    station: str | None = station_option("name of the station; default: that of the camera")
+    output: Path = output_option("the observations (.json or .npz)")
+
+
+def photographs_in(args: InputArguments) -> list[Path]:
     """The photographs that are named, each once; none where observations are."""
     observed = [name for name in args.inputs if Path(name).suffix.lower() in _OBSERVATIONS]
     if len(observed) == len(args.inputs):
@@ -52,28 +72,106 @@ def photographs_in(args: Namespace) -> list[Path]:
     return images
 
 
-def photographs_data(detections: KnownDetections | None) -> dict[str, Any]:
-    """What photographs showed, for --json; nothing where none were given."""
+def shown(detections: KnownDetections | None) -> Section:
+    """What photographs showed; nothing where none were given."""
     if detections is None:
-        return {}
-    images = {"images": detections.images, "shown": detections.shown, "missed": missed_data(detections.missed)}
-    return {"photographs": images}
-
-
-def photographs_text(detections: KnownDetections | None) -> list[str]:
-    """The same for people: one section, or none."""
-    if detections is None:
-        return []
+        return Section()
+    missed = missed_section(detections.missed)
     counts = ", ".join(f"{name} in {count}" for name, count in detections.shown.items())
     first = f"{plural(detections.images, 'photograph')} of station {detections.station}: {counts}"
-    return [section("images", [first, *missed_text(detections.missed)])]
+    images = {"images": detections.images, "shown": detections.shown, **missed.data}
+    return Section("images", [first, *missed.lines], {"photographs": images})
 
 
-def missed_data(missed: tuple[tuple[str, str], ...]) -> list[dict[str, str]]:
-    """Images in which nothing was detected, for --json."""
-    return [{"image": path, "reason": reason} for path, reason in missed]
+def missed_section(missed: tuple[tuple[str, str], ...]) -> Section:
+    """Images in which nothing was detected, a line each."""
+    data = {"missed": [{"image": path, "reason": reason} for path, reason in missed]}
+    return Section("", [f"{path}: {reason}" for path, reason in missed], data)
 
 
-def missed_text(missed: tuple[tuple[str, str], ...]) -> list[str]:
-    """The same for people, a line each."""
-    return [f"{path}: {reason}" for path, reason in missed]
+# ---- detection ------------------------------------------------------------------------------------------------------
+
+
+def detected(timeout: float | None, detect: Callable[[], _T]) -> _T:
+    """What `detect` returns; InputError where it takes longer than --timeout."""
+    if timeout is not None and not timeout > 0.0:
+        raise InputError(f"--timeout must be above 0 seconds, not {timeout:g}")
+    try:
+        return interruptibly(detect, timeout)
+    except TimeoutError:
+        raise InputError(
+            f"--timeout: not done after {timeout:g} s, nothing was written: give fewer images, or more time"
+        ) from None
+
+
+# ---- videos and medians ---------------------------------------------------------------------------------------------
+
+
+def frames_of_videos(videos: Sequence[Path], count: int, folder: Path, bar: ProgressBar) -> list[Path]:
+    """The sharpest frames of videos, each written into a folder of its name.
+
+    Args:
+        count: of each, --frames.
+
+    Raises:
+        InputError: what cannot be read, or --frames below 1.
+    """
+    if count < 1:
+        raise InputError(f"--frames must be at least 1, not {count}")
+    if not videos:
+        return []
+    from ceres_cal.detect.video import sharpest_frames
+
+    return [path for one in videos for path in sharpest_frames(one, folder / one.stem, count, bar.update)]
+
+
+def median_path(output: Path, inputs: Sequence[Path]) -> Path:
+    """Where the one picture is written, beside the observations; InputError where that is one of the inputs."""
+    path = output.with_name(f"{output.stem}_median.png")
+    require_output(path, inputs)
+    return path
+
+
+def write_median(path: Path, images: Sequence[Path], videos: Sequence[Path], bar: ProgressBar) -> dict[str, Any]:
+    """Write the one picture of photographs and videos, in 16 bits; what became of each of them, for --json.
+
+    Raises:
+        InputError: see `detect.median.merged`; an image or a video that cannot be read.
+    """
+    import numpy as np
+
+    from ceres_cal.base.files import write_bytes
+    from ceres_cal.detect.images import encoded
+    from ceres_cal.detect.median import merged
+
+    found: Merged = merged(_pictures(images, videos, bar))
+    levels = np.round(found.picture * (65535 // found.white)).astype(np.uint16)
+    with finishing():
+        write_bytes(path, encoded(np.asarray(levels), ".png", 100))
+    left_out = [{"image": name, "reason": reason} for name, reason in found.left_out]
+    return {"picture": str(path), "used": list(found.used), "left_out": left_out}
+
+
+def _pictures(images: Sequence[Path], videos: Sequence[Path], bar: ProgressBar) -> Iterator[tuple[str, Image]]:
+    from ceres_cal.detect.images import read_colour
+    from ceres_cal.detect.median import MOST_PICTURES
+    from ceres_cal.detect.video import spread_frames
+
+    each = max(1, MOST_PICTURES // (len(videos) + bool(images)))  # of every video, and of the photographs together
+    for path in images[:: -(-len(images) // each) or 1]:
+        yield str(path), read_colour(path)
+    for video in videos[:MOST_PICTURES]:
+        yield from spread_frames(video, each, bar.update)
+
+
+def median_text(data: dict[str, Any]) -> str:
+    """What became of the pictures, in one line."""
+    used, left_out = len(data["used"]), data["left_out"]
+    reasons: dict[str, list[str]] = {}
+    for one in left_out:
+        reasons.setdefault(one["reason"], []).append(one["image"])
+    said = [
+        f"{len(names)} left out, {reason} ({', '.join(names[:_MOST_NAMED])}{', ...' if names[_MOST_NAMED:] else ''})"
+        for reason, names in reasons.items()
+    ]
+    return "; ".join([f"{data['picture']}: the median of {plural(used, 'picture')} of {used + len(left_out)}", *said])

@@ -3,62 +3,70 @@
 from __future__ import annotations
 
 import shlex
-from argparse import ArgumentParser, Namespace
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from ceres_cal.base.errors import InputError, NothingShownError
 from ceres_cal.base.words import plural
-from ceres_cal.cli.advise import COMMANDS as ADVISE
-from ceres_cal.cli.arguments import add_prior, add_quiet, parse_board
-from ceres_cal.cli.calibrate import COMMANDS as CALIBRATE
-from ceres_cal.cli.command import Answer, Command
-from ceres_cal.cli.detect import COMMANDS as DETECT_BOARD
-from ceres_cal.cli.detect_field import COMMANDS as DETECT_FIELD
-from ceres_cal.cli.estimate import add_estimate
-from ceres_cal.cli.export import COMMANDS as EXPORT
-from ceres_cal.cli.frames import add_frames, frames_of_videos
-from ceres_cal.cli.inputs import IMAGE_ENDINGS, images_and_videos
-from ceres_cal.cli.outputs import section, sections_of
-from ceres_cal.cli.progress import progress_bar
+from ceres_cal.cli.arguments import (
+    estimate_option,
+    frames_option,
+    not_painted_option,
+    output_option,
+    parse_board,
+    prior_option,
+)
+from ceres_cal.cli.command import COMMANDS, command
+from ceres_cal.cli.files import IMAGE_ENDINGS, images_and_videos
+from ceres_cal.cli.options import QuietArguments, argument, option
+from ceres_cal.cli.photographs import frames_of_videos
+from ceres_cal.cli.terminal import progress_bar
+from ceres_cal.report.document import Document, Section
 
 _SHOWN = ("fit", "lens", "located", "widened", "weak", "unknown", "warning", "verdict")
 _MOST_NAMES = 3
+_BLANK = Section("", [""])
 
 
-def _add_arguments(parser: ArgumentParser) -> None:
-    add = parser.add_argument
-    add("images", nargs="+", metavar="IMAGE", help="photographs of one camera, a folder of them, or a video")
-    add("-o", "--output", metavar="FOLDER", type=Path, required=True, help="for everything that is made")
-    add("--target", metavar="TARGET", help="the field: its name, such as ssl-b, or a file, as of `detect field`")
-    add("--facing", metavar="NAME=SIDE", action="append", default=[], help="which way round it is, likewise")
-    add("--not-painted", metavar="NAME,...", help="lines that this field does not have")
-    add(
-        "--board",
-        metavar="COLUMNSxROWSxMM",
-        help="a chessboard by its inner corners and the side of a square, such as 9x6x25mm",
+@dataclass(frozen=True, kw_only=True)
+class RunArguments(QuietArguments):
+    """What there is, and what is to come of it."""
+
+    images: tuple[str, ...] = argument("IMAGE", "photographs of one camera, a folder of them, or a video")
+    output: Path = output_option("everything that is made", metavar="FOLDER")
+    target: str | None = option("the field: its name, such as ssl-b, or a file, as of `detect field`", "TARGET")
+    facing: tuple[str, ...] = option("which way round it is, likewise", "NAME=SIDE", repeatable=True)
+    not_painted: str = not_painted_option("lines that this field does not have")
+    board: str | None = option(
+        "a chessboard by its inner corners and the side of a square, such as 9x6x25mm", "COLUMNSxROWSxMM"
     )
-    add("--lens", metavar="KIND", default="auto", help="as of `calibrate`; default: auto")
-    add_prior(parser)
-    add_estimate(parser)
-    add("--camera", default="camera", metavar="NAME", help="name of the camera; default: camera")
-    add("--to", metavar="FORMAT", action="append", default=[], help="export it, too, as of `export`; repeatable")
-    add_frames(parser)
-    add_quiet(parser)
+    lens: str = option("as of `calibrate`", "KIND", "auto")
+    prior: tuple[str, ...] = prior_option()
+    estimate: tuple[str, ...] = estimate_option()
+    camera: str = option("name of the camera", "NAME", "camera")
+    to: tuple[str, ...] = option("export it, too, as of `export`", "FORMAT", repeatable=True)
+    frames: int = frames_option()
 
 
 @dataclass(frozen=True)
 class _Step:
-    """A command that was run, as one would type it, and what is worth showing of its answer."""
+    """A command that was run, as one would type it, what it answered, and what is worth showing of that."""
 
     command: str
-    lines: tuple[str, ...]
+    lines: Sequence[str]
     data: dict[str, Any]
 
 
-def _run(args: Namespace) -> Answer:
+@command(
+    "run",
+    "from photographs or a video to a calibration, its report and its exports",
+    "photographs/ --target ssl-b --facing LeftGoalLine=top --board 9x6x25mm -o camera/",
+    "photographs/ --target ssl-b --facing LeftGoalLine=top --prior height_m=4.02:20mm --to opencv -o camera/",
+    "boards.mp4 --board 9x6x25mm -o camera/",
+)
+def _run(args: RunArguments) -> Document:
     if args.target is None and args.board is None:
         raise InputError("say what the photographs show: --target ssl-b, --board 9x6x25mm, or both")
     if args.board is not None:
@@ -74,55 +82,45 @@ def _run(args: Namespace) -> Answer:
     level = calibrated.data["verdict"]["level"]
     steps.append(calibrated)
     if level != "good" and args.target is not None:
-        steps.append(_step(args, ADVISE[0], [str(args.output / "calibration.json")], most=2))
+        steps.append(_step(args, "advise", [str(args.output / "calibration.json")], most=2))
     if level != "no":
         steps += [_exported(args, name, f"{args.output / name}{ending}") for name, ending in endings.items()]
     data = {"images": len(images), "verdict": calibrated.data["verdict"]}
     data["steps"] = [{"command": step.command, "answer": step.data} for step in steps]
     made = level != "no" and all(step.data for step in steps[-len(endings) :])
-    return Answer(data, lambda: _text(args, images, steps, level), 0 if made else 1)
-
-
-COMMANDS = (
-    Command(
-        "run",
-        "from photographs or a video to a calibration, its report and its exports",
-        _add_arguments,
-        _run,
-        (
-            "photographs/ --target ssl-b --facing LeftGoalLine=top --board 9x6x25mm -o camera/",
-            "photographs/ --target ssl-b --facing LeftGoalLine=top --prior height_m=4.02:20mm --to opencv -o camera/",
-            "boards.mp4 --board 9x6x25mm -o camera/",
-        ),
-    ),
-)
+    return Document((Section(data=data), *_sections(args, images, steps, level)), 0 if made else 1)
 
 
 # ---- the steps ------------------------------------------------------------------------------------------------------
 
 
-def _step(args: Namespace, command: Command, arguments: Sequence[str], most: int | None = None) -> _Step:
+def _step(
+    args: RunArguments,
+    name: str,
+    arguments: Sequence[str],
+    most: int | None = None,
+    titles: Collection[str] | None = None,
+) -> _Step:
     """Run a command and keep the first lines of what it says, and the images that showed nothing."""
-    quiet = ["--quiet"] if (args.quiet or args.json) and command is not EXPORT[0] else []
-    answer = command.run(command.parse([*arguments, *quiet]))
+    quiet = ["--quiet"] if (args.quiet or args.json) and name != "export" else []
+    answer = COMMANDS[name].run(COMMANDS[name].parse([*arguments, *quiet]))
     missed = [f"{one['image']}: {one['reason']}" for one in answer.data.get("missed", ())]
-    lines = [*answer.text().splitlines()[:most], *missed]
-    return _Step(_typed(command, arguments), tuple(lines), dict(answer.data))
+    return _Step(_typed(name, arguments), [*answer.text(titles).splitlines()[:most], *missed], answer.data)
 
 
-def _typed(command: Command, arguments: Sequence[str]) -> str:
-    return shlex.join(["ceres-cal", *command.name.split(), *arguments])
+def _typed(name: str, arguments: Sequence[str]) -> str:
+    return shlex.join(["ceres-cal", *name.split(), *arguments])
 
 
-def _photographs(args: Namespace) -> list[Path]:
+def _photographs(args: RunArguments) -> list[Path]:
     """The photographs that were given, and those taken out of a video."""
     images, videos = images_and_videos(args.images)
     with progress_bar(args) as bar:
-        images += frames_of_videos(args, videos, args.output, bar)
+        images += frames_of_videos(videos, args.frames, args.output, bar)
     return images
 
 
-def _observed(args: Namespace, images: list[Path]) -> Iterator[_Step]:
+def _observed(args: RunArguments, images: list[Path]) -> Iterator[_Step]:
     """Boards first; what shows none may show the field."""
     rest = [str(path) for path in images]
     if args.board is not None:
@@ -131,13 +129,13 @@ def _observed(args: Namespace, images: list[Path]) -> Iterator[_Step]:
         board = ["--columns", columns, "--rows", rows, "--square", square]
         goal = ["--camera", args.camera, "-o", str(args.output / "board.json")]
         try:
-            found = _step(args, DETECT_BOARD[0], [*rest, *board, *goal], most=1)
+            found = _step(args, "detect board", [*rest, *board, *goal], most=1)
             rest = [path for path in rest if path not in found.data["found"]]
             yield found if args.target is None else replace(found, lines=found.lines[:1])  # the rest may be the field
         except NothingShownError as error:  # reads: "..." below the command of this step
             if args.target is None:
                 raise
-            yield _Step(_typed(DETECT_BOARD[0], [*rest, *board, *goal]), (str(error),), {})
+            yield _Step(_typed("detect board", [*rest, *board, *goal]), (str(error),), {})
     if args.target is not None:
         if not rest:
             raise InputError("every photograph shows the board, and none is left for the field: take one without it")
@@ -147,41 +145,43 @@ def _observed(args: Namespace, images: list[Path]) -> Iterator[_Step]:
         goal = ["--camera", args.camera, "-o", str(args.output / "field.json")]
         still = [] if images_and_videos(args.images)[0] else ["--median"]  # of videos alone
         asked = [*rest, *still, "--target", args.target, "--auto", *facing, *missing, *lengths, *goal]
-        yield _step(args, DETECT_FIELD[0], asked, most=1)
+        yield _step(args, "detect field", asked, most=1)
 
 
-def _calibrated(args: Namespace, detected: Sequence[dict[str, Any]]) -> _Step:
+def _calibrated(args: RunArguments, detected: Sequence[dict[str, Any]]) -> _Step:
     observations = [data["output"] for data in detected]
     stretched = ["--free-aspect"] if any(data.get("stretched") for data in detected) else []
     priors = [word for prior in args.prior for word in ("--prior", prior)]
     goal = ["-o", str(args.output / "calibration.json"), "--report", str(args.output / "report.html")]
-    step = _step(args, CALIBRATE[0], [*observations, "--lens", args.lens, *stretched, *priors, *goal])
-    return replace(step, lines=tuple(sections_of("\n".join(step.lines), _SHOWN)))
+    asked = [*observations, "--lens", args.lens, *stretched, *priors, *goal]
+    return _step(args, "calibrate", asked, titles=_SHOWN)
 
 
-def _exported(args: Namespace, form: str, goal: str) -> _Step:
+def _exported(args: RunArguments, form: str, goal: str) -> _Step:
     """The step of an export, without data where the format cannot hold the calibration."""
     arguments = [str(args.output / "calibration.json"), "--to", form, "-o", goal]
     try:
-        return _step(args, EXPORT[0], arguments)
+        return _step(args, "export", arguments)
     except InputError as error:  # reads: "error ..." in place of the export
-        return _Step(_typed(EXPORT[0], arguments), (section("error", [str(error)]),), {})
+        return _Step(_typed("export", arguments), tuple(Section("error", [str(error)]).shown()), {})
 
 
 # ---- for people -----------------------------------------------------------------------------------------------------
 
 
-def _text(args: Namespace, images: Sequence[Path], steps: Sequence[_Step], level: str) -> str:
-    parts = [section("read", [f"{plural(len(images), 'photograph')} in {', '.join(args.images[:_MOST_NAMES])}"])]
+def _sections(args: RunArguments, images: Sequence[Path], steps: Sequence[_Step], level: str) -> Iterator[Section]:
+    yield Section("read", [f"{plural(len(images), 'photograph')} in {', '.join(args.images[:_MOST_NAMES])}"])
     for number, step in enumerate(steps, start=1):
-        parts += ["", section(f"step {number}", [_short(step.command)]), *step.lines]
-    parts += ["", section("written", [f"{args.output}/: {', '.join(sorted(_made(args, steps)))}"])]
+        yield _BLANK
+        yield Section(f"step {number}", [_short(step.command)])
+        yield Section("", step.lines)
+    yield _BLANK
+    yield Section("written", [f"{args.output}/: {', '.join(sorted(_made(args, steps)))}"])
     if args.to and level == "no":
-        parts.append(section("warning", ["a calibration that is not to be trusted was not exported"]))
-    return "\n".join(parts)
+        yield Section("warning", ["a calibration that is not to be trusted was not exported"])
 
 
-def _made(args: Namespace, steps: Sequence[_Step]) -> set[str]:
+def _made(args: RunArguments, steps: Sequence[_Step]) -> set[str]:
     files = {str(step.data[name]) for step in steps for name in ("output", "report") if step.data.get(name)}
     return {str(Path(path).relative_to(args.output)) for path in files}
 

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from argparse import ArgumentParser, Namespace
-from dataclasses import asdict
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
 
-from ceres_cal.cli.arguments import add_calibration
-from ceres_cal.cli.command import Answer, Command
-from ceres_cal.cli.inputs import read_calibration, read_observations, require_different
-from ceres_cal.cli.outputs import section
+from ceres_cal.cli.arguments import Loss, calibration_argument
+from ceres_cal.cli.command import command
+from ceres_cal.cli.files import read_calibration, read_observations, require_different
+from ceres_cal.cli.options import Arguments, argument, option, switch
+from ceres_cal.report.document import Document, Section
 
 if TYPE_CHECKING:
     from ceres_cal.moves import Part, Score
@@ -17,74 +18,58 @@ if TYPE_CHECKING:
 _MOST_VIEWS = 3  # shown
 
 
-def _add_arguments(parser: ArgumentParser) -> None:
-    add_calibration(parser)
-    add = parser.add_argument
-    add("observations", nargs="+", metavar="OBS", help="files of new observations (.json or .npz), taken together")
-    add(
-        "--hold-stations",
-        action="store_true",
-        help="stations stand where the calibration has them, boards alone are posed: tests the poses of a rig, too",
+@dataclass(frozen=True, kw_only=True)
+class ScoreArguments(Arguments):
+    """A calibration, new observations, and how they are weighed."""
+
+    calibration: Path = calibration_argument()
+    observations: tuple[str, ...] = argument("OBS", "files of new observations (.json or .npz), taken together")
+    hold_stations: bool = switch(
+        "stations stand where the calibration has them, boards alone are posed: tests the poses of a rig, too",
     )
-    add("--loss", choices=("trivial", "huber", "soft_l1", "cauchy", "tukey"), help="default: the calibration's")
-    add(
-        "--reject-sigma",
-        type=float,
-        metavar="SIGMA",
-        help="observations farther off do not take part; default: the calibration's. inf keeps all, and with --loss "
+    loss: Loss | None = option("default: the calibration's")
+    reject_sigma: float | None = option(
+        "observations farther off do not take part; default: the calibration's. inf keeps all, and with --loss "
         "trivial the rms is the one that other programs state",
+        "SIGMA",
     )
 
 
-def _run(args: Namespace) -> Answer:
+@command(
+    "score",
+    "how well a calibration predicts new boards or fields: intrinsics held",
+    "calibration.json new.json",
+    "rig.json boards.json --hold-stations --loss trivial --reject-sigma inf",
+)
+def _run(args: ScoreArguments) -> Document:
     require_different(args.observations)
     from dataclasses import replace
 
     from ceres_cal.moves import score
 
-    calibration = read_calibration(args)
+    calibration = read_calibration(args.calibration)
     asked = {name: value for name in ("loss", "reject_sigma") if (value := getattr(args, name)) is not None}
     options = replace(calibration.options, **asked)
     observations = read_observations(args.observations)
-    answer = score(calibration, observations, options=options, hold_stations=args.hold_stations)
-    return Answer(_data(answer), lambda: _text(answer))
+    return _document(score(calibration, observations, options=options, hold_stations=args.hold_stations))
 
 
-COMMANDS = (
-    Command(
-        "score",
-        "how well a calibration predicts new boards or fields: intrinsics held",
-        _add_arguments,
-        _run,
-        ("calibration.json new.json", "rig.json boards.json --hold-stations --loss trivial --reject-sigma inf"),
-    ),
-)
-
-
-def _data(answer: Score) -> dict[str, Any]:
-    return {
-        "fit": asdict(answer.fit),
+def _document(answer: Score) -> Document:
+    ratios = dict(zip(("points", "curves"), answer.noise_ratios, strict=True))
+    known = [f"noise of {kind} {ratio:.2f} times the calibration's" for kind, ratio in ratios.items() if ratio == ratio]
+    numbers = {
+        "fit": answer.fit,
         "rms_px": answer.fit.rms_px,
         "calibration_rms_px": answer.before.rms_px,
-        "noise_ratios": dict(zip(("points", "curves"), answer.noise_ratios, strict=True)),
-        "cameras": [asdict(part) for part in answer.cameras],
-        "views": [asdict(part) for part in answer.views],
+        "noise_ratios": ratios,
     }
-
-
-def _text(answer: Score) -> str:
-    ratios = [
-        f"noise of {kind} {ratio:.2f} times the calibration's"
-        for kind, ratio in zip(("points", "curves"), answer.noise_ratios, strict=True)
-        if ratio == ratio
-    ]
-    shown = [f"{part.name}: {_left(part)}" for part in answer.views[:_MOST_VIEWS]]
-    return "\n".join(
-        [
-            section("score", ["intrinsics held, poses alone solved for", *ratios]),
-            *(section("camera", [f"{part.name}: {_left(part)}"]) for part in answer.cameras),
-            section("worst", shown),
-        ]
+    worst = [f"{part.name}: {_left(part)}" for part in answer.views[:_MOST_VIEWS]]
+    return Document(
+        (
+            Section("score", ["intrinsics held, poses alone solved for", *known], numbers),
+            *(Section("camera", [f"{part.name}: {_left(part)}"]) for part in answer.cameras),
+            Section("worst", worst, {"cameras": answer.cameras, "views": answer.views}),
+        )
     )
 
 

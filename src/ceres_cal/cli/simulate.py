@@ -2,34 +2,47 @@
 
 from __future__ import annotations
 
-from argparse import ArgumentParser, Namespace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.words import plural
-from ceres_cal.cli.command import Answer, Command
-from ceres_cal.cli.outputs import finishing
+from ceres_cal.cli.arguments import output_option
+from ceres_cal.cli.command import command
+from ceres_cal.cli.files import finishing
+from ceres_cal.cli.options import Arguments, argument, option, switch
+from ceres_cal.report.document import Document, Section
 
 if TYPE_CHECKING:
     from ceres_cal.simulate import Simulation
 
 
-def _add_arguments(parser: ArgumentParser) -> None:
-    add = parser.add_argument
-    add("scene", nargs="?", metavar="SCENE", help="name of a built-in scene, or a scene file (.json)")
-    add("-o", "--output", metavar="DIR", type=Path, help="folder for observations.json and truth.json; made if missing")
-    add("--seed", type=int, default=0, metavar="N", help="the same seed gives the same observations; default: 0")
-    add("--list", action="store_true", help="list the built-in scenes")
+@dataclass(frozen=True, kw_only=True)
+class SimulateArguments(Arguments):
+    """A scene, and where its observations go."""
+
+    scene: str | None = argument("SCENE", "name of a built-in scene, or a scene file (.json)", None)
+    output: Path | None = output_option("observations.json and truth.json; made if missing", None, "DIR")
+    seed: int = option("the same seed gives the same observations", "N", 0)
+    list: bool = switch("list the built-in scenes")
 
 
-def _run(args: Namespace) -> Answer:
+@command(
+    "simulate",
+    "make observations of a scene, with noise and errors, and their truth",
+    "ssl-field -o try/",
+    "two-cameras -o try/ --seed 3",
+    "--list",
+)
+def _run(args: SimulateArguments) -> Document:
     from ceres_cal.simulate import built_in_scene, load_scene, scene_names, simulate, write_simulation
 
     scenes = scene_names()
     if args.list:
         width = max(map(len, scenes))
-        return Answer({"scenes": scenes}, lambda: "\n".join(f"{name:{width}}  {text}" for name, text in scenes.items()))
+        lines = [f"{name:{width}}  {text}" for name, text in scenes.items()]
+        return Document((Section("", lines, {"scenes": scenes}),))
     if args.scene is None or args.output is None:
         raise InputError(
             "name a scene and a folder, as in `ceres-cal simulate ssl-field -o DIR`; --list shows the scenes"
@@ -44,18 +57,7 @@ def _run(args: Namespace) -> Answer:
     with finishing():
         write_simulation(simulation, args.output)
     data = _data(simulation, args.scene, args.output)
-    return Answer(data, lambda: _text(data))
-
-
-COMMANDS = (
-    Command(
-        "simulate",
-        "make observations of a scene, with noise and errors, and their truth",
-        _add_arguments,
-        _run,
-        ("ssl-field -o try/", "two-cameras -o try/ --seed 3", "--list"),
-    ),
-)
+    return Document((Section("", _lines(data), data),))
 
 
 def _data(simulation: Simulation, scene: str, folder: Path) -> dict[str, Any]:
@@ -75,10 +77,8 @@ def _data(simulation: Simulation, scene: str, folder: Path) -> dict[str, Any]:
     }
 
 
-def _text(data: dict[str, Any]) -> str:
-    return (
-        f"{data['observations']}: {plural(data['views'], 'view')}, {plural(data['points'], 'point observation')}, "
-        f"{plural(data['curves'], 'curve observation')}, of them {plural(data['outliers'], 'outlier')} and "
-        f"{plural(data['wrong_labels'], 'wrong label')}\n"
-        f"{data['truth']}: what is true of them"
-    )
+def _lines(data: dict[str, Any]) -> list[str]:
+    kinds = (("views", "view"), ("points", "point observation"), ("curves", "curve observation"))
+    seen = ", ".join(plural(data[name], word) for name, word in kinds)
+    wrong = f"{plural(data['outliers'], 'outlier')} and {plural(data['wrong_labels'], 'wrong label')}"
+    return [f"{data['observations']}: {seen}, of them {wrong}", f"{data['truth']}: what is true of them"]

@@ -2,37 +2,47 @@
 
 from __future__ import annotations
 
-from argparse import ArgumentParser, Namespace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ceres_cal.base.errors import InputError
-from ceres_cal.cli.arguments import add_output
-from ceres_cal.cli.command import Answer, Command
-from ceres_cal.cli.inputs import spelled_target
-from ceres_cal.cli.outputs import finishing, require_ending, require_output, section
+from ceres_cal.cli.arguments import output_option
+from ceres_cal.cli.command import command
+from ceres_cal.cli.files import finishing, require_ending, require_output, spelled_target
+from ceres_cal.cli.options import Arguments, argument, option
+from ceres_cal.report.document import Document, Section
 
 if TYPE_CHECKING:
     from ceres_cal.scene.targets import Curve, Target, TargetKind
 
 
-def _add_arguments(parser: ArgumentParser) -> None:
+def _help() -> str:
     from ceres_cal.scene.targets import TARGET_KINDS, targets_by_name
 
-    parser.add_argument(
-        "target",
-        nargs="?",
-        metavar="TARGET",
-        help=f"list the features of a kind ({', '.join(TARGET_KINDS)}), of {' or '.join(targets_by_name())}, of one "
+    return (
+        f"list the features of a kind ({', '.join(TARGET_KINDS)}), of {' or '.join(targets_by_name())}, of one "
         "that is spelled out as in files ('{\"kind\": ...}'), or of the targets in a file of observations; without it "
-        "the kinds are listed",
-    )
-    parser.add_argument(
-        "--picture", metavar="SVG", type=Path, help="draw the target there, with the names of its lines"
+        "the kinds are listed"
     )
 
 
-def _run(args: Namespace) -> Answer:
+@dataclass(frozen=True, kw_only=True)
+class TargetsArguments(Arguments):
+    """What to list."""
+
+    target: str | None = argument("TARGET", _help, None)
+    picture: Path | None = option("draw the target there, with the names of its lines", "SVG")
+
+
+@command(
+    "targets",
+    "the kinds of targets and the names of their features",
+    "",
+    "vss-3 --picture vss-3.svg",
+    "observations.json",
+)
+def _run(args: TargetsArguments) -> Document:
     from ceres_cal.scene.targets import TARGET_KINDS
 
     if args.picture is not None:
@@ -41,14 +51,14 @@ def _run(args: Namespace) -> Answer:
         if args.target is None:
             raise InputError("--picture draws one target: name it, such as vss-3")
     if args.target is None:
-        return Answer({"kinds": {name: _kind_data(kind) for name, kind in TARGET_KINDS.items()}}, _kinds_text)
+        kinds = {name: _kind_data(kind) for name, kind in TARGET_KINDS.items()}
+        return Document((Section("", _kinds_text().splitlines(), {"kinds": kinds}),))
     targets = _targets(args.target)
     if args.picture is not None:
         _draw(targets, args.target, args.picture)
-    return Answer(
-        {"targets": {name: _target_data(target) for name, target in targets.items()}},
-        lambda: "\n\n".join(_target_text(name, target) for name, target in targets.items()),
-    )
+    data = {"targets": {name: _target_data(target) for name, target in targets.items()}}
+    text = "\n\n".join(_target_text(name, target) for name, target in targets.items())
+    return Document((Section("", text.splitlines(), data),))
 
 
 def _draw(targets: dict[str, Target], wanted: str, picture: Path) -> None:
@@ -63,12 +73,20 @@ def _draw(targets: dict[str, Target], wanted: str, picture: Path) -> None:
         write_bytes(picture, content)
 
 
-def _add_print(parser: ArgumentParser) -> None:
-    parser.add_argument("target", metavar="BOARD", help='as `ceres-cal targets` has it, or {"kind": ...} as in files')
-    add_output(parser, "the sheet (.pdf)", required=True)
+@dataclass(frozen=True, kw_only=True)
+class PrintArguments(Arguments):
+    """What to print."""
+
+    target: str = argument("BOARD", 'as `ceres-cal targets` has it, or {"kind": ...} as in files')
+    output: Path = output_option("the sheet (.pdf)")
 
 
-def _print(args: Namespace) -> Answer:
+@command(
+    "targets print",
+    "a board as a PDF to print to scale, with a ruler on it",
+    '\'{"kind": "checkerboard", "columns": 9, "rows": 6, "square_m": 0.025}\' -o board.pdf',
+)
+def _print(args: PrintArguments) -> Document:
     require_output(args.output, [])
     require_ending(args.output, "sheets are", ".pdf")
     import json
@@ -83,25 +101,7 @@ def _print(args: Namespace) -> Answer:
     content = sheet_pdf(target, json.dumps(target.spec))
     with finishing():
         write_bytes(args.output, content)
-    return Answer({"output": str(args.output), "spec": target.spec}, lambda: section("written", [str(args.output)]))
-
-
-COMMANDS = (
-    Command(
-        "targets",
-        "the kinds of targets and the names of their features",
-        _add_arguments,
-        _run,
-        ("", "vss-3 --picture vss-3.svg", "observations.json"),
-    ),
-    Command(
-        "targets print",
-        "a board as a PDF to print to scale, with a ruler on it",
-        _add_print,
-        _print,
-        ('\'{"kind": "checkerboard", "columns": 9, "rows": 6, "square_m": 0.025}\' -o board.pdf',),
-    ),
-)
+    return Document((Section("written", [str(args.output)], {"output": str(args.output), "spec": target.spec}),))
 
 
 def _targets(wanted: str) -> dict[str, Target]:

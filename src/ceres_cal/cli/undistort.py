@@ -2,28 +2,28 @@
 
 from __future__ import annotations
 
-from argparse import ArgumentParser, Namespace
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.words import frame_of
 from ceres_cal.cli.arguments import (
-    add_calibration,
-    add_height,
-    add_quiet,
-    add_station,
-    height_m,
+    calibration_argument,
+    height_option,
     length,
+    metres,
+    number,
+    output_option,
     parse_lengths,
-    parse_number,
+    station_option,
 )
-from ceres_cal.cli.command import Answer, Command
-from ceres_cal.cli.inputs import image_files, read_calibration
-from ceres_cal.cli.outputs import finishing
-from ceres_cal.cli.progress import progress_bar
+from ceres_cal.cli.command import command
+from ceres_cal.cli.files import finishing, image_files, read_calibration
+from ceres_cal.cli.options import QuietArguments, argument, given_of, option, switch
+from ceres_cal.cli.terminal import progress_bar
+from ceres_cal.report.document import Document, Section
 
 if TYPE_CHECKING:
     from ceres_cal.base.arrays import Image
@@ -34,49 +34,81 @@ if TYPE_CHECKING:
 _MARGIN_M = 0.3  # around the field in a top view
 _JPEG_QUALITY = 95
 _FORMAT, _VERSION = "ceres-cal/pictures", 1
-_OF_STRAIGHT = ("whole", "crop", "size", "phi", "angle")
-_OF_TOP = ("mm_per_px", "area")
-_OF_OVERLAY = ("before", "observations")
+_STRAIGHT = "straight images (default)"
+_TOP = "the field from above"
+_OVERLAY = "the model in the photograph"
+Area = tuple[float, float, float, float]
+"""x0, y0, x1 and y1 in metres."""
 
 
-def _add_arguments(parser: ArgumentParser) -> None:
-    add = parser.add_argument
-    add_calibration(parser)
-    add("images", nargs="+", metavar="IMAGE", help="photographs of one camera, or folders of them")
-    add("-o", "--output", metavar="FOLDER", type=Path, required=True, help="for the pictures; made if missing")
-    add("--camera", metavar="NAME", help="which camera; may be left out where there is only one")
-    add_station(parser)
-    add("--format", choices=("png", "jpg"), default="png", help="default: png, which loses nothing")
-    add_quiet(parser)
-    group = parser.add_argument_group("straight images (default)")
-    either = group.add_mutually_exclusive_group()
-    either.add_argument("--crop", action="store_true", help="the largest rectangle without black (default)")
-    either.add_argument("--whole", action="store_true", help="everything that the photograph shows, black around it")
-    scale = group.add_mutually_exclusive_group()
-    scale.add_argument("--size", metavar="WxH", help="size of the straight image, px; default: the photograph's")
-    scale.add_argument("--phi", metavar="PX", help="its focal length instead; the camera's own keeps the scale")
-    group.add_argument(
-        "--angle", metavar="DEG", help="widest angle of view; default: 150 with --whole, else as far as detail goes"
+def _size(text: str) -> tuple[int, int]:
+    across, by, down = text.lower().partition("x")
+    if not (by and across.isdecimal() and down.isdecimal()):
+        raise InputError(f"--size {text!r}: write WIDTHxHEIGHT in px, such as 1280x960")
+    return int(across), int(down)
+
+
+def _area(text: str) -> Area:
+    numbers = parse_lengths(text, f"--area {text!r}")
+    if len(numbers) != 4:
+        raise InputError(f"--area {text!r}: write X0,Y0,X1,Y1 in metres, such as -4.5,-3,0,3")
+    return numbers[0], numbers[1], numbers[2], numbers[3]
+
+
+@dataclass(frozen=True, kw_only=True)
+class UndistortArguments(QuietArguments):
+    """Photographs, and what is made of each."""
+
+    calibration: Path = calibration_argument()
+    images: tuple[str, ...] = argument("IMAGE", "photographs of one camera, or folders of them")
+    output: Path = output_option("the pictures; made if missing", metavar="FOLDER")
+    camera: str | None = option("which camera; may be left out where there is only one", "NAME")
+    station: str | None = station_option()
+    format: Literal["png", "jpg"] = option("default: png, which loses nothing", default="png")
+    crop: bool = switch("the largest rectangle without black (default)", group=_STRAIGHT, alone="shape")
+    whole: bool = switch("everything that the photograph shows, black around it", group=_STRAIGHT, alone="shape")
+    size: tuple[int, int] | None = option(
+        "size of the straight image, px; default: the photograph's", "WxH", read=_size, group=_STRAIGHT, alone="scale"
     )
-    group = parser.add_argument_group("the field from above")
-    group.add_argument("--top-view", action="store_true", help="the field from straight above, to scale")
-    group.add_argument("--mm-per-px", type=length("mm"), metavar="MM", help="scale of the top view; default: 5")
-    group.add_argument("--area", metavar="X0,Y0,X1,Y1", help="area in metres; default: the field and 0.3 m around it")
-    group = parser.add_argument_group("the model in the photograph")
-    group.add_argument("--overlay", action="store_true", help="draw the calibrated lines and boards into photographs")
-    group.add_argument("--before", metavar="CALIBRATION", type=Path, help="draw an earlier calibration too")
-    group.add_argument("--observations", metavar="OBS", type=Path, help="say what each frame shows, and draw them too")
-    add_height(parser, "plane of the top view, or of a second drawing in an overlay")
+    phi: float | None = option(
+        "its focal length instead; the camera's own keeps the scale",
+        "PX",
+        read=number("--phi"),
+        group=_STRAIGHT,
+        alone="scale",
+    )
+    angle: float | None = option(
+        "widest angle of view; default: 150 with --whole, else as far as detail goes",
+        "DEG",
+        read=number("--angle"),
+        group=_STRAIGHT,
+    )
+    top_view: bool = switch("the field from straight above, to scale", group=_TOP)
+    mm_per_px: float | None = option("scale of the top view; default: 5", "MM", read=length("mm"), group=_TOP)
+    area: Area | None = option(
+        "area in metres; default: the field and 0.3 m around it", "X0,Y0,X1,Y1", read=_area, group=_TOP
+    )
+    overlay: bool = switch("draw the calibrated lines and boards into photographs", group=_OVERLAY)
+    before: Path | None = option("draw an earlier calibration too", "CALIBRATION", group=_OVERLAY)
+    observations: Path | None = option("say what each frame shows, and draw them too", "OBS", group=_OVERLAY)
+    height_mm: float | None = height_option("plane of the top view, or of a second drawing in an overlay")
 
 
-def _run(args: Namespace) -> Answer:
+@command(
+    "undistort",
+    "straight images, top views to scale, the model in a photograph",
+    "calibration.json photographs/ -o straight/",
+    "calibration.json photographs/ -o top/ --top-view --mm-per-px 5 --height-mm 150",
+    "calibration.json photographs/ -o look/ --overlay --before old.json",
+)
+def _run(args: UndistortArguments) -> Document:
     require_fitting(args)
     images = image_files(args.images)
     kind = "top" if args.top_view else "overlay" if args.overlay else "straight"
     outputs = _outputs(images, args.output, f"-{kind}.{args.format}", f"{kind}.json")
     from ceres_cal.base.files import write_json
 
-    calibration = read_calibration(args)
+    calibration = read_calibration(args.calibration)
     make = {"top": _top_view, "overlay": _overlay, "straight": _straight}[kind](args, calibration)
     args.output.mkdir(parents=True, exist_ok=True)
     lines: list[str] = []
@@ -92,43 +124,26 @@ def _run(args: Namespace) -> Answer:
     data = {"format": _FORMAT, "version": _VERSION, "calibration": str(args.calibration), "kind": kind, **make.facts}
     with finishing():
         write_json(about, {**data, "pictures": written})
-    return Answer(
-        {**data, "pictures": written, "output": str(about)}, lambda: "\n".join([*lines, f"{about}: {make.about}"])
-    )
-
-
-COMMANDS = (
-    Command(
-        "undistort",
-        "straight images, top views to scale, the model in a photograph",
-        _add_arguments,
-        _run,
-        (
-            "calibration.json photographs/ -o straight/",
-            "calibration.json photographs/ -o top/ --top-view --mm-per-px 5 --height-mm 150",
-            "calibration.json photographs/ -o look/ --overlay --before old.json",
-        ),
-    ),
-)
+    said = {**data, "pictures": written, "output": str(about)}
+    return Document((Section("", [*lines, f"{about}: {make.about}"], said),))
 
 
 # ---- options --------------------------------------------------------------------------------------------------------
 
 
-def require_fitting(args: Namespace) -> None:
+def require_fitting(args: UndistortArguments) -> None:
     """Raise InputError where options of different pictures are mixed."""
     if args.top_view and args.overlay:
         raise InputError("--top-view and --overlay are two kinds of pictures: make one at a time")
     groups = (
-        (_OF_STRAIGHT, not (args.top_view or args.overlay), "straight images"),
-        (_OF_TOP, args.top_view, "--top-view"),
-        (_OF_OVERLAY, args.overlay, "--overlay"),
-        (("height_mm",), args.top_view or args.overlay, "--top-view and --overlay"),
+        (given_of(args, _STRAIGHT), not (args.top_view or args.overlay), "straight images"),
+        (given_of(args, _TOP), args.top_view, "--top-view"),
+        (given_of(args, _OVERLAY), args.overlay, "--overlay"),
+        ([] if args.height_mm is None else ["--height-mm"], args.top_view or args.overlay, "--top-view and --overlay"),
     )
-    for names, chosen, what in groups:
-        given = [name for name in names if getattr(args, name) not in (None, False)]
+    for given, chosen, what in groups:
         if given and not chosen:
-            raise InputError(f"--{given[0].replace('_', '-')} is for {what}: leave it out, or ask for that")
+            raise InputError(f"{given[0]} is for {what}: leave it out, or ask for that")
 
 
 def _outputs(images: list[Path], folder: Path, ending: str, about: str) -> dict[Path, Path]:
@@ -147,21 +162,7 @@ def _outputs(images: list[Path], folder: Path, ending: str, about: str) -> dict[
     return outputs
 
 
-def _size(text: str) -> tuple[int, int]:
-    across, by, down = text.lower().partition("x")
-    if not (by and across.isdecimal() and down.isdecimal()):
-        raise InputError(f"--size {text!r}: write WIDTHxHEIGHT in px, such as 1280x960")
-    return int(across), int(down)
-
-
-def _area(text: str) -> tuple[float, float, float, float]:
-    numbers = parse_lengths(text, f"--area {text!r}")
-    if len(numbers) != 4:
-        raise InputError(f"--area {text!r}: write X0,Y0,X1,Y1 in metres, such as -4.5,-3,0,3")
-    return numbers[0], numbers[1], numbers[2], numbers[3]
-
-
-def _station(args: Namespace, calibration: Calibration) -> str:
+def _station(args: UndistortArguments, calibration: Calibration) -> str:
     """The station that took the photographs; --camera is enough where it stood at one only."""
     stations = calibration.estimate.stations
     if args.station is not None:
@@ -174,13 +175,14 @@ def _station(args: Namespace, calibration: Calibration) -> str:
         if args.station in (None, name) and args.camera in (None, station.camera)
     ]
     if not fitting:
-        raise InputError(f"station {args.station!r} is of camera {stations[args.station].camera!r}: leave out --camera")
+        owner = stations[str(args.station)].camera
+        raise InputError(f"station {args.station!r} is of camera {owner!r}: leave out --camera")
     if len(fitting) > 1:
         raise InputError(f"there are several stations, name one: --station {' or '.join(fitting)}")
     return fitting[0]
 
 
-def _camera(args: Namespace, calibration: Calibration) -> tuple[str, str | None, Camera]:
+def _camera(args: UndistortArguments, calibration: Calibration) -> tuple[str, str | None, Camera]:
     """Names of the camera and of its station, where that is one, and the camera, posed in that case."""
     owners = {name: station.camera for name, station in calibration.estimate.stations.items()}
     wanted = set(calibration.cameras) if args.camera is None else {args.camera}
@@ -219,7 +221,7 @@ def _write(path: Path, picture: Image) -> None:
         write_bytes(path, content)
 
 
-def _straight(args: Namespace, calibration: Calibration) -> _PictureMaker:
+def _straight(args: UndistortArguments, calibration: Calibration) -> _PictureMaker:
     from ceres_cal.pictures.straight import straighten
     from ceres_cal.scene.files import camera_to_json
 
@@ -227,9 +229,9 @@ def _straight(args: Namespace, calibration: Calibration) -> _PictureMaker:
     straight = straighten(
         camera,
         whole=args.whole,
-        size=None if args.size is None else _size(args.size),
-        phi=None if args.phi is None else parse_number(args.phi, "--phi"),
-        angle_deg=None if args.angle is None else parse_number(args.angle, "--angle"),
+        size=args.size,
+        phi=args.phi,
+        angle_deg=args.angle,
     )
     facts = {
         "camera": name,
@@ -272,14 +274,14 @@ def _black(size: tuple[int, int], count: int) -> str:
     return "nothing black" if count == 0 else f"{count} px ({100.0 * count / (size[0] * size[1]):.1f} %) black"
 
 
-def _top_view(args: Namespace, calibration: Calibration) -> _PictureMaker:
+def _top_view(args: UndistortArguments, calibration: Calibration) -> _PictureMaker:
     from ceres_cal.pictures.top_view import make_grid, top_view
 
     station = _station(args, calibration)
     camera, name = calibration.stations[station], calibration.estimate.stations[station].camera
-    area = _field(calibration) if args.area is None else _area(args.area)
+    area = args.area or _field(calibration)
     mm_per_px = 5.0 if args.mm_per_px is None else args.mm_per_px
-    grid = make_grid(area, mm_per_px / 1000.0, height_m(args))
+    grid = make_grid(area, mm_per_px / 1000.0, metres(args.height_mm))
     warp = top_view(camera, grid)
     x0, y0, x1, y1 = grid.area_m
     facts = {
@@ -301,7 +303,7 @@ def _top_view(args: Namespace, calibration: Calibration) -> _PictureMaker:
     )
 
 
-def _field(calibration: Calibration) -> tuple[float, float, float, float]:
+def _field(calibration: Calibration) -> Area:
     from ceres_cal.uncertainty.uncertainty import field_grid
 
     try:
@@ -313,13 +315,13 @@ def _field(calibration: Calibration) -> tuple[float, float, float, float]:
     return x0, y0, x1, y1
 
 
-def _overlay(args: Namespace, calibration: Calibration) -> _PictureMaker:
+def _overlay(args: UndistortArguments, calibration: Calibration) -> _PictureMaker:
     from ceres_cal.calibration import Calibration as File
     from ceres_cal.observations import Observations
     from ceres_cal.pictures.frames import Frame, frame_by_name, frames_of, marks_of, model_of
     from ceres_cal.pictures.overlay import AFTER, BEFORE, LIFTED, Layer, draw_overlay
 
-    station, height = _station(args, calibration), height_m(args)
+    station, height = _station(args, calibration), metres(args.height_mm)
     camera, name = calibration.stations[station], calibration.estimate.stations[station].camera
     before = None if args.before is None else File.load(args.before)
     observations = None if args.observations is None else Observations.load(args.observations)
@@ -327,7 +329,7 @@ def _overlay(args: Namespace, calibration: Calibration) -> _PictureMaker:
 
     def layers(frame: Frame) -> Iterator[Layer]:
         if before is not None:
-            yield Layer(model_of(before, frame), f"before: {args.before.name}", BEFORE)
+            yield Layer(model_of(before, frame), f"before: {Path(args.before or '').name}", BEFORE)
         if height:
             yield Layer(model_of(calibration, frame, height), f"{1e3 * height:g} mm above", LIFTED)
         yield Layer(model_of(calibration, frame), args.calibration.name, AFTER)

@@ -31,7 +31,6 @@ _THEMED = {
 
 NARROW_IN, WIDE_IN = 3.65, 7.5
 """A picture in one column, which is what a phone shows, and one across both."""
-_POINTS_PER_INCH = 72
 _STYLE: dict[str, Any] = {
     "svg.fonttype": "none",  # letters stay letters: in the page's own face, to be searched and read aloud
     "text.parse_math": False,  # names come from files

@@ -1,38 +1,56 @@
-"""The chapter behind the verdict: what the residuals say, cause by cause."""
+"""What the residuals say: sections of a diagnosis, and the chapter of a report behind its verdict."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from ceres_cal.base.words import DASH, chance, counted, fixed, grouped, mm, powered, sentence, short
-from ceres_cal.diagnostics import Finding, Noise
-from ceres_cal.diagnostics.held_out import Choice, HeldOut
+from ceres_cal.base.words import DASH, chance, counted, fixed, grouped, mm, plural, powered, sentence, short
+from ceres_cal.diagnostics import Diagnosis, Finding, Noise, ResidualTable, Summary
+from ceres_cal.diagnostics.held_out import Choice
+from ceres_cal.report.document import Card, Chapter, Piece, Section, Table, Text, wrapped
 from ceres_cal.report.grounds import is_against
-from ceres_cal.report.material import Material
-from ceres_cal.report.page import Card, Chapter, Piece, Table, Text
 
-_MOST_CARDS = 8
+_MOST_CARDS, _MOST_ROWS = 8, 8
+_MOST_SAID = 3  # amounts that the sentence of a finding says itself
+_CHOSEN_BY = "the simplest within 1.75 standard errors of the least error; radial 2,3 wins ties"
+_MODEL_ERROR = (
+    "the model is wrong by more than its noise can hide: no covariance or standard deviation of this calibration "
+    "contains that error"
+)
+_NEW_DATA = (
+    "residuals are those of the calibration as it stands; the findings are what would be left if it were refitted to "
+    "them"
+)
 
-CHOSEN_BY = "the simplest within 1.75 standard errors of the least error; radial 2,3 wins ties"
+
+def diagnosis_sections(diagnosis: Diagnosis, choice: Choice | None) -> Iterator[Section]:
+    """The verdict, the findings by size, then tables; everything but the table of single observations."""
+    summaries = diagnosis.summaries
+    own = ("model_error", "conflicts", "new_data", "tests", "false_alarm_rate", "findings")
+    said = _verdict(diagnosis)
+    yield Section("verdict", wrapped(*said), {"verdict": said, **{name: getattr(diagnosis, name) for name in own}})
+    yield from (Section("conflict", wrapped(conflict.words)) for conflict in diagnosis.conflicts)
+    for number, finding in enumerate(diagnosis.findings, start=1):
+        yield Section(f"finding {number}", _finding(finding))
+    yield _noise(diagnosis.noise)
+    yield _held_out(choice) if choice is not None else Section(data={"held_out": None})
+    yield _outliers(diagnosis.table)
+    for title, name in (("frames", "frames"), ("features", "features"), ("radius", "radii"), ("regions", "regions")):
+        one = getattr(summaries, name)
+        yield Section(title, _summary(one, by_size=name != "radii"), {"summaries": {name: one}})
+    yield Section("leverage", _leverage(diagnosis.table), {"radius_trend": summaries.trends})
 
 
-def findings(material: Material) -> Chapter:
+def chapter(diagnosis: Diagnosis, choice: Choice | None) -> Chapter:
     """Findings, the largest first, the noise that is left, and the held-out errors where they were computed."""
-    diagnosis = material.diagnosis
     rate = f"{100.0 * diagnosis.false_alarm_rate:g} %"
     tested = (
         f"{counted(diagnosis.tests, 'alternative')} of the model were tested; of sound data {rate} raise any finding."
     )
-    pieces: list[Piece] = []
-    if diagnosis.new_data:
-        pieces.append(
-            Text(
-                "These are new data: residuals are those of the calibration as it stands, the findings are what would "
-                "be left if it were refitted to them."
-            )
-        )
+    pieces: list[Piece] = [Text(f"These are new data: {_NEW_DATA}.")] if diagnosis.new_data else []
     if diagnosis.findings:
         pieces.append(Text(f"What is wrong with the calibration first, then the rest, each by size. {tested}"))
         ordered = sorted(diagnosis.findings, key=lambda one: not is_against(one))
@@ -40,20 +58,37 @@ def findings(material: Material) -> Chapter:
         pieces += _others(ordered[_MOST_CARDS:])
     else:
         pieces.append(Text(f"Nothing was found: what is left over looks like noise. {tested}"))
-    pieces.append(_noise(diagnosis.noise))
-    if material.choice is not None:
-        pieces += _held_out(material.choice)
+    pieces += _noise(diagnosis.noise).pieces
+    pieces += () if choice is None else _held_out(choice).pieces
     return Chapter("findings", "What the residuals say", tuple(pieces))
 
 
-def _others(others: Sequence[Finding]) -> Iterator[Piece]:
-    if others:
-        rows = tuple(
-            (sentence(one.sentence), short(one.effect_px), short(one.effect_mm), powered(chance(one.log10_p)))
-            for one in others
+def _verdict(diagnosis: Diagnosis) -> list[str]:
+    rate = f"{diagnosis.tests} tests; sound data raise a finding in {100.0 * diagnosis.false_alarm_rate:g} % of cases"
+    lines = [f"new data: {_NEW_DATA}"] if diagnosis.new_data else []
+    if diagnosis.conflicts:
+        lines.append(
+            "what was known beforehand is contradicted: its standard deviations hold what is in dispute, and findings "
+            "may follow from it"
         )
-        head = ("", "px", "mm", "false alarm")
-        yield Table(head, rows, f"{counted(len(others), 'smaller finding')}", stacked=True)
+    if not diagnosis.findings:
+        sound = "nothing else" if diagnosis.conflicts else "sound"
+        return [*lines, f"{sound}: what is left over looks like noise ({rate})"]
+    lines.append(f"{plural(len(diagnosis.findings), 'finding')}, the largest first ({rate})")
+    return [*lines, _MODEL_ERROR] if diagnosis.model_error else lines
+
+
+# ---- findings -------------------------------------------------------------------------------------------------------
+
+
+def _finding(finding: Finding) -> list[str]:
+    lines = wrapped(finding.sentence, f"-> {finding.advice}")
+    moved = plural(finding.observations, "observation")
+    size = f"{finding.effect_px:.2f} px, {fixed(finding.effect_mm, 2)} mm; {moved}"
+    lines.append(f"   {size}; false alarm: {chance(finding.log10_p)}")
+    if len(finding.amounts) > _MOST_SAID:
+        lines += [f"   {one.name:28}{one.value:9.3f} ± {one.sd:.3f} {one.unit}" for one in finding.amounts]
+    return lines
 
 
 def _card(finding: Finding) -> Card:
@@ -68,45 +103,102 @@ def _card(finding: Finding) -> Card:
     )
 
 
-def _noise(noise: tuple[Noise, ...]) -> Table:
-    return Table(
-        ("noise of", "observations", "sd, px", "of the stated", "neighbours' correlation"),
-        tuple(
-            (
-                one.kind,
-                grouped(one.observations),
-                fixed(one.sigma_px, 3),
-                f"{one.scale:.2f} times" if np.isfinite(one.stated_px) else "none stated",
-                fixed(one.correlation, 2, "+"),
-            )
-            for one in noise
-        ),
-        stacked=True,
-    )
+def _others(others: Sequence[Finding]) -> Iterator[Piece]:
+    if others:
+        rows = tuple(
+            (sentence(one.sentence), short(one.effect_px), short(one.effect_mm), powered(chance(one.log10_p)))
+            for one in others
+        )
+        head = ("", "px", "mm", "false alarm")
+        yield Table(head, rows, f"{counted(len(others), 'smaller finding')}", stacked=True)
 
 
-def _held_out(choice: Choice) -> tuple[Table, Text]:
-    rule = f"{sentence(chosen_lens(choice))}: {CHOSEN_BY}."
-    thinned = f" On {100.0 * choice.thinned:.0f} % of the observations." if choice.thinned < 1.0 else ""
-    rows = tuple(_candidate(choice, number, one) for number, one in enumerate(choice.candidates))
+# ---- noise, outliers, lenses held out -------------------------------------------------------------------------------
+
+
+def _noise(every: Sequence[Noise]) -> Section:
+    lines, rows = [], []
+    for one in every:
+        stated = np.isfinite(one.stated_px)
+        said = f"{one.scale:.3f} times what was stated" if stated else "no sigma stated"
+        near = f", neighbours correlated {one.correlation:+.2f}" if np.isfinite(one.correlation) else ""
+        lines.append(f"{one.kind}  {one.sigma_px:.4f} px over {one.observations}, {said}{near}")
+        of_stated = f"{one.scale:.2f} times" if stated else "none stated"
+        numbers = (grouped(one.observations), fixed(one.sigma_px, 3), of_stated, fixed(one.correlation, 2, "+"))
+        rows.append((one.kind, *numbers))
+    head = ("noise of", "observations", "sd, px", "of the stated", "neighbours' correlation")
+    return Section("noise", lines, {"noise": every}, (Table(head, tuple(rows), stacked=True),))
+
+
+def _outliers(table: ResidualTable) -> Section:
+    names = np.array(table.features)[table.feature[table.outlier]]
+    rejected = Counter(names.tolist())
+    out = f"{sum(rejected.values())} of {len(table)} taken out" if rejected else f"none of {len(table)}"
+    lines = [out, *(f"{count:5}  {name}" for name, count in rejected.most_common(_MOST_ROWS))]
+    rest = len(rejected) - _MOST_ROWS
+    lines += [f"and on {plural(rest, 'other feature')}"] if rest > 0 else []
+    return Section("outliers", lines, {"rejected": rejected})
+
+
+def _held_out(choice: Choice) -> Section:
+    """Which lens predicts parts that it was not fitted to best."""
+    chosen, current, best = (choice.candidates[i].label for i in (choice.chosen, choice.current, choice.best))
+    take = "the calibration's lens is the one to take" if choice.chosen == choice.current else f"take {chosen}"
+    rows = []
+    for number, one in enumerate(choice.candidates):
+        kinds = (("now", choice.current), ("least error", choice.best), ("chosen", choice.chosen))
+        marks = ", ".join(word for word, index in kinds if index == number)
+        if one.failed_folds:
+            marks = f"{marks} without {plural(one.failed_folds, 'part')} that failed".strip()
+        cells = (fixed(one.rms_px, 4), fixed(one.rms_mm, 3), fixed(one.fit_rms_px, 4), marks)
+        rows.append((one.label, *((DASH, DASH, DASH, one.failed) if one.failed else cells)))
+    thinned = f"on {100.0 * choice.thinned:.0f} % of the observations" if choice.thinned < 1.0 else ""
+    parts = max(one.folds for one in choice.candidates)
+    rule = f"{parts} parts of the frames; chosen: {_CHOSEN_BY}"
     head = ("lens", "held-out px", "mm", "fit px", "")
-    return Table(head, rows, "Frames held out: how well others predict them", stacked=True), Text(rule + thinned)
+    table = Table(head, tuple(rows), "Frames held out: how well others predict them", stacked=True)
+    lines = [*table.lines(), f"{rule}; {thinned}" if thinned else rule, take]
+    text = f"{sentence(take)}: {_CHOSEN_BY}." + (f" {sentence(thinned)}." if thinned else "")
+    labels = {"best": best, "chosen": chosen, "current": current}
+    data = {"candidates": choice.candidates, **labels, "share_of_observations": choice.thinned}
+    return Section("held out", lines, {"held_out": data}, (table, Text(text)))
 
 
-def _candidate(choice: Choice, number: int, one: HeldOut) -> tuple[str, ...]:
-    if one.failed:
-        return one.label, DASH, DASH, DASH, one.failed
-    marks = choice_marks(choice, number)
-    return one.label, fixed(one.rms_px, 4), fixed(one.rms_mm, 3), fixed(one.fit_rms_px, 4), marks
+# ---- tables ---------------------------------------------------------------------------------------------------------
 
 
-def chosen_lens(choice: Choice) -> str:
-    """Which lens to take."""
-    chosen = choice.candidates[choice.chosen].label
-    return "the calibration's lens is the one to take" if choice.chosen == choice.current else f"take {chosen}"
+def summary_table(head: str, summary: Summary, rows: Sequence[int], names: Sequence[str] = ()) -> Table:
+    """Some groups of observations, by their numbers; `names`: of them, where the summary's own are not shown."""
+    of_points, of_curves = summary.points_rms_px, summary.curves_rms_px
+    cells = tuple(
+        (
+            name,
+            grouped(int(summary.points[i])),
+            fixed(float(of_points[i]), 3),
+            grouped(int(summary.curves[i])),
+            fixed(float(of_curves[i]), 3),
+            fixed(float(summary.rms_mm[i]), 2),
+            fixed(float(summary.rms_sigma[i]), 3),
+            grouped(int(summary.rejected[i])),
+        )
+        for i, name in zip(rows, names or [summary.names[i] for i in rows], strict=True)
+    )
+    return Table((head, "points", "rms px", "curves", "rms px", "mm", "sigma", "out"), cells)
 
 
-def choice_marks(choice: Choice, number: int) -> str:
-    """What one of the candidates is: the current one, that of the least error, the chosen one."""
-    marks = (("now", choice.current), ("least error", choice.best), ("chosen", choice.chosen))
-    return ", ".join(word for word, index in marks if index == number)
+def _summary(summary: Summary, *, by_size: bool) -> list[str]:
+    """Rows of one summary: all, or those of the largest residuals beside their noise."""
+    order: Sequence[int] = range(len(summary.names))
+    if by_size:
+        order = np.argsort(-np.nan_to_num(summary.rms_sigma), kind="stable")[:_MOST_ROWS].tolist()
+    rest = len(summary.names) - len(order)
+    more = [f"and {rest} more with smaller residuals"] if rest else []
+    return [*summary_table("", summary, order).lines(), *more]
+
+
+def _leverage(table: ResidualTable) -> Iterator[str]:
+    """The observations that the answer hangs on most."""
+    leverage = np.where(table.inlier, np.nan_to_num(table.leverage), 0.0)
+    for i in np.argsort(-leverage, kind="stable")[:3]:
+        view, feature = table.views[table.view[i]], table.features[table.feature[i]]
+        yield f"{leverage[i]:.2f}  {table.id_of(int(i))}, frame {view['frame']!r}, {feature}"

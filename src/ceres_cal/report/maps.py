@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -14,9 +14,9 @@ from ceres_cal.calibration import Calibration
 from ceres_cal.moves import StationComparison
 from ceres_cal.report import canvas
 from ceres_cal.report.canvas import INK, OUTLIER, QUIET, Drawing, Hover
+from ceres_cal.report.document import Figure, Table
 from ceres_cal.report.grounds import worst_radius
 from ceres_cal.report.material import Material, image_border, paint_of
-from ceres_cal.report.page import Figure, Table
 from ceres_cal.report.scale import COLORS, MM, PX, Scale, spoken
 from ceres_cal.scene.heights import at_height
 from ceres_cal.uncertainty import FieldMap, image_grid
@@ -31,7 +31,7 @@ _SERIES = (
 )
 """Rounder steps first; the finer ones where the others would leave too few lines."""
 _FEWEST_STEPS = 6
-_TABLE_COLUMNS, _TABLE_ROWS = 7, 6
+_TABLE_SIZE = 7, 6
 _DOT, _DOT_ALPHA = 1.1, 0.45
 _MOST_LINES = 4
 _LABEL = "95 % within, mm"
@@ -136,7 +136,7 @@ def map_figure(material: Material, station: str, number: int) -> Figure:
         f"{_reading(one)}. Dashed: the border of the image, open beyond it. Triangle: the camera."
         + (" Dots: observations." if one.height_m == 0.0 else ""),
         map_drawing.drawing,
-        _grid_table(one),
+        grid_table(f"{_LABEL}, at y \\ x", one.radius_95_mm[::-1], one.x_m, one.y_m[::-1], "{:.1f} m"),
         hover=Hover.of(one.x_m, one.y_m, spoken(one.radius_95_mm), "x {x} m, y {y} m: 95 % within {value} mm"),
     )
 
@@ -166,20 +166,30 @@ def _reading(one: FieldMap) -> str:
     return f"Darker is worse: 95 % of the points located at the worst place (ring) are within {mm(radius)}"
 
 
-def _grid_table(one: FieldMap) -> Table:
-    columns, rows = evenly(len(one.x_m), _TABLE_COLUMNS), evenly(len(one.y_m), _TABLE_ROWS)[::-1]
+def grid_table(
+    head: str,
+    values: Array,
+    x: Array,
+    y: Array,
+    place: str,
+    most: tuple[int, int] = _TABLE_SIZE,
+    shown: Callable[[float], str] = short,
+) -> Table:
+    """Some of the values (Y, X) of a map, the first row at the top.
+
+    Args:
+        place: how a place on its axes is written. most: columns and rows. shown: how a value is written.
+    """
+    columns, rows = _evenly(len(x), most[0]), _evenly(len(y), most[1])
+    cells = [["∞" if np.isinf(value) else shown(value) for value in values[r, columns].tolist()] for r in rows]
+    names = (place.format(y[r]) for r in rows)
     return Table(
-        ("95 % within, mm, at y \\ x", *(f"{one.x_m[c]:.1f} m" for c in columns)),
-        tuple((f"{one.y_m[r]:.1f} m", *cells(one.radius_95_mm[r, columns])) for r in rows),
+        (head, *(place.format(x[c]) for c in columns)),
+        tuple((name, *row) for name, row in zip(names, cells, strict=True)),
     )
 
 
-def cells(values: Array) -> tuple[str, ...]:
-    """A row of a map's table."""
-    return tuple("∞" if np.isinf(value) else short(value) for value in values.tolist())
-
-
-def evenly(count: int, most: int) -> list[int]:
+def _evenly(count: int, most: int) -> list[int]:
     """At most so many of `count` numbers from 0 on, that lie evenly, both ends among them."""
     return [int(number) for number in np.unique(np.linspace(0, count - 1, most).round())]
 
@@ -209,7 +219,6 @@ class _OverImage:
 
     def figure(self, name: str, title: str, what: str) -> Figure:
         """With how much of the image was observed."""
-        columns, rows = evenly(len(self.x), _TABLE_COLUMNS), evenly(len(self.y), _TABLE_ROWS)
         width, height = self.image_size
         unit = self.scale.unit
         return Figure(
@@ -218,10 +227,7 @@ class _OverImage:
             f"{what} Dots: observations, in {_covered(self.observed, self.image_size)} of 192 parts of the image; "
             "where there are none, the model of the lens speaks alone.",
             Drawing(self.draw, 0.92 * height / width + 0.2),
-            Table(
-                (f"95 % within, {unit}, at y \\ x", *(f"{self.x[c]:.0f} px" for c in columns)),
-                tuple((f"{self.y[r]:.0f} px", *cells(self.radii[r, columns])) for r in rows),
-            ),
+            grid_table(f"95 % within, {unit}, at y \\ x", self.radii, self.x, self.y, "{:.0f} px"),
             hover=Hover.of(self.x, self.y, spoken(self.radii), f"pixel {{x}}, {{y}}: 95 % within {{value}} {unit}"),
         )
 

@@ -12,17 +12,15 @@ from ceres_cal.calibration import Calibration
 from ceres_cal.diagnostics import Diagnosis, diagnose
 from ceres_cal.diagnostics.held_out import Choice
 from ceres_cal.observations import Observations
-from ceres_cal.report.findings import findings
+from ceres_cal.report import findings
+from ceres_cal.report.document import Chapter, Figure, Folded, Gallery, Piece, Text
 from ceres_cal.report.grounds import promises
-from ceres_cal.report.lens_picture import distortion
 from ceres_cal.report.maps import image_figure, lens_image_figure, map_figure
 from ceres_cal.report.material import ClosedForm, FramePhotographs, Material
-from ceres_cal.report.numbers import numbers
-from ceres_cal.report.outlier_picture import outliers
-from ceres_cal.report.page import Chapter, Figure, Folded, Gallery, Piece, Text, page
-from ceres_cal.report.residual_pictures import against_radius, by_frame, vectors
-from ceres_cal.report.solve_pictures import against_closed_form, convergence, correlation
-from ceres_cal.report.verdict import verdict_chapter
+from ceres_cal.report.page import page
+from ceres_cal.report.residual_pictures import against_radius, by_frame, outliers, vectors
+from ceres_cal.report.solve_pictures import against_closed_form, convergence, correlation, distortion
+from ceres_cal.report.summary import numbers_chapter, verdict_chapter
 
 _CHAPTERS = 7  # at most
 MOST_CAMERAS = 8
@@ -83,8 +81,8 @@ def write_report(
 
 def _chapters(material: Material) -> Iterator[Chapter]:
     yield verdict_chapter(material)
-    yield findings(material)
-    yield numbers(material)
+    yield findings.chapter(material.diagnosis, material.choice)
+    yield numbers_chapter(material, material.seams)
     if material.photographs is not None:
         from ceres_cal.report.in_photographs import in_photographs  # OpenCV, for photographs alone
 

@@ -1,7 +1,8 @@
-"""Pictures of residuals: as vectors over the image, against the radius, by frame."""
+"""Pictures of the residuals: over the image, against the radius, by frame; and what was taken out, by feature."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -15,8 +16,9 @@ from ceres_cal.diagnostics import ResidualTable, Summary
 from ceres_cal.diagnostics.summaries import RadiusTrend
 from ceres_cal.report import canvas
 from ceres_cal.report.canvas import CURVE, INK, OUTLIER, PAINT, POINT, QUIET, Drawing, Hover
+from ceres_cal.report.document import Figure, Table
+from ceres_cal.report.findings import summary_table
 from ceres_cal.report.material import Material, paint_of
-from ceres_cal.report.page import Figure, Table
 from ceres_cal.report.scale import spoken
 from ceres_cal.scene.camera import Camera
 
@@ -30,7 +32,7 @@ _NOT_NOISE = 13.8  # squared length of a mean in its sigmas that noise reaches o
 _VAGUE = 0.3  # of the residuals' reach: a ring's mean that is less sure than that is in the table alone
 _TYPICAL = 0.015  # of the image's width: what the median is enlarged to
 _ENLARGED = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
-_MOST_FRAMES_NAMED = 24
+_MOST_FRAMES_NAMED, _MOST_BARS = 24, 12
 
 
 def stride(material: Material, count: int) -> int:
@@ -192,21 +194,8 @@ def _scale_bar(axes: Axes, camera: Camera, enlarged: int, typical: float) -> Non
 
 def _region_table(summary: Summary, camera: str) -> Table:
     rows = [i for i, name in enumerate(summary.names) if name.rpartition(" ")[0] == camera]
-    return Table(
-        ("part of the image (column, row)", "points", "rms px", "curves", "rms px", "out"),
-        tuple(_summary_row(summary, i, summary.names[i].rpartition(" ")[2]) for i in rows),
-    )
-
-
-def _summary_row(summary: Summary, number: int, name: str) -> tuple[str, ...]:
-    return (
-        name,
-        grouped(int(summary.points[number])),
-        fixed(float(summary.points_rms_px[number]), 3),
-        grouped(int(summary.curves[number])),
-        fixed(float(summary.curves_rms_px[number]), 3),
-        grouped(int(summary.rejected[number])),
-    )
+    parts = [summary.names[i].rpartition(" ")[2] for i in rows]
+    return summary_table("part of the image (column, row)", summary, rows, parts)
 
 
 # ---- against the radius ---------------------------------------------------------------------------------------------
@@ -291,10 +280,7 @@ def by_frame(material: Material) -> Figure:
         "Root mean square residual of each frame over its expected noise: 1 is as everywhere. A frame that stands out "
         "has wrong labels, motion blur or a bumped camera; a step that stays means that the camera moved then.",
         Drawing(draw, 0.66),
-        Table(
-            ("frame", "points", "rms px", "curves", "rms px", "out"),
-            tuple(_summary_row(frames, i, frames.names[i]) for i in range(len(frames.names))),
-        ),
+        summary_table("frame", frames, range(len(frames.names))),
         hover=Hover.of(number, np.zeros(1), spoken(frames.rms_sigma), "{x}: {value} sigma").named(frames.names),
     )
 
@@ -305,3 +291,72 @@ def _at(x: Array, y: ArrayLike) -> Array:
 
 def _clipped(name: str) -> str:
     return name if len(name) <= 14 else f"{name[:6]}…{name[-7:]}"
+
+
+# ---- outliers -------------------------------------------------------------------------------------------------------
+
+
+def outliers(material: Material) -> Figure | None:
+    """Which features were taken out, how often; None where nothing was."""
+    table = material.diagnosis.table
+    rows = np.flatnonzero(table.outlier)
+    if not len(rows):
+        return None
+    totals = Counter(table.features[i] for i in table.feature.tolist())
+    named = Counter(table.features[i] for i in table.feature[rows].tolist()).most_common(_MOST_BARS)
+    several = len(material.observations.targets) > 1
+
+    def draw(axes: Axes, width_in: float) -> None:
+        places = np.arange(len(named))
+        axes.barh(places, [number for _, number in named], height=0.62, color=OUTLIER)
+        for place, (name, number) in enumerate(named):
+            text = f"{number} of {totals[name]}"
+            axes.annotate(
+                text, (number, place), (3, 0), textcoords="offset points", va="center", fontsize=6.5, color=INK
+            )
+        names = [_short_name(name, several) for name, _ in named]
+        axes.set_yticks(places, names, fontsize=6.5)
+        axes.tick_params(axis="y", length=0)
+        axes.invert_yaxis()
+        axes.set(xlim=(0.0, 1.25 * named[0][1]), xlabel="observations taken out")
+        axes.grid(visible=False, axis="y")
+        axes.spines["left"].set_color(QUIET)
+
+    order = rows[np.argsort(-_sigmas(material, rows), kind="stable")]
+    return Figure(
+        "outliers",
+        "Outliers, by feature",
+        f"{grouped(len(rows))} of {grouped(len(table))} observations did not take part "
+        f"({material.calibration.options.reject_sigma:g} sigma off and more). Here and there one is normal; most "
+        "of one feature means a wrong label, or paint that is not where it was drawn.",
+        Drawing(draw, 0.2 + 0.055 * max(len(named), 6)),
+        Table(
+            ("farthest first", "feature", "frame", "px off", "sigma"),
+            tuple(_outlier_row(material, int(row)) for row in order),
+        ),
+    )
+
+
+def _sigmas(material: Material, rows: Indices) -> Array:
+    table = material.diagnosis.table
+    sigmas = np.abs(table.distance_px[rows]) / (table.sigma_px[rows] * table.scale[rows])
+    return np.where(np.isfinite(sigmas), sigmas, np.inf)
+
+
+def _outlier_row(material: Material, row: int) -> tuple[str, ...]:
+    table = material.diagnosis.table
+    frame = str(table.views[table.view[row]]["frame"])
+    sigma = float(_sigmas(material, np.array([row]))[0])
+    off = float(abs(table.distance_px[row]))
+    return (
+        table.id_of(row),
+        table.features[table.feature[row]],
+        frame,
+        fixed(off, 2),
+        short(sigma) if sigma < np.inf else "",
+    )
+
+
+def _short_name(name: str, several: bool) -> str:
+    text = name if several else name.partition("/")[2]
+    return text if len(text) <= 30 else f"{text[:29]}…"

@@ -1,0 +1,255 @@
+"""What commands read and write: files, checked before any long work; results are written all or none."""
+
+from __future__ import annotations
+
+import glob
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ceres_cal.base.errors import InputError
+from ceres_cal.cli.arguments import ReportArguments
+from ceres_cal.cli.terminal import progress_bar
+from ceres_cal.report.document import Section
+
+if TYPE_CHECKING:
+    from ceres_cal.calibration import Calibration
+    from ceres_cal.diagnostics import Diagnosis
+    from ceres_cal.diagnostics.held_out import Choice
+    from ceres_cal.observations import Observations
+    from ceres_cal.report import FramePhotographs
+    from ceres_cal.scene.targets import Target
+
+IMAGE_ENDINGS = {".bmp", ".jp2", ".jpeg", ".jpg", ".pbm", ".pgm", ".png", ".pnm", ".ppm", ".tif", ".tiff", ".webp"}
+VIDEO_ENDINGS = {".3gp", ".avi", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".mts", ".ogv", ".webm", ".wmv"}
+_WRITTEN = ("output", "report")
+
+
+def images_and_videos(given: Iterable[str]) -> tuple[list[Path], list[Path]]:
+    """The images as `image_files` has them, and the videos among what is given."""
+    files = image_files(given)
+    videos = [path for path in files if path.suffix.lower() in VIDEO_ENDINGS]
+    return [path for path in files if path not in videos], videos
+
+
+def image_files(given: Iterable[str]) -> list[Path]:
+    """The files named; those of folders, and of patterns that no shell expanded, in the order of their names."""
+    return [path for name in given for path in _files(name)]
+
+
+def _files(name: str) -> Iterator[Path]:
+    path = Path(name)
+    if path.is_dir():
+        inside = sorted(file for file in path.iterdir() if file.suffix.lower() in IMAGE_ENDINGS and file.is_file())
+        if not inside:
+            raise InputError(f"{name}: there are no images in this folder")
+        yield from inside
+    elif path.exists():
+        yield path
+    else:
+        matches = sorted(glob.glob(name))  # noqa: PTH207, Path.glob refuses absolute patterns
+        if not matches:
+            raise InputError(f"{name}: no such file")
+        yield from map(Path, matches)
+
+
+def spelled_target(text: str, where: str) -> Target | None:
+    """The target that somebody spelled out as `{"kind": ...}`; None for anything else, such as a name or a file."""
+    if not text.lstrip().startswith("{"):
+        return None
+    from ceres_cal.base.files import parse_json
+    from ceres_cal.scene.targets import target_from_spec
+
+    return target_from_spec(parse_json(text.encode(), where), where)
+
+
+def read_target(text: str, name: str) -> Target:
+    """The target of `--target`: by its name, spelled out, or in a file, alone or as one of that name among several."""
+    from ceres_cal.scene.targets import target_from_spec, targets_by_name
+
+    if (spelled := spelled_target(text, "--target")) is not None:
+        return spelled
+    by_name = targets_by_name()
+    if text in by_name:
+        return by_name[text]
+    if not Path(text).exists():
+        raise InputError(f"--target {text!r}: neither {' nor '.join(by_name)}, nor a file")
+    content = json_object(Path(text))
+    named = content.get("targets")
+    spec = named.get(name) if isinstance(named, dict) else content
+    if not isinstance(spec, dict):
+        raise InputError(f"{text}: it holds no target named {name!r}")
+    return target_from_spec(spec, text)
+
+
+def json_object(path: Path) -> Mapping[str, Any]:
+    """What a file holds; InputError where it is no JSON object."""
+    from ceres_cal.base.files import parse_json, read_bytes
+
+    content = parse_json(read_bytes(path), str(path))
+    if not isinstance(content, dict):
+        raise InputError(f"{path}: it must hold one JSON object")
+    return content
+
+
+def require_different(files: Iterable[str | Path]) -> None:
+    """A file that counts twice would make its observations look better than they are."""
+    given: set[str] = set()
+    for file in files:
+        place = os.path.realpath(file)
+        if place in given:
+            raise InputError(f"{file}: given twice: name every file once")
+        given.add(place)
+
+
+def read_calibration(path: Path) -> Calibration:
+    """The calibration of a file."""
+    from ceres_cal.calibration import Calibration
+
+    return Calibration.load(path)
+
+
+def read_observations(paths: Iterable[str]) -> Observations:
+    """All files of observations as one."""
+    from ceres_cal.observations import Observations, combine
+
+    return combine([Observations.load(path) for path in paths])
+
+
+def station_of(path: Path, station: str | None, calibration: Calibration) -> str:
+    """Name of the station in --station, or of the only one there is in a calibration out of a file."""
+    if station is None and len(calibration.stations) > 1:
+        raise InputError(f"{path} has several stations, name one: --station {' or '.join(calibration.stations)}")
+    calibration.station(station)  # or says which there are
+    return station or next(iter(calibration.stations))
+
+
+# ---- what is written ------------------------------------------------------------------------------------------------
+
+
+def written(args: ReportArguments) -> Section:
+    """The section that names the files which were asked for."""
+    paths = {name: None if path is None else str(path) for name, path in vars(args).items() if name in _WRITTEN}
+    return Section("written", [path for path in paths.values() if path is not None], paths)
+
+
+# ---- files ----------------------------------------------------------------------------------------------------------
+
+
+def require_output(path: Path | None, inputs: Iterable[str | Path]) -> None:
+    """Raise InputError, before any long work, where a result cannot be written or would replace an input."""
+    if path is None:
+        return
+    if not path.parent.is_dir():
+        raise InputError(f"{path}: cannot be written: there is no folder {str(path.parent)!r}: make it first")
+    if path.is_dir():
+        raise InputError(f"{path}: cannot be written: it is a folder: name a file in it")
+    if path.exists() and any(Path(given).exists() and path.samefile(given) for given in inputs):
+        raise InputError(f"{path}: is an input, and the output would replace it: name another file")
+
+
+def require_observations_output(path: Path, inputs: Iterable[str | Path]) -> None:
+    """`require_output` of a file of observations."""
+    require_output(path, inputs)
+    require_ending(path, "observations are", ".json", ".npz")
+
+
+def require_ending(path: Path | None, what: str, *endings: str) -> None:
+    """Raise InputError where a file's ending is none of those that can be written; `what` such as "the table is"."""
+    if path is not None and path.suffix not in endings:
+        known = f"{', '.join(endings[:-1])} or {endings[-1]}"
+        raise InputError(f"{path}: {what} written as {known}: give one of these endings")
+
+
+def require_outputs(args: ReportArguments, inputs: Sequence[str | Path]) -> None:
+    """`require_output` of output and report, and that they are two files."""
+    require_output(args.output, inputs)
+    require_output(args.report, inputs)
+    if (
+        args.output is not None
+        and args.report is not None
+        and os.path.realpath(args.output) == os.path.realpath(args.report)
+    ):
+        raise InputError(f"{args.report}: is named as output and as report: give them two names")
+
+
+@contextmanager
+def finishing() -> Iterator[None]:
+    """Hold Ctrl-C and SIGTERM back while results are written: a command that was interrupted has written nothing."""
+    if threading.current_thread() is not threading.main_thread():  # where Ctrl-C does not arrive
+        yield
+        return
+    before = {number: signal.signal(number, signal.SIG_IGN) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def write_results(args: ReportArguments, save: Callable[[Path], None], page: str | None) -> None:
+    """Write what was asked for: the output by `save`, and the page of the report."""
+    from ceres_cal.base.files import write_bytes
+
+    with finishing():
+        if args.output is not None:
+            save(args.output)
+        if page is not None and args.report is not None:
+            write_bytes(args.report, page.encode())
+
+
+# ---- the report -----------------------------------------------------------------------------------------------------
+
+
+def report_photographs(
+    args: ReportArguments,
+    observations: Observations,
+    before: Calibration | None = None,
+    detected_in: Sequence[Path] = (),
+) -> FramePhotographs | None:
+    """The photographs of `--report PAGE --images FOLDER` that belong to the observations' frames; None without any.
+
+    Args:
+        detected_in: photographs that the observations were just detected in: a report shows them without being asked.
+
+    Raises:
+        InputError: --images without --report, or none of the images is called like a frame.
+    """
+    if args.images and args.report is None:
+        raise InputError("--images is for the report: name a page with --report, or leave it out")
+    images = image_files(args.images) if args.images else list(detected_in)
+    if not images or args.report is None:
+        return None
+    from ceres_cal.pictures.frames import photographs_by_frame
+    from ceres_cal.report import FramePhotographs
+
+    paths = photographs_by_frame(images)
+    frames = dict.fromkeys(view.frame for view in observations.views)
+    known = {frame: paths[frame] for frame in frames if frame in paths}
+    if not known:
+        raise InputError(
+            f"none of the {len(paths)} images is called like a frame of the observations, such as "
+            f"{next(iter(frames))!r}: --images takes the photographs that were observed"
+        )
+    return FramePhotographs(known, before)
+
+
+def report_page(
+    args: ReportArguments,
+    calibration: Calibration,
+    observations: Observations,
+    photographs: FramePhotographs | None,
+    diagnosis: Diagnosis | None = None,
+    choice: Choice | None = None,
+) -> str | None:
+    """The page that --report asks for, or None."""
+    if args.report is None:
+        return None
+    from ceres_cal.report import make_report
+
+    with progress_bar(args) as bar:
+        return make_report(calibration, observations, diagnosis, choice, photographs, bar.update)

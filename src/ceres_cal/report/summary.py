@@ -1,0 +1,228 @@
+"""What a calibration says of itself: its verdict, beside its numbers and how well each is known."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ceres_cal.base.words import DASH, at_precision, counted, fixed, metres, mm, plural, sentence, short, two_digits
+from ceres_cal.report.document import BulletList, Chapter, Piece, Section, Table, Text, Tile, Tiles, wrapped
+from ceres_cal.report.grounds import (
+    CARE_MM,
+    GOOD_MM,
+    disputed,
+    focal,
+    is_against,
+    judge_quality,
+    level_of,
+    level_of_verdict,
+    promises,
+    worst,
+    worst_radius,
+)
+from ceres_cal.report.numbers import bounds, number_sections, observed, outliers, stopped, warnings
+from ceres_cal.report.quality import Quality, Seam
+from ceres_cal.scene.heights import HEIGHTS_M, at_height
+from ceres_cal.uncertainty import FieldMap, Uncertainty, Verdict
+from ceres_cal.uncertainty.rig import RigPair
+
+if TYPE_CHECKING:
+    from ceres_cal.report.material import Material
+
+_MOST_FINDINGS, _MOST_DIRECTIONS = 3, 4
+_MEANING = (
+    "The headline holds for 95 % of the points located at the worst place that a camera sees; ± is a standard "
+    "deviation. Both are the calibration's own share: the noise of the pixel that is asked about comes on top. Green: "
+    f"up to {GOOD_MM:g} mm, a painted line's width; amber: up to {CARE_MM:g} mm."
+)
+
+
+def calibration_sections(quality: Quality, inputs: Sequence[str]) -> Iterator[Section]:
+    """The answer of `calibrate` and `refit`; `inputs`: the files of observations."""
+    calibration, observations = quality.calibration, quality.observations
+    read = {"inputs": list(inputs), "counts": observations.counts, "calibration": calibration.to_file()}
+    yield Section("read", [", ".join(map(str, inputs)), *observed(observations)], read)
+    yield from number_sections(quality)
+    yield from accuracy_sections(quality, tuple(quality.each_seam()))
+    yield outliers(calibration)
+    yield stopped(calibration)
+    warned = list(warnings(calibration))
+    yield Section(data={"warnings": warned})
+    yield from (Section("warning", wrapped(text)) for text in warned)
+    yield _verdict(quality)
+
+
+def _verdict(quality: Quality) -> Section:
+    """The headline of the report, and what stands behind it and was not said yet."""
+    judged, findings = judge_quality(quality), () if quality.diagnosis is None else quality.diagnosis.findings
+    cause = disputed(quality)
+    named = [one for one in findings if is_against(one) and not cause][:_MOST_FINDINGS]
+    lines = wrapped(judged.headline, *(f"{one.kind}: {one.sentence}" for one in named))
+    if findings:
+        whence = " may follow from that" if cause else ": `ceres-cal diagnose` says what to do"
+        lines.append(f"{plural(len(findings), 'finding')}{whence}")
+    reasons = [{"level": level, "text": text} for level, text in judged.reasons]
+    data = {"level": judged.level, "headline": judged.headline, "reasons": reasons, "findings": findings}
+    return Section("verdict", lines, {"verdict": data})
+
+
+# ---- how well places are known --------------------------------------------------------------------------------------
+
+
+def accuracy_sections(quality: Quality, seams: Sequence[Seam]) -> Iterator[Section]:
+    """How well cameras and places are known; `seams`: those that are said."""
+    uncertainty, maps = quality.uncertainty, quality.maps
+    if uncertainty is None:
+        yield Section(data={"uncertainty": None})
+        return
+    yield Section("rig", [_rig_line(pair) for pair in uncertainty.rig])
+    yield Section("located", [f"{name}: {_sd_at_heights(every)}" for name, every in maps.items()])
+    yield _seams(seams)
+    yield Section("widened", [uncertainty.widening] if uncertainty.widening else [])
+    yield from _unknown(uncertainty)
+    known = {
+        "numbers": [{**vars(one), "key": one.key._asdict()} for one in uncertainty.verdicts],
+        "widening": uncertainty.widening,
+        "rig": uncertainty.rig,
+        "dependence": uncertainty.posterior.dependence,
+        "unknown_placements": uncertainty.unknown_placements,
+        "maps": {name: [_map_data(one) for one in every] for name, every in maps.items()},
+    }
+    yield Section(data={"uncertainty": known})
+
+
+def _rig_line(pair: RigPair) -> str:
+    """Baseline and angle of two stations, each with its standard deviation."""
+    baseline = 1e3 * np.array([pair.baseline_m, pair.baseline_sd_m])
+    turn = np.degrees([pair.angle_rad, pair.angle_sd_rad])
+    apart, turned = (
+        f"{at_precision(value, sd)} ± {two_digits(sd) if np.isfinite(sd) else 'unknown'}"
+        for value, sd in (baseline, turn)
+    )
+    return f"{' - '.join(pair.stations)}: baseline {apart} mm, angle {turned} deg"
+
+
+def _sd_at_heights(maps: Sequence[FieldMap]) -> str:
+    parts = []
+    for m in maps:
+        x, y = m.worst_place_m
+        mean = f"± {two_digits(m.mean_mm)} mm" if np.isfinite(m.mean_mm) else "unknown"
+        worst = f" (worst {two_digits(m.worst_mm)} at {x:.1f}, {y:.1f} m)" if np.isfinite(m.worst_mm) else ""
+        parts.append(f"{mean} {at_height(m.height_m)}{worst}")
+    return ", ".join(parts)
+
+
+def _map_data(m: FieldMap) -> dict[str, Any]:
+    own = {name: getattr(m, name) for name in ("height_m", "worst_place_m", "x_m", "y_m", "sd_mm", "radius_95_mm")}
+    return {**own, "mean_sd_mm": m.mean_mm, "worst_sd_mm": m.worst_mm}
+
+
+def _seams(seams: Sequence[Seam]) -> Section:
+    """By how much two cameras disagree about what both see."""
+    lines, data, rows = [], [], []
+    for seam in seams:
+        rms, expected, count = seam.measured.rms_mm, seam.measured.expected_rms_mm, len(seam.measured.what)
+        lines.append(f"{' - '.join(seam.stations)}: {_sd_at_heights(seam.predicted)}")
+        if count:
+            found = f"found {two_digits(rms)} mm where {two_digits(expected)} were expected"
+            lines.append(f"{found} (rms of {count} points and stretches that both observed)")
+        measured = {"found_mm": rms, "expected_mm": expected, "compared": count}
+        predicted = [_map_data(one) for one in seam.predicted]
+        data.append({"stations": seam.stations, "predicted": predicted, **measured})
+        means = (f"± {mm(one.mean_mm)}" for one in seam.predicted)
+        over = f" rms of {count}" if count else ""
+        rows.append((f" {DASH} ".join(seam.stations), *means, f"{mm(rms)}{over}", mm(expected)))
+    head = ("stations", *map(at_height, HEIGHTS_M), "found", "expected")
+    table = Table(head, tuple(rows), "Where two cameras see the same: by how much they disagree", stacked=True)
+    return Section("seam", lines, {"uncertainty": {"seams": data}}, (table,) if rows else ())
+
+
+def _unknown(uncertainty: Uncertainty) -> Iterator[Section]:
+    """What the observations hardly tell."""
+    weak = uncertainty.weak_directions
+    lines = [one.words for one in weak[:_MOST_DIRECTIONS]]
+    if len(weak) > _MOST_DIRECTIONS:
+        lines.append(f"and {len(weak) - _MOST_DIRECTIONS} more (--json)")
+    data = [
+        {"words": one.words, "relative": one.relative, "shares": [[*key[:3], share] for key, share in one.shares]}
+        for one in weak
+    ]
+    bullets = BulletList(tuple(("care", one.words) for one in weak))
+    pieces = (Text("What the observations hardly tell, weakest first:"), bullets) if weak else ()
+    yield Section("weak", lines, {"uncertainty": {"weak_directions": data}}, pieces)
+    unknown = uncertainty.unknown_placements
+    if unknown:
+        name, quantities = next(iter(unknown.items()))
+        rest = f", and of {len(unknown) - 1} more placements" if len(unknown) > 1 else ""
+        yield Section("unknown", [f"{', '.join(quantities)} of placement {name!r}{rest}"])
+
+
+# ---- on a page ------------------------------------------------------------------------------------------------------
+
+
+def verdict_chapter(material: Material) -> Chapter:
+    """The chapter, its level the colour of the page's first box."""
+    judged = judge_quality(material)
+    tiles = tuple(_tiles(material))
+    if not promises(material):  # the verdict's colour, not that of a number nobody vouches for
+        tiles = tuple(tile._replace(level=worst(judged.level, tile.level)) if tile.level else tile for tile in tiles)
+    pieces: list[Piece] = [Tiles(tiles), BulletList(judged.reasons)]
+    if material.maps:
+        pieces.append(Text(_MEANING, "note"))
+    return Chapter("verdict", judged.headline, tuple(pieces), judged.level)
+
+
+# ---- large numbers --------------------------------------------------------------------------------------------------
+
+
+def _tiles(material: Material) -> Iterator[Tile]:
+    several = len(material.maps) > 1
+    for station, maps in material.maps.items():
+        for one in maps:
+            yield _map_tile(sentence(at_height(one.height_m)) + (f", {station}" if several else ""), one)
+    if not material.maps:
+        for verdict in focal(material):
+            yield _focal_tile(verdict)
+    fit, table = material.calibration.fit, material.diagnosis.table
+    if material.diagnosis.new_data:
+        distance = table.distance_px[table.inlier]
+        rms = float(np.sqrt(np.mean(distance**2))) if len(distance) else np.nan
+        yield Tile("Residuals of new data", short(rms), "px rms", f"over {counted(len(distance), 'observation')}")
+    else:
+        total = counted(fit.points + fit.curves, "observation")
+        yield Tile("Residuals", short(fit.rms_px), "px rms", f"over {total}: how well data and model agree")
+    out = int(np.count_nonzero(table.outlier))
+    share = 100.0 * out / max(len(table), 1)
+    yield Tile("Taken out", short(share), "%", f"{counted(out, 'outlier')} of {counted(len(table), 'observation')}")
+
+
+def _map_tile(label: str, one: FieldMap) -> Tile:
+    radius = worst_radius(one)
+    if np.isnan(radius):
+        return Tile(label, "unseen", "", "the image shows no place of the field", "no")
+    level = level_of(radius)
+    if np.isinf(one.mean_mm):
+        return Tile(
+            label, "unknown", "", "the observations do not tell it: add tilted boards or measure the height", level
+        )
+    note = f"of a located point, in the mean; at worst {mm(one.worst_mm)}, at {metres(one.worst_place_m)}"
+    return Tile(label, f"± {short(one.mean_mm)}", "mm", note, level)
+
+
+def _focal_tile(verdict: Verdict) -> Tile:
+    known = np.isfinite(verdict.relative)
+    value = f"± {short(100.0 * verdict.relative)}" if known else "unknown"
+    note = f"{fixed(verdict.value, 1)} px, 95 %: {bounds(verdict)}"
+    return Tile(f"phi of {verdict.key.owner}", value, "%" if known else "", note, level_of_verdict(verdict))
+
+
+def numbers_chapter(quality: Quality, seams: Sequence[Seam]) -> Chapter:
+    """The numbers on a page."""
+    intro = (
+        "In the paper's units; coefficients with its a1 = 1 (another a1 goes with a1 a2, a1 a3 and a1 phi). Known "
+        "means to 1 % or better, weak to 30 %."
+    )
+    every = (*number_sections(quality), *accuracy_sections(quality, seams))
+    return Chapter("numbers", "The numbers", (Text(intro), *(piece for one in every for piece in one.pieces)))
