@@ -17,7 +17,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from ceres_cal.cli.commands import COMMANDS
+from ceres_cal.cli.command import COMMANDS
 from ssl_settings_file import settings
 
 from ceres_cal.base.errors import CalibrationError
