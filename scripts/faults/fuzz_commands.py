@@ -17,7 +17,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-from ceres_cal.cli.command import COMMANDS
 from ssl_settings_file import settings
 
 from ceres_cal.base.errors import CalibrationError
@@ -25,7 +24,7 @@ from ceres_cal.base.files import write_json
 from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
 from ceres_cal.cli import main as cli
-from ceres_cal.cli.command import Parser
+from ceres_cal.cli.command import COMMANDS, Parser
 from ceres_cal.detect.images import read_colour, read_grey
 from ceres_cal.formats import LookupTable, export, make_lookup_table, read_foreign
 from ceres_cal.model.parameters import Options

@@ -114,7 +114,8 @@ def pose_candidates(search: PoseSearch, old: Sequence[Pose], patience: int = 2) 
     """
     closed = closed_form(search)
     seeds = [*old, *(pose.turned(turn) for pose in old for turn in _TURNS)]
-    candidates = _refined(search, [*seeds, *([closed] if closed is not None else [])])
+    unmoved = _refined(search, old, ())  # a wide loss leads away from a true pose where many labels are wrong
+    candidates = _distinct([*unmoved, *_refined(search, [*seeds, *([closed] if closed is not None else [])])])
     if patience and not (candidates and candidates[0].fits):
         around = [pose.turned(turn) for pose in seeds for turn in _GRID]
         candidates = _distinct([*candidates, *_refined(search, around)])
@@ -143,10 +144,14 @@ def closed_form(search: PoseSearch) -> Pose | None:
     return None if homography is None else pose_from_homography(homography)
 
 
-def _refined(search: PoseSearch, poses: Sequence[Pose]) -> list[PoseCandidate]:
-    """Each candidate at its best, best first; those from which something cannot be seen are left out."""
+def _refined(search: PoseSearch, poses: Sequence[Pose], wides: Sequence[float] = _WIDE) -> list[PoseCandidate]:
+    """Each candidate at its best, best first; those from which something cannot be seen are left out.
+
+    Args:
+        wides: scales of the loss before the one at the noise that is expected, in standard deviations.
+    """
     stack = np.array([pose.matrix for pose in poses])
-    for wide in _WIDE:
+    for wide in wides:
         stack = _searched(search, stack, Weighting(*search.scales, "huber", wide), 1e-3)
     stack = _searched(search, stack, Weighting(*search.scales, "cauchy", 2.0), 1e-8)
     refined = [Pose(matrix[:, :3], matrix[:, 3]) for matrix in stack]
