@@ -203,7 +203,7 @@ def radial_alignment(data: PlaneData, unit_px: float, terms: int, rounds: int) -
         align_sights(data.bounds, x, p, weights, h12, shares, reduced)
         c = np.linalg.lstsq(reduced[:terms, :terms], reduced[:terms, terms], rcond=1e-10)[0]
         h3 = shares[:, :, terms] - shares[:, :, :terms] @ c
-        alignment_errors(data.bounds, x, p, h12, h3, c, errors)
+        alignment_errors(data.bounds, x, p, h12, h3, np.asarray(c, dtype=float), errors)
         usual_by_radius(errors, radius, usual)
         weights = 1.0 / (1.0 + (errors / (1.5 * usual)) ** 2)
     homographies = np.concatenate([h12.reshape(-1, 2, 3) * unit_px, h3[:, None, :]], axis=1) @ _restored(lifts)
