@@ -45,7 +45,7 @@ from ceres_cal.scene.lens import KannalaBrandt
 from ceres_cal.simulate import overhead_pose
 
 OURS = "ceres-cal"
-MODULES = {OURS: "ceres_cal.calibrating", "opencv": "cv2", "pycolmap": "pycolmap", "mrcal": "mrcal"}
+MODULES = {OURS: "ceres_cal.calibration.calibrating", "opencv": "cv2", "pycolmap": "pycolmap", "mrcal": "mrcal"}
 MRCAL_PYTHON = "/usr/bin/python3"  # Debian's mrcal belongs to the system's Python
 MIRRORED_DEG = 5.0  # that far off the truth, a pose is the other one of the two that a plane's picture allows
 WARM_UP_LINE_POINTS, WARM_UP_S = 1000, 0.3
@@ -60,9 +60,9 @@ Solver = Callable[[Corners], Answer]
 
 def solve_ours(corners: Corners) -> Answer:
     """From Observations to Calibration, with the nine intrinsics that OpenCV and mrcal solve for."""
-    from ceres_cal.calibrating import calibrate
-    from ceres_cal.model.parameters import Options
+    from ceres_cal.calibration.calibrating import calibrate
     from ceres_cal.observations.sights import gather_sights
+    from ceres_cal.problem.parameters import Options
     from ceres_cal.start.initialise import initialise
 
     options = Options(lens="brown", free_aspect=True)
@@ -202,8 +202,8 @@ def corners_memory(frames: int, repeat: int) -> float:
 
 def field_growth(line_points: int, repeat: int) -> dict[str, Any]:
     """Seconds of calibrate (median) and the memory that the process holds at most meanwhile, observations included."""
-    from ceres_cal.calibrating import calibrate
-    from ceres_cal.model.parameters import Options
+    from ceres_cal.calibration.calibrating import calibrate
+    from ceres_cal.problem.parameters import Options
 
     calibrate(field_observations(WARM_UP_LINE_POINTS), Options(lens="radial"))
     observations = field_observations(line_points)
@@ -237,12 +237,14 @@ TASKS: dict[str, Callable[[int, int], Any]] = {
 
 def uncertainty_share(frames: int, repeat: int) -> float:
     """What the standard deviations of everything, placements too, add to a calibration's seconds (median of turns)."""
-    from ceres_cal.calibrating import calibrate
-    from ceres_cal.model.parameters import Options, make_layout
-    from ceres_cal.model.residuals import residuals
+    from ceres_cal.calibration.calibrating import calibrate
+    from ceres_cal.effects.dependence import measure_scatter
     from ceres_cal.observations.sights import gather_sights
-    from ceres_cal.solve import Problem, Weighting, information
-    from ceres_cal.uncertainty import assess, measure_scatter
+    from ceres_cal.posterior.assess import assess
+    from ceres_cal.problem.parameters import Options, make_layout
+    from ceres_cal.problem.problem import Problem, Weighting
+    from ceres_cal.problem.reduced import information
+    from ceres_cal.problem.residuals import residuals
 
     observations, options = corner_observations(wide_lens(frames).corners), Options(lens="brown", free_aspect=True)
     calibrate(observations, options)

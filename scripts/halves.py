@@ -24,18 +24,18 @@ from runner import Row, root_and_error, script
 from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.errors import CalibrationError
 from ceres_cal.base.transforms import Pose, skew
-from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
+from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.detect.boards import detect_boards
-from ceres_cal.model.keys import Key
-from ceres_cal.model.parameters import Options
-from ceres_cal.model.quantities import camera_moved, natural_sizes, values_of
 from ceres_cal.observations import Observations, Points
 from ceres_cal.observations.columns import taken
+from ceres_cal.posterior.posterior import Posterior
+from ceres_cal.problem.information import Key
+from ceres_cal.problem.parameters import Options
+from ceres_cal.problem.quantities import camera_moved, natural_sizes, values_of
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Lens
 from ceres_cal.scene.targets import checkerboard
-from ceres_cal.uncertainty import Posterior
 
 LEAST, MOST = 0.85, 1.25
 _CONTROL = 0.9, 1.1

@@ -9,12 +9,12 @@ from functools import partial
 import numpy as np
 
 from ceres_cal.base.transforms import Pose
-from ceres_cal.model.parameters import Options
+from ceres_cal.problem.parameters import Options
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Brown, KannalaBrandt, Lens, Radial, Spline
 from ceres_cal.scene.lens.surface import COLUMNS, ROWS
 from ceres_cal.scene.targets import Segment, Target, checkerboard, custom, rings, ssl_field
-from ceres_cal.simulate import Held, Scene, Station, board_scene, field_scene, join, overhead_pose, rings_scene
+from ceres_cal.simulate import BoardRanges, Scene, Station, board_scene, field_scene, join, overhead_pose, rings_scene
 
 # phi, lens, and the height (m) from which the image just holds a division B field.
 _LENSES: dict[str, tuple[float, Lens, float]] = {
@@ -159,7 +159,7 @@ def two_cameras(lens: str) -> Scene:
     cameras = {"west": west, "east": east}
     field = field_scene(ssl_field("B"), cameras, stations, spacing_m=_SPACING_M)
     distance_m = (0.5 * height, 0.9 * height)
-    return join(field, board_scene(_BOARD, cameras, stations, count=4, seed=12, held=Held(distance_m)))
+    return join(field, board_scene(_BOARD, cameras, stations, count=4, seed=12, held=BoardRanges(distance_m)))
 
 
 def several_stations(lens: str) -> Scene:

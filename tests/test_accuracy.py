@@ -22,14 +22,14 @@ from runner import mean_and_error
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.transforms import Pose
-from ceres_cal.calibrating import calibrate
-from ceres_cal.model.parameters import Options
-from ceres_cal.model.quantities import moved
-from ceres_cal.model.residuals import residuals
-from ceres_cal.model.structure import Tolerance
+from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.observations.sights import gather_sights
+from ceres_cal.problem.parameters import Options
+from ceres_cal.problem.quantities import moved
+from ceres_cal.problem.residuals import residuals
+from ceres_cal.problem.structure import Tolerance
+from ceres_cal.robust.poses import mirrored
 from ceres_cal.simulate import simulate
-from ceres_cal.solve.mirrored import mirrored
 
 RUNS = 20
 PROBLEMS = tuple(scenes.PROBLEMS)

@@ -20,23 +20,24 @@ from accuracy.scenes import CLEAN_NOISE, FIELD, tilted, two_cameras
 from accuracy.scenes import Problem as Case
 from scenes import RADIAL
 
-from ceres_cal.advice import Advice, Errors, Measurement, Promise, advise, promised
-from ceres_cal.advice.measurements import Ground, _observed, together
-from ceres_cal.advice.ranking import _chosen, _prepared, _weighting
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
-from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
+from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.cli import main
-from ceres_cal.model.parameters import Options, make_layout
-from ceres_cal.model.priors import gather_priors
-from ceres_cal.model.structure import Tolerance, make_structure
+from ceres_cal.diagnostics.advice import Advice, Errors, Measurement, Promise, advise, promised
+from ceres_cal.diagnostics.advice.measurements import Ground, _observed, together
+from ceres_cal.diagnostics.advice.ranking import _chosen, _prepared, _weighting
 from ceres_cal.observations import Observations, combine
 from ceres_cal.observations.sights import gather_sights
+from ceres_cal.posterior.uncertainty import Uncertainty
+from ceres_cal.problem.parameters import Options, make_layout
+from ceres_cal.problem.priors import gather_priors
+from ceres_cal.problem.problem import Problem, Weighting
+from ceres_cal.problem.reduced import information
+from ceres_cal.problem.structure import Tolerance, make_structure
 from ceres_cal.scene.targets import checkerboard, rings
 from ceres_cal.simulate import Disturbance, board_scene, simulate
-from ceres_cal.solve import Problem, Weighting, information
-from ceres_cal.uncertainty import Uncertainty
 
 PROBLEMS: dict[str, Callable[[], Case]] = {**CASES, "two cameras": two_cameras, "as built": partial(tilted, 8.0)}
 

@@ -10,13 +10,13 @@ from accuracy import scenes as accuracy_scenes
 from accuracy.as_built import CAMERAS, Board, observed, sigmas_off
 
 from ceres_cal.base.errors import InputError
-from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
+from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.diagnostics import diagnose
-from ceres_cal.model.parameters import Options
-from ceres_cal.model.structure import Tolerance, make_structure, numbers_by_kind
+from ceres_cal.problem.parameters import Options
+from ceres_cal.problem.structure import Tolerance, make_structure, numbers_by_kind
+from ceres_cal.robust.repeats import AsBuilt
 from ceres_cal.scene.targets import checkerboard
-from ceres_cal.solve.repeats import AsBuilt
 
 DRAWN = Options(lens="radial")
 BUILT = replace(DRAWN, as_built="estimate")

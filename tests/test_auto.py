@@ -14,22 +14,22 @@ from rendering.photograph import photograph
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.transforms import Pose
-from ceres_cal.calibrating import calibrate
+from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.cli import main
 from ceres_cal.detect.courses import clear_px, predict
 from ceres_cal.detect.images import light
 from ceres_cal.detect.lines import SPACING_PX, measure
+from ceres_cal.detect.photographs import Auto, Facing, detect_field
+from ceres_cal.detect.photographs.candidates import candidates, prepare_search
+from ceres_cal.detect.photographs.facing import agreeing_with_facing, nearest_to_before, side_of
+from ceres_cal.detect.photographs.follow import refine
+from ceres_cal.detect.photographs.grid import grid_of
+from ceres_cal.detect.photographs.painted import likelihood_of_place
+from ceres_cal.detect.photographs.refit import FreeIntrinsics
+from ceres_cal.detect.photographs.search import search
+from ceres_cal.detect.photographs.upright import find_upright
 from ceres_cal.detect.strokes import Strokes, alone, find_strokes
 from ceres_cal.observations import Observations
-from ceres_cal.photographs import Auto, Facing, detect_field
-from ceres_cal.photographs.candidates import candidates, prepare_search
-from ceres_cal.photographs.facing import agreeing_with_facing, nearest_to_before, side_of
-from ceres_cal.photographs.follow import refine
-from ceres_cal.photographs.grid import grid_of
-from ceres_cal.photographs.painted import likelihood_of_place
-from ceres_cal.photographs.refit import FreeIntrinsics
-from ceres_cal.photographs.search import search
-from ceres_cal.photographs.upright import find_upright
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Radial
 from ceres_cal.scene.symmetry import turns_of
@@ -207,7 +207,7 @@ def test_another_field_is_a_miss_that_says_why(tmp_path: Path) -> None:
 def test_a_search_ends_and_says_so(shot: script.Shot, looks: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """After so many looks at the clock. Another field's lines may fit in so many places that it took 200 s."""
     clock = iter([0.0, *[1.0] * looks])
-    monkeypatch.setattr("ceres_cal.photographs.candidates.thread_time", lambda: next(clock, 1000.0))
+    monkeypatch.setattr("ceres_cal.detect.photographs.candidates.thread_time", lambda: next(clock, 1000.0))
     result = search(light(shot.picture.image), FIELD, NAMES, TOP)
     assert result.followed is None
     assert result.reason.startswith("the field was not found within 60 s of processor time: check the target's")

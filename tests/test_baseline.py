@@ -11,9 +11,9 @@ from scenes import RADIAL, SCENES
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import DegenerateError
-from ceres_cal.calibrating import calibrate
-from ceres_cal.model.parameters import Options
+from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.observations import Observations, Prior, combine
+from ceres_cal.problem.parameters import Options
 from ceres_cal.simulate import built_in_scene, simulate
 
 DATA = Path(__file__).parents[1] / "data" / "field_2004"

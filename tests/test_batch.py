@@ -16,14 +16,15 @@ import numpy as np
 import pytest
 
 from ceres_cal import Options, advise, calibrate
-from ceres_cal.advice.ranking import _prepared
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.executing import each, processes
 from ceres_cal.base.threads import available
-from ceres_cal.batch import Job, Outcome, read_plan, run_jobs
-from ceres_cal.batch.jobs import RESULTS, remember, remembered
 from ceres_cal.cli import main
 from ceres_cal.cli.files import finishing
+from ceres_cal.cli.jobs import RESULTS, Job, Outcome, remember, remembered
+from ceres_cal.cli.plan import read_plan
+from ceres_cal.cli.running import run_jobs
+from ceres_cal.diagnostics.advice.ranking import _prepared
 from ceres_cal.diagnostics.held_out import cross_validate
 from ceres_cal.observations import Observations
 from ceres_cal.scene.heights import ROBOT_TOP_M

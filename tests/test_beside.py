@@ -12,11 +12,11 @@ from ceres_cal.base.arrays import Array, Indices32
 from ceres_cal.base.transforms import Pose
 from ceres_cal.detect.courses import predict
 from ceres_cal.detect.images import light
+from ceres_cal.detect.photographs.beside import among_others
+from ceres_cal.detect.photographs.clicks import unknown_optics
+from ceres_cal.detect.photographs.painted import visible_curves
+from ceres_cal.detect.photographs.refit import observations_of, refit_camera
 from ceres_cal.detect.strokes import find_narrow_strokes, find_strokes
-from ceres_cal.photographs.beside import among_others
-from ceres_cal.photographs.clicks import unknown_optics
-from ceres_cal.photographs.painted import visible_curves
-from ceres_cal.photographs.refit import observations_of, refit_camera
 from ceres_cal.scene.lens import Radial
 from ceres_cal.scene.targets import ssl_field
 

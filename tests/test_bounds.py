@@ -13,7 +13,7 @@ from scenes import RADIAL, SCENES
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
-from ceres_cal.calibrating import calibrate
+from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.observations import Observations
 from ceres_cal.simulate import Disturbance, simulate
 

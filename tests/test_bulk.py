@@ -11,12 +11,14 @@ import pytest
 from scenes import RADIAL, two_cameras
 from test_competing import NOISE, half_field, moved_aside, wholes
 
-from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
-from ceres_cal.model.quantities import difference
+from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.observations import Observations, thinning
+from ceres_cal.problem import shares
+from ceres_cal.problem.bundle import Progress
+from ceres_cal.problem.quantities import difference
+from ceres_cal.robust import bulk
 from ceres_cal.simulate import Disturbance, simulate
-from ceres_cal.solve import Progress, bulk, shares
 
 OUTLIERS = Disturbance(points_sigma_px=0.3, curves_sigma_px=0.3, outliers=0.05)
 

@@ -17,7 +17,11 @@ from scipy.optimize import least_squares
 from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.errors import DegenerateError
 from ceres_cal.base.transforms import Pose, rotation_exp, rotation_log
-from ceres_cal.model.parameters import (
+from ceres_cal.observations import Observations, Prior, taken
+from ceres_cal.observations.sights import gather_sights
+from ceres_cal.problem.bundle import Progress, _left_to_gain, solve
+from ceres_cal.problem.engines import Chart, chart_of
+from ceres_cal.problem.parameters import (
     Estimate,
     Layout,
     Options,
@@ -26,17 +30,13 @@ from ceres_cal.model.parameters import (
     make_layout,
     with_intrinsics,
 )
-from ceres_cal.model.priors import gather_priors
-from ceres_cal.model.residuals import residuals
-from ceres_cal.observations import Observations, Prior, taken
-from ceres_cal.observations.sights import gather_sights
+from ceres_cal.problem.priors import gather_priors
+from ceres_cal.problem.problem import Problem, Weighting
+from ceres_cal.problem.residuals import residuals
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Brown, Radial
 from ceres_cal.scene.targets import ssl_field
 from ceres_cal.simulate import Disturbance, field_scene, overhead_pose, simulate
-from ceres_cal.solve import Problem, Progress, Weighting, solve
-from ceres_cal.solve.bundle import _left_to_gain
-from ceres_cal.solve.charts import Chart, chart_of
 from ceres_cal.start.initialise import initialise
 
 NOISE = Disturbance(points_sigma_px=0.3, curves_sigma_px=0.3, outliers=0.03, outlier_spread_px=5.0)

@@ -13,7 +13,7 @@ from pathlib import Path
 from scenes import RADIAL, corners
 
 from ceres_cal.base.cached import cached_property
-from ceres_cal.calibrating import calibrate
+from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.simulate import simulate
 
 PACKAGE = Path(__file__).parents[1] / "src" / "ceres_cal"

@@ -17,17 +17,18 @@ from scipy.optimize import least_squares
 from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.errors import DegenerateError, InputError, SolutionError
 from ceres_cal.base.transforms import Pose, rotation_exp, rotation_log
-from ceres_cal.calibrating import calibrate
-from ceres_cal.model.parameters import Options, intrinsic_names, intrinsics_scales, intrinsics_vector, with_intrinsics
+from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.observations import Curves, Observations, Points, Prior, View, combine
+from ceres_cal.problem.bundle import Progress
+from ceres_cal.problem.parameters import Options, intrinsic_names, intrinsics_scales, intrinsics_vector, with_intrinsics
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.curves import along_track
 from ceres_cal.scene.lens import Brown, Radial
 from ceres_cal.scene.targets import Arc, Segment, Target, checkerboard, custom, ssl_field
 from ceres_cal.simulate import (
     CLEAN,
+    BoardRanges,
     Disturbance,
-    Held,
     Scene,
     Simulation,
     Station,
@@ -37,7 +38,6 @@ from ceres_cal.simulate import (
     overhead_pose,
     simulate,
 )
-from ceres_cal.solve import Progress
 
 ROOT = Path(__file__).resolve().parents[1]
 NOISE = Disturbance(points_sigma_px=0.3, curves_sigma_px=0.3)
@@ -204,7 +204,7 @@ def test_no_board_is_left_in_its_mirrored_pose(
     camera = Camera((1280, 960), phi, (650.0, 470.0), lens)
     stations = {"camera": Station("camera", Pose.identity())}
     board = checkerboard(9, 6, 0.05)
-    scene = board_scene(board, {"camera": camera}, stations, 60, seed=5, held=Held((nearest_m, farthest_m)))
+    scene = board_scene(board, {"camera": camera}, stations, 60, seed=5, held=BoardRanges((nearest_m, farthest_m)))
     calibration = calibrate(simulate(scene, NOISE, seed).observations, options_for(scene))
     assert calibration.rejected == ()
     assert not any("placement" in warning for warning in calibration.warnings)  # phi may well have started from a guess
@@ -652,7 +652,7 @@ def test_a_lens_that_folds_inside_the_image_is_no_solution() -> None:
     """Pincushion that turns at 716 px, boards out to 566 px, and an image that reaches 801 px."""
     camera = Camera((1280, 960), 900.0, (640.0, 480.0), Radial((0.0, -6.5e-7)))
     stations = {"camera": Station("camera", Pose.identity())}
-    scene = board_scene(checkerboard(9, 6, 0.05), {"camera": camera}, stations, 8, seed=3, held=Held((0.8, 1.2)))
+    scene = board_scene(checkerboard(9, 6, 0.05), {"camera": camera}, stations, 8, seed=3, held=BoardRanges((0.8, 1.2)))
     with pytest.raises(
         SolutionError, match=r"camera 'camera'.*radial lens folds 7\d\d px.*corner at 801 px.*fewer"
     ) as caught:

@@ -16,10 +16,10 @@ from scenes import SCENES
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.transforms import rotation_from_euler
-from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration, Fit
-from ceres_cal.model.parameters import Options
+from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.observations import Prior
+from ceres_cal.problem.parameters import Options
 from ceres_cal.simulate import Disturbance, simulate
 
 WORKDAY = Disturbance(points_sigma_px=0.3, curves_sigma_px=0.3, outliers=0.04)

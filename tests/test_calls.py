@@ -24,7 +24,7 @@ from ceres_cal import kernels
 from ceres_cal.base.arrays import AnyArray, Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.kernels import Loss, Unknowns
-from ceres_cal.model.residuals import camera_optics
+from ceres_cal.problem.residuals import camera_optics
 from ceres_cal.scene.lens import Brown
 
 ROOT = Path(__file__).parents[1]

@@ -12,13 +12,13 @@ from scenes import side_by_side
 
 from ceres_cal.base.errors import InputError, SolutionError
 from ceres_cal.base.transforms import Pose, rotation_exp
-from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
-from ceres_cal.model.parameters import Options, Station
-from ceres_cal.model.structure import Tolerance
+from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.moves import check
 from ceres_cal.moves.labels import MIRRORED, relabelled
 from ceres_cal.observations import Observations
+from ceres_cal.problem.parameters import Options, Station
+from ceres_cal.problem.structure import Tolerance
 from ceres_cal.scene.camera import Camera
 from ceres_cal.simulate import Disturbance, field_scene, simulate
 

@@ -22,7 +22,7 @@ from accuracy.compare_with_truth import main as compare_with_truth
 from accuracy.scenes import CLEAN_NOISE, tilted
 from scenes import RADIAL
 
-import ceres_cal.calibrating
+import ceres_cal.calibration.calibrating
 from ceres_cal import cli
 from ceres_cal.base.errors import InputError
 from ceres_cal.calibration import Calibration
@@ -31,8 +31,8 @@ from ceres_cal.cli.arguments import length, parse_length
 from ceres_cal.cli.command import COMMANDS, Command
 from ceres_cal.cli.terminal import ProgressBar, coloured, in_colour
 from ceres_cal.detect.boards import CORNER_FITS
-from ceres_cal.model.parameters import LOSSES, Options
 from ceres_cal.observations import Observations
+from ceres_cal.problem.parameters import LOSSES, Options
 from ceres_cal.scene.lens import LENSES
 from ceres_cal.scene.targets import TARGET_KINDS, ssl_field
 from ceres_cal.simulate import scene_names
@@ -697,7 +697,7 @@ def test_no_failure_is_a_traceback(
     def fail(*_: object) -> None:
         raise failure
 
-    monkeypatch.setattr(sys.modules["ceres_cal.calibrating"], "calibrate", fail)
+    monkeypatch.setattr(sys.modules["ceres_cal.calibration.calibrating"], "calibrate", fail)
     assert refused(say("calibrate", SAMPLE), code) == f"ceres-cal: {line}\n"
     if code == 3:
         monkeypatch.setenv("CERES_CAL_DEBUG", "1")
@@ -709,7 +709,7 @@ def test_no_usable_solution_is_3(say: Say, tmp_path: Path, monkeypatch: pytest.M
     def fail(*_: object) -> None:
         raise ceres_cal.SolutionError("no camera\ncame out")
 
-    monkeypatch.setattr(sys.modules["ceres_cal.calibrating"], "calibrate", fail)
+    monkeypatch.setattr(sys.modules["ceres_cal.calibration.calibrating"], "calibrate", fail)
     said = say("calibrate", SAMPLE, "-o", tmp_path / "calibration.json")
     assert refused(said, 3) == "ceres-cal: no camera came out\n"
     assert list(tmp_path.iterdir()) == []

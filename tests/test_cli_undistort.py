@@ -11,11 +11,11 @@ import pytest
 from photos import shots as script
 from test_cli import Say, refused, say
 
-from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
+from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.cli.terminal import ProgressBar
-from ceres_cal.model.parameters import Station
-from ceres_cal.photographs import detect_field
+from ceres_cal.detect.photographs import detect_field
+from ceres_cal.problem.parameters import Station
 
 __all__ = ["say"]
 

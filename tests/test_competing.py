@@ -13,20 +13,22 @@ from scenes import RADIAL, boards, lines_and_arcs
 
 from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.transforms import Pose
-from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
+from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.cli import main
 from ceres_cal.effects.evidence import RandomEffects
-from ceres_cal.model.information import Information
-from ceres_cal.model.keys import Key
-from ceres_cal.model.quantities import difference
+from ceres_cal.effects.offsets import Offsets, fault_of
 from ceres_cal.observations import Observations
+from ceres_cal.problem.information import Information, Key
+from ceres_cal.problem.problem import Problem
+from ceres_cal.problem.quantities import difference
+from ceres_cal.robust import competing
+from ceres_cal.robust import wholes as looked_at
+from ceres_cal.robust.robust import solve_robustly
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Radial
 from ceres_cal.scene.targets import ssl_field
 from ceres_cal.simulate import Disturbance, Scene, Station, field_scene, overhead_pose, simulate
-from ceres_cal.solve import Problem, competing, looked_at, solve_robustly
-from ceres_cal.solve.offsets import Offsets, fault_of
 
 NOISE = Disturbance(points_sigma_px=0.3, curves_sigma_px=0.3)
 LINES = ("TopTouchLine", "BottomTouchLine", "HalfwayLine", "CenterLine", "LeftPenaltyStretch")
@@ -126,9 +128,9 @@ def test_of_very_many_observations_a_part_is_asked_and_all_of_a_whole_is_taken_o
     of_all = calibrate(observations, RADIAL)
     monkeypatch.setattr(looked_at, "_MOST_ASKED", 1_000)
     monkeypatch.setattr(looked_at, "_FEWEST_ASKED", 4)
-    parts: list[looked_at.Asked] = []
+    parts: list[looked_at.Subproblem] = []
 
-    def spied(every: looked_at.Asked) -> looked_at.Asked:
+    def spied(every: looked_at.Subproblem) -> looked_at.Subproblem:
         parts.append(looked_at.asked(every))
         return parts[0]
 

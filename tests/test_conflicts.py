@@ -14,20 +14,19 @@ from hypothesis import strategies as st
 from scenes import RADIAL, SCENES, camera
 
 from ceres_cal.base.errors import SolutionError
-from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
+from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.diagnostics import diagnose
-from ceres_cal.model.information import Information
-from ceres_cal.model.keys import Key
-from ceres_cal.model.parameters import Options
-from ceres_cal.model.structure import Tolerance
 from ceres_cal.moves import RefitOptions, refit
 from ceres_cal.observations import Observations, Prior
+from ceres_cal.problem.information import Information, Key
+from ceres_cal.problem.parameters import Options
+from ceres_cal.problem.structure import Tolerance
 from ceres_cal.report.grounds import Judgement, judge_quality
 from ceres_cal.report.quality import quality_of
+from ceres_cal.robust.conflicts import _beside
 from ceres_cal.scene.targets import Segment, checkerboard, custom, ssl_field
 from ceres_cal.simulate import Disturbance, Station, field_scene, overhead_pose, simulate
-from ceres_cal.solve.wald import _beside
 
 HEIGHT_M = 4.02
 WRONG, RIGHT = ((value, 0.005) for value in (3.0, HEIGHT_M))
@@ -264,7 +263,7 @@ def test_what_stands_beside_a_prior(seed: int, size: int, strength: float) -> No
 @settings(max_examples=20)
 def test_what_is_in_dispute_is_in_the_covariance(seed: int) -> None:
     """Two shifts d and e: C + d d^T + e e^T."""
-    from ceres_cal.uncertainty import Posterior
+    from ceres_cal.posterior.posterior import Posterior
 
     rng = np.random.default_rng(seed)
     keys = tuple(Key("camera", "a", name, "px") for name in "abc")

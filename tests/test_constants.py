@@ -61,10 +61,10 @@ def test_changes() -> None:
 def test_a_constant_is_set_where_it_is_read() -> None:
     """Where it is defined, where it was imported to, and as the default of a dataclass; in a process of its own."""
     code = (
-        "from constants import Constant; from ceres_cal.model.parameters import Options; "
+        "from constants import Constant; from ceres_cal.problem.parameters import Options; "
         "import ceres_cal.diagnostics.of_lens as of_lens; "
-        "Constant('model.parameters', 'Options.reject_sigma', ()).set(7.0); "
-        "Constant('diagnostics.findings', 'SMALL', ()).set(0.8); "
+        "Constant('problem.parameters', 'Options.reject_sigma', ()).set(7.0); "
+        "Constant('diagnostics.diagnostic', 'SMALL', ()).set(0.8); "
         "print(Options().reject_sigma, Options().loss_scale, of_lens.SMALL)"
     )
     folder = Path(__file__).parents[1] / "scripts"
@@ -74,7 +74,7 @@ def test_a_constant_is_set_where_it_is_read() -> None:
 
 def test_figures_are_measured(tmp_path: Path) -> None:
     """Where next to nothing is worth doing nothing is followed; an error is told, not hidden."""
-    constant = Constant("advice.ranking", "_WORTH", ("advice",))
+    constant = Constant("diagnostics.advice.ranking", "_WORTH", ("advice",))
     now, then = measured("advice", 1, tmp_path), measured("advice", 1, tmp_path, constant, 1e-6)
     assert "measurements ranked" in changes(now, {**now, "measurements ranked, 3 deg": "0"})
     assert changes(now, then) != "nothing"

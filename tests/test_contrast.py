@@ -4,15 +4,14 @@ import numpy as np
 import pytest
 
 from ceres_cal.base.arrays import Array
-from ceres_cal.model.information import Information
-from ceres_cal.model.keys import Key
-from ceres_cal.moves.contrast import Contrast, Statement, contrast
+from ceres_cal.moves.contrast import Contrast, NormalDistribution, contrast
+from ceres_cal.problem.information import Information, Key
 
 KEYS = tuple(Key("camera", "a", name, "px") for name in ("phi", "cx", "cy"))
 
 
-def stated(sd: float, offsets: Array, freedom: float = np.inf) -> Statement:
-    return Statement(Information(KEYS, np.eye(3) / sd**2), offsets, freedom)
+def stated(sd: float, offsets: Array, freedom: float = np.inf) -> NormalDistribution:
+    return NormalDistribution(Information(KEYS, np.eye(3) / sd**2), offsets, freedom)
 
 
 def test_what_differs_in_one_number_is_seen_in_that_number() -> None:
@@ -25,11 +24,13 @@ def test_what_differs_in_one_number_is_seen_in_that_number() -> None:
 
 
 def test_what_either_knows_nothing_of_is_not_tested() -> None:
-    nothing = Statement(Information.nothing(KEYS), np.zeros(3), 10.0)
+    nothing = NormalDistribution(Information.nothing(KEYS), np.zeros(3), 10.0)
     found = contrast(stated(1.0, np.ones(3)), nothing, KEYS)
     assert found.degrees == 0 and found.probability == 1.0
     along = np.outer([1.0, 1.0, 0.0], [1.0, 1.0, 0.0])  # phi + cx alone
-    found = contrast(stated(1.0, np.zeros(3)), Statement(Information(KEYS, along), np.zeros(3), 10.0), KEYS[:2])
+    found = contrast(
+        stated(1.0, np.zeros(3)), NormalDistribution(Information(KEYS, along), np.zeros(3), 10.0), KEYS[:2]
+    )
     assert found.degrees == 1
 
 

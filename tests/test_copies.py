@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from scenes import RADIAL, SCENES
 
 from ceres_cal.base.arrays import AnyArray
-from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
+from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.diagnostics import diagnose
 from ceres_cal.moves import check, refit
 from ceres_cal.observations import NO_CURVES, Observations, Points, View, combine, taken

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ceres_cal import InputError, Observations, custom, ssl_field
-from ceres_cal.photographs.clicks import Clicks, starts_from_clicks
+from ceres_cal.detect.photographs.clicks import Clicks, starts_from_clicks
 from ceres_cal.scene.curves import Arc, Curve, Segment, distance_to_curve
 from ceres_cal.scene.targets.crossings import crossings
 

@@ -15,23 +15,21 @@ from hypothesis import strategies as st
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.tails import NORMAL_95, student_95
-from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
-from ceres_cal.model.information import Information
-from ceres_cal.model.keys import Key
-from ceres_cal.model.parameters import Options
-from ceres_cal.model.residuals import residuals
+from ceres_cal.calibration.calibrating import calibrate
+from ceres_cal.effects.between import _averaged, _expected
+from ceres_cal.effects.dependence import Dependence, Scatter, _freedom_of_mixture
+from ceres_cal.effects.likelihood import likelihoods
+from ceres_cal.effects.sample import _shown
+from ceres_cal.effects.strands import Strand, StrandFamily, decay
 from ceres_cal.moves import refit
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import gather_sights
+from ceres_cal.problem.information import Information, Key
+from ceres_cal.problem.parameters import Options
+from ceres_cal.problem.residuals import residuals
 from ceres_cal.simulate import Disturbance, simulate
 from ceres_cal.start.initialise import initialise
-from ceres_cal.uncertainty.between import _averaged, _expected
-from ceres_cal.uncertainty.correlation import _freedom_of_mixture
-from ceres_cal.uncertainty.dependence import Dependence, Scatter
-from ceres_cal.uncertainty.likelihood import likelihoods
-from ceres_cal.uncertainty.sample import _shown
-from ceres_cal.uncertainty.strands import Family, Strand, decay
 
 HALF = SSL_PROBLEMS["half, paper's lens"]()
 TEN = boards(868.0, RADIAL, 10)
@@ -210,7 +208,7 @@ def test_a_mixture_has_the_tails_of_its_widest_part() -> None:
 # ---- what is summed first -------------------------------------------------------------------------------------------
 
 
-def _family(rng: np.random.Generator) -> tuple[Family, Array]:
+def _family(rng: np.random.Generator) -> tuple[StrandFamily, Array]:
     """Nine strands of three shapes over three views, and the columns of all their rows: private, two shared, left."""
     places = [np.column_stack([rng.uniform(0.0, 1.0, (count, 2)), np.zeros(count)]) for count in (20, 28, 20)]
     strands, first = [], 0
@@ -224,7 +222,7 @@ def _family(rng: np.random.Generator) -> tuple[Family, Array]:
         columns[own, :6] = np.linalg.qr(rng.standard_normal((np.count_nonzero(own), 6)))[0]
     columns[:, 6:8] = 0.02 * rng.standard_normal((first, 2))
     columns[:, 8] = rng.standard_normal(first)
-    return Family.of(strands, False, columns, group), columns
+    return StrandFamily.of(strands, False, columns, group), columns
 
 
 def test_strands_of_one_shape_are_multiplied_as_one_matrix() -> None:
@@ -275,7 +273,7 @@ def test_the_likelihood_is_that_of_the_whole_covariance() -> None:
     assert max(skipped, default=-np.inf) < expected[0] - 6.0
 
 
-def _split(family: Family, values: Array) -> list[Array]:
+def _split(family: StrandFamily, values: Array) -> list[Array]:
     """Values of the rows, strand by strand."""
     return np.split(values, np.cumsum([len(strand.rows) for strand in family.strands])[:-1])
 

@@ -12,11 +12,11 @@ from scenes import RADIAL
 
 from ceres_cal import write_report
 from ceres_cal.base.arrays import Array
-from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
+from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.cli import main
 from ceres_cal.diagnostics import DIAGNOSTICS, Case, Evidence, Family, ScoreTest, Words, diagnose
-from ceres_cal.diagnostics.findings import amounts
+from ceres_cal.diagnostics.diagnostic import amounts
 from ceres_cal.observations import Observations
 from ceres_cal.simulate import simulate
 

@@ -16,21 +16,21 @@ from scenes import RADIAL
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.transforms import Pose
-from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
+from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.cli import main
 from ceres_cal.detect.boards import BoardDetections
 from ceres_cal.diagnostics import Diagnosis, diagnose
 from ceres_cal.diagnostics.held_out import choose, cross_validate
-from ceres_cal.model.equations import Equations, whole_structure, write_equations
-from ceres_cal.model.parameters import Options, intrinsics_vector, with_intrinsics
-from ceres_cal.model.residuals import residuals
+from ceres_cal.effects.linearised import Weights, make_linear_model
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.observations.sights import gather_sights
+from ceres_cal.problem.equations import Equations, whole_structure, write_equations
+from ceres_cal.problem.parameters import Options, intrinsics_vector, with_intrinsics
+from ceres_cal.problem.residuals import residuals
 from ceres_cal.report.grounds import judge_quality
 from ceres_cal.report.quality import quality_of
 from ceres_cal.simulate import Disturbance, simulate
-from ceres_cal.solve.linear_model import Weights, make_linear_model
 
 PLAIN = Options(lens="radial", loss="trivial")
 

@@ -14,18 +14,17 @@ from rendering.photograph import photograph
 
 from ceres_cal.base.arrays import Image
 from ceres_cal.base.errors import DegenerateError, InputError
-from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
+from ceres_cal.calibration.calibrating import calibrate
+from ceres_cal.calibration.lens_forms import AS_GOOD_BESIDE_LENGTHS, PAPER, decide, standard_errors
 from ceres_cal.cli import main
 from ceres_cal.cli.arguments import parse_estimates
+from ceres_cal.detect.photographs.candidates import candidates, prepare_search
 from ceres_cal.diagnostics import diagnose
-from ceres_cal.lens_choice.forms import PAPER
-from ceres_cal.lens_choice.rule import AS_GOOD_BESIDE_LENGTHS, decide, standard_errors
-from ceres_cal.model.parameters import Options
-from ceres_cal.model.structure import Tolerance
 from ceres_cal.moves import check, refit
 from ceres_cal.observations import Observations, Prior
-from ceres_cal.photographs.candidates import candidates, prepare_search
+from ceres_cal.problem.parameters import Options
+from ceres_cal.problem.structure import Tolerance
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Radial
 from ceres_cal.scene.targets import checkerboard, ssl_field

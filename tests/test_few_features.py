@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from ceres_cal.base.errors import DegenerateError
-from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
-from ceres_cal.model.parameters import Options
+from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.observations.columns import taken
+from ceres_cal.problem.parameters import Options
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Radial
 from ceres_cal.scene.targets import ssl_field

@@ -11,23 +11,23 @@ from photos import shots as script
 from photos.disturbed import AUTO, taken
 
 from ceres_cal.base.errors import NothingShownError
-from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
+from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.cli import main
 from ceres_cal.cli.detect_field import _sections
 from ceres_cal.detect.courses import predict
 from ceres_cal.detect.images import filled, light
 from ceres_cal.detect.lines import Lines, measure
+from ceres_cal.detect.photographs import Auto, Clicks, FieldDetections, FieldOptions, detect_field
+from ceres_cal.detect.photographs.as_built import FieldAsBuilt, as_built
+from ceres_cal.detect.photographs.clicks import unknown_optics
+from ceres_cal.detect.photographs.matching import StrokeMap
+from ceres_cal.detect.photographs.refit import observations_of
+from ceres_cal.detect.photographs.search import search
 from ceres_cal.detect.registration import nearness_to
 from ceres_cal.detect.strokes import Strokes, drawn, find_strokes
-from ceres_cal.model.parameters import Options
 from ceres_cal.observations import Observations, Prior
-from ceres_cal.photographs import Auto, Clicks, FieldDetections, FieldOptions, detect_field
-from ceres_cal.photographs.as_built import AsBuilt, as_built
-from ceres_cal.photographs.clicks import unknown_optics
-from ceres_cal.photographs.matching import StrokeMap
-from ceres_cal.photographs.refit import observations_of
-from ceres_cal.photographs.search import search
+from ceres_cal.problem.parameters import Options
 from ceres_cal.report.document import Document
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Radial
@@ -45,7 +45,7 @@ CAMERA = Camera(
 )
 
 
-def told(painted: Target, asked: Target = FIELD, noise_px: float = 0.1) -> AsBuilt:
+def told(painted: Target, asked: Target = FIELD, noise_px: float = 0.1) -> FieldAsBuilt:
     """What lines that are painted so tell of the field that is asked for."""
     course = predict(painted, CAMERA, painted.curve_names, 8.0, 8.0)
     offset = np.random.default_rng(3).normal(0.0, noise_px, len(course))

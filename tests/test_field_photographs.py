@@ -13,15 +13,15 @@ from rendering.photograph import photograph
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
-from ceres_cal.calibrating import calibrate
+from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.cli import main
 from ceres_cal.detect.courses import Course, clear_px, predict
 from ceres_cal.detect.crossings import find_crossings
 from ceres_cal.detect.images import light, read_light
 from ceres_cal.detect.lines import SPACING_PX, measure
+from ceres_cal.detect.photographs import Clicks, FieldOptions, detect_field, follow, load_clicks
+from ceres_cal.detect.photographs.clicks import FORMAT, clicks_from_json
 from ceres_cal.observations import Observations
-from ceres_cal.photographs import Clicks, FieldOptions, detect_field, follow, load_clicks
-from ceres_cal.photographs.clicks import FORMAT, clicks_from_json
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Radial
 from ceres_cal.scene.targets import Segment, custom, ssl_field

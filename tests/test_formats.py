@@ -11,7 +11,7 @@ from scenes import RADIAL, lines_and_arcs
 
 from ceres_cal import Calibration, InputError, calibrate
 from ceres_cal.cli import main
-from ceres_cal.formats import EXPORT_FORMATS, Exported, ExportFormat, ExportRequest, LookupTable, Loss, export
+from ceres_cal.formats import EXPORT_FORMATS, Exported, ExportFormat, ExportLoss, ExportRequest, LookupTable, export
 from ceres_cal.simulate import Disturbance, simulate
 
 
@@ -26,7 +26,7 @@ def write_toy(request: ExportRequest) -> Exported:
     cameras = {name: request.calibration.station(name) for name in request.stations}
     lines = [f"{name} {camera.phi:.{request.options.digits}f}" for name, camera in cameras.items()]
     lines = [request.options.comment, *lines] if request.options.comment else lines
-    losses = tuple(Loss(name, {0.0: (0.1, 0.2), 0.15: (0.3, 0.4)}, (0.01, 0.02)) for name in cameras)
+    losses = tuple(ExportLoss(name, {0.0: (0.1, 0.2), 0.15: (0.3, 0.4)}, (0.01, 0.02)) for name in cameras)
     before = request.existing or b""
     return Exported(
         before + "\n".join(lines).encode(), losses, f"{len(lines)} lines", {"lines": len(lines)}, ("toys break",)
@@ -107,7 +107,7 @@ def test_the_look_up_table_is_a_format(tmp_path: Path, capsys: pytest.CaptureFix
     exported = export(calibrated(), "table", tmp_path / "python.npz", error_mm=1.0)
     one, other = LookupTable.load(old), LookupTable.load(new)
     assert np.array_equal(one.floor_m, other.floor_m, equal_nan=True) and one.error_mm == other.error_mm
-    assert exported.losses == (Loss("overhead", one.error_mm),) and exported.losses[0].field_mm[0.0][1] <= 1.0
+    assert exported.losses == (ExportLoss("overhead", one.error_mm),) and exported.losses[0].field_mm[0.0][1] <= 1.0
 
 
 @pytest.mark.parametrize(

@@ -10,8 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ceres_cal.base.arrays import Array
-from ceres_cal.model.information import Information
-from ceres_cal.model.keys import Key
+from ceres_cal.problem.information import Information, Key
 
 KEYS = tuple(Key("camera", "overhead", f"k{number}", "1") for number in range(6))
 

@@ -11,10 +11,10 @@ from scenes import RADIAL, SCENES
 
 from ceres_cal.base.errors import DegenerateError
 from ceres_cal.base.transforms import Pose, rotation_log
-from ceres_cal.model.parameters import Options
-from ceres_cal.model.residuals import residuals
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.observations.sights import gather_sights
+from ceres_cal.problem.parameters import Options
+from ceres_cal.problem.residuals import residuals
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Radial
 from ceres_cal.scene.targets import checkerboard, ssl_field

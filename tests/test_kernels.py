@@ -20,9 +20,9 @@ from ceres_cal.base.arrays import Array, Indices, Indices32
 from ceres_cal.base.transforms import Pose, rotation_exp
 from ceres_cal.kernels import CurveColumns, Loss, PointColumns, Unknowns
 from ceres_cal.kernels.calls import core
-from ceres_cal.model.parameters import intrinsic_names, intrinsics_vector, with_intrinsics
-from ceres_cal.model.residuals import camera_optics
-from ceres_cal.model.structure import EXACT
+from ceres_cal.problem.parameters import intrinsic_names, intrinsics_vector, with_intrinsics
+from ceres_cal.problem.residuals import camera_optics
+from ceres_cal.problem.structure import EXACT
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.curves import along_track
 from ceres_cal.scene.lens import Brown, KannalaBrandt, Radial

@@ -13,12 +13,12 @@ from test_cli import ROOT, Say, refused, say
 
 from ceres_cal.base.errors import InputError, NothingShownError
 from ceres_cal.base.transforms import Pose
-from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
+from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.detect.boards import detect_boards
+from ceres_cal.detect.photographs import check_photographs, detect_field, detect_known
 from ceres_cal.moves import check, movements, refit
 from ceres_cal.observations import Observations, combine
-from ceres_cal.photographs import check_photographs, detect_field, detect_known
 from ceres_cal.scene.camera import Camera
 from ceres_cal.simulate import built_in_scene
 

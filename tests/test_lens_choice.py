@@ -18,33 +18,32 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from photos import disturbed as disturbed
 
-from ceres_cal import calibrating
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError, SolutionError
-from ceres_cal.calibrating import Watched, calibrate
-from ceres_cal.calibration import Calibration, LensChoice
+from ceres_cal.calibration import Calibration, LensChoice, calibrating
+from ceres_cal.calibration import lens_choice as choosing
+from ceres_cal.calibration import lens_seen as seen
+from ceres_cal.calibration.calibrating import Watched, calibrate
+from ceres_cal.calibration.lens_choice import Comparison, choose_lens
+from ceres_cal.calibration.lens_forms import PAPER, candidates, decide, label_of, papers, pseudo_bma
+from ceres_cal.calibration.lens_kinds import Candidate
 from ceres_cal.cli import main
 from ceres_cal.detect.boards import BoardDetections
+from ceres_cal.detect.photographs import detect_field
 from ceres_cal.diagnostics.held_out import choose
-from ceres_cal.lens_choice import PAPER, candidates, choose_lens, decide, label_of, papers, seen
-from ceres_cal.lens_choice import choice as choosing
-from ceres_cal.lens_choice.choice import Comparison
-from ceres_cal.lens_choice.kinds import Candidate
-from ceres_cal.lens_choice.rule import pseudo_bma
-from ceres_cal.model.equations import write_equations
-from ceres_cal.model.keys import Key
-from ceres_cal.model.parameters import AUTO, Options
-from ceres_cal.model.residuals import residuals
+from ceres_cal.effects.left_out import GroupNormals, group_normals
+from ceres_cal.effects.linearised import Linearised, equation_weights, make_linear_model
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights, gather_sights
-from ceres_cal.photographs import detect_field
+from ceres_cal.problem.bundle import Solution, solve
+from ceres_cal.problem.equations import write_equations
+from ceres_cal.problem.information import Key
+from ceres_cal.problem.parameters import AUTO, Options
+from ceres_cal.problem.residuals import residuals
 from ceres_cal.scene.camera import in_image
 from ceres_cal.scene.lens import LENSES, KannalaBrandt
 from ceres_cal.scene.targets import ssl_field
 from ceres_cal.simulate import Disturbance, simulate
-from ceres_cal.solve import Solution, solve
-from ceres_cal.solve.left_out import GroupNormals, group_normals
-from ceres_cal.solve.linear_model import LinearModel, equation_weights, make_linear_model
 from ceres_cal.start.initialise import Start, initialise
 
 _PLAIN = Options(loss="trivial", reject_sigma=50.0)
@@ -307,7 +306,7 @@ def test_a_lens_that_no_formula_has_is_seen_in_what_all_others_leave() -> None:
     assert plain is not None and not [one for one in plain.tried if one.label.startswith("spline")]
 
 
-def _normals(observations: Observations, calibration: Calibration) -> tuple[GroupNormals, LinearModel]:
+def _normals(observations: Observations, calibration: Calibration) -> tuple[GroupNormals, Linearised]:
     """Of each sight, with the linear model that they follow from."""
     problem, estimate = calibration.problem(observations), calibration.estimate
     there = residuals(observations, problem.sights, estimate)
@@ -410,7 +409,7 @@ def test_that_no_other_lens_could_be_compared_is_said(monkeypatch: pytest.Monkey
     def fails(*_: object) -> None:
         raise SolutionError("nothing came out")
 
-    monkeypatch.setattr("ceres_cal.lens_choice.seen.Seen.solved_near", fails)
+    monkeypatch.setattr("ceres_cal.calibration.lens_seen.InlierRows.solved_near", fails)
     calibration = calibrate(_seen("radial-2-3", "boards"))
     without = "so the standard deviations do not include what they would say: nothing came out"
     assert f"other lenses could not be compared, {without}" in calibration.warnings

@@ -14,14 +14,14 @@ import scenes
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
-from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
+from ceres_cal.calibration.calibrating import calibrate
+from ceres_cal.calibration.lens_forms import candidates, label_of
 from ceres_cal.cli import main
 from ceres_cal.diagnostics import diagnose
-from ceres_cal.lens_choice import candidates, label_of
-from ceres_cal.model.parameters import Options, intrinsics_vector, with_intrinsics
-from ceres_cal.model.residuals import camera_optics, residuals
 from ceres_cal.observations.sights import gather_sights
+from ceres_cal.problem.parameters import Options, intrinsics_vector, with_intrinsics
+from ceres_cal.problem.residuals import camera_optics, residuals
 from ceres_cal.report import make_report
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import LENSES, Lens, make_lens, register
@@ -112,7 +112,7 @@ def test_a_name_is_given_once() -> None:
 
 def test_its_derivatives_are_those_of_its_map(simulation: Simulation) -> None:
     """What the solve differentiates, against differences of the residuals."""
-    from ceres_cal.model.equations import write_equations
+    from ceres_cal.problem.equations import write_equations
 
     observations, options = simulation.observations, Options(lens="division", fixed={"k": -2.4e-7})
     truth = calibrate(observations, options).estimate

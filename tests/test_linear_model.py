@@ -10,15 +10,15 @@ from accuracy.moves import calibrated as calibrated_at_home
 from accuracy.scenes import FIELD
 from scenes import side_by_side
 
-from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
+from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.diagnostics import Diagnosis, diagnose
-from ceres_cal.model.parameters import Options
-from ceres_cal.model.structure import Tolerance
 from ceres_cal.moves import refit
 from ceres_cal.observations import Observations, taken
+from ceres_cal.problem.noise import USUAL_EQUATIONS
+from ceres_cal.problem.parameters import Options
+from ceres_cal.problem.structure import Tolerance
 from ceres_cal.simulate import field_scene, simulate
-from ceres_cal.solve.noise import USUAL_EQUATIONS
 
 
 def rows_of(observations: Observations, points: np.ndarray, curves: np.ndarray) -> Observations:

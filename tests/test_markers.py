@@ -12,9 +12,9 @@ from test_cli import Say, refused, say
 from ceres_cal.base.arrays import Array, Image8
 from ceres_cal.base.errors import InputError, NothingShownError
 from ceres_cal.base.transforms import Pose, rotation_exp
-from ceres_cal.calibrating import calibrate
+from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.detect.boards import detect_boards
-from ceres_cal.model.parameters import Options
+from ceres_cal.problem.parameters import Options
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Brown
 from ceres_cal.scene.targets import Marker, markers, target_from_spec

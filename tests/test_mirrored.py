@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 
 from ceres_cal.base.transforms import Pose, rotation_log
-from ceres_cal.calibrating import calibrate
-from ceres_cal.model.parameters import Estimate, Options, make_layout
+from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import gather_sights
+from ceres_cal.problem.parameters import Estimate, Options, make_layout
+from ceres_cal.problem.problem import Problem, Weighting
+from ceres_cal.robust.poses import mirrored, without_mirrored_poses
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Brown
 from ceres_cal.scene.targets import checkerboard
-from ceres_cal.simulate import Disturbance, Held, Scene, Station, board_scene, simulate
-from ceres_cal.solve import Problem, Weighting
-from ceres_cal.solve.mirrored import mirrored, without_mirrored_poses
+from ceres_cal.simulate import BoardRanges, Disturbance, Scene, Station, board_scene, simulate
 
 OPTIONS = Options(lens="brown")
 
@@ -27,7 +27,7 @@ def small_boards(seed: int, count: int = 60) -> tuple[Scene, Observations]:
     camera = Camera((1280, 960), 600.0, (645.0, 470.0), Brown((-0.28, 0.07, 0.0, 0.0, 0.0)))
     stations = {"camera": Station("camera", Pose.identity())}
     scene = board_scene(
-        checkerboard(6, 5, 0.06), {"camera": camera}, stations, count, seed, held=Held((0.7, 2.5), (15, 40))
+        checkerboard(6, 5, 0.06), {"camera": camera}, stations, count, seed, held=BoardRanges((0.7, 2.5), (15, 40))
     )
     return scene, simulate(scene, Disturbance(0.3, 0.3), seed).observations
 

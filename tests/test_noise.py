@@ -11,8 +11,8 @@ from accuracy.diagnostic_scenes import held_boards
 from scenes import RADIAL
 
 from ceres_cal.base.arrays import Array
-from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
+from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.observations import Observations
 from ceres_cal.scene.lens import Radial
 from ceres_cal.simulate import Disturbance, simulate

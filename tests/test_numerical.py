@@ -16,10 +16,10 @@ from scenes import RADIAL
 
 from ceres_cal.base.errors import CalibrationError, InputError, SolutionError
 from ceres_cal.base.numerical import numerical
-from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
-from ceres_cal.model.parameters import Options
+from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.observations import Prior
+from ceres_cal.problem.parameters import Options
 from ceres_cal.simulate import Disturbance, simulate
 from ceres_cal.start.closed_forms import fit_lines, point_lines
 

@@ -24,7 +24,7 @@ from ceres_cal.cli.options import (
     options_of,
     switch,
 )
-from ceres_cal.model.parameters import AUTO, Options
+from ceres_cal.problem.parameters import AUTO, Options
 
 
 @dataclass(frozen=True)

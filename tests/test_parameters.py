@@ -13,7 +13,9 @@ from hypothesis import strategies as st
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.transforms import Pose
-from ceres_cal.model.parameters import (
+from ceres_cal.observations import NO_CURVES, Observations, Points, Prior, View
+from ceres_cal.observations.sights import SightKey
+from ceres_cal.problem.parameters import (
     LOSSES,
     Estimate,
     Layout,
@@ -27,9 +29,7 @@ from ceres_cal.model.parameters import (
     unit_px,
     with_intrinsics,
 )
-from ceres_cal.model.structure import make_structure
-from ceres_cal.observations import NO_CURVES, Observations, Points, Prior, View
-from ceres_cal.observations.sights import SightKey
+from ceres_cal.problem.structure import make_structure
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Brown, KannalaBrandt, Radial, make_lens
 from ceres_cal.scene.targets import checkerboard

@@ -20,15 +20,15 @@ import pytest
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.transforms import Pose, rotation_exp, rotation_log
-from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
+from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.detect.boards import BoardDetections
-from ceres_cal.model.parameters import Options
 from ceres_cal.observations import Observations
+from ceres_cal.problem.parameters import Options
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Brown, KannalaBrandt, Lens
 from ceres_cal.scene.targets import checkerboard
-from ceres_cal.simulate import Disturbance, Held, Station, board_scene, simulate
+from ceres_cal.simulate import BoardRanges, Disturbance, Station, board_scene, simulate
 
 BOARD = checkerboard(9, 6, 0.125)  # its corners are the same numbers in single precision, which OpenCV asks for
 SIZE = (1280, 960)
@@ -53,7 +53,12 @@ def corners(lens: str) -> Observations:
     phi, model = LENSES[lens]
     camera = Camera(SIZE, phi, (651.3, 468.9), model, 1.004)
     scene = board_scene(
-        BOARD, {"camera": camera}, {"camera": Station("camera", Pose.identity())}, 15, seed=1, held=Held((0.8, 2.0))
+        BOARD,
+        {"camera": camera},
+        {"camera": Station("camera", Pose.identity())},
+        15,
+        seed=1,
+        held=BoardRanges((0.8, 2.0)),
     )
     found = simulate(scene, Disturbance(points_sigma_px=0.3), seed=1).observations
     return replace(found, points=replace(found.points, pixels=found.points.pixels.astype(np.float32)))

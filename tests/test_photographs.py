@@ -25,7 +25,7 @@ from ceres_cal.scene.heights import ROBOT_TOP_M
 from ceres_cal.scene.lens import Radial
 from ceres_cal.scene.targets import Segment, checkerboard, custom, rings, ssl_field
 from ceres_cal.simulate import (
-    Held,
+    BoardRanges,
     Photography,
     Scene,
     Station,
@@ -96,7 +96,7 @@ def test_rings_have_the_size_that_the_model_says() -> None:
 def test_board_corners_lie_where_the_model_says() -> None:
     board = checkerboard(9, 6, 0.05)
     stations = {"camera": Station("camera", Pose.identity())}
-    scene = board_scene(board, {"camera": camera("radial-2-3")}, stations, 3, seed=4, held=Held((0.6, 1.0)))
+    scene = board_scene(board, {"camera": camera("radial-2-3")}, stations, 3, seed=4, held=BoardRanges((0.6, 1.0)))
     errors = []
     for plan in scene.views:
         image = cv2.cvtColor(

@@ -18,18 +18,18 @@ from scenes import LENSES, camera
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.transforms import Pose
-from ceres_cal.calibrating import calibrate
+from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.detect.boards import BoardDetections
 from ceres_cal.detect.images import encoded, read_grey
-from ceres_cal.model.parameters import Estimate, Options
-from ceres_cal.model.parameters import Station as Posed
-from ceres_cal.model.structure import Tolerance, make_structure
-from ceres_cal.pictures.files import jpeg_of_at_most
-from ceres_cal.pictures.frames import Frame, frame_by_name, frames_of, marks_of, model_of, photographs_by_frame
-from ceres_cal.pictures.model import model_seen
-from ceres_cal.pictures.overlay import AFTER, BEFORE, Layer, Marks, draw_overlay
-from ceres_cal.pictures.straight import Straight, straighten
-from ceres_cal.pictures.top_view import TopViewGrid, make_grid, top_view
+from ceres_cal.problem.parameters import Estimate, Options
+from ceres_cal.problem.parameters import Station as Posed
+from ceres_cal.problem.structure import Tolerance, make_structure
+from ceres_cal.report.pictures.files import jpeg_of_at_most
+from ceres_cal.report.pictures.frames import Frame, frame_by_name, frames_of, marks_of, model_of, photographs_by_frame
+from ceres_cal.report.pictures.model import model_seen
+from ceres_cal.report.pictures.overlay import AFTER, BEFORE, Layer, Marks, draw_overlay
+from ceres_cal.report.pictures.straight import Straight, straighten
+from ceres_cal.report.pictures.top_view import TopViewGrid, make_grid, top_view
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Brown, KannalaBrandt, Lens, Radial
 from ceres_cal.simulate import overhead_pose

@@ -13,17 +13,17 @@ from scenes import RADIAL, SCENES, camera
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import SolutionError
 from ceres_cal.base.transforms import Pose
-from ceres_cal.calibrating import calibrate
-from ceres_cal.model.parameters import Estimate, Options
-from ceres_cal.model.parameters import Station as Placed
-from ceres_cal.model.residuals import residuals
-from ceres_cal.model.structure import EXACT
+from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import gather_sights
+from ceres_cal.problem.parameters import Estimate, Options
+from ceres_cal.problem.parameters import Station as Placed
+from ceres_cal.problem.residuals import residuals
+from ceres_cal.problem.structure import EXACT
+from ceres_cal.robust.usable import require_possible
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.targets import Target, custom
 from ceres_cal.simulate import Disturbance, Scene, Station, field_scene, overhead_pose, simulate
-from ceres_cal.solve.possible import require_possible
 
 NOISE = Disturbance(0.3, 0.3)
 MIRRORED: dict[str, Callable[[Array], Array]] = {

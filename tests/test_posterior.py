@@ -16,21 +16,21 @@ from ceres_cal.base.errors import InputError
 from ceres_cal.base.spread import Spread
 from ceres_cal.base.tails import student_95
 from ceres_cal.base.transforms import Pose, left_jacobian, skew
-from ceres_cal.calibrating import calibrate
-from ceres_cal.model.keys import Key, pose_keys
-from ceres_cal.model.parameters import Estimate, Layout, Options, intrinsics_scales, make_layout
-from ceres_cal.model.priors import gather_priors
-from ceres_cal.model.quantities import difference, free_keys, moved
-from ceres_cal.model.structure import Tolerance
+from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.observations import Prior
 from ceres_cal.observations.sights import gather_sights
+from ceres_cal.posterior.posterior import make_posterior
+from ceres_cal.problem.bundle import _ParameterBlocks, solve
+from ceres_cal.problem.costs import Run, SightCost
+from ceres_cal.problem.information import Key, pose_keys
+from ceres_cal.problem.parameters import Estimate, Layout, Options, intrinsics_scales, make_layout
+from ceres_cal.problem.prior_cost import PriorCost
+from ceres_cal.problem.priors import gather_priors
+from ceres_cal.problem.problem import Problem, Weighting
+from ceres_cal.problem.quantities import difference, free_keys, moved
+from ceres_cal.problem.reduced import information
+from ceres_cal.problem.structure import Tolerance
 from ceres_cal.simulate import Disturbance, simulate
-from ceres_cal.solve import Problem, Weighting, information, solve
-from ceres_cal.solve.bundle import _Blocks
-from ceres_cal.solve.cached_cost import Run
-from ceres_cal.solve.costs import SightCost
-from ceres_cal.solve.prior_cost import PriorCost
-from ceres_cal.uncertainty import make_posterior
 
 NOISE = Disturbance(points_sigma_px=0.3, curves_sigma_px=0.3)
 WEIGHTING = Weighting(0.3, 0.3, "cauchy", 3.0)  # a loss whose bend the blocks leave out, as the posterior does
@@ -74,7 +74,7 @@ def step_of_block(kind: str, name: str, estimate: Estimate, layout: Layout) -> A
 def covariance_of_pyceres(whole: Problem, estimate: Estimate) -> dict[tuple[str, str], Array]:
     """Covariance of each block by pyceres, nothing eliminated, no kernel of `information` in it."""
     layout = whole.layout
-    blocks = _Blocks.pack(estimate, layout, frozenset())
+    blocks = _ParameterBlocks.pack(estimate, layout, frozenset())
     ceres, run = pyceres.Problem(), Run()
     costs: list[tuple[Any, list[Array]]] = []
     for number, key in enumerate(whole.sights.keys):

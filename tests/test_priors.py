@@ -13,18 +13,17 @@ from scenes import RADIAL
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.transforms import Pose, rotation_exp
-from ceres_cal.model.information import Information
-from ceres_cal.model.keys import Key, pose_keys
-from ceres_cal.model.parameters import Estimate, Options, Station, make_layout
-from ceres_cal.model.priors import GaussianPrior, gather_priors, stated_prior, tolerances
-from ceres_cal.model.quantities import intrinsic_keys, moved
-from ceres_cal.model.structure import Tolerance, make_structure
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.observations.sights import gather_sights
+from ceres_cal.problem.information import Information, Key, pose_keys
+from ceres_cal.problem.parameters import Estimate, Options, Station, make_layout
+from ceres_cal.problem.priors import GaussianPrior, gather_priors, stated_prior, tolerances
+from ceres_cal.problem.problem import Problem
+from ceres_cal.problem.quantities import intrinsic_keys, moved
+from ceres_cal.problem.structure import Tolerance, make_structure
 from ceres_cal.scene.lens import Brown, Radial
 from ceres_cal.scene.targets import ssl_field
 from ceres_cal.simulate import Disturbance, simulate
-from ceres_cal.solve import Problem
 
 PHI = Key("camera", "overhead", "phi", "px")
 HEIGHT = Key("station", "overhead", "height", "m")

@@ -7,7 +7,7 @@ import pytest
 
 from ceres_cal.base.arrays import Array, Array32
 from ceres_cal.detect.blur import blur_of, no_blur
-from ceres_cal.detect.profiles import Shape, cut_windows, fit_profiles, fit_shape, normal_step
+from ceres_cal.detect.profiles import EdgeShape, cut_windows, fit_profiles, fit_shape, normal_step
 
 WIDTH_PX = 2.4
 COUNT = 200
@@ -52,10 +52,10 @@ def test_an_unknown_blur_moves_nothing_and_is_found() -> None:
     for wrong in (0.5, 1.1):
         assert fitted(image, normal, wrong)[0] == pytest.approx(0.3, abs=0.01)  # 0.004 px
     windows = cut_windows(image.astype(np.float32), np.array([[30.0, 30.0]]), normal[None], np.zeros(1), 6.0, 3)
-    shape = fit_shape(windows, 0.5 * WIDTH_PX * np.array([[-1.0, 1.0]]), Shape(1.0))
+    shape = fit_shape(windows, 0.5 * WIDTH_PX * np.array([[-1.0, 1.0]]), EdgeShape(1.0))
     assert shape.blur_px == pytest.approx(np.hypot(0.9, 12**-0.5), rel=0.03)
     assert shape.stretch == pytest.approx(1.0, abs=0.03)
-    wider = fit_shape(windows, 0.5 * 0.6 * WIDTH_PX * np.array([[-1.0, 1.0]]), Shape(1.0))
+    wider = fit_shape(windows, 0.5 * 0.6 * WIDTH_PX * np.array([[-1.0, 1.0]]), EdgeShape(1.0))
     assert wider.stretch == pytest.approx(1.0 / 0.6, rel=0.05)
 
 
@@ -64,11 +64,11 @@ def test_a_smear_is_found_and_moves_nothing() -> None:
     image = np.mean([stripe(normal, 0.3 + along, 0.6) for along in np.linspace(-3.0, 3.0, 61)], axis=0)
     noisy = image + np.random.default_rng(3).normal(0.0, 2.0, image.shape)
     windows = cut_windows(noisy.astype(np.float32), np.array([[30.0, 30.0]]), normal[None], np.zeros(1), 9.0, 3)
-    shape = fit_shape(windows, edges, Shape(0.8, 1.0, 4.0))
+    shape = fit_shape(windows, edges, EdgeShape(0.8, 1.0, 4.0))
     assert shape.smear_px == pytest.approx(6.0, rel=0.1)  # 0.03
     found = fit_profiles(windows, edges, shape.blur_px, 1.5, shape.smear_px)
     assert abs(found.offset_px[0] - 0.3) < 3.0 * found.sigma_px[0] < 0.1  # 0.027 and 0.077 px
-    as_gaussian = fit_profiles(windows, edges, fit_shape(windows, edges, Shape(1.0)).blur_px, 1.5)
+    as_gaussian = fit_profiles(windows, edges, fit_shape(windows, edges, EdgeShape(1.0)).blur_px, 1.5)
     assert as_gaussian.sigma_px[0] > 2.0 * found.sigma_px[0]  # 3.3
 
 

@@ -13,12 +13,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ceres_cal.base.errors import InputError
-from ceres_cal.calibrating import calibrate
-from ceres_cal.model.parameters import Options
-from ceres_cal.model.ranges import require_possible_numbers
-from ceres_cal.model.structure import Tolerance
+from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.moves import RefitOptions, refit
 from ceres_cal.observations import Prior
+from ceres_cal.problem.parameters import Options
+from ceres_cal.problem.ranges import require_possible_numbers
+from ceres_cal.problem.structure import Tolerance
 from ceres_cal.scene.targets import custom
 from ceres_cal.simulate import Disturbance, simulate
 

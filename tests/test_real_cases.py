@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
+from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.cli import main
-from ceres_cal.model.parameters import Options
-from ceres_cal.model.structure import Tolerance
 from ceres_cal.moves import score
 from ceres_cal.observations import Observations, Prior
+from ceres_cal.problem.parameters import Options
+from ceres_cal.problem.structure import Tolerance
 
 HELD = ("--lens", "brown", *(part for name in ("k1", "k2", "k3", "p1", "p2") for part in ("--fix", f"{name}=0")))
 

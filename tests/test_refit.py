@@ -28,25 +28,25 @@ from scenes import side_by_side
 
 from ceres_cal.base.errors import DegenerateError, InputError, SolutionError
 from ceres_cal.base.transforms import Pose, rotation_exp
-from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
+from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.calibration.file import PriorFile
-from ceres_cal.model.parameters import Layout, Options, Station
-from ceres_cal.model.priors import GaussianPrior
-from ceres_cal.model.quantities import difference, moved
-from ceres_cal.model.structure import Tolerance
 from ceres_cal.moves import RefitOptions, refit
 from ceres_cal.moves.carried import carried_prior, make_plan
 from ceres_cal.moves.labels import MIRRORED, TURNED, relabelled
 from ceres_cal.moves.poses import movement
 from ceres_cal.observations import Observations, taken
+from ceres_cal.problem.bundle import _ParameterBlocks
+from ceres_cal.problem.costs import Run
+from ceres_cal.problem.parameters import Layout, Options, Station
+from ceres_cal.problem.prior_cost import PriorCost
+from ceres_cal.problem.priors import GaussianPrior
+from ceres_cal.problem.quantities import difference, moved
+from ceres_cal.problem.structure import Tolerance
 from ceres_cal.scene.files import CameraFile, PoseFile
 from ceres_cal.scene.lens import Radial
 from ceres_cal.scene.targets import ssl_field
 from ceres_cal.simulate import field_scene, overhead_pose, simulate
-from ceres_cal.solve.bundle import _Blocks
-from ceres_cal.solve.cached_cost import Run
-from ceres_cal.solve.prior_cost import PriorCost
 
 FAR = overhead_pose(-2.3, -1.9, 3.9, tilt_y_deg=-25.0, yaw_deg=90.0)
 
@@ -96,7 +96,7 @@ def test_the_prior_says_what_its_matrix_says(two_cameras: tuple[Calibration, dic
     away = moved(estimate, posterior.keys, step)
     np.testing.assert_allclose(prior.offsets(away), step, rtol=1e-6, atol=1e-12)
     cost = PriorCost(Run(), prior, away, layout)
-    blocks = _Blocks.pack(away, layout, frozenset())
+    blocks = _ParameterBlocks.pack(away, layout, frozenset())
     arrays = [blocks.owned_by(*owner) for owner in cost.owners]
 
     def value(arrays: list[np.ndarray]) -> np.ndarray:

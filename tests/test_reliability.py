@@ -34,13 +34,13 @@ from scenes import RADIAL
 
 from ceres_cal.base.errors import CalibrationError, InputError
 from ceres_cal.base.files import LIMIT, read_bytes, write_bytes
-from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
+from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.cli import main
 from ceres_cal.detect.images import read_grey
 from ceres_cal.formats import LookupTable
-from ceres_cal.model.parameters import Options
 from ceres_cal.observations import Observations
+from ceres_cal.problem.parameters import Options
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Radial
 from ceres_cal.scene.targets import checkerboard, custom, ssl_field
@@ -494,7 +494,7 @@ def test_sigterm_is_as_clean_as_ctrl_c(tmp_path: Path) -> None:
 
 
 def test_a_solver_does_not_take_sigterm(tmp_path: Path) -> None:
-    code = "import os, signal, ceres_cal.solve; os.kill(os.getpid(), signal.SIGTERM); import time; time.sleep(5)"
+    code = "import os, signal, ceres_cal.problem; os.kill(os.getpid(), signal.SIGTERM); import time; time.sleep(5)"
     run = subprocess.run([sys.executable, "-c", code], env=ENVIRONMENT, capture_output=True, timeout=60)
     assert (run.returncode, run.stderr) == (-signal.SIGTERM, b"")
 

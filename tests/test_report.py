@@ -22,7 +22,7 @@ from ceres_cal.base.transforms import euler_from_rotation, rotation_exp
 from ceres_cal.base.words import at_precision, short
 from ceres_cal.cli import main
 from ceres_cal.diagnostics import diagnose
-from ceres_cal.model.quantities import camera_moved
+from ceres_cal.problem.quantities import camera_moved
 from ceres_cal.report import make_report, quality
 from ceres_cal.report.grounds import CARE_MM, GOOD_MM, judge_quality, level_of, worst
 from ceres_cal.report.maps import levels_of

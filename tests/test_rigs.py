@@ -12,13 +12,13 @@ from test_cli import Say, refused, say
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.transforms import Pose, rotation_exp
-from ceres_cal.calibrating import calibrate
+from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.detect.images import read_grey
-from ceres_cal.model.parameters import Options, Station
 from ceres_cal.observations import Observations, combine
 from ceres_cal.observations.same_frame import with_same_frames
+from ceres_cal.problem.parameters import Options, Station
 from ceres_cal.scene.targets import Target, checkerboard
-from ceres_cal.simulate import Disturbance, Held, board_scene, simulate
+from ceres_cal.simulate import BoardRanges, Disturbance, board_scene, simulate
 from ceres_cal.start.same_labels import with_same_labels
 
 __all__ = ["say"]
@@ -33,7 +33,7 @@ _STATIONS = {
 
 def _rig(board: Target, count: int = 11, seed: int = 3) -> Observations:
     cameras = {"left": _LEFT, "right": replace(_LEFT, phi=873.4)}
-    scene = board_scene(board, cameras, _STATIONS, count, seed, Held((1.2, 2.2)))
+    scene = board_scene(board, cameras, _STATIONS, count, seed, BoardRanges((1.2, 2.2)))
     return simulate(scene, Disturbance(points_sigma_px=0.1), seed=seed).observations
 
 

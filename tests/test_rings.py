@@ -12,7 +12,7 @@ from scenes import RADIAL, camera, rings_and_field
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
-from ceres_cal.calibrating import calibrate
+from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.cli import main
 from ceres_cal.detect.rings import RingsDetection, detect_rings
 from ceres_cal.observations import Observations, combine

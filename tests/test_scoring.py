@@ -13,11 +13,11 @@ from test_cli import Say, refused, say
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.transforms import Pose, rotation_exp
-from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
-from ceres_cal.model.parameters import Options, Station
+from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.moves import compare_cameras, score
 from ceres_cal.observations import Observations
+from ceres_cal.problem.parameters import Options, Station
 from ceres_cal.scene.targets import checkerboard
 from ceres_cal.simulate import Disturbance, board_scene, simulate
 

@@ -28,8 +28,8 @@ from ceres_cal.simulate import (
     CLEAN,
     OUTLIER,
     WRONG_LABEL,
+    BoardRanges,
     Disturbance,
-    Held,
     Scene,
     Simulation,
     Station,
@@ -337,7 +337,7 @@ def test_overhead_pose_looks_down() -> None:
 def test_boards_are_seen_whole_by_every_camera() -> None:
     board = checkerboard(9, 6, 0.1)
     posed = [CAMERA.at(overhead_pose(-0.5, 0, 4.0)), CAMERA.at(overhead_pose(0.5, 0.2, 4.0, yaw_deg=170.0))]
-    placements = board_placements(board, posed, 6, seed=4, held=Held((2.5, 3.5), (20.0, 40.0)))
+    placements = board_placements(board, posed, 6, seed=4, held=BoardRanges((2.5, 3.5), (20.0, 40.0)))
     for placement in placements:
         for camera in posed:
             pixels = camera.project(placement.transform(board.point_array))
@@ -347,10 +347,10 @@ def test_boards_are_seen_whole_by_every_camera() -> None:
         assert 2.5 <= distance <= 3.5
         normal = posed[0].cam_from_world.rotation @ placement.rotation[:, 2]
         assert 20.0 <= np.rad2deg(np.arccos(normal @ middle / distance)) <= 40.0
-    again = board_placements(board, posed, 6, seed=4, held=Held((2.5, 3.5), (20.0, 40.0)))
+    again = board_placements(board, posed, 6, seed=4, held=BoardRanges((2.5, 3.5), (20.0, 40.0)))
     assert placements == again
     with pytest.raises(InputError, match="no 1 places found"):
-        board_placements(board, posed, 1, seed=4, held=Held((0.2, 0.3)))
+        board_placements(board, posed, 1, seed=4, held=BoardRanges((0.2, 0.3)))
 
 
 def test_frames_are_numbered_for_each_camera() -> None:

@@ -10,9 +10,8 @@ import scenes
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.transforms import Pose
-from ceres_cal.model.parameters import intrinsic_names, unit_px
-from ceres_cal.model.quantities import camera_moved
-from ceres_cal.model.slopes import pixel_slopes
+from ceres_cal.problem.parameters import intrinsic_names, unit_px
+from ceres_cal.problem.quantities import camera_moved, pixel_slopes
 from ceres_cal.scene.camera import Camera
 from ceres_cal.simulate import overhead_pose
 

@@ -16,19 +16,19 @@ from photos.real_data import ov_plane
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.transforms import Pose
-from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
+from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.diagnostics import diagnose
 from ceres_cal.formats import export
-from ceres_cal.model.parameters import Options, Station, make_layout
 from ceres_cal.moves.refitting import refit
 from ceres_cal.observations import Observations, taken
 from ceres_cal.observations.sights import gather_sights
+from ceres_cal.problem.parameters import Options, Station, make_layout
+from ceres_cal.problem.problem import Problem
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Spline, make_lens
 from ceres_cal.scene.targets import checkerboard
 from ceres_cal.simulate import Disturbance, Simulation, board_scene, simulate
-from ceres_cal.solve import Problem
 
 
 @st.composite

@@ -13,16 +13,18 @@ from scenes import camera, side_by_side
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.tails import NORMAL_95
-from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
-from ceres_cal.model.information import Information
-from ceres_cal.model.keys import Key, over
-from ceres_cal.model.parameters import AUTO, Options
+from ceres_cal.calibration.calibrating import calibrate
+from ceres_cal.effects.dependence import Dependence, Scatter
 from ceres_cal.observations import Observations, Prior
+from ceres_cal.posterior.bent import Bends
+from ceres_cal.posterior.files import PosteriorFile
+from ceres_cal.posterior.posterior import Posterior
+from ceres_cal.posterior.profile import PhiProfile
+from ceres_cal.problem.information import Information, Key, over
+from ceres_cal.problem.parameters import AUTO, Options
 from ceres_cal.scene.targets import ssl_field
 from ceres_cal.simulate import Disturbance, Station, field_scene, overhead_pose, simulate
-from ceres_cal.uncertainty import Dependence, PhiProfile, Posterior, PosteriorFile, Scatter
-from ceres_cal.uncertainty.bent import Bends
 
 KEYS = tuple(Key("camera", "a", name, "px") for name in ("phi", "cx", "cy", "k1", "k2"))
 ROUNDING = 1.0 + 1e-6

@@ -11,13 +11,13 @@ import pytest
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
-from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
+from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.diagnostics import diagnose
-from ceres_cal.model.parameters import Options
-from ceres_cal.model.structure import EXACT, WARP, Tolerance, make_structure
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import gather_sights
+from ceres_cal.problem.parameters import Options
+from ceres_cal.problem.structure import EXACT, WARP, Tolerance, make_structure
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Radial
 from ceres_cal.scene.targets import Arc, Curve, Segment, Target, checkerboard, custom, ssl_field

@@ -11,15 +11,16 @@ import scenes
 from ceres_cal import kernels
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.transforms import Pose
-from ceres_cal.model.parameters import Options, make_layout
-from ceres_cal.model.residuals import camera_optics
-from ceres_cal.model.slopes import pixel_slopes
-from ceres_cal.model.structure import EXACT
 from ceres_cal.observations.sights import gather_sights
+from ceres_cal.problem.bundle import solve
+from ceres_cal.problem.parameters import Options, make_layout
+from ceres_cal.problem.problem import Problem
+from ceres_cal.problem.quantities import pixel_slopes
+from ceres_cal.problem.residuals import camera_optics
+from ceres_cal.problem.structure import EXACT
 from ceres_cal.scene.lens import Spline, make_lens
 from ceres_cal.scene.lens.surface import COLUMNS, NODES, ROWS, Surface, roughness
 from ceres_cal.simulate import Disturbance, simulate
-from ceres_cal.solve import Problem, solve
 from ceres_cal.start.initialise import initialise
 
 CAMERA = scenes.camera("spline-surface")

@@ -10,13 +10,13 @@ import pytest
 from scenes import camera
 
 from ceres_cal import Calibration, InputError, Observations, Options, calibrate, write_report
-from ceres_cal.advice import advise
 from ceres_cal.base.files import convert
 from ceres_cal.cli import main
 from ceres_cal.diagnostics import diagnose
-from ceres_cal.model.structure import Tolerance
+from ceres_cal.diagnostics.advice import advise
 from ceres_cal.moves.labels import TURNED, mistaken_targets, relabelled
-from ceres_cal.pictures.frames import frame_by_name
+from ceres_cal.problem.structure import Tolerance
+from ceres_cal.report.pictures.frames import frame_by_name
 from ceres_cal.scene.curves import Arc, Curve, Segment
 from ceres_cal.scene.symmetry import turns_of
 from ceres_cal.scene.targets import TARGET_KINDS, Grid, Target, TargetKind, target_from_spec, targets_by_name

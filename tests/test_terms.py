@@ -13,20 +13,20 @@ import pytest
 import scenes
 
 from ceres_cal.base.errors import InputError
-from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
+from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.cli import main
 from ceres_cal.diagnostics import diagnose
-from ceres_cal.model.parameters import Options, make_layout
-from ceres_cal.model.residuals import residuals
 from ceres_cal.observations import NO_CURVES, Observations, Points, View
 from ceres_cal.observations.sights import gather_sights
+from ceres_cal.problem.bundle import solve
+from ceres_cal.problem.parameters import Options, make_layout
+from ceres_cal.problem.problem import Problem, Weighting
+from ceres_cal.problem.residuals import residuals
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import make_lens
 from ceres_cal.scene.targets import checkerboard
 from ceres_cal.simulate import Disturbance, Simulation, simulate
-from ceres_cal.solve import Problem, solve
-from ceres_cal.solve.problem import Weighting
 from ceres_cal.start.initialise import initialise
 
 

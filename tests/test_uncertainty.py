@@ -21,24 +21,27 @@ from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.transforms import Pose
 from ceres_cal.base.words import bounds_text
-from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
-from ceres_cal.model.keys import Key, pose_keys
-from ceres_cal.model.parameters import Estimate, Options, make_layout, unit_px
-from ceres_cal.model.priors import gather_priors
-from ceres_cal.model.quantities import intrinsic_keys, moved, natural_sizes
-from ceres_cal.model.ranges import PHI_RANGE
-from ceres_cal.model.structure import make_structure
+from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.observations import Observations, Prior, combine
 from ceres_cal.observations.sights import gather_sights
+from ceres_cal.posterior.assess import with_other_lenses
+from ceres_cal.posterior.maps import locate_slopes, radius_95, spread_of_points, visible_pixels
+from ceres_cal.posterior.other_lenses import OtherLenses, shifts_to_lenses
+from ceres_cal.posterior.posterior import Posterior
+from ceres_cal.posterior.seam import predicted
+from ceres_cal.posterior.uncertainty import Uncertainty
+from ceres_cal.posterior.weak import Verdict
+from ceres_cal.problem.bundle import solve
+from ceres_cal.problem.information import Key, pose_keys
+from ceres_cal.problem.parameters import Estimate, Options, make_layout, unit_px
+from ceres_cal.problem.priors import gather_priors
+from ceres_cal.problem.problem import Problem, Weighting
+from ceres_cal.problem.quantities import intrinsic_keys, moved, natural_sizes
+from ceres_cal.problem.ranges import PHI_RANGE
+from ceres_cal.problem.structure import make_structure
 from ceres_cal.scene.lens import KannalaBrandt
 from ceres_cal.scene.targets import Segment
-from ceres_cal.solve import Problem, Weighting, solve
-from ceres_cal.uncertainty import Posterior, Uncertainty, Verdict
-from ceres_cal.uncertainty.doubts import with_other_lenses
-from ceres_cal.uncertainty.maps import locate_slopes, radius_95, spread_of_points, visible_pixels
-from ceres_cal.uncertainty.other_lenses import OtherLenses, shifts_to_lenses
-from ceres_cal.uncertainty.seam import predicted
 
 ROOT = Path(__file__).resolve().parents[1]
 

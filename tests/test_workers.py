@@ -17,13 +17,15 @@ from test_bulk import OUTLIERS
 from test_competing import half_field
 
 from ceres_cal.base.errors import InputError, SolutionError
-from ceres_cal.calibrating import calibrate
+from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.cli import main
-from ceres_cal.model.quantities import difference
 from ceres_cal.observations import Observations, thinning
 from ceres_cal.observations.columns import FileRows, read_rows
+from ceres_cal.problem import engines, shares
+from ceres_cal.problem.bundle import Progress
+from ceres_cal.problem.quantities import difference
+from ceres_cal.robust import bulk
 from ceres_cal.simulate import simulate
-from ceres_cal.solve import Progress, bulk, engines, shares
 
 dask = pytest.importorskip("dask", reason="Dask is an extra: pip install 'ceres-cal[dask]'")
 distributed = pytest.importorskip("distributed", reason="Dask is an extra: pip install 'ceres-cal[dask]'")

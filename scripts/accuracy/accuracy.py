@@ -29,18 +29,19 @@ from accuracy.scenes import (
     small_boards,
 )
 from ceres_cal.base.arrays import Array
-from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
-from ceres_cal.model.parameters import Options
-from ceres_cal.model.quantities import moved
-from ceres_cal.model.structure import Tolerance
+from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import gather_sights
+from ceres_cal.problem.bundle import placement_costs
+from ceres_cal.problem.parameters import Options
+from ceres_cal.problem.problem import Weighting
+from ceres_cal.problem.quantities import moved
+from ceres_cal.problem.structure import Tolerance
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.heights import HEIGHTS_M
 from ceres_cal.scene.targets import Arc, Target
 from ceres_cal.simulate import Disturbance, simulate
-from ceres_cal.solve import Weighting, placement_costs
 
 MOST_SIGMA = 4.0  # a mean farther from 0 than so many of its own standard errors is a bias
 LEAST_GAIN = 1e-6  # share of a pose's cost; what a better pose must save to be another pose

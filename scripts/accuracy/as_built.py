@@ -19,15 +19,15 @@ from runner import Row, mean_and_error, over, script, share_error
 from accuracy.scenes import RADIAL
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.transforms import Pose
-from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
+from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.diagnostics.held_out import cross_validate
-from ceres_cal.model.parameters import Options, Station
-from ceres_cal.model.quantities import difference
 from ceres_cal.observations import Observations
+from ceres_cal.problem.parameters import Options, Station
+from ceres_cal.problem.quantities import difference
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.targets import Target, checkerboard
-from ceres_cal.simulate import Disturbance, Held, Scene, board_scene, simulate
+from ceres_cal.simulate import BoardRanges, Disturbance, Scene, board_scene, simulate
 
 SIGMA_PX = 0.3
 SQUARE_M = 0.03
@@ -53,7 +53,9 @@ class Board:
 def observed(board: Board, seed: int) -> tuple[Scene, Observations]:
     """Views of a board as built, under the names of the board as drawn."""
     drawn = checkerboard(board.columns, board.rows, SQUARE_M)
-    scene = board_scene(built(drawn, board, seed), CAMERAS, STATIONS, board.views, seed=seed, held=Held((0.3, 0.9)))
+    scene = board_scene(
+        built(drawn, board, seed), CAMERAS, STATIONS, board.views, seed=seed, held=BoardRanges((0.3, 0.9))
+    )
     seen = simulate(scene, Disturbance(points_sigma_px=SIGMA_PX), seed).observations
     return scene, replace(seen, targets={"board": drawn})
 

@@ -10,19 +10,18 @@ import numpy as np
 from runner import mean_and_error, over
 
 from accuracy.scenes import Problem
-from ceres_cal import solve
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import CalibrationError
-from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
-from ceres_cal.model import quantities
-from ceres_cal.model.information import Information
-from ceres_cal.model.keys import Key
-from ceres_cal.model.parameters import Estimate, Options, Station, make_layout
-from ceres_cal.model.priors import gather_priors
-from ceres_cal.model.structure import make_structure
+from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights, gather_sights
+from ceres_cal.problem import bundle, quantities, reduced
+from ceres_cal.problem import problem as least_squares
+from ceres_cal.problem.information import Information, Key
+from ceres_cal.problem.parameters import Estimate, Options, Station, make_layout
+from ceres_cal.problem.priors import gather_priors
+from ceres_cal.problem.structure import make_structure
 from ceres_cal.simulate import CLEAN, Disturbance, Simulation, simulate
 
 
@@ -41,13 +40,13 @@ class Trial:
     used: Callable[[Sights], Sights]
     options: Options
 
-    def problem(self, observations: Observations) -> solve.Problem:
+    def problem(self, observations: Observations) -> least_squares.Problem:
         """What somebody solves who knows every sigma, and which observations are wrong."""
-        return solve.Problem(
+        return least_squares.Problem(
             self.used(gather_sights(observations, predicted=True)),
             make_layout(self.clean, self.options),
             gather_priors(observations, self.options, self.truth.structure),
-            solve.Weighting(1.0, 1.0, "trivial"),
+            least_squares.Weighting(1.0, 1.0, "trivial"),
             self.options,
         )
 
@@ -84,12 +83,12 @@ def true_estimate(simulation: Simulation, options: Options) -> Estimate:
 
 def bound(trial: Trial) -> Information:
     """Information, at the truth, about everything shared: the inverse of the Cramer-Rao bound."""
-    return solve.information(trial.problem(trial.clean), trial.truth).shared
+    return reduced.information(trial.problem(trial.clean), trial.truth).shared
 
 
 def best(trial: Trial) -> Estimate:
     """What somebody reaches who knows the truth to start from, every sigma, and which observations are wrong."""
-    return solve.solve(trial.problem(trial.observations), trial.truth).estimate
+    return bundle.solve(trial.problem(trial.observations), trial.truth).estimate
 
 
 def difference(trial: Trial, estimate: Estimate) -> Array:

@@ -39,23 +39,23 @@ from accuracy.moves import (
     truth_of,
 )
 from accuracy.scenes import CLEAN_NOISE, GROSS_NOISE, PROBLEMS, small_boards, tilted
-from ceres_cal.advice import advise
 from ceres_cal.base.errors import CalibrationError
 from ceres_cal.base.transforms import Pose
-from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
+from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.detect.boards import detect_boards
+from ceres_cal.detect.photographs import Auto, follow
+from ceres_cal.detect.photographs.clicks import starts_from_clicks
 from ceres_cal.detect.rings import detect_rings
-from ceres_cal.model.parameters import Options
-from ceres_cal.model.quantities import difference
+from ceres_cal.diagnostics.advice import advise
 from ceres_cal.moves import check, compare, refit
 from ceres_cal.observations import Observations, taken
-from ceres_cal.photographs import Auto, follow
-from ceres_cal.photographs.clicks import starts_from_clicks
+from ceres_cal.problem.parameters import Options
+from ceres_cal.problem.quantities import difference
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import KannalaBrandt, Radial
 from ceres_cal.scene.targets import checkerboard, ssl_field
-from ceres_cal.simulate import Held, Station, board_scene, built_in_scene, overhead_pose, simulate
+from ceres_cal.simulate import BoardRanges, Station, board_scene, built_in_scene, overhead_pose, simulate
 
 Figures = dict[str, float]
 
@@ -106,7 +106,7 @@ def _lost(seed: int) -> int:
     cameras = {"camera": Camera((1280, 960), 400.0, (646.5, 473.8), KannalaBrandt((-0.012, 0.004, -0.003, 0.0006)))}
     stations = {"camera": Station("camera", Pose.identity())}
     board = checkerboard(9, 6, 0.05)
-    scene = board_scene(board, cameras, stations, 40, seed, held=Held((0.3, 2.5), (0.0, 60.0)))
+    scene = board_scene(board, cameras, stations, 40, seed, held=BoardRanges((0.3, 2.5), (0.0, 60.0)))
     seen_boards = simulate(scene, replace(NOISE, outliers=0.3), seed).observations
     try:
         posed = calibrate(seen_boards, Options(lens="kannala-brandt")).estimate.placements

@@ -9,15 +9,15 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.transforms import Pose
-from ceres_cal.model.parameters import Options
-from ceres_cal.model.structure import Tolerance
 from ceres_cal.observations import Observations, Prior
+from ceres_cal.problem.parameters import Options
+from ceres_cal.problem.structure import Tolerance
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Brown, KannalaBrandt, Lens, Radial
 from ceres_cal.scene.targets import Segment, checkerboard, custom, ssl_field
 from ceres_cal.simulate import (
+    BoardRanges,
     Disturbance,
-    Held,
     Scene,
     Station,
     board_scene,
@@ -51,7 +51,7 @@ def held_boards(lens: Lens, phi: float = 868.0, count: int = 12) -> Scene:
     """A board held before one camera."""
     cameras = {"camera": Camera((1280, 960), phi, (646.5, 473.8), lens)}
     stations = {"camera": Station("camera", Pose.identity())}
-    return board_scene(checkerboard(9, 6, 0.05), cameras, stations, count=count, seed=3, held=Held((0.5, 1.5)))
+    return board_scene(checkerboard(9, 6, 0.05), cameras, stations, count=count, seed=3, held=BoardRanges((0.5, 1.5)))
 
 
 @dataclass(frozen=True)

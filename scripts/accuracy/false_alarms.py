@@ -23,9 +23,9 @@ from runner import Row, finished, measured, over, over_processes, parser
 
 from accuracy.diagnostic_scenes import CLEAN, FAULTS, NOISE, USUAL, Problem, held_boards
 from ceres_cal.base.tails import log_binomial_tail
-from ceres_cal.calibrating import calibrate
+from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.diagnostics import FALSE_ALARM_RATE, Diagnosis, Finding, diagnose
-from ceres_cal.model.parameters import Options
+from ceres_cal.problem.parameters import Options
 from ceres_cal.simulate import simulate
 
 MOST_SECONDS = 5.0

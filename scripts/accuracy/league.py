@@ -23,15 +23,15 @@ import numpy as np
 
 from accuracy.odd_scenes import LENSES, MOST_RADII, MOST_SIGMAS, farthest
 from ceres_cal.base.errors import CalibrationError
-from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
-from ceres_cal.model.parameters import AUTO, Options
+from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.observations import Prior
+from ceres_cal.problem.parameters import AUTO, Options
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.targets import checkerboard, ssl_field
 from ceres_cal.simulate import (
+    BoardRanges,
     Disturbance,
-    Held,
     Scene,
     Station,
     board_scene,
@@ -114,7 +114,7 @@ def scene_of(set_up: SetUp, rng: np.random.Generator) -> Scene:
         stations[name] = Station(name, pose)
     scenes = [field_scene(ssl_field("B"), cameras, stations, spacing_m=0.2)]
     for number, name in enumerate(cameras if set_up.boards else ()):
-        held = Held((0.4 * height_m, 0.7 * height_m))
+        held = BoardRanges((0.4 * height_m, 0.7 * height_m))
         own = board_scene(_BOARD, {name: cameras[name]}, {name: stations[name]}, _BOARDS, number, held)
         names = {old: f"{name}_{old}" for old in own.placements}
         placements = {names[old]: pose for old, pose in own.placements.items()}

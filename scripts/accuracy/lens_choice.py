@@ -14,9 +14,9 @@ from functools import partial
 from runner import Row, script
 
 from ceres_cal.base.transforms import Pose
-from ceres_cal.calibrating import calibrate
-from ceres_cal.lens_choice import PAPER
-from ceres_cal.model.parameters import Options
+from ceres_cal.calibration.calibrating import calibrate
+from ceres_cal.calibration.lens_forms import PAPER
+from ceres_cal.problem.parameters import Options
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Brown, KannalaBrandt, Lens, Radial, Spline
 from ceres_cal.scene.targets import checkerboard, ssl_field

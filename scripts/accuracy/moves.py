@@ -27,17 +27,20 @@ from accuracy.scenes import FIELD, field_places
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import CalibrationError
 from ceres_cal.base.transforms import Pose, rotation_exp
-from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
+from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.detect.boards import detect_boards
-from ceres_cal.model.keys import Key
-from ceres_cal.model.parameters import Estimate, Options
-from ceres_cal.model.quantities import difference
-from ceres_cal.model.structure import make_structure
+from ceres_cal.detect.photographs import FieldOptions, check_photographs, detect_field
 from ceres_cal.moves import refit
 from ceres_cal.moves.carried import make_plan, refit_problem
 from ceres_cal.observations import Observations, combine, taken
-from ceres_cal.photographs import FieldOptions, check_photographs, detect_field
+from ceres_cal.posterior.maps import locate_slopes, visible_pixels
+from ceres_cal.problem.information import Key
+from ceres_cal.problem.parameters import Estimate, Options
+from ceres_cal.problem.problem import Weighting
+from ceres_cal.problem.quantities import difference
+from ceres_cal.problem.reduced import information
+from ceres_cal.problem.structure import make_structure
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.heights import HEIGHTS_M
 from ceres_cal.scene.lens import Radial
@@ -53,8 +56,6 @@ from ceres_cal.simulate import (
     overhead_pose,
     simulate,
 )
-from ceres_cal.solve import Weighting, information
-from ceres_cal.uncertainty.maps import locate_slopes, visible_pixels
 
 CAMERA = Camera((1280, 960), 868.0, (646.5, 473.8), Radial((-5.2e-5, 6.1e-7)))
 HOME = overhead_pose(-2.27, -0.12, 4.02, tilt_x_deg=1.8, tilt_y_deg=-2.4, yaw_deg=90.6)

@@ -22,18 +22,27 @@ from accuracy.scenes import FIELD, Problem
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import CalibrationError
 from ceres_cal.base.transforms import Pose
-from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
-from ceres_cal.model.parameters import Estimate, Options
-from ceres_cal.model.quantities import difference
+from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.observations import Prior
+from ceres_cal.posterior.maps import visible_pixels
+from ceres_cal.problem.parameters import Estimate, Options
+from ceres_cal.problem.quantities import difference
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.heights import HEIGHTS_M
 from ceres_cal.scene.lens import Brown, KannalaBrandt, Lens, Radial
 from ceres_cal.scene.targets import checkerboard
-from ceres_cal.simulate import Disturbance, Held, Scene, Station, board_scene, field_scene, overhead_pose, simulate
+from ceres_cal.simulate import (
+    BoardRanges,
+    Disturbance,
+    Scene,
+    Station,
+    board_scene,
+    field_scene,
+    overhead_pose,
+    simulate,
+)
 from ceres_cal.simulate.compose import well_inside
-from ceres_cal.uncertainty.maps import visible_pixels
 
 MOST_SIGMAS, MOST_RADII = 5.0, 2.5
 MOST_WRONG_KNOWN, MOST_WRONG_PLACES = 0, 2  # of 2000 scenes
@@ -119,7 +128,7 @@ def _boards(drawn: _Drawn, most: int) -> Scene:
     board = checkerboard(int(rng.integers(5, 10)), int(rng.integers(4, 7)), 0.1)
     low = rng.uniform(0.0, 40.0)
     near = rng.uniform(0.6, 3.0)
-    held = Held((near, 1.3 * near), (low, low + 5.0))
+    held = BoardRanges((near, 1.3 * near), (low, low + 5.0))
     stations = {"a": Station("a", Pose.identity())}
     return board_scene(board, {"a": drawn.camera}, stations, most, int(rng.integers(1 << 30)), held)
 

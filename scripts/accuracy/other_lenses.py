@@ -20,8 +20,8 @@ from runner import Row, root_and_error, script
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import CalibrationError
 from ceres_cal.base.transforms import Pose, rotation_exp
-from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
+from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.observations import NO_CURVES, Observations, Points, View
 from ceres_cal.scene.targets import checkerboard
 

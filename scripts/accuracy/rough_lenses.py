@@ -23,10 +23,10 @@ from runner import Row, mean_and_error, root_and_error, script
 from accuracy.other_lenses import off_over_stated
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.transforms import rotation_exp
-from ceres_cal.calibrating import calibrate
-from ceres_cal.model.parameters import Options
-from ceres_cal.model.structure import Tolerance
+from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.observations import NO_CURVES, Observations, Points, View
+from ceres_cal.problem.parameters import Options
+from ceres_cal.problem.structure import Tolerance
 from ceres_cal.scene.targets import checkerboard
 
 _SIZE, _CENTRE, _PHI, _REACH_DEG = (6016, 4016), np.array([3021.3, 1997.8]), 1900.0, 86.0

@@ -12,14 +12,14 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.transforms import Pose
-from ceres_cal.model.parameters import Options
 from ceres_cal.observations import Observations, Prior
+from ceres_cal.problem.parameters import Options
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Brown, Lens, Radial
 from ceres_cal.scene.targets import Arc, Curve, Segment, checkerboard, custom, ssl_field
 from ceres_cal.simulate import (
+    BoardRanges,
     Disturbance,
-    Held,
     Scene,
     Station,
     board_scene,
@@ -63,7 +63,7 @@ def boards(phi: float, lens: Lens, count: int = 20) -> Problem:
     """A board at some places before one camera."""
     cameras = {"camera": Camera((1280, 960), phi, (646.5, 473.8), lens)}
     stations = {"camera": Station("camera", Pose.identity())}
-    scene = board_scene(checkerboard(9, 6, 0.05), cameras, stations, count=count, seed=3, held=Held((0.5, 1.5)))
+    scene = board_scene(checkerboard(9, 6, 0.05), cameras, stations, count=count, seed=3, held=BoardRanges((0.5, 1.5)))
     return Problem(scene, Options(lens=lens.kind))
 
 
@@ -84,7 +84,7 @@ def two_cameras() -> Problem:
     }
     field = field_scene(FIELD, cameras, stations, spacing_m=_SPACING_M)
     board = checkerboard(9, 6, 0.1)
-    both = board_scene(board, cameras, stations, count=6, seed=2, held=Held((3.0, 5.0), (20.0, 50.0)))
+    both = board_scene(board, cameras, stations, count=6, seed=2, held=BoardRanges((3.0, 5.0), (20.0, 50.0)))
     return Problem(join(field, both), Options(lens="radial"))
 
 
@@ -106,7 +106,7 @@ def tilted(tilt_deg: float, height_sigma_m: float | None = None, boards: int = 0
     stations = {"overhead": Station("overhead", pose)}
     scene = field_scene(FIELD, cameras, stations, points=(), spacing_m=spacing_m)
     if boards:
-        shown = board_scene(checkerboard(9, 6, 0.1), cameras, stations, boards, seed=5, held=Held((1.0, 2.0)))
+        shown = board_scene(checkerboard(9, 6, 0.1), cameras, stations, boards, seed=5, held=BoardRanges((1.0, 2.0)))
         scene = join(scene, shown)
     priors = () if height_sigma_m is None else (_height(scene, "overhead", height_sigma_m),)
     return Problem(scene, Options(lens="radial"), priors)
@@ -120,7 +120,7 @@ def small_boards(count: int, seed: int) -> Scene:
     cameras = {"camera": Camera((1280, 960), 600.0, (645.0, 470.0), Brown((-0.28, 0.07, 0.0, 0.0, 0.0)))}
     stations = {"camera": Station("camera", Pose.identity())}
     board = checkerboard(6, 5, 0.06)
-    return board_scene(board, cameras, stations, count, seed, held=Held((0.7, 2.5), (15.0, 40.0)))
+    return board_scene(board, cameras, stations, count, seed, held=BoardRanges((0.7, 2.5), (15.0, 40.0)))
 
 
 # ---- ssl-vision's table ---------------------------------------------------------------------------------------------

@@ -9,9 +9,9 @@ from statistics import median
 from typing import Any
 
 from benchmarks.problems import corner_observations, wide_lens
-from ceres_cal.calibrating import calibrate
-from ceres_cal.model.parameters import Options
+from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.observations import Observations
+from ceres_cal.problem.parameters import Options
 
 _BROWN, _SPLINE, _AUTO = Options(lens="brown"), Options(lens="spline"), Options()
 

@@ -81,8 +81,8 @@ def stored_growth(line_points: int, workers: int) -> dict[str, Any]:
     Args:
         workers: of Dask, in processes of their own with a thread each; 0 for none.
     """
-    from ceres_cal.calibrating import calibrate
-    from ceres_cal.model.parameters import Options
+    from ceres_cal.calibration.calibrating import calibrate
+    from ceres_cal.problem.parameters import Options
 
     _warm_up()
     with ExitStack() as stack:
@@ -116,8 +116,8 @@ def stored_growth(line_points: int, workers: int) -> dict[str, Any]:
 
 def _warm_up() -> None:
     """What a process does once: imports, compiled kernels."""
-    from ceres_cal.calibrating import calibrate
-    from ceres_cal.model.parameters import Options
+    from ceres_cal.calibration.calibrating import calibrate
+    from ceres_cal.problem.parameters import Options
 
     calibrate(field_observations(_WARM_UP), Options(lens="radial"))
 
@@ -129,8 +129,8 @@ def _processor(client: Any) -> list[float]:
 
 def _overhead_s(client: Any, observations: Observations) -> float:
     """What it takes to ask the workers and hear their answers, without the work: the median."""
-    from ceres_cal.solve.engines import OnWorkers
-    from ceres_cal.solve.shares import cut
+    from ceres_cal.problem.engines import OnWorkers
+    from ceres_cal.problem.shares import cut
 
     engine, seconds = OnWorkers(client, list(cut(observations))), []
     for _ in range(_ASKED):
@@ -150,8 +150,8 @@ def frames_in_turns(sizes: Sequence[int], turns: int) -> list[dict[str, Any]]:
 
     Each size stands between two times of the fewest: a processor's pace changes by half within a minute.
     """
-    from ceres_cal.calibrating import calibrate
-    from ceres_cal.model.parameters import Options
+    from ceres_cal.calibration.calibrating import calibrate
+    from ceres_cal.problem.parameters import Options
 
     options, few = Options(lens="brown", free_aspect=True), wide_lens(min(sizes)).corners
 
@@ -200,8 +200,8 @@ def _cluster(workers: int) -> Iterator[Any]:
 
 def _watched(stack: ExitStack, client: Any) -> list[tuple[float, int]]:
     """Seconds of each evaluation from now on, and the bytes that go to a worker and back for it, the most of any."""
-    from ceres_cal.solve import engines
-    from ceres_cal.solve.shares import Share
+    from ceres_cal.problem import engines
+    from ceres_cal.problem.shares import Share
 
     trips: list[tuple[float, int]] = []
     sent = [0]

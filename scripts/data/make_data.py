@@ -12,7 +12,7 @@ import numpy as np
 from rendering.album import Album, take_album
 
 from ceres_cal.base.files import write_bytes, write_json
-from ceres_cal.model.parameters import Station
+from ceres_cal.problem.parameters import Station
 from ceres_cal.simulate import (
     Disturbance,
     Scene,

@@ -12,8 +12,8 @@ import numpy as np
 
 from ceres_cal import Calibration, Camera, Observations, calibrate
 from ceres_cal.base.arrays import Array
-from ceres_cal.model.residuals import residuals
 from ceres_cal.observations.sights import gather_sights
+from ceres_cal.problem.residuals import residuals
 from ceres_cal.scene.curves import curve_points
 
 ROOT = Path(__file__).parents[2]

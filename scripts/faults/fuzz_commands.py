@@ -21,15 +21,15 @@ from ssl_settings_file import settings
 
 from ceres_cal.base.errors import CalibrationError
 from ceres_cal.base.files import write_json
-from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
+from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.cli import main as cli
 from ceres_cal.cli.command import COMMANDS, Parser
 from ceres_cal.detect.images import read_colour, read_grey
+from ceres_cal.detect.photographs.clicks import load_clicks
 from ceres_cal.formats import LookupTable, export, make_lookup_table, read_foreign
-from ceres_cal.model.parameters import Options
 from ceres_cal.observations import Observations
-from ceres_cal.photographs.clicks import load_clicks
+from ceres_cal.problem.parameters import Options
 from ceres_cal.scene.targets import TARGET_KINDS, target_from_spec, targets_from_specs
 from ceres_cal.simulate import built_in_scene, load_scene, simulate
 from ceres_cal.simulate.files import scene_to_json

@@ -17,8 +17,8 @@ from runner import Row
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.detect.images import read_light
-from ceres_cal.photographs import Auto, Facing
-from ceres_cal.photographs.search import search
+from ceres_cal.detect.photographs import Auto, Facing
+from ceres_cal.detect.photographs.search import search
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import KannalaBrandt, Radial
 from ceres_cal.scene.targets import Target, ssl_field

@@ -18,11 +18,11 @@ from rendering.photograph import photograph
 from runner import Row, mean_and_error, over, root_and_error, script
 
 from ceres_cal.base.errors import CalibrationError
-from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
-from ceres_cal.model.parameters import Options
+from ceres_cal.calibration.calibrating import calibrate
+from ceres_cal.detect.photographs import Auto, Facing, FieldOptions, detect_field
 from ceres_cal.observations import Prior
-from ceres_cal.photographs import Auto, Facing, FieldOptions, detect_field
+from ceres_cal.problem.parameters import Options
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Radial
 from ceres_cal.scene.targets import ssl_field

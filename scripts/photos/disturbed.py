@@ -18,7 +18,7 @@ from rendering.photograph import photograph
 from runner import Row, over
 
 from ceres_cal.base.arrays import Image8
-from ceres_cal.photographs import Auto, Facing
+from ceres_cal.detect.photographs import Auto, Facing
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.curves import Arc, Curve, Segment
 from ceres_cal.scene.lens import Brown, KannalaBrandt, Lens, Radial

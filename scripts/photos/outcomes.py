@@ -10,9 +10,9 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import CalibrationError, InputError
-from ceres_cal.calibrating import calibrate
-from ceres_cal.model.parameters import Options
-from ceres_cal.photographs import Auto, Clicks, detect_field
+from ceres_cal.calibration.calibrating import calibrate
+from ceres_cal.detect.photographs import Auto, Clicks, detect_field
+from ceres_cal.problem.parameters import Options
 from ceres_cal.scene.targets import Target
 
 USUAL_MM, MOVED_MM = 1.5, 3.0  # mean error of a map, as small pictures allow; of several disturbances, or motion

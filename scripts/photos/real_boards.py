@@ -14,10 +14,10 @@ from dataclasses import replace
 
 from runner import Row, script
 
-from ceres_cal.calibrating import calibrate
+from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.detect.boards import detect_boards
-from ceres_cal.model.parameters import Options
 from ceres_cal.moves.scoring import score
+from ceres_cal.problem.parameters import Options
 from ceres_cal.scene.targets import checkerboard
 from photos.real_data import ov_plane, real_folder
 

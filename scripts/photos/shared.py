@@ -14,7 +14,7 @@ import numpy as np
 from runner import Row, over
 
 from ceres_cal.base.arrays import Array
-from ceres_cal.photographs import Auto, Clicks, Facing
+from ceres_cal.detect.photographs import Auto, Clicks, Facing
 from ceres_cal.scene.targets import targets_by_name
 from photos.outcomes import MOVED_MM, STATED, USUAL_MM, Outcome, outcome
 

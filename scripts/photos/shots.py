@@ -20,12 +20,12 @@ from runner import Row
 from ceres_cal.base.arrays import Array, Array32, Indices32, Mask
 from ceres_cal.base.errors import CalibrationError
 from ceres_cal.base.transforms import Pose, rotation_exp
-from ceres_cal.calibrating import calibrate
+from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.detect.images import light
+from ceres_cal.detect.photographs import Clicks, FieldDetections, detect_field, follow
 from ceres_cal.detect.rings import detect_rings
-from ceres_cal.model.parameters import Options
-from ceres_cal.model.structure import Tolerance
-from ceres_cal.photographs import Clicks, FieldDetections, detect_field, follow
+from ceres_cal.problem.parameters import Options
+from ceres_cal.problem.structure import Tolerance
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.curves import along_track, nearest_on_track
 from ceres_cal.scene.lens import Brown, KannalaBrandt, Lens, Radial

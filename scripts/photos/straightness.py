@@ -20,11 +20,11 @@ from runner import Row
 
 from ceres_cal.base.arrays import Array, Image, Image8
 from ceres_cal.base.transforms import Pose
-from ceres_cal.calibrating import calibrate
+from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.detect.boards import BoardDetections, detect_boards
 from ceres_cal.detect.images import read_colour
-from ceres_cal.model.parameters import Options
-from ceres_cal.pictures.straight import Straight, straighten
+from ceres_cal.problem.parameters import Options
+from ceres_cal.report.pictures.straight import Straight, straighten
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.targets import checkerboard
 from ceres_cal.start.closed_forms import homography_from_points

@@ -7,18 +7,17 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from ceres_cal.advice import advise as advise
     from ceres_cal.base.errors import CalibrationError as CalibrationError
     from ceres_cal.base.errors import DegenerateError as DegenerateError
     from ceres_cal.base.errors import InputError as InputError
     from ceres_cal.base.errors import SolutionError as SolutionError
     from ceres_cal.base.transforms import Pose as Pose
-    from ceres_cal.calibrating import calibrate as calibrate
     from ceres_cal.calibration import Calibration as Calibration
+    from ceres_cal.calibration.calibrating import calibrate as calibrate
+    from ceres_cal.diagnostics.advice import advise as advise
     from ceres_cal.formats import export as export
     from ceres_cal.formats import import_calibration as import_calibration
     from ceres_cal.formats import import_observations as import_observations
-    from ceres_cal.model.parameters import Options as Options
     from ceres_cal.moves import RefitOptions as RefitOptions
     from ceres_cal.moves import audit as audit
     from ceres_cal.moves import check as check
@@ -30,6 +29,7 @@ if TYPE_CHECKING:
     from ceres_cal.observations import Points as Points
     from ceres_cal.observations import Prior as Prior
     from ceres_cal.observations import View as View
+    from ceres_cal.problem.parameters import Options as Options
     from ceres_cal.report import write_report as write_report
     from ceres_cal.scene.camera import Camera as Camera
     from ceres_cal.scene.targets import Arc as Arc
@@ -47,8 +47,8 @@ if TYPE_CHECKING:
     from ceres_cal.scene.targets import tape_grid as tape_grid
 
 _HOME = {
-    "advise": "advice",
-    "calibrate": "calibrating",
+    "advise": "diagnostics.advice",
+    "calibrate": "calibration.calibrating",
     "Calibration": "calibration",
     "Camera": "scene.camera",
     "CalibrationError": "base.errors",
@@ -76,7 +76,7 @@ _HOME = {
         ),
         "scene.targets",
     ),
-    "Options": "model.parameters",
+    "Options": "problem.parameters",
     "Pose": "base.transforms",
     "write_report": "report",
 }

@@ -25,18 +25,23 @@ from ceres_cal.calibration.file import (
     options_to_json,
 )
 from ceres_cal.calibration.origin import COPY, Fit, LensChoice, Refitted, Rejected, package_versions
-from ceres_cal.model.dimensions import redrawn
-from ceres_cal.model.keys import Key
-from ceres_cal.model.parameters import Estimate, Options, make_layout
-from ceres_cal.model.priors import GaussianPrior, gather_priors
-from ceres_cal.model.quantities import every_key
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import gather_sights
+from ceres_cal.posterior.files import PosteriorFile
+from ceres_cal.posterior.posterior import Posterior
+from ceres_cal.posterior.seam import Disagreement, disagreement
+from ceres_cal.posterior.uncertainty import Uncertainty
+from ceres_cal.problem.information import Key
+from ceres_cal.problem.parameters import Estimate, Options, make_layout
+from ceres_cal.problem.priors import GaussianPrior, gather_priors
+from ceres_cal.problem.problem import Problem, Weighting
+from ceres_cal.problem.quantities import every_key
+from ceres_cal.problem.structure import redrawn
+from ceres_cal.robust.repeats import AsBuilt
+from ceres_cal.robust.stated import Conflict
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.files import CameraFile, PoseFile
 from ceres_cal.scene.targets import Target, targets_from_specs
-from ceres_cal.solve import AsBuilt, Conflict, Problem, Weighting
-from ceres_cal.uncertainty import Disagreement, Posterior, PosteriorFile, Uncertainty, disagreement
 
 _ALIKE = (
     *("fit", "rejected", "termination", "converged", "rounds", "history"),

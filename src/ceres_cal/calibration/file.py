@@ -13,15 +13,16 @@ from ceres_cal.base.errors import InputError, naming
 from ceres_cal.base.files import PixelOrigin, Units, convert
 from ceres_cal.base.transforms import euler_from_rotation, require_rotation, rotation_from_euler
 from ceres_cal.calibration.origin import Fit, LensChoice, Refitted, Rejected
-from ceres_cal.model.keys import Key
-from ceres_cal.model.parameters import Estimate, Options, Station
-from ceres_cal.model.priors import GaussianPrior
-from ceres_cal.model.structure import EXACT, WARP, make_structure
 from ceres_cal.observations import prior_from_json, prior_to_json
+from ceres_cal.posterior.files import PosteriorFile, information_from, lower_triangle, require_keys
+from ceres_cal.problem.information import Key
+from ceres_cal.problem.parameters import Estimate, Options, Station
+from ceres_cal.problem.priors import GaussianPrior
+from ceres_cal.problem.structure import EXACT, WARP, make_structure
+from ceres_cal.robust.repeats import AsBuilt
+from ceres_cal.robust.stated import Conflict
 from ceres_cal.scene.files import CameraFile, Matrix, PoseFile, Vector
 from ceres_cal.scene.targets import Target
-from ceres_cal.solve import AsBuilt, Conflict
-from ceres_cal.uncertainty import PosteriorFile, information_from, lower_triangle, require_keys
 
 FORMAT, VERSION = "ceres-cal/calibration", 1
 _ALIKE = 1e-5  # somebody who edits a file rounds

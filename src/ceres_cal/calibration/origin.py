@@ -8,8 +8,8 @@ from functools import cache
 import numpy as np
 
 from ceres_cal.base.version import __version__
-from ceres_cal.model.priors import GaussianPrior
-from ceres_cal.solve import solver_version
+from ceres_cal.problem import solver_version
+from ceres_cal.problem.priors import GaussianPrior
 
 COPY = "a copy"
 """How the reason begins of an observation that repeats another one, and was not taken out for its residual."""

@@ -23,7 +23,7 @@ from ceres_cal.cli.terminal import progress_bar
 from ceres_cal.report.document import Document, Section, wrapped
 
 if TYPE_CHECKING:
-    from ceres_cal.advice import Advice, Measurement, Promise
+    from ceres_cal.diagnostics.advice import Advice, Measurement, Promise
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,7 +54,7 @@ def _run(args: AdviseArguments) -> Document:
     enough = args.good_enough_mm
     if enough is not None and not enough > 0.0:
         raise InputError(f"--good-enough-mm {enough:g}: give a number of millimetres above 0")
-    from ceres_cal.advice import advise
+    from ceres_cal.diagnostics.advice import advise
     from ceres_cal.scene.targets import checkerboard
 
     calibration = read_calibration(args.calibration)

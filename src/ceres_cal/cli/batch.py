@@ -20,7 +20,7 @@ from ceres_cal.cli.options import QuietArguments, argument, option, switch
 from ceres_cal.report.document import Document, Section
 
 if TYPE_CHECKING:
-    from ceres_cal.batch import Job, Outcome
+    from ceres_cal.cli.jobs import Job, Outcome
 
 _COMMANDS = ("calibrate", "check", "refit")
 _READ = ("observations", "calibration", "inputs", "images")  # arguments that name files
@@ -59,8 +59,8 @@ class BatchArguments(QuietArguments):
 def _run(args: BatchArguments) -> Document:
     from ceres_cal.base.executing import processes
     from ceres_cal.base.files import make_folder, write_bytes
-    from ceres_cal.batch import run_jobs
-    from ceres_cal.batch.page import summary_page
+    from ceres_cal.cli.batch_page import summary_page
+    from ceres_cal.cli.running import run_jobs
 
     jobs = plan_jobs(args.plan, args.output, args.options, reports=args.reports)
     make_folder(args.output)
@@ -90,7 +90,7 @@ def plan_jobs(plan: Path, to: Path, options: str = "", *, reports: bool = False)
     Raises:
         InputError: the plan cannot be read, or a row is wrong usage of its command; it says which.
     """
-    from ceres_cal.batch import read_plan
+    from ceres_cal.cli.plan import read_plan
 
     base = plan if plan.is_dir() else plan.parent
     try:
@@ -108,7 +108,7 @@ def plan_jobs(plan: Path, to: Path, options: str = "", *, reports: bool = False)
 
 
 def _job(name: str, command: str, arguments: Sequence[str], base: Path, to: Path, reports: bool) -> Job:
-    from ceres_cal.batch import Job
+    from ceres_cal.cli.jobs import Job
 
     if command not in _COMMANDS:
         raise InputError(f"there is no command {command!r} for a batch: {', '.join(_COMMANDS)}")
@@ -150,7 +150,7 @@ def work(job: Job) -> Outcome:
 def _of_calibration(job: Job, data: Mapping[str, Any]) -> Outcome:
     import numpy as np
 
-    from ceres_cal.batch import Outcome
+    from ceres_cal.cli.jobs import Outcome
 
     verdict, known = data["verdict"], data["uncertainty"] or {"maps": {}}
     radii = [float(np.nanmax(one["radius_95_mm"], initial=0.0)) for maps in known["maps"].values() for one in maps]
@@ -161,7 +161,7 @@ def _of_calibration(job: Job, data: Mapping[str, Any]) -> Outcome:
 
 
 def _of_check(job: Job, data: Mapping[str, Any]) -> Outcome:
-    from ceres_cal.batch import Outcome
+    from ceres_cal.cli.jobs import Outcome
 
     stations = data["stations"]
     said = [f"{name} {one['words']}" for name, one in stations.items() if not one["holds"]]

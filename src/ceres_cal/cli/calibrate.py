@@ -38,10 +38,10 @@ from ceres_cal.cli.terminal import ProgressBar, progress_bar
 from ceres_cal.report.document import Document
 
 if TYPE_CHECKING:
-    from ceres_cal.model.parameters import Options
-    from ceres_cal.model.structure import Tolerance
     from ceres_cal.observations import Observations
-    from ceres_cal.solve import Progress
+    from ceres_cal.problem.bundle import Progress
+    from ceres_cal.problem.parameters import Options
+    from ceres_cal.problem.structure import Tolerance
 
 
 _AUTO = "auto"
@@ -146,7 +146,7 @@ def _run(args: CalibrateArguments) -> Document:
     photographs = report_photographs(args, observations)
     options = _options(args, observations, fixed=fixed, powers=powers)
     with progress_bar(args) as bar, _client(args.scheduler) as client:
-        from ceres_cal.calibrating import calibrate
+        from ceres_cal.calibration.calibrating import calibrate
         from ceres_cal.report.quality import quality_of
 
         workers = {} if client is None else {"client": client}
@@ -218,8 +218,8 @@ def _fixed(specs: Sequence[str]) -> dict[str, float]:
 
 def _options(args: CalibrateArguments, observations: Observations, **parsed: Any) -> Options:
     """The options; `parsed`: powers and what is fixed."""
-    from ceres_cal.model.dimensions import dimensions_of
-    from ceres_cal.model.parameters import Options
+    from ceres_cal.problem.parameters import Options
+    from ceres_cal.problem.structure import dimensions_of
 
     parsed |= {"lens": args.lens or _AUTO, "terms": tuple(parse_names(args.terms))}  # powers alone make radial
     lengths, drawn = parse_estimates(args.estimate, observations.targets), dimensions_of(observations.targets)
@@ -238,7 +238,7 @@ def _options(args: CalibrateArguments, observations: Observations, **parsed: Any
 
 def _tolerances(specs: Sequence[str]) -> dict[str, Tolerance]:
     """The tolerances of `--tolerance` arguments: TARGET.lines_m|points_m|warp_m=SIGMA."""
-    from ceres_cal.model.structure import Tolerance
+    from ceres_cal.problem.structure import Tolerance
 
     given: dict[str, dict[str, Any]] = {}
     names = ("lines_m", "points_m", "warp_m")

@@ -18,8 +18,8 @@ from ceres_cal.report.document import Document, Section
 from ceres_cal.scene.heights import at_height
 
 if TYPE_CHECKING:
+    from ceres_cal.detect.photographs import KnownDetections
     from ceres_cal.moves import Check, StationCheck
-    from ceres_cal.photographs import KnownDetections
 
 
 def _share(text: str) -> float:
@@ -67,7 +67,7 @@ def _run(args: CheckArguments) -> Document:
 
 
 def _photographed(args: CheckArguments, images: list[Path]) -> tuple[Check, KnownDetections]:
-    from ceres_cal.photographs import check_photographs
+    from ceres_cal.detect.photographs import check_photographs
 
     calibration, not_painted = read_calibration(args.calibration), parse_names(args.not_painted)
     with progress_bar(args) as bar:

@@ -28,7 +28,7 @@ from ceres_cal.cli.terminal import progress_bar
 from ceres_cal.report.document import Document, Section
 
 if TYPE_CHECKING:
-    from ceres_cal.photographs import Auto, Clicks, Facing, FieldDetections, SearchResult
+    from ceres_cal.detect.photographs import Auto, Clicks, Facing, FieldDetections, SearchResult
     from ceres_cal.scene.camera import Camera
     from ceres_cal.scene.targets import Target
 
@@ -98,7 +98,7 @@ def _run(args: FieldArguments) -> Document:
     one = median_path(args.output, [*images, *videos]) if videos or args.median else None
     _require_fitting(args)
     from ceres_cal.detect.images import read_grey
-    from ceres_cal.photographs import FieldOptions, detect_field
+    from ceres_cal.detect.photographs import FieldOptions, detect_field
 
     start = _start(args)
     target = start.target if args.target is None else read_target(args.target, "field")
@@ -137,7 +137,7 @@ def _drawing(picture: Path | None, target: Target) -> Callable[[Path, SearchResu
         return None
     from ceres_cal.base.files import write_bytes
     from ceres_cal.detect.images import encoded, read_colour
-    from ceres_cal.pictures.refused import draw_seen
+    from ceres_cal.report.pictures.refused import draw_seen
 
     drawn: list[Path] = []
 
@@ -177,8 +177,8 @@ def _start(args: FieldArguments) -> _Start:
         start = _auto(args.facing, None) if args.auto else _corners(args.corner)
         return _Start(start, camera, args.station or camera, None)
     from ceres_cal.calibration import FORMAT, Calibration
-    from ceres_cal.photographs.clicks import load_clicks
-    from ceres_cal.photographs.known import is_painted
+    from ceres_cal.detect.photographs.clicks import load_clicks
+    from ceres_cal.detect.photographs.known import is_painted
 
     if json_object(args.start).get("format") != FORMAT:
         if args.auto:
@@ -195,13 +195,13 @@ def _start(args: FieldArguments) -> _Start:
 
 
 def _auto(facing: Sequence[str], before: Camera | None) -> Auto:
-    from ceres_cal.photographs import Auto
+    from ceres_cal.detect.photographs import Auto
 
     return Auto(tuple(_facing(spec) for spec in facing), before)
 
 
 def _facing(spec: str) -> Facing:
-    from ceres_cal.photographs import SIDES, Facing
+    from ceres_cal.detect.photographs import SIDES, Facing
 
     name, equals, side = (part.strip() for part in spec.partition("="))
     if not (name and equals and side in SIDES):
@@ -210,7 +210,7 @@ def _facing(spec: str) -> Facing:
 
 
 def _corners(specs: Sequence[str]) -> Clicks:
-    from ceres_cal.photographs import Clicks
+    from ceres_cal.detect.photographs import Clicks
 
     points: dict[str, tuple[float, float]] = {}
     for spec in specs:

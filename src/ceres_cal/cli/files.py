@@ -224,8 +224,8 @@ def report_photographs(
     images = image_files(args.images) if args.images else list(detected_in)
     if not images or args.report is None:
         return None
-    from ceres_cal.pictures.frames import photographs_by_frame
     from ceres_cal.report import FramePhotographs
+    from ceres_cal.report.pictures.frames import photographs_by_frame
 
     paths = photographs_by_frame(images)
     frames = dict.fromkeys(view.frame for view in observations.views)

@@ -25,7 +25,7 @@ from ceres_cal.report.document import Section
 if TYPE_CHECKING:
     from ceres_cal.base.arrays import Image
     from ceres_cal.detect.median import Merged
-    from ceres_cal.photographs import KnownDetections
+    from ceres_cal.detect.photographs import KnownDetections
 
 _T = TypeVar("_T")
 _OBSERVATIONS = (".json", ".npz")

@@ -24,7 +24,7 @@ from ceres_cal.report.document import Document, Section
 
 if TYPE_CHECKING:
     from ceres_cal.calibration import Calibration
-    from ceres_cal.photographs import KnownDetections
+    from ceres_cal.detect.photographs import KnownDetections
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,7 +86,7 @@ def _run(args: RefitArguments) -> Document:
 
 
 def _photographed(args: RefitArguments, calibration: Calibration, images: list[Path]) -> KnownDetections:
-    from ceres_cal.photographs import detect_known
+    from ceres_cal.detect.photographs import detect_known
 
     not_painted = parse_names(args.not_painted)
     with progress_bar(args) as bar:

@@ -13,7 +13,7 @@ from ceres_cal.cli.options import Arguments, argument, option, switch
 from ceres_cal.report.document import Document, Section
 
 if TYPE_CHECKING:
-    from ceres_cal.moves import Part, Score
+    from ceres_cal.moves import Score, ScorePart
 
 _MOST_VIEWS = 3  # shown
 
@@ -73,7 +73,7 @@ def _document(answer: Score) -> Document:
     )
 
 
-def _left(part: Part) -> str:
+def _left(part: ScorePart) -> str:
     kinds = [
         f"rms {rms:.4f} px over {count} {kind}"
         for kind, count, rms in (

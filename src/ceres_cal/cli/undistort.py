@@ -28,7 +28,7 @@ from ceres_cal.report.document import Document, Section
 if TYPE_CHECKING:
     from ceres_cal.base.arrays import Image
     from ceres_cal.calibration import Calibration
-    from ceres_cal.pictures.straight import Straight
+    from ceres_cal.report.pictures.straight import Straight
     from ceres_cal.scene.camera import Camera
 
 _MARGIN_M = 0.3  # around the field in a top view
@@ -206,7 +206,7 @@ class _PictureMaker:
 
 
 def _read(path: Path, camera: Camera, name: str) -> Image:
-    from ceres_cal.pictures.files import read_photograph
+    from ceres_cal.report.pictures.files import read_photograph
 
     return read_photograph(path, camera.image_size, name)
 
@@ -214,7 +214,7 @@ def _read(path: Path, camera: Camera, name: str) -> Image:
 def _write(path: Path, picture: Image) -> None:
     from ceres_cal.base.files import write_bytes
     from ceres_cal.detect.images import encoded
-    from ceres_cal.pictures.overlay import in_8_bit_colour
+    from ceres_cal.report.pictures.overlay import in_8_bit_colour
 
     content = encoded(in_8_bit_colour(picture) if path.suffix == ".jpg" else picture, path.suffix, _JPEG_QUALITY)
     with finishing():
@@ -222,7 +222,7 @@ def _write(path: Path, picture: Image) -> None:
 
 
 def _straight(args: UndistortArguments, calibration: Calibration) -> _PictureMaker:
-    from ceres_cal.pictures.straight import straighten
+    from ceres_cal.report.pictures.straight import straighten
     from ceres_cal.scene.files import camera_to_json
 
     name, station, camera = _camera(args, calibration)
@@ -275,7 +275,7 @@ def _black(size: tuple[int, int], count: int) -> str:
 
 
 def _top_view(args: UndistortArguments, calibration: Calibration) -> _PictureMaker:
-    from ceres_cal.pictures.top_view import make_grid, top_view
+    from ceres_cal.report.pictures.top_view import make_grid, top_view
 
     station = _station(args, calibration)
     camera, name = calibration.stations[station], calibration.estimate.stations[station].camera
@@ -304,7 +304,7 @@ def _top_view(args: UndistortArguments, calibration: Calibration) -> _PictureMak
 
 
 def _field(calibration: Calibration) -> Area:
-    from ceres_cal.uncertainty.uncertainty import field_grid
+    from ceres_cal.posterior.uncertainty import field_grid
 
     try:
         x, y = field_grid(calibration.targets)
@@ -318,8 +318,8 @@ def _field(calibration: Calibration) -> Area:
 def _overlay(args: UndistortArguments, calibration: Calibration) -> _PictureMaker:
     from ceres_cal.calibration import Calibration as File
     from ceres_cal.observations import Observations
-    from ceres_cal.pictures.frames import Frame, frame_by_name, frames_of, marks_of, model_of
-    from ceres_cal.pictures.overlay import AFTER, BEFORE, LIFTED, Layer, draw_overlay
+    from ceres_cal.report.pictures.frames import Frame, frame_by_name, frames_of, marks_of, model_of
+    from ceres_cal.report.pictures.overlay import AFTER, BEFORE, LIFTED, Layer, draw_overlay
 
     station, height = _station(args, calibration), metres(args.height_mm)
     camera, name = calibration.stations[station], calibration.estimate.stations[station].camera

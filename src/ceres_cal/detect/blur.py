@@ -8,7 +8,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask
 from ceres_cal.detect.courses import Course
-from ceres_cal.detect.profiles import LEAST_BLUR_PX, MOST_BLUR_PX, MOST_SMEAR_PX, Shape, Windows, fit_shape
+from ceres_cal.detect.profiles import LEAST_BLUR_PX, MOST_BLUR_PX, MOST_SMEAR_PX, EdgeShape, Windows, fit_shape
 
 _WINDOWS = 150  # that tell a blur
 # Directions that lines run in, of which each has its own blur where the camera moved; windows to tell it by; and
@@ -40,12 +40,12 @@ class Blur:
         """At these places only."""
         return replace(self, blur_px=self.blur_px[rows], smear_px=self.smear_px[rows])
 
-    def smeared(self, rows: Indices) -> Shape:
+    def smeared(self, rows: Indices) -> EdgeShape:
         """What these places look like if what is beyond a lens's blur is a smear."""
         lens = min(float(np.min(self.blur_px)), _IN_FOCUS_PX)
         here = float(np.median(self.blur_px[rows]))
         smear = _AS_SMEARED * np.sqrt(max(here**2 - lens**2, 0.0))
-        return Shape(lens if smear > 0.0 else here, self.stretch, float(smear))
+        return EdgeShape(lens if smear > 0.0 else here, self.stretch, float(smear))
 
 
 def no_blur(count: int) -> Blur:
@@ -71,7 +71,7 @@ def blur_of(windows: Windows, course: Course, bright: Array, before: Blur) -> Bl
         shapes = [_shape_of(windows, edges, some, before.smeared(some)) for some in own]
         stretch = float(np.exp(np.mean(np.log([one.stretch for one in shapes]))))
     else:
-        start = _shape_of(windows, edges, every, Shape(1.0))
+        start = _shape_of(windows, edges, every, EdgeShape(1.0))
         shapes = [_shape_of(windows, edges, some, start) for some in own] if len(own) > 1 else [start]
         stretch = start.stretch
     blur, smear = _between(angle, own, shapes)
@@ -86,7 +86,7 @@ def _by_direction(angle: Array, bright: Array, rows: Indices) -> list[Indices]:
     return own if len(own) > 1 else []
 
 
-def _between(angle: Array, own: list[Indices], shapes: list[Shape]) -> tuple[Array, Array]:
+def _between(angle: Array, own: list[Indices], shapes: list[EdgeShape]) -> tuple[Array, Array]:
     """Blur and smear (N,) at all angles: squared they are a + b cos 2t + c sin 2t, as ellipses and ways are across a
     line in direction t.
     """
@@ -113,7 +113,7 @@ def _doubled(angle: Array) -> Array:
     return np.column_stack([np.cos(2.0 * angle), np.sin(2.0 * angle)])
 
 
-def _shape_of(windows: Windows, edges: Array, rows: Indices, start: Shape) -> Shape:
+def _shape_of(windows: Windows, edges: Array, rows: Indices, start: EdgeShape) -> EdgeShape:
     rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), _WINDOWS)).astype(int)]
     some = Windows(windows.values[rows], windows.distance[rows], windows.inside[rows])
     return fit_shape(some, edges[rows], start)

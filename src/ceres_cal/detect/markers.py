@@ -13,7 +13,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, Array32, Image, Image8
 from ceres_cal.base.errors import InputError
-from ceres_cal.detect.profiles import Shape, Windows, cut_windows, fit_profiles, fit_shape
+from ceres_cal.detect.profiles import EdgeShape, Windows, cut_windows, fit_profiles, fit_shape
 from ceres_cal.scene.targets import Target
 from ceres_cal.scene.targets.marker_targets import CORNERS
 
@@ -89,7 +89,7 @@ def _measured_sides(image: Array32, quad: Array, cells: int) -> Array | None:
         return None
     edge = np.zeros((len(places), 1))
     whole = Windows(windows.values[inside], windows.distance[inside], inside[inside])
-    fits = fit_profiles(windows, edge, fit_shape(whole, edge[inside], Shape(1.0)).blur_px, 0.5 * half_px)
+    fits = fit_profiles(windows, edge, fit_shape(whole, edge[inside], EdgeShape(1.0)).blur_px, 0.5 * half_px)
     offsets = np.where(fits.heights[:, 0] > 0.0, fits.offset_px, np.nan).reshape(4, count)
     sides = [
         _side(2.0 * share - 1.0, *side) for side in zip(offsets, fits.sigma_px.reshape(4, count), lengths, strict=True)

@@ -67,7 +67,7 @@ class Profiles:
 
 
 @dataclass(frozen=True)
-class Shape:
+class EdgeShape:
     """What a picture makes of edges: blur_px, the Gaussian's standard deviation; stretch, a factor on the edges'
     distances; smear_px, how far a camera that moved smears them, 0 of one that did not.
     """
@@ -159,7 +159,7 @@ def _misfit(squares: Array, normal: Array, right: Array, solution: Array) -> Arr
     )
 
 
-def fit_shape(windows: Windows, edges: Array, start: Shape, rounds: int = 8) -> Shape:
+def fit_shape(windows: Windows, edges: Array, start: EdgeShape, rounds: int = 8) -> EdgeShape:
     """What all windows share: the blur, the factor on the edges' distances that suits them best, and the smear.
 
     Each is pulled towards where it starts, by as much as one window in good light would outweigh: of a line that is
@@ -195,7 +195,7 @@ def fit_shape(windows: Windows, edges: Array, start: Shape, rounds: int = 8) -> 
         heights = solution[:, 2:-1]
         if np.all(np.abs(change) < 1e-3):
             break
-    return Shape(*np.exp(shape).tolist())
+    return EdgeShape(*np.exp(shape).tolist())
 
 
 def normal_step(x: Array) -> tuple[Array, Array]:

@@ -18,7 +18,7 @@ from ceres_cal.base.arrays import Array, Array32, Indices32, Mask
 from ceres_cal.base.errors import InputError, naming
 from ceres_cal.base.words import frame_of
 from ceres_cal.detect.images import read_grey
-from ceres_cal.detect.profiles import Shape, Windows, cut_windows, fit_profiles, fit_shape
+from ceres_cal.detect.profiles import EdgeShape, Windows, cut_windows, fit_profiles, fit_shape
 from ceres_cal.detect.ring_centre import ring_centre
 from ceres_cal.observations import NO_POINTS, Curves, Observations, View
 from ceres_cal.scene.targets import Target, rings
@@ -256,7 +256,7 @@ def _measured_ring(
     some = Windows(windows.values[inside], windows.distance[inside], windows.inside[inside])
     if not len(inside):
         return np.full((len(angle), 2), np.nan), np.full(len(angle), np.inf), np.nan
-    blur = fit_shape(some, edge[inside], Shape(1.0)).blur_px
+    blur = fit_shape(some, edge[inside], EdgeShape(1.0)).blur_px
     fits = fit_profiles(windows, edge, blur, 0.5 * half_length_px)
     height = fits.heights[:, 0] * (1.0 if track.rises else -1.0)
     clear = height > np.maximum(_LEAST_CONTRAST * fits.noise, 0.3 * np.median(height[inside]))

@@ -9,23 +9,21 @@ import numpy as np
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.numerical import numerical
 from ceres_cal.calibration import Calibration
-from ceres_cal.diagnostics.alternatives import Sums
-from ceres_cal.diagnostics.diagnostic import Case, Tested
-from ceres_cal.diagnostics.findings import Finding
+from ceres_cal.diagnostics.diagnostic import Case, Finding, Tested
 from ceres_cal.diagnostics.labels import find_mislabelled
 from ceres_cal.diagnostics.leftover import Noise, measure_noise
-from ceres_cal.diagnostics.of_new_data import with_newcomers_placed
+from ceres_cal.diagnostics.of_observations import with_newcomers_placed
 from ceres_cal.diagnostics.of_target import recalled
 from ceres_cal.diagnostics.registry import DIAGNOSTICS, all_families
-from ceres_cal.diagnostics.scores import select
+from ceres_cal.diagnostics.scores import AlternativeSums, select
 from ceres_cal.diagnostics.summaries import Summaries, summarise
 from ceres_cal.diagnostics.table import ResidualTable, make_table
-from ceres_cal.model.equations import write_equations
-from ceres_cal.model.residuals import Residuals, residuals
+from ceres_cal.effects.linearised import Weights, equation_weights, make_linear_model
 from ceres_cal.observations import Observations
-from ceres_cal.solve import Conflict
-from ceres_cal.solve.linear_model import Weights, equation_weights, make_linear_model
-from ceres_cal.solve.noise import USUAL_EQUATIONS, Inliers, Redundancy, judge, relative_lengths
+from ceres_cal.problem.equations import write_equations
+from ceres_cal.problem.noise import USUAL_EQUATIONS, Inliers, Redundancy, judge, relative_lengths
+from ceres_cal.problem.residuals import Residuals, residuals
+from ceres_cal.robust.stated import Conflict
 
 FALSE_ALARM_RATE = 0.01
 """Probability that a calibration of sound data gets any finding at all."""
@@ -165,7 +163,7 @@ def _judged(calibration: Calibration, observations: Observations, there: Residua
 
 def _tested(case: Case, rate: float) -> Tested:
     """Alternatives chosen at a rate of false alarms, and the noise that they leave."""
-    alternatives = [Sums.of(case.model, family) for family in all_families(case)]
+    alternatives = [AlternativeSums.of(case.model, family) for family in all_families(case)]
     extra = sum(one.tests(case) for one in DIAGNOSTICS.values())
     selection = select(case.model, alternatives, rate, extra)
     noise = measure_noise(case.observations, selection.model, case.model, case.inliers)

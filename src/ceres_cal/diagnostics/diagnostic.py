@@ -1,11 +1,11 @@
-"""What a diagnostic is: a kind of finding with its test and its words; and what it is asked about."""
+"""What a diagnosis finds: the cause by name, how large, how sure."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple
+from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
 
@@ -13,19 +13,77 @@ from ceres_cal.base.arrays import Array, Indices, Mask, distinct
 from ceres_cal.base.cached import cached_property
 from ceres_cal.base.words import first_of, two_digits
 from ceres_cal.calibration import Calibration
-from ceres_cal.diagnostics.alternatives import Family
-from ceres_cal.diagnostics.findings import Amount, Finding, Wrong
 from ceres_cal.diagnostics.labels import Mislabelling
 from ceres_cal.diagnostics.leftover import Noise
-from ceres_cal.diagnostics.scores import Score, Selection
+from ceres_cal.diagnostics.scores import Family, Selection, TestedAlternative
 from ceres_cal.diagnostics.table import ResidualTable, plane_shift
-from ceres_cal.model.equations import Equations, whole_structure
-from ceres_cal.model.parameters import Estimate
-from ceres_cal.model.structure import Structure
+from ceres_cal.effects.linearised import Linearised
 from ceres_cal.observations import Observations
-from ceres_cal.solve import AsBuilt, Problem
-from ceres_cal.solve.linear_model import LinearModel
-from ceres_cal.solve.noise import Inliers
+from ceres_cal.problem.equations import Equations, whole_structure
+from ceres_cal.problem.noise import Inliers
+from ceres_cal.problem.parameters import Estimate
+from ceres_cal.problem.problem import Problem
+from ceres_cal.problem.structure import Structure
+from ceres_cal.robust.repeats import AsBuilt
+
+SMALL = 0.4
+"""Beside the noise: an effect of less than this share of it does not show in a single observation, only in many."""
+Wrong = Literal["model", "calibration", "observations"]
+
+
+@dataclass(frozen=True)
+class Amount:
+    """One number that would mend it: its name, value, standard deviation and unit ("mm", "deg", "px", "")."""
+
+    name: str
+    value: float
+    sd: float
+    unit: str
+
+
+def amounts(names: Iterable[str], values: Array, sd: Array, unit: str) -> tuple[Amount, ...]:
+    """Several numbers of one unit."""
+    return tuple(Amount(n, float(v), float(s), unit) for n, v, s in zip(names, values, sd, strict=False))
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One cause of what is left over.
+
+    Attributes:
+        kind: of one of DIAGNOSTICS. wrong: what is, the model (no covariance of the parameters contains that), the
+            calibration (a refit would mend it), or the observations, their labels or their noise.
+        subject: what it is about: a camera, a station, "target/feature", a board's target, "points" or "curves".
+            frame: at which frame, None where it is about all.
+        sentence: the cause in words. advice: what to do.
+        effect_px: root mean square displacement in the image of the observations that it moves (of the lens: of what
+            the calibration could not absorb); of noise its standard deviation, of a wrong label how far off it is.
+        noise_ratio: that over the noise of the same observations; below SMALL it shows in many of them together only.
+        effect_mm: the same on the target's plane; NaN where the plane is seen edge-on.
+        amounts: what would mend it.
+        log10_p: decimal logarithm of the probability of a false alarm anywhere in the calibration, after Bonferroni.
+        observations: how many it moves; rows: (kind, row) of the observations of a wrong label.
+    """
+
+    kind: str
+    wrong: Wrong
+    subject: str
+    frame: str | None
+    sentence: str
+    advice: str
+    effect_px: float
+    effect_mm: float
+    noise_ratio: float
+    amounts: tuple[Amount, ...]
+    log10_p: float
+    observations: int
+    rows: tuple[tuple[str, int], ...] = ()
+
+    @property
+    def is_model_error(self) -> bool:
+        """Whether it says that the model is wrong, so that no covariance contains it."""
+        return self.wrong == "model"
+
 
 _LN_10 = float(np.log(10.0))
 
@@ -52,7 +110,7 @@ class Case:
     problem: Problem
     estimate: Estimate
     inliers: Inliers
-    model: LinearModel
+    model: Linearised
     table: ResidualTable
     labels: Mislabelling
     calibration: Calibration | None
@@ -143,8 +201,8 @@ class Evidence:
     """
 
     case: Case
-    score: Score
-    others: LinearModel
+    score: TestedAlternative
+    others: Linearised
     shift: Array
     effect: Effect
     noise_ratio: float

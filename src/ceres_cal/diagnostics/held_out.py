@@ -19,18 +19,19 @@ from ceres_cal.base.errors import CalibrationError, DegenerateError, InputError
 from ceres_cal.base.executing import each
 from ceres_cal.base.progress import StepProgress
 from ceres_cal.base.transforms import Pose
-from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
+from ceres_cal.calibration.calibrating import calibrate
+from ceres_cal.calibration.lens_forms import any_lens, candidates, coefficients_of, decide, label_of, size_of, surprise
 from ceres_cal.diagnostics.table import error_mm
-from ceres_cal.lens_choice import any_lens, candidates, coefficients_of, decide, label_of, size_of, surprise
-from ceres_cal.model.equations import write_equations
-from ceres_cal.model.parameters import Estimate, Layout, Options
-from ceres_cal.model.residuals import residuals
-from ceres_cal.model.structure import make_structure
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights, gather_sights
 from ceres_cal.observations.thinning import column_of, frames_of, thinned
-from ceres_cal.solve import Problem, Weighting, solve
+from ceres_cal.problem.bundle import solve
+from ceres_cal.problem.equations import write_equations
+from ceres_cal.problem.parameters import Estimate, Layout, Options
+from ceres_cal.problem.problem import Problem, Weighting
+from ceres_cal.problem.residuals import residuals
+from ceres_cal.problem.structure import make_structure
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor

@@ -15,14 +15,14 @@ from ceres_cal import kernels
 from ceres_cal.base.arrays import Array, Indices, Mask, distinct
 from ceres_cal.base.cached import cached_property
 from ceres_cal.base.tails import log_binomial_tail
-from ceres_cal.model.parameters import Estimate
-from ceres_cal.model.residuals import camera_optics
-from ceres_cal.model.structure import EXACT
 from ceres_cal.observations import Columns, Curves, Observations
+from ceres_cal.problem.noise import Inliers
+from ceres_cal.problem.parameters import Estimate
+from ceres_cal.problem.residuals import camera_optics
+from ceres_cal.problem.structure import EXACT
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.curves import Curve, curve_points, nearest_to_rays, turned_on
 from ceres_cal.scene.targets import Target
-from ceres_cal.solve.noise import Inliers
 
 _PIECES = 199  # of a curve, to measure its length in the image
 _MOST = 20_000  # rejected observations looked at: of more, evenly spread ones

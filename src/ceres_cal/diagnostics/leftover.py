@@ -8,10 +8,10 @@ import numpy as np
 
 from ceres_cal.base.arrays import AnyArray, Indices, Mask
 from ceres_cal.base.tails import log_chi2_tail
+from ceres_cal.effects.linearised import Linearised
 from ceres_cal.observations import Observations
+from ceres_cal.problem.noise import Inliers
 from ceres_cal.scene.curves import nearest_on_track
-from ceres_cal.solve.linear_model import LinearModel
-from ceres_cal.solve.noise import Inliers
 
 # Noise within so much of what was stated is as stated: sigmas are guessed to a tenth or two. Below 1 every sound
 # scene is a finding; at 2.3 noise of twice the stated one is missed.
@@ -51,7 +51,7 @@ class Noise:
 
 
 def measure_noise(
-    observations: Observations, model: LinearModel, before: LinearModel, inliers: Inliers
+    observations: Observations, model: Linearised, before: Linearised, inliers: Inliers
 ) -> tuple[Noise, ...]:
     """The noise of points and of curves, where there are any.
 
@@ -68,7 +68,7 @@ def measure_noise(
 
 
 def _noise_of(
-    observations: Observations, model: LinearModel, kind: str, rows: Mask, own_scale: float, own_variance: float
+    observations: Observations, model: Linearised, kind: str, rows: Mask, own_scale: float, own_variance: float
 ) -> Noise:
     column = observations.curves if kind == "curves" else observations.points
     variance, spare = model.variance(rows), model.spare_of(rows)
@@ -85,7 +85,7 @@ def _noise_of(
     return Noise(kind, count, typical, scale, stated, log_p, correlation, pairs_log_p, effective)
 
 
-def _neighbours(observations: Observations, model: LinearModel, kind: str) -> tuple[Indices, Indices]:
+def _neighbours(observations: Observations, model: Linearised, kind: str) -> tuple[Indices, Indices]:
     """Pairs of used equations: next to one another along a line of one view, or on one row of a board."""
     equations = model.equations
     if kind == "curves":
@@ -114,7 +114,7 @@ def _successive(rows: Indices, *keys: AnyArray) -> tuple[Indices, Indices]:
     return order[:-1], order[1:]
 
 
-def _correlation(model: LinearModel, pairs: tuple[Indices, Indices], variance: float) -> tuple[float, float]:
+def _correlation(model: Linearised, pairs: tuple[Indices, Indices], variance: float) -> tuple[float, float]:
     """Correlation of neighbouring residuals beyond what the fit makes of white noise, and log P of so much."""
     first, second = pairs
     if len(first) < _FEWEST_PAIRS:

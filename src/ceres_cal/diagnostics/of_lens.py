@@ -8,10 +8,9 @@ from typing import ClassVar
 import numpy as np
 
 from ceres_cal.base.arrays import Array, Mask
-from ceres_cal.diagnostics.alternatives import Family
-from ceres_cal.diagnostics.diagnostic import Case, Evidence, ScoreTest, Words
-from ceres_cal.diagnostics.findings import SMALL, amounts
-from ceres_cal.model.parameters import intrinsic_names, unit_px
+from ceres_cal.diagnostics.diagnostic import SMALL, Case, Evidence, ScoreTest, Words, amounts
+from ceres_cal.diagnostics.scores import Family
+from ceres_cal.problem.parameters import intrinsic_names, unit_px
 from ceres_cal.scene.lens import LENSES, Lens
 
 _RADIAL_BASIS = 3  # powers of the radius past those of the lens: enough for any smooth trend that one more power mends
@@ -226,7 +225,7 @@ class Skew(ScoreTest):
         )
 
 
-class Held(ScoreTest):
+class HeldNumbers(ScoreTest):
     """Numbers of the pixels that are held; places: theirs in the intrinsics vector."""
 
     absorbed = True
@@ -239,7 +238,7 @@ class Held(ScoreTest):
         yield Family(self.kind, case.equations.intrinsics[:, self.places], group, case.cameras)
 
 
-class Aspect(Held):
+class Aspect(HeldNumbers):
     """How high pixels are beside their width."""
 
     kind = "aspect"
@@ -256,7 +255,7 @@ class Aspect(Held):
         )
 
 
-class PrincipalPoint(Held):
+class PrincipalPoint(HeldNumbers):
     """Where the optical axis meets the image."""
 
     kind = "principal point"
@@ -273,7 +272,7 @@ class PrincipalPoint(Held):
         )
 
 
-class Phi(Held):
+class Phi(HeldNumbers):
     """The focal length."""
 
     kind = "phi"

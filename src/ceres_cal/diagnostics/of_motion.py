@@ -10,13 +10,12 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.transforms import skew
-from ceres_cal.diagnostics.alternatives import Family, grouped
-from ceres_cal.diagnostics.diagnostic import Case, Evidence, ScoreTest, Words
-from ceres_cal.diagnostics.findings import amounts
+from ceres_cal.diagnostics.diagnostic import Case, Evidence, ScoreTest, Words, amounts
+from ceres_cal.diagnostics.scores import Family, grouped
 from ceres_cal.diagnostics.table import numbers_of
 
 
-class _Moved(ScoreTest):
+class _PoseTest(ScoreTest):
     """Each station turned about the camera's axes, shifted in the world."""
 
     onwards: ClassVar[bool]
@@ -66,7 +65,7 @@ class _Moved(ScoreTest):
         )
 
 
-class MovedAfter(_Moved):
+class MovedAfter(_PoseTest):
     """From some frame on."""
 
     kind = "moved after"
@@ -77,7 +76,7 @@ class MovedAfter(_Moved):
         return group if count > 1 else np.full(len(group), -1)
 
 
-class MovedIn(_Moved):
+class MovedIn(_PoseTest):
     """In one frame alone."""
 
     kind = "moved in"

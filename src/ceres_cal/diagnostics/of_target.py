@@ -10,12 +10,11 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask
 from ceres_cal.base.words import first_of
-from ceres_cal.diagnostics.alternatives import Family, grouped
-from ceres_cal.diagnostics.diagnostic import Case, Evidence, ScoreTest, Tested, Words
-from ceres_cal.diagnostics.findings import Amount, Finding, amounts
-from ceres_cal.model.structure import WARP, Kind, numbers_by_kind
+from ceres_cal.diagnostics.diagnostic import Amount, Case, Evidence, Finding, ScoreTest, Tested, Words, amounts
+from ceres_cal.diagnostics.scores import Family, grouped
+from ceres_cal.problem.structure import WARP, Kind, numbers_by_kind
+from ceres_cal.robust.repeats import AsBuilt
 from ceres_cal.scene.targets import Arc, Segment
-from ceres_cal.solve import AsBuilt
 
 # Observations that say whether a curve lies aside: three numbers of an arc, and as many left to contradict them.
 # Nothing changes from half to double.
@@ -34,7 +33,7 @@ _FAR_M = 0.1
 _CLEAR = 2.0
 
 
-class _AsBuilt(ScoreTest):
+class _StructureTest(ScoreTest):
     """What moves some numbers of the structure that no tolerance solves for, where enough equations of it are used.
 
     Attributes:
@@ -117,7 +116,7 @@ def _feature_of(name: str) -> str:
     return name.removesuffix("/bow")
 
 
-class CurveAside(_AsBuilt):
+class CurveAside(_StructureTest):
     """A line or an arc is not painted as drawn."""
 
     kind = "curve aside"
@@ -145,7 +144,7 @@ class CurveAside(_AsBuilt):
         return Words(sentence, advice, amounts(["left"], mm[:1], sd[:1], "mm"))
 
 
-class PointAside(_AsBuilt):
+class PointAside(_StructureTest):
     """A point does not lie where it is drawn."""
 
     kind = "point aside"
@@ -163,7 +162,7 @@ class PointAside(_AsBuilt):
         )
 
 
-class BoardBent(_AsBuilt):
+class BoardBent(_StructureTest):
     """A board is bowed along its sides, twisted or wavy."""
 
     kind = "board bent"

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from ceres_cal.diagnostics.alternatives import Family
 from ceres_cal.diagnostics.diagnostic import Case, Diagnostic, ScoreTest
 from ceres_cal.diagnostics.of_floor import FloorBowed, FloorUneven
 from ceres_cal.diagnostics.of_lens import Aspect, Decentring, Phi, PrincipalPoint, Prism, Radius, Skew
 from ceres_cal.diagnostics.of_motion import MovedAfter, MovedIn
-from ceres_cal.diagnostics.of_new_data import DoesNotHold
-from ceres_cal.diagnostics.of_observations import Correlated, LargerNoise, PointsShifted, WrongLabel
+from ceres_cal.diagnostics.of_observations import Correlated, DoesNotHold, LargerNoise, PointsShifted, WrongLabel
 from ceres_cal.diagnostics.of_target import BoardBent, CurveAside, PointAside
+from ceres_cal.diagnostics.scores import Family
 
 DIAGNOSTICS: dict[str, Diagnostic] = {
     one.kind: one

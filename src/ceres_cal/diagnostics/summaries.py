@@ -10,8 +10,8 @@ import numpy as np
 from ceres_cal.base.arrays import Array, Indices, Mask
 from ceres_cal.diagnostics.diagnostic import Case
 from ceres_cal.diagnostics.table import ResidualTable, numbers_of
+from ceres_cal.effects.linearised import Linearised
 from ceres_cal.scene.camera import Camera
-from ceres_cal.solve.linear_model import LinearModel
 
 REGIONS = (6, 4)
 """Columns and rows of equal parts into which an image is divided."""
@@ -144,7 +144,7 @@ def _ring_of(radius: Array, edges: Array) -> Indices:
     return np.asarray(np.clip(np.searchsorted(edges, radius, side="right") - 1, 0, RADIUS_BINS - 1))
 
 
-def _trend(model: LinearModel, camera: Camera, name: str, own: Mask, edges: Array) -> RadiusTrend:
+def _trend(model: Linearised, camera: Camera, name: str, own: Mask, edges: Array) -> RadiusTrend:
     equations = model.equations
     rows = np.flatnonzero(own[equations.observation] & model.used)
     offsets = camera.offsets(equations.pixel[rows])

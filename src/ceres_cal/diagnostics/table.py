@@ -14,11 +14,11 @@ import numpy as np
 from ceres_cal.base.arrays import AnyArray, Array, Codes, Indices, Mask
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import write_bytes, write_json
-from ceres_cal.model.equations import Equations
+from ceres_cal.effects.linearised import Linearised
 from ceres_cal.observations import Observations
+from ceres_cal.problem.equations import Equations
+from ceres_cal.problem.noise import Inliers
 from ceres_cal.scene.camera import Camera
-from ceres_cal.solve.linear_model import LinearModel
-from ceres_cal.solve.noise import Inliers
 
 FORMAT, VERSION = "ceres-cal/residuals", 1
 INLIER, TOO_FAR, NOT_SEEN, COPIED = 0, 1, 2, 3
@@ -141,7 +141,7 @@ def _plain(column: AnyArray) -> list[Any]:
 
 
 def make_table(
-    observations: Observations, inliers: Inliers, model: LinearModel, weight: Array, cameras: Mapping[str, Camera]
+    observations: Observations, inliers: Inliers, model: Linearised, weight: Array, cameras: Mapping[str, Camera]
 ) -> ResidualTable:
     """The table of all observations.
 
@@ -241,14 +241,14 @@ def pairs_of(equations: Equations) -> tuple[Indices, Indices]:
     return first, second
 
 
-def _mean_leverage(model: LinearModel, count: int) -> Array:
+def _mean_leverage(model: Linearised, count: int) -> Array:
     equations, leverage = model.equations, model.leverage
     sums = np.bincount(equations.observation, leverage, count)
     numbers = np.bincount(equations.observation, minlength=count)
     return np.where(numbers > 0, sums / np.maximum(numbers, 1), np.nan)
 
 
-def _standardised(model: LinearModel, count: int) -> Array:
+def _standardised(model: Linearised, count: int) -> Array:
     """e' (1 - H)^-1 e as a length; 1 + H where the observation took no part."""
     equations = model.equations
     sign = np.where(model.used, -1.0, 1.0)

@@ -2,8 +2,8 @@
 
 from ceres_cal.formats.export_format import Exported as Exported
 from ceres_cal.formats.export_format import ExportFormat as ExportFormat
+from ceres_cal.formats.export_format import ExportLoss as ExportLoss
 from ceres_cal.formats.export_format import ExportRequest as ExportRequest
-from ceres_cal.formats.export_format import Loss as Loss
 from ceres_cal.formats.import_format import ImportFormat as ImportFormat
 from ceres_cal.formats.import_format import ImportRequest as ImportRequest
 from ceres_cal.formats.lookup import LookupTable as LookupTable

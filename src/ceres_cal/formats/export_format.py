@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Loss:
+class ExportLoss:
     """What a file gets wrong about one station, against the calibration that it was made from: 0 where it is exact.
 
     Attributes:
@@ -40,7 +40,7 @@ class Exported:
     """
 
     content: bytes | Mapping[str, bytes]
-    losses: tuple[Loss, ...]
+    losses: tuple[ExportLoss, ...]
     words: str
     facts: Mapping[str, Any] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()

@@ -72,8 +72,8 @@ class ImportedCameras:
         A camera without a pose is the world, as one that saw only boards.
         """
         from ceres_cal.calibration import Calibration, Fit
-        from ceres_cal.model.parameters import Estimate, Options, Station
-        from ceres_cal.model.structure import EXACT
+        from ceres_cal.problem.parameters import Estimate, Options, Station
+        from ceres_cal.problem.structure import EXACT
 
         cameras, warnings = self._ours()
         stations = {name: Station(name, camera.cam_from_world) for name, camera in cameras.items()}

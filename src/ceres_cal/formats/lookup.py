@@ -19,7 +19,7 @@ from ceres_cal.base.archives import Column, read_npz
 from ceres_cal.base.arrays import AnyArray, Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.files import read_bytes, write_bytes
-from ceres_cal.formats.export_format import Exported, ExportFormat, ExportRequest, Loss
+from ceres_cal.formats.export_format import Exported, ExportFormat, ExportLoss, ExportRequest
 from ceres_cal.formats.loss import field_error_mm
 from ceres_cal.scene.heights import HEIGHTS_M
 
@@ -199,7 +199,7 @@ class LookupOptions:
 
 
 def _export(request: ExportRequest) -> Exported:
-    from ceres_cal.uncertainty.uncertainty import field_grid  # not for the command line's help
+    from ceres_cal.posterior.uncertainty import field_grid  # not for the command line's help
 
     (station,) = request.stations
     box, options = field_grid(request.calibration.targets), request.options
@@ -207,7 +207,7 @@ def _export(request: ExportRequest) -> Exported:
     nodes = (len(table.x_px), len(table.y_px))
     return Exported(
         table.to_bytes(),
-        (Loss(station, table.error_mm),),
+        (ExportLoss(station, table.error_mm),),
         f"{nodes[0]} x {nodes[1]} nodes every {table.step_px} px",
         {"station": station, "step_px": table.step_px, "nodes": nodes},
     )

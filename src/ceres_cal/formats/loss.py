@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ceres_cal.base.arrays import Array
-from ceres_cal.formats.export_format import Loss
+from ceres_cal.formats.export_format import ExportLoss
 from ceres_cal.scene.camera import in_image
 from ceres_cal.scene.foreign import ForeignCamera, image_grid
 from ceres_cal.scene.heights import HEIGHTS_M, at_height
@@ -55,7 +55,7 @@ def _size(off: Array) -> tuple[float, float]:
 
 def field_box(targets: Mapping[str, Target]) -> Box | None:
     """x and y of a grid over what does not move; None where everything does."""
-    from ceres_cal.uncertainty.uncertainty import field_grid  # not for the command line's help
+    from ceres_cal.posterior.uncertainty import field_grid  # not for the command line's help
 
     still = {name: target for name, target in targets.items() if not target.movable}
     return field_grid(still) if still else None
@@ -69,7 +69,7 @@ def field_pixels(camera: Camera, box_m: Box) -> Array:
     return np.asarray(pixels[in_image(pixels, camera.image_size)])
 
 
-def camera_loss(station: str, camera: Camera, project: Callable[[Array], Array], box_m: Box | None) -> Loss:
+def camera_loss(station: str, camera: Camera, project: Callable[[Array], Array], box_m: Box | None) -> ExportLoss:
     """What a file gets wrong about a camera.
 
     Args:
@@ -82,7 +82,7 @@ def camera_loss(station: str, camera: Camera, project: Callable[[Array], Array],
     points = camera.position + depth_m * (rays[known] @ camera.cam_from_world.rotation)
     image_px = _size(np.linalg.norm(project(points) - pixels[known], axis=1))
     if box_m is None:
-        return Loss(station, {}, image_px)
+        return ExportLoss(station, {}, image_px)
 
     def locate(seen: Array, height_m: float) -> Array:
         """Where the file's camera has these pixels: from where ours has them, by what it misses there."""
@@ -92,19 +92,21 @@ def camera_loss(station: str, camera: Camera, project: Callable[[Array], Array],
             place = place + there - camera.locate(shown, height_m)
         return place
 
-    return Loss(station, field_error_mm(camera, locate, field_pixels(camera, box_m), box_m, HEIGHTS_M), image_px)
+    return ExportLoss(station, field_error_mm(camera, locate, field_pixels(camera, box_m), box_m, HEIGHTS_M), image_px)
 
 
-def as_foreign(camera: Camera, station: str, models: Sequence[str], box_m: Box | None) -> tuple[ForeignCamera, Loss]:
+def as_foreign(
+    camera: Camera, station: str, models: Sequence[str], box_m: Box | None
+) -> tuple[ForeignCamera, ExportLoss]:
     """A station's camera in the first of these models that holds it, else the best fit among them; what is lost."""
     foreign = camera.to_foreign(*models)
     if foreign.error_px == (0.0, 0.0):
-        return foreign, Loss(station, {} if box_m is None else dict.fromkeys(HEIGHTS_M, (0.0, 0.0)), (0.0, 0.0))
+        return foreign, ExportLoss(station, {} if box_m is None else dict.fromkeys(HEIGHTS_M, (0.0, 0.0)), (0.0, 0.0))
     pose = camera.cam_from_world
     return foreign, camera_loss(station, camera, lambda points: foreign.project_rays(pose.transform(points)), box_m)
 
 
-def loss_words(loss: Loss) -> list[str]:
+def loss_words(loss: ExportLoss) -> list[str]:
     """What is lost, a line each, for files that have room for it."""
     lines = []
     if loss.image_px is not None:

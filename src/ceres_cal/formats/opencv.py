@@ -15,7 +15,7 @@ import numpy as np
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.transforms import Pose
-from ceres_cal.formats.export_format import Exported, ExportFormat, ExportRequest, Loss
+from ceres_cal.formats.export_format import Exported, ExportFormat, ExportLoss, ExportRequest
 from ceres_cal.formats.import_format import ImportedCameras, ImportFormat, ImportRequest
 from ceres_cal.formats.loss import as_foreign, field_box, loss_words
 from ceres_cal.scene.foreign import FISHEYE, LARGEST, ForeignCamera, image_grid
@@ -82,7 +82,7 @@ def _common(camera: ForeignCamera) -> dict[str, Any]:
     return {"image_width": width, "image_height": height, "distortion_model": camera.model}
 
 
-def _mono(camera: ForeignCamera, loss: Loss) -> dict[str, Any]:
+def _mono(camera: ForeignCamera, loss: ExportLoss) -> dict[str, Any]:
     matrix, coefficients, pose = _numbers(camera)
     named = {"camera_matrix": matrix, "distortion_coefficients": coefficients, "extrinsic_parameters": pose}
     return _common(camera) | named | {"loss": "; ".join(loss_words(loss))}

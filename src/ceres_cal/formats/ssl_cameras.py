@@ -17,7 +17,7 @@ from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.least_squares import least_squares
 from ceres_cal.base.transforms import Pose, quaternion, rotation_exp, rotation_of
-from ceres_cal.formats.export_format import ExportRequest, Loss
+from ceres_cal.formats.export_format import ExportLoss, ExportRequest
 from ceres_cal.formats.loss import Box, camera_loss, field_pixels
 from ceres_cal.formats.opencv import parse_size
 from ceres_cal.scene.camera import Camera
@@ -59,7 +59,9 @@ def _last_digits(name: str) -> str:
     return name[len(name.rstrip("0123456789")) :]
 
 
-def to_entries(request: ExportRequest, box_m: Box | None) -> tuple[dict[int, dict[str, Any]], list[Loss], list[str]]:
+def to_entries(
+    request: ExportRequest, box_m: Box | None
+) -> tuple[dict[int, dict[str, Any]], list[ExportLoss], list[str]]:
     """id -> SSL_GeometryCameraCalibration as plain data; what is lost; what to know of those who will read it."""
     entries, losses, warnings = {}, [], []
     ids = camera_ids(request.stations, request.options.camera_id)

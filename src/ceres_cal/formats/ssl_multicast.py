@@ -13,8 +13,7 @@ from select import select
 from typing import Any
 
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.words import first_of, plural
-from ceres_cal.base.written import note
+from ceres_cal.base.words import first_of, note, plural
 from ceres_cal.formats.ssl_fields import target_of
 from ceres_cal.formats.ssl_messages import from_bytes, to_bytes
 from ceres_cal.scene.targets import Target
@@ -55,7 +54,7 @@ def wrapped(geometry: Mapping[str, Any]) -> bytes:
 
 def publish(packet: bytes, group: Group, times: int | None = None, period_s: float = 3.0) -> int:
     """Send a packet so many times, without end where None; how often it was sent. What ends it early learns of it by
-    `base.written`.
+    `base.words`.
 
     Raises:
         InputError: the network does not take it.

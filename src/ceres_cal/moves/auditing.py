@@ -19,16 +19,17 @@ from ceres_cal.base.errors import CalibrationError, InputError
 from ceres_cal.base.numerical import numerical
 from ceres_cal.base.tails import upper_tail
 from ceres_cal.base.transforms import Pose
-from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
-from ceres_cal.model.parameters import Estimate, Layout, Options, Station
-from ceres_cal.model.residuals import residuals
+from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.observations import Columns, Observations
 from ceres_cal.observations.sights import gather_sights
+from ceres_cal.posterior.uncertainty import field_grid
+from ceres_cal.problem.bundle import solve
+from ceres_cal.problem.parameters import Estimate, Layout, Options, Station
+from ceres_cal.problem.problem import Problem, Weighting
+from ceres_cal.problem.residuals import residuals
 from ceres_cal.scene.camera import Camera, in_image
 from ceres_cal.scene.heights import HEIGHTS_M, at_height
-from ceres_cal.solve import Problem, Weighting, solve
-from ceres_cal.uncertainty.uncertainty import field_grid
 
 # How often a sound calibration is said to be at fault.
 _FALSE_ALARMS = 0.005
@@ -87,7 +88,7 @@ def audit(foreign: Calibration, observations: Observations) -> dict[str, Station
 
 
 @dataclass(frozen=True, eq=False)
-class _Case:
+class _AuditCase:
     """One station's observations, those of them that count, and ours."""
 
     observations: Observations
@@ -157,7 +158,7 @@ def _audited(name: str, given: Camera, observations: Observations) -> StationAud
     )
 
 
-def _case(observations: Observations, given: Camera) -> _Case:
+def _case(observations: Observations, given: Camera) -> _AuditCase:
     """Ours, with the lens that explains the observations best for the number of its coefficients."""
     found: list[tuple[float, Calibration]] = []
     failure: CalibrationError | None = None
@@ -180,7 +181,7 @@ def _case(observations: Observations, given: Camera) -> _Case:
     problem = ours.problem(observations)
     used = replace(problem, sights=sights, weighting=weighting, priors=())
     points, curves = ours.inlier_masks(observations)
-    return _Case(observations, ours, used.used(points, curves))
+    return _AuditCase(observations, ours, used.used(points, curves))
 
 
 def _sound(rise: float, degrees: int) -> bool:
@@ -191,7 +192,7 @@ def _sound(rise: float, degrees: int) -> bool:
 # ---- what is wrong with it ------------------------------------------------------------------------------------------
 
 
-def _cause(case: _Case, camera: Camera, best: float, degrees: int, posed: bool) -> tuple[str, str]:
+def _cause(case: _AuditCase, camera: Camera, best: float, degrees: int, posed: bool) -> tuple[str, str]:
     """The least change after which the camera explains the observations, and what to do."""
     for cause, words, changed in _mistakes(camera, case.ours.station()):
         if _sound(case.least(changed, pose=not posed)[0] - best, degrees):

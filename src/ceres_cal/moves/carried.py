@@ -10,17 +10,16 @@ import numpy as np
 from ceres_cal.base.errors import InputError, SolutionError
 from ceres_cal.base.transforms import Pose
 from ceres_cal.calibration import Calibration
-from ceres_cal.model.information import Information
-from ceres_cal.model.keys import Key
-from ceres_cal.model.parameters import Estimate, Layout, Options, Station, intrinsic_names
-from ceres_cal.model.priors import GaussianPrior, gather_priors
-from ceres_cal.model.quantities import intrinsic_keys
-from ceres_cal.model.ranges import require_possible_numbers
-from ceres_cal.model.structure import make_structure
 from ceres_cal.moves.labels import TURNED, relabelled
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.observations.sights import Sights, gather_sights
-from ceres_cal.solve import Problem
+from ceres_cal.problem.information import Information, Key
+from ceres_cal.problem.parameters import Estimate, Layout, Options, Station, intrinsic_names
+from ceres_cal.problem.priors import GaussianPrior, gather_priors
+from ceres_cal.problem.problem import Problem
+from ceres_cal.problem.quantities import intrinsic_keys
+from ceres_cal.problem.ranges import require_possible_numbers
+from ceres_cal.problem.structure import make_structure
 
 WHAT = ("pose", "pose-only", "zoom", "iris", "everything")
 LABELS = ("check", "as-given", "turned")

@@ -18,24 +18,25 @@ from ceres_cal.base.errors import CalibrationError, InputError
 from ceres_cal.base.numerical import numerical
 from ceres_cal.base.transforms import Pose
 from ceres_cal.calibration import Calibration
-from ceres_cal.model.information import Information
-from ceres_cal.model.keys import Key
-from ceres_cal.model.parameters import Estimate
-from ceres_cal.model.priors import GaussianPrior, tolerances
-from ceres_cal.model.quantities import layout_of
-from ceres_cal.model.residuals import residuals
-from ceres_cal.model.structure import make_structure
+from ceres_cal.effects.dependence import measure_scatter
 from ceres_cal.moves.carried import require_posterior, require_same_things
-from ceres_cal.moves.contrast import Contrast, Statement, contrast
+from ceres_cal.moves.contrast import Contrast, NormalDistribution, contrast
 from ceres_cal.moves.poses import PoseCandidate, PoseSearch, movement, pose_candidates
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights, gather_sights
+from ceres_cal.posterior.maps import FieldGrid, visible_pixels
+from ceres_cal.posterior.uncertainty import field_grid
+from ceres_cal.problem.bundle import solve
+from ceres_cal.problem.information import Information, Key
+from ceres_cal.problem.parameters import Estimate
+from ceres_cal.problem.priors import GaussianPrior, tolerances
+from ceres_cal.problem.problem import Problem, Weighting
+from ceres_cal.problem.quantities import layout_of
+from ceres_cal.problem.reduced import information
+from ceres_cal.problem.residuals import residuals
+from ceres_cal.problem.structure import make_structure
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.heights import HEIGHTS_M
-from ceres_cal.solve import Problem, Weighting, information, solve
-from ceres_cal.uncertainty import measure_scatter
-from ceres_cal.uncertainty.maps import Grid, visible_pixels
-from ceres_cal.uncertainty.uncertainty import field_grid
 
 FALSE_ALARMS = 0.01
 # Of 2000 clean distances to a curve one is longer. At half of it too many good ones go, and false alarms rise (0.05
@@ -153,7 +154,7 @@ def check(
 
 
 @dataclass(frozen=True, eq=False)
-class _Case:
+class _CheckCase:
     """One station's new observations and what was known of its numbers."""
 
     calibration: Calibration
@@ -203,7 +204,7 @@ class _Case:
         return whole, offsets
 
 
-def _case(calibration: Calibration, observed: Observations, sight: Sights) -> _Case:
+def _case(calibration: Calibration, observed: Observations, sight: Sights) -> _CheckCase:
     key, old, posterior = sight.key, calibration.estimate, calibration.uncertainty.posterior
     own = posterior.keys_of(old, key.station)
     if not posterior.knows_station(key.station):
@@ -214,11 +215,11 @@ def _case(calibration: Calibration, observed: Observations, sight: Sights) -> _C
     estimate = Estimate({key.camera: old.cameras[key.camera]}, {key.station: old.stations[key.station]}, {}, structure)
     tested = tuple(k for k in own if k.kind == "station" or k.quantity == "phi")
     kept = [k for k in posterior.keys if k in own or k.is_structure]
-    return _Case(calibration, observed, sight, estimate, calibration.prior_of(kept), tested)
+    return _CheckCase(calibration, observed, sight, estimate, calibration.prior_of(kept), tested)
 
 
 @dataclass(frozen=True)
-class _Test:
+class _CheckOutcome:
     """The outcome of a station's test: the first attributes of its `StationCheck`."""
 
     holds: bool
@@ -242,13 +243,13 @@ def _checked(calibration: Calibration, observed: Observations, sight: Sights, le
         return _not_understood(case, inside, count)
     noise, apart = _apart(case, used, *posed)
     holds = apart.probability >= level
-    test = _Test(holds, apart.probability, apart.statistic, apart.degrees, inside, count - inside, noise)
+    test = _CheckOutcome(holds, apart.probability, apart.statistic, apart.degrees, inside, count - inside, noise)
     zoomed = None if holds else case.least(used, case.tested, near[0].pose)
     will_do = zoomed is None or posed[0] - zoomed[0] < _WILL_DO * noise**2
     return _answer(case, test, posed[1] if will_do or zoomed is None else zoomed[1])
 
 
-def _apart(case: _Case, used: Sights, least: float, estimate: Estimate) -> tuple[float, Contrast]:
+def _apart(case: _CheckCase, used: Sights, least: float, estimate: Estimate) -> tuple[float, Contrast]:
     """The noise, in that of the calibration, and how far what was known and what is seen now are apart.
 
     Args:
@@ -267,8 +268,8 @@ def _apart(case: _Case, used: Sights, least: float, estimate: Estimate) -> tuple
         seen = scatter.widened(seen)
         freedom = 1.0 / (1.0 / freedom + scatter.dependence.inverse_freedom)
     before = case.calibration.uncertainty.posterior.degrees_of_freedom
-    old = Statement(*case.known(used, (), estimate, keys), before)
-    return noise, contrast(old, Statement(seen, -best, freedom), case.tested)
+    old = NormalDistribution(*case.known(used, (), estimate, keys), before)
+    return noise, contrast(old, NormalDistribution(seen, -best, freedom), case.tested)
 
 
 def _inliers(search: PoseSearch, near: PoseCandidate) -> tuple[Mask, Mask]:
@@ -284,7 +285,7 @@ def _inliers(search: PoseSearch, near: PoseCandidate) -> tuple[Mask, Mask]:
 # ---- in words -------------------------------------------------------------------------------------------------------
 
 
-def _not_understood(case: _Case, inside: int, count: int) -> StationCheck:
+def _not_understood(case: _CheckCase, inside: int, count: int) -> StationCheck:
     words = (
         f"moved far, or not understood: only {inside} of {count} observations fit the known lens from anywhere near: "
         "refit, or check labels and camera"
@@ -292,7 +293,7 @@ def _not_understood(case: _Case, inside: int, count: int) -> StationCheck:
     return StationCheck.unknown(case.name, words, inside, count - inside)
 
 
-def _answer(case: _Case, test: _Test, anew: Estimate) -> StationCheck:
+def _answer(case: _CheckCase, test: _CheckOutcome, anew: Estimate) -> StationCheck:
     old, new = case.estimate.camera_at(case.name), anew.camera_at(case.name)
     shift_m, turn = movement(new.cam_from_world, old.cam_from_world)
     maps = {height_m: _map_shift_mm(old, new, _visible_places(case, height_m)) for height_m in HEIGHTS_M}
@@ -311,7 +312,7 @@ def _answer(case: _Case, test: _Test, anew: Estimate) -> StationCheck:
     )
 
 
-def _words(test: _Test, movement: str, worst_mm: float) -> str:
+def _words(test: _CheckOutcome, movement: str, worst_mm: float) -> str:
     if test.holds:
         probability = f"probability {test.probability:.2g}"
         words = f"holds: no movement beyond what is known ({worst_mm:.1f} mm on the floor at most, {probability})"
@@ -324,9 +325,9 @@ def _words(test: _Test, movement: str, worst_mm: float) -> str:
     return words
 
 
-def _visible_places(case: _Case, height_m: float) -> Array:
+def _visible_places(case: _CheckCase, height_m: float) -> Array:
     """Places (N, 3) of the map's grid that the station sees."""
-    places = Grid(height_m, *field_grid(case.calibration.targets)).places
+    places = FieldGrid(height_m, *field_grid(case.calibration.targets)).places
     visible = np.isfinite(visible_pixels(case.estimate, case.name, places, height_m)[:, 0])
     return np.column_stack([places[visible], np.full(np.count_nonzero(visible), height_m)])
 

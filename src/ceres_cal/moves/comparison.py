@@ -15,13 +15,13 @@ from ceres_cal.base.numerical import numerical
 from ceres_cal.base.tails import upper_tail
 from ceres_cal.base.transforms import nearest_rotation, rotation_log
 from ceres_cal.calibration import Calibration
-from ceres_cal.model.keys import Key
-from ceres_cal.model.parameters import Estimate
-from ceres_cal.model.quantities import difference
-from ceres_cal.model.structure import EXACT
 from ceres_cal.moves.poses import movement
-from ceres_cal.uncertainty.maps import ErrorMap, Grid, field_map, visible_pixels
-from ceres_cal.uncertainty.uncertainty import field_grid
+from ceres_cal.posterior.maps import ErrorMap, FieldGrid, field_map, visible_pixels
+from ceres_cal.posterior.uncertainty import field_grid
+from ceres_cal.problem.information import Key
+from ceres_cal.problem.parameters import Estimate
+from ceres_cal.problem.quantities import difference
+from ceres_cal.problem.structure import EXACT
 
 # Probability below which uncertainty alone does not explain a difference; that often two sound calibrations differ.
 # At half of it nothing changes, at double one of six pairs does.
@@ -91,7 +91,7 @@ def _listed(names: Sequence[str]) -> str:
 
 def _compared(a: Calibration, b: Calibration, station: str, height_m: float) -> StationComparison:
     first, second = a.station(station), b.station(station)
-    grid = Grid(height_m, *field_grid(a.targets))
+    grid = FieldGrid(height_m, *field_grid(a.targets))
     pixels = visible_pixels(a.estimate, station, grid.places, height_m)
     off = 1e3 * (second.locate(pixels, height_m) - grid.places)
     shift_m, turn = movement(second.cam_from_world, first.cam_from_world)
@@ -110,7 +110,7 @@ def _compared(a: Calibration, b: Calibration, station: str, height_m: float) -> 
     )
 
 
-def _expected_mm(a: Calibration, b: Calibration, station: str, grid: Grid) -> Array:
+def _expected_mm(a: Calibration, b: Calibration, station: str, grid: FieldGrid) -> Array:
     maps = [field_map(c.estimate, c.uncertainty.posterior, station, grid).sd_mm for c in (a, b)]
     return np.asarray(np.hypot(*maps))
 

@@ -15,15 +15,14 @@ import numpy as np
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.cached import cached_property
 from ceres_cal.base.tails import NORMAL_95_ONE_SIDED, quadratic_tail
-from ceres_cal.model.information import Information
-from ceres_cal.model.keys import Key
+from ceres_cal.problem.information import Information, Key
 
 _DETERMINED = 1e-11  # singular value, at unit columns, from which on a direction counts as determined
 _TESTABLE = 1e-6  # length, at unit columns, that both statements together must leave of a direction
 
 
 @dataclass(frozen=True, eq=False)
-class Statement:
+class NormalDistribution:
     """A normal distribution of K numbers, seen from an estimate.
 
     Attributes:
@@ -70,7 +69,7 @@ def _chi2_95(freedom: float) -> float:
     return freedom * (1.0 - spread + NORMAL_95_ONE_SIDED * math.sqrt(spread)) ** 3
 
 
-def contrast(first: Statement, second: Statement, tested: Sequence[Key]) -> Contrast:
+def contrast(first: NormalDistribution, second: NormalDistribution, tested: Sequence[Key]) -> Contrast:
     """The contrast in the tested numbers, all others being the same in both; both speak of the same numbers."""
     roots = first.information.root, second.information.root
     known, at = len(roots[0]), first.information.columns(tested)

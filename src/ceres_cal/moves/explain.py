@@ -13,16 +13,16 @@ import numpy as np
 from ceres_cal.base.errors import CalibrationError, SolutionError
 from ceres_cal.base.tails import upper_tail
 from ceres_cal.base.transforms import Pose
-from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
-from ceres_cal.model.parameters import Estimate
-from ceres_cal.model.residuals import residuals
-from ceres_cal.model.structure import make_structure
+from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.moves.carried import RefitPlan
 from ceres_cal.moves.labels import MIRRORED, TURNED, mistaken_targets, relabelled
 from ceres_cal.moves.poses import PoseCandidate, PoseSearch, movement, pose_candidates
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import gather_sights
+from ceres_cal.problem.parameters import Estimate
+from ceres_cal.problem.residuals import residuals
+from ceres_cal.problem.structure import make_structure
 
 _ZOOMS = 15
 # Share of the observations that another zoom must explain to be looked at. Nothing changes from 0.33 to 0.67.
@@ -164,7 +164,7 @@ def zoomed_search(search: PoseSearch, old: list[Pose]) -> tuple[PoseSearch, Pose
 
 
 @dataclass(frozen=True)
-class Judged:
+class RefitVerdict:
     """How a solved refit stands to what was known before.
 
     Attributes:
@@ -187,13 +187,13 @@ class Judged:
         return self.noisy or (upper_tail(self.strain, self.rank) < _RARE)
 
 
-def judged(plan: RefitPlan, what: str, result: Calibration) -> Judged:
+def judged(plan: RefitPlan, what: str, result: Calibration) -> RefitVerdict:
     """Strain and noise of a result."""
     off = plan.prior_for(what).residuals(result.estimate)
     fit, (points, curves) = result.fit, plan.scales
     ratios = ((fit.points, fit.point_scale / points), (fit.curves, fit.curve_scale / curves))
     noise = [ratio for count, ratio in ratios if count]
-    return Judged(float(off @ off), len(off), max(noise, default=1.0))
+    return RefitVerdict(float(off @ off), len(off), max(noise, default=1.0))
 
 
 def require_supported(plan: RefitPlan, result: Calibration, attempt: Callable[[str, Estimate], Calibration]) -> bool:

@@ -14,12 +14,13 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, distinct, median
 from ceres_cal.base.transforms import Pose
-from ceres_cal.model.parameters import Estimate
-from ceres_cal.model.residuals import Residuals, residuals
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import SightKey, Sights
+from ceres_cal.problem.bundle import placement_costs
+from ceres_cal.problem.parameters import Estimate
+from ceres_cal.problem.problem import Weighting
+from ceres_cal.problem.residuals import Residuals, residuals
 from ceres_cal.scene.camera import Camera
-from ceres_cal.solve import Weighting, placement_costs
 from ceres_cal.start.closed_forms import fit_lines, pose_from_homography
 from ceres_cal.start.planes import plane_sight
 

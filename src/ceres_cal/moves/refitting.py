@@ -14,9 +14,8 @@ import numpy as np
 from ceres_cal.base.errors import DegenerateError, SolutionError
 from ceres_cal.base.numerical import numerical
 from ceres_cal.base.transforms import Pose
-from ceres_cal.calibrating import Again, Watched, solved_from
 from ceres_cal.calibration import Calibration, Refitted
-from ceres_cal.model.parameters import Estimate, Station
+from ceres_cal.calibration.calibrating import Again, Watched, solved_from
 from ceres_cal.moves.carried import RefitOptions, RefitPlan, make_plan, refit_problem
 from ceres_cal.moves.explain import (
     judged,
@@ -29,7 +28,8 @@ from ceres_cal.moves.explain import (
 from ceres_cal.moves.poses import PoseSearch, equations, movement, pose_candidates
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights
-from ceres_cal.solve import Progress
+from ceres_cal.problem.bundle import Progress
+from ceres_cal.problem.parameters import Estimate, Station
 from ceres_cal.start.initialise import Start
 
 # Poses whose likelihoods differ by less compete: a factor of 20 000 decides. Nothing changes from half to double.

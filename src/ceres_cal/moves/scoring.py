@@ -11,22 +11,22 @@ from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.errors import DegenerateError, InputError
 from ceres_cal.base.numerical import numerical
 from ceres_cal.base.transforms import Pose
-from ceres_cal.calibrating import Again, solved_from
 from ceres_cal.calibration import Calibration, Fit
-from ceres_cal.model.parameters import Estimate, Options, Station, make_layout
-from ceres_cal.model.priors import gather_priors
-from ceres_cal.model.residuals import Residuals, residuals
-from ceres_cal.model.structure import EXACT, Structure, make_structure
+from ceres_cal.calibration.calibrating import Again, solved_from
 from ceres_cal.moves.carried import require_same_things
 from ceres_cal.moves.poses import PoseSearch, pose_candidates
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights, gather_sights
-from ceres_cal.solve import Problem
+from ceres_cal.problem.parameters import Estimate, Options, Station, make_layout
+from ceres_cal.problem.priors import gather_priors
+from ceres_cal.problem.problem import Problem
+from ceres_cal.problem.residuals import Residuals, residuals
+from ceres_cal.problem.structure import EXACT, Structure, make_structure
 from ceres_cal.start.initialise import Start, chained_poses
 
 
 @dataclass(frozen=True)
-class Part:
+class ScorePart:
     """What one camera, or one view, leaves.
 
     Attributes:
@@ -57,8 +57,8 @@ class Score:
 
     fit: Fit
     before: Fit
-    cameras: tuple[Part, ...]
-    views: tuple[Part, ...]
+    cameras: tuple[ScorePart, ...]
+    views: tuple[ScorePart, ...]
     estimate: Estimate
 
     @property
@@ -161,20 +161,20 @@ def _start(
 # ---- what is left ---------------------------------------------------------------------------------------------------
 
 
-def _by_camera(observations: Observations, left: Residuals, posed: Calibration) -> Iterator[Part]:
+def _by_camera(observations: Observations, left: Residuals, posed: Calibration) -> Iterator[ScorePart]:
     cameras = [view.camera for view in observations.views]
     for name in posed.cameras:
         if name in cameras:
             yield _part(name, np.array([camera == name for camera in cameras]), observations, left, posed)
 
 
-def _by_view(observations: Observations, left: Residuals, posed: Calibration) -> Iterator[Part]:
+def _by_view(observations: Observations, left: Residuals, posed: Calibration) -> Iterator[ScorePart]:
     for number, view in enumerate(observations.views):
         name = f"frame {view.frame!r} of station {view.station!r}, {view.target}"
         yield _part(name, np.arange(len(observations.views)) == number, observations, left, posed)
 
 
-def _part(name: str, views: Mask, observations: Observations, left: Residuals, posed: Calibration) -> Part:
+def _part(name: str, views: Mask, observations: Observations, left: Residuals, posed: Calibration) -> ScorePart:
     own = views[observations.points.view], views[observations.curves.view]
     kept = posed.inlier_masks(observations)
     inside = [lengths[mine & used] for lengths, mine, used in zip(left.lengths, own, kept, strict=True)]
@@ -182,7 +182,9 @@ def _part(name: str, views: Mask, observations: Observations, left: Residuals, p
         np.concatenate([lengths[mine] for lengths, mine in zip(left.lengths, own, strict=True)]), nan=np.inf
     )
     points, curves = inside
-    return Part(name, len(points), len(curves), len(every) - len(points) - len(curves), *map(_rms, (*inside, every)))
+    return ScorePart(
+        name, len(points), len(curves), len(every) - len(points) - len(curves), *map(_rms, (*inside, every))
+    )
 
 
 def _rms(values: Array) -> float:

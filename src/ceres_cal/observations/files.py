@@ -109,7 +109,7 @@ class _ViewFile(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True, 
         return View(self.frame, self.camera, station, self.target, self.placement)
 
 
-class _CameraFile(msgspec.Struct, forbid_unknown_fields=True):
+class _ObservedCamera(msgspec.Struct, forbid_unknown_fields=True):
     image_size: tuple[int, int]
 
 
@@ -121,7 +121,7 @@ class ObservationsFile(msgspec.Struct, forbid_unknown_fields=True, kw_only=True)
     units: Units = UNITS
     pixel_origin: PixelOrigin = PIXEL_ORIGIN
     targets: dict[str, Any]
-    cameras: dict[str, _CameraFile]
+    cameras: dict[str, _ObservedCamera]
     views: list[_ViewFile]
     priors: list[dict[str, Any]] = []
     notes: dict[str, Any] | msgspec.UnsetType = msgspec.UNSET
@@ -168,7 +168,7 @@ def header_of(content: Content) -> ObservationsFile:
         format=FORMAT,
         version=VERSION,
         targets={name: target.spec for name, target in content.targets.items()},
-        cameras={name: _CameraFile(size) for name, size in content.cameras.items()},
+        cameras={name: _ObservedCamera(size) for name, size in content.cameras.items()},
         views=[_ViewFile(**vars(view)) for view in content.views],
         priors=[prior_to_json(prior) for prior in content.priors],
         notes=dict(content.notes) or msgspec.UNSET,

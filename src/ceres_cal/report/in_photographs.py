@@ -8,11 +8,11 @@ import numpy as np
 
 from ceres_cal.base.words import counted, first_of, fixed
 from ceres_cal.calibration import Calibration
-from ceres_cal.pictures.files import jpeg_of_at_most, read_photograph
-from ceres_cal.pictures.frames import Frame, frames_of, marks_of, model_of
-from ceres_cal.pictures.overlay import AFTER, BEFORE, Layer, draw_overlay
 from ceres_cal.report.document import Chapter, Gallery, PhotoFigure, Text
 from ceres_cal.report.material import ClosedForm, FramePhotographs, Material
+from ceres_cal.report.pictures.files import jpeg_of_at_most, read_photograph
+from ceres_cal.report.pictures.frames import Frame, frames_of, marks_of, model_of
+from ceres_cal.report.pictures.overlay import AFTER, BEFORE, Layer, draw_overlay
 
 MOST_PHOTOGRAPHS = 4
 _WIDEST_PX, _MOST_BYTES = 1400, 230_000  # of one picture: four of them are 1.2 MB in a page

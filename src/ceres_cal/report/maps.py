@@ -12,6 +12,8 @@ from ceres_cal.base.arrays import Array
 from ceres_cal.base.words import mm, sentence, short
 from ceres_cal.calibration import Calibration
 from ceres_cal.moves import StationComparison
+from ceres_cal.posterior.maps import FieldMap
+from ceres_cal.posterior.other_lenses import image_grid
 from ceres_cal.report import canvas
 from ceres_cal.report.canvas import INK, OUTLIER, QUIET, Drawing, Hover
 from ceres_cal.report.document import Figure, Table
@@ -19,7 +21,6 @@ from ceres_cal.report.grounds import worst_radius
 from ceres_cal.report.material import Material, image_border, paint_of
 from ceres_cal.report.scale import COLORS, MM, PX, Scale, spoken
 from ceres_cal.scene.heights import at_height
-from ceres_cal.uncertainty import FieldMap, image_grid
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -12,17 +12,17 @@ import numpy as np
 from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.cached import cached_property
 from ceres_cal.base.errors import CalibrationError
-from ceres_cal.calibrating import calibrate
 from ceres_cal.calibration import Calibration
+from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.diagnostics import Diagnosis
 from ceres_cal.diagnostics.held_out import Choice
-from ceres_cal.model.residuals import residuals
 from ceres_cal.observations.sights import gather_sights
+from ceres_cal.posterior.maps import FieldMap
+from ceres_cal.problem.residuals import residuals
 from ceres_cal.report.quality import Quality, Seam
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.curves import curve_points
 from ceres_cal.scene.targets import Target
-from ceres_cal.uncertainty import FieldMap
 
 _CURVE_PIECES = 95
 _FINER = 2  # than the maps' own grid, where that is quick

@@ -23,13 +23,13 @@ from ceres_cal.base.words import (
     two_digits,
 )
 from ceres_cal.calibration import Calibration, LensChoice
-from ceres_cal.model.parameters import anchored_stations
 from ceres_cal.observations import Observations
+from ceres_cal.posterior.weak import Verdict
+from ceres_cal.problem.parameters import anchored_stations
 from ceres_cal.report.document import Piece, Section, Table, Text, wrapped
 from ceres_cal.report.quality import Quality
+from ceres_cal.robust.as_built import words_of
 from ceres_cal.scene.camera import Camera
-from ceres_cal.solve import words_of
-from ceres_cal.uncertainty import Verdict
 
 _HEAD = ("", "value", "± sd", "by the model alone", "95 % bounds", "verdict")
 _MOST_FEATURES, _MOST_OFFSETS = 6, 40

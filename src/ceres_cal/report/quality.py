@@ -14,9 +14,12 @@ from ceres_cal.calibration import Calibration
 from ceres_cal.diagnostics import Diagnosis, diagnose
 from ceres_cal.observations import Observations
 from ceres_cal.observations.thinning import thinned
+from ceres_cal.posterior.maps import FieldMap
+from ceres_cal.posterior.seam import Disagreement
+from ceres_cal.posterior.uncertainty import Uncertainty
+from ceres_cal.posterior.weak import Verdict
 from ceres_cal.scene.heights import HEIGHTS_M
 from ceres_cal.scene.targets import Target
-from ceres_cal.uncertainty import Disagreement, FieldMap, Uncertainty, Verdict
 
 _DIAGNOSED = 5_000  # observations that a calibration's own answer reads; `diagnose` and the report read all
 

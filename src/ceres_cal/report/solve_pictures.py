@@ -10,7 +10,7 @@ import numpy as np
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.words import counted, fixed, powered, short
 from ceres_cal.calibration import Calibration
-from ceres_cal.model.keys import Key
+from ceres_cal.problem.information import Key
 from ceres_cal.report import canvas
 from ceres_cal.report.canvas import DIVERGING, OUTLIER, PAINT, POINT, QUIET, Drawing, Hover
 from ceres_cal.report.document import Figure, Table

@@ -8,6 +8,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ceres_cal.base.words import DASH, at_precision, counted, fixed, metres, mm, plural, sentence, short, two_digits
+from ceres_cal.posterior.maps import FieldMap
+from ceres_cal.posterior.seam import RigPair
+from ceres_cal.posterior.uncertainty import Uncertainty
+from ceres_cal.posterior.weak import Verdict
 from ceres_cal.report.document import BulletList, Chapter, Piece, Section, Table, Text, Tile, Tiles, wrapped
 from ceres_cal.report.grounds import (
     CARE_MM,
@@ -25,8 +29,6 @@ from ceres_cal.report.grounds import (
 from ceres_cal.report.numbers import bounds, number_sections, observed, outliers, stopped, warnings
 from ceres_cal.report.quality import Quality, Seam
 from ceres_cal.scene.heights import HEIGHTS_M, at_height
-from ceres_cal.uncertainty import FieldMap, Uncertainty, Verdict
-from ceres_cal.uncertainty.rig import RigPair
 
 if TYPE_CHECKING:
     from ceres_cal.report.material import Material

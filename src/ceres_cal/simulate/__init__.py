@@ -3,10 +3,10 @@
 A scene also says how photographs of it look (`Photography`); scripts/rendering draws them.
 """
 
-from ceres_cal.model.parameters import Station
+from ceres_cal.problem.parameters import Station
 from ceres_cal.simulate.built_in import built_in_scene, scene_names
 from ceres_cal.simulate.compose import (
-    Held,
+    BoardRanges,
     board_placements,
     board_pose,
     board_scene,
@@ -25,8 +25,8 @@ __all__ = [
     "CLEAN",
     "OUTLIER",
     "WRONG_LABEL",
+    "BoardRanges",
     "Disturbance",
-    "Held",
     "Photography",
     "Scene",
     "Simulation",

@@ -7,11 +7,11 @@ from dataclasses import replace
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.transforms import Pose
-from ceres_cal.model.parameters import Station
+from ceres_cal.problem.parameters import Station
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import KannalaBrandt, Radial
 from ceres_cal.scene.targets import Target, checkerboard, custom, rings, ssl_field
-from ceres_cal.simulate.compose import Held, board_scene, field_scene, join, overhead_pose, rings_scene
+from ceres_cal.simulate.compose import BoardRanges, board_scene, field_scene, join, overhead_pose, rings_scene
 from ceres_cal.simulate.photography import Photography
 from ceres_cal.simulate.scene import Disturbance, Scene
 
@@ -92,7 +92,7 @@ def _two_cameras() -> tuple[Scene, Disturbance]:
     }
     field = field_scene(ssl_field("B"), cameras, stations, frames=4, spacing_m=0.15)
     shared = board_scene(
-        checkerboard(9, 6, 0.1), cameras, stations, count=8, seed=2, held=Held((3.0, 5.0), (20.0, 50.0))
+        checkerboard(9, 6, 0.1), cameras, stations, count=8, seed=2, held=BoardRanges((3.0, 5.0), (20.0, 50.0))
     )
     return join(field, shared), _WORKDAY
 
@@ -118,7 +118,7 @@ def _photographs() -> tuple[Scene, Disturbance]:
 def _boards() -> tuple[Scene, Disturbance]:
     cameras = {"camera": _overhead_camera()}
     stations = {"camera": Station("camera", Pose.identity())}
-    scene = board_scene(checkerboard(9, 6, 0.05), cameras, stations, count=20, seed=3, held=Held((0.5, 1.5)))
+    scene = board_scene(checkerboard(9, 6, 0.05), cameras, stations, count=20, seed=3, held=BoardRanges((0.5, 1.5)))
     return scene, Disturbance(points_sigma_px=0.2)
 
 

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from ceres_cal.base.arrays import Array, Mask
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.transforms import Pose, rotation_exp
-from ceres_cal.model.parameters import Station
+from ceres_cal.problem.parameters import Station
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.targets import Target
 from ceres_cal.simulate.scene import Scene, ViewPlan
@@ -43,7 +43,7 @@ def overhead_pose(
 
 
 @dataclass(frozen=True)
-class Held:
+class BoardRanges:
     """Ranges of how a board is held before the first camera: the distance to its middle, and the angle between its
     normal and the line of sight to that.
     """
@@ -57,7 +57,7 @@ def board_placements(
     cameras: Sequence[Camera],
     count: int,
     seed: int,
-    held: Held = Held(),
+    held: BoardRanges = BoardRanges(),
 ) -> list[Pose]:
     """world_from_target of a board at random places where every one of the posed cameras sees all of its points.
 
@@ -79,7 +79,7 @@ def board_placements(
     )
 
 
-def _random_board_pose(board: Target, camera: Camera, held: Held, rng: np.random.Generator) -> Pose:
+def _random_board_pose(board: Target, camera: Camera, held: BoardRanges, rng: np.random.Generator) -> Pose:
     """cam_from_board with the board's middle at a random pixel."""
     pixel = rng.uniform((0.0, 0.0), camera.image_size)
     direction, spin = rng.uniform(0.0, 2.0 * np.pi, size=2)
@@ -154,7 +154,7 @@ def board_scene(
     stations: Mapping[str, Station],
     count: int,
     seed: int,
-    held: Held = Held(),
+    held: BoardRanges = BoardRanges(),
 ) -> Scene:
     """A board held at `count` places, each seen whole from every station at once (see `board_placements`)."""
     posed = [cameras[station.camera].at(station.cam_from_world) for station in stations.values()]

@@ -15,7 +15,7 @@ from ceres_cal.base.arrays import Array
 from ceres_cal.base.errors import InputError, naming
 from ceres_cal.base.files import check_header, convert, make_folder, read_json, write_json
 from ceres_cal.base.transforms import Pose, euler_from_rotation, rotation_exp, rotation_from_euler, rotation_log
-from ceres_cal.model.parameters import Station
+from ceres_cal.problem.parameters import Station
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.files import CameraFile, Vector, camera_to_json
 from ceres_cal.scene.targets import targets_from_specs
@@ -35,7 +35,7 @@ class _RotationFile(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
     rotation_vector: Vector | None = None
 
 
-class _StationFile(_RotationFile, forbid_unknown_fields=True, kw_only=True):
+class _SceneStation(_RotationFile, forbid_unknown_fields=True, kw_only=True):
     camera: str
     position_m: Vector
 
@@ -111,7 +111,7 @@ def _rotation(file: _RotationFile, here: str) -> Array:
 
 
 def _station(entry: Any, here: str) -> Station:
-    file = convert(entry, _StationFile, here)
+    file = convert(entry, _SceneStation, here)
     return Station(file.camera, Pose.looking(file.position_m, _rotation(file, here)))
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.transforms import Pose
-from ceres_cal.model.parameters import Station
+from ceres_cal.problem.parameters import Station
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.targets import SIDES, Target
 from ceres_cal.simulate.photography import Photography

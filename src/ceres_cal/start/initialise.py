@@ -15,11 +15,11 @@ from ceres_cal.base.arrays import Array, Indices, distinct
 from ceres_cal.base.errors import DegenerateError
 from ceres_cal.base.numerical import numerical
 from ceres_cal.base.transforms import Pose, Poses, chained, inverted
-from ceres_cal.model.parameters import Estimate, Options, Station, anchored_stations, unit_px
-from ceres_cal.model.ranges import PHI_RANGE
-from ceres_cal.model.structure import make_structure
 from ceres_cal.observations import Observations, Prior
 from ceres_cal.observations.sights import Sights
+from ceres_cal.problem.parameters import Estimate, Options, Station, anchored_stations, unit_px
+from ceres_cal.problem.ranges import PHI_RANGE
+from ceres_cal.problem.structure import make_structure
 from ceres_cal.scene.camera import Camera
 from ceres_cal.scene.lens import Lens
 from ceres_cal.start.closed_forms import orthogonality_error, poses_from_homographies

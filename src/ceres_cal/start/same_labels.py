@@ -15,9 +15,9 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, median
 from ceres_cal.base.transforms import Pose, rotation_exp
-from ceres_cal.model.parameters import Options
 from ceres_cal.observations import Observations, View
 from ceres_cal.observations.sights import SightKey, gather_sights
+from ceres_cal.problem.parameters import Options
 from ceres_cal.scene.targets import Target
 from ceres_cal.start.initialise import posed_sights
 

@@ -13,7 +13,7 @@ from ceres_cal.base.arrays import Array
 from ceres_cal.base.cached import cached_property
 from ceres_cal.base.errors import InputError
 from ceres_cal.scene.lens.base import Lens, LinearEquations, ahead, unit_rays
-from ceres_cal.scene.lens.polynomials import Ratio, dense_polynomial, horner, invert_increasing
+from ceres_cal.scene.lens.planar import Ratio, dense_polynomial, horner, invert_increasing
 
 _MOST_POWER = 30  # 100,000 px to this power has a square that a computer holds
 

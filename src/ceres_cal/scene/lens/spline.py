@@ -13,10 +13,22 @@ import numpy as np
 from ceres_cal.base.arrays import AnyArray, Array, Mask
 from ceres_cal.base.cached import cached_property
 from ceres_cal.base.errors import InputError
-from ceres_cal.scene.lens.b_splines import COUNT, Growth, bending, first_falls, pieces, profile_columns
 from ceres_cal.scene.lens.base import Lens, LinearEquations, Roughness
 from ceres_cal.scene.lens.planar import Planar
-from ceres_cal.scene.lens.surface import COLUMNS, EXTENTS, NODES, ROWS, Surface, roughness
+from ceres_cal.scene.lens.surface import (
+    COLUMNS,
+    COUNT,
+    EXTENTS,
+    NODES,
+    ROWS,
+    Growth,
+    Surface,
+    bending,
+    first_falls,
+    pieces,
+    profile_columns,
+    roughness,
+)
 
 _CONRADY = 3  # terms of the decentring
 _MOST = 9  # powers across the radius

@@ -29,11 +29,11 @@ def april_grid(columns: int, rows: int, tag_m: float, gap: float) -> Target:
         raise InputError(f"april-grid: tag_m and gap must be positive numbers, not {tag_m} and {gap}")
     x, y = ([(n // 2 * (1.0 + gap) + n % 2) * tag_m for n in range(2 * count)] for count in (columns, rows))
     points = {f"{c},{r}": (x[c], y[r], 0.0) for r in range(2 * rows) for c in range(2 * columns)}
-    given = _Spec("april-grid", int(columns), int(rows), float(tag_m), float(gap))
+    given = _AprilGridSpec("april-grid", int(columns), int(rows), float(tag_m), float(gap))
     return Target(msgspec.to_builtins(given), points, {}, movable=True, bows=True)
 
 
-class _Spec(msgspec.Struct, forbid_unknown_fields=True):
+class _AprilGridSpec(msgspec.Struct, forbid_unknown_fields=True):
     kind: str
     columns: int
     rows: int
@@ -42,7 +42,7 @@ class _Spec(msgspec.Struct, forbid_unknown_fields=True):
 
 
 def _from_spec(spec: dict[str, Any], where: str) -> Target:
-    given = convert(spec, _Spec, where)
+    given = convert(spec, _AprilGridSpec, where)
     return april_grid(given.columns, given.rows, given.tag_m, given.gap)
 
 

@@ -60,7 +60,7 @@ def _squares(grid: Grid) -> Iterator[Square]:
             yield Square((column * grid.spacing_m, row * grid.spacing_m), grid.spacing_m)
 
 
-class _Spec(msgspec.Struct, forbid_unknown_fields=True):
+class _CheckerboardSpec(msgspec.Struct, forbid_unknown_fields=True):
     kind: str
     columns: int
     rows: int
@@ -68,7 +68,7 @@ class _Spec(msgspec.Struct, forbid_unknown_fields=True):
 
 
 def _from_spec(spec: dict[str, Any], where: str) -> Target:
-    board = convert(spec, _Spec, where)
+    board = convert(spec, _CheckerboardSpec, where)
     return checkerboard(board.columns, board.rows, board.square_m)
 
 

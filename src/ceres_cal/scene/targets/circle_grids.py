@@ -34,7 +34,9 @@ def circle_grid(columns: int, rows: int, spacing_m: float, diameter_m: float, *,
     apart_m = float(spacing_m) * (np.sqrt(2.0) if asymmetric else 1.0)
     if not 0.0 < diameter_m < apart_m:
         raise InputError(f"circle-grid: diameter_m must be above 0 and below the {apart_m:.4g} m between circles")
-    given = _Spec("circle-grid", int(columns), int(rows), float(spacing_m), float(diameter_m), bool(asymmetric))
+    given = _CircleGridSpec(
+        "circle-grid", int(columns), int(rows), float(spacing_m), float(diameter_m), bool(asymmetric)
+    )
     step = 2 if asymmetric else 1
     places = {
         f"{c},{r}": ((step * c + (r % 2 if asymmetric else 0)) * spacing_m, r * spacing_m, 0.0)
@@ -52,7 +54,7 @@ def circle_grid(columns: int, rows: int, spacing_m: float, diameter_m: float, *,
     return Target(msgspec.to_builtins(given), places, {}, movable=True, bows=True, grid=grid, paper=paper)
 
 
-def _dark_circles(grid: _Spec, footprints: Footprints) -> Array:
+def _dark_circles(grid: _CircleGridSpec, footprints: Footprints) -> Array:
     """Of the two rows around a place the nearer circle decides: circles do not meet."""
     step, x, y = (2.0 if grid.asymmetric else 1.0), *(footprints.plane.T / grid.spacing_m)
     offs = []
@@ -72,7 +74,7 @@ def _discs(places: Mapping[str, tuple[float, float, float]], radius_m: float) ->
         yield Disc((x, y), radius_m)
 
 
-class _Spec(msgspec.Struct, forbid_unknown_fields=True):
+class _CircleGridSpec(msgspec.Struct, forbid_unknown_fields=True):
     kind: str
     columns: int
     rows: int
@@ -82,7 +84,7 @@ class _Spec(msgspec.Struct, forbid_unknown_fields=True):
 
 
 def _from_spec(spec: dict[str, Any], where: str) -> Target:
-    given = convert(spec, _Spec, where)
+    given = convert(spec, _CircleGridSpec, where)
     return circle_grid(given.columns, given.rows, given.spacing_m, given.diameter_m, asymmetric=given.asymmetric)
 
 

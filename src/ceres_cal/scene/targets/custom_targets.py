@@ -15,7 +15,7 @@ from ceres_cal.scene.targets.crossings import with_crossings
 from ceres_cal.scene.targets.target import Target, TargetKind, require_places
 
 
-class _Spec(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True):
+class _CustomSpec(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True):
     kind: str
     points: dict[str, tuple[float, float, float]] = {}
     segments: dict[str, Segment] = {}
@@ -44,7 +44,7 @@ def custom(
     require_places("custom target", points, curves)
     segments = {name: curve for name, curve in curves.items() if isinstance(curve, Segment)}
     arcs = {name: curve for name, curve in curves.items() if isinstance(curve, Arc)}
-    spec = msgspec.to_builtins(_Spec("custom", points, segments, arcs, movable))
+    spec = msgspec.to_builtins(_CustomSpec("custom", points, segments, arcs, movable))
     curves = {**segments, **arcs}  # in the order in which a file would give them back
     every = with_crossings(points, curves)
     return Target(spec, every, curves, movable=movable, bows=movable and not curves and _is_flat(every))
@@ -57,7 +57,7 @@ def _is_flat(points: Mapping[str, tuple[float, float, float]]) -> bool:
 
 
 def _from_spec(spec: dict[str, Any], where: str) -> Target:
-    given = convert(spec, _Spec, where)
+    given = convert(spec, _CustomSpec, where)
     if both := given.segments.keys() & given.arcs.keys():
         raise InputError(f"two curves are named {min(both)!r}")
     return custom(given.points, {**given.segments, **given.arcs}, movable=given.movable)

@@ -38,7 +38,7 @@ class Marker(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True, fro
         return [(x + dx, y + dy, z) for dx, dy in away.tolist()]
 
 
-class _Spec(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True):
+class _MarkersSpec(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True):
     kind: str
     dictionary: str
     markers: dict[str, Marker]
@@ -71,12 +71,12 @@ def markers(dictionary: str, places: Mapping[int, Marker], *, movable: bool = Fa
         for number, marker in places.items()
         for corner, place in zip(CORNERS, marker.corners_m, strict=True)
     }
-    given = _Spec("markers", dictionary, {str(number): marker for number, marker in places.items()}, movable)
+    given = _MarkersSpec("markers", dictionary, {str(number): marker for number, marker in places.items()}, movable)
     return Target(msgspec.to_builtins(given), points, {}, movable=movable, bows=movable)
 
 
 def _from_spec(spec: dict[str, Any], where: str) -> Target:
-    given = convert(spec, _Spec, where)
+    given = convert(spec, _MarkersSpec, where)
     if wrong := [name for name in given.markers if not (name.isascii() and name.isdigit())]:
         raise InputError(f"a marker is named by its number, not {wrong[0]!r}")
     places = {int(name): marker for name, marker in given.markers.items()}

@@ -40,7 +40,7 @@ class _Variants(msgspec.Struct, forbid_unknown_fields=True):
     names: dict[str, str]
 
 
-class _Segment(msgspec.Struct, forbid_unknown_fields=True, rename={"start": "from", "end": "to"}):
+class _SegmentSpec(msgspec.Struct, forbid_unknown_fields=True, rename={"start": "from", "end": "to"}):
     start: tuple[Expression, Expression]
     end: tuple[Expression, Expression]
     width_m: Expression = "line_thickness_m"
@@ -51,7 +51,7 @@ class _Segment(msgspec.Struct, forbid_unknown_fields=True, rename={"start": "fro
         return Segment(start, end, _value(self.width_m, names))
 
 
-class _Arc(msgspec.Struct, forbid_unknown_fields=True):
+class _ArcSpec(msgspec.Struct, forbid_unknown_fields=True):
     centre: tuple[Expression, Expression]
     radius_m: Expression
     from_rad: Expression = 0.0
@@ -90,12 +90,12 @@ class Template(msgspec.Struct, forbid_unknown_fields=True):
     source: tuple[str, ...]
     measured: str
     dimensions: dict[str, float | dict[str, float]]
-    segments: dict[str, _Segment]
+    segments: dict[str, _SegmentSpec]
     variants: _Variants | None = None
     parts: dict[str, bool | dict[str, bool]] = {}
     optional: tuple[str, ...] = ()
     lengths: dict[str, Expression] = {}
-    arcs: dict[str, _Arc] = {}
+    arcs: dict[str, _ArcSpec] = {}
     points: dict[str, _Point] = {}
 
     @property

@@ -50,7 +50,7 @@ def _shapes(radii: Sequence[float], border: float) -> Iterator[Square | Disc]:
         yield Disc((0.0, 0.0), radii[number], is_dark=number % 2 == 0)
 
 
-class _Spec(msgspec.Struct, forbid_unknown_fields=True):
+class _RingSheetSpec(msgspec.Struct, forbid_unknown_fields=True):
     kind: str
     radii_m: list[float]
 
@@ -61,5 +61,5 @@ KIND = TargetKind(
     "radii_m, from the inside out",
     'curves "ring_1", "ring_2", ... from the inside out, point "centre"',
     lambda: {"rings": rings((0.05, 0.1, 0.15))},
-    lambda spec, where: rings(convert(spec, _Spec, where).radii_m),
+    lambda spec, where: rings(convert(spec, _RingSheetSpec, where).radii_m),
 )

@@ -40,12 +40,12 @@ def tape_grid(columns: int, rows: int, pitch_m: float, line_thickness_m: float) 
     for r in range(rows):
         curves[f"row_{r}"] = Segment((0.0, r * pitch_m, 0.0), (x, r * pitch_m, 0.0), line_thickness_m)
     points = {f"{c},{r}": (c * pitch_m, r * pitch_m, 0.0) for r in range(rows) for c in range(columns)}
-    given = _Spec("tape-grid", int(columns), int(rows), float(pitch_m), float(line_thickness_m))
+    given = _TapeGridSpec("tape-grid", int(columns), int(rows), float(pitch_m), float(line_thickness_m))
     sizes = {"pitch_m": float(pitch_m), "line_thickness_m": float(line_thickness_m)}
     return Target(msgspec.to_builtins(given), points, curves, dimensions=sizes)
 
 
-class _Spec(msgspec.Struct, forbid_unknown_fields=True):
+class _TapeGridSpec(msgspec.Struct, forbid_unknown_fields=True):
     kind: str
     columns: int
     rows: int
@@ -54,7 +54,7 @@ class _Spec(msgspec.Struct, forbid_unknown_fields=True):
 
 
 def _from_spec(spec: dict[str, Any], where: str) -> Target:
-    given = convert(spec, _Spec, where)
+    given = convert(spec, _TapeGridSpec, where)
     return tape_grid(given.columns, given.rows, given.pitch_m, given.line_thickness_m)
 
 

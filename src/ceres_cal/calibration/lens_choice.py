@@ -1,0 +1,263 @@
+"""Which lens the data ask for: the simplest of those that predict placements, or lines, as well as any other does.
+
+Some of the observations are solved once, robustly, and from there with the longest lens of each kind. Shorter ones are
+these with coefficients held at 0: what a solve without a group of equations would leave of it follows for every lens
+from the normal equations of each group (`effects/left_out.py`). Errors that go together within a group make a longer
+lens predict the others no better: a criterion that counts observations would take them for a lens.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import TypeVar
+
+import numpy as np
+
+from ceres_cal.base.arrays import Mask
+from ceres_cal.base.cached import cached_property
+from ceres_cal.base.errors import CalibrationError, DegenerateError
+from ceres_cal.base.transforms import Poses
+from ceres_cal.calibration import LensChoice, TriedLens
+from ceres_cal.calibration.lens_comparison import compared_kinds, explained_by_another, last_resort
+from ceres_cal.calibration.lens_forms import (
+    AS_GOOD,
+    AS_GOOD_BESIDE_LENGTHS,
+    PAPER,
+    decide,
+    papers,
+    pseudo_bma,
+    standard_errors,
+)
+from ceres_cal.calibration.lens_kinds import Candidate, Kind
+from ceres_cal.calibration.lens_seen import FewGroupsError, InlierRows
+from ceres_cal.observations import Observations
+from ceres_cal.posterior.other_lenses import OtherLenses
+from ceres_cal.problem.parameters import Estimate, Options
+from ceres_cal.start.initialise import Start
+
+_T = TypeVar("_T")
+_BROKEN = "solved for, it leaves more than the equations of a longer lens had it"
+_EXPLAINED = "takes out observations that another lens explains"
+_LEAST_PROBABILITY = 0.02  # of another lens that counts: all that have less make no difference
+_LEAST_SHARE = 0.25  # of the observations: where fewer took part, what other lenses say by chance makes no difference
+
+
+@dataclass(frozen=True, eq=False)
+class Chosen:
+    """The lens that was chosen: options with it, where to start from, and what it was compared with.
+
+    Attributes:
+        among: the lenses it was chosen from; None where nothing could be compared.
+    """
+
+    options: Options
+    start: Start
+    choice: LensChoice
+    among: Comparison | None = None
+
+    def first_solved(self, solved: Callable[[Chosen], _T], options: Options, start: Start) -> tuple[_T, Chosen]:
+        """What is solved with it, or where all of the observations make no calibration with it, with the best lens of
+        another kind, or with the paper's at last; and with which.
+
+        Args:
+            options: with the paper's lens. start: of everything.
+
+        Raises:
+            CalibrationError: none makes one.
+        """
+        try:
+            return solved(self), self
+        except CalibrationError as error:  # reads: "..." beside that lens, why it failed
+            if self.among is None:
+                raise
+            other = self.among.without_kind(str(error)) or self._papers(str(error), options, start)
+        return other.first_solved(solved, options, start)
+
+    def _papers(self, failure: str, options: Options, start: Start) -> Chosen:
+        """The paper's lens in its place, from the start of everything."""
+        failed = [replace(one, failed=failure) if one.label == self.choice.chosen else one for one in self.choice.tried]
+        tried = sorted(failed, key=lambda one: one.label != PAPER)
+        return Chosen(options, start, replace(self.choice, chosen=PAPER, tried=tuple(tried)))
+
+    @property
+    def others(self) -> OtherLenses | None:
+        """What other lenses would say, as far as they are probable; None where nothing was compared."""
+        return None if self.among is None else self.among.others
+
+    def instead(self, points: Mask, curves: Mask) -> Chosen | None:
+        """The lens in its place, where others explain what it takes out of the observations; None where none does.
+
+        Args:
+            points, curves: (N,), (M,) which ones that is.
+        """
+        return None if self.among is None else self.among.instead(points, curves)
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """The lenses that were compared, and the one that was chosen.
+
+    Attributes:
+        seen: the observations that took part, and `share` of all. as_good: how many standard errors worse is as good.
+        start: of everything. there: where the chosen one is at its best.
+        passed: the one that was chosen first, where all of the observations make no calibration with it.
+    """
+
+    seen: InlierRows
+    share: float
+    as_good: float
+    start: Start
+    tried: tuple[Candidate, ...]
+    best: Candidate
+    chosen: Candidate
+    there: Estimate
+    passed: Candidate | None = None
+
+    @cached_property
+    def probabilities(self) -> tuple[float, ...]:
+        """That each lens that was tried is the one that predicts best; 0 where it gives no answer."""
+        known = {i: one.squares for i, one in enumerate(self.tried) if one.squares is not None}
+        likely = dict(zip(known, pseudo_bma(list(known.values())).tolist(), strict=True))
+        return tuple(likely.get(i, 0.0) for i in range(len(self.tried)))
+
+    @property
+    def worse_than_passed(self) -> float:
+        """By how many standard errors it predicts worse than the one that was passed over; 0 where that is as good."""
+        if self.passed is None or self.passed.squares is None or self.chosen.squares is None:
+            return 0.0
+        worse = standard_errors(self.chosen.squares, self.passed.squares)
+        return worse if worse > self.as_good else 0.0
+
+    @cached_property
+    def others(self) -> OtherLenses:
+        """What other lenses would say; nothing beside one without a formula, or of many more observations."""
+        found = OtherLenses(self.there, (), (), self.chosen.of.reach_px)
+        if self.chosen.form.blank.roughness or self.share < _LEAST_SHARE:
+            return found
+        try:
+            found = replace(found, near=self.seen.solved_near(self.chosen))
+        except CalibrationError as error:  # reads: "other lenses could not be compared, so the standard deviations ..."
+            return replace(found, failed=str(error))
+        for one, likely in zip(self.tried, self.probabilities, strict=True):
+            if one is self.chosen or likely < _LEAST_PROBABILITY or one.form.blank.roughness or one.fault:
+                continue
+            with suppress(CalibrationError):  # quiet: a lens that cannot be solved for says nothing of the numbers
+                others, weights = (*found.others, self.seen.solved_near(one)), (*found.weights, likely)
+                found = replace(found, others=others, weights=weights)
+        # What they say by chance is less by as much as there are more observations than took part.
+        return replace(found, weights=tuple(self.share * one for one in found.weights))
+
+    @property
+    def outcome(self) -> Chosen:
+        """The options with the lens that was chosen, and where to start from."""
+        there, form, start = self.there, self.chosen.form, self.start
+        placements = Poses.of(start.estimate.placements)
+        placements = placements.updated(list(there.placements), Poses.of(there.placements).stack)
+        near = replace(start, estimate=replace(there, placements=placements), is_near=not form.blank.roughness)
+        return Chosen(form.of(self.seen.options), near, _choice(self), self)
+
+    def instead(self, points: Mask, curves: Mask) -> Chosen | None:
+        """See `Chosen.instead`; of very many observations some were compared, and the rest is not looked at. What
+        predicts clearly better, a lens without a formula, stays.
+        """
+        if self.share < 1.0 or self.chosen.form.blank.roughness:
+            return None
+        if not explained_by_another(self.seen, self.tried, self.chosen, points, curves):
+            return None
+        found = self._excluding(lambda one: one is self.chosen, _EXPLAINED)
+        return None if found is None else found.outcome
+
+    def without_kind(self, failure: str) -> Chosen | None:
+        """The best of the other kinds, how much worse it predicts said with it; None where none gives an answer."""
+        found = self._excluding(lambda one: one.of is self.chosen.of, failure)
+        return None if found is None else replace(found, passed=self.passed or self.chosen).outcome
+
+    def _excluding(self, is_out: Callable[[Candidate], bool], why: str) -> Comparison | None:
+        """Without some lenses, of which it is said why; None where no other one gives an answer."""
+        known = {one.form.label for one in self.tried}
+        every = [*self.tried, *(one for one in _shorter(self.tried, None) if one.form.label not in known)]
+        others = [replace(one, squares=None, failed=one.failed or why) if is_out(one) else one for one in every]
+        try:
+            return _compared(self.seen, self.share, self.as_good, self.start, others)
+        except CalibrationError:  # quiet: the lens stays, or its own failure is told
+            return None
+
+
+def choose_lens(observations: Observations, options: Options, start: Start) -> Chosen:
+    """The lens that the data ask for, one for all cameras; the paper's where there is too little to tell by.
+
+    Args:
+        options: their lens is not looked at. start: of everything, with whatever lens.
+    """
+    as_good = AS_GOOD_BESIDE_LENGTHS if options.dimensions else AS_GOOD
+    try:
+        seen, kinds, share = compared_kinds(observations, options, start.estimate)
+        return _among(seen, share, as_good, start, kinds).outcome
+    except CalibrationError as error:  # reads: "..." beside the paper's lens, why no other was compared
+        failed = "" if isinstance(error, FewGroupsError) else str(error)
+        return Chosen(papers(options), start, LensChoice(PAPER, (TriedLens(PAPER, 2, failed=failed),), 0, 0.0))
+
+
+def _shorter(tried: Sequence[Candidate], best: Candidate | None) -> list[Candidate]:
+    """The lenses of each kind that were not tried, where they may be as good as the best."""
+    return [one for longest in tried if longest.may_win(best) for one in longest.of.candidates(first=False)]
+
+
+def _among(seen: InlierRows, share: float, as_good: float, start: Start, kinds: Sequence[Kind]) -> Comparison:
+    """The paper's lens, where it gives an answer, and the longest of each kind come first: only where it is not as good
+    as the best of them are the shorter ones looked at.
+    """
+    tried = [one for kind in kinds for one in kind.candidates(first=True)]
+    found: Comparison | None = None
+    if any(one.form.label == PAPER and one.squares is not None for one in tried):
+        with suppress(DegenerateError):  # quiet: all of these fold; the shorter ones that follow need not
+            found = _compared(seen, share, as_good, start, tried)
+    if found is None:
+        found = _compared(seen, share, as_good, start, [*tried, *_shorter(tried, None)])
+    elif found.chosen.form.label != PAPER:
+        found = _compared(seen, share, as_good, start, [*found.tried, *_shorter(found.tried, found.best)])
+    more = tuple(last_resort(seen, found.chosen))
+    found = replace(found, tried=(*found.tried, *more))
+    clearly = next((one for one in more if one.clearly_beats(found.chosen)), None)
+    return found if clearly is None else replace(found, chosen=clearly, there=clearly.estimate)
+
+
+def _compared(seen: InlierRows, share: float, as_good: float, start: Start, tried: Sequence[Candidate]) -> Comparison:
+    """Some lenses: one that folds where it must not gives no answer, nor does one that leaves more than was promised.
+
+    Raises:
+        DegenerateError: none gives one.
+    """
+    labels, sizes = [one.form.label for one in tried], [one.form.size for one in tried]
+    while True:
+        is_refuted = partial(_is_refuted, tried)
+        best, chosen = decide(labels, sizes, [one.squares for one in tried], as_good, is_refuted)
+        faults = {number: fault for number in (best, chosen) if (fault := tried[number].fault)}
+        there = None if faults else seen.reached(tried[chosen])
+        if there is not None:
+            return Comparison(seen, share, as_good, start, tuple(tried), tried[best], tried[chosen], there)
+        faults = faults or {chosen: _BROKEN}
+        tried = [replace(one, squares=None, failed=faults[n]) if n in faults else one for n, one in enumerate(tried)]
+
+
+def _is_refuted(tried: Sequence[Candidate], number: int) -> bool:
+    return any(other.refutes(tried[number]) for other in tried)
+
+
+def _choice(among: Comparison) -> LensChoice:
+    chosen = among.chosen
+
+    def as_told(one: Candidate) -> TriedLens:
+        label, count = one.form.label, len(one.form.names)
+        if one.squares is None or chosen.squares is None:
+            return TriedLens(label, count, failed=one.failed)
+        likely = among.probabilities[among.tried.index(one)]
+        worse = among.worse_than_passed if one is chosen else standard_errors(one.squares, chosen.squares)
+        return TriedLens(label, count, one.rms_px, worse, probability=likely)
+
+    order = sorted(among.tried, key=lambda one: (one is not chosen, one.rms_px if one.squares is not None else np.inf))
+    groups = 0 if chosen.squares is None else len(chosen.squares)
+    return LensChoice(chosen.form.label, tuple(map(as_told, order)), groups, among.share)

@@ -1,0 +1,176 @@
+"""Whether the chosen lens takes out observations that another one explains: then these tell the lens, too.
+
+Where lenses predict alike, a few corners at the rim may be all that tells them apart, and the lens that is wrong there
+calls them outliers. By the odds of a mixture of good and bad observations (Aitkin and Wilson, Technometrics 22, 1980)
+what is taken out has its price, and so has every coefficient (Schwarz, Annals of Statistics 6, 1978).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import replace
+
+import numpy as np
+
+from ceres_cal.base.arrays import Mask
+from ceres_cal.base.errors import CalibrationError, DegenerateError
+from ceres_cal.base.transforms import Poses
+from ceres_cal.calibration.lens_forms import Form, kinds, without_formula
+from ceres_cal.calibration.lens_kinds import Candidate, Kind
+from ceres_cal.calibration.lens_seen import (
+    MOST_ROUNDS,
+    InlierRows,
+    problem_of,
+    profiles_of,
+    require_groups,
+    seen_through,
+)
+from ceres_cal.observations import Observations
+from ceres_cal.observations.sights import Sights, gather_sights
+from ceres_cal.observations.thinning import thinned
+from ceres_cal.posterior.roughness import cells_of
+from ceres_cal.problem.parameters import Estimate, Options
+from ceres_cal.robust.robust import RobustSolution, solve_robustly
+from ceres_cal.start.initialise import initialise
+
+# Sigmas up to which an observation is explained: between it and what is taken out lies what any lens may leave.
+_EXPLAINED = 3.0
+# Twice the log-odds of an observation that is taken out: one of a hundred is bad, somewhere within twenty sigmas.
+_PRICE = 13.0
+
+
+def explained_by_another(
+    seen: InlierRows, tried: Sequence[Candidate], chosen: Candidate, points: Mask, curves: Mask
+) -> bool:
+    """Whether another lens explains so much of what the chosen one takes out that it is the likelier one.
+
+    Args:
+        points, curves: (N,), (M,) what the chosen one takes out of all observations.
+    """
+    sights = seen.sights
+    out = points[sights.point_rows], curves[sights.curve_rows]
+    if not (out[0].any() or out[1].any()):
+        return False
+    price = float(np.log(sights.equations))
+    for other in tried:
+        if other is chosen or other.squares is None:
+            continue
+        with suppress(CalibrationError):  # quiet: a lens that cannot be solved for explains nothing
+            explained = _explained(seen, seen.solved_near(other), out)
+            if _PRICE * explained > price * max(other.form.size - chosen.form.size, 0):
+                return True
+    return False
+
+
+def _explained(seen: InlierRows, there: Estimate, out: tuple[Mask, Mask]) -> int:
+    """How many equations of what is taken out are explained there, less those that would be taken out instead."""
+    farthest = seen.options.reject_sigma
+    points, curves = seen.in_sigmas(there)
+    count = 0
+    for off, own, equations in ((np.linalg.norm(points, axis=1), out[0], 2), (np.abs(curves), out[1], 1)):
+        count += equations * int(np.count_nonzero(own & (off < _EXPLAINED)))
+        count -= equations * int(np.count_nonzero(~own & (off > farthest)))
+    return count
+
+
+_LEAST_ROWS, _SHARE, _FEWEST_FRAMES = 1_000, 0.025, 24  # of the observations, how many take part
+# What shows any direction and comes near to any lens but for its decentring: the first solve is with it.
+_WIDEST = "kannala-brandt"
+# Share of its squares: a kind that leaves less is solved instead, for it may have other inliers.
+_QUIETER = 0.7
+_SOUND_PX = 1.0  # noise beyond which a first solve may have ended in a wrong valley: others are tried from nothing
+
+
+def compared_kinds(
+    observations: Observations, options: Options, start: Estimate
+) -> tuple[InlierRows, list[Kind], float]:
+    """The observations that take part, each kind near its best over them, at the noise of the one that explains the
+    most, and their share of all.
+
+    Raises:
+        CalibrationError: too little to tell lenses apart, or no calibration.
+    """
+    every = sorted(kinds(), key=lambda forms: forms[0].lens != _WIDEST)
+    total = len(observations.points) + len(observations.curves)
+    few = thinned(observations, max(_LEAST_ROWS, int(_SHARE * total)), _FEWEST_FRAMES)
+    sights = gather_sights(few)
+    require_groups(sights)
+    names = list(dict.fromkeys(key.placement for key in sights.keys if key.placement is not None))
+    start = replace(start, placements=Poses.stacked(names, Poses.of(start.placements).of_names(names)))
+    tried = every
+    while True:
+        end, used = _solved(few, options, sights, start, tried)
+        seen = InlierRows(few, end, options)
+        compared = [seen.kind(forms, is_solved=forms is used) for forms in every]
+        best = min(compared, key=lambda one: one.least)
+        least = next(one.least for one in compared if one.forms is used)
+        if len(tried) == 1 or best.least > _QUIETER * least:
+            return seen, compared, (len(few.points) + len(few.curves)) / total
+        tried = [best.forms]
+
+
+_Found = tuple[RobustSolution, tuple[Form, ...]]
+
+
+def _solved(
+    observations: Observations, options: Options, sights: Sights, start: Estimate, kinds: Sequence[tuple[Form, ...]]
+) -> _Found:
+    """The robust solve with the first of these kinds that explains the observations, or with the one that does it best,
+    up to where the noise is known well enough.
+    """
+    failure: CalibrationError | None = None
+    found: list[_Found] = []
+    for forms, from_nothing in [(kinds[0], False), *((forms, True) for forms in kinds)]:
+        own = forms[0].of(options)
+        try:
+            near = initialise(observations, sights, own).estimate if from_nothing else start
+            near = seen_through(near, own, profiles_of(near, sights))
+            problem = problem_of(observations, sights, own, near)
+            most_rounds = MOST_ROUNDS if from_nothing else 1
+            end = solve_robustly(problem, observations, near, most_rounds=most_rounds)
+        except CalibrationError as error:  # quiet: the next lens is tried, and the failure raised where none is left
+            failure = error
+            continue
+        if _noise_px(end) < _SOUND_PX:
+            return end, forms
+        found.append((end, forms))
+    if not found:
+        raise failure or DegenerateError("there is no lens")
+    return min(found, key=lambda one: _noise_px(one[0]))
+
+
+def _noise_px(end: RobustSolution) -> float:
+    """Of a typical observation."""
+    sights, inliers = end.problem.sights, end.inliers
+    sigmas = inliers.point_scale * sights.sigma_px, inliers.curve_scale * sights.curve_sigma_px
+    return float(np.exp(np.mean(np.log(np.concatenate(sigmas)))))
+
+
+# Between cells over within them, from which on residuals go together: in white noise it is 1.0 by 0.17. From half to
+# double it decides which observations are asked, seldom what is chosen.
+_TOGETHER = 1.5
+
+
+def last_resort(seen: InlierRows, chosen: Candidate) -> Iterator[Candidate]:
+    """The lenses without a formula, where even the longest lens of the chosen kind leaves what goes together.
+
+    Not of so few placements that their features are held out one by one: what goes together within each would be
+    predicted, too. Nor of one view of a floor: a line that is painted aside bends there as by a lens.
+    """
+    if len(seen.sights) > 1 and not seen.splits_placements and _between_cells(seen, chosen.of) > _TOGETHER:
+        for forms in without_formula():
+            yield from seen.solved(forms, chosen.of.estimate).candidates(first=True)
+
+
+def _between_cells(seen: InlierRows, kind: Kind) -> float:
+    """Mean square of residuals between cells over that within them; the x and y of points and each curve apart."""
+    points, curves = seen.in_sigmas(kind.estimate)
+    left = np.concatenate([points[:, 0], points[:, 1], curves])
+    cell = cells_of(seen.sights, seen.observations.cameras)
+    counts = np.bincount(cell)
+    seen_in = counts > 0
+    counts = counts[seen_in]
+    between = np.bincount(cell, left)[seen_in] ** 2 / counts
+    within = float(left @ left - between.sum()) / max(len(left) - len(counts), 1)
+    return float(between.mean()) / within

@@ -1,0 +1,221 @@
+"""Whether the lines that were followed are where the target says: which lie aside, and which dimensions are others.
+
+One linear model of the camera and of all that may be painted otherwise: every curve's offset, and the target's own
+dimensions, which move several curves at once. The camera is projected out, and what is left decides by evidence
+(marginal likelihood) between curves that belong, scattering by as much as paint does, single curves that lie aside, and
+dimensions that are others: a spike and slab prior (Mitchell and Beauchamp, JASA 83, 1988), its sets searched by beam.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ceres_cal.base.arrays import Array, Indices
+from ceres_cal.base.errors import SolutionError
+from ceres_cal.detect.lines import Lines
+from ceres_cal.detect.photographs.refit import observations_of, problem_of
+from ceres_cal.effects.evidence import RandomEffects
+from ceres_cal.effects.linearised import Weights, make_linear_model
+from ceres_cal.observations import Prior
+from ceres_cal.problem.equations import whole_structure, write_equations
+from ceres_cal.problem.parameters import intrinsic_names
+from ceres_cal.problem.residuals import residuals
+from ceres_cal.problem.structure import dimension_slopes, dimensions_of
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.targets import Target
+
+_SCATTER_M = np.array([0.0005, 0.001, 0.002, 0.004, 0.008])  # of paint about its drawing
+ASIDE_M, _OTHER = 0.04, 0.1  # of a curve that lies aside; of a dimension that is another one, as a share of it
+_LOG_ODDS = np.log(0.1 / 0.9)  # that a curve lies aside, or a dimension is another one
+_BEAM, _MOST = 24, 9
+# Of a dimension, another field; what a tape measure, a strange lens and a floor that is not flat make of one is less.
+_OTHER_FIELD = 0.02
+_SURELY = 10.0  # standard deviations of it, which take lines to be taped independently of each other
+_DETERMINED = 1e-12  # of what the curves' numbers are known to in all: below is rounding
+_FARTHEST_M = 0.12  # of all curves that lie aside, root sum of squares: farther, they are others
+# Of what neither offsets nor dimensions explain, mean square over what is stated: below 0.5 of other lenses, motion,
+# wear and sun, 2 of tape that wanders by pixels, 8 to 29 of fields of other widths whose lines bend the camera.
+_MOST_MISFIT = 6.0
+_LEAST_SIGMA_PX = 0.05  # of places on a curve: what a model of its shape is good for
+_TOGETHER = 4.0  # neighbouring places whose errors go together, at least
+_APART, _ALIKE = 40, 0.1  # places up to which, and correlation down to which, errors are seen to go together
+
+
+@dataclass(frozen=True, eq=False)
+class FieldAsBuilt:
+    """What explains best how curves lie.
+
+    Attributes:
+        aside_m: name of a curve -> by how much it lies beside its drawing, m, where it does.
+        dimensions: name of a dimension -> its most likely value, m, where it is another one than the target's.
+        sd_m: name of each of those -> its standard deviation, m.
+        drawn: name of a dimension -> its value by the target, m. curves: how many there are to tell.
+        misfit: mean square, over what is stated, of what none of that explains; infinite where the camera shows none.
+    """
+
+    aside_m: Mapping[str, float]
+    dimensions: Mapping[str, float]
+    sd_m: Mapping[str, float]
+    drawn: Mapping[str, float]
+    curves: int
+    misfit: float = 0.0
+
+    @property
+    def is_other(self) -> bool:
+        """Whether this is another field: a dimension too far off for a tape measure, lines all over the place, or bent
+        as by no lens.
+        """
+        changes = [
+            abs(length / self.drawn[name] - 1.0)
+            for name, length in self.dimensions.items()
+            if abs(length - self.drawn[name]) > _SURELY * self.sd_m[name]
+        ]
+        far = float(np.linalg.norm(list(self.aside_m.values())))
+        elsewhere = far > _FARTHEST_M or 2 * len(self.aside_m) > self.curves
+        return elsewhere or max(changes, default=0.0) > _OTHER_FIELD or self.misfit > _MOST_MISFIT
+
+    def words(self) -> tuple[str, ...]:
+        """A sentence on each dimension and each curve that is not as drawn."""
+        dimensions = [
+            f"{_spoken(name)} is {_change(length / self.drawn[name])} than the target says, "
+            f"{length:.3f} ± {self.sd_m[name]:.3f} m instead of {self.drawn[name]:g}: other dimensions?"
+            for name, length in self.dimensions.items()
+        ]
+        curves = [
+            f"{name} lies {1e3 * abs(aside):.0f} ± {1e3 * self.sd_m[name]:.0f} mm beside its drawing"
+            for name, aside in self.aside_m.items()
+        ]
+        bent = f"its lines are bent as by no lens, {self.misfit**0.5:.1f} times what is stated"
+        return (*dimensions, *curves, *([bent] if self.misfit > _MOST_MISFIT else []))
+
+
+AS_DRAWN = FieldAsBuilt({}, {}, {}, {}, 0)
+"""Nothing is known of how a target is painted."""
+
+
+def _spoken(name: str) -> str:
+    """center_circle_radius_m -> the center circle radius"""
+    return f"the {name.removesuffix('_m').replace('_', ' ')}"
+
+
+def _change(factor: float) -> str:
+    return f"{100.0 * abs(factor - 1.0):.1f} % {'larger' if factor > 1.0 else 'smaller'}"
+
+
+def as_built(lines: Lines, camera: Camera, target: Target, priors: tuple[Prior, ...]) -> FieldAsBuilt:
+    """What the lines that were found say of how the target is painted: as drawn where they do not say it.
+
+    All of the camera but its aspect may follow.
+
+    Args:
+        priors: on its intrinsics.
+    """
+    rows = lines.found
+    sigma = np.sqrt(_TOGETHER) * np.maximum(lines.sigma_px[rows], _LEAST_SIGMA_PX)
+    seen = observations_of(target, camera.image_size, lines.course.curve[rows], lines.pixels[rows], sigma)
+    free = tuple(name for name in intrinsic_names(camera.lens) if name != "aspect")
+    problem, estimate = problem_of(camera, seen, free, priors)
+    try:
+        equations = write_equations(seen, problem.sights, estimate, residuals(seen, problem.sights, estimate))
+    except SolutionError:  # reads: "..." of `AsBuilt.words`: this is another field
+        return replace(AS_DRAWN, misfit=np.inf)
+    every = np.ones(len(equations), dtype=bool)
+    weights = Weights(1.0 / sigma[equations.observation], every, np.ones(len(equations)))
+    model = make_linear_model(problem, estimate, equations, weights)
+    structure = whole_structure(seen.targets)
+    columns = equations.structure_columns(structure)
+    there = np.flatnonzero(np.any(columns != 0.0, axis=0))
+    normal, slope = model.left_of(columns[:, there])
+    bent = model.with_columns(columns[:, there])  # lines that no offset straightens: wavy tape, another lens
+    misfit = float(bent.left_over @ bent.left_over) / max(bent.spare, 1)
+    noise = max(1.0, misfit) * max(1.0, _places_together(bent.left_over, equations.feature) / _TOGETHER)
+    names = tuple(dimensions_of(seen.targets))
+    drawn_m, moves = dimension_slopes(structure.names, seen.targets, names)
+    owner = np.array([_curve_of(structure.names[row]) for row in there])
+    effects = RandomEffects.of(normal / noise, slope / noise, _DETERMINED * float(np.trace(normal)) / noise)
+    shape = _CurveNumbers(effects, owner, moves[there], names, drawn_m)
+    return replace(shape.explained(), misfit=misfit)
+
+
+def _places_together(residuals: Array, curve: Indices) -> float:
+    """How many neighbouring places count as one: their correlation, summed until it has fallen to nothing."""
+    products, pairs = np.zeros(_APART), np.zeros(_APART)
+    for number in np.unique(curve):
+        own = residuals[curve == number]
+        for apart in range(min(_APART, len(own))):
+            products[apart] += float(own[: len(own) - apart] @ own[apart:])
+            pairs[apart] += len(own) - apart
+    correlation = products / np.maximum(pairs, 1.0) * pairs[0] / max(products[0], 1e-300)
+    ends = int(np.argmax(np.append(correlation, 0.0) < _ALIKE))
+    return float(1.0 + 2.0 * np.sum(correlation[1:ends]))
+
+
+def _curve_of(name: str) -> str:
+    """field/CenterCircle.x -> CenterCircle"""
+    return name.partition("/")[2].partition(".")[0]
+
+
+@dataclass(frozen=True, eq=False)
+class _CurveNumbers:
+    """What is left of the curves' Q numbers once the camera followed, and what moves them.
+
+    Attributes:
+        effects: these numbers as random effects. owner: (Q,) names of curves. moves: (Q, D) of the dimensions, whose
+            values (D,) are `lengths`.
+    """
+
+    effects: RandomEffects
+    owner: Array
+    moves: Array
+    names: tuple[str, ...]
+    lengths: Array
+
+    def explained(self) -> FieldAsBuilt:
+        """The set of curves and dimensions of most evidence."""
+        curves = list(dict.fromkeys(self.owner.tolist()))
+        moving = [int(d) for d in np.flatnonzero(np.any(self.moves != 0.0, axis=0))]
+        roots = [ASIDE_M * np.eye(len(self.owner))[:, self.owner == name] for name in curves]
+        roots += [_OTHER * self.lengths[d] * self.moves[:, d : d + 1] for d in moving]
+        chosen, scatter_m = self._searched(roots)
+        together = np.hstack([np.empty((len(self.owner), 0)), *(roots[n] for n in chosen)])
+        mean, sd = self.effects.amounts(together, scatter_m)
+        aside, dimensions, sds, at = {}, {}, {}, 0
+        for number in chosen:
+            size = roots[number].shape[1]
+            values, own = mean[at : at + size], sd[at : at + size]
+            at += size
+            worst = int(np.argmax(np.abs(values)))
+            if number < len(curves):
+                aside[curves[number]] = ASIDE_M * float(values[worst])
+                sds[curves[number]] = ASIDE_M * float(own[worst])
+                continue
+            d = moving[number - len(curves)]
+            name = self.names[d].partition("/")[2]
+            dimensions[name] = float(self.lengths[d] * (1.0 + _OTHER * values[0]))
+            sds[name] = float(self.lengths[d] * _OTHER * own[0])
+        drawn = {name.partition("/")[2]: float(length) for name, length in zip(self.names, self.lengths, strict=True)}
+        return FieldAsBuilt(aside, dimensions, sds, drawn, len(curves))
+
+    def _searched(self, roots: Sequence[Array]) -> tuple[list[int], float]:
+        """The best set of the parts, each a root (Q, Z) of a covariance, and the scatter of paint, m, beside it."""
+        width = max((root.shape[1] for root in roots), default=1)
+        padded = [np.pad(root, ((0, 0), (0, width - root.shape[1]))) for root in roots]
+        modes = self.effects.modes(np.array(padded).reshape(len(roots), len(self.owner), width))
+        beam: list[frozenset[int]] = [frozenset()]
+        best, most, scatter_m = frozenset[int](), -np.inf, float(_SCATTER_M[0])
+        for _ in range(_MOST + 1):
+            sets = np.swapaxes(modes[np.array([sorted(one) for one in beam], dtype=int)], 1, 2)
+            evidence = self.effects.log_evidence(sets.reshape(*sets.shape[:2], len(beam[0]) * width), _SCATTER_M)
+            score = evidence.max(axis=1) + _LOG_ODDS * len(beam[0])
+            order = np.argsort(-score)
+            if score[order[0]] > most:
+                best, most = beam[order[0]], float(score[order[0]])
+                scatter_m = float(_SCATTER_M[np.argmax(evidence[order[0]])])
+            kept = [beam[row] for row in order[:_BEAM]]
+            beam = list({one | {n} for one in kept for n in range(len(roots)) if n not in one})
+            if not beam:
+                break
+        return sorted(best), scatter_m

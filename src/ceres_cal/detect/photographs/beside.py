@@ -1,0 +1,107 @@
+"""Lines that run beside each other where a target has one, as a boundary line beside a touch line: which of them is it.
+
+The nearer or the brighter one is often the wrong one, and a camera bends until that fits, too. All curves together tell
+them apart: for every choice a camera is solved for, and hardly more than one fits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+
+from ceres_cal.base.arrays import Array, Array32, Indices, Mask, median
+from ceres_cal.detect.courses import Course, predict
+from ceres_cal.detect.lines import peaks
+from ceres_cal.detect.photographs.refit import FreeIntrinsics, misfit, observations_of, refit_camera
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.targets import Target
+
+_SPACING_PX = 12.0
+# Of half the image's diagonal, how far to either side others are looked for.
+_REACH = 0.06
+_FAINT = 0.4  # of the usual brightness, what may be a line
+# Places that a line may be hidden for, and by how much it may bend from one to the next, px.
+_GAP, _BEND_PX = 4, 1.2
+_LEAST = 0.35  # of a curve's places, those on a line that runs along it
+_MOST_BESIDE, _MOST_CHOICES = 3, 48
+_SIGMA_PX = 0.5  # of a peak
+
+
+@dataclass(frozen=True, eq=False)
+class _PaintLine:
+    """Paint that runs along a curve: rows of the course, and where paint is from there, px along the normal."""
+
+    rows: Indices
+    offset_px: Array
+
+
+def among_others(
+    grey: Array32, target: Target, camera: Camera, curves: Collection[str], free: FreeIntrinsics
+) -> tuple[Camera, Target] | None:
+    """The camera by which curves are other lines than those next to where they were predicted; None where none are."""
+    course = predict(target, camera, curves, _SPACING_PX, 2.0)
+    best, least = None, np.inf
+    for nearest, chosen in _choices(_lines_beside(grey, course, _REACH * 0.5 * float(np.hypot(*camera.image_size)))):
+        rows, offset = (
+            np.concatenate(one) for one in zip(*((line.rows, line.offset_px) for line in chosen), strict=True)
+        )
+        places = course.pixels[rows] + offset[:, None] * course.normals[rows]
+        sigma = np.full(len(rows), _SIGMA_PX)
+        seen = observations_of(target, camera.image_size, course.curve[rows], places, sigma)
+        there = refit_camera(camera, seen, free.names, free.priors)
+        left = np.inf if there is None else misfit(there[0], seen)
+        if left < least:
+            best, least = None if nearest else there, left
+    return best
+
+
+def _choices(beside: Sequence[Sequence[_PaintLine]]) -> Iterator[tuple[bool, list[_PaintLine]]]:
+    """Every choice of a line for each curve, the nearest first, and whether it is that; none where there is no other.
+
+    Of more curves with others beside them than can be tried, only some take part.
+    """
+    ordered = sorted(beside, key=lambda lines: (len(lines) > 1, -len(lines[0].rows)))
+    taking_part, count = [], 1
+    for lines in ordered:
+        if count * len(lines) <= _MOST_CHOICES:
+            taking_part.append(lines)
+            count *= len(lines)
+    if count > 1:
+        for number, chosen in enumerate(product(*taking_part)):
+            yield number == 0, list(chosen)
+
+
+def _lines_beside(grey: Array32, course: Course, reach_px: float) -> list[list[_PaintLine]]:
+    """Of each curve along which paint runs, the lines that may be it, the nearest first."""
+    if not len(course):
+        return []
+    steps, bright = peaks(grey, course, reach_px)
+    seen = bright > _FAINT * median(np.max(bright, axis=1))
+    beside = []
+    for number in np.unique(course.curve):
+        rows = np.flatnonzero(course.curve == number)
+        lines = [one for one in _joined(rows, steps, seen) if len(one.rows) >= _LEAST * len(rows)]
+        lines.sort(key=lambda line: abs(median(line.offset_px)))
+        if lines:
+            beside.append(lines[:_MOST_BESIDE])
+    return beside
+
+
+def _joined(rows: Indices, steps: Array, seen: Mask) -> list[_PaintLine]:
+    """Peaks at neighbouring rows that are about as far off, joined."""
+    lines: list[list[tuple[int, float]]] = []
+    for row in rows.tolist():
+        for offset in steps[seen[row]].tolist():
+            before = [
+                line
+                for line in lines
+                if 0 < row - line[-1][0] <= _GAP and abs(line[-1][1] - offset) < _BEND_PX * (row - line[-1][0]) ** 0.5
+            ]
+            if before:
+                min(before, key=lambda line: abs(line[-1][1] - offset)).append((row, offset))
+            else:
+                lines.append([(row, offset)])
+    return [_PaintLine(*(np.array(one) for one in zip(*line, strict=True))) for line in lines]

@@ -1,0 +1,219 @@
+"""Cameras that may have taken a photograph of a target, from nothing but its strokes of paint."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+from time import thread_time
+
+import numpy as np
+
+from ceres_cal.base.arrays import Array32
+from ceres_cal.base.transforms import Pose, rotation_log
+from ceres_cal.detect.photographs.grid import LineGrid, grid_of, offsets_of
+from ceres_cal.detect.photographs.matching import CROWDED, FloorLines, Match, StrokeMap, lines_seen, match
+from ceres_cal.detect.photographs.painted import likelihood_of_place
+from ceres_cal.detect.photographs.upright import Upright, find_upright
+from ceres_cal.detect.registration import nearness_to
+from ceres_cal.detect.strokes import Strokes, drawn, find_narrow_strokes, find_strokes
+from ceres_cal.observations import Prior
+from ceres_cal.problem.structure import redrawn
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.curves import curve_points
+from ceres_cal.scene.lens import Radial
+from ceres_cal.scene.symmetry import turns_of
+from ceres_cal.scene.targets import Target
+
+_UPRIGHTS = 4  # answers for lens and tilt, at most, that are matched
+# The score of a match after which no other lens and tilt is tried: it only saves time. Nothing changes from 0.79 to
+# 0.94.
+_SURE = 0.88
+_POWERS = (2, 3, 4, 5)
+# Of the best match's score: another's, and that of another way to take the picture. Nothing changes from 0.6 to 0.86.
+_COMPARABLE, _ALIKE = 0.3, 0.9
+# Of the best one's likelihood of place, another's that is followed. In 17 disturbed pictures others had 0.38 at most.
+_LIKELY = 0.5
+_MOST, _MOST_ALIKE = 4, 60
+# Share of a length that is not known by which it is drawn longer and shorter, too: a match is nearly as good up to half
+# of that beside it.
+_LENGTH_STEP = 0.06
+BUDGET_S = 60.0
+"""Of processor time for one photograph: ten times what one takes that shows the field (6 s on two cores). Where another
+field is asked for, whose lines fit in ever more places, the search took more than 200 s."""
+_SAME_PLACE, _SAME_TURN = 0.08, 0.1  # in heights, rad
+
+
+@dataclass(frozen=True, eq=False)
+class FieldSearch:
+    """A photograph and the target that it may show.
+
+    Attributes:
+        turns: of the target that put its painted curves onto themselves; the first is none.
+        others: the target drawn with other lengths, where some are not known.
+        until_s: of this thread's processor time, after which no further camera is looked at.
+    """
+
+    grey: Array32
+    stroke_map: StrokeMap
+    grid: LineGrid
+    turns: tuple[Pose, ...]
+    others: tuple[LineGrid, ...] = ()
+    until_s: float = np.inf
+
+    @property
+    def is_out_of_time(self) -> bool:
+        return thread_time() > self.until_s
+
+    @property
+    def target(self) -> Target:
+        return self.grid.target
+
+    @property
+    def curves(self) -> tuple[str, ...]:
+        """Names of those that are painted."""
+        return self.grid.curves
+
+
+def prepare_search(
+    grey: Array32, target: Target, curves: Collection[str], lengths: Sequence[Prior] = ()
+) -> FieldSearch:
+    """The strokes of a photograph, beside what they are to be taken for.
+
+    Args:
+        lengths: what is known of dimensions of the target that may be others.
+
+    Raises:
+        InputError: the target has too few straight lines.
+    """
+    grid, *others = (grid_of(drawn, curves) for drawn in _drawings(target, curves, lengths))
+    until_s, turns = thread_time() + BUDGET_S, tuple(turns_of(target, curves))
+    return FieldSearch(grey, _stroke_map(grey, find_strokes(grey)), grid, turns, tuple(others), until_s)
+
+
+def narrowed(search: FieldSearch) -> FieldSearch:
+    """The same among the strokes of narrow paint alone: where nothing else was found, stripes may have hidden it."""
+    strokes = find_narrow_strokes(search.grey, CROWDED * search.stroke_map.unit_px)
+    return replace(search, stroke_map=_stroke_map(search.grey, strokes))
+
+
+def _stroke_map(grey: Array32, strokes: Strokes) -> StrokeMap:
+    size = (int(grey.shape[1]), int(grey.shape[0]))
+    return StrokeMap(strokes, nearness_to(drawn(strokes, size)), size, 0.5 * (np.array(size) - 1.0))
+
+
+def _drawings(target: Target, curves: Collection[str], lengths: Sequence[Prior]) -> Iterator[Target]:
+    """The target, and drawn with those two of the lengths by which most paint moves in steps to either side."""
+    yield target
+    moved: dict[float, str] = {}
+    for prior in lengths:
+        if prior.sigma[0] > 0.5 * _LENGTH_STEP * prior.value[0]:
+            other = redrawn(target, {prior.quantity: (1.0 + _LENGTH_STEP) * prior.value[0]})
+            ways = [curve_points(one.curves[name], 0, 20) for name in curves for one in (target, other)]
+            paint = sum(
+                float(np.mean(np.linalg.norm(here - there, axis=1))) * target.curves[name].length_m
+                for name, here, there in zip(curves, ways[::2], ways[1::2], strict=True)
+            )
+            moved[paint] = prior.quantity
+    names = [moved[paint] for paint in sorted(moved, reverse=True)[:2]]
+    for steps in product((0.0, -_LENGTH_STEP, _LENGTH_STEP), repeat=len(names)):
+        if any(steps):
+            yield redrawn(target, {n: (1.0 + s) * target.dimensions[n] for n, s in zip(names, steps, strict=True)})
+
+
+def candidates(search: FieldSearch) -> list[tuple[Camera, LineGrid]]:
+    """Cameras that may have taken it, the best first, each once for all turns of the target; and how it was drawn."""
+    scored: list[tuple[float, Camera]] = []
+    drawn: dict[int, LineGrid] = {}
+    ends, weights = search.stroke_map.ends, search.stroke_map.weights
+    for upright in find_upright(ends, weights, _UPRIGHTS, search.grid.least_share):
+        optics = _optics(upright, search.stroke_map)
+        seen = lines_seen(upright, search.stroke_map)
+        for grid in (search.grid, *search.others):
+            found = [(one.score, _posed(optics, one)) for one in match(upright, search.stroke_map, grid, seen)]
+            drawn |= {id(camera): grid for _, camera in found}
+            scored += found
+        if scored and max(score for score, _ in scored) > _SURE:
+            break
+    distinct = _distinct(sorted(scored, key=lambda one: -one[0]), search.turns, _COMPARABLE)
+    return _likely(search, [(camera, drawn[id(camera)]) for camera in distinct])
+
+
+def alike(search: FieldSearch, camera: Camera, detected: Collection[str]) -> list[Camera]:
+    """Other cameras with about these optics, turned by quarters, moved, higher or lower, that may have taken it too.
+
+    Args:
+        camera: that may have. detected: names of the curves that were found from there.
+    """
+    stroke_map = replace(search.stroke_map, centre=np.array(camera.principal_point))
+    upright = _upright_of(camera, search)
+    x, y = camera.position[:2] @ search.grid.turn
+    along, across = offsets_of(search.target, detected, search.grid.turn)
+    lines = FloorLines((across - x) / camera.position[2], (along - y) / camera.position[2])
+    optics = _optics(upright, stroke_map)
+    others = [(one.score, _posed(optics, one)) for one in match(upright, stroke_map, search.grid, lines)]
+    distinct = [camera, *_distinct(others, search.turns, _ALIKE, camera)]
+    likely = _likely(search, [(one, search.grid) for one in distinct])
+    return [one for one, _ in likely if one is not camera]
+
+
+def _likely(search: FieldSearch, cameras: Sequence[tuple[Camera, LineGrid]]) -> list[tuple[Camera, LineGrid]]:
+    """Those by which the target's own lines are seen in the picture about as well as by the best, the best first."""
+    in_time = (one for one in cameras if not search.is_out_of_time)  # who asks says that it ended early
+    likelihood = [likelihood_of_place(search.grey, grid.target, camera, search.curves) for camera, grid in in_time]
+    order = np.argsort(-np.array(likelihood), kind="stable")[:_MOST]
+    best = likelihood[order[0]] if likelihood else 0.0
+    return [cameras[row] for row in order if likelihood[row] >= min(_LIKELY * best, best)]
+
+
+def _posed(optics: Camera, one: Match) -> Camera:
+    return optics.at(Pose.looking(one.position, one.rotation))
+
+
+# ---- one coefficient and lenses -------------------------------------------------------------------------------------
+
+
+def _optics(upright: Upright, stroke_map: StrokeMap) -> Camera:
+    """A camera with the polynomial that is nearest to the one coefficient, over the image."""
+    share = np.linspace(0.0, 1.02, 60)  # of half the image's diagonal
+    ideal = share / (1.0 + upright.bend * share**2)
+    values = np.linalg.lstsq(share[:, None] ** np.array(_POWERS), ideal - share, rcond=None)[0]
+    lens = Radial(tuple(values / stroke_map.unit_px ** (np.array(_POWERS) - 1.0)), _POWERS)
+    x, y = stroke_map.centre
+    return Camera(stroke_map.image_size, upright.phi * stroke_map.unit_px, (float(x), float(y)), lens)
+
+
+def _upright_of(camera: Camera, search: FieldSearch) -> Upright:
+    share, unit = np.linspace(0.1, 1.0, 30), search.stroke_map.unit_px
+    rays = camera.lens.undistort(np.column_stack([share * unit, np.zeros(30)]), camera.phi)
+    ahead = np.isfinite(rays[:, 2]) & (rays[:, 2] > 0.0)
+    stretch = share[ahead] * unit * rays[ahead, 2] / (camera.phi * rays[ahead, 0]) - 1.0  # c p^2
+    bend = float(stretch @ share[ahead] ** 2 / np.sum(share[ahead] ** 4))
+    turn = np.eye(3)
+    turn[:2, :2] = search.grid.turn
+    return Upright(bend, camera.phi / unit, camera.cam_from_world.rotation @ turn, 1.0)
+
+
+# ---- one and the same -----------------------------------------------------------------------------------------------
+
+
+def _distinct(
+    scored: Sequence[tuple[float, Camera]], turns: Sequence[Pose], least: float, known: Camera | None = None
+) -> list[Camera]:
+    """The best of those that put the target elsewhere, whatever its turn, and not where it is known; best first."""
+    chosen: list[Camera] = [] if known is None else [known]
+    for score, camera in scored:
+        if len(chosen) > _MOST_ALIKE or score < least * scored[0][0]:
+            break
+        if not any(_same_place(camera, other, turns) for other in chosen):
+            chosen.append(camera)
+    return chosen if known is None else chosen[1:]
+
+
+def _same_place(one: Camera, other: Camera, turns: Sequence[Pose]) -> bool:
+    for turn in turns:
+        between = (one.cam_from_world @ turn) @ other.cam_from_world.inverse
+        near = np.linalg.norm(between.translation) < _SAME_PLACE * max(one.position[2], other.position[2])
+        if near and np.linalg.norm(rotation_log(between.rotation)) < _SAME_TURN:
+            return True
+    return False

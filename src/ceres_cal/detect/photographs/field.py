@@ -1,0 +1,265 @@
+"""A field's painted lines, arcs, corners and crossings from photographs of one station, as observations."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from ceres_cal.base.arrays import Array32, Mask
+from ceres_cal.base.errors import InputError, NothingShownError, naming
+from ceres_cal.base.progress import ImageProgress
+from ceres_cal.base.words import frame_of
+from ceres_cal.detect.crossings import find_crossings
+from ceres_cal.detect.images import filled, read_light
+from ceres_cal.detect.lines import Lines
+from ceres_cal.detect.photographs.as_built import ASIDE_M
+from ceres_cal.detect.photographs.candidates import prepare_search
+from ceres_cal.detect.photographs.clicks import Clicks, starts_from_clicks
+from ceres_cal.detect.photographs.follow import follow
+from ceres_cal.detect.photographs.followed import Followed
+from ceres_cal.detect.photographs.judgement import is_shown, why_missed
+from ceres_cal.detect.photographs.refit import FreeIntrinsics
+from ceres_cal.detect.photographs.search import Auto, SearchResult, SeveralWaysError, search
+from ceres_cal.observations import NO_POINTS, Curves, Observations, Points, Prior, View, combine
+from ceres_cal.problem.structure import features_of
+from ceres_cal.robust.as_built import drawn_as_stated
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.targets import Target
+
+TARGET_NAME = "field"
+# Of a length, the standard deviation under which lines are followed: what a few lines leave open does not run off.
+_ABOUT = 0.15
+
+
+@dataclass(frozen=True, eq=False)
+class FieldDetections:
+    """What `detect_field` found.
+
+    Attributes:
+        observations: one view per image that shows the field.
+        found: path -> the camera that predicts its lines, and what was measured.
+        missed: path and reason of every other image.
+        searched: what came of those images in which the field was found without a start.
+    """
+
+    observations: Observations
+    found: dict[str, Followed]
+    missed: tuple[tuple[str, str], ...]
+    searched: dict[str, SearchResult]
+
+
+@dataclass(frozen=True)
+class FieldOptions:
+    """What observations of a field are to be.
+
+    Attributes:
+        camera, station: the names they bear; the station's is that of the camera by default.
+        points: corners and crossings, too; else curve observations only.
+        edges: both edges of the paint instead of its middle.
+        left_out: (height, width) pixels that show nothing of the field: hall, walls, people.
+        keep_start: nothing farther from the start than 12 px is looked at.
+        lengths: what is known of dimensions of the target (named "field") that are to be told by the photographs.
+        refused: called with the path of each image that does not show the field, and what was seen there instead.
+    """
+
+    camera: str = "camera"
+    station: str | None = None
+    points: bool = True
+    edges: bool = False
+    left_out: Mask | None = None
+    keep_start: bool = False
+    lengths: tuple[Prior, ...] = ()
+    refused: Callable[[Path, SearchResult], None] | None = None
+
+
+def detect_field(
+    images: Sequence[Path],
+    target: Target,
+    start: Camera | Clicks | Auto,
+    curves: Collection[str] | None = None,
+    options: FieldOptions | None = None,
+    progress: ImageProgress | None = None,
+) -> FieldDetections:
+    """Painted lines, arcs, corners and crossings of a field in photographs that one camera took at one station.
+
+    Curve observations are of the paint's middle, at places whose windows share no pixel; `sigma_px` comes from the
+    pixels of each window, times a factor that the scatter from place to place tells. A point is where measured curves
+    meet; the places that told it are no curve observations besides.
+
+    Args:
+        images: files of any kind OpenCV reads, all of one size.
+        start: the station's camera before it was moved (by up to 130 px, or 5 degrees), points that somebody showed, or
+            `Auto()`: the field is found without any (see `search`). Later images start from what the last one told.
+        curves: names of those that are painted; None: all of the target with a width.
+        progress: called after each image.
+
+    Raises:
+        InputError: an image cannot be read or has another size than the camera, a name that the target does not have, a
+            length that no painted line shows, or it cannot be told which way round the field is.
+        NothingShownError: no image shows the field.
+    """
+    options = options or FieldOptions()
+    painted = _painted(target, curves)
+    paths, drawn = [Path(path) for path in images], drawn_as_stated({TARGET_NAME: target}, options.lengths)[TARGET_NAME]
+    for prior in options.lengths:
+        if not features_of(target, prior.quantity) & set(painted):
+            raise InputError(
+                f"no painted line lies elsewhere with another {prior.quantity}: it cannot be found, leave it out"
+            )
+    results: dict[str, SearchResult] = {}
+    last: Followed | None = None
+    for number, path in enumerate(paths, start=1):
+        grey = _without(read_light(path), options.left_out, path)
+        result = _looked_for(grey, drawn, painted, start if last is None else last, (path, options))
+        results[str(path)] = result
+        if result.followed is None and options.refused is not None:
+            options.refused(path, result)
+        last = result.followed or last
+        if progress is not None:
+            progress(number, len(paths), path.name)
+    followed = {path: result.followed for path, result in results.items() if result.followed is not None}
+    missed = tuple((path, result.reason) for path, result in results.items() if result.followed is None)
+    if not followed:
+        raise NothingShownError(f"no field in any of {len(paths)} images; {missed[0][0]}: {missed[0][1]}", missed)
+    parts = [_observations(frame_of(path), one, target, options) for path, one in followed.items()]
+    searched = {path: result for path, result in results.items() if result.followed is not None and result.ways}
+    every = combine(parts)
+    seen = {target.curve_names[number] for number in np.unique(every.curves.feature)}
+    seen |= {target.point_names[number] for number in np.unique(every.points.feature)}
+    lengths = [_found(one, next(iter(followed.values()))) for one in options.lengths]
+    lengths = [one for one in lengths if features_of(target, one.quantity) & seen]  # else it may stay as drawn
+    priors = dict.fromkeys((*every.priors, *lengths))
+    return FieldDetections(replace(every, priors=tuple(priors)), followed, missed, searched)
+
+
+def _found(prior: Prior, followed: Followed) -> Prior:
+    """What is known of a length; where nothing is, a calibration starts from what was found."""
+    return replace(prior, value=(followed.target.dimensions[prior.quantity],)) if prior.is_open else prior
+
+
+def _tracked(lengths: tuple[Prior, ...]) -> tuple[Prior, ...]:
+    """The same as tight as lines are followed under: a field is about as large as it is said to be."""
+    return tuple(replace(one, sigma=(min(one.sigma[0], _ABOUT * one.value[0]),)) for one in lengths)
+
+
+def _painted(target: Target, curves: Collection[str] | None) -> tuple[str, ...]:
+    for name in curves or ():
+        if name not in target.curves:
+            raise InputError(f"curve {name!r} is not one of the target's: `ceres-cal targets` lists the names")
+    painted = tuple(n for n, curve in target.curves.items() if curve.width_m > 0.0 and (curves is None or n in curves))
+    if not painted:
+        raise InputError("the target has no painted curve: a line to be found needs a width")
+    return painted
+
+
+def _without(grey: Array32, left_out: Mask | None, path: Path) -> Array32:
+    """A photograph in which what is left out looks like what is around it."""
+    if left_out is None:
+        return grey
+    if left_out.shape != grey.shape:
+        size = f"{left_out.shape[1]} x {left_out.shape[0]}"
+        raise InputError(f"{path}: {grey.shape[1]} x {grey.shape[0]} px, but the mask has {size}: draw it on this one")
+    return filled(grey, left_out)
+
+
+def _looked_for(
+    grey: Array32,
+    target: Target,
+    painted: tuple[str, ...],
+    start: Camera | Clicks | Auto | Followed,
+    where: tuple[Path, FieldOptions],
+) -> SearchResult:
+    """The field from where the last image showed it, or from the start that was given, or from none.
+
+    Args:
+        where: the image's path, and what observations are to be.
+    """
+    path, options = where
+    lengths = _tracked(options.lengths)
+    if isinstance(start, Auto):
+        with naming(path):
+            try:
+                return search(grey, target, painted, replace(start, lengths=lengths))
+            except SeveralWaysError as error:
+                if options.refused is not None:
+                    options.refused(path, SearchResult(None, str(error), seen=error.seen))
+                raise
+    target = start.target if isinstance(start, Followed) else target
+    starts, free = _starts(start, target, (int(grey.shape[1]), int(grey.shape[0])), (path, lengths))
+    followed = follow(grey, target, starts, painted, replace(free, keep=options.keep_start))
+    if not followed.built.is_other and (followed.holds or _is_worn(grey, followed)):
+        return SearchResult(followed)
+    return SearchResult(None, why_missed(followed, target, started=True), seen=followed)
+
+
+def _is_worn(grey: Array32, followed: Followed) -> bool:
+    """Whether this is the field, its lines worn to dashes: of a target without a grid of lines it cannot be told."""
+    try:
+        return followed.may_be_worn and is_shown(prepare_search(grey, followed.target, followed.curves), followed)
+    except InputError:  # reads: "its lines were not found ..."
+        return False
+
+
+def _starts(
+    start: Camera | Clicks | Followed, target: Target, size: tuple[int, int], given: tuple[Path, tuple[Prior, ...]]
+) -> tuple[list[Camera], FreeIntrinsics]:
+    """The cameras to start from: the last image's, or the one given, or those that the clicks may belong to.
+
+    Args:
+        given: the image's path, and what is known of lengths.
+    """
+    path, lengths = given
+    if isinstance(start, Clicks):
+        return starts_from_clicks(start, target, size, lengths)
+    camera = start.camera if isinstance(start, Followed) else start
+    if camera.image_size != size:
+        raise InputError(
+            f"{path}: {size[0]} x {size[1]} px, "
+            + (
+                "unlike the images before: give it on its own"
+                if isinstance(start, Followed)
+                else f"but the camera has {camera.image_size[0]} x {camera.image_size[1]}: "
+                "start from a calibration of this camera"
+            )
+        )
+    return [camera], FreeIntrinsics(priors=lengths)
+
+
+def _observations(frame: str, followed: Followed, target: Target, options: FieldOptions) -> Observations:
+    """One image's view: what its lines and crossings are, each pixel counted once.
+
+    Curves that lie beside their drawing are straight and round nevertheless: they tell the lens, under an offset.
+    """
+    camera, lines = followed.camera, followed.lines
+    points, used = NO_POINTS, np.zeros(len(lines.found), dtype=bool)
+    if options.points:
+        met = find_crossings(followed.target, camera, lines)
+        points, used = Points(np.zeros(len(met.feature), np.int32), met.feature, met.pixels, met.sigma_px), met.used
+    curves, beside = _curves(lines, lines.found & ~used, options.edges), followed.beside
+    if beside is not None:
+        aside = _curves(beside, beside.found, options.edges)
+        curves = Curves(**{name: np.concatenate([own, getattr(aside, name)]) for name, own in vars(curves).items()})
+    return Observations(
+        {TARGET_NAME: target},
+        {options.camera: camera.image_size},
+        (View(frame, options.camera, options.station or options.camera, TARGET_NAME),),
+        points,
+        curves,
+        tuple(Prior.of_offset(TARGET_NAME, name, ASIDE_M) for name in followed.built.aside_m),
+    )
+
+
+def _curves(lines: Lines, taken: Mask, edges: bool) -> Curves:
+    rows = np.flatnonzero(taken)
+    sides = (1, -1) if edges else (0,)
+    pixels = [lines.edge(side) if edges else lines.pixels for side in sides]
+    return Curves(
+        np.zeros(len(sides) * len(rows), np.int32),
+        np.tile(lines.course.curve[rows], len(sides)),
+        np.concatenate([places[rows] for places in pixels]),
+        np.tile(np.sqrt(len(sides)) * lines.sigma_px[rows], len(sides)),
+        np.repeat(np.array(sides, np.int8), len(rows)),
+    )

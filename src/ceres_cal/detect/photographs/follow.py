@@ -1,0 +1,350 @@
+"""Following a field's lines in a photograph: search along normals, refit the camera, search nearer, until at rest."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import islice, product
+
+import numpy as np
+
+from ceres_cal.base.arrays import Array32
+from ceres_cal.base.errors import CalibrationError
+from ceres_cal.calibration.calibrating import calibrate
+from ceres_cal.detect.courses import Course, clear_px, predict
+from ceres_cal.detect.lines import SPACING_PX, Lines, measure, search
+from ceres_cal.detect.photographs.as_built import AS_DRAWN, FieldAsBuilt, as_built
+from ceres_cal.detect.photographs.beside import among_others
+from ceres_cal.detect.photographs.followed import Followed
+from ceres_cal.detect.photographs.painted import painted_curves, visible_curves
+from ceres_cal.detect.photographs.refit import TARGET, FreeIntrinsics, moved_px, observations_of, refit_camera
+from ceres_cal.detect.registration import nearness, shifted
+from ceres_cal.observations import Observations
+from ceres_cal.problem.parameters import Options, intrinsic_names
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.lens import LENSES
+from ceres_cal.scene.targets import Target, target_from_spec
+
+FAR_PX = 130.0  # how far off the start may be
+# Share from which on no other start is tried. At half of its odds nothing changes.
+SURE_SHARE = 0.7
+_ROUGH_SPACING_PX = 12.0
+_NEAR_REACHES_PX = (12.0, 6.0, 4.0)
+# From points that were shown: what stands farther beside a line than they are off cannot draw it away.
+_SHOWN_REACHES_PX = (12.0, 12.0, 12.0, 8.0, 8.0, 5.0)
+_FAR_REACHES_PX = (45.0, 45.0, 30.0, 30.0, 20.0, 12.0, 8.0, 5.0)
+_ASPECTS = (1.0, 0.94, 0.97, 1.03, 1.06)  # that a picture which was stretched may have, to start from
+_LAST_REACH_PX = 5.0
+_CANDIDATES = 5
+_FEWEST = 12
+_MOST_OTHERS = 3  # ways to see the field that are tried where the best looks like another field
+_ROUNDS = 6
+_NEARER = 2  # times that lines of other dimensions are looked for again
+_LESS = 0.02  # of the share: by so much less is no worse
+_AT_REST_PX = 0.02
+
+
+def follow(
+    grey: Array32, target: Target, starts: Sequence[Camera], curves: Collection[str], free: FreeIntrinsics | None = None
+) -> Followed:
+    """Follow a target's painted curves in a photograph, from the best of several starts.
+
+    A start that is near is taken at once; else shifts, turns and scales of it are tried, by 130 px and 7.5 degrees.
+
+    Args:
+        starts: posed cameras, any of which may be right. curves: names of those that are painted.
+
+    Returns:
+        The best that was reached; whether it is the field, `Followed.holds` tells.
+    """
+    tracker = _Tracker(grey, target, curves, free or FreeIntrinsics())
+    tried = tracker.tried(starts)
+    best = next(tried)
+    if not tracker.free.names:
+        return best
+    if best.may_be_worn:
+        best = tracker.refined(best)
+        for one in islice(tried, _MOST_OTHERS):
+            if best.is_field:
+                break
+            again = tracker.refined(one) if one.holds else one
+            if again.is_field and not again.built.dimensions:
+                best = again
+    return best if best.holds else tracker.stretched(best)
+
+
+def approach(grey: Array32, target: Target, camera: Camera, curves: Collection[str], free: FreeIntrinsics) -> Followed:
+    """`follow` from one start, up to where the lens remains that it started from."""
+    return next(_Tracker(grey, target, curves, free).tried([camera]))
+
+
+def look_again(
+    grey: Array32, target: Target, seen: Followed, curves: Collection[str], free: FreeIntrinsics
+) -> Followed:
+    """What nearly is the field, with the kind of lens that suits best, or as drawn next to where it was seen, or in a
+    picture that was stretched.
+    """
+    tracker = _Tracker(grey, target, curves, free)
+    refined = tracker.refined(seen)
+    drawn = refined if refined.is_field else tracker.as_drawn(seen)
+    return drawn if drawn.holds else tracker.stretched(drawn)
+
+
+def refine(
+    grey: Array32,
+    target: Target,
+    camera: Camera,
+    curves: Collection[str],
+    free: FreeIntrinsics,
+    lacking: Sequence[tuple[str, ...]] = (),
+) -> Followed:
+    """From a camera that is right but for its lens: the kind that suits best, without curves that lie aside.
+
+    Args:
+        lacking: parts that this field is known to lack.
+    """
+    tracker = _Tracker(grey, target, curves, free).lacking(lacking).of_painted(camera)
+    return tracker.refined(tracker.followed(camera, tracker.measured(camera), np.inf))
+
+
+@dataclass(frozen=True, eq=False)
+class _Tracker:
+    """A photograph, the target's painted curves that are followed in it, and what of the camera is free."""
+
+    grey: Array32
+    target: Target
+    curves: Collection[str]
+    free: FreeIntrinsics
+    missing: tuple[str, ...] = ()
+
+    def followed(self, camera: Camera, lines: Lines, moved_px: float) -> Followed:
+        """What was measured from a camera."""
+        visible = visible_curves(self.grey, self.target, camera, self.curves)
+        return Followed(camera, self.target, tuple(self.curves), self.missing, lines, moved_px, visible)
+
+    def of_painted(self, camera: Camera) -> _Tracker:
+        """The same without what the target may lack and this camera does not see."""
+        painted = painted_curves(self.grey, self.target, camera, self.curves)
+        missing = (*self.missing, *(name for name in self.curves if name not in painted))
+        return replace(self, curves=painted, missing=missing)
+
+    def lacking(self, parts: Sequence[tuple[str, ...]]) -> _Tracker:
+        """The same without some parts that the target may lack."""
+        names = [name for part in parts for name in part]
+        return replace(self, curves=[one for one in self.curves if one not in names], missing=tuple(names))
+
+    def tried(self, starts: Sequence[Camera]) -> Iterator[Followed]:
+        """What is reached from each start: what is surely the field at once, then the others, the best first."""
+        left: list[Followed] = []
+        for one in self._reached(starts):
+            if one.holds and one.share >= SURE_SHARE:
+                yield one
+            else:
+                left.append(one)
+        yield from sorted(left, key=lambda one: (one.holds, one.share), reverse=True)
+
+    def _reached(self, starts: Sequence[Camera]) -> Iterator[Followed]:
+        if self.free.hints is None:
+            yield self.close_in(starts[0], _NEAR_REACHES_PX)
+            if self.free.keep:
+                return
+        shifted = self.shifted_starts(starts)
+        shown = (_SHOWN_REACHES_PX,) if self.free.hints is not None else ()
+        for reaches, camera in product(shown if self.free.keep else (*shown, _FAR_REACHES_PX), shifted):
+            yield self.close_in(camera, reaches)
+        if not shifted:
+            yield self.close_in(starts[0], ())  # as it is: nothing to search
+
+    def shifted_starts(self, starts: Sequence[Camera]) -> list[Camera]:
+        """Cameras that put the lines near something thin and bright, the best first."""
+        courses = [self._predicted(camera) for camera in starts]
+        usable = [number for number, course in enumerate(courses) if len(course) >= _FEWEST]
+        if not usable:
+            return []
+        width = float(np.median(courses[usable[0]].width_px))
+        near = nearness(self.grey, max(width, 2.0))
+        usable.sort(key=lambda number: -near.score(courses[number].pixels))
+        if self.free.hints is not None:
+            return [starts[number] for number in usable[:_CANDIDATES]]
+        camera = starts[usable[0]]
+        wide, sigma_px = self._predicted(camera, -FAR_PX), 5.0
+        refitted = []
+        for places in shifted(wide, near, camera.image_size, FAR_PX, _CANDIDATES):
+            moved = observations_of(self.target, camera.image_size, wide.curve, places, np.full(len(wide), sigma_px))
+            there = refit_camera(camera, moved)
+            refitted.append(camera if there is None else there[0])
+        return refitted
+
+    def close_in(self, camera: Camera, reaches_px: Sequence[float]) -> Followed:
+        """Search ever nearer, freeing one intrinsic after the other; then measure and refit until at rest."""
+        tracker = self
+        for number, reach in enumerate(reaches_px):
+            names = self.free.names[: max(0, 2 * number - 1)]
+            tracker, camera = tracker._search_step(camera, names, reach) or (tracker, camera)
+        tracker = tracker.of_painted(camera)
+        other = among_others(self.grey, tracker.target, camera, tracker.curves, self.free)
+        if other is not None:
+            tracker, camera = replace(tracker, target=other[1]), other[0]
+        return tracker.at_rest(camera, self.free.names)
+
+    def at_rest(self, camera: Camera, names: tuple[str, ...]) -> Followed:
+        """Measured and refitted, with these intrinsics free, until nothing moves any more."""
+        tracker, lines, moved = self, self.measured(camera), np.inf
+        for _ in range(_ROUNDS):
+            if np.count_nonzero(lines.found) < _FEWEST:
+                break
+            refitted = tracker._refitted(camera, tracker._observed(lines, camera), names)
+            if refitted is None:
+                break
+            before, (tracker, there) = camera, refitted
+            moved = moved_px(before, there, lines.course.pixels)
+            camera, lines = there, tracker.measured(there)
+            if moved < _AT_REST_PX:
+                break
+        return tracker.followed(camera, lines, moved)
+
+    def refined(self, followed: Followed) -> Followed:
+        """The same, predicted with the lens that suits the curves best, without those that lie aside."""
+        whole = replace(self, curves=followed.curves, missing=followed.missing, target=followed.target)
+        followed = whole.without_aside(followed)
+        if followed.built.is_other:
+            followed = self.as_drawn(followed)
+        if followed.built.is_other:
+            return followed
+        curves = [name for name in whole.curves if name not in followed.built.aside_m]
+        left = replace(whole, curves=curves, target=followed.target)
+        return whole.without_aside(left.with_best_lens(followed))
+
+    def as_drawn(self, other: Followed) -> Followed:
+        """What looks like another field, or the one that is drawn, where all of its lines are there as well.
+
+        A line around the field that was taken for its own bends the camera until areas and circle disagree. With their
+        dimensions free the camera is right: its own lines are next to where that puts them.
+        """
+        there = self.as_built(other, _free(other.camera))[1]
+        drawn = self.of_painted(there).at_rest(there, _free(there))
+        if drawn.share < SURE_SHARE or not drawn.holds:
+            return other
+        drawn = replace(self, curves=drawn.curves, missing=drawn.missing).without_aside(drawn)
+        return other if drawn.built.is_other or drawn.built.dimensions else drawn
+
+    def stretched(self, other: Followed) -> Followed:
+        """What does not hold with square pixels, or the field in a picture that was stretched one way."""
+        names = [name for name in self.free.names if name in intrinsic_names(other.camera.lens)]
+        anew = replace(self.lacking(other.lacks_wholly), free=replace(self.free, names=("aspect", *names)))
+        starts = [replace(other.camera, phi=other.camera.phi / one**0.5, aspect=one) for one in _ASPECTS]
+        tried = [anew.close_in(start, _SHOWN_REACHES_PX) for start in starts]
+        there = max(tried, key=lambda one: (one.holds, one.share))
+        if not there.holds:
+            return other
+        refined = self.refined(there)
+        return refined if refined.is_field and not refined.built.dimensions else other
+
+    def without_aside(self, followed: Followed) -> Followed:
+        """The same without the curves that lie aside: none of them draws the camera to where others look aside."""
+        free = _free(followed.camera)
+        whole, built = replace(self, target=followed.target), AS_DRAWN
+        left = whole
+        for _ in range(_ROUNDS):
+            known, built = built, whole.as_built(followed, free)[0]
+            if built.is_other or built.aside_m.keys() == known.aside_m.keys():
+                break
+            left = replace(whole, curves=[name for name in whole.curves if name not in built.aside_m])
+            followed = left.at_rest(followed.camera, free)
+            whole, left = (replace(one, target=followed.target) for one in (whole, left))
+        lines, beside = left.measured(followed.camera), None
+        if built.aside_m:
+            every = whole.measured(followed.camera)
+            aside = [followed.target.curve_index[name] for name in built.aside_m]
+            beside = every.take(np.isin(every.course.curve, aside))
+        return replace(followed, curves=tuple(self.curves), built=built, lines=lines, beside=beside)
+
+    def as_built(self, followed: Followed, free: tuple[str, ...]) -> tuple[FieldAsBuilt, Camera]:
+        """How all curves lie, and the camera by which they do.
+
+        Lines of other dimensions are several pixels from where they were looked for, and some are missed or taken for
+        others; so they are looked for again, and measured, where those dimensions put them.
+        """
+        lines, camera, target = self.measured(followed.camera), followed.camera, self.target
+        built = as_built(lines, camera, target, self.free.priors)
+        for _ in range(_NEARER):
+            if not built.dimensions:
+                break
+            there = replace(self, target=target_from_spec({**target.spec, **built.dimensions}, target.kind))
+            nearer = there.at_rest(camera, free)
+            if nearer.share < lines.share - _LESS:
+                break
+            lines, camera = nearer.lines, nearer.camera
+            built = as_built(lines, camera, target, self.free.priors)
+        return built, camera
+
+    def with_best_lens(self, followed: Followed) -> Followed:
+        """What is found when the lines are predicted with the kind of lens that suits them best.
+
+        A polynomial that is a pixel off bends what crossings are extrapolated along, and one that folds in the picture
+        does so where nothing was measured.
+        """
+        lines, fits = followed.lines, []
+        known = tuple(prior for prior in self.free.priors if prior.dimension)
+        observations = self._observed(lines, followed.camera)
+        for kind, lens in LENSES.items():
+            if lens.set_at_start:
+                continue  # a few lines do not tell a lens without a formula
+            try:
+                powers, stretched = (lens.trial_powers or ((),))[-1], followed.camera.aspect != 1.0
+                options = Options(lens=kind, powers=powers, priors=known, free_aspect=stretched)
+                calibration = calibrate(observations, options)
+            except CalibrationError:
+                # quiet: a lens of several that does not fit these lines; where none does, they are judged as found
+                continue
+            fits.append((calibration.fit.curve_scale * len(lines.found) / calibration.fit.curves, calibration))
+        if not fits:
+            return followed
+        best = min(fits, key=lambda fit: (fit[1].station().folds, fit[0]))[1]
+        camera, target = best.station(), best.targets[TARGET]
+        lines = replace(self, target=target).measured(camera)
+        moved = moved_px(followed.camera, camera, lines.course.pixels)
+        refined = replace(self, target=target).followed(camera, lines, moved)
+        return refined if refined.may_be_worn and refined.share > followed.share - _LESS else followed
+
+    def _refitted(
+        self, camera: Camera, observations: Observations, names: tuple[str, ...]
+    ) -> tuple[_Tracker, Camera] | None:
+        """The camera refitted with these intrinsics free, and the tracker of the target as it is then."""
+        refitted = refit_camera(camera, observations, names, self.free.priors)
+        return None if refitted is None else (replace(self, target=refitted[1]), refitted[0])
+
+    def _search_step(self, camera: Camera, names: tuple[str, ...], reach_px: float) -> tuple[_Tracker, Camera] | None:
+        """The camera refitted to what is brightest along the normals; None where too little is."""
+        course = self._predicted(camera, 2.0)
+        if len(course) < _FEWEST:
+            return None
+        offset, bright = search(self.grey, course, reach_px, 0.6 * reach_px)
+        clear = bright > 0.4 * float(np.quantile(bright, 0.8))
+        if np.count_nonzero(clear) < _FEWEST:
+            return None
+        course, offset = course.take(clear), offset[clear]
+        places = course.pixels + offset[:, None] * course.normals
+        sigma = np.full(len(course), max(0.1 * reach_px, 0.5))
+        hints = self.free.hints if reach_px > 10.0 else None
+        observations = observations_of(self.target, camera.image_size, course.curve, places, sigma, hints)
+        return self._refitted(camera, observations, names)
+
+    def _predicted(self, camera: Camera, margin_px: float = 0.0) -> Course:
+        return predict(self.target, camera, self.curves, _ROUGH_SPACING_PX, margin_px)
+
+    def measured(self, camera: Camera) -> Lines:
+        course = predict(self.target, camera, self.curves, SPACING_PX, SPACING_PX)
+        clear = clear_px(self.target, camera, course, self.curves)
+        return measure(self.grey, course, _LAST_REACH_PX, clear)
+
+    def _observed(self, lines: Lines, camera: Camera) -> Observations:
+        rows = lines.found
+        return observations_of(
+            self.target, camera.image_size, lines.course.curve[rows], lines.pixels[rows], lines.sigma_px[rows]
+        )
+
+
+def _free(camera: Camera) -> tuple[str, ...]:
+    """Names of the intrinsics that a photograph may change: its pixels are square where they are so far."""
+    return tuple(name for name in intrinsic_names(camera.lens) if name != "aspect" or camera.aspect != 1.0)

@@ -1,0 +1,105 @@
+"""What came of following a field's lines in a photograph, and whether that is the field."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ceres_cal.base.cached import cached_property
+from ceres_cal.detect.courses import Course, predict
+from ceres_cal.detect.lines import SPACING_PX, Lines
+from ceres_cal.detect.photographs.as_built import AS_DRAWN, FieldAsBuilt
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.targets import Target
+
+# Of the places in view where paint must be found: robots and wear hide a third. Nothing changes from 0.33 to 0.67.
+LEAST_SHARE = 0.5
+# The same of lines that may be worn to dashes: other fields and wrong places have as much, and strokes must decide.
+_LEAST_IF_WORN = 0.3
+# Found of a curve, at least; places on curves without that, at most.
+_ABSENT, _MOST_ABSENT = 0.2, 0.08
+
+
+@dataclass(frozen=True, eq=False)
+class Followed:
+    """A field's lines as they were followed.
+
+    Attributes:
+        camera: the posed camera that predicts them. target: as its dimensions were found.
+        curves: names of those that were followed. missing: of those that the target may lack, and this field does.
+        lines: what was measured there, but for curves that lie aside.
+        beside: the same of the curves that lie aside.
+        moved_px: how far the last refit moved the prediction; at rest below 0.02.
+        visible: names of the curves along which there is paint, whether it could be measured or not.
+        built: how the curves lie, where the photograph had to tell the lens, too.
+    """
+
+    camera: Camera
+    target: Target
+    curves: tuple[str, ...]
+    missing: tuple[str, ...]
+    lines: Lines
+    moved_px: float
+    visible: tuple[str, ...]
+    built: FieldAsBuilt = AS_DRAWN
+    beside: Lines | None = None
+
+    @cached_property
+    def places(self) -> int:
+        """How many are in view, those on curves that this field does not have among them."""
+        return len(self.lines.found) + len(self._lacking)
+
+    @property
+    def share(self) -> float:
+        """Of the places in view, the share where paint was found: of a field that lacks something the rest must be
+        seen all the better.
+        """
+        return float(np.count_nonzero(self.lines.found) / self.places) if self.places else 0.0
+
+    @property
+    def absent(self) -> tuple[int, ...]:
+        """The curves in view of which next to nothing was found, nor is to be seen unless the target may lack them: of
+        these there may be others, elsewhere.
+        """
+        curve, found = self.lines.course.curve, self.lines.found
+        numbers, places = np.unique(curve, return_counts=True)
+        counts = np.array([np.count_nonzero(found[curve == number]) for number in numbers])
+        sure = set(self.visible).difference(*self.target.optional)
+        visible = np.isin(numbers, [self.target.curve_index[name] for name in sure])
+        return tuple(int(number) for number in numbers[(counts < _ABSENT * places) & ~visible])
+
+    @property
+    def lacks_wholly(self) -> tuple[tuple[str, ...], ...]:
+        """The parts that the target may lack of which nothing is there."""
+        none = {*self.missing, *(self.target.curve_names[number] for number in self.absent)}
+        return tuple(part for part in self.target.optional if none.issuperset(part))
+
+    @property
+    def lacking(self) -> tuple[str, ...]:
+        """Names of the missing curves in view."""
+        return tuple(self.target.curve_names[number] for number in np.unique(self._lacking.curve))
+
+    @cached_property
+    def _lacking(self) -> Course:
+        return predict(self.target, self.camera, self.missing, SPACING_PX, SPACING_PX)
+
+    @property
+    def holds(self) -> bool:
+        """Whether this is the field: paint at half of the places in view, and no line missing that weighs."""
+        return self.share >= LEAST_SHARE and self._has_all
+
+    @property
+    def is_field(self) -> bool:
+        """Whether it holds, and its curves lie as those of the target do."""
+        return self.holds and not self.built.is_other
+
+    @property
+    def may_be_worn(self) -> bool:
+        """Whether it is at least the field if its lines are worn to dashes."""
+        return self.share >= _LEAST_IF_WORN and self._has_all
+
+    @property
+    def _has_all(self) -> bool:
+        missing = np.isin(self.lines.course.curve, self.absent)
+        return float(np.mean(missing)) <= _MOST_ABSENT

@@ -1,0 +1,132 @@
+"""A target as lines in two directions at right angles, which is how it is found in a photograph without a start."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ceres_cal.base.arrays import Array, Mask
+from ceres_cal.base.errors import InputError
+from ceres_cal.scene.curves import Arc, Segment, curve_points
+from ceres_cal.scene.symmetry import turns_of
+from ceres_cal.scene.targets import Target
+
+_AXIS = 1e-6  # sine of the angle to the main direction of a line that is parallel to it
+_DIGITS = 6  # of metres, after which two offsets are one
+_OUTLINE = 300
+_SHORT = 0.015  # of the length of all straight lines: what is shorter is no line to find the target by
+
+
+@dataclass(frozen=True, eq=False)
+class LineGrid:
+    """A target's lines in its main direction and across.
+
+    Attributes:
+        curves: names of the painted ones. turns: in how many turns they look the same.
+        turn: (2, 2) target from grid: columns are the main direction and the one across.
+        along, across: the offsets of lines that run so, and of the arcs' tangents, in the grid's y and x.
+    """
+
+    target: Target
+    curves: tuple[str, ...]
+    turns: int
+    turn: Array
+    along: Array
+    across: Array
+
+    @property
+    def least_share(self) -> float:
+        """Of the length of all painted curves, that of the straight lines in the direction that has fewer."""
+        lines = _segments(self.target, self.curves)
+        along = [sum(one.length_m for one in lines if abs(_way(one) @ self.turn[:, axis]) < _AXIS) for axis in (0, 1)]
+        return min(along) / sum(self.target.curves[name].length_m for name in self.curves)
+
+    @property
+    def outline(self) -> Array:
+        """(P, 2) places all along the painted curves, in the grid."""
+        return places_along(self, _OUTLINE).grid
+
+
+@dataclass(frozen=True, eq=False)
+class Places:
+    """Places (P, 2) along the painted curves in the grid's frame; `first` (P,) is 1 where a curve begins."""
+
+    grid: Array
+    first: Mask
+
+
+def places_along(grid: LineGrid, count: int) -> Places:
+    """About so many places at even distances on the painted curves."""
+    painted = [grid.target.curves[name] for name in grid.curves]
+    spacing = sum(curve.length_m for curve in painted) / count
+    places, first = [], []
+    for curve in painted:
+        there = curve_points(curve, 0, max(int(curve.length_m / spacing), 2))
+        places.append(there[:, :2] @ grid.turn)
+        first.append(np.arange(len(there)) == 0)
+    return Places(np.concatenate(places).astype(np.float32), np.concatenate(first))
+
+
+def grid_of(target: Target, curves: Collection[str]) -> LineGrid:
+    """The painted lines that are parallel to the longest of them, or across.
+
+    Raises:
+        InputError: fewer than two lines in one direction and one across.
+    """
+    lines = _segments(target, curves)
+    if lines:
+        x, y = _way(max(lines, key=lambda one: one.length_m))
+        turn = np.array([[x, -y], [y, x]])
+        numbers = [len(_offsets(lines, turn, axis)) for axis in (0, 1)]
+        if max(numbers) > 1 and min(numbers) > 0:
+            both = offsets_of(target, curves, turn)
+            return LineGrid(target, tuple(curves), len(turns_of(target, curves)), turn, *both)
+    raise InputError(
+        "a field is found without a start by straight lines at right angles, two one way and one across at least: "
+        "this target has fewer; start from a calibration or from corners"
+    )
+
+
+def offsets_of(target: Target, curves: Collection[str], turn: Array) -> tuple[Array, Array]:
+    """What a grid calls `along` and `across`, of these curves alone."""
+    across, along = (
+        np.unique([*_offsets(_segments(target, curves), turn, axis), *tangents])
+        for axis, tangents in enumerate(_tangents(target, curves, turn))
+    )
+    return along, across
+
+
+def _segments(target: Target, curves: Collection[str]) -> list[Segment]:
+    return [curve for name, curve in target.curves.items() if name in curves and isinstance(curve, Segment)]
+
+
+def _way(line: Segment) -> Array:
+    """(2,) of length 1."""
+    way = np.subtract(line.end, line.start)[:2]
+    return np.asarray(way / np.linalg.norm(way))
+
+
+def _offsets(lines: Sequence[Segment], turn: Array, axis: int) -> Array:
+    """The grid coordinates x (axis 0) or y that lines keep, of those that keep it and are long enough to be seen."""
+    kept = [line for line in lines if abs(_way(line) @ turn[:, axis]) < _AXIS]
+    offsets, which = np.unique(
+        np.round([line.start[:2] @ turn[:, axis] for line in kept], _DIGITS), return_inverse=True
+    )
+    lengths = np.bincount(which, [line.length_m for line in kept], len(offsets))
+    return np.asarray(offsets[lengths > _SHORT * sum(line.length_m for line in lines)])
+
+
+def _tangents(target: Target, curves: Collection[str], turn: Array) -> tuple[Array, ...]:
+    """Grid coordinates, first x, then y, of the lines across and along that touch the painted arcs."""
+    arcs = [c for name, c in target.curves.items() if name in curves and isinstance(c, Arc)]
+    return tuple(np.round([p for arc in arcs for p in _touched(arc, turn[:, axis])], _DIGITS) for axis in (0, 1))
+
+
+def _touched(arc: Arc, way: Array) -> list[float]:
+    """Offsets along `way` (2,) of the lines across it that touch an arc somewhere along it."""
+    angles = np.arctan2(way[1], way[0]) + np.array([0.0, np.pi])
+    within = np.mod(angles - arc.from_rad, 2.0 * np.pi) < arc.to_rad - arc.from_rad
+    offsets = way @ arc.centre[:2] + arc.radius_m * np.array([1.0, -1.0])
+    return [float(one) for one in offsets[within]]

@@ -1,0 +1,149 @@
+"""Whether what was followed is the field: what speaks against it, how good it is, and when two are one and the same."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from ceres_cal.detect.courses import predict
+from ceres_cal.detect.photographs.candidates import FieldSearch
+from ceres_cal.detect.photographs.followed import LEAST_SHARE, Followed
+from ceres_cal.detect.photographs.matching import divergence
+from ceres_cal.detect.photographs.painted import BY_CHANCE
+from ceres_cal.problem.ranges import PHI_RANGE
+from ceres_cal.scene.targets import Target
+
+_COURSE_PX = 3.0
+# Of the target: a stroke that lies on it. Wide paint's edge is that far from its middle. Nothing changes from half to
+# double.
+_NEAR_PX = 6.0
+# Of the strokes that could be lines of the target, the share that must lie on it. On photographs with cables, seams and
+# stripes of sun it is 0.83 at least, of other fields 0.6 at most.
+_EXPLAINED = 0.75
+# The same of a field whose paint is found at fewer than half of the places; worn lines in dashes: 1.
+_EXPLAINED_IF_WORN = 0.9
+# The same, also of those beside the target, where walls and boundary lines run: 0.61 at least where it is seen whole,
+# and less where a wider boundary line shows more strokes than its lines do: then all of these must be there.
+# A corner alone may be any corner, so that fewer curves than that must explain as much of the rest of the picture.
+_OF_ALL, _OF_ALL_IF_WHOLE, _MANY_CURVES = 0.55, 0.4, 6
+# Sine of the angle between a stroke and the lines, at most: 4 degrees. Of the usual strength of strokes on the lines,
+# another line's at least.
+_PARALLEL, _AS_STRONG = 0.07, 0.5
+_RIM = 0.02  # of its size
+# Found on a curve, and curves of which so many were: fewer could be any lines. Nothing changes from half to double.
+_FEWEST_PLACES, _FEWEST_CURVES = 5, 3
+# Cosine of the tilt: 65 degrees, 20 more than is promised. Nothing changes at half of it; at double, 33 degrees,
+# tilted views are missed.
+_LEAST_UPRIGHT = 0.42
+# Of the extent of what is seen: cameras that put it nearer together than that name it alike. Nothing changes from
+# half to double.
+_SAME_FLOOR = 0.1
+
+
+def why_missed(followed: Followed, target: Target, *, started: bool) -> str:
+    """Why lines that were followed are not the target's; for those that do not hold.
+
+    Args:
+        started: whether somebody said where to start.
+    """
+    if followed.built.is_other:
+        help_ = ": correct the target, or have them found (--estimate)" if followed.built.dimensions else ""
+        return "; ".join(followed.built.words()) + help_
+    if followed.share >= LEAST_SHARE:
+        names = ", ".join(target.curve_names[number] for number in followed.absent)
+        return f"there is no {names} where they should be: say which lines are not painted, or check the dimensions"
+    share = f" (paint at {100.0 * followed.share:.0f} % of where this start, moved, puts them)" if started else ""
+    elsewhere = "start from other points" if started else "start from corners"
+    return f"its lines were not found{share}: check the target's dimensions and which lines are painted, or {elsewhere}"
+
+
+def objection(search: FieldSearch, followed: Followed) -> str:
+    """What speaks against taking what was followed for the field, or nothing."""
+    if not is_shown(search, followed) or followed.built.is_other:
+        return why_missed(followed, search.target, started=False)
+    names = detected_curves(search, followed)
+    if len(names) < _FEWEST_CURVES or not _in_two_directions(search, names):
+        return f"only {', '.join(names)} would be in the picture: too little to find a field by; start from corners"
+    phi = followed.camera.phi / search.stroke_map.unit_px
+    if -followed.camera.cam_from_world.rotation[2, 2] < _LEAST_UPRIGHT or not PHI_RANGE[0] < phi < PHI_RANGE[1]:
+        return "its lines were not found in any view from above: start from corners"
+    share, of_all = explained(search, followed), explained(search, followed, everywhere=True)
+    enough = (_OF_ALL if followed.absent else _OF_ALL_IF_WHOLE) if len(names) >= _MANY_CURVES else _EXPLAINED
+    if share < _EXPLAINED or of_all < enough:
+        share = min(share, of_all)
+        return (
+            f"of the bright lines where the field would be, only {100.0 * share:.0f} % are lines of it: "
+            "check the target's dimensions and which lines are painted, or start from corners"
+        )
+    return ""
+
+
+def is_shown(search: FieldSearch, followed: Followed) -> bool:
+    """Whether paint is found at enough places: of a worn field at fewer, where there are no strokes but its own, and on
+    more than half of its curves: a few cables lie on some of any field's.
+    """
+    if followed.holds or not followed.may_be_worn:
+        return followed.holds
+    if 2 * len({*detected_curves(search, followed), *followed.visible}) <= len(search.curves):
+        return False
+    everywhere = explained(search, followed, everywhere=True)
+    return everywhere > _EXPLAINED and explained(search, followed) > _EXPLAINED_IF_WORN
+
+
+def likelihood(followed: Followed) -> float:
+    """How much likelier the paint that was found is of the target there than of lines laid anywhere.
+
+    The log-likelihood ratio of so many places with paint: a grid that is moved by a line has fewer of them.
+    """
+    return float(followed.places * divergence(max(followed.share, BY_CHANCE), BY_CHANCE))
+
+
+def explained(search: FieldSearch, followed: Followed, *, everywhere: bool = False) -> float:
+    """Of the strokes inside the target's outline, or everywhere, that could be its lines, the share that lies on them.
+
+    Those could be that run along its lines or across, and are as strong as the ones on it: cables, seams, shadows and
+    stripes of sun that run otherwise, or are fainter, say nothing against it.
+    """
+    strokes, camera, target = search.stroke_map.strokes, followed.camera, followed.target
+    course = predict(target, camera, search.curves, _COURSE_PX)
+    ends = np.stack([camera.locate(strokes.ends[:, end]) @ search.grid.turn for end in (0, 1)])
+    middles, along = ends.mean(axis=0), np.abs(ends[1] - ends[0])
+    places = replace(search.grid, target=target).outline
+    margin = _RIM * np.ptp(places, axis=0)
+    with np.errstate(invalid="ignore"):
+        inside = np.all((middles > places.min(axis=0) - margin) & (middles < places.max(axis=0) + margin), axis=1)
+        inside |= everywhere
+        inside &= along.min(axis=1) < _PARALLEL * along.max(axis=1)
+    if not np.any(inside) or not len(course):
+        return 0.0
+    away = np.linalg.norm(strokes.ends[inside].mean(axis=1)[:, None] - course.pixels, axis=2)
+    on_it, strength = np.min(away, axis=1) < _NEAR_PX, strokes.strength[inside]
+    if not np.any(on_it):
+        return 0.0
+    strong = strength > _AS_STRONG * np.median(strength[on_it])
+    return float(np.average(on_it[strong], weights=strokes.length_px[inside][strong]))
+
+
+def same_labels(search: FieldSearch, one: Followed, other: Followed) -> bool:
+    """Whether two put what is seen onto the same places of the target, whatever its turn."""
+    pixels = one.lines.pixels[one.lines.found]
+    here, there = (np.column_stack([c.locate(pixels), np.zeros(len(pixels))]) for c in (one.camera, other.camera))
+    extent = float(np.max(np.ptp(here, axis=0)))
+    away = [np.linalg.norm(turn.inverse.transform(here) - there, axis=1) for turn in search.turns]
+    return min(float(np.median(np.nan_to_num(one, nan=np.inf))) for one in away) < _SAME_FLOOR * extent
+
+
+def detected_curves(search: FieldSearch, followed: Followed) -> list[str]:
+    """Names of the curves that were found."""
+    numbers, places = np.unique(followed.lines.course.curve[followed.lines.found], return_counts=True)
+    return [search.target.curve_names[number] for number in numbers[places >= _FEWEST_PLACES]]
+
+
+def _in_two_directions(search: FieldSearch, names: list[str]) -> bool:
+    """Whether these curves run in more than one direction."""
+    numbers = [search.target.curve_names.index(name) for name in names]
+    tracks, is_arc = search.target.tracks[0, numbers], search.target.is_arc[numbers]
+    ways = tracks[~is_arc, 1, :2]
+    parallel = np.abs(ways[:, 0] * ways[:1, 1] - ways[:, 1] * ways[:1, 0]) < 1e-6 * np.linalg.norm(ways, axis=1)
+    return bool(np.any(is_arc) or not np.all(parallel))

@@ -1,0 +1,178 @@
+"""What photographs show of the things that a calibration knows, as observations for `refit` and `check`."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from ceres_cal.base.errors import InputError, NothingShownError
+from ceres_cal.base.progress import ImageProgress
+from ceres_cal.calibration import Calibration
+from ceres_cal.detect.boards import detect_boards
+from ceres_cal.detect.photographs.field import FieldOptions, detect_field
+from ceres_cal.detect.photographs.follow import FAR_PX
+from ceres_cal.moves import FALSE_ALARMS, Check, StationCheck, check
+from ceres_cal.observations import Observations, combine
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.targets import Target
+
+_REACH = f"{FAR_PX:.0f} px or 5 degrees"
+
+
+@dataclass(frozen=True, eq=False)
+class KnownDetections:
+    """What `detect_known` found.
+
+    Attributes:
+        station: where the photographs were taken.
+        observations: under the names of the calibration; None where no photograph shows anything.
+        shown: name of a target -> how many photographs show it.
+        missed: path and reason of every photograph that shows nothing.
+        images: how many photographs there were.
+    """
+
+    station: str
+    observations: Observations | None
+    shown: dict[str, int]
+    missed: tuple[tuple[str, str], ...]
+    images: int
+
+    def require(self) -> Observations:
+        """The observations; NothingShownError where there are none."""
+        if self.observations is None:
+            path, reason = self.missed[0]
+            raise NothingShownError(
+                f"nothing that the calibration knows was found in {_counted(self.images)}, within {_REACH} of where "
+                f"it was: after a larger move detect the field from its corners first; {path}: {reason}",
+                self.missed,
+            )
+        return self.observations
+
+
+def detect_known(
+    calibration: Calibration,
+    images: Sequence[Path],
+    station: str | None = None,
+    *,
+    not_painted: Collection[str] = (),
+    boards: bool = True,
+    progress: ImageProgress | None = None,
+) -> KnownDetections:
+    """Look through photographs of one station for everything that the calibration's targets let one find there.
+
+    Painted fields by `detect_field`, from where the station stood (it may have moved by up to 130 px, or 5 degrees),
+    chessboards by `detect_boards`. The search follows the picture and moves its own camera along, but what comes out
+    are pixels and names of what they show: a move stays in them.
+
+    Args:
+        images: files of any kind OpenCV reads.
+        station: by default the only one there is.
+        not_painted: curves that the field does not have. boards: else painted fields only.
+        progress: called after each image and target with (steps done, steps in all, file name).
+
+    Raises:
+        InputError: an image cannot be read or has another size than the camera, the calibration has no such station, no
+            such curve, or no target that is found in photographs.
+    """
+    paths, posed = [Path(path) for path in images], calibration.station(station)
+    name = station or next(iter(calibration.stations))
+    names = calibration.estimate.stations[name].camera, name
+    wanted = {
+        what: target
+        for what, target in calibration.targets.items()
+        if is_painted(target) or (boards and target.grid is not None and target.grid.checkered)
+    }
+    if not wanted:
+        raise InputError(
+            f"the calibration's targets ({', '.join(calibration.targets)}) have no painted lines"
+            f"{' and are no chessboards' if boards else ''}: give a file of observations instead of images"
+        )
+    known = {curve for target in calibration.targets.values() for curve in target.curves}
+    if unknown := sorted(set(not_painted) - known):
+        raise InputError(f"curve {unknown[0]!r} is not one of the calibration's targets': see `ceres-cal targets`")
+    parts: list[Observations] = []
+    shown: dict[str, int] = {}
+    reasons: dict[str, list[str]] = {str(path): [] for path in paths}
+    for turn, (what, target) in enumerate(wanted.items()):
+        report = _counting_on(progress, turn, len(wanted))
+        try:
+            detected, missed = _searched(paths, target, posed, names, not_painted, report)
+            parts.append(_renamed(detected, what))
+        except NothingShownError as error:  # reads: "..." beside each photograph that shows nothing
+            missed = error.missed
+        shown[what] = len(paths) - len(missed)
+        for path, reason in missed:
+            reasons[path].append(reason)
+    nothing = tuple((path, "; ".join(why)) for path, why in reasons.items() if len(why) == len(wanted))
+    return KnownDetections(name, combine(parts) if parts else None, shown, nothing, len(paths))
+
+
+def _searched(
+    paths: Sequence[Path],
+    target: Target,
+    posed: Camera,
+    names: tuple[str, str],
+    not_painted: Collection[str],
+    report: ImageProgress,
+) -> tuple[Observations, tuple[tuple[str, str], ...]]:
+    """What images show of one target, and path and reason of those that do not show it."""
+    camera, station = names
+    if not is_painted(target):
+        corners = detect_boards(paths, target, camera, station, progress=report)
+        return corners.observations, corners.missed
+    painted = [curve for curve in target.curves if curve not in not_painted]
+    lines = detect_field(paths, target, posed, painted, FieldOptions(camera, station), report)
+    return lines.observations, lines.missed
+
+
+def check_photographs(
+    calibration: Calibration,
+    images: Sequence[Path],
+    station: str | None = None,
+    false_alarms: float = FALSE_ALARMS,
+    *,
+    checks: int = 1,
+    not_painted: Collection[str] = (),
+    progress: ImageProgress | None = None,
+) -> tuple[Check, KnownDetections]:
+    """`check` with photographs of one station; boards, which lie anywhere, are not looked for.
+
+    Where no photograph shows the field near where the calibration has it, the station does not hold, and its words say
+    so: the camera has moved far, or nothing is to be seen. Raises what `detect_known` and `check` raise.
+    """
+    detections = detect_known(calibration, images, station, not_painted=not_painted, boards=False, progress=progress)
+    if detections.observations is not None:
+        return check(calibration, detections.observations, false_alarms, checks), detections
+    words = (
+        f"not found: no field within {_REACH} of where it was in {_counted(len(images))}: the camera has moved "
+        "farther, or it sees no field (dark, covered, other lines): look at the picture"
+    )
+    return Check(
+        false_alarms, checks, {detections.station: StationCheck.unknown(detections.station, words)}
+    ), detections
+
+
+def is_painted(target: Target) -> bool:
+    """Whether a target has lines to be found in photographs: those with a width."""
+    return any(curve.width_m > 0.0 for curve in target.curves.values())
+
+
+def _counted(images: int) -> str:
+    return "the photograph" if images == 1 else f"any of {images} photographs"
+
+
+def _counting_on(progress: ImageProgress | None, turn: int, turns: int) -> ImageProgress:
+    """The callback of one of several searches through the same images."""
+
+    def report(done: int, images: int, name: str) -> None:
+        if progress is not None:
+            progress(turn * images + done, turns * images, name)
+
+    return report
+
+
+def _renamed(detected: Observations, target: str) -> Observations:
+    (known,) = detected.targets.values()
+    views = tuple(replace(view, target=target) for view in detected.views)
+    return replace(detected, targets={target: known}, views=views)

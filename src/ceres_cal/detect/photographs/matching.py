@@ -1,0 +1,238 @@
+"""Which line of a target is which in a photograph whose floor is known but for place, size and quarter turns.
+
+Two parallel lines of the floor taken for two of the target tell the camera's height and one coordinate of its place,
+one line across tells the other: every such choice, in all four turns, is a hypothesis. Its score is how much likelier
+it makes the paint that was found than lines laid anywhere. Mirrored choices do not arise: the camera stands above a
+floor whose z points up, and a rotation mirrors nothing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from math import gcd
+
+import numpy as np
+
+from ceres_cal.base.arrays import Array
+from ceres_cal.base.cached import cached_property
+from ceres_cal.detect.photographs.grid import LineGrid, Places, places_along
+from ceres_cal.detect.photographs.upright import Upright
+from ceres_cal.detect.registration import Nearness
+from ceres_cal.detect.strokes import Strokes, alone
+
+# Of lines on the floor, in camera heights: how well a straightened stroke tells its place.
+_PEAK = 0.012
+_MOST_PEAKS, _LEAST_PEAK = 9, 0.015  # of lines in one direction; of all strokes, in one line
+# Sine of the angle by which a stroke may be off the direction of its line: 9 degrees, as lens and tilt are rough yet.
+_PARALLEL = 0.15
+# Within which two hypotheses are one, in camera heights.
+_CELL = 0.03
+# Choices of two lines one way, at least, that are tried with each one across: it only saves time.
+_PAIRS = 120
+_FEW, _MANY = 60, 300  # places on the target at which all, and the best, are tried
+_KEPT = 800
+_TELLS_PX = 40.0  # of a line, as much as one place on it tells
+# Of the places on the target: a camera nearer than that sees too little of it.
+_LEAST_IN_VIEW = 0.03
+CROWDED = 0.12  # half diagonals within which lines of a target hardly ever run beside each other
+_BLOCK = 2000
+_QUARTERS = np.array([[[c, -s, 0], [s, c, 0], [0, 0, 1]] for c, s in ((1, 0), (0, 1), (-1, 0), (0, -1))], dtype=float)
+
+
+@dataclass(frozen=True, eq=False)
+class Match:
+    """A hypothesis: how good it is, and the camera's place (3,) and turn (3, 3) camera from target."""
+
+    score: float
+    position: Array
+    rotation: Array
+
+
+@dataclass(frozen=True, eq=False)
+class StrokeMap:
+    """The strokes of a photograph, how near each pixel is to them, and the lens's centre (2,) px."""
+
+    strokes: Strokes
+    near: Nearness
+    image_size: tuple[int, int]
+    centre: Array
+
+    @property
+    def unit_px(self) -> float:
+        """Half the image's diagonal."""
+        return 0.5 * float(np.hypot(*self.image_size))
+
+    @property
+    def ends(self) -> Array:
+        """(N, 2, 2) the strokes' ends from the centre, in half image diagonals."""
+        return np.asarray((self.strokes.ends - self.centre) / self.unit_px)
+
+    @cached_property
+    def weights(self) -> Array:
+        """(N,) px of each stroke, as far as it may be a line."""
+        return self.strokes.length_px * alone(self.strokes, CROWDED * self.unit_px)
+
+    @cached_property
+    def paint_px(self) -> float:
+        """The length of any lines that strokes can cover: of worn lines they cover the gaps, too."""
+        return max(self.near.length_px, 1.0)
+
+    @cached_property
+    def _by_chance(self) -> float:
+        """The share of any line that strokes cover by chance."""
+        return float(np.clip(np.mean(self.near.plane), 1e-3, 0.5))
+
+    def likelihood(self, covered_px: Array, shown_px: Array) -> Array:
+        """How much likelier a target is than lines laid anywhere, by how much of what it shows strokes cover.
+
+        The log-likelihood ratio of so many successes, at whatever share of the paint is left, over what it would be if
+        the target were the strokes: from 0 to about 1.
+        """
+        chance = self._by_chance
+        covered_px = np.minimum(covered_px, self.paint_px)
+        share = np.clip(covered_px / np.maximum(shown_px, 1e-9), chance, 1.0 - 1e-9)
+        return np.asarray(shown_px * divergence(share, chance) / max(-self.paint_px * np.log(chance), 1e-9))
+
+
+def divergence(share: Array | float, other: Array | float) -> Array:
+    """Kullback and Leibler's, of two probabilities: what a trial tells of the first against the second."""
+    share, other = (np.clip(one, 1e-6, 1.0 - 1e-6) for one in (share, other))
+    return np.asarray(share * np.log(share / other) + (1.0 - share) * np.log((1.0 - share) / (1.0 - other)))
+
+
+@dataclass(frozen=True, eq=False)
+class FloorLines:
+    """Where lines lie on the floor, in increasing order: x of those that run along y, and y of those along x.
+
+    In camera heights from the place below the camera.
+    """
+
+    x: Array
+    y: Array
+
+    def turned(self, quarters: int) -> FloorLines:
+        """The same in axes that are turned by quarters, counter-clockwise."""
+        lines = self
+        for _ in range(quarters):
+            lines = FloorLines(lines.y, -lines.x[::-1])
+        return lines
+
+
+def lines_seen(upright: Upright, stroke_map: StrokeMap) -> FloorLines:
+    """The lines on which most strokes lie."""
+    ends, weights = stroke_map.ends, stroke_map.weights
+    floor = np.stack([upright.floor(ends[:, 0]), upright.floor(ends[:, 1])], axis=1)
+    on_floor = np.all(np.isfinite(floor), axis=(1, 2))
+    floor, weights = floor[on_floor], weights[on_floor]
+    along = np.diff(floor, axis=1)[:, 0]
+    slope = np.abs(along / np.linalg.norm(along, axis=1, keepdims=True))
+    middle = floor.mean(axis=1)
+    x, y = (
+        _peaks(middle[rows, axis], weights[rows], float(weights.sum()))
+        for axis, rows in enumerate((slope[:, 0] < _PARALLEL, slope[:, 1] < _PARALLEL))
+    )
+    return FloorLines(x, y)
+
+
+def match(upright: Upright, stroke_map: StrokeMap, grid: LineGrid, lines: FloorLines) -> list[Match]:
+    """The best hypotheses for these lines, the best first."""
+    few, many = (places_along(grid, count) for count in (_FEW, _MANY))
+    scored: list[tuple[float, Array, Array]] = []
+    for quarters in range(4 // gcd(4, grid.turns)):
+        turned = replace(upright, rotation=upright.rotation @ _QUARTERS[quarters])
+        hypotheses = _hypotheses(lines.turned(quarters), grid)
+        score = _scores(stroke_map, turned, hypotheses, few)
+        best = np.argsort(-score)[:_KEPT]
+        score = _scores(stroke_map, turned, hypotheses[best], many)
+        scored += [(float(value), hypotheses[row], turned.rotation) for value, row in zip(score, best, strict=True)]
+    scored.sort(key=lambda one: -one[0])
+    return [_as_match(score, place, rotation, grid) for score, place, rotation in scored[:_KEPT]]
+
+
+def _as_match(score: float, place: Array, rotation: Array, grid: LineGrid) -> Match:
+    height, x, y = place
+    turn = np.eye(3)
+    turn[:2, :2] = grid.turn.T
+    return Match(score, np.array([*(grid.turn @ [x, y]), height]), rotation @ turn)
+
+
+# ---- hypotheses -----------------------------------------------------------------------------------------------------
+
+
+def _hypotheses(lines: FloorLines, grid: LineGrid) -> Array:
+    """(K, 3) camera height and place x, y in the grid that put two lines one way and one across on lines of it."""
+    x, y = lines.x, lines.y
+    height_y, place_y = _pairs(y, grid.along)
+    height_x, place_x = _pairs(x, grid.across)
+    parts = [
+        _crossed(height_y, place_y, x, grid.across)[:, [0, 2, 1]],
+        _crossed(height_x, place_x, y, grid.along),
+    ]
+    every = np.concatenate(parts)
+    every = every[every[:, 0] > 0.0]
+    cells = np.column_stack([np.log(every[:, 0]), every[:, 1:] / every[:, :1]]) / _CELL
+    return every[np.unique(np.round(cells).astype(np.int64), axis=0, return_index=True)[1]]
+
+
+def _pairs(peaks: Array, lines: Array) -> tuple[Array, Array]:
+    """Camera height and place for every two lines seen taken for two of the grid, in the same order."""
+    i, j = np.triu_indices(len(peaks), 1)
+    a, b = np.triu_indices(len(lines), 1)
+    height = (lines[b] - lines[a])[None] / (peaks[j] - peaks[i])[:, None]
+    place = lines[a][None] - height * peaks[i][:, None]
+    return _telling(height.ravel(), place.ravel(), peaks, lines)
+
+
+def _telling(height: Array, place: Array, peaks: Array, lines: Array) -> tuple[Array, Array]:
+    """Those that put most of the lines seen on lines of the grid; where many are as good, all of them."""
+    if len(height) <= _PAIRS:
+        return height, place
+    where = (lines - place[:, None]) / height[:, None]
+    near = np.min(np.abs(where[:, None] - peaks[:, None]), axis=2) < 2.0 * _PEAK
+    count = np.count_nonzero(near, axis=1)
+    kept = count >= np.sort(count)[-_PAIRS]
+    return height[kept], place[kept]
+
+
+def _crossed(height: Array, place: Array, peaks: Array, lines: Array) -> Array:
+    """(K, 3) each height and place with, third, the place across for each line seen taken for each of the grid."""
+    other = lines[None, None] - height[:, None, None] * peaks[None, :, None]
+    count = len(peaks) * len(lines)
+    return np.column_stack([np.repeat(height, count), np.repeat(place, count), other.ravel()])
+
+
+def _peaks(values: Array, weights: Array, total: float) -> Array:
+    """Where most strokes lie, in increasing order."""
+    chosen: list[float] = []
+    left = weights.copy()
+    for _ in range(_MOST_PEAKS):
+        density = np.exp(-(((values[:, None] - values) / _PEAK) ** 2)) @ left if len(values) else left
+        if not len(density) or np.max(density) < _LEAST_PEAK * total:
+            break
+        near = np.abs(values - values[np.argmax(density)]) < 2.0 * _PEAK
+        chosen.append(float(np.average(values[near], weights=left[near] + 1e-9)))
+        left[near] = 0.0
+    return np.sort(np.array(chosen))
+
+
+# ---- their scores --------------------------------------------------------------------------------------------------
+
+
+def _scores(stroke_map: StrokeMap, upright: Upright, hypotheses: Array, places: Places) -> Array:
+    """(K,) of each hypothesis, from 0 to 1."""
+    blocks = range(0, len(hypotheses), _BLOCK)
+    parts = [_scored(stroke_map, upright, hypotheses[b : b + _BLOCK].astype(np.float32), places) for b in blocks]
+    return np.concatenate([np.empty(0), *parts])
+
+
+def _scored(stroke_map: StrokeMap, upright: Upright, hypotheses: Array, places: Places) -> Array:
+    floor = (places.grid - hypotheses[:, None, 1:]) / hypotheses[:, None, :1]
+    pixels = stroke_map.centre.astype(np.float32) + np.float32(stroke_map.unit_px) * upright.offsets(floor)
+    with np.errstate(invalid="ignore"):
+        inside = np.all((pixels > -0.5) & (pixels < np.array(stroke_map.image_size) - 0.5), axis=2)
+    step = np.linalg.norm(np.diff(pixels, axis=1, prepend=pixels[:, :1]), axis=2)
+    step = np.where(inside & ~places.first & np.isfinite(step), np.minimum(step, _TELLS_PX), 0.0)
+    near = stroke_map.near.at(pixels[..., 0], pixels[..., 1])
+    covered, shown = np.sum(step * near, axis=1), np.sum(step, axis=1)
+    enough = np.mean(inside, axis=1) >= _LEAST_IN_VIEW
+    return np.where(enough, stroke_map.likelihood(covered, shown), 0.0)

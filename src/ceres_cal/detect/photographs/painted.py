@@ -1,0 +1,99 @@
+"""How well a target's own lines are seen where a camera puts them, and which of those it may lack are not there."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+
+import numpy as np
+
+from ceres_cal.base.arrays import Array, Array32
+from ceres_cal.detect.courses import Course, predict
+from ceres_cal.detect.lines import search
+from ceres_cal.detect.photographs.matching import divergence
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.targets import Target
+
+# Where lines are sought: px apart, and to either side as a share of half the image's diagonal.
+_SPACING_PX, _REACH, _FEWEST = 8.0, 0.035, 12
+BY_CHANCE = 0.3  # of the places on any lines, those that look like paint: what is brighter than the others does
+_ANYWHERE = 400  # places of lines laid anywhere, by which that brightness is known
+_R3 = 1.2207440846057596 ** -np.arange(1.0, 4.0)
+_NEAR = 0.012  # the same where they are known to lie
+# Log-likelihood ratio from which on paint along a curve is none by chance.
+_SURELY = 3.0
+# Of the places on lines, at most, where lines that are not painted look like paint: 0.3 by chance, 0.8 of worn ones.
+_LACKS = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class _PaintCoverage:
+    """Of each of the target's C curves: places in view, and those of them that have paint nearby."""
+
+    places: Array
+    bright: Array
+
+    def lacks(self, target: Target, part: Collection[str]) -> bool:
+        """Whether these curves are in view and hardly more is seen of them than by chance."""
+        rows = [target.curve_index[name] for name in part]
+        return bool(np.sum(self.bright[rows]) < _LACKS * np.sum(self.places[rows]))
+
+
+def _seen(
+    grey: Array32, target: Target, camera: Camera, curves: Collection[str], share_of_image: float = _REACH
+) -> _PaintCoverage:
+    course = predict(target, camera, curves, _SPACING_PX, _SPACING_PX)
+    count = len(target.curves)
+    if len(course) < _FEWEST:
+        return _PaintCoverage(np.zeros(count), np.zeros(count))
+    reach_px = 0.5 * share_of_image * float(np.hypot(*camera.image_size))
+    anywhere = _laid_anywhere(camera.image_size, float(np.median(course.width_px)))
+    by_chance = float(np.quantile(search(grey, anywhere, reach_px)[1], 1.0 - BY_CHANCE))
+    bright = search(grey, course, reach_px)[1] > by_chance
+    return _PaintCoverage(
+        *(np.bincount(course.curve, one, count).astype(float) for one in (np.ones(len(course)), bright))
+    )
+
+
+def _laid_anywhere(image_size: tuple[int, int], width_px: float) -> Course:
+    """Places of lines all over an image, in all directions: a low-discrepancy sequence (Roberts 2018, R3)."""
+    x, y, turn = np.mod(np.outer(_R3, np.arange(1.0, _ANYWHERE + 1.0)), 1.0)
+    pixels = np.column_stack([x, y]) * (np.array(image_size) - 1.0)
+    normals = np.column_stack([np.cos(np.pi * turn), np.sin(np.pi * turn)])
+    none = np.zeros(_ANYWHERE)
+    return Course(none.astype(np.int32), none, pixels, normals, none, np.full(_ANYWHERE, width_px))
+
+
+def painted_curves(grey: Array32, target: Target, camera: Camera, curves: Collection[str]) -> tuple[str, ...]:
+    """These curves without the optional parts of the target that are not in the picture, where the camera sees them."""
+    seen = _seen(grey, target, camera, curves)
+    lacking = {name for part in target.optional if seen.lacks(target, part) for name in part}
+    return tuple(name for name in curves if name not in lacking)
+
+
+def visible_curves(grey: Array32, target: Target, camera: Camera, curves: Collection[str]) -> tuple[str, ...]:
+    """Those of the curves along which there is more paint than by chance, though it may be in dashes, or too near to
+    other paint, to be measured.
+    """
+    seen = _seen(grey, target, camera, curves, _NEAR)
+    share = np.maximum(seen.bright / np.maximum(seen.places, 1.0), BY_CHANCE)
+    sure = seen.places * divergence(share, BY_CHANCE) > _SURELY
+    return tuple(name for name in curves if sure[target.curve_index[name]])
+
+
+def likelihood_of_place(grey: Array32, target: Target, camera: Camera, curves: Collection[str]) -> float:
+    """How much likelier the target is there than elsewhere, by where its own lines are seen in the picture itself.
+
+    The log-likelihood ratio of so many places with paint, less what tells that the curves do not share one share: of a
+    target that is elsewhere some lie on paint and others do not, while wear and robots are everywhere. Optional parts
+    that are not seen say nothing.
+    """
+    seen = _seen(grey, target, camera, curves)
+    painted = np.ones(len(target.curves), dtype=bool)
+    for part in target.optional:
+        painted[[target.curve_index[name] for name in part]] &= not seen.lacks(target, part)
+    places, bright = seen.places[painted], seen.bright[painted]
+    if not np.sum(places):
+        return -np.inf
+    own, share = bright / np.maximum(places, 1.0), max(float(np.sum(bright) / np.sum(places)), BY_CHANCE)
+    return float(np.sum(places) * divergence(share, BY_CHANCE) - np.sum(places * divergence(own, share)))

@@ -1,0 +1,127 @@
+"""The camera that a photograph's lines, as far as they are known yet, belong to: from a start, in one robust solve."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ceres_cal.base.arrays import Array, Indices32
+from ceres_cal.base.errors import CalibrationError
+from ceres_cal.observations import NO_POINTS, Curves, Observations, Points, Prior, View
+from ceres_cal.observations.sights import gather_sights
+from ceres_cal.problem.bundle import solve
+from ceres_cal.problem.parameters import Estimate, Layout, Options, Station, intrinsic_names
+from ceres_cal.problem.priors import stated_prior
+from ceres_cal.problem.problem import Problem, Weighting
+from ceres_cal.problem.residuals import residuals
+from ceres_cal.problem.structure import make_structure, redrawn
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.targets import Target
+
+CAMERA, STATION, TARGET = "camera", "station", "field"
+_QUICK = Options(max_iterations=30, threads=1)
+
+
+@dataclass(frozen=True, eq=False)
+class PointHints:
+    """Points that somebody showed: index (P,) among the target's, pixels (P, 2), sigma_px (P,)."""
+
+    feature: Indices32
+    pixels: Array
+    sigma_px: Array
+
+
+@dataclass(frozen=True, eq=False)
+class FreeIntrinsics:
+    """What of the camera, and of the target, a photograph may change besides the pose.
+
+    Attributes:
+        names: of the free intrinsics, in the order in which they are freed. priors: that hold them, and dimensions of
+            the target, which are free because of that.
+        hints: points that somebody showed, which hold the camera while lines are far off.
+        keep: whether the starts are known to be near: nothing far off is looked at.
+    """
+
+    names: tuple[str, ...] = ()
+    priors: tuple[Prior, ...] = ()
+    hints: PointHints | None = None
+    keep: bool = False
+
+
+def observations_of(
+    target: Target,
+    image_size: tuple[int, int],
+    curve: Indices32,
+    pixels: Array,
+    sigma_px: Array,
+    hints: PointHints | None = None,
+) -> Observations:
+    """One view of a field in the world: pixels (N, 2) on curves (N,), and points."""
+    count = len(curve)
+    points = NO_POINTS
+    if hints is not None:
+        points = Points(np.zeros(len(hints.feature), np.int32), hints.feature, hints.pixels, hints.sigma_px)
+    return Observations(
+        {TARGET: target},
+        {CAMERA: image_size},
+        (View("frame", CAMERA, STATION, TARGET),),
+        points,
+        Curves(np.zeros(count, np.int32), curve, pixels, sigma_px, np.zeros(count, np.int8)),
+    )
+
+
+def problem_of(
+    camera: Camera, observations: Observations, free: tuple[str, ...], priors: tuple[Prior, ...]
+) -> tuple[Problem, Estimate]:
+    """What `refit_camera` solves, and where from."""
+    names, solved = intrinsic_names(camera.lens), tuple(prior.dimension for prior in priors if prior.dimension)
+    freed = np.array(sorted(names.index(name) for name in free), dtype=np.int64)
+    estimate = Estimate(
+        {CAMERA: camera.at(camera.cam_from_world)},
+        {STATION: Station(CAMERA, camera.cam_from_world)},
+        {},
+        make_structure(observations.targets, {}, solved),
+    )
+    layout = Layout({CAMERA: freed}, frozenset({STATION}), frozenset())
+    known = tuple(stated_prior(prior, camera.lens) for prior in priors)
+    weighting = Weighting(loss="cauchy", loss_scale=2.0)
+    return Problem(gather_sights(observations), layout, known, weighting, _QUICK), estimate
+
+
+def refit_camera(
+    camera: Camera, observations: Observations, free: tuple[str, ...] = (), priors: tuple[Prior, ...] = ()
+) -> tuple[Camera, Target] | None:
+    """The posed camera that one view's observations tell, from one that is near, and the target; None where they tell
+    none.
+
+    Args:
+        free: names of the intrinsics that are free too. priors: on them, and on dimensions that are solved for.
+    """
+    problem, estimate = problem_of(camera, observations, free, priors)
+    try:
+        solution = solve(problem, estimate, precision=1e-6)
+        refitted = solution.estimate.camera_at(STATION)
+    except CalibrationError:  # reads: "its lines were not found ..." where no start leads to a camera
+        return None
+    finite = np.all(np.isfinite(refitted.position))
+    usable = not solution.failed and not refitted.folds and finite and refitted.position[2] > 0.0
+    found = solution.estimate.structure.dimensions
+    lengths = {name.partition("/")[2]: length for name, length in found.items()}
+    if not usable or not all(length > 0.0 for length in lengths.values()):
+        return None
+    return refitted, redrawn(observations.targets[TARGET], lengths)
+
+
+def misfit(camera: Camera, observations: Observations) -> float:
+    """Mean cost of the curve observations of one view, by the loss of `refit_camera`."""
+    problem, estimate = problem_of(camera, observations, (), ())
+    left = residuals(observations, problem.sights, estimate).curves / problem.weighting.loss_scale
+    return float(np.mean(np.log1p(np.nan_to_num(left, nan=np.inf) ** 2)))
+
+
+def moved_px(camera: Camera, refitted: Camera, pixels: Array) -> float:
+    """How far the floor that is seen at these pixels moves from one camera to the other, px at most."""
+    floor = camera.locate(pixels)
+    moved = refitted.project(np.column_stack([floor, np.zeros(len(floor))])) - pixels
+    return float(np.nanmax(np.linalg.norm(moved, axis=1), initial=0.0))

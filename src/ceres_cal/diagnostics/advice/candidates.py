@@ -1,0 +1,240 @@
+"""What could be measured next, the best of each kind searched for: heights, poles, boards, lines, frames."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ceres_cal.base.arrays import Array
+from ceres_cal.diagnostics.advice.measurements import Ground, Measurement, together
+from ceres_cal.diagnostics.advice.outlook import Outlook
+from ceres_cal.observations import Prior
+from ceres_cal.problem.information import Information
+from ceres_cal.problem.structure import Tolerance
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.curves import Arc, curve_points
+from ceres_cal.scene.targets import Target, checkerboard, custom
+from ceres_cal.simulate import ViewPlan, board_pose, well_inside
+
+HEIGHT_SIGMAS_M = (0.02, 0.01, 0.005)
+POSITION_SIGMA_M = 0.01
+POLE_M, POLE_SIGMA_M = 1.0, 0.005
+"""Height of a pole, and how far its top may stand aside from where it should, along x and along y."""
+BOARD = checkerboard(9, 6, 0.1)
+_POLE_COUNTS, _BOARD_COUNTS, _LINE_COUNTS = (1, 3), (3, 6), (1, 3)
+_FRAMES = 10
+_LINE_SPACING_M, _FRAME_SPACING_M = 0.05, 0.1
+_FINE = 199  # pieces of a curve, to tell which stretch is seen
+_GRID_M = 0.5  # between two places that a pole is tried at
+# A marked place does for a pole where another one leaves not much less: nobody measures a place to save a tenth.
+# Nothing changes from half to double.
+_MARKED = 1.1
+_BOARD_SIZES = (0.5, 0.3)  # shares of the image's shorter side that a board's diagonal takes
+_BOARD_PLACES = (0.2, 0.5, 0.8)  # of the image's width and height
+_BOARD_TILTS_DEG = (20.0, 40.0)
+_NEARER = ("upper", "right", "lower", "left")  # the edge that leans towards the camera, by quarter turns
+_LEAST_HEIGHT_M = 0.05  # of any corner of a board over the floor
+
+
+@dataclass(frozen=True, eq=False)
+class CandidateSearch:
+    """Where the best of each kind is looked for.
+
+    Attributes:
+        board: the board that would be shown, under its name.
+    """
+
+    ground: Ground
+    outlook: Outlook
+    board: tuple[str, Target]
+    curves_observed: bool
+
+    @property
+    def station(self) -> str:
+        return self.outlook.today.station
+
+    @property
+    def camera(self) -> Camera:
+        return self.ground.estimate.camera_at(self.station)
+
+    def candidates(self) -> Iterator[Measurement]:
+        """The least work first."""
+        yield from heights(self.station, self.camera)
+        yield from self._best(poles(self), _POLE_COUNTS, _poles_words, _marked_first)
+        yield from self._best(lines(self), _LINE_COUNTS, _lines_words)
+        yield from frames(self)
+        yield from self._best(boards(self), _BOARD_COUNTS, self._boards_words)
+
+    def _best(
+        self,
+        pool: Iterator[Measurement],
+        counts: Sequence[int],
+        words: Callable[[Sequence[Measurement]], str],
+        choose: Callable[[Sequence[Measurement], Array], int] = lambda pool, worst: int(np.argmin(worst)),
+    ) -> Iterator[Measurement]:
+        """Of a pool the best ones, each the one that brings most beside those before it."""
+        left = list(pool)
+        informations = [self.ground.information_of(measurement) for measurement in left]
+        taken: list[Measurement] = []
+        total = Information.nothing(self.ground.keys)
+        while left and len(taken) < max(counts):
+            errors = [self.outlook.after(total + one) for one in informations]
+            number = choose(left, np.array([e.worst_mm for e in errors]))
+            total = total + informations.pop(number)
+            taken.append(left.pop(number))
+            if len(taken) in counts:
+                yield together(taken, words(taken))
+
+    def _boards_words(self, taken: Sequence[Measurement]) -> str:
+        grid = self.board[1].grid
+        assert grid is not None  # `advise` takes no other board
+        size = f"{grid.columns} x {grid.rows} corners, {1e3 * grid.spacing_m:.0f} mm apart"
+        return f"show a board of {size}, in {len(taken)} frames"
+
+
+# ---- the tape -------------------------------------------------------------------------------------------------------
+
+
+def heights(station: str, camera: Camera) -> Iterator[Measurement]:
+    """The height, or the whole position, by tape."""
+    x, y, height = camera.position.tolist()
+    for sigma in HEIGHT_SIGMAS_M:
+        prior = Prior("station", station, "height_m", (height,), (sigma,))
+        yield Measurement("tape", f"measure the camera's height to {1e3 * sigma:.0f} mm", priors=(prior,))
+    position = Prior("station", station, "position_m", (x, y, height), (POSITION_SIGMA_M,) * 3)
+    words = f"measure the camera's x, y and height to {1e3 * POSITION_SIGMA_M:.0f} mm each"
+    yield Measurement("tape", words, priors=(position,))
+
+
+# ---- poles ----------------------------------------------------------------------------------------------------------
+
+
+def poles(search: CandidateSearch) -> Iterator[Measurement]:
+    """A pole at each place of a grid over the field, and on each of its marked points, where its top is seen.
+
+    Where phi is followed along its profile, that is wherever the camera may be by it, if not hardly over the pole.
+    """
+    camera, grid = search.camera, search.outlook.today
+    top = min(POLE_M, float(np.floor(4.0 * camera.position[2]) / 10.0))  # a short one under a low camera
+    elsewhere = [estimate.camera_at(search.station) for _, estimate in search.outlook.possible]
+    cameras = [camera, *(other for other in elsewhere if other.position[2] > 2.0 * top)]
+    x, y = (np.arange(np.ceil(a[0] / _GRID_M), a[-1] / _GRID_M + 1e-9) * _GRID_M for a in (grid.x_m, grid.y_m))
+    places = [("", float(a), float(b)) for a in x for b in y]
+    for _, target in still(search.ground.targets):
+        places += [(name, a, b) for name, (a, b, z) in target.points.items() if z == 0.0]
+    for mark, a, b in places:
+        if all(well_inside(one, np.array([[a, b, top]]))[0] for one in cameras):
+            yield _pole(search.station, mark, a, b, top)
+
+
+def _pole(station: str, mark: str, x: float, y: float, top: float) -> Measurement:
+    name = f"pole_{mark}" if mark else f"pole_{x:.2f}_{y:.2f}"
+    where = f"on {mark} ({x:.2f}, {y:.2f} m)" if mark else f"at ({x:.2f}, {y:.2f} m)"
+    frames = tuple(f"{name}_{number:02d}" for number in range(1, _FRAMES + 1))
+    return Measurement(
+        "pole",
+        f"{where}, its top {top:.2f} m over the field",
+        targets={name: custom({"top": (x, y, top)})},
+        tolerances={name: Tolerance(points_m=POLE_SIGMA_M)},
+        views=(ViewPlan(frames, station, name),),
+    )
+
+
+def _marked_first(pool: Sequence[Measurement], worst_mm: Array) -> int:
+    """The best place, or a marked one that is nearly as good: nobody has to measure where that is."""
+    marked = np.array([measurement.words.startswith("on ") for measurement in pool])
+    near = marked & (worst_mm <= _MARKED * np.min(worst_mm))
+    return int(np.argmin(np.where(near, worst_mm, np.inf))) if near.any() else int(np.argmin(worst_mm))
+
+
+def _poles_words(taken: Sequence[Measurement]) -> str:
+    what = "a pole" if len(taken) == 1 else f"{len(taken)} poles"
+    return f"stand {what} upright, to {1e3 * POLE_SIGMA_M:.0f} mm, and observe the top in {_FRAMES} frames"
+
+
+# ---- boards ---------------------------------------------------------------------------------------------------------
+
+
+def boards(search: CandidateSearch) -> Iterator[Measurement]:
+    """The board at several places of the image, distances and tilts, where it is seen whole and over the floor."""
+    name, board = search.board
+    camera, size = search.camera, np.array(search.camera.image_size, dtype=float)
+    diagonal = float(np.linalg.norm(np.ptp(board.point_array, axis=0)))
+    for share in _BOARD_SIZES:
+        distance = camera.phi * diagonal / (share * float(size.min()))
+        for column in _BOARD_PLACES:
+            for row in _BOARD_PLACES:
+                pixel = np.round(size * (column, row))
+                for tilt in _BOARD_TILTS_DEG:
+                    for quarter, edge in enumerate(_NEARER):
+                        turn = (np.deg2rad(tilt), 0.5 * np.pi * quarter, 0.0)
+                        pose = board_pose(board, camera, pixel, distance, turn)
+                        held = camera.cam_from_world.inverse @ pose
+                        corners = held.transform(board.point_array)
+                        if np.min(corners[:, 2]) < _LEAST_HEIGHT_M or not np.all(well_inside(camera, corners)):
+                            continue
+                        label = f"advised_{share:.1f}_{pixel[0]:.0f}_{pixel[1]:.0f}_{tilt:.0f}_{edge}"
+                        words = (
+                            f"middle at pixel ({pixel[0]:.0f}, {pixel[1]:.0f}), {distance:.2f} m from the camera, "
+                            f"tilted by {tilt:.0f} deg, its {edge} edge nearer"
+                        )
+                        yield Measurement(
+                            "board",
+                            words,
+                            targets={name: board},
+                            placements={label: held},
+                            views=(ViewPlan((label,), search.station, name, label),),
+                        )
+
+
+# ---- the field's own curves -----------------------------------------------------------------------------------------
+
+
+def still(targets: Mapping[str, Target]) -> Iterator[tuple[str, Target]]:
+    """The targets that lie in the world."""
+    yield from ((name, target) for name, target in targets.items() if not target.movable)
+
+
+def lines(search: CandidateSearch) -> Iterator[Measurement]:
+    """Each curve of the field that the image shows, observed densely in one more frame."""
+    for name, target in still(search.ground.targets):
+        for curve in target.curves:
+            stretch = _seen_stretch(search, target, curve)
+            if stretch is not None:
+                plan = ViewPlan((f"advised_{curve}",), search.station, name, None, (), (curve,), _LINE_SPACING_M)
+                yield Measurement("line", f"{curve}, {stretch}", views=(plan,))
+
+
+def _seen_stretch(search: CandidateSearch, target: Target, name: str) -> str | None:
+    """What of a curve the image shows, in words; None where it shows none of it."""
+    curve = target.curves[name]
+    places = curve_points(curve, 0, _FINE)
+    seen = well_inside(search.camera, places)
+    if not seen.any():
+        return None
+    (x1, y1, _), (x2, y2, _) = places[seen][[0, -1]]
+    if isinstance(curve, Arc):
+        x, y, _ = curve.centre
+        return f"around ({x:.2f}, {y:.2f} m), {100 * np.mean(seen):.0f} % of it in view"
+    return f"from ({x1:.2f}, {y1:.2f}) to ({x2:.2f}, {y2:.2f} m)"
+
+
+def _lines_words(taken: Sequence[Measurement]) -> str:
+    what = "a line" if len(taken) == 1 else f"{len(taken)} lines"
+    return f"observe {what} every {1e3 * _LINE_SPACING_M:.0f} mm in one more frame"
+
+
+def frames(search: CandidateSearch) -> Iterator[Measurement]:
+    """More frames of the field, as it was observed: its curves, or its points where no curves were."""
+    names = tuple(f"advised_{number:02d}" for number in range(1, _FRAMES + 1))
+    for name, target in still(search.ground.targets):
+        if search.curves_observed and target.curves:
+            plan = ViewPlan(names, search.station, name, None, (), None, _FRAME_SPACING_M)
+            what = f"every line, a point each {1e3 * _FRAME_SPACING_M:.0f} mm"
+        elif target.points:
+            plan, what = ViewPlan(names, search.station, name, None, None, ()), "every point"
+        else:
+            continue
+        yield Measurement("frames", f"take {_FRAMES} more frames of {name!r}, {what}", views=(plan,))

@@ -1,0 +1,153 @@
+"""What a station's map would be if more were known: the worst and the mean error, in mm, at one height."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from ceres_cal.base.arrays import Array, Indices
+from ceres_cal.base.cached import cached_property
+from ceres_cal.base.spread import Spread
+from ceres_cal.posterior.maps import FieldMap, locate_slopes, station_keys, visible_pixels
+from ceres_cal.posterior.posterior import Posterior
+from ceres_cal.posterior.profile import PhiProfile
+from ceres_cal.problem.information import Information, Key
+from ceres_cal.problem.parameters import Estimate
+from ceres_cal.problem.quantities import moved
+
+BENT = 0.05  # relative sigma of phi up to which the quadratic picture holds (`posterior.assess` leaves it there)
+_NODES = 7  # of a valley at which a promise is worked out
+
+
+@dataclass(frozen=True, eq=False)
+class Errors:
+    """Largest and mean standard deviation of located points over what the image shows, mm; infinite where unknown."""
+
+    worst_mm: float
+    mean_mm: float
+
+
+@dataclass(frozen=True, eq=False)
+class Outlook:
+    """One station at one height.
+
+    Attributes:
+        today: its map. keys: (K) the posterior's own that it depends on. slopes: (N, 2, K) by them of where the N
+            places that the image shows are located.
+    """
+
+    estimate: Estimate
+    posterior: Posterior
+    today: FieldMap
+    keys: tuple[Key, ...]
+    slopes: Array
+
+    @classmethod
+    def of(cls, estimate: Estimate, posterior: Posterior, today: FieldMap) -> Outlook:
+        """The outlook from today's map.
+
+        Raises:
+            InputError: see `maps.station_keys`.
+        """
+        keys = station_keys(estimate, posterior, today.station)
+        return cls(estimate, posterior, today, keys, _slopes(estimate, today, keys))
+
+    @property
+    def before(self) -> Errors:
+        """Today's errors."""
+        return Errors(self.today.worst_mm, self.today.mean_mm)
+
+    @property
+    def profile(self) -> PhiProfile | None:
+        """The valley along phi that today's map follows, where it does."""
+        return self.posterior.profiles.get(self.estimate.stations[self.today.station].camera)
+
+    def after(self, added: Information) -> Errors:
+        """The errors with information added, by the quadratic picture at the estimate.
+
+        Where phi was followed along its profile and would have to be still, see `shrunk`.
+        """
+        known = self._known(added)
+        bent = self.profile is not None and self._phi_sd(self.estimate, known) > BENT
+        return self.shrunk(added) if bent else _errors(known, self.slopes)
+
+    def shrunk(self, added: Information) -> Errors:
+        """Today's errors, smaller as those of the quadratic picture get smaller with information added."""
+        today = Information.nothing(added.keys)
+        now, then = (_errors(self._known(more), self.slopes) for more in (today, added))
+        if not np.isfinite(now.worst_mm):
+            return then
+        worst = self.before.worst_mm * min(then.worst_mm / now.worst_mm, 1.0)
+        return Errors(worst, self.before.mean_mm * min(then.mean_mm / now.mean_mm, 1.0))
+
+    def _phi_sd(self, estimate: Estimate, known: Spread) -> float:
+        """Relative standard deviation of phi by what is known of the K numbers; 0 where it is held."""
+        camera = estimate.stations[self.today.station].camera
+        column = next((i for i, key in enumerate(self.keys) if key[:3] == ("camera", camera, "phi")), None)
+        return 0.0 if column is None else float(known.sd[column]) / estimate.cameras[camera].phi
+
+    def _known(self, added: Information) -> Spread:
+        """What is known of the K numbers with information added."""
+        others = [key for key in added.keys if key not in set(self.keys)]
+        if not np.any(added.matrix[added.columns(others)]):  # nothing of what is integrated out: do that once
+            return (self._own + added.given(self.keys)).spread
+        whole = self.posterior.information + added
+        return _part(whole.spread, whole.columns(self.keys))
+
+    @cached_property
+    def _own(self) -> Information:
+        return self.posterior.information.marginal(self.keys)
+
+    @cached_property
+    def possible(self) -> tuple[tuple[int, Estimate], ...]:
+        """Some nodes of the valley within its 95 % bounds, by number; none where phi is not followed."""
+        if self.profile is None:
+            return ()
+        keys, steps = self.profile.keys, self.profile.steps
+        within = np.flatnonzero(self.profile.rises <= self.posterior.half_width**2)
+        some = within[np.unique(np.linspace(0, len(within) - 1, _NODES).round().astype(int))]
+        return tuple((int(node), moved(self.estimate, keys, steps[node])) for node in some)
+
+    def along_valley(self, information_at: Callable[[Estimate], Information]) -> Iterator[tuple[float, float, Errors]]:
+        """phi (px), its relative standard deviation and the errors if that is what it is and the information there is
+        added, over what phi may be by its 95 % bounds.
+
+        There the observations of today tell everything but phi as the valley has it, and phi by the parabola that fits
+        the valley best. Where nothing would be seen of what is added, all of it is infinite.
+        """
+        profile = self.profile
+        assert profile is not None
+        tangents = np.gradient(profile.steps[:, 1:], profile.steps[:, 0], axis=0)
+        bend = max(float(np.polyfit(np.log(profile.phi), profile.rises, 2)[0]), 0.0) if len(profile.phi) > 2 else 0.0
+        for node, there in self.possible:
+            added = information_at(there).given(profile.keys)
+            if not np.any(added.matrix):
+                yield float(profile.phi[node]), np.inf, Errors(np.inf, np.inf)
+                continue
+            across, along = profile.across[node].matrix, tangents[node]
+            coupling = -across @ along
+            phi = along @ across @ along + bend / profile.phi[node] ** 2
+            matrix = np.block([[np.atleast_2d(phi), coupling[None]], [coupling[:, None], across]])
+            whole = Information(profile.keys, matrix) + added
+            known = _part(whole.spread, whole.columns(self.keys))
+            errors = _errors(known, _slopes(there, self.today, self.keys))
+            yield float(profile.phi[node]), self._phi_sd(there, known), errors
+
+
+def _part(known: Spread, at: Indices) -> Spread:
+    """What is known of some of the numbers."""
+    return Spread(known.covariance[np.ix_(at, at)], known.unknown[at], known.scale[at])
+
+
+def _errors(known: Spread, slopes: Array) -> Errors:
+    """The errors of places with slopes (N, 2, K) by numbers of which so much is known."""
+    sd = 1e3 * np.sqrt(np.trace(known.through(slopes), axis1=1, axis2=2))
+    return Errors(float(np.max(sd)), float(np.mean(sd)))
+
+
+def _slopes(estimate: Estimate, grid: FieldMap, keys: tuple[Key, ...]) -> Array:
+    """(N, 2, K) of the N places of the grid that the image shows."""
+    pixels = visible_pixels(estimate, grid.station, grid.places, grid.height_m)
+    return locate_slopes(estimate, keys, grid.station, pixels[np.isfinite(pixels[:, 0])], grid.height_m)

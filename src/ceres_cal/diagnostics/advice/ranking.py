@@ -1,0 +1,235 @@
+"""What to measure next, and what it would bring, in mm."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from ceres_cal.base.errors import InputError
+from ceres_cal.base.executing import each
+from ceres_cal.base.numerical import numerical
+from ceres_cal.base.progress import StepProgress
+from ceres_cal.calibration import Calibration, Fit
+from ceres_cal.diagnostics.advice.candidates import BOARD, CandidateSearch, still
+from ceres_cal.diagnostics.advice.measurements import Ground, Measurement
+from ceres_cal.diagnostics.advice.outlook import BENT, Errors, Outlook
+from ceres_cal.posterior.posterior import Posterior
+from ceres_cal.problem.information import Information
+from ceres_cal.problem.parameters import Estimate
+from ceres_cal.problem.problem import Weighting
+from ceres_cal.scene.heights import ROBOT_TOP_M
+from ceres_cal.scene.targets import Target
+
+_LARGER, _LESS = 0.5, 0.2
+"""Less work is nearly as good as the best where the error that it leaves is larger by no more than the first share of
+the best's, and what it takes off smaller by no more than the second share of the best's."""
+# Of today's worst error; what leaves more is not advised: less than a tenth is within what advice is off by.
+# Nothing changes from 0.82 to 0.95.
+_MUST_LEAVE = 0.9
+
+
+@dataclass(frozen=True, eq=False)
+class Promise:
+    """What one measurement would bring.
+
+    Attributes:
+        after: the errors that it leaves, where everything is as estimated.
+        valley: where phi is followed along its profile today, and the measurement settles it: phi (px) and the errors
+            left if that is what phi is, over its 95 % bounds.
+        rough: whether phi is followed along its profile and might have to be still. Then `after` is a guess: what was
+            obtained in simulation is from a tenth to five times of it, or known where it says unknown.
+    """
+
+    measurement: Measurement
+    after: Errors
+    rough: bool = False
+    valley: tuple[tuple[float, Errors], ...] = ()
+
+    @property
+    def worst_range_mm(self) -> tuple[float, float]:
+        """Least and largest worst error, over what phi may be."""
+        worst = [self.after.worst_mm, *(errors.worst_mm for _, errors in self.valley)]
+        return min(worst), max(worst)
+
+
+@dataclass(frozen=True, eq=False)
+class Advice:
+    """Measurements and their promises, the one that leaves the smallest worst error first.
+
+    Attributes:
+        station: whose map. height_m: at which height. before: its errors today; worst_place_m: where they are largest.
+        promises: best first. best: the one to follow, with the least work of those that are nearly as good as the best;
+            None where nothing brings enough. then: what to do after it, with what both together leave.
+        good_enough_mm: what the worst error may be; None where nobody said.
+    """
+
+    station: str
+    height_m: float
+    before: Errors
+    worst_place_m: tuple[float, float]
+    promises: tuple[Promise, ...]
+    best: Promise | None
+    then: Promise | None
+    good_enough_mm: float | None
+
+
+@numerical("the advice")
+def advise(
+    calibration: Calibration,
+    station: str | None = None,
+    height_m: float = ROBOT_TOP_M,
+    good_enough_mm: float | None = None,
+    board: Target | None = None,
+    progress: StepProgress | None = None,
+    executor: Executor | None = None,
+) -> Advice:
+    """What to measure besides, ranked by the worst error that it leaves on a station's map.
+
+    Computed from the posterior and what each measurement would add to it at the estimate (no observations are needed),
+    with the noise that the calibration found. It promises what the next calibration will say of itself; model error (a
+    lens with too few coefficients, a field painted amiss) is in neither.
+
+    Args:
+        station: may be left out where there is only one. board: that could be shown; by default the calibration's own,
+            or one of 9 x 6 corners, 100 mm apart. progress: called after each measurement that was looked at.
+        executor: over which the measurements go; the same advice whatever it is.
+
+    Raises:
+        InputError: no such station, one that was held as the world, or a calibration that says nothing of how well it
+            is known.
+    """
+    if board is not None and board.grid is None:
+        raise InputError(f"a board to show is a checkerboard, not of kind {board.kind!r}")
+    ground, outlook = _prepared(calibration, station, height_m)
+    search = CandidateSearch(ground, outlook, _board(calibration.targets, board), calibration.fit.curves > 0)
+    candidates = list(search.candidates())
+    informations = list(each(ground.information_of, candidates, executor=executor))
+    promises = []
+    one_promise = partial(_promise, ground=ground, outlook=outlook)
+    for number, promise in enumerate(each(one_promise, candidates, informations, executor=executor), start=1):
+        promises.append(promise)
+        if progress is not None:
+            progress(number, len(candidates), promise.measurement.words)
+    enough = 0.0 if good_enough_mm is None else good_enough_mm
+    best = _chosen(promises, outlook.before, enough)
+    then = None if best is None else _next(best, candidates, informations, outlook, enough)
+    ranked = sorted(promises, key=lambda promise: (promise.after.worst_mm, promise.after.mean_mm))
+    today = outlook.today
+    return Advice(
+        today.station,
+        height_m,
+        outlook.before,
+        today.worst_place_m,
+        tuple(ranked),
+        None if best is None else promises[best],
+        then,
+        good_enough_mm,
+    )
+
+
+def promised(
+    calibration: Calibration,
+    measurements: Sequence[Measurement],
+    station: str | None = None,
+    height_m: float = ROBOT_TOP_M,
+) -> tuple[Promise, ...]:
+    """What measurements of one's own would bring, each by itself.
+
+    Raises:
+        InputError: see `advise`.
+    """
+    ground, outlook = _prepared(calibration, station, height_m)
+    return tuple(_promise(one, ground.information_of(one), ground, outlook) for one in measurements)
+
+
+def _prepared(calibration: Calibration, station: str | None, height_m: float) -> tuple[Ground, Outlook]:
+    """What to add to, and the outlook: both of the numbers that a measurement at this station can tell of."""
+    known = calibration.uncertainty
+    if not any(still(calibration.targets)):
+        raise InputError("advice is about a map of a field, and there is none: nothing that was observed stands still")
+    today = known.map_sd_mm(station, height_m)
+    if not np.any(today.sd_mm >= 0.0):
+        raise InputError(f"station {today.station!r} sees nothing of the field at {1e3 * height_m:.0f} mm")
+    posterior = _of_camera(known.posterior, known.estimate, known.estimate.stations[today.station].camera)
+    tolerances, weighting = calibration.options.tolerances, _weighting(calibration.fit)
+    ground = Ground(known.estimate, posterior.keys, calibration.targets, tolerances, weighting)
+    return ground, Outlook.of(known.estimate, posterior, today)
+
+
+def _of_camera(posterior: Posterior, estimate: Estimate, camera: str) -> Posterior:
+    """What is known of a camera, its stations and the targets as built, all else integrated out."""
+    owners = {("camera", camera), *(("station", name) for name, s in estimate.stations.items() if s.camera == camera)}
+    keys = [key for key in posterior.keys if key[:2] in owners or key.is_structure]
+    stated = posterior.stated.over(posterior.keys).marginal(keys)
+    return replace(posterior, information=posterior.information.marginal(keys), bends=None, stated=stated)
+
+
+def _weighting(fit: Fit) -> Weighting:
+    """Noise in px of points and curves, as the fit found it; of a kind that nobody observed that of the other."""
+    points, curves = (mine or other for mine, other in (fit.noise_px, fit.noise_px[::-1]))
+    if not points > 0.0:
+        raise InputError("the calibration found no noise at all: advice would promise miracles")
+    return Weighting(points, curves, "trivial")
+
+
+def _board(targets: Mapping[str, Target], board: Target | None) -> tuple[str, Target]:
+    for name, target in targets.items():
+        if target.grid is not None and board in (None, target):
+            return name, target
+    name = "board"
+    while name in targets:
+        name += "_"
+    return name, board or BOARD
+
+
+def _promise(measurement: Measurement, added: Information, ground: Ground, outlook: Outlook) -> Promise:
+    """Sure where phi is not followed along its profile, or would not have to be any more, whatever it is.
+
+    Where the camera would not see what is measured does not count: who measures will see.
+    """
+    after = outlook.after(added)
+    if outlook.profile is None:
+        return Promise(measurement, after)
+    valley = tuple(outlook.along_valley(lambda there: _information_there(measurement, ground, there, outlook)))
+    known = [sd for _, sd, _ in valley if np.isfinite(sd)]
+    if not known or max(known) > BENT or not np.isfinite(after.worst_mm):
+        return Promise(measurement, outlook.shrunk(added), rough=True)
+    return Promise(measurement, after, valley=tuple((phi, errors) for phi, _, errors in valley))
+
+
+def _information_there(measurement: Measurement, ground: Ground, there: Estimate, outlook: Outlook) -> Information:
+    """What it would say if everything were elsewhere: boards are held before the camera, wherever that is."""
+    here, other = (e.stations[outlook.today.station].cam_from_world for e in (ground.estimate, there))
+    return replace(ground, estimate=there).information_of(measurement.before(here, other))
+
+
+def _chosen(promises: Sequence[Promise], before: Errors, enough_mm: float) -> int | None:
+    """Number of the one with the least work that is good enough whatever phi is, or nearly as good as the best."""
+    worst = np.array([promise.after.worst_mm for promise in promises])
+    least = float(np.min(worst))
+    if before.worst_mm <= enough_mm or not least < _MUST_LEAVE * before.worst_mm:
+        return None
+    surely = np.array([promise.worst_range_mm[1] for promise in promises])
+    nearly = least + min(_LARGER * least, _LESS * (before.worst_mm - least))
+    return int(np.argmax((worst <= nearly) | (surely <= enough_mm)))
+
+
+def _next(
+    first: int,
+    candidates: Sequence[Measurement],
+    informations: Sequence[Information],
+    outlook: Outlook,
+    enough_mm: float,
+) -> Promise | None:
+    """What brings most after the first, of another kind; None where nothing does, or the first is good enough."""
+    kind = candidates[first].kind
+    others = [number for number, candidate in enumerate(candidates) if candidate.kind != kind]
+    promises = [
+        Promise(candidates[number], outlook.after(informations[first] + informations[number])) for number in others
+    ]
+    chosen = _chosen(promises, outlook.after(informations[first]), enough_mm) if promises else None
+    return None if chosen is None else promises[chosen]

@@ -1,0 +1,281 @@
+"""Errors that go together along a curve, or over a board, within one view or over all views of a sight.
+
+Their covariance falls off with the distance d on the target like exp(-d / l), and over boards, which bend smoothly,
+also like exp(-(d / l)^2 / 2). The likelihood of a grid of lengths l and shares (`likelihood`) weighs them against
+independent errors, and the covariance of the scores is averaged over all (the best alone would be too sure of itself).
+Whether there is anything to look for is asked first (`score_test`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ceres_cal.base.arrays import Array, Mask
+from ceres_cal.base.tails import student_95
+from ceres_cal.base.words import two_digits
+from ceres_cal.effects.between import FEWEST_GROUPS, INDEPENDENT, Between, compare_groups
+from ceres_cal.effects.likelihood import Likelihoods, is_loud, likelihoods
+from ceres_cal.effects.sample import Sample, take_sample
+from ceres_cal.effects.strands import Strand, StrandFamily, decay, distances_of
+from ceres_cal.observations import Observations
+from ceres_cal.problem.information import Information
+from ceres_cal.problem.parameters import Estimate
+from ceres_cal.problem.problem import Problem
+from ceres_cal.problem.reduced import ReducedInformation
+from ceres_cal.problem.residuals import Residuals
+
+_FEWEST_ROWS = 12
+_INDEFINITE, _BISECTIONS = 1e6, 50  # degrees of freedom that are as good as any number
+_NEGLIGIBLE = 1e-3  # weight below which a place on the grid is left out
+
+
+@dataclass(frozen=True)
+class Correlation:
+    """How the errors of one kind of observation go together.
+
+    Attributes:
+        kind: "points" or "curves". probability: that they do. length_m, share: the likeliest length over which, None
+            where whole curves lie aside, and share of the variance that does. lasting: whether over all views of a
+            sight, not anew in each of them.
+    """
+
+    kind: str
+    probability: float
+    length_m: float | None
+    share: float
+    lasting: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Covariances:
+    """What correlated errors make of the scores.
+
+    Attributes:
+        scores: (G, P, P) covariance of each group's score. private: factor on the variance of private placements.
+        inverse_freedom: 1 / degrees of freedom of these covariances. kinds: those that are correlated.
+    """
+
+    scores: Array
+    private: float
+    inverse_freedom: float
+    kinds: tuple[Correlation, ...] = ()
+
+
+def correlated(sample: Sample) -> Covariances:
+    """The covariance of each group's score, with what errors have in common."""
+    scores, private, inverse, kinds = sample.informations.copy(), [1.0], 0.0, []
+    for is_curve, kind in ((False, "points"), (True, "curves")):
+        rows = sample.is_curve == is_curve
+        if np.count_nonzero(rows) < _FEWEST_ROWS:
+            continue
+        families = sample.families(is_curve)
+        if not any(map(is_loud, families)):
+            continue
+        average = _Average.of(sample, families, rows, may_be_smooth=not is_curve)
+        change, factor = average.change(sample)
+        scores += change
+        private.append(factor)
+        inverse += average.inverse_freedom
+        kinds.append(average.correlation(kind))
+    return Covariances(scores, max(private), inverse, tuple(kinds))
+
+
+@dataclass(frozen=True, eq=False)
+class _Average:
+    """The mean over the grid.
+
+    Attributes:
+        families: of strands. at: the places, the first one independence. variance: (N,) in that of independence.
+        weight: (N,). inverse_freedom: of what is averaged.
+    """
+
+    families: Sequence[StrandFamily]
+    at: Likelihoods
+    variance: Array
+    weight: Array
+    inverse_freedom: float
+
+    @classmethod
+    def of(cls, sample: Sample, families: Sequence[StrandFamily], rows: Mask, may_be_smooth: bool) -> _Average:
+        """Weighed by likelihood and prior. Bent boards and lenses err smoothly, edges along a line do not."""
+        own = np.sum(sample.shared[rows] ** 2)
+        at = likelihoods(families, may_be_smooth, float(own))
+        weight = np.full(len(at.share), (1.0 - INDEPENDENT) / max(len(at.share) - 1, 1))
+        weight[0] = INDEPENDENT
+        variance = at.variance / at.variance[0]  # the noise scale is that of independent errors
+        weight *= np.exp(at.log - at.log.max())
+        weight /= weight.sum()
+        weight[weight < _NEGLIGIBLE] = 0.0
+        weight /= weight.sum()
+        used, rest = weight > 0.0, sample.shared.shape[1] - own  # what all other rows say
+        mixed = 1.0 / _freedom_of_mixture(weight[used], (rest + variance * at.trace)[used])
+        return cls(families, at, variance, weight, mixed + float(weight @ at.inverse_freedom))
+
+    def correlation(self, kind: str) -> Correlation:
+        """What is likeliest."""
+        best = 1 + int(np.argmax(self.weight[1:])) if len(self.weight) > 1 else 0
+        length, longest = float(self.at.length_m[best]), max(family.longest for family in self.families)
+        aside, probability = length > 2.0 * longest, float(1.0 - self.weight[0])
+        share, lasting = float(self.at.share[best]), self.families[int(self.at.family[best])].lasting
+        return Correlation(kind, probability, None if aside else length, share, lasting)
+
+    def change(self, sample: Sample) -> tuple[Array, float]:
+        """(G, P, P) what is added to the covariance of each group's score, and the factor on private placements."""
+        scores, private = np.zeros_like(sample.informations), np.zeros(2)
+        for number, family in enumerate(self.families):
+            here = self.at.family == number
+            each, share = (self.weight * self.variance)[here], self.at.share[here]
+            alone = float(np.sum(each * (1.0 - share))) - (1.0 if number == 0 else 0.0)
+            for strands in map(family.strands.__getitem__, family.of_shape):
+                kernel = self._kernel(strands[0], here, each * share)
+                x = sample.columns[np.array([strand.rows for strand in strands])][..., :-1]
+                product = np.swapaxes(x, 1, 2) @ (alone * x + kernel @ x)
+                np.add.at(scores, sample.group[[strand.rows[0] for strand in strands]], product[:, 6:, 6:])
+                if number == 0:
+                    private[1] += float(np.sum(x[..., :6] ** 2))
+                # What moves all of a view is not its scatter.
+                common = float(kernel.min()) * float(np.sum(x[..., :6].sum(axis=1) ** 2))
+                private[0] += float(np.trace(product[:, :6, :6], axis1=1, axis2=2).sum()) - common
+        return scores, float(1.0 + max(private[0], 0.0) / private[1]) if private[1] > 0.0 else 1.0
+
+    def _kernel(self, strand: Strand, here: Mask, weights: Array) -> Array:
+        """(N, N) sum of weights times the correlation at some places."""
+        distance = distances_of(strand.places)
+        kernel, used = np.zeros_like(distance), weights > 0.0
+        lengths, smooth, weights = self.at.length_m[here][used], self.at.smooth[here][used], weights[used]
+        for length, one in sorted(set(zip(lengths.tolist(), smooth.tolist(), strict=True))):
+            same = (lengths == length) & (smooth == one)
+            kernel += float(np.sum(weights[same])) * decay(distance, length, one)
+        return kernel
+
+
+# ---- degrees of freedom of a mixture --------------------------------------------------------------------------------
+
+
+def _freedom_of_mixture(weights: Array, variances: Array) -> float:
+    """Degrees of freedom at which Student's t is as wide at 95 % as a mixture of normals of these variances, once both
+    have the same mean variance.
+    """
+    mean = float(weights @ variances)
+
+    def beyond(width: float) -> float:
+        inside = [math.erf(width * math.sqrt(0.5 * mean / v)) for v in variances.tolist()]
+        return 0.05 - (1.0 - float(weights @ inside))
+
+    width = _root_of(beyond, 1.0, 12.0)
+    return math.exp(_root_of(lambda log: width - student_95(math.exp(log)), 0.0, math.log(_INDEFINITE)))
+
+
+def _root_of(rising: Callable[[float], float], low: float, high: float) -> float:
+    """Where a rising function changes its sign, by bisection; one of the ends where it does not."""
+    for _ in range(_BISECTIONS):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if rising(middle) < 0.0 else (low, middle)
+    return 0.5 * (low + high)
+
+
+_DETERMINED = 1e-12  # share of the largest variance of a score: what is below is rounding
+_LIKELY = 0.5  # probability from which on a cause is named
+_OVER = {"points": "errors go together between a target's points", "curves": "errors go together along lines"}
+
+
+@dataclass(frozen=True)
+class Dependence:
+    """What the residuals say of the errors' dependence.
+
+    Attributes:
+        correlations: of points and of curves, where neighbours might agree. between: how views or placements scatter;
+            None where there are too few, or one sees what lasts over all of them.
+        private: factor on the variance of placements by their own observations.
+        inverse_freedom: 1 / degrees of freedom of all that, beside the noise scale's.
+    """
+
+    correlations: tuple[Correlation, ...] = ()
+    between: Between | None = None
+    private: float = 1.0
+    inverse_freedom: float = 0.0
+
+    @property
+    def causes(self) -> tuple[str, ...]:
+        """What is likely, in words."""
+        likely = [one for one in self.correlations if one.probability > _LIKELY]
+        causes = [_OVER[one.kind] + _reach(one) for one in likely]
+        if self.between is not None and self.between.probability > _LIKELY:
+            factor = two_digits(self.between.variance**0.5)
+            causes.append(f"views scatter {factor} times as far as what is within them says")
+        return tuple(causes)
+
+
+def _reach(correlation: Correlation) -> str:
+    length = correlation.length_m
+    over = " as a whole" if length is None else f" over {two_digits(length)} m"
+    return over + (" in all views alike" if correlation.lasting else "")
+
+
+@dataclass(frozen=True, eq=False)
+class Scatter:
+    """How much more, or less, the shared numbers scatter than the model says.
+
+    Attributes:
+        root: (K, P) from directions in which they are known to one by the model. matrix: (P, P) their covariance as
+            the data scatter. dependence: what that rests on.
+    """
+
+    root: Array
+    matrix: Array
+    dependence: Dependence
+
+    def widened(self, seen: Information) -> Information:
+        """What the observations say without any prior, as they scatter.
+
+        Args:
+            seen: what they say by the model.
+        """
+        along = self.root.T @ seen.matrix
+        own = along @ self.root
+        values, vectors = np.linalg.eigh(0.5 * (own + own.T))
+        determined = values > _DETERMINED * values[-1]
+        white = vectors[:, determined] / np.sqrt(values[determined])
+        scores = np.eye(white.shape[1]) + white.T @ (self.matrix - np.eye(len(own))) @ white
+        change = (along.T @ white) @ (np.linalg.inv(scores) - np.eye(len(scores))) @ (white.T @ along)
+        return Information(seen.keys, seen.matrix + 0.5 * (change + change.T))
+
+
+def measure_scatter(
+    observations: Observations, problem: Problem, there: Residuals, estimate: Estimate, reduced: ReducedInformation
+) -> Scatter | None:
+    """How the shared numbers scatter by the residuals; None where there is no such number, or nothing left over.
+
+    Args:
+        problem: as it was solved, at the noise that was found. there: residuals at the estimate. reduced: what the
+            problem says there.
+    """
+    sample = take_sample(observations, problem, there, estimate, reduced)
+    if sample is None or not sample.root.shape[1]:
+        return None
+    within = correlated(sample)
+    whole = _whole(sample, within.scores)
+    lasting = sample.is_shared and any(kind.lasting for kind in within.kinds)
+    between, inverse = None, within.inverse_freedom
+    compared = compare_groups(sample, within.scores, whole) if sample.groups >= FEWEST_GROUPS and not lasting else None
+    if compared is not None:
+        between, whole = compared
+        inverse += between.probability / between.degrees_of_freedom
+    return Scatter(sample.root, whole, Dependence(within.kinds, between, within.private, inverse))
+
+
+def _whole(sample: Sample, scores: Array) -> Array:
+    """(P, P) covariance of the score of everything: the views that were not looked at scatter like those that were."""
+    seen, everything = sample.informations.sum(axis=0), np.eye(len(sample.prior)) - sample.prior
+    values, vectors = np.linalg.eigh(seen)
+    determined = values > 1e-6
+    back = vectors[:, determined] / np.sqrt(values[determined])
+    change = back.T @ scores.sum(axis=0) @ back - np.eye(int(determined.sum()))
+    values, vectors_of = np.linalg.eigh(everything)
+    root = (vectors_of * np.sqrt(np.maximum(values, 0.0))) @ vectors_of.T @ vectors[:, determined]
+    whole = np.eye(len(seen)) + root @ change @ root.T
+    return np.asarray(0.5 * (whole + whole.T))

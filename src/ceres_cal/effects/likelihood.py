@@ -1,0 +1,209 @@
+"""Is there any correlation to look for? Score tests at three lengths, which cost no likelihood.
+
+That of a share a of nothing is r' K r with K = exp(-d / l) - 1, against its expectation -tr(K H) and its variance under
+independent errors, of which the fit took up the part H = U U'. Summed over the strands of one shape first, r r' and H
+serve all lengths.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+
+from ceres_cal.base.arrays import Array, Indices, Mask
+from ceres_cal.effects.strands import StrandFamily, decay
+
+ASIDE = 20.0
+"""Times the longest strand: the length of what moves it as a whole."""
+# The likelihood is asked from so many standard deviations of a score test on (one in five of white noise), if the
+# correlation that is likely by it would widen the variance of what is shared by so much.
+_LOUD, _MATTERS = 0.85, 0.08
+_NO_NOISE = 1e-6  # mean square, in squared standard deviations, below which residuals are rounding
+
+
+def is_loud(family: StrandFamily) -> bool:
+    """Whether neighbours, nearby rows or whole strands agree more than they do in one of five sets of white noise."""
+    gap, longest, sums = family.gap, family.longest, np.diagonal(family.products)
+    noise = sums[-1] / max(np.count_nonzero(family.filled) - np.sum(sums[:-1]), 1.0)
+    if gap == 0.0 or noise < _NO_NOISE:
+        return False
+    residuals, private, shared = (family.squared(s) for s in (slice(-1, None), slice(6), slice(6, -1)))
+    agreement, count = residuals / noise + private + shared, np.diff(family.bounds)
+    for length in (gap, np.sqrt(gap * longest), ASIDE * longest):
+        together = np.exp(-family.distance / length) * (family.distance > 0.0)
+        squares = float(count @ np.sum(together**2, axis=(1, 2)))
+        total = float(np.sum(together * agreement))
+        widening = total / squares * float(np.sum(together * shared) / np.sum(sums[6:-1]))
+        least = 0.2 * squares
+        if widening <= _MATTERS or total <= _LOUD * np.sqrt(least):
+            continue
+        if total > _LOUD * np.sqrt(max(_variance(family, together, squares), least)):
+            return True
+    return False
+
+
+def _variance(family: StrandFamily, together: Array, squares: float) -> float:
+    """Of the score at the matrices (D, M, M), whose squared entries add up to so much over all strands."""
+    taken, along = family.columns[..., :-1], family.applied(together)[..., :-1]
+    inner = np.swapaxes(taken, 1, 2) @ along
+    return float(2.0 * (squares - 2.0 * np.sum(along**2) + np.sum(inner**2)))
+
+
+# To 0.995: with 0.95 at most, lines that bend over 2 m are covered in 84 to 88 %. In parts: the next one is left out
+# where the likelihood falls over the one before it to nothing.
+_SHARES = np.array([0.1, 0.25, 0.5]), np.array([0.75, 0.9, 0.97, 0.995])
+_NOTHING = 6.0  # nats below the best: less than the share of a place that is left out
+_FEWEST_FREEDOM = 3.0  # degrees of freedom that a variance is given at least
+
+_Place = tuple[int, bool, float]  # number of the family, whether errors have no edges, length
+
+
+@dataclass(frozen=True, eq=False)
+class Likelihoods:
+    """N places on the grid.
+
+    Attributes:
+        family: (N,) its number. smooth: (N,) whether errors have no edges. length_m, share: (N,).
+        log: (N,) the likelihood's logarithm. variance: (N,) s^2. trace: (N,) of the scores' covariance.
+        inverse_freedom: (N,) of that.
+    """
+
+    family: Indices
+    smooth: Mask
+    length_m: Array
+    share: Array
+    log: Array
+    variance: Array
+    trace: Array
+    inverse_freedom: Array
+
+
+def likelihoods(families: Sequence[StrandFamily], may_be_smooth: bool, squared: float) -> Likelihoods:
+    """Of independent errors first, then of those that go together in one of the families.
+
+    Args:
+        may_be_smooth: whether errors without edges are looked for, too.
+        squared: sum of the squared shared columns over all rows, of which the families show some.
+    """
+    parts = [_independent(families[0], squared)]
+    best = float(parts[0].log[0])
+    for smooth, (number, family) in product((False, True)[: 1 + may_be_smooth], enumerate(families)):
+        for length in _lengths(family):
+            at, falls = _Eigenbasis.of(family, length, smooth), False
+            for shares in _SHARES:
+                place = number, smooth, length
+                part = (_impossible if falls else _of_shares)(family, at, shares, squared, place)
+                parts.append(part)
+                best = max(best, float(part.log.max()))
+                falls = bool(part.log[-1] < min(best - _NOTHING, part.log[-2]))
+    return Likelihoods(*map(np.concatenate, zip(*(vars(part).values() for part in parts), strict=True)))
+
+
+def _lengths(family: StrandFamily) -> list[float]:
+    """The lengths of a family's grid, m."""
+    gap, longest = family.gap, family.longest
+    if gap == 0.0:
+        return []
+    lengths = 0.5 * gap * 2.0 ** np.arange(np.ceil(np.log2(3.0 * longest / gap)))
+    if not np.any(family.columns[:, 0, :6]):  # a pose of its own takes up what moves the whole
+        lengths = np.append(lengths, ASIDE * longest)
+    return list(lengths.tolist())
+
+
+@dataclass(frozen=True, eq=False)
+class _Eigenbasis:
+    """A family where its correlation is diagonal.
+
+    Attributes:
+        values: (S, M) its eigenvalues. columns: (S, M, Z) those of the family. white: (S, M) squared lengths of the
+            shared ones.
+    """
+
+    values: Array
+    columns: Array
+    white: Array
+
+    @classmethod
+    def of(cls, family: StrandFamily, length: float, smooth: bool) -> _Eigenbasis:
+        """At one length."""
+        values, vectors = np.linalg.eigh(decay(family.distance, length, smooth))
+        columns = family.applied(np.swapaxes(vectors, 1, 2))
+        shared = columns[..., 6:-1]
+        return cls(family.per_strand(np.maximum(values, 0.0)), columns, np.einsum("smz,smz->sm", shared, shared))
+
+
+def _independent(family: StrandFamily, squared: float) -> Likelihoods:
+    """The likelihood of independent errors."""
+    shared = family.columns[..., 6:-1]
+    white = np.einsum("smz,smz->sm", shared, shared)
+    at = _Eigenbasis(family.filled.astype(float), family.columns, white)
+    return _of_shares(family, at, np.zeros(1), squared, (0, False, 0.0))
+
+
+def _of_shares(family: StrandFamily, at: _Eigenbasis, shares: Array, squared: float, place: _Place) -> Likelihoods:
+    """The restricted likelihood at one place for some shares (A,)."""
+    diagonal = 1.0 - shares[:, None, None] * (1.0 - at.values)
+    logs, reduced, taken = _without_private(at.columns / np.sqrt(diagonal)[..., None], family.group)
+    size, count = at.columns.shape[2] - 7, int(np.count_nonzero(family.filled))
+    log, variance, freedom = _restricted(family, reduced, count - taken)
+    parts = (1.0 - shares) * at.white.sum(), shares * np.sum(at.white * at.values)
+    few = max(count**2 / float(np.sum(at.values**2)) - (0 if taken else size), _FEWEST_FREEDOM)
+    inverse = (parts[0] ** 2 / freedom + parts[1] ** 2 / few) / np.maximum(parts[0] + parts[1], 1e-300) ** 2
+    scale = squared / max(float(at.white.sum()), 1e-300)  # of all rows to those looked at
+    number, smooth, length_m = (np.full(len(shares), one) for one in place)
+    return Likelihoods(
+        number,
+        smooth,
+        length_m,
+        shares,
+        log - 0.5 * (np.log(diagonal).sum(axis=(1, 2)) + logs),
+        variance,
+        scale * (parts[0] + parts[1]),
+        inverse,
+    )
+
+
+def _impossible(family: StrandFamily, at: _Eigenbasis, shares: Array, squared: float, place: _Place) -> Likelihoods:
+    """Shares that need not be looked at."""
+    number, smooth, length = (np.full(len(shares), one) for one in place)
+    one = np.ones(len(shares))
+    return Likelihoods(number, smooth, length, shares, -np.inf * one, one, one, one)
+
+
+def _without_private(columns: Array, group: Indices) -> tuple[Array, Array, int]:
+    """The private placement of each view eliminated from products of columns (A, S, M, Z): logarithms of the
+    determinants (A,), what is left over of all (A, P + 1, P + 1), and how many numbers were eliminated.
+    """
+    count, size = len(columns), columns.shape[-1] - 6
+    shared = columns[..., 6:].reshape(count, -1, size)
+    rest = np.swapaxes(shared, 1, 2) @ shared
+    views, view = np.unique(group, return_inverse=True)
+    products = (np.swapaxes(columns[..., :6], 2, 3) @ columns).reshape(count, len(view), -1)
+    whole = ((np.arange(len(views))[:, None] == view).astype(float) @ products).reshape(count, -1, 6, 6 + size)
+    own, coupling = whole[..., :6], whole[..., 6:]
+    there = np.diagonal(own, axis1=2, axis2=3) > 1e-9
+    taken = int(np.count_nonzero(there[0]))
+    if not taken:
+        return np.zeros(count), rest, 0
+    own = np.where(there[..., :, None] & there[..., None, :], own, np.eye(6))
+    coupling = np.where(there[..., :, None], coupling, 0.0)
+    eliminated = np.linalg.solve(own, coupling).reshape(count, -1, size)
+    rest -= np.swapaxes(coupling.reshape(count, -1, size), 1, 2) @ eliminated
+    return np.linalg.slogdet(own)[1].sum(axis=1), rest, taken
+
+
+def _restricted(family: StrandFamily, reduced: Array, count: int) -> tuple[Array, Array, float]:
+    """Logarithm of the restricted likelihood (A,) without the determinant of R, s^2 (A,), and its degrees of freedom.
+
+    What all other rows and the priors say of the shared numbers is a prior here; the whole is at its optimum.
+    """
+    own = family.products[6:, 6:]
+    normal = np.eye(len(own) - 1) - own[:-1, :-1] + reduced[:, :-1, :-1]
+    slope = reduced[:, :-1, -1] - own[:-1, -1]
+    squares = reduced[:, -1, -1] - np.einsum("ai,ai->a", slope, np.linalg.solve(normal, slope[..., None])[..., 0])
+    freedom = max(count - float(np.trace(own[:-1, :-1])), 1.0)
+    variance = np.maximum(squares, 1e-9) / freedom
+    return -0.5 * (freedom * np.log(variance) + np.linalg.slogdet(normal)[1]), variance, freedom

@@ -1,0 +1,343 @@
+"""What the free numbers of a calibration can take up of the residuals, and what they must leave.
+
+The linear model of the bundle at its end, in standard deviations: placements that one sight shows are projected out
+sight by sight, everything shared by one triangular factor, priors as equations of their own. Then a column over the
+equations (an alternative to the model) has a part that the calibration would have absorbed and a part that it cannot;
+the score test (Rao 1948) looks at the second part alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ceres_cal.base.arrays import Array, Indices, Mask
+from ceres_cal.base.cached import cached_property
+from ceres_cal.observations import Observations
+from ceres_cal.observations.sights import ranges
+from ceres_cal.problem.costs import robust_weights
+from ceres_cal.problem.equations import Equations, of_observations
+from ceres_cal.problem.information import Key, columns_by_owner
+from ceres_cal.problem.parameters import Estimate, intrinsic_names, intrinsics_scales
+from ceres_cal.problem.problem import Problem, Weighting
+from ceres_cal.problem.quantities import free_keys, from_placement, from_station
+from ceres_cal.problem.residuals import Residuals
+
+LEAST_LEFT = 1e-7
+"""Share of an alternative's squared length that the free numbers must leave for it to be testable."""
+SINGULAR = 1e-12
+"""Share of its own information that a number must keep beside the others."""
+
+
+@dataclass(frozen=True, eq=False)
+class Weights:
+    """How the E equations count.
+
+    Attributes:
+        inverse_sigma: (E,) 1 / standard deviation, px^-1. used: (E,) which take part. robust: (E,) rho' of each
+            equation's observation.
+    """
+
+    inverse_sigma: Array
+    used: Mask
+    robust: Array
+
+    @property
+    def within_sigma(self) -> Weights:
+        """The same with the robust weights in the standard deviations, as the solver sees them."""
+        return Weights(self.inverse_sigma * np.sqrt(self.robust), self.used, np.ones_like(self.robust))
+
+
+@dataclass(frozen=True, eq=False)
+class AddedNumbers:
+    """What Q more free numbers would do to a model.
+
+    Attributes:
+        rest: (E, Q) their columns, in standard deviations, beyond private placements. taken: (P, Q) what its shared
+            directions take of them. root: (Q, R) a root of their covariance, of what is determined. step: (R,) how far
+            they are from their best values.
+    """
+
+    rest: Array
+    taken: Array
+    root: Array
+    step: Array
+
+    @property
+    def amount(self) -> Array:
+        """(Q,) what brings them to their best values; 0 for what cannot be determined."""
+        return -self.root @ self.step
+
+    @property
+    def sd(self) -> Array:
+        """(Q,) its standard deviations, infinite for what cannot be determined."""
+        return np.where(np.any(self.root != 0.0, axis=1), np.sqrt(np.sum(self.root**2, axis=1)), np.inf)
+
+    @property
+    def decrease(self) -> float:
+        """By how much the squared residuals fall."""
+        return float(self.step @ self.step)
+
+
+@dataclass(frozen=True, eq=False)
+class Linearised:
+    """Equations in standard deviations, and an orthonormal basis of what the free numbers do to them.
+
+    Attributes:
+        weight: (E,) 1 / standard deviation, px^-1. used: (E,) which equations take part.
+        score: (E,) robust residuals, in standard deviations; 0 where an equation is not used.
+        private: (E, 6) basis of what each private placement does to its sight's equations, 0 elsewhere.
+        shared: (E, P) basis of what shared numbers do beyond that; with priors of less than unit length.
+        step: (P,) how far each direction of `shared` is from its best value, in standard deviations.
+        unknowns: how many free numbers the equations determine. prior_equations: how many equations priors add.
+        known_noise: equations that what was known of the noise before counts as.
+    """
+
+    equations: Equations
+    weight: Array
+    used: Mask
+    score: Array
+    private: Array
+    shared: Array
+    step: Array
+    unknowns: int
+    prior_equations: int
+    known_noise: float = 0.0
+
+    @property
+    def spare(self) -> int:
+        """Equations left over, priors counted."""
+        return int(np.count_nonzero(self.used)) + self.prior_equations - self.unknowns
+
+    def beyond_private(self, columns: Array) -> Array:
+        """Columns (E, Q), in standard deviations, without what private placements take up."""
+        rest = columns.copy()
+        inside = columns if self.used.all() else columns * self.used[:, None]
+        for start, stop in self._private_ranges:
+            basis = self.private[start:stop]
+            rest[start:stop] -= basis @ (basis.T @ inside[start:stop])
+        return rest
+
+    @cached_property
+    def _is_private(self) -> Mask:
+        """(S,) whether each sight's placement is projected out."""
+        return np.asarray(np.any(self.private[self.equations.bounds[:-1]] != 0.0, axis=1))
+
+    @cached_property
+    def _private_ranges(self) -> list[tuple[int, int]]:
+        bounds = self.equations.bounds
+        return [(int(bounds[i]), int(bounds[i + 1])) for i in np.flatnonzero(self._is_private)]
+
+    @cached_property
+    def of_private(self) -> Mask:
+        """(E,) the equations of sights whose placement is projected out."""
+        return self.equations.of_sights(self._is_private)
+
+    @cached_property
+    def placed_score(self) -> Array:
+        """(E,) `score` with every private placement at its best."""
+        return self.beyond_private(self.score[:, None])[:, 0]
+
+    @cached_property
+    def left_over(self) -> Array:
+        """(E,) the residuals, in standard deviations, once every free number is at its best value; 0 where not used."""
+        return np.where(self.used, self.placed_score - self.shared @ self.step, 0.0)
+
+    def freed(self, columns: Array) -> AddedNumbers:
+        """More numbers to be free besides: columns (E, Q), px per unit."""
+        scaled = columns * self.weight[:, None]
+        rest, taken = self._projected(scaled)
+        normal, slope = self._normal(rest, taken)
+        root = inverse_root(normal, np.sum(scaled[self.used] ** 2, axis=0), LEAST_LEFT)
+        return AddedNumbers(rest, taken, root, root.T @ slope)
+
+    def left_of(self, columns: Array) -> tuple[Array, Array]:
+        """Normal equations (Q, Q) of more numbers, columns (E, Q), px per unit, once everything free followed them; and
+        half the derivative (Q,) of the squared residuals by them.
+        """
+        return self._normal(*self._projected(columns * self.weight[:, None]))
+
+    def _normal(self, rest: Array, taken: Array) -> tuple[Array, Array]:
+        inside = rest[self.used]
+        return inside.T @ inside - taken.T @ taken, inside.T @ self.score[self.used] - taken.T @ self.step
+
+    def with_columns(self, columns: Array) -> Linearised:
+        """The same model with these numbers free."""
+        more = self.freed(columns)
+        basis = (more.rest - self.shared @ more.taken) @ more.root
+        return replace(
+            self,
+            shared=np.hstack([self.shared, basis]),
+            step=np.concatenate([self.step, more.step]),
+            unknowns=self.unknowns + more.root.shape[1],
+        )
+
+    def decreases(self, columns: Array) -> Array:
+        """(Q,) by how much the squared residuals fall with each of the columns (E, Q), px per unit, alone."""
+        scaled = columns * self.weight[:, None]
+        rest, taken = self._projected(scaled)
+        left = np.sum(rest[self.used] ** 2, axis=0) - np.sum(taken**2, axis=0)
+        determined = left > LEAST_LEFT * np.sum(scaled[self.used] ** 2, axis=0)
+        slope = rest[self.used].T @ self.score[self.used] - taken.T @ self.step
+        return np.where(determined, slope**2 / np.where(determined, left, 1.0), 0.0)
+
+    def unabsorbed(self, shift: Array) -> Array:
+        """(E,) px of a displacement (E,) px that the free numbers could not have taken up."""
+        rest, taken = self._projected((shift * self.weight)[:, None])
+        return np.asarray((rest - self.shared @ taken)[:, 0] / self.weight)
+
+    def _projected(self, columns: Array) -> tuple[Array, Array]:
+        """Columns (E, Q), in standard deviations, beyond private placements, and what `shared` takes of them (P, Q)."""
+        rest = self.beyond_private(columns)
+        return rest, self.shared[self.used].T @ rest[self.used]
+
+    @cached_property
+    def leverage(self) -> Array:
+        """(E,) the share of each equation that went into the fit; of unused ones, how much the fit's own uncertainty
+        adds to their variance.
+        """
+        return np.asarray(np.sum(self.private**2, axis=1) + np.sum(self.shared**2, axis=1))
+
+    def spare_of(self, rows: Mask) -> float:
+        """How many of these equations (E,) are left over for the noise."""
+        return float(np.sum(1.0 - self.leverage[rows]))
+
+    def variance(self, rows: Mask) -> float:
+        """Mean square of what is left of these equations (E,), in squared standard deviations."""
+        return float(np.sum(self.left_over[rows] ** 2)) / max(self.spare_of(rows), 1e-9)
+
+    def overlap(self, first: Indices, second: Indices) -> Array:
+        """Entries of the hat matrix between pairs of equations of one sight, (N,)."""
+        private = np.sum(self.private[first] * self.private[second], axis=1)
+        return np.asarray(private + np.sum(self.shared[first] * self.shared[second], axis=1))
+
+
+def inverse_root(normal: Array, sizes: Array, least: float) -> Array:
+    """W (Q, rank) with W W^T = normal^-1 on what is determined.
+
+    Directions that keep less than `least` of `sizes`, the squared lengths before anything was projected out, are left
+    out.
+    """
+    root, rank = inverse_roots(normal, sizes, least)
+    return np.asarray(root[:, len(sizes) - int(rank) :])
+
+
+def inverse_roots(normals: Array, sizes: Array, least: float) -> tuple[Array, Indices]:
+    """The same of a stack (..., Q, Q): roots (..., Q, Q) whose first columns are 0 for what is left out, and ranks."""
+    scale = 1.0 / np.sqrt(np.where(sizes > 0.0, sizes, 1.0))
+    values, vectors = np.linalg.eigh(scale[..., :, None] * normals * scale[..., None, :])
+    kept = values > least
+    roots = scale[..., :, None] * vectors / np.sqrt(np.where(kept, values, np.inf))[..., None, :]
+    return np.asarray(roots), np.asarray(np.count_nonzero(kept, axis=-1))
+
+
+def equation_weights(
+    observations: Observations,
+    weighting: Weighting,
+    equations: Equations,
+    there: Residuals,
+    taking_part: tuple[Mask, Mask] | None = None,
+) -> Weights:
+    """How each equation counts at a noise and a loss.
+
+    Args:
+        there: residuals where the equations stand. taking_part: of points (N,) and of curve observations (M,); by
+            default all do.
+    """
+    at, scale = equations.observation, np.where(equations.is_curve, weighting.curve_scale, weighting.point_scale)
+    sigma = scale * of_observations(at, observations.points.sigma_px, observations.curves.sigma_px)
+    squared = (of_observations(at, *there.lengths) / sigma) ** 2
+    used = np.ones(len(at), dtype=bool) if taking_part is None else of_observations(at, *taking_part)
+    return Weights(1.0 / sigma, used, robust_weights(weighting, squared))
+
+
+def make_linear_model(problem: Problem, estimate: Estimate, equations: Equations, weights: Weights) -> Linearised:
+    """The linear model of a calibration, its priors included."""
+    keys = free_keys(estimate, problem.layout, problem.private)
+    blank, columns = without_shared(problem, estimate, equations, weights)
+    rest = blank.beyond_private(columns)
+    prior_rows, prior_values = prior_equations(problem, estimate, keys)
+    inside = rest[weights.used]
+    normal = inside.T @ inside + prior_rows.T @ prior_rows
+    sizes = np.sum(columns[weights.used] ** 2, axis=0) + np.sum(prior_rows**2, axis=0)
+    root = inverse_root(normal, sizes, SINGULAR)
+    gradient = inside.T @ blank.score[weights.used] + prior_rows.T @ prior_values
+    return replace(
+        blank,
+        shared=rest @ root,
+        step=root.T @ gradient,
+        unknowns=blank.unknowns + root.shape[1],
+        prior_equations=len(prior_rows),
+    )
+
+
+def without_shared(
+    problem: Problem, estimate: Estimate, equations: Equations, weights: Weights
+) -> tuple[Linearised, Array]:
+    """The model of private placements alone, and the columns (E, P) of the shared numbers, in standard deviations."""
+    used, weight = weights.used, weights.inverse_sigma
+    score = np.where(used, weights.robust * weight * equations.residual, 0.0)
+    private, count = _private_basis(equations, problem, weight, used)
+    columns = shared_columns(equations, estimate, free_keys(estimate, problem.layout, problem.private))
+    nothing = np.zeros((len(equations), 0))
+    blank = Linearised(equations, weight, used, score, private, nothing, np.zeros(0), count, 0)
+    return blank, columns * weight[:, None]
+
+
+def _private_basis(equations: Equations, problem: Problem, weight: Array, used: Mask) -> tuple[Array, int]:
+    """(E, 6) see `Linearised`, and how many numbers it stands for."""
+    basis = np.zeros((len(equations), 6))
+    numbers = equations.sights.numbers(placements=problem.private)
+    if not len(numbers):
+        return basis, 0
+    columns = equations.pose * weight[:, None]
+    inside = columns if used.all() else columns * used[:, None]
+    parts = [slice(equations.bounds[number], equations.bounds[number + 1]) for number in numbers]
+    normal = np.array([inside[part].T @ inside[part] for part in parts])
+    sizes = np.diagonal(normal, axis1=1, axis2=2)
+    roots, ranks = inverse_roots(normal, sizes, SINGULAR)
+    for part, root in zip(parts, roots, strict=True):
+        np.matmul(columns[part], root, out=basis[part])
+    return basis, int(np.sum(ranks))
+
+
+def shared_columns(equations: Equations, estimate: Estimate, keys: Sequence[Key]) -> Array:
+    """(E, P) px per unit of each key: what a step of the shared numbers does to every equation."""
+    columns, owned = np.zeros((len(equations), len(keys))), columns_by_owner(keys)
+    cameras = equations.sights.cameras
+    for name in cameras:
+        camera, own = estimate.cameras[name], owned.get(("camera", name), [])
+        if not own:
+            continue
+        at = [intrinsic_names(camera.lens).index(keys[column].quantity) for column in own]
+        here: slice | Indices = slice(None)
+        if len(cameras) > 1:
+            here = ranges(equations.bounds, equations.sights.numbers(name))
+        columns[here, own[0] : own[-1] + 1] = equations.intrinsics[here][:, at] * intrinsics_scales(camera)[at]
+    posed = any(kind in ("station", "placement") for kind, _ in owned)
+    for number, key in enumerate(equations.sights.keys if posed else ()):
+        here = slice(equations.bounds[number], equations.bounds[number + 1])
+        pose = equations.poses[number : number + 1]
+        world = estimate.stations[key.station].cam_from_world
+        if own := owned.get(("station", key.station), []):
+            columns[here, own] = equations.pose[here] @ from_station(pose, world)[0]
+        if own := owned.get(("placement", str(key.placement)), []):
+            columns[here, own] = equations.pose[here] @ from_placement(pose, world)[0]
+    structure = [column for column, key in enumerate(keys) if key.is_structure]
+    if structure:
+        columns[:, structure] = equations.structure_columns(estimate.structure)
+    return columns
+
+
+def prior_equations(problem: Problem, estimate: Estimate, keys: Sequence[Key]) -> tuple[Array, Array]:
+    """What priors say of the shared numbers, as rows (K, P) and values (K,) in their sigmas."""
+    place = {key: column for column, key in enumerate(keys)}
+    rows, values = [np.zeros((0, len(keys)))], [np.zeros(0)]
+    for prior in problem.priors_at(estimate):
+        row = np.zeros((len(prior.information.root), len(keys)))
+        row[:, [place[key] for key in prior.keys]] = prior.information.root
+        rows.append(row)
+        values.append(prior.residuals(estimate))
+    return np.vstack(rows), np.concatenate(values)

@@ -1,0 +1,172 @@
+"""Equations whose errors may go together, side by side: of one curve, or of one image axis at one target's points."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import pairwise
+
+import numpy as np
+
+from ceres_cal.base.arrays import Array, Indices, Mask, distinct, median
+from ceres_cal.base.cached import cached_property
+from ceres_cal.observations.sights import bounds_of
+from ceres_cal.problem.equations import Equations
+
+_NEAR, _FAR = 30, 30  # rows of a strand that are looked at: next to one another, and over all of it
+
+
+@dataclass(frozen=True, eq=False)
+class Strand:
+    """Equations whose errors may go together: of one curve, or of one image axis at one target's points.
+
+    Attributes:
+        rows: (N,) of the sample. places: (N, 3) m, where they lie on the target.
+    """
+
+    rows: Indices
+    places: Array
+
+    @cached_property
+    def shape(self) -> bytes:
+        """Equal where the places are."""
+        return self.places.tobytes()
+
+
+def strands_of(equations: Equations, owner: Indices) -> Iterator[Strand]:
+    """The curves, and the image axes of points, of each owner (E,): a view or a sight."""
+    axis = (equations.direction[:, 1] > 0.5).astype(np.int64)
+    what = np.where(equations.is_curve, equations.feature + 2, axis)
+    name = owner * (what.max() + 1) + what
+    order = np.argsort(name, kind="stable")
+    ends = np.flatnonzero(np.diff(name[order], append=-1)) + 1
+    start = 0
+    for end in ends.tolist():
+        rows, start = order[start:end], end
+        places = equations.place[rows]
+        if equations.is_curve[rows[0]]:
+            along = np.argsort(places @ _along(places), kind="stable")
+            rows, places = rows[along], places[along]
+        yield Strand(rows, places)
+
+
+def _along(places: Array) -> Array:
+    """(3,) from the first place towards the farthest."""
+    away = places - places[0]
+    return np.asarray(away[np.argmax(np.sum(away**2, axis=1))])
+
+
+def evenly(count: int, most: int) -> Indices:
+    """At most so many of `count` numbers, evenly."""
+    taken = min(count, most)
+    return np.asarray((np.arange(taken) * (count - 1)) // max(taken - 1, 1))
+
+
+def distances_of(places: Array) -> Array:
+    """(N, N) m between places (N, 3)."""
+    squared = np.sum((places[:, None] - places[None]) ** 2, axis=2)
+    return np.asarray(np.sqrt(squared))
+
+
+def decay(distance: Array, length: float, smooth: bool) -> Array:
+    """Correlation at distances: of a rough random function, or of a smooth one."""
+    relative = distance / length
+    return np.asarray(np.exp(-0.5 * relative**2 if smooth else -relative))
+
+
+@dataclass(frozen=True, eq=False)
+class StrandFamily:
+    """S strands side by side, of M rows each at most that are looked at.
+
+    Attributes:
+        lasting: whether they go over several views.
+        strands: with all their rows, shape by shape. filled: (S, M) which rows there are.
+        columns: (S, M, Z) what is in them: six of private placements, those of what is shared, the residual; 0 where
+            there is no row.
+        distance: (D, M, M) m of each shape, infinite where a row is missing; bounds: (D + 1,) where its strands begin.
+        group: (S,) whose private placement it shows.
+    """
+
+    lasting: bool
+    strands: Sequence[Strand]
+    filled: Mask
+    columns: Array
+    distance: Array
+    bounds: Indices
+    group: Indices
+
+    @classmethod
+    def of(cls, strands: Sequence[Strand], lasting: bool, columns: Array, group: Indices) -> StrandFamily:
+        """Of the strands of one kind; columns (E, Z) and group (E,) of all equations."""
+        shapes: dict[bytes, int] = {}
+        same = [shapes.setdefault(strand.shape, len(shapes)) for strand in strands]
+        strands = [strands[number] for number in np.argsort(same, kind="stable")]
+        starts = bounds_of(np.bincount(same))
+        picked = [_near_and_far(len(strand.rows)) for strand in strands]
+        shape = len(strands), max(len(p) for p in picked)
+        rows, filled = np.zeros(shape, dtype=np.int64), np.zeros(shape, dtype=bool)
+        for number, (strand, at) in enumerate(zip(strands, picked, strict=True)):
+            rows[number, : len(at)], filled[number, : len(at)] = strand.rows[at], True
+        distance = np.full((len(shapes), shape[1], shape[1]), np.inf)
+        for whole, first in zip(distance, starts[:-1].tolist(), strict=True):
+            at = picked[first]
+            whole[: len(at), : len(at)] = distances_of(strands[first].places[at])
+            np.fill_diagonal(whole, 0.0)
+        # Rows first in memory: those of all strands of one shape are then multiplied as one matrix.
+        side_by_side = columns[rows.T]
+        side_by_side[~filled.T] = 0.0
+        return cls(lasting, strands, filled, np.swapaxes(side_by_side, 0, 1), distance, starts, group[rows[:, 0]])
+
+    @cached_property
+    def of_shape(self) -> list[slice]:
+        """The strands of each shape."""
+        return [slice(*ends) for ends in pairwise(self.bounds.tolist())]
+
+    def per_strand(self, values: Array) -> Array:
+        """(S, ...) of values (D, ...) of each shape."""
+        return np.repeat(values, np.diff(self.bounds), axis=0)
+
+    @cached_property
+    def gap(self) -> float:
+        """Median distance to the nearest neighbour, m; 0 where no strand has two places."""
+        apart = np.where(self.distance > 0.0, self.distance, np.inf).min(axis=2)
+        apart = apart[np.isfinite(apart)]
+        return median(apart) if len(apart) else 0.0
+
+    @cached_property
+    def longest(self) -> float:
+        """Of all its distances, m."""
+        return float(np.max(self.distance, where=np.isfinite(self.distance), initial=0.0))
+
+    @cached_property
+    def products(self) -> Array:
+        """(Z, Z) of the columns over all rows."""
+        flat = np.swapaxes(self.columns, 0, 1).reshape(-1, self.columns.shape[2])
+        return np.asarray(flat.T @ flat)
+
+    def applied(self, matrices: Array) -> Array:
+        """(S, M, Z) the columns multiplied by matrices (D, M, M) of each shape."""
+        if len(matrices) == len(self.columns):
+            return np.asarray(matrices @ self.columns)
+        rows_first = np.swapaxes(self.columns, 0, 1)
+        product = np.empty(rows_first.shape)
+        for own, matrix in zip(self.of_shape, matrices, strict=True):
+            part = rows_first[:, own]
+            product[:, own] = (matrix @ part.reshape(len(part), -1)).reshape(part.shape)
+        return np.swapaxes(product, 0, 1)
+
+    def squared(self, chosen: slice) -> Array:
+        """(D, M, M) sum of x x^T over the strands of each shape, x (M, Q) some of the columns."""
+        columns = self.columns[..., chosen]
+        if len(self.distance) == len(columns):
+            return np.asarray(columns @ np.swapaxes(columns, 1, 2))
+        parts = (np.swapaxes(columns[own], 0, 1).reshape(columns.shape[1], -1) for own in self.of_shape)
+        return np.array([part @ part.T for part in parts])
+
+
+@lru_cache(maxsize=256)
+def _near_and_far(count: int) -> Indices:
+    """Rows of a strand: some next to one another in its middle, and some over all of it."""
+    middle = max(0, (count - _NEAR) // 2)
+    return distinct(np.append(np.arange(middle, min(count, middle + _NEAR)), evenly(count, _FAR)))

@@ -1,1 +1,0 @@
-"""What is solved for: the free numbers and their layout, targets as built, residuals, priors."""

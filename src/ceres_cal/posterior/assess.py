@@ -1,0 +1,192 @@
+"""The last step of a calibration: what is known of its numbers, and what to do where phi ran away."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ceres_cal.base.numerical import numerical
+from ceres_cal.effects.dependence import Scatter
+from ceres_cal.observations import Observations
+from ceres_cal.posterior.bent import bends
+from ceres_cal.posterior.posterior import Posterior, make_posterior, widths_over
+from ceres_cal.posterior.profile import Node, PhiProfile, profile, valley
+from ceres_cal.problem.bundle import Solution
+from ceres_cal.problem.information import Information
+from ceres_cal.problem.parameters import Estimate, unit_px
+from ceres_cal.problem.problem import Problem
+from ceres_cal.problem.quantities import difference, moved
+from ceres_cal.problem.ranges import PHI_RANGE
+from ceres_cal.problem.reduced import ReducedInformation, information
+from ceres_cal.robust.competing import Explanation
+from ceres_cal.robust.conflicts import Conflicts
+from ceres_cal.robust.other_minima import shifts_to
+from ceres_cal.robust.robust import RobustSolution
+from ceres_cal.scene.camera import Camera
+from ceres_cal.start.initialise import USUAL_PHI, USUAL_PHI_FACTOR
+
+if TYPE_CHECKING:
+    from ceres_cal.posterior.other_lenses import OtherLenses
+
+
+# Relative sigma of phi above which the quadratic picture is left. Nothing changes from half to double.
+_BENT = 0.05
+
+
+@numerical("the uncertainty")
+def assess(
+    problem: Problem,
+    estimate: Estimate,
+    reduced: ReducedInformation,
+    degrees_of_freedom: float,
+    scatter_at: Callable[[Estimate, ReducedInformation], Scatter | None],
+) -> tuple[Estimate, Posterior]:
+    """What is known at the estimate, and the estimate: another one where phi went astray.
+
+    Nearly frontal views can be fitted a little better by a camera a hand's breadth over the floor, or in the clouds,
+    than by the true one. Where the least cost lies at a phi that no lens has, or the observations leave phi open on
+    a side as far as lenses go, the node of the valley is taken that fits best with what is usual of lenses; the
+    posterior says that phi is unknown.
+
+    Args:
+        reduced: what the problem says at the estimate.
+        degrees_of_freedom: spare equations behind the estimated noise, infinite where the sigmas were taken as stated.
+        scatter_at: how the data scatter at an estimate, of which the problem says so much.
+
+    Raises:
+        SolutionError: no possible lens fits.
+    """
+    posterior = make_posterior(reduced, degrees_of_freedom, scatter_at(estimate, reduced))
+    width = posterior.half_width
+    valleys: dict[str, tuple[Node, ...]] = {}
+    astray = problem  # with phi held of the cameras that went astray, while others are looked at
+    for name in [name for name, numbers in problem.layout.free.items() if 0 in numbers]:
+        camera = estimate.cameras[name]
+        if _is_lens(camera) and posterior.sd_of("camera", name, "phi") <= _BENT * camera.phi:
+            continue
+        nodes = valleys[name] = valley(name, astray, estimate, _inflation(posterior, name))
+        rise = min(nodes[0].cost, nodes[-1].cost) - min(node.cost for node in nodes)
+        if not _is_lens(camera) or rise < width**2:
+            estimate = _usual(name, nodes)
+            astray = astray.holding(name, 0)
+    if astray is not problem:
+        reduced = information(problem, estimate)
+        posterior = make_posterior(reduced, degrees_of_freedom, scatter_at(estimate, reduced))
+    profiles = {name: _profile(name, nodes, estimate, posterior) for name, nodes in valleys.items()}
+    return estimate, _with_bends(replace(posterior, profiles=profiles), problem, estimate)
+
+
+def _with_bends(posterior: Posterior, problem: Problem, estimate: Estimate) -> Posterior:
+    """The posterior with what bends in it; across its valleys, where phi is held, that is put into what they say."""
+    followed = {profile.keys[0] for profile in posterior.profiles.values()}
+    held = [key for key in posterior.keys if key not in followed]
+    by_model = posterior.by_model or posterior.information
+    for name in posterior.profiles:
+        problem = problem.holding(name, 0)
+    known = posterior.information.given(held)
+    bent = bends(problem, estimate, known, by_model.given(held), posterior.half_width)
+    if bent is None:
+        return posterior
+    profiles = {
+        name: replace(profile, across=tuple(posterior.wider(one, bent.widened) for one in profile.across))
+        for name, profile in posterior.profiles.items()
+    }
+    bent = bent.beside(known, posterior.stated.over(posterior.keys).marginal(held))
+    return replace(posterior, profiles=profiles, bends=bent)
+
+
+def _inflation(posterior: Posterior, camera: str) -> float:
+    """Factor on the variance of the observations along a camera's valley: that of phi by them alone."""
+    if posterior.by_model is None:
+        return 1.0
+    spreads = (one.less(posterior.stated).spread for one in (posterior.information, posterior.by_model))
+    return float(widths_over(*spreads)[posterior.column("camera", camera, "phi")] ** 2)
+
+
+def _profile(camera: str, nodes: Sequence[Node], estimate: Estimate, posterior: Posterior) -> PhiProfile:
+    """The valley as seen from the estimate, across it as wide as the data scatter with phi held."""
+    stated_sd = dict(zip(posterior.keys, posterior.stated_sd.tolist(), strict=True))
+    along = profile(camera, nodes, estimate, posterior.half_width, stated_sd)
+    if posterior.by_model is None:
+        return along
+    others = [key for key in posterior.keys if key != along.keys[0]]
+    held = (i.less(posterior.stated).given(others) for i in (posterior.information, posterior.by_model))
+    factors = widths_over(*(one.marginal(along.keys[1:]).spread for one in held))
+
+    def scattered(seen: Information) -> Information:
+        return Information(seen.keys, seen.matrix / factors[:, None] / factors)
+
+    return replace(along, across=tuple(posterior.wider(one, scattered) for one in along.across))
+
+
+def _is_lens(camera: Camera) -> bool:
+    unit = unit_px(camera)
+    return PHI_RANGE[0] * unit <= camera.phi <= PHI_RANGE[1] * unit
+
+
+def _usual(name: str, nodes: Sequence[Node]) -> Estimate:
+    """The node that fits best with what is usual of lenses: a standard deviation is a factor of USUAL_PHI_FACTOR."""
+
+    def cost(node: Node) -> float:
+        camera = node.estimate.cameras[name]
+        return float(node.cost + (np.log(camera.phi / (USUAL_PHI * unit_px(camera))) / np.log(USUAL_PHI_FACTOR)) ** 2)
+
+    return min(nodes, key=cost).estimate
+
+
+def with_doubts(
+    posterior: Posterior,
+    end: RobustSolution,
+    conflicts: Conflicts,
+    explanations: Sequence[Explanation],
+    others: Sequence[Solution],
+) -> Posterior:
+    """Wider by how far the numbers move with each of them.
+
+    Args:
+        explanations: of which the less probable one counts as far as it is probable. others: minima beside the end.
+    """
+    estimate = end.solution.estimate
+    posterior = posterior.in_doubt(conflicts.keys, conflicts.shifts)
+    doubtful = [one for one in explanations if one.is_doubtful]
+    shifts = [one.doubt**0.5 * difference(one.other, estimate, posterior.keys) for one in doubtful]
+    posterior = posterior.in_doubt(posterior.keys, shifts)
+    if posterior.profiles:  # a valley that is followed has its other places in it
+        return posterior
+    known = posterior.by_model or posterior.information
+    return posterior.in_doubt(posterior.keys, shifts_to(others, estimate, known, posterior.half_width))
+
+
+def with_roughness(posterior: Posterior, end: RobustSolution, observations: Observations) -> Posterior:
+    """Wider by what a lens without a formula leaves in the same places of all views."""
+    if not end.problem.options.blank_lens.roughness:
+        return posterior
+    from ceres_cal.posterior.roughness import shifts_by_roughness
+
+    return posterior.in_doubt(*shifts_by_roughness(end, observations))
+
+
+def with_other_lenses(posterior: Posterior, estimate: Estimate, lenses: OtherLenses) -> Posterior:
+    """Wider by what other lenses would say, each as far as it is probable; across a valley along phi at each node."""
+    if not lenses.others:
+        return posterior
+    from ceres_cal.posterior.other_lenses import shifts_to_lenses
+
+    followed = {profile.keys[0] for profile in posterior.profiles.values()}
+    # A lens shows nothing of how targets are built or lie, and was compared with these as drawn and as seen in part.
+    keys = [key for key in posterior.keys if key.kind in ("camera", "station") and key not in followed]
+    wider = posterior.in_doubt(keys, shifts_to_lenses(lenses, keys, lenses.near))
+    profiles = dict(posterior.profiles)
+    for name, other in profiles.items():
+        nodes = [moved(estimate, other.keys, step) for step in other.steps]
+        shifts = [np.array(shifts_to_lenses(lenses, other.keys[1:], node)) for node in nodes]
+        across = [
+            posterior.wider(known, partial(Information.widened, shifts=here))
+            for known, here in zip(other.across, shifts, strict=True)
+        ]
+        profiles[name] = replace(other, across=tuple(across))
+    return replace(wider, profiles=profiles)

@@ -1,0 +1,188 @@
+"""Where the quadratic picture bends: the least cost at the ends of weak directions, and by how much that widens.
+
+A direction that is known to a few hundredths of its natural size reaches so far that the least cost there is a curve,
+not a line: one board before a lens with tangential terms fits nearly as well with its principal point a quarter of the
+image aside and all coefficients changed along. At both ends of each such direction the rest is solved for anew; what
+the numbers do there, less what the normal equations promise, is added to the covariance. Nothing is solved where all
+directions are well known.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ceres_cal.base.arrays import Array
+from ceres_cal.base.errors import CalibrationError, InputError
+from ceres_cal.problem.bundle import Solution, solve
+from ceres_cal.problem.information import Information, Key, over
+from ceres_cal.problem.parameters import Estimate
+from ceres_cal.problem.priors import GaussianPrior
+from ceres_cal.problem.problem import Problem
+from ceres_cal.problem.quantities import difference, moved, natural_sizes
+
+# Sigma in natural sizes from which on a direction is looked at.
+BENDING = 0.01
+_HELD = 0.005  # of a step: how closely its end is held
+_FARTHEST = 4.0  # times as far as the normal equations have it: what is flatter than that is unknown
+_FEW = 300  # equations beside which other minima are sought: not measured; the cases mended had under 200
+_MOST_ITERATIONS = 30  # of each end: along a flat valley the solver creeps for hundreds that change nothing here
+_FAR_OUT = 3.0  # times 95 %: where a search for another minimum starts
+
+
+@dataclass(frozen=True, eq=False)
+class Bends:
+    """What the numbers do at the ends of weak directions.
+
+    Attributes:
+        keys: (K). steps: (B, K) as far as the quadratic picture has the end of the 95 % interval along each direction.
+        ends: (B, K) where the least cost has risen there as much, or has another minimum.
+        half_width: standard deviations that a step is long.
+    """
+
+    keys: tuple[Key, ...]
+    steps: Array
+    ends: Array
+    half_width: float
+
+    @property
+    def excesses(self) -> Array:
+        """(B, K) by how much the ends are farther off, in standard deviations' worth."""
+        return np.asarray((self.ends - self.steps) / self.half_width)
+
+    def widened(self, information: Information) -> Information:
+        """Information about some of the keys with the excesses as variances of their own."""
+        return information.widened(over(self.excesses, self.keys, information.keys))
+
+    def beside(self, information: Information, stated: Information) -> Bends:
+        """With ends no farther than what was stated lets them be.
+
+        With L what the observations say, P what was stated, C = (L + P)^-1 and E the excesses, the covariance of L + P
+        with L widened by E is C + G^T N^-1 G, where G = E L C and N = 1 + E L C P E^T: N^-1/2 G takes the place of E.
+
+        Args:
+            information: L + P of the keys.
+        """
+        if not np.any(stated.matrix):
+            return self
+        moved = self.excesses @ information.less(stated).matrix @ information.inverse
+        left = moved @ stated.matrix @ self.excesses.T
+        values, vectors = np.linalg.eigh(np.eye(len(left)) + 0.5 * (left + left.T))
+        excesses = (vectors / np.sqrt(np.maximum(values, 1.0))) @ vectors.T @ moved
+        return replace(self, ends=self.steps + self.half_width * excesses)
+
+
+def weak_axes(information: Information, estimate: Estimate, keys: Sequence[Key]) -> Array:
+    """(K, A) directions of some of the keys whose sigma in natural sizes is above BENDING, one sigma long, in the units
+    of the keys.
+
+    Structure is not looked at, nor what is not known at all, nor a lens without a formula, which is a sum of what its
+    numbers do.
+    """
+    sizes, at = natural_sizes(estimate, keys), information.columns(keys)
+    sums = {(name, q) for name, one in estimate.cameras.items() for form in one.lens.roughness for q in form.names}
+    plain = np.array([key.kind != "structure" and key[1:3] not in sums for key in keys], dtype=bool)
+    scaled = information.spread.covariance[np.ix_(at, at)] / sizes[:, None] / sizes
+    values, vectors = np.linalg.eigh(np.where(plain[:, None] & plain, scaled, 0.0))
+    weak = values > BENDING**2
+    return np.asarray(vectors[:, weak] * np.sqrt(values[weak]) * sizes[:, None])
+
+
+def bends(
+    problem: Problem, estimate: Estimate, information: Information, by_model: Information, half_width: float
+) -> Bends | None:
+    """What the numbers of the information do at the ends of its weak directions, and, of few observations, where other
+    minima are that fit as well; None where it has no such direction.
+
+    Args:
+        problem: whose cost is least at the estimate. information: as the data scatter. by_model: as that cost says.
+    """
+    keys, sizes = information.keys, natural_sizes(estimate, information.keys)
+    axes = half_width * weak_axes(information, estimate, keys)
+    if not axes.shape[1]:
+        return None
+    least = 2.0 * solve(problem, estimate).cost
+    few = problem.sights.equations < _FEW
+    steps, excesses = [], []
+    for axis in axes.T:
+        ends = []
+        # The cost rises as the model has it, which knows the direction better than the data scatter.
+        slopes = axis / sizes**2
+        at_one = by_model.spread.covariance @ slopes
+        rise = float((axis / sizes) @ (axis / sizes)) ** 2 / float(slopes @ at_one)
+        for step in (axis, -axis):
+            end = _end(problem, estimate, keys, step)
+            ends.append((step / sizes, _excess(end, step / sizes, least, rise)))
+            far = _end(problem, estimate, keys, _FAR_OUT * step) if few else None
+            if far is None:
+                continue
+            other = _minimum(problem, far)
+            if other is not None and 2.0 * other.cost <= least + rise:
+                steps.append(np.zeros(len(keys)))
+                excesses.append(difference(other.estimate, estimate, keys) / sizes)
+            # Where the cost rises ever less, the interval ends between; what far ends are by themselves tells nothing.
+            nearer = _FAR_OUT * _reach(far, least, rise)
+            if nearer > 1.0:
+                end = _end(problem, estimate, keys, nearer * step)
+                ends.append((step / sizes, _excess(end, step / sizes, least, rise, nearer)))
+        step, excess = max(ends, key=lambda one: float(np.linalg.norm(np.clip(one[1], -1.0, 1.0))))
+        steps.append(step)
+        excesses.append(excess)
+    reached = np.array(steps)
+    return Bends(keys, reached * sizes, (reached + excesses) * sizes, half_width)
+
+
+@dataclass(frozen=True, eq=False)
+class _End:
+    """Where the numbers are (K,), in natural sizes from the estimate, and twice the cost there."""
+
+    estimate: Estimate
+    off: Array
+    cost: float
+
+
+def _end(problem: Problem, estimate: Estimate, keys: tuple[Key, ...], step: Array) -> _End | None:
+    """The least cost where the part of the numbers along a step is as long as it; None where it is not found."""
+    sizes = natural_sizes(estimate, keys)
+    row = step / sizes**2 / float(np.sum((step / sizes) ** 2)) / _HELD
+    with suppress(InputError):  # quiet: no camera there; the end counts as far away as any
+        held = GaussianPrior.about(Information(keys, np.outer(row, row)), moved(estimate, keys, step))
+        solution = _solved(replace(problem, priors=(*problem.priors, held)), estimate)
+        if solution is not None:
+            pulled = float(np.sum(held.residuals(solution.estimate) ** 2))
+            off = difference(solution.estimate, estimate, keys) / sizes
+            return _End(solution.estimate, off, 2.0 * solution.cost - pulled)
+    return None
+
+
+def _solved(problem: Problem, start: Estimate) -> Solution | None:
+    short = replace(problem.options, max_iterations=min(_MOST_ITERATIONS, problem.options.max_iterations))
+    try:
+        solution = solve(replace(problem, options=short), start)
+    except CalibrationError:  # quiet: the end counts as far away as any
+        return None
+    return None if solution.failed else solution
+
+
+def _minimum(problem: Problem, end: _End | None) -> Solution | None:
+    """Where a solve runs into from an end."""
+    return None if end is None else _solved(problem, end.estimate)
+
+
+def _reach(end: _End, least: float, rise: float) -> float:
+    """How many times as far as an end the cost has risen as it should, if it is a parabola up to there."""
+    return float(np.clip(np.sqrt(rise / max(end.cost - least, 1e-12)), 1.0 / _FARTHEST, _FARTHEST))
+
+
+def _excess(end: _End | None, step: Array, least: float, rise: float, factor: float = 1.0) -> Array:
+    """(K,) in natural sizes: an end that is so many steps away, brought to where the cost has risen as it should by
+    one, less that.
+    """
+    if end is None:
+        return (_FARTHEST - 1.0) * step if factor == 1.0 else np.zeros(len(step))
+    excess = end.off * _reach(end, least, rise) - step
+    along = step / np.linalg.norm(step)
+    return np.asarray(excess - min(float(along @ excess), 0.0) * along)  # that it ends earlier narrows nothing

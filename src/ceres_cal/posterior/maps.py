@@ -1,0 +1,265 @@
+"""How well a pixel tells a place: standard deviations and 95 % bounds of located points, in metres at a height.
+
+They are the calibration's own share: the noise of the pixel that is asked about comes on top, and model error (a lens
+with too few coefficients, a field painted amiss) is not in them.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+
+import numpy as np
+
+from ceres_cal.base.arrays import Array
+from ceres_cal.base.errors import InputError
+from ceres_cal.base.tails import NORMAL_95, NORMAL_95_ONE_SIDED
+from ceres_cal.posterior.bent import weak_axes
+from ceres_cal.posterior.posterior import Posterior
+from ceres_cal.posterior.profile import FARTHER
+from ceres_cal.problem.information import STATION_QUANTITIES, Key, over
+from ceres_cal.problem.parameters import Estimate, intrinsic_names
+from ceres_cal.problem.quantities import moved, pixel_slopes
+
+
+@dataclass(frozen=True, eq=False)
+class PointSpread:
+    """What is known of N located points.
+
+    Attributes:
+        located: (N, 2) m, by the estimate.
+        low, high: (N, 2) m, 95 % bounds of x and of y, each by itself; infinite where unknown.
+        radius_95_m: (N,) 95 % of the errors are shorter. sd_m: (N,) root mean square length of the error; where phi
+            is known by its profile alone, the radius over NORMAL_95.
+    """
+
+    located: Array
+    low: Array
+    high: Array
+    radius_95_m: Array
+    sd_m: Array
+
+
+def station_keys(estimate: Estimate, posterior: Posterior, station: str) -> tuple[Key, ...]:
+    """Keys of a station and of its camera.
+
+    Raises:
+        InputError: no such station, or one that was held, so that where it stands in the world is nobody's guess.
+    """
+    if not posterior.knows_station(estimate.station_name(station)):
+        raise InputError(f"station {station!r} was held as the world: it has no map of a field: observe one with it")
+    return posterior.keys_of(estimate, station)
+
+
+def locate_slopes(estimate: Estimate, keys: Sequence[Key], station: str, pixels: Array, height_m: float) -> Array:
+    """(N, 2, K) derivatives of where pixels (N, 2) are located on the plane z = height_m, by each of the keys; NaN
+    where they are located nowhere.
+
+    What a number moves in the picture the place takes back: it moves by the inverse of how places move it.
+    """
+    camera = estimate.camera_at(station)
+    located = camera.locate(pixels, height_m)
+    by = pixel_slopes(camera, np.column_stack([located, np.full(len(located), height_m)]))
+    names = intrinsic_names(camera.lens)
+    moving = np.zeros((len(pixels), 2, len(keys)))
+    for k, key in enumerate(keys):
+        if key[:2] == ("station", station):
+            axis = STATION_QUANTITIES.index(key.quantity)
+            moving[:, :, k] = -by.places[:, :, axis] if axis < 3 else by.turns[:, :, axis - 3]
+        elif key[:2] == ("camera", estimate.stations[station].camera):
+            moving[:, :, k] = by.intrinsics[:, :, names.index(key.quantity)]
+    slopes, known = np.full(moving.shape, np.nan), np.isfinite(by.places[:, 0, 0])
+    slopes[known] = -np.linalg.solve(by.places[known, :, :2], moving[known])
+    return slopes
+
+
+def radius_95(covariance: Array) -> Array:
+    """(N,) radius of the circle that holds 95 % of errors with covariances (N, 2, 2).
+
+    The squared length is taken for a scaled chi-squared variable of the same mean and variance: within 1 %.
+    """
+    a, b, c = covariance[:, 0, 0], covariance[:, 1, 1], covariance[:, 0, 1]
+    with np.errstate(invalid="ignore"):
+        mean, variance = a + b, 2.0 * (a**2 + b**2 + 2.0 * np.nan_to_num(c) ** 2)
+        cubed = variance / (9.0 * mean**2)  # 2 / (9 degrees of freedom); Wilson and Hilferty
+        radius = np.sqrt(mean * (1.0 - cubed + NORMAL_95_ONE_SIDED * np.sqrt(cubed)) ** 3)
+    return np.where(np.isinf(mean), np.inf, np.where(mean > 0.0, radius, 0.0))
+
+
+def spread_of_points(
+    estimate: Estimate, posterior: Posterior, station: str, pixels: Array, height_m: float
+) -> PointSpread:
+    """What is known of the places at a height that pixels (N, 2) show.
+
+    Raises:
+        InputError: see `station_keys`.
+    """
+    keys = station_keys(estimate, posterior, station)
+    if estimate.stations[station].camera in posterior.profiles:
+        return _by_profile(estimate, posterior, station, pixels, height_m)
+    located = estimate.camera_at(station).locate(pixels, height_m)
+    slopes = locate_slopes(estimate, keys, station, pixels, height_m)
+    covariance = posterior.spread.through(over(slopes, keys, posterior.keys))
+    if (bends := posterior.bends) is not None:
+        steps, ends = (over(values, bends.keys, keys) for values in (bends.steps, bends.ends))
+        bend = _bend(estimate, keys, (steps, ends), (station, pixels, height_m), slopes)
+        covariance += bend / posterior.half_width**2
+    variance = np.diagonal(covariance, axis1=1, axis2=2)
+    reach = posterior.half_width * np.sqrt(variance)
+    radius = radius_95(covariance) * posterior.half_width / NORMAL_95
+    return PointSpread(located, located - reach, located + reach, radius, np.sqrt(np.sum(variance, axis=1)))
+
+
+def _bend(
+    estimate: Estimate,
+    keys: Sequence[Key],
+    steps: tuple[Array, Array],
+    asked: tuple[str, Array, float],
+    slopes: Array,
+) -> Array:
+    """(N, 2, 2) squares of how much farther off places are than their slopes (N, 2, K) say, summed over directions;
+    infinite where a place is lost on the way.
+
+    Args:
+        steps: (B, K) what the slopes take, and where the numbers really go. asked: station, pixels (N, 2), height in m.
+    """
+    station, pixels, height_m = asked
+    located = estimate.camera_at(station).locate(pixels, height_m)
+    total = np.zeros((len(pixels), 2, 2))
+    for step, end in zip(*steps, strict=True):
+        off = np.full((len(pixels), 2), np.nan)
+        with suppress(InputError):  # reads: "unknown" at these places of the map
+            off = moved(estimate, keys, end).camera_at(station).locate(pixels, height_m) - located - slopes @ step
+        total += off[:, :, None] * off[:, None, :]
+    lost = np.isnan(total).any(axis=(1, 2))
+    total[lost] = np.nan
+    total[lost, 0, 0] = total[lost, 1, 1] = np.inf
+    return total
+
+
+def _by_profile(estimate: Estimate, posterior: Posterior, station: str, pixels: Array, height_m: float) -> PointSpread:
+    """The same along the valley: where each of its nodes puts the points, and how sure it is of that."""
+    profile, width = posterior.profiles[estimate.stations[station].camera], posterior.half_width
+    located = estimate.camera_at(station).locate(pixels, height_m)
+    offsets, covariances = [], []
+    for step, across in zip(profile.steps, profile.across, strict=True):
+        there = moved(estimate, profile.keys, step)
+        offsets.append(there.camera_at(station).locate(pixels, height_m) - located)
+        slopes = locate_slopes(there, profile.keys[1:], station, pixels, height_m)
+        axes = width * weak_axes(across, there, across.keys).T
+        steps = np.concatenate([axes, -axes])
+        bend = 0.5 * _bend(there, across.keys, (steps, steps), (station, pixels, height_m), slopes)
+        covariances.append(across.spread.through(slopes) + bend / width**2)
+    values, known = np.array(offsets), np.array(covariances)
+    nowhere = np.asarray(np.isnan(values).any(axis=(0, 2)))  # from some node of the valley nothing is seen there
+    sds = np.sqrt(np.diagonal(known, axis1=2, axis2=3))
+    shape = (len(values), -1)
+    below, above = profile.bounds(values.reshape(shape), sds.reshape(shape), width)
+    low = np.where(nowhere[:, None], -np.inf, below.reshape(-1, 2))
+    high = np.where(nowhere[:, None], np.inf, above.reshape(-1, 2))
+    circles = np.array([radius_95(part) for part in known]) / NORMAL_95
+    unknown = ~np.isfinite(circles).all(axis=0)  # from some node of the valley
+
+    def radius_at(width: float) -> Array:
+        weights, widths = profile.reaches(width)
+        away = np.linalg.norm(np.einsum("mn,npk->mpk", weights, values), axis=2)
+        return np.asarray(np.max(away + widths[:, None] * (weights @ np.where(unknown, 0.0, circles)), axis=0))
+
+    radius = np.maximum(radius_at(width), 0.5 * radius_at(FARTHER))  # of what is normal, 0.65
+    radius = np.where(unknown | np.isinf(low).any(axis=1) | np.isinf(high).any(axis=1), np.inf, radius)
+    return PointSpread(located, located + low, located + high, radius, radius / NORMAL_95)
+
+
+@dataclass(frozen=True, eq=False)
+class FieldGrid:
+    """Places on the field at one height: all x_m (X,) at all y_m (Y,)."""
+
+    height_m: float
+    x_m: Array
+    y_m: Array
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(Y, X)."""
+        return len(self.y_m), len(self.x_m)
+
+    @property
+    def places(self) -> Array:
+        """(Y * X, 2) m, row by row."""
+        return np.column_stack([part.ravel() for part in np.meshgrid(self.x_m, self.y_m)])
+
+
+@dataclass(frozen=True, eq=False)
+class ErrorMap(FieldGrid, ABC):
+    """Errors of one station over a grid."""
+
+    @property
+    @abstractmethod
+    def errors_mm(self) -> Array:
+        """(Y, X); NaN where the image does not show the place."""
+
+    @property
+    def mean_mm(self) -> float:
+        """Mean over what the image shows; NaN where it shows nothing."""
+        visible = self.errors_mm[~np.isnan(self.errors_mm)]
+        return float(np.mean(visible)) if len(visible) else np.nan
+
+    @property
+    def worst_mm(self) -> float:
+        """Largest over what the image shows."""
+        visible = self.errors_mm[~np.isnan(self.errors_mm)]
+        return float(np.max(visible)) if len(visible) else np.nan
+
+
+@dataclass(frozen=True, eq=False)
+class FieldMap(ErrorMap):
+    """How well one station locates points at one height, over a grid.
+
+    Attributes:
+        sd_mm, radius_95_mm: (Y, X) as in `PointSpread`; NaN where the image does not show the place, infinite where it
+            is not known.
+    """
+
+    station: str
+    sd_mm: Array
+    radius_95_mm: Array
+
+    @property
+    def errors_mm(self) -> Array:
+        return self.sd_mm
+
+    @property
+    def worst_place_m(self) -> tuple[float, float]:
+        """Where that is."""
+        row, column = np.unravel_index(np.argmax(np.nan_to_num(self.sd_mm, nan=-1.0, posinf=1e300)), self.sd_mm.shape)
+        return float(self.x_m[column]), float(self.y_m[row])
+
+
+def visible_pixels(estimate: Estimate, station: str, places: Array, height_m: float) -> Array:
+    """Pixels (N, 2) of places (N, 2) m at a height; NaN where the station's image does not show them."""
+    camera = estimate.camera_at(station)
+    pixels = camera.project(np.column_stack([places, np.full(len(places), height_m)]))
+    with np.errstate(invalid="ignore"):
+        inside = np.all((pixels >= -0.5) & (pixels <= np.array(camera.image_size) - 0.5), axis=1)
+    # A ray that comes from below the plane is no view of it, and past the rim of the lens there is no way back.
+    back = camera.locate(pixels, height_m)
+    with np.errstate(invalid="ignore"):
+        inside &= np.linalg.norm(back - places, axis=1) < 1e-6
+    return np.where(inside[:, None], pixels, np.nan)
+
+
+def field_map(estimate: Estimate, posterior: Posterior, station: str, grid: FieldGrid) -> FieldMap:
+    """The map over a grid.
+
+    Raises:
+        InputError: see `station_keys`.
+    """
+    pixels = visible_pixels(estimate, station, grid.places, grid.height_m)
+    visible = np.isfinite(pixels[:, 0])
+    sd_mm, radius_mm = np.full(len(pixels), np.nan), np.full(len(pixels), np.nan)
+    spread = spread_of_points(estimate, posterior, station, pixels[visible], grid.height_m)
+    sd_mm[visible], radius_mm[visible] = 1e3 * spread.sd_m, 1e3 * spread.radius_95_m
+    values = (part.reshape(grid.shape) for part in (sd_mm, radius_mm))
+    return FieldMap(grid.height_m, grid.x_m, grid.y_m, station, *values)

@@ -1,0 +1,257 @@
+"""What a calibration knows of its own numbers: kept as information, read as standard deviations."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from ceres_cal.base.arrays import Array
+from ceres_cal.base.cached import cached_property
+from ceres_cal.base.errors import InputError
+from ceres_cal.base.spread import Spread, without
+from ceres_cal.base.tails import NORMAL_95, student_95
+from ceres_cal.effects.dependence import Dependence, Scatter
+from ceres_cal.posterior.bent import Bends
+from ceres_cal.posterior.profile import PhiProfile
+from ceres_cal.problem.information import Information, Key, over, pose_keys, sigma_limits
+from ceres_cal.problem.parameters import Estimate, Layout
+from ceres_cal.problem.quantities import layout_of
+from ceres_cal.problem.reduced import Eliminated, ReducedInformation
+
+
+@dataclass(frozen=True, eq=False)
+class Posterior:
+    """What observations and priors say together, about the solution, at the noise that was estimated.
+
+    It is kept as information because a covariance does not exist where something is unknown. Errors that go together
+    count together, as far as the residuals show it (`dependence`); what all views have in common, such as a field
+    painted amiss, is not in it.
+
+    Attributes:
+        information: about the P numbers that are shared.
+        placements: name -> information about each placement that one station alone sees, all else integrated out.
+        degrees_of_freedom: spare equations behind the estimated noise; infinite where the sigmas were taken as stated.
+        profiles: camera -> the valley along its phi, where that is too little known for the quadratic picture.
+        stated: the part of the information that was known beforehand. Nothing widens it: see `wider`.
+        by_model: what the model alone says of the shared numbers, were every error independent of the others; None
+            where that is all there is. dependence: what the rest of it rests on; None where nobody asked.
+        bends: what else leaves the quadratic picture, or None: it counts in sd, bounds and maps.
+    """
+
+    information: Information
+    placements: Mapping[str, Information] = field(default_factory=dict)
+    degrees_of_freedom: float = np.inf
+    profiles: Mapping[str, PhiProfile] = field(default_factory=dict)
+    by_model: Information | None = None
+    dependence: Dependence | None = None
+    bends: Bends | None = None
+    stated: Information = field(default_factory=Information.nothing)
+
+    @property
+    def keys(self) -> tuple[Key, ...]:
+        """(P) the numbers that are shared."""
+        return self.information.keys
+
+    def in_doubt(self, keys: Sequence[Key], shifts: Sequence[Array]) -> Posterior:
+        """The posterior that holds what is in dispute: each shift d (K,) of some numbers, when something is left out,
+        goes into the covariance of what the observations say as d d^T, so that they state no number better than to
+        what it would move.
+        """
+        if not len(shifts):
+            return self
+        whole = over(np.array(shifts), keys, self.keys)
+        information = self.wider(self.information, lambda seen: seen.widened(whole))
+        placements = self.placements
+        if isinstance(placements, _Placements):
+            placements = replace(placements, shared=information)
+        return replace(self, information=information, placements=placements)
+
+    def wider(self, information: Information, how: Callable[[Information], Information]) -> Information:
+        """Information about some of the numbers, with what observations say of them made wider, beside what was stated
+        of them as it was: so nothing is known worse than it was stated, whatever widens.
+
+        Args:
+            information: of everything. how: what makes wider what the observations say by themselves.
+        """
+        stated = self.stated.over(self.keys).marginal(information.keys)
+        return how(information.less(stated)) + stated
+
+    @cached_property
+    def stated_sd(self) -> Array:
+        """(P,) standard deviations by what was stated alone, infinite where that says nothing."""
+        sd = np.full(len(self.keys), np.inf)
+        sd[self.information.columns(self.stated.keys)] = self.stated.spread.sd
+        return sd
+
+    @property
+    def spread(self) -> Spread:
+        """Covariance and unknown directions of the shared numbers."""
+        return self.information.spread
+
+    @cached_property
+    def covariance(self) -> Array:
+        """(P, P) of the shared numbers; where one is unknown, infinity on the diagonal and NaN beside it."""
+        return self.spread.matrix
+
+    @cached_property
+    def sd(self) -> Array:
+        """(P,) standard deviations in the units of the keys, infinite where unknown."""
+        variance = self.spread.sd**2
+        if self.bends is not None:
+            variance += over(np.sum(self.bends.excesses**2, axis=0), self.bends.keys, self.keys)
+        return np.minimum(np.sqrt(variance), self.stated_sd)
+
+    @cached_property
+    def factors(self) -> Array:
+        """(P,) standard deviations over what the model alone gives; 1 where both are infinite."""
+        if self.by_model is None:
+            return np.ones(len(self.keys))
+        return widths_over(self.spread, self.by_model.spread)
+
+    @property
+    def half_width(self) -> float:
+        """Standard deviations from the middle to either end of a 95 % interval: Student's t, with the degrees of
+        freedom behind the noise and behind what is known of the dependence.
+        """
+        inverse = 1.0 / max(self.degrees_of_freedom, 1.0)
+        inverse += 0.0 if self.dependence is None else self.dependence.inverse_freedom
+        return student_95(1.0 / inverse if inverse > 0.0 else np.inf)
+
+    @cached_property
+    def bounds(self) -> Array:
+        """(P, 2) 95 % bounds of the shared numbers, from the estimate; infinite on a side that is open."""
+        limit = NORMAL_95 * self.stated_sd[:, None]  # what was stated rests on no estimated noise
+        return np.clip(self.bounds_at(self.half_width), -limit, limit)
+
+    def bounds_at(self, width: float) -> Array:
+        """(P, 2) the same so many standard deviations up, at most three."""
+        bounds = width * self.sd[:, None] * (-1.0, 1.0)
+        for profile in self.profiles.values():
+            across = [information.spread.sd for information in profile.across]
+            sds = np.column_stack([np.zeros(len(across)), across])
+            at = self.information.columns(profile.keys)
+            bounds[at] = np.column_stack(profile.bounds(profile.steps, sds, width))
+        limit = width * self.stated_sd[:, None]
+        return np.clip(bounds, -limit, limit)
+
+    def layout(self, estimate: Estimate) -> Layout:
+        """The layout of everything that it speaks of."""
+        return layout_of(self.keys, estimate, self.placements)
+
+    def keys_of(self, estimate: Estimate, station: str) -> tuple[Key, ...]:
+        """Keys of a station and of its camera."""
+        owners = {("station", station), ("camera", estimate.stations[station].camera)}
+        return tuple(key for key in self.keys if key[:2] in owners)
+
+    def knows_station(self, station: str) -> bool:
+        """Whether it says where a station stands: not of one that was held as the world."""
+        return any(key[:2] == ("station", station) for key in self.keys)
+
+    def column(self, kind: str, owner: str, quantity: str) -> int:
+        """Where a number is among the keys.
+
+        Raises:
+            InputError: it is not: held, or not there at all.
+        """
+        for column, key in enumerate(self.keys):
+            if key[:3] == (kind, owner, quantity):
+                return column
+        raise InputError(f"{kind} {owner!r} has no free number {quantity!r}: it was held, or is not there")
+
+    def sd_of(self, kind: str, owner: str, quantity: str) -> float:
+        """Standard deviation of one shared number, in its key's unit; 0 is never one, infinity means unknown.
+
+        Raises:
+            InputError: it is not a free number.
+        """
+        return float(self.sd[self.column(kind, owner, quantity)])
+
+    def placement(self, name: str) -> Spread:
+        """What is known of a placement's six numbers (`keys.PLACEMENT_QUANTITIES`).
+
+        Raises:
+            InputError: no such placement, or it was held.
+        """
+        if name in self.placements:
+            return self.placements[name].spread
+        keys = self.information.among(pose_keys("placement", name))
+        if not keys:
+            raise InputError(f"placement {name!r} has no free pose: it was held, or is not there")
+        return self.information.marginal(keys).spread
+
+
+def widths_over(spread: Spread, other: Spread) -> Array:
+    """(n,) standard deviations of one spread over those of another of the same numbers; 1 where either is infinite."""
+    both = np.isfinite(spread.sd) & np.isfinite(other.sd)
+    return np.where(both, spread.sd, 1.0) / np.where(both, other.sd, 1.0)
+
+
+def make_posterior(reduced: ReducedInformation, degrees_of_freedom: float, scatter: Scatter | None = None) -> Posterior:
+    """The posterior of everything shared, and of the placements that were eliminated.
+
+    Args:
+        degrees_of_freedom: spare equations behind the estimated noise, infinite where the sigmas were taken as stated.
+        scatter: how the data scatter; without it errors are independent.
+    """
+    model, stated = reduced.shared, reduced.stated
+    if scatter is None:
+        return Posterior(model, _Placements(reduced.eliminated, model), degrees_of_freedom, stated=stated)
+    shared, dependence = scatter.widened(reduced.points + reduced.curves) + reduced.priors, scatter.dependence
+    placements = _Placements(reduced.eliminated, shared, dependence.private)
+    return Posterior(shared, placements, degrees_of_freedom, by_model=model, dependence=dependence, stated=stated)
+
+
+@dataclass(frozen=True, eq=False)
+class _Placements(Mapping[str, Information]):
+    """Information about each eliminated placement, worked out when the first one is asked for.
+
+    Attributes:
+        shared: about what they follow. inflation: factor on the variance that their own observations leave.
+    """
+
+    eliminated: tuple[Eliminated, ...]
+    shared: Information
+    inflation: float = 1.0
+
+    @cached_property
+    def _informations(self) -> dict[str, Information]:
+        parts = ((part.names, _placement_information(part, self.shared, self.inflation)) for part in self.eliminated)
+        return {
+            name: Information(tuple(pose_keys("placement", name)), matrix)
+            for names, matrices in parts
+            for name, matrix in zip(names, matrices, strict=True)
+        }
+
+    def __getitem__(self, name: str) -> Information:
+        return self._informations[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._informations)
+
+    def __len__(self) -> int:
+        return len(self._informations)
+
+
+def _placement_information(part: Eliminated, shared: Information, inflation: float) -> Array:
+    """(S, 6, 6) information about each placement, everything shared integrated out.
+
+    A placement follows the shared numbers by -G, and deviates from that by what its own observations leave open:
+    covariance own^-1 + G C G^T where both exist, else the Schur complement of the two together.
+    """
+    regular = part.ranks > 5.5
+    regular &= not shared.spread.unknown.shape[1]
+    informations, gains = np.empty_like(part.own), part.gains[regular]
+    at = shared.columns(part.keys)
+    covariance = shared.spread.covariance[np.ix_(at, at)]
+    informations[regular] = np.linalg.inv(
+        inflation * part.inverses[regular] + gains @ covariance @ np.swapaxes(gains, 1, 2)
+    )
+    if np.all(regular):
+        return np.asarray(0.5 * (informations + np.swapaxes(informations, 1, 2)))
+    marginal, limits = shared.marginal(part.keys).matrix, sigma_limits(part.keys)
+    for s in np.flatnonzero(~regular):
+        own, gain = part.own[s] / inflation, part.gains[s]
+        informations[s] = without(own, gain.T @ own, marginal + gain.T @ own @ gain, limits)
+    return np.asarray(0.5 * (informations + np.swapaxes(informations, 1, 2)))

@@ -1,0 +1,200 @@
+"""Cells of the image, and whether residuals of different sights agree in them: what a lens leaves behind.
+
+What goes together within a sight alone, as a bent board or a blurred frame has it, is no lens, and does not count: only
+products of different sights do.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ceres_cal.base.arrays import Array, Indices, Mask
+from ceres_cal.effects.evidence import agreement as agreement_of
+from ceres_cal.effects.evidence import likeliest_sizes
+from ceres_cal.effects.linearised import Linearised, equation_weights, without_shared
+from ceres_cal.effects.sample import known_root
+from ceres_cal.observations import Observations
+from ceres_cal.observations.sights import Sights
+from ceres_cal.problem.equations import Equations, equations_of
+from ceres_cal.problem.information import Key
+from ceres_cal.problem.reduced import ReducedInformation, information
+from ceres_cal.robust.robust import RobustSolution
+from ceres_cal.scene.camera import Camera
+
+AGREES = 3.0
+"""From how many standard deviations on a lens leaves something: of one that leaves nothing one in a thousand does."""
+# Observations on average; cells along the image: some show what is long, many what a surface's nodes do not follow.
+_IN_A_CELL, _MOST_CELLS, _FINE_CELLS = 8, 8, 24
+_RINGS = 24  # from the middle to the farthest observation
+_MOST_COMPARED = 50_000  # of more, those of some sights
+_MOST_GROUPS = 200  # of sights: products within one do not count, a half of a percent
+
+
+def agreement(end: RobustSolution, sizes: Mapping[str, tuple[int, int]]) -> float:
+    """By how many standard deviations sums of residuals over a cell have one sign in all sights; 0 of one sight.
+
+    Args:
+        end: of all rounds; what took part is asked. sizes: of the images of each camera, px.
+    """
+    sights = _some(end)
+    points, curves = _in_sigmas(end, sights)
+    of_points, of_curves = _sight_of(sights.point_bounds), _sight_of(sights.curve_bounds)
+    sight = np.concatenate([of_points, of_points, of_curves])
+    left = np.concatenate([points[:, 0], points[:, 1], curves])
+    return max(_agreement(cells_of(sights, sizes, most), sight, left) for most in (_MOST_CELLS, _FINE_CELLS))
+
+
+def agreement_in_rings(end: RobustSolution) -> float:
+    """The same of sums over rings about the principal point, of what points lie farther out; of cameras the most."""
+    agree, some = 0.0, _some(end)
+    for name, camera in end.solution.estimate.cameras.items():
+        sights = some.of_camera(name)
+        offsets = camera.offsets(sights.pixels)
+        radius = np.maximum(np.hypot(offsets[:, 0], offsets[:, 1]), 1e-12)
+        ring = (_RINGS / np.max(radius, initial=1e-12) * radius).astype(int)
+        outward = np.einsum("ij,ij->i", offsets, _in_sigmas(end, sights)[0]) / radius
+        agree = max(agree, _agreement(ring, _sight_of(sights.point_bounds), outward))
+    return agree
+
+
+def _some(end: RobustSolution) -> Sights:
+    sights = end.problem.sights
+    every = -(-sights.equations // _MOST_COMPARED)
+    return sights if every <= 1 else sights[::every]
+
+
+def _sight_of(bounds: Indices) -> Indices:
+    """Of each observation its sight's number; of very many sights, that of some beside each other."""
+    sights = len(bounds) - 1
+    return np.repeat(np.arange(sights) * min(sights, _MOST_GROUPS) // max(sights, 1), np.diff(bounds))
+
+
+def _in_sigmas(end: RobustSolution, sights: Sights) -> tuple[Array, Array]:
+    """(N, 2), (M,) residuals of points and curve observations, in standard deviations."""
+    of_points, of_curves = end.problem.weighting.scales
+    points = end.residuals.points[sights.point_rows] / (of_points * sights.sigma_px[:, None])
+    return points, end.residuals.curves[sights.curve_rows] / (of_curves * sights.curve_sigma_px)
+
+
+def _agreement(place: Indices, sight: Indices, left: Array) -> float:
+    """By how many standard deviations the sums of residuals (N,) by place (N,) agree between sights (N,)."""
+    count = int(np.max(sight, initial=0)) + 1
+    size = count * (int(np.max(place, initial=0)) + 1)
+    sums = np.bincount(place * count + sight, left, size).reshape(-1, count)
+    return agreement_of(np.asarray(sums.T, dtype=float))
+
+
+def cells_of(sights: Sights, sizes: Mapping[str, tuple[int, int]], most: int = _MOST_CELLS) -> Indices:
+    """(2 N + M,) numbers of the cells of all points' x, of their y and of all curve observations, each curve apart;
+    no more than so many along the image.
+    """
+    names = sorted(sizes)
+    count = (len(sights.point_rows) + len(sights.curve_rows)) / (_IN_A_CELL * len(names))
+    side = min(most, max(2, int(np.sqrt(count))))
+    owners = np.array([names.index(key.camera) for key in sights.keys])
+    per_px = side / np.array([sizes[name] for name in names], dtype=float)
+
+    def cells(bounds: Indices, pixels: Array) -> Indices:
+        owner = np.repeat(owners, np.diff(bounds))
+        x, y = (np.clip((pixels[:, k] * per_px[owner, k]).astype(int), 0, side - 1) for k in (0, 1))
+        return np.asarray((owner * side + y) * side + x)
+
+    points, curves = cells(sights.point_bounds, sights.pixels), cells(sights.curve_bounds, sights.curve_pixels)
+    first = 2 * side * side * len(names)
+    return np.concatenate([points * 2, points * 2 + 1, first + curves * len(sights.tracks) + sights.track_index])
+
+
+_MOST_EQUATIONS = 12_000  # that tell how rough a lens is: of more, those of some views
+_ALONG, _OVER = (
+    36,
+    (6, 12, 24),
+)  # bumps from the middle to the farthest observation, or along the longer side of the image
+_LOOSE_PX, _LEAST_PX = 3.0, 1e-3  # of bumps, before the data have spoken, and what they cannot talk below
+_AT_REST = 0.02  # relative change of a size
+
+
+def shifts_by_roughness(end: RobustSolution, observations: Observations) -> tuple[Sequence[Key], Sequence[Array]]:
+    """Numbers (K), and shifts (K,) of them whose products with themselves, added up, are the covariance of what rough
+    lenses do to them; none where views do not agree on anything that is left.
+    """
+    if max(agreement(end, observations.cameras), agreement_in_rings(end)) <= AGREES:
+        return (), ()
+    reduced = end.reduced or information(end.problem, end.solution.estimate)
+    left = _Left.of(end, observations, reduced)
+    every = [left.shifts_of(name, camera) for name, camera in end.solution.estimate.cameras.items()]
+    return reduced.shared.keys, [shift for shifts in every for shift in shifts]
+
+
+@dataclass(frozen=True, eq=False)
+class _Left:
+    """What the free numbers leave of some equations, in standard deviations.
+
+    Attributes:
+        model: of private placements alone. shared: (E, P) directions of the shared numbers beyond these. root: (K, P)
+            from them to the numbers. normal: (P, P) what the equations and the priors say of them.
+    """
+
+    model: Linearised
+    shared: Array
+    root: Array
+    normal: Array
+
+    @classmethod
+    def of(cls, end: RobustSolution, observations: Observations, reduced: ReducedInformation) -> _Left:
+        problem, estimate = end.problem, end.solution.estimate
+        every = max(1, -(-problem.sights.equations // _MOST_EQUATIONS))
+        sights = problem.sights[::every]
+        equations = equations_of(observations, sights, estimate, end.residuals)
+        weights = equation_weights(observations, problem.weighting, equations, end.residuals).within_sigma
+        model, columns = without_shared(problem, estimate, equations, weights)
+        root = known_root(reduced.shared)
+        shared = model.beyond_private(columns @ root)
+        share = sights.equations / problem.sights.equations
+        prior = root.T @ reduced.priors.over(reduced.shared.keys).matrix @ root
+        return cls(model, shared, root, shared.T @ shared + share * prior)
+
+    def shifts_of(self, name: str, camera: Camera) -> Array:
+        """(R, K) by the bumps of a camera's image."""
+        equations, rows = self.model.equations, self.model.equations.bounds[:-1]
+        own = equations.of_sights(np.array([key.camera == name for key in equations.sights.keys]))
+        every = list(_bumps(equations, camera, own))
+        kind = np.repeat(np.arange(len(every)), [columns.shape[1] for columns in every])
+        inside = self.model.beyond_private(np.hstack(every) * (own * self.model.weight)[:, None])
+        taken = self.shared.T @ inside
+        moved = np.linalg.solve(self.normal, taken)
+        normal = inside.T @ inside - taken.T @ moved
+        score = self.model.placed_score
+        score = score - self.shared @ np.linalg.solve(self.normal, self.shared.T @ score)
+        slope = inside.T @ score
+        best = np.linalg.solve(normal + np.eye(len(kind)) / _LOOSE_PX**2, slope)
+        rest = score - inside @ best + self.shared @ (moved @ best)
+        scatter = np.add.reduceat(inside * rest[:, None], rows), np.add.reduceat(inside**2, rows)
+        within = max(1.0, float(np.sum(scatter[0] ** 2) / np.sum(scatter[1])))
+        forms = [np.diag((kind == number).astype(float)) for number in range(len(every))]
+        loose, least = np.full((2, len(every)), [[_LOOSE_PX], [_LEAST_PX]])
+        sizes = likeliest_sizes(normal / within, slope / within, forms, loose, least, _AT_REST)
+        covariance = np.linalg.inv(sizes.precision)
+        values, vectors = np.linalg.eigh(covariance + np.outer(sizes.amount, sizes.amount))
+        half = vectors * np.sqrt(np.maximum(values, 0.0))
+        return np.asarray(np.linalg.qr((self.root @ moved @ half).T, mode="r"))
+
+
+def _bumps(equations: Equations, camera: Camera, own: Mask) -> Iterator[Array]:
+    """(E, Q) px per px of bumps along the radius and over the image, as far as a camera's own equations (E,) reach."""
+    offsets = camera.offsets(equations.pixel)
+    radius = np.maximum(np.linalg.norm(offsets, axis=1), 1e-12)
+    outward = np.sum(equations.direction * offsets * (1.0, camera.aspect), axis=1) / radius
+    yield _hats(radius / np.max(radius[own], initial=1e-12) * _ALONG, _ALONG) * outward[:, None]
+    for count in _OVER:
+        step_px = max(camera.image_size) / count
+        x, y = (_hats(equations.pixel[:, k] / step_px, -int(-camera.image_size[k] // step_px)) for k in (0, 1))
+        over = (x[:, :, None] * y[:, None, :]).reshape(len(x), -1)
+        yield np.hstack([over * equations.direction[:, axis, None] for axis in (0, 1)])
+
+
+def _hats(place: Array, count: int) -> Array:
+    """(E, count + 1) straight up to 1 at each whole number from 0 to the count, and down."""
+    return np.asarray(np.maximum(0.0, 1.0 - np.abs(place[:, None] - np.arange(count + 1))))

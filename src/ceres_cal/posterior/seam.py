@@ -1,0 +1,257 @@
+"""How two cameras stand to each other: baseline and angle, with standard deviations."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ceres_cal.base.arrays import Array, Indices, distinct
+from ceres_cal.base.tails import NORMAL_95
+from ceres_cal.base.transforms import rotation_log
+from ceres_cal.observations import Columns, Observations
+from ceres_cal.posterior.maps import (
+    FieldGrid,
+    FieldMap,
+    field_map,
+    locate_slopes,
+    radius_95,
+    station_keys,
+    visible_pixels,
+)
+from ceres_cal.posterior.posterior import Posterior
+from ceres_cal.problem.information import over
+from ceres_cal.problem.parameters import Estimate
+from ceres_cal.problem.quantities import moved, natural_sizes
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.curves import along_track, nearest_on_track, turned_on
+from ceres_cal.scene.targets import Target
+
+_STEP = 1e-6  # of a number's natural size, either way, for derivatives
+
+
+@dataclass(frozen=True)
+class RigPair:
+    """Two stations, and how the second stands to the first.
+
+    Attributes:
+        baseline_m, baseline_sd_m: between their positions. angle_rad, angle_sd_rad: between their orientations, about
+            whichever axis; a standard deviation is infinite where nothing is known of one of them.
+    """
+
+    stations: tuple[str, str]
+    baseline_m: float
+    baseline_sd_m: float
+    angle_rad: float
+    angle_sd_rad: float
+
+
+def rig_pairs(estimate: Estimate, posterior: Posterior) -> tuple[RigPair, ...]:
+    """The first station with each one of another camera."""
+    first, *others = estimate.stations
+    camera = estimate.stations[first].camera
+    return tuple(_pair(estimate, posterior, first, o) for o in others if estimate.stations[o].camera != camera)
+
+
+def _pair(estimate: Estimate, posterior: Posterior, first: str, second: str) -> RigPair:
+    at = [column for column, key in enumerate(posterior.keys) if key[:2] in (("station", first), ("station", second))]
+    keys = [posterior.keys[column] for column in at]
+    steps = _STEP * natural_sizes(estimate, keys)
+    jacobian = np.zeros((2, len(posterior.keys)))
+    for column, number, step in zip(at, range(len(keys)), steps, strict=True):
+        along = step * (np.arange(len(keys)) == number)
+        there = [_numbers(moved(estimate, keys, sign * along), first, second) for sign in (1.0, -1.0)]
+        jacobian[:, column] = (there[0] - there[1]) / (2.0 * step)
+    variance = np.diagonal(posterior.spread.through(jacobian))
+    if posterior.bends is not None:
+        ends = over(posterior.bends.excesses, posterior.bends.keys, posterior.keys) @ jacobian.T
+        variance = variance + np.sum(ends**2, axis=0)
+    sd = np.sqrt(variance)
+    baseline, angle = _numbers(estimate, first, second).tolist()
+    return RigPair((first, second), baseline, float(sd[0]), angle, float(sd[1]))
+
+
+def _numbers(estimate: Estimate, first: str, second: str) -> Array:
+    """Baseline (m) and angle (rad)."""
+    a, b = (estimate.stations[name].cam_from_world for name in (first, second))
+    turn = rotation_log(b.rotation @ a.rotation.T)
+    return np.array([np.linalg.norm(b.position - a.position), np.linalg.norm(turn)])
+
+
+_BIN_M = 0.5  # along a curve; observations of one stretch are taken together
+_FEWEST = 2  # observations of a stretch by each of the two stations
+_PIXEL = 0.5  # for the slope of a map by differences
+
+
+def seam_map(estimate: Estimate, posterior: Posterior, pair: tuple[str, str], grid: FieldGrid) -> FieldMap:
+    """Predicted disagreement of two stations about places that both see, over a grid; `station` names both.
+
+    What they have in common (one field, one camera, shared boards) is taken into account, but for cameras whose phi is
+    followed along its profile: those count as independent.
+
+    Raises:
+        InputError: see `maps.station_keys`.
+    """
+    if {estimate.stations[s].camera for s in pair if s in estimate.stations} & set(posterior.profiles):
+        a, b = (field_map(estimate, posterior, station, grid) for station in pair)
+        sd_mm, radius_mm = np.hypot(a.sd_mm, b.sd_mm), np.hypot(a.radius_95_mm, b.radius_95_mm)
+    else:
+        covariance = predicted(estimate, posterior, pair, grid.places, grid.height_m)
+        sd_mm = 1e3 * np.sqrt(np.trace(covariance, axis1=1, axis2=2)).reshape(grid.shape)
+        radius_mm = 1e3 * (radius_95(covariance) * posterior.half_width / NORMAL_95).reshape(grid.shape)
+    return FieldMap(grid.height_m, grid.x_m, grid.y_m, " - ".join(pair), sd_mm, radius_mm)
+
+
+def predicted(estimate: Estimate, posterior: Posterior, pair: tuple[str, str], places: Array, height_m: float) -> Array:
+    """Covariances (N, 2, 2) m^2 of first less second about places (N, 2) m; NaN where not both see them."""
+    covariances, slopes = np.full((len(places), 2, 2), np.nan), np.zeros((len(places), 2, len(posterior.keys)))
+    visible = np.ones(len(places), dtype=bool)
+    for station, sign in zip(pair, (1.0, -1.0), strict=True):
+        keys = station_keys(estimate, posterior, station)
+        pixels = visible_pixels(estimate, station, places, height_m)
+        visible &= np.isfinite(pixels[:, 0])
+        slopes += sign * over(locate_slopes(estimate, keys, station, pixels, height_m), keys, posterior.keys)
+    covariances[visible] = posterior.spread.through(slopes[visible])
+    return covariances
+
+
+@dataclass(frozen=True, eq=False)
+class Disagreement:
+    """What two stations actually say of what both observed.
+
+    Attributes:
+        what: (N) the point, or the curve. places: (N, 2) m, about where.
+        off_mm: (N,) first less second: of a point the distance, of a stretch of a curve the sideways one, signed.
+        expected_mm: (N,) its standard deviation, by the calibration's uncertainty and the pixels' noise.
+    """
+
+    what: tuple[str, ...]
+    places: Array
+    off_mm: Array
+    expected_mm: Array
+
+    @property
+    def rms_mm(self) -> float:
+        """Root mean square of the differences; NaN where the two observed nothing in common."""
+        return float(np.sqrt(np.mean(self.off_mm**2))) if len(self.off_mm) else np.nan
+
+    @property
+    def expected_rms_mm(self) -> float:
+        """The same of what was expected."""
+        return float(np.sqrt(np.mean(self.expected_mm**2))) if len(self.off_mm) else np.nan
+
+
+@dataclass(frozen=True, eq=False)
+class _Sighting:
+    """What one station saw of one thing, all frames taken together.
+
+    Attributes:
+        place: (3,) where the thing is as drawn. off_m: (2,) by how much the station locates it elsewhere, on average.
+        noise_m: what the pixels' noise leaves in off_m, along each axis. normal: (2,) of a curve, None of a point.
+    """
+
+    place: Array
+    off_m: Array
+    noise_m: float
+    normal: Array | None = None
+
+
+_Thing = tuple[str, int]
+"""A point (its name, 0) or a stretch of a curve (its name, how many stretches from its start)."""
+
+
+def disagreement(
+    observations: Observations,
+    estimate: Estimate,
+    posterior: Posterior,
+    scales: tuple[float, float],
+    pair: tuple[str, str],
+) -> Disagreement:
+    """Compare what two stations say of the points, and of the stretches of curve of half a metre, that both observed.
+
+    Only what lies in the world counts; how it was built does not matter, both saw the same.
+
+    Args:
+        observations: that the calibration was made from, without those that were taken out.
+        scales: noise scales of points and curves.
+    """
+    a, b = (dict(_sightings(observations, estimate, station, scales)) for station in pair)
+    common = [thing for thing in a if thing in b]
+    places = np.array([a[thing].place for thing in common]).reshape(-1, 3)
+    covariances = np.empty((len(common), 2, 2))
+    for height_m in distinct(places[:, 2]):
+        here = places[:, 2] == height_m
+        covariances[here] = predicted(estimate, posterior, pair, places[here, :2], float(height_m))
+    gaps = [_gap(a[thing], b[thing], covariance) for thing, covariance in zip(common, covariances, strict=True)]
+    known = [number for number, (_, expected) in enumerate(gaps) if np.isfinite(expected)]
+    off, expected = 1e3 * np.array([gaps[number] for number in known]).reshape(-1, 2).T
+    return Disagreement(tuple(common[number][0] for number in known), places[known, :2], off, expected)
+
+
+def _gap(here: _Sighting, there: _Sighting, covariance: Array) -> tuple[float, float]:
+    """By how much the two differ and its standard deviation, m: what a fit has taken up of its own noise is missing."""
+    gap = here.off_m - there.off_m
+    noise = (here.noise_m**2 + there.noise_m**2) * np.eye(2) - covariance
+    if here.normal is None:
+        return float(np.linalg.norm(gap)), float(np.sqrt(np.maximum(np.trace(noise), 0.0)))
+    return float(here.normal @ gap), float(np.sqrt(np.maximum(here.normal @ noise @ here.normal, 0.0)))
+
+
+def _sightings(
+    observations: Observations, estimate: Estimate, station: str, scales: tuple[float, float]
+) -> Iterator[tuple[_Thing, _Sighting]]:
+    """What a station saw of the points and of the stretches of curve that lie in the world."""
+    camera = estimate.camera_at(station)
+    points, curves = observations.points, observations.curves
+    for target, feature, rows in _rows(observations, points, station):
+        drawn = np.broadcast_to(target.point_array[feature], (len(rows), 3))
+        yield (target.point_names[feature], 0), _sighting(camera, points, rows, drawn, scales[0])
+    for target, feature, rows in _rows(observations, curves, station):
+        name, tracks = target.curve_names[feature], target.tracks[curves.side[rows], feature]
+        curve, is_arc, height_m = target.curves[name], bool(target.is_arc[feature]), float(tracks[0, 0, 2])
+        located = camera.locate(curves.pixels[rows], height_m)
+        s = nearest_on_track(tracks, is_arc, np.column_stack([located, np.full(len(rows), height_m)]))
+        feet, start = along_track(tracks, is_arc, s), curve.parameter_range[0]
+        length = (turned_on(curve, s) - start) * np.linalg.norm(tracks[:, 1], axis=1)
+        stretch = np.floor(length / _BIN_M).astype(int)
+        for number in distinct(stretch):
+            part = stretch == number
+            if np.count_nonzero(part) >= _FEWEST:
+                sighting = _sighting(camera, curves, rows[part], feet[part], scales[1])
+                normal = _normal(tracks[0], is_arc, sighting.place)
+                yield (name, int(number)), replace(sighting, normal=normal)
+
+
+def _sighting(camera: Camera, columns: Columns, rows: Indices, drawn: Array, scale: float) -> _Sighting:
+    """Some rows taken together that show what is drawn at (N, 3), all of it at one height."""
+    pixels, height_m = columns.pixels[rows], float(drawn[0, 2])
+    off_m = np.mean(camera.locate(pixels, height_m) - drawn[:, :2], axis=0)
+    sigma_px = scale * float(np.mean(columns.sigma_px[rows])) / np.sqrt(len(rows))
+    return _Sighting(np.mean(drawn, axis=0), off_m, sigma_px * _metres_per_px(camera, pixels, height_m))
+
+
+def _rows(observations: Observations, columns: Columns, station: str) -> Iterator[tuple[Target, int, Indices]]:
+    """What a station saw of targets that lie in the world: the number of each feature, and its rows."""
+    rows: dict[str, list[Indices]] = {}
+    for number, view in enumerate(observations.views):
+        if view.station == station and view.placement is None:
+            first, last = np.searchsorted(columns.view, [number, number + 1])
+            rows.setdefault(view.target, []).append(np.arange(first, last))
+    for name, parts in rows.items():
+        every = np.concatenate(parts)
+        for feature in distinct(columns.feature[every]):
+            yield observations.targets[name], int(feature), every[columns.feature[every] == feature]
+
+
+def _metres_per_px(camera: Camera, pixels: Array, height_m: float) -> float:
+    """Of the map about the mean of some pixels, in the mean over directions."""
+    middle = np.mean(pixels, axis=0) + _PIXEL * np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
+    x1, x0, y1, y0 = camera.locate(middle, height_m)
+    return float(np.sqrt(0.5 * (np.sum((x1 - x0) ** 2) + np.sum((y1 - y0) ** 2)))) / (2.0 * _PIXEL)
+
+
+def _normal(track: Array, is_arc: bool, place: Array) -> Array:
+    """(2,) across a curve, at a place on it."""
+    across = place[:2] - track[0, :2] if is_arc else np.array([-track[1, 1], track[1, 0]])
+    return np.asarray(across / np.linalg.norm(across))

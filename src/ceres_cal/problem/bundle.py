@@ -1,0 +1,322 @@
+"""The one nonlinear least-squares problem: its blocks, the solve and what comes out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pyceres
+
+from ceres_cal.base.arrays import Array
+from ceres_cal.base.errors import DegenerateError, InputError, SolutionError
+from ceres_cal.base.threads import at_most, available
+from ceres_cal.base.transforms import Pose, Poses
+from ceres_cal.observations.sights import SightKey, Sights
+from ceres_cal.problem.costs import ROWS_WORTH_A_THREAD, EliminatedCost, Run, SightCost
+from ceres_cal.problem.engines import Chart, ChartedCost, chart_of
+from ceres_cal.problem.parameters import Estimate, Layout, Station, intrinsics_vector, with_intrinsics
+from ceres_cal.problem.prior_cost import PriorCost
+from ceres_cal.problem.problem import Problem, Weighting
+
+_AT_REST = 10  # iterations
+_NOTHING_LEFT = "Nothing left to gain."
+_SUCCESS = (pyceres.TerminationType.CONVERGENCE, pyceres.TerminationType.USER_SUCCESS)
+# Relative change of a placement's cost that a start may leave. Nothing changes from half to double.
+_POSED = 1e-2
+_MOST_INVALID = 20  # steps one after the other: the trust region shrinks ever faster, and what is beyond has no pose
+_DENSE_LIMIT = 600  # numbers that stay after the Schur complement; above it a sparse factorisation is faster
+
+
+@dataclass(frozen=True)
+class Progress:
+    """One iteration of a solve, as the progress callback gets it."""
+
+    iteration: int
+    cost: float
+    step_norm: float
+
+
+@dataclass(frozen=True)
+class Solution:
+    """The end of one solve.
+
+    Attributes:
+        cost: half the sum of all rho, at the end, infinite where it failed. history: the same at every iteration.
+        converged: False when the iterations ran out or the solver failed; termination: Ceres' own words why it stopped.
+        failed: the estimate is where it started.
+    """
+
+    estimate: Estimate
+    cost: float
+    converged: bool
+    termination: str
+    history: tuple[float, ...]
+    failed: bool = False
+
+
+@dataclass(eq=False)
+class _ParameterBlocks:
+    """The arrays that Ceres moves, by name; the caller's estimate is never touched."""
+
+    cameras: dict[str, Array]
+    stations: dict[str, Array]
+    placements: dict[str, Array]
+    structure: Array
+
+    @classmethod
+    def pack(cls, estimate: Estimate, layout: Layout, eliminated: frozenset[str | None]) -> _ParameterBlocks:
+        kept = layout.placements - eliminated
+        return cls(
+            {name: intrinsics_vector(camera)[layout.free[name]] for name, camera in estimate.cameras.items()},
+            {n: estimate.stations[n].cam_from_world.log() for n in estimate.stations if n in layout.stations},
+            {n: estimate.placements[n].log() for n in estimate.placements if n in kept},
+            estimate.structure.values.copy(),
+        )
+
+    def of(self, key: SightKey, slots: Iterable[int]) -> list[Array]:
+        """The arrays of a sight's camera (slot 0), station (1), placement (2) and structure (3)."""
+        every = (
+            lambda: self.cameras[key.camera],
+            lambda: self.stations[key.station],
+            lambda: self.placements[str(key.placement)],
+            lambda: self.structure,
+        )
+        return [every[slot]() for slot in slots]
+
+    def owned_by(self, kind: str, name: str) -> Array:
+        """The array of a camera, a station, or the structure."""
+        return self.cameras[name] if kind == "camera" else self.stations[name] if kind == "station" else self.structure
+
+    def charts(self, estimate: Estimate, layout: Layout) -> dict[int, Chart]:
+        """Those of the arrays that are not moved as they are, by the array's id."""
+        charts = {id(self.cameras[n]): chart_of(camera, layout.free[n]) for n, camera in estimate.cameras.items()}
+        return {number: chart for number, chart in charts.items() if chart is not None}
+
+    def change(self, charts: Mapping[int, Chart], by: Callable[[Chart, Array], Array]) -> None:
+        """Each array that has a chart, in its place."""
+        for array in self.cameras.values():
+            if id(array) in charts:
+                array[:] = by(charts[id(array)], array)
+
+    def unpack(self, estimate: Estimate, layout: Layout) -> Estimate:
+        cameras = {}
+        for name, camera in estimate.cameras.items():
+            vector = intrinsics_vector(camera)
+            vector[layout.free[name]] = self.cameras[name]
+            cameras[name] = with_intrinsics(camera, vector) if len(layout.free[name]) else camera
+        stations = {
+            name: Station(old.camera, Pose.exp(self.stations[name])) if name in layout.stations else old
+            for name, old in estimate.stations.items()
+        }
+        moved = Poses.of({name: Pose.exp(vector) for name, vector in self.placements.items()})
+        placements = Poses.of(estimate.placements).updated(list(moved), moved.stack)
+        return Estimate(cameras, stations, placements, estimate.structure.with_values(self.structure))
+
+
+@dataclass(eq=False)
+class _Assembly:
+    """Every cost of a problem with the arrays it depends on; costs that depend on nothing free have no array."""
+
+    blocks: _ParameterBlocks
+    costs: list[tuple[Any, list[Array]]]
+    eliminated: list[tuple[EliminatedCost, list[Array]]]
+    threads: int = 1
+    """Blocks that are worth a thread each."""
+
+
+def _assemble(run: Run, problem: Problem, estimate: Estimate) -> _Assembly:
+    private, sights, layout = problem.private, problem.sights, problem.layout
+    blocks = _ParameterBlocks.pack(estimate, layout, private)
+    assembly = _Assembly(blocks, [], [])
+    for camera in estimate.cameras:
+        own = sights.numbers(camera, placements=private)
+        if len(own):
+            cost = EliminatedCost(run, sights.take(own), problem, estimate)
+            assembly.eliminated.append((cost, blocks.of(sights.keys[own[0]], cost.slots)))
+    assembly.costs += assembly.eliminated
+    for number, key in enumerate(sights.keys):
+        if key.placement not in private:
+            parts = list(_parts(sights[number]))
+            assembly.threads = max(assembly.threads, len(parts))
+            for part in parts:
+                sight_cost = SightCost(run, part, problem, estimate)
+                assembly.costs.append((sight_cost, blocks.of(key, sight_cost.slots)))
+    if problem.elsewhere is not None:
+        more = problem.elsewhere.cost(run, problem, estimate)
+        assembly.costs.append((more, [blocks.owned_by(*owner) for owner in more.owners]))
+    for prior in problem.priors_at(estimate):
+        prior_cost = PriorCost(run, prior, estimate, layout)
+        assembly.costs.append((prior_cost, [blocks.owned_by(*owner) for owner in prior_cost.owners]))
+    return assembly
+
+
+class _Watcher(pyceres.IterationCallback):
+    """Passes progress on; ends the solve when nothing is left to gain, a callback has failed or Ctrl-C was pressed."""
+
+    def __init__(self, run: Run, progress: Callable[[Progress], None] | None, precision: float) -> None:
+        super().__init__()
+        self._run, self._progress, self._precision = run, progress, precision
+        self._accepted: list[float] = []
+
+    def __call__(self, summary: Any) -> Any:
+        try:
+            self._run.history.append(float(summary.cost))
+            if summary.step_is_successful:
+                self._accepted.append(float(summary.cost))
+            if self._progress is not None:
+                self._progress(Progress(int(summary.iteration), float(summary.cost), float(summary.step_norm)))
+        except BaseException as error:  # quiet: raised again when Ceres has returned
+            self._run.failure = self._run.failure or error
+        if self._run.failure is not None:
+            return pyceres.CallbackReturnType.SOLVER_ABORT
+        if summary.step_is_successful and _left_to_gain(self._accepted) <= self._precision:
+            return pyceres.CallbackReturnType.SOLVER_TERMINATE_SUCCESSFULLY
+        return pyceres.CallbackReturnType.SOLVER_CONTINUE
+
+
+def _left_to_gain(costs: Sequence[float]) -> float:
+    """The share of the cost that all further steps bring if the gains go on shrinking as the last two did.
+
+    Ceres waits for a gain of nothing, which near the end of Newton's way is an iteration in vain.
+    """
+    if len(costs) < 3:
+        return np.inf
+    before, last = costs[-3] - costs[-2], costs[-2] - costs[-1]
+    if costs[-1] <= 0.0:  # an exact fit
+        return 0.0
+    return last * last / (before - last) / costs[-1] if before > last > 0.0 else np.inf
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Ceres keeps to its summary: what it would print besides says no more."""
+    before = pyceres.logging.minloglevel
+    pyceres.logging.minloglevel = int(pyceres.logging.FATAL)
+    try:
+        yield
+    finally:
+        pyceres.logging.minloglevel = before
+
+
+def _parts(sight: Sights) -> list[Sights]:
+    """A sight of very many observations as one for each thread."""
+    count = max(1, min(available(), (len(sight.points) + len(sight.curve_pixels)) // ROWS_WORTH_A_THREAD))
+    return [sight.part(number, count) for number in range(count)] if count > 1 else [sight]
+
+
+def solve(
+    problem: Problem,
+    estimate: Estimate,
+    progress: Callable[[Progress], None] | None = None,
+    *,
+    precision: float = 1e-14,
+    is_near: bool = True,
+) -> Solution:
+    """Minimise the robust cost over everything free, from `estimate`.
+
+    Args:
+        progress: called at every iteration. precision: relative change of the cost at which the solve ends.
+        is_near: whether the estimate is near the minimum. There plain Gauss-Newton is right where the loss is convex,
+            and phi against height creeps without it.
+
+    Raises:
+        DegenerateError: fewer observations than free numbers.
+        SolutionError: the least cost lies where phi or the aspect is negative.
+    """
+    _require_enough(problem, estimate)
+    run, layout = Run(), problem.layout
+    with at_most(problem.options.threads):
+        assembly = _assemble(run, problem, estimate)
+    ceres, charts = pyceres.Problem(), assembly.blocks.charts(estimate, layout)
+    for cost, arrays in assembly.costs:
+        own = [charts.get(id(array)) for array in arrays]
+        if arrays:
+            ceres.add_residual_block(ChartedCost(run, cost, own) if any(own) else cost, None, arrays)
+    assembly.blocks.change(charts, Chart.moved)
+    settings = _solver_options(problem, assembly, precision)
+    settings.callbacks = [_Watcher(run, progress, precision)]
+    if is_near and problem.weighting.is_convex:
+        settings.initial_trust_region_radius = 1e8
+    summary = pyceres.SolverSummary()
+    with _quiet():
+        pyceres.solve(settings, ceres, summary)
+    if run.failure is not None:
+        raise run.failure
+    assembly.blocks.change(charts, Chart.numbers)
+    try:
+        solved = assembly.blocks.unpack(estimate, layout)
+    except InputError as error:  # phi or aspect below 0
+        raise SolutionError(f"the solve ended at no camera ({error}): check labels and target dimensions") from None
+    for eliminated, arrays in assembly.eliminated:
+        solved = solved.with_placements(*eliminated.converged(arrays))
+    usable = bool(summary.IsSolutionUsable())
+    return Solution(
+        solved,
+        float(summary.final_cost) if usable else np.inf,
+        summary.termination_type in _SUCCESS or _rests(run.history),
+        _NOTHING_LEFT if summary.termination_type == pyceres.TerminationType.USER_SUCCESS else str(summary.message),
+        tuple(run.history),
+        not usable,
+    )
+
+
+def placement_costs(
+    sights: Sights, estimate: Estimate, weighting: Weighting, poses: Array, tolerance: float = 1e-6
+) -> tuple[Array, Array]:
+    """Costs (S,) and cam_from_target (S, 3, 4) of one camera's sights after each placement alone was solved for.
+
+    Args:
+        poses: (S, 3, 4) where the search for each cam_from_target starts; a start from where an observation cannot be
+            projected costs infinity. tolerance: relative, of each cost.
+    """
+    held = Layout({sights.keys[0].camera: np.empty(0, dtype=np.int64)}, frozenset(), frozenset())
+    problem = Problem(sights, held, weighting=weighting)
+    return EliminatedCost(Run(), sights, problem, estimate).from_poses(poses, tolerance)
+
+
+def with_placements_at_best(problem: Problem, estimate: Estimate) -> Estimate:
+    """The estimate with every private placement where it fits best, everything else held."""
+    for camera in estimate.cameras:
+        own = problem.sights.take(problem.sights.numbers(camera, placements=problem.private))
+        if len(own):
+            poses = estimate.pose_stack(own.keys)
+            _, best = placement_costs(own, estimate, problem.weighting, poses, _POSED)
+            estimate = estimate.with_placements(own.keys, best)
+    return estimate
+
+
+def _rests(history: Sequence[float]) -> bool:
+    """Whether the last iterations changed the cost by rounding alone: a redescending loss can go on like that."""
+    last = history[-_AT_REST:]
+    return len(last) == _AT_REST and max(last) - min(last) <= 1e-11 * max(last)
+
+
+def _require_enough(problem: Problem, estimate: Estimate) -> None:
+    unknowns = problem.layout.size + len(estimate.structure.values)
+    known = unknowns - problem.unknowns(estimate)
+    if problem.equations + known < unknowns:
+        raise DegenerateError(
+            f"{problem.equations + known} measured numbers (two a point, one a curve observation or prior) "
+            f"cannot determine {unknowns} unknowns: add observations, or fix some of the unknowns"
+        )
+
+
+def _solver_options(problem: Problem, assembly: _Assembly, precision: float) -> Any:
+    solver = pyceres.SolverOptions()
+    kept = sum(len(free) for free in problem.layout.free.values()) + len(assembly.blocks.structure)
+    few = kept + 6 * len(problem.layout.stations) < _DENSE_LIMIT
+    solver.linear_solver_type = pyceres.LinearSolverType.DENSE_SCHUR if few else pyceres.LinearSolverType.SPARSE_SCHUR
+    if few and not assembly.blocks.placements:  # nothing is left to be eliminated
+        solver.linear_solver_type = pyceres.LinearSolverType.DENSE_NORMAL_CHOLESKY
+    solver.max_num_iterations = problem.options.max_iterations
+    solver.max_num_consecutive_invalid_steps = _MOST_INVALID
+    solver.function_tolerance = precision
+    solver.parameter_tolerance = 1e-12
+    solver.gradient_tolerance = 1e-14
+    # Short kernels are over before Python's lock is had; only parts of very large sights are worth a thread each.
+    solver.num_threads = assembly.threads
+    solver.logging_type = pyceres.LoggingType.SILENT
+    return solver

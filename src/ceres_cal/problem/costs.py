@@ -1,0 +1,259 @@
+"""What Ceres calls: the last answer is kept, and an exception ends the solve instead of travelling through C++."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
+
+import numpy as np
+import pyceres
+
+from ceres_cal import kernels
+from ceres_cal.base.arrays import Array
+from ceres_cal.base.threads import parts_of, run_parts
+from ceres_cal.observations.sights import SightKey, Sights
+from ceres_cal.problem.parameters import Estimate
+from ceres_cal.problem.problem import Problem, Weighting
+from ceres_cal.problem.residuals import camera_optics, curve_columns, point_columns, starting_feet
+from ceres_cal.problem.structure import Structure
+
+
+@dataclass(eq=False)
+class Run:
+    """What the callbacks of one solve share: the first exception in any of them (Ctrl-C too) ends the solve."""
+
+    failure: BaseException | None = None
+    history: list[float] = field(default_factory=list)
+
+
+class Evaluation(NamedTuple):
+    """The residuals (N,) in a place, and the flat Jacobians (N, size) of each block there."""
+
+    at: Array
+    residuals: Array
+    jacobians: Sequence[Array]
+
+
+class CachedCost(pyceres.CostFunction):
+    """A cost function; what it costs is `_evaluated`."""
+
+    def __init__(self, run: Run) -> None:
+        super().__init__()
+        self._run = run
+        self._known: Evaluation | None = None
+
+    def Evaluate(self, parameters: Sequence[Array], residuals: Array, jacobians: Sequence[Array] | None) -> bool:
+        try:
+            at = np.concatenate(parameters)
+            # Ceres asks for the cost of a step first, then for the Jacobian in the same place: once is enough.
+            if self._known is None or not np.array_equal(self._known.at, at):
+                self._known = self._evaluated(at, parameters)
+        except BaseException as error:  # quiet: raised again when Ceres has returned
+            self._run.failure = self._run.failure or error
+            return False
+        if self._known is None:
+            return False
+        residuals[:] = self._known.residuals
+        for jacobian, known in zip(jacobians or (), self._known.jacobians, strict=False):
+            jacobian[:] = known
+        if jacobians is not None:
+            self._accept()
+        return True
+
+    def _evaluated(self, at: Array, parameters: Sequence[Array]) -> Evaluation | None:
+        """The answer in a place, whole and by blocks; None where an observation cannot be projected from there.
+
+        For every cost function to say: pyceres' own class has a metaclass that none with abstract methods can join.
+        """
+        raise NotImplementedError
+
+    def _accept(self) -> None:
+        """Jacobians are asked for where a step was accepted, and nowhere else."""
+
+
+_STRUCTURE = 3  # slot
+ROWS_WORTH_A_THREAD = 20_000
+NORMAL_NS = 60.0
+"""That an observation's share of the normal equations takes."""
+# Of a sight's cost, by the step its pose would take: the complement takes that along exactly, to second order. From
+# half to double the answer moves by under 1 % of its error.
+_LEFT_TO_THE_COMPLEMENT = 1e-2
+
+
+class SightCost(CachedCost):
+    """The compressed block of one sight (design, section 6).
+
+    Attributes:
+        slots: which of its camera (0), station (1), placement (2) and structure (3) the solver hands over; the others
+            are held.
+    """
+
+    def __init__(self, run: Run, sight: Sights, problem: Problem, estimate: Estimate) -> None:
+        super().__init__(run)
+        self._sight, self._structure = sight, estimate.structure
+        key, layout, weighting = sight.key, problem.layout, problem.weighting
+        free, count, offsets = layout.free[key.camera], len(self._structure.values), len(self._structure.offsets)
+        feet = starting_feet(sight, estimate, problem.feet)
+        self._optics, self._unknowns = camera_optics(estimate.cameras[key.camera]), kernels.Unknowns(free, offsets)
+        self._points = point_columns(sight, estimate.structure, weighting.point_scale)
+        self._curves = curve_columns(sight, estimate.structure, feet, weighting.curve_scale)
+        self._loss = kernel_loss(weighting)
+        self._poses = [estimate.stations[key.station].cam_from_world.log(), np.zeros(6)]
+        if key.placement is not None:
+            self._poses[1] = estimate.placements[key.placement].log()
+        sizes = (len(free), 6, 6, count)
+        is_free = (len(free) > 0, key.station in layout.stations, key.placement in layout.placements, count > 0)
+        self.slots = [slot for slot in range(4) if is_free[slot]]
+        self.set_num_residuals(len(free) + offsets + 7)
+        self.set_parameter_block_sizes([sizes[slot] for slot in self.slots])
+
+    def block(self, parameters: Sequence[Array]) -> Array | None:
+        """(N, K + 1) the Jacobians side by side and the residuals, None where an observation cannot be projected."""
+        known = self._evaluated(kernels.NOTHING, parameters)
+        if known is None:
+            return None
+        return np.column_stack([*(each.reshape(self.num_residuals(), -1) for each in known.jacobians), known.residuals])
+
+    def _evaluated(self, at: Array, parameters: Sequence[Array]) -> Evaluation | None:
+        numbers, jacobians = [kernels.NOTHING, *self._poses, kernels.NOTHING], [kernels.NOTHING] * 4
+        rows, mixing = self.num_residuals(), self._structure.mixing
+        for place, slot in enumerate(self.slots):
+            size = self._unknowns.structure if slot == _STRUCTURE else len(parameters[place])
+            numbers[slot], jacobians[slot] = parameters[place], np.empty(rows * size)
+        residuals = np.empty(rows)
+        points, curves = as_built(self._points, self._curves, self._sight, self._structure.with_values(numbers[3]))
+        answered = kernels.evaluate_block(
+            self._optics, self._unknowns, points, curves, self._loss, kernels.Blocks(*numbers), residuals,
+            kernels.Blocks(*jacobians),
+        )  # fmt: skip
+        if mixing is not None:
+            jacobians[_STRUCTURE] = (jacobians[_STRUCTURE].reshape(rows, -1) @ mixing).reshape(-1)
+        return Evaluation(at, residuals, [jacobians[slot] for slot in self.slots]) if answered else None
+
+
+def kernel_loss(weighting: Weighting) -> kernels.Loss:
+    """The loss as the kernels take it."""
+    return kernels.Loss(kernels.LOSS_CODES[weighting.loss], weighting.loss_scale)
+
+
+def robust_weights(weighting: Weighting, squared: Array) -> Array:
+    """(N,) the weight rho' that each squared residual has in the solve."""
+    weights = np.empty(len(squared))
+    kernels.loss_weights(kernel_loss(weighting), squared, weights)
+    return weights
+
+
+def as_built(
+    points: kernels.PointColumns, curves: kernels.CurveColumns, sights: Sights, structure: Structure
+) -> tuple[kernels.PointColumns, kernels.CurveColumns]:
+    """The columns with points and tracks where the structure has them."""
+    if not len(structure.values):
+        return points, curves
+    return points._replace(places=structure.points(sights)), curves._replace(tracks=structure.tracks(sights))
+
+
+@dataclass(frozen=True, eq=False)
+class _Evaluation:
+    """An EliminatedCost in one place: its numbers `at`, what Ceres is told, poses and gains (see `kernels.Sweep`)."""
+
+    at: Array
+    residuals: Array
+    jacobian: Array
+    poses: Array
+    gains: Array
+
+
+class EliminatedCost(CachedCost):
+    """All sights of one camera whose placements no other station sees, over its free intrinsics and the structure."""
+
+    def __init__(self, run: Run, sights: Sights, problem: Problem, estimate: Estimate) -> None:
+        super().__init__(run)
+        self.camera, weighting = sights.keys[0].camera, problem.weighting
+        self._sights, self._structure = sights, estimate.structure
+        free, count = problem.layout.free[self.camera], len(self._structure.values)
+        feet = starting_feet(sights, estimate, problem.feet)
+        self._optics = camera_optics(estimate.cameras[self.camera])
+        self._unknowns = kernels.Unknowns(free, len(self._structure.offsets))
+        self._points = point_columns(sights, estimate.structure, weighting.point_scale)
+        self._curves = curve_columns(sights, estimate.structure, feet, weighting.curve_scale)
+        self._loss = kernel_loss(weighting)
+        sizes = (len(free), count)
+        self._size = sum(sizes)
+        start = np.concatenate([self._optics.intrinsics[free], estimate.structure.values])
+        # The kernels speak of offsets alone; (size + 1, size + 1) but for that.
+        self._chain, lead = self._structure.chain(len(free), 1), len(free) + self._unknowns.structure
+        poses, gains = estimate.pose_stack(sights.keys), np.zeros((len(sights), 6, lead))
+        # Every step starts from the poses of the last accepted one: a rejected step may have led them astray.
+        self._accepted = _Evaluation(start, kernels.NOTHING, kernels.NOTHING, poses, gains)
+        self._last = self._accepted
+        self._parts = parts_of(len(sights), len(sights.points) + len(sights.curve_pixels), NORMAL_NS)
+        self.slots = [slot for slot, size in zip((0, 3), sizes, strict=True) if size]
+        self.set_num_residuals(self._size + 1)
+        self.set_parameter_block_sizes([size for size in sizes if size])
+
+    def _evaluated(self, at: Array, parameters: Sequence[Array]) -> Evaluation | None:
+        last = self._eliminated(at, _LEFT_TO_THE_COMPLEMENT)
+        if last is None:
+            return None
+        self._last = last
+        sizes = np.cumsum(self.parameter_block_sizes()[:-1])
+        return Evaluation(at, last.residuals, [part.reshape(-1) for part in np.split(last.jacobian, sizes, axis=1)])
+
+    def _accept(self) -> None:
+        self._accepted = self._last
+
+    def _eliminated(self, at: Array, tolerance: float) -> _Evaluation | None:
+        """The cost in a place, or None where an observation cannot be projected from there."""
+        upper = np.empty((self._size + 1, self._size + 1))
+        for newton in (True, False):
+            swept = self._swept(at, tolerance, newton)
+            cost = float(np.sum(swept.costs))
+            if not np.isfinite(cost):
+                return None
+            kernels.cholesky(swept.reduced, upper)
+            residuals = upper[:, -1].copy()
+            missing = cost - float(residuals[:-1] @ residuals[:-1])
+            if missing > -kernels.ROUNDING * cost:  # else Newton's step promises more than there is
+                break
+        residuals[-1] = np.sqrt(max(missing, 0.0))
+        upper[-1] = 0.0
+        return _Evaluation(at, residuals, upper[:, :-1], swept.poses, swept.gains)
+
+    def _swept(self, at: Array, tolerance: float, newton: bool = True) -> kernels.Sweep:
+        """Every placement brought to its best in a place, from the last accepted one."""
+        free = self._unknowns.free
+        intrinsics = self._optics.intrinsics.copy()
+        intrinsics[free] = at[: len(free)]
+        optics = self._optics._replace(intrinsics=intrinsics)
+        built = self._structure.with_values(at[len(free) :])
+        points, curves = as_built(self._points, self._curves, self._sights, built)
+        change, size, chain = at - self._accepted.at, self._accepted.gains.shape[2] + 1, self._chain
+        change = change if chain is None else chain[:-1, :-1] @ change
+        poses, gains, costs = self._accepted.poses.copy(), self._accepted.gains.copy(), np.empty(len(self._sights))
+
+        def part(first: int, last: int) -> Array:
+            sweep = kernels.Sweep(poses, gains, costs, np.zeros((size, size)))
+            kernels.eliminate_placements(
+                first, last, optics, self._unknowns, points, curves, self._loss, newton, tolerance, change, sweep
+            )
+            return sweep.reduced
+
+        reduced = np.sum(run_parts(part, self._parts), axis=0)
+        return kernels.Sweep(poses, gains, costs, reduced if chain is None else chain.T @ reduced @ chain)
+
+    def from_poses(self, poses: Array, tolerance: float) -> tuple[Array, Array]:
+        """Costs (S,) and poses (S, 3, 4) that the search for each placement ends with when it starts from `poses`,
+        everything else held; an infinite cost where a start cannot be seen.
+        """
+        self._accepted = replace(self._accepted, poses=poses, gains=np.zeros_like(self._accepted.gains))
+        swept = self._swept(self._accepted.at, tolerance)
+        return swept.costs, swept.poses
+
+    def converged(self, parameters: Sequence[Array]) -> tuple[tuple[SightKey, ...], Array]:
+        """The sights' keys and their cam_from_target, (S, 3, 4), at their best for these numbers."""
+        at = np.concatenate([kernels.NOTHING, *parameters])
+        # At rest they have come to rest as well; elsewhere, or where Ceres had nothing to move, they are sought.
+        if not len(self._accepted.residuals) or not np.array_equal(self._accepted.at, at):
+            self._accepted = self._eliminated(at, 1e-14) or self._accepted
+        return self._sights.keys, self._accepted.poses

@@ -1,0 +1,267 @@
+"""A camera's numbers as Ceres moves them, where phi and height trade off along a straight line.
+
+A picture taken straight down tells phi over height alone: with another phi everything looks the same from another
+height, through a lens whose coefficients of tan^n have grown with phi^(n - 1). Along this curve Gauss-Newton creeps. In
+coefficients over phi^(n - 1), which act on pixels as the paper's do, it is a line.
+"""
+
+from __future__ import annotations
+
+import errno
+import time
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import reduce
+from operator import add
+from typing import Any, Protocol, TypeVar
+
+import numpy as np
+import pyceres
+
+from ceres_cal.base.arrays import Array, Indices
+from ceres_cal.base.errors import CalibrationError, InputError, SolutionError
+from ceres_cal.base.native import keep_freed_memory
+from ceres_cal.base.threads import at_most, available, single_threaded_blas
+from ceres_cal.problem.costs import Run
+from ceres_cal.problem.parameters import unit_px
+from ceres_cal.problem.shares import Share
+from ceres_cal.scene.camera import Camera
+
+_PHI = 0  # of the intrinsics
+
+
+class Chart:
+    """What of a camera's free numbers Ceres moves in their stead; Ceres' own word is a manifold, which pyceres cannot
+    have made in Python.
+    """
+
+    def __init__(self, camera: Camera, free: Indices) -> None:
+        powers = np.array([0.0] * 4 + [order - 1.0 for order in camera.lens.orders] + [0.0])
+        self._powers, self._phi, self._unit = powers[free], free.tolist().index(_PHI), unit_px(camera)
+
+    def moved(self, numbers: Array) -> Array:
+        """(K,) what Ceres moves, of the free numbers (K,)."""
+        return np.asarray(numbers / self._scales(numbers))
+
+    def numbers(self, moved: Array) -> Array:
+        """(K,) the free numbers again."""
+        return np.asarray(moved * self._scales(moved))
+
+    def chained(self, jacobian: Array, numbers: Array) -> Array:
+        """(N, K) derivatives by what Ceres moves, from those by the free numbers (K,)."""
+        chained = jacobian * self._scales(numbers)
+        chained[:, self._phi] += jacobian @ (self._powers * numbers) / numbers[self._phi]
+        return np.asarray(chained)
+
+    @np.errstate(all="ignore")  # phi may be 0 on the way: no camera, which shows nothing
+    def _scales(self, numbers: Array) -> Array:
+        return np.asarray((numbers[self._phi] / self._unit) ** self._powers)
+
+
+def chart_of(camera: Camera, free: Indices) -> Chart | None:
+    """None where the numbers are moved as they are."""
+    return Chart(camera, free) if camera.lens.acts_on_tangents and _PHI in free else None
+
+
+class ChartedCost(pyceres.CostFunction):
+    """A cost function over what Ceres moves, of one over the numbers themselves."""
+
+    def __init__(self, run: Run, cost: Any, charts: Sequence[Chart | None]) -> None:
+        super().__init__()
+        self._run, self._cost, self._charts = run, cost, charts
+        self.set_num_residuals(cost.num_residuals())
+        self.set_parameter_block_sizes(cost.parameter_block_sizes())
+
+    def Evaluate(self, parameters: Sequence[Array], residuals: Array, jacobians: Sequence[Array] | None) -> bool:
+        try:
+            numbers = [
+                chart.numbers(block) if chart else block for chart, block in zip(self._charts, parameters, strict=True)
+            ]
+            if not self._cost.Evaluate(numbers, residuals, jacobians):
+                return False
+            for chart, jacobian, block in zip(self._charts, jacobians or (), numbers, strict=False):
+                if chart:
+                    jacobian[:] = chart.chained(jacobian.reshape(len(residuals), -1), block).reshape(-1)
+        except BaseException as error:  # quiet: raised again when Ceres has returned
+            self._run.failure = self._run.failure or error
+            return False
+        return True
+
+
+_A = TypeVar("_A")
+_RETRIES = 3  # of what a worker that was lost had to do
+_GROUPS = 16  # workers up to which sums are the same to the last bit; what is sent for each answer grows with it
+_PAUSE_S = 0.05  # before what a lost worker had is asked again, four times as long each time
+_NO_ROOM = "a worker's disk is full: make room, or start it with another --local-directory"
+_NO_MEMORY = "a worker ran out of memory: give it more, or start more workers"
+
+
+class Engine(Protocol):
+    """Where shares are asked."""
+
+    def ask(self, answer: Callable[..., _A], *request: Any) -> _A:
+        """The sum of answer(share, *request) over all shares."""
+
+    def close(self) -> None:
+        """Let the shares go."""
+
+
+class InProcess:
+    """Shares that this process asks, a thread for each group."""
+
+    def __init__(self, shares: Sequence[Share]) -> None:
+        self._groups = _groups_of(shares)
+
+    def ask(self, answer: Callable[..., _A], *request: Any) -> _A:
+        """The sum of answer(share, *request) over all shares."""
+        return reduce(add, asked_of(self._groups, answer, request, available()))
+
+    def close(self) -> None:
+        """Let the shares go."""
+        self._groups = []
+
+
+def _groups_of(shares: Sequence[Share], workers: int = 1) -> list[Sequence[Share]]:
+    """Consecutive shares that are added up by themselves, where they are: the same ones for any number of workers up
+    to so many, and so are all sums, to the last bit.
+    """
+    count = min(len(shares), max(_GROUPS, workers))
+    return [shares[len(shares) * n // count : len(shares) * (n + 1) // count] for n in range(count)]
+
+
+def asked_of(
+    groups: Sequence[Sequence[Share]], answer: Callable[..., _A], request: Sequence[Any], threads: int
+) -> list[_A]:
+    """The sum of answer(share, *request) over the shares of each group, by so many threads."""
+
+    def one(group: Sequence[Share]) -> _A:
+        with at_most(1):
+            return reduce(add, (answer(share, *request) for share in group))
+
+    if threads == 1:
+        return list(map(one, groups))
+    with ThreadPoolExecutor(threads) as pool:
+        try:
+            return list(pool.map(one, groups))
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
+
+
+class OnWorkers:
+    """Shares that the workers of a `distributed.Client` keep, one after the other each; one that is lost is made again.
+
+    They are kept by tasks, which Dask does again elsewhere, and asked past its scheduler, which takes ten milliseconds.
+
+    Raises:
+        SolutionError: a worker ran out of memory or disk, or was lost again and again; it is named.
+    """
+
+    def __init__(self, client: Any, shares: Sequence[Share]) -> None:
+        self._client = client
+        # Not scheduler_info(): between its question and its answer the client's own poll may empty what it returns.
+        workers = sorted(client.nthreads())
+        if not workers:
+            raise SolutionError("the scheduler has no workers: start some with `dask worker ADDRESS`")
+        groups = _groups_of(shares, len(workers))
+        count = min(len(workers), len(groups))
+        self._kept = [
+            client.submit(_kept, group, workers=[workers[n * count // len(groups)]], allow_other_workers=True,
+                          pure=False, retries=_RETRIES)
+            for n, group in enumerate(groups)
+        ]  # fmt: skip
+        self._places = self._found()
+        # From now on anywhere: a task that is to be done by a worker that is gone waits for ever.
+        client.sync(client.scheduler.set_restrictions, worker={one.key: None for one in self._kept})
+
+    def _found(self) -> dict[str, list[int]]:
+        """Numbers of the groups that each worker keeps, once all are kept."""
+        for one in self._kept:
+            if (error := one.exception()) is not None:
+                raise _in_words(error)
+        places: dict[str, list[int]] = {}
+        held = self._client.who_has(self._kept)
+        for number, one in enumerate(self._kept):
+            for worker in held.get(one.key, ())[:1]:
+                places.setdefault(worker, []).append(number)
+        return places
+
+    def ask(self, answer: Callable[..., _A], *request: Any) -> _A:
+        """The sum of answer(share, *request) over all shares."""
+        answers: dict[int, _A] = {}
+        last = ""
+        for again in range(_RETRIES + 1):
+            if again:
+                time.sleep(_PAUSE_S * 4**again)
+                self._places = self._found()
+            asked = {
+                worker: {n: self._kept[n].key for n in numbers if n not in answers}
+                for worker, numbers in self._places.items()
+            }
+            workers = [worker for worker, keys in asked.items() if keys]
+            replies = self._client.run(_answered, asked, answer, request, workers=workers, on_error="return")
+            for worker, reply in replies.items():
+                if isinstance(reply, dict):
+                    answers |= reply
+                elif not isinstance(reply, (OSError, KeyError)):  # else the worker or what it kept is lost
+                    raise _in_words(reply)
+                else:
+                    last = worker
+            if len(answers) == len(self._kept):
+                return reduce(add, (answers[number] for number in range(len(self._kept))))
+        raise _lost(last)
+
+    def close(self) -> None:
+        """Let the shares go."""
+        for one in self._kept:
+            one.release()
+
+
+def _kept(group: Sequence[Share]) -> Sequence[Share]:
+    """What a worker keeps."""
+    keep_freed_memory()
+    return group
+
+
+async def _answered(
+    asked: Mapping[str, Mapping[int, str]], answer: Callable[..., _A], request: Sequence[Any], dask_worker: Any
+) -> dict[int, _A] | CalibrationError:
+    """What the groups answer that are asked of this worker, by number; what stops it, and where."""
+    keys = asked[dask_worker.address]
+    groups = [dask_worker.data[key] for key in keys.values()]
+
+    def all_of_them() -> list[_A]:
+        with single_threaded_blas():
+            return asked_of(groups, answer, request, 1)
+
+    here = dask_worker.address
+    try:
+        answers = await dask_worker.loop.run_in_executor(dask_worker.executor, all_of_them)
+    except (MemoryError, InputError, OSError) as error:  # quiet: who asked raises it
+        return _named(error, here, dask_worker.local_directory)
+    return dict(zip(keys, answers, strict=True))
+
+
+def _named(error: Exception, worker: str, folder: str) -> CalibrationError:
+    """What a worker ran into, with its name."""
+    if isinstance(error, InputError):  # of a file
+        return InputError(f"{error} (worker {worker})")
+    if isinstance(error, OSError):
+        full = error.errno in (errno.ENOSPC, errno.EDQUOT)
+        what = _NO_ROOM if full else error.strerror
+        return SolutionError(f"{error.filename or folder}: {what} (worker {worker})")
+    return SolutionError(f"{_NO_MEMORY} ({worker})")
+
+
+def _in_words(error: BaseException) -> BaseException:
+    """What a worker raised, in one line where that is known."""
+    if isinstance(error, MemoryError):
+        return SolutionError(_NO_MEMORY)
+    if type(error).__name__ in ("KilledWorker", "FutureCancelledError", "CancelledError"):
+        last = getattr(getattr(error, "last_worker", None), "address", "")
+        return _lost(last)
+    return error
+
+
+def _lost(last: str) -> SolutionError:
+    return SolutionError("workers were lost again and again: have they enough memory?" + f" ({last})" * bool(last))

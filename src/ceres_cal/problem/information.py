@@ -1,0 +1,210 @@
+"""Names of the numbers that a calibration is about, each with an owner and a unit.
+
+Intrinsics are in the units of the files. A pose has a position in the world (m) and three turns (rad): of a station
+about the camera's own axes (x right, y down, z forward), of a placement about the target's own. Turns are small angles
+from where the pose is, so no pose is special, not even one turned by half a turn.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from ceres_cal.base.arrays import Array, Indices
+from ceres_cal.base.cached import cached_property
+from ceres_cal.base.spread import Spread, known_inverses, without
+
+_TURNS = ("turn_x", "turn_y", "turn_z")
+STATION_QUANTITIES = ("x", "y", "height", *_TURNS)
+PLACEMENT_QUANTITIES = ("x", "y", "z", *_TURNS)
+_POSE_UNITS = ("m", "m", "m", "rad", "rad", "rad")
+_LIMITS = {"rad": 1e2, "m": 1e6, "px": 1e7}
+
+
+class Key(NamedTuple):
+    """One number: whose it is (a "camera", "station", "placement", "structure" or "dimension" by name), what, and in
+    which unit.
+
+    A camera, a station and a placement may carry the same name. Of a structure number the owner is the target, the
+    quantity the feature ("HalfwayLine", "CenterCircle.radius", "0,0.x", "bow.x"), or a dimension of the target.
+    """
+
+    kind: str
+    owner: str
+    quantity: str
+    unit: str
+
+    @classmethod
+    def of_structure(cls, name: str, kind: str = "structure") -> Key:
+        """Of a structure number by its full name, "target/feature"."""
+        target, _, feature = name.partition("/")
+        return cls(kind, target, feature, "m")
+
+    @property
+    def whose(self) -> str:
+        """Its owner in words: station 'overhead', target 'field'."""
+        return f"{'target' if self.is_structure else self.kind} {self.owner!r}"
+
+    @property
+    def is_structure(self) -> bool:
+        """Whether it is one of the numbers of the targets as built."""
+        return self.kind in ("structure", "dimension")
+
+    @property
+    def structure_name(self) -> str:
+        """The full name of a structure number."""
+        return f"{self.owner}/{self.quantity}"
+
+
+def sigma_limits(keys: Sequence[Key]) -> Array:
+    """(P,) sigmas beyond which a number means nothing: turns of many turns, a camera in orbit."""
+    return np.array([_LIMITS.get(key.unit, 1e12) for key in keys])
+
+
+def pose_keys(kind: str, name: str) -> list[Key]:
+    """The six keys of a station or a placement."""
+    quantities = STATION_QUANTITIES if kind == "station" else PLACEMENT_QUANTITIES
+    return [Key(kind, name, q, unit) for q, unit in zip(quantities, _POSE_UNITS, strict=True)]
+
+
+def over(values: Array, keys: Sequence[Key], wanted: Sequence[Key]) -> Array:
+    """(..., W) values (..., K) of the keys (K), in the order of the wanted keys (W): 0 of what is not among the keys.
+
+    What is known of one camera says nothing of another: whoever takes a part of the keys takes it by this.
+    """
+    column = {key: number for number, key in enumerate(keys)}
+    whole = np.zeros((*np.shape(values)[:-1], len(wanted)))
+    at = [number for number, key in enumerate(wanted) if key in column]
+    whole[..., at] = np.asarray(values)[..., [column[wanted[number]] for number in at]]
+    return whole
+
+
+def columns_by_owner(keys: Sequence[Key]) -> dict[tuple[str, str], list[int]]:
+    """(kind, owner) -> where its keys are."""
+    columns: dict[tuple[str, str], list[int]] = {}
+    for column, key in enumerate(keys):
+        columns.setdefault((key.kind, key.owner), []).append(column)
+    return columns
+
+
+_VISIBLE = 1e-12  # share of what is known of a number that can be told from rounding
+_DETERMINED = 1e-11  # eigenvalue, at unit diagonal, from which on a direction counts as determined
+
+
+@dataclass(frozen=True, eq=False)
+class Information:
+    """An information matrix, symmetric, not necessarily of full rank.
+
+    Attributes:
+        keys: (K) the numbers. matrix: (K, K), in the inverse units of the keys.
+    """
+
+    keys: tuple[Key, ...]
+    matrix: Array
+
+    @classmethod
+    def nothing(cls, keys: Sequence[Key] = ()) -> Information:
+        """Nothing at all is known of these numbers."""
+        return cls(tuple(keys), np.zeros((len(keys), len(keys))))
+
+    @classmethod
+    def of_sigmas(cls, sigmas: Mapping[Key, float]) -> Information:
+        """Each number known by itself, to a standard deviation."""
+        return cls(tuple(sigmas), np.diag(np.array(list(sigmas.values()), dtype=float) ** -2.0))
+
+    @cached_property
+    def _column(self) -> dict[Key, int]:
+        return {key: column for column, key in enumerate(self.keys)}
+
+    def columns(self, keys: Sequence[Key]) -> Indices:
+        """Where some of the keys are."""
+        return np.array([self._column[key] for key in keys], dtype=np.int64)
+
+    def among(self, keys: Collection[Key]) -> tuple[Key, ...]:
+        """Those of its keys that are among others."""
+        wanted = set(keys)
+        return tuple(key for key in self.keys if key in wanted)
+
+    def given(self, keys: Sequence[Key]) -> Information:
+        """About some of the numbers, with all others held where they are."""
+        at = self.columns(keys)
+        return Information(tuple(keys), self.matrix[np.ix_(at, at)])
+
+    def marginal(self, keys: Sequence[Key]) -> Information:
+        """About some of the numbers, all others integrated out: the Schur complement."""
+        rest = [key for key in self.keys if key not in set(keys)]
+        if not rest:
+            return self.given(keys)
+        at, others = self.columns(keys), self.columns(rest)
+        here, coupling = self.matrix[np.ix_(at, at)], self.matrix[np.ix_(others, at)]
+        return Information(
+            tuple(keys), without(here, coupling, self.matrix[np.ix_(others, others)], sigma_limits(rest))
+        )
+
+    def without(self, keys: Collection[Key]) -> Information:
+        """About all but some numbers, of which nothing is known any more."""
+        gone = set(keys)
+        return self.marginal([key for key in self.keys if key not in gone])
+
+    def over(self, keys: Sequence[Key]) -> Information:
+        """The same over other keys, which have all of its own among them."""
+        whole = Information.nothing(keys)
+        at = whole.columns(self.keys)
+        whole.matrix[np.ix_(at, at)] = self.matrix
+        return whole
+
+    def widened(self, shifts: Array) -> Information:
+        """With a covariance that is larger by d d^T for each of the shifts d (S, K) (Woodbury).
+
+        By a root A of the matrix, so that rounding makes no variance negative: A^T (1 + A D D^T A^T)^-1 A.
+        """
+        if not len(shifts):
+            return self
+        unit = np.sqrt(np.maximum(np.diagonal(self.matrix), np.finfo(float).tiny))
+        values, vectors = np.linalg.eigh(self.matrix / unit[:, None] / unit)
+        root = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T * unit
+        along, sizes, _ = np.linalg.svd(root @ shifts.T, full_matrices=False)
+        left = root - (along * (1.0 - 1.0 / np.hypot(1.0, sizes))) @ (along.T @ root)
+        return Information(self.keys, left.T @ left)
+
+    def less(self, other: Information) -> Information:
+        """What is left without a part of it; nothing of numbers of which that part says all but rounding."""
+        left = self.matrix - other.over(self.keys).matrix
+        visible = np.diagonal(left) > _VISIBLE * np.diagonal(self.matrix)
+        return Information(self.keys, np.where(visible[:, None] & visible, left, 0.0))
+
+    def __add__(self, other: Information) -> Information:
+        """Both together, over the keys of either."""
+        if self.keys == other.keys:
+            return Information(self.keys, self.matrix + other.matrix)
+        keys = tuple(dict.fromkeys((*self.keys, *other.keys)))
+        return Information(keys, self.over(keys).matrix + other.over(keys).matrix)
+
+    @cached_property
+    def spread(self) -> Spread:
+        """Covariance and unknown directions."""
+        return Spread.of(self.matrix, sigma_limits(self.keys))
+
+    @cached_property
+    def inverse(self) -> Array:
+        """(K, K) inverse over what is known; unknown directions are left out."""
+        return known_inverses(self.matrix, sigma_limits(self.keys))
+
+    @property
+    def known_rank(self) -> int:
+        """Number of directions that are known."""
+        return len(self.keys) - int(self.spread.unknown.shape[1])
+
+    @cached_property
+    def root(self) -> Array:
+        """(R, K) with root^T root = matrix: a row for each direction that is determined, in standard deviations."""
+        diagonal = np.diagonal(self.matrix)
+        if np.count_nonzero(self.matrix) == np.count_nonzero(diagonal):
+            return np.asarray(np.diag(np.sqrt(diagonal))[diagonal > 0.0])
+        scale = np.where(diagonal > 0.0, 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0)), 1.0)
+        values, vectors = np.linalg.eigh(self.matrix * scale[:, None] * scale)
+        kept = values > _DETERMINED
+        return np.asarray((vectors[:, kept] * np.sqrt(values[kept])).T / scale)

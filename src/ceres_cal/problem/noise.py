@@ -1,0 +1,326 @@
+"""Reading the residuals: how large the noise is, and which observations do not belong.
+
+Residuals are taken in units of their stated sigma; the noise scale is the factor by which the stated sigmas of a kind
+(points, curves) must be multiplied to describe what is seen.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from ceres_cal.base.arrays import Array, Indices, Mask
+from ceres_cal.observations import Observations
+from ceres_cal.observations.files import Content
+from ceres_cal.observations.sights import Sights
+from ceres_cal.problem.parameters import Options
+from ceres_cal.problem.problem import Weighting
+from ceres_cal.problem.residuals import Residuals
+
+_BEYOND = 100.0  # an exponent: no observation is so rare
+# Spare equations below which a spread says nothing: its own error is 25 % at 8. At 4 the errors of fits to ten points
+# are 1.46 of their stated sigmas, at 16 they are 0.8 (1.16 at 8), because the stated sigmas are then taken.
+_LEAST_SPARE = 8.0
+# Spare equations that the other kind's noise counts as: a handful of points beside many curve observations, which the
+# fit nearly goes through, must not seem exact (without it their scale fell to 0.04 of the truth and less).
+_BORROWED = 4.0
+# Spare equations that a scale seen before stands for: few exact ones must not make it 0. Nothing changes from half to
+# double.
+USUAL_EQUATIONS = 10.0
+# Share by which rows kept may outnumber those that their scale was taken from, and still be the tail of the same noise:
+# of Student's t with two degrees of freedom it is 1 %, of outliers more.
+_TAIL = 0.02
+_MOST_WIDER = 5
+# Of the root of how many there are: so many outliers more or fewer, at the bound, move what is shared by no 0.05 sd.
+# None of fewer than 60 000.
+SAME = 4e-3
+_ENOUGH = 5_000
+_LEAST_SCALE_PX = 1e-4  # no image is measured better than that
+_BLOCK = 1 << 16  # lengths at once: what is made of them stays where the processor is quick
+_RAYLEIGH_MEDIAN = 1.177410022515474  # of the length of a two-dimensional standard normal
+_NORMAL_MEDIAN = 0.674489750196082  # of the absolute value of a standard normal
+
+
+@dataclass(frozen=True)
+class Redundancy:
+    """The share of the equations of points and of curves that is left over for the noise: 1 less the mean leverage."""
+
+    points: float
+    curves: float
+
+    @classmethod
+    def by_count(cls, equations: int, unknowns: int) -> Redundancy:
+        """As if every equation determined as much as any other."""
+        share = 1.0 - unknowns / max(equations, 1)
+        return cls(share, share)
+
+    @classmethod
+    def by_leverage(cls, sights: Sights, leverages: tuple[float, float]) -> Redundancy:
+        """As the observations in the sights determine the free numbers.
+
+        Args:
+            leverages: equations of points and of curves that the free numbers take up.
+        """
+        counts = 2 * len(sights.point_rows), len(sights.curve_rows)
+        points, curves = (1.0 - taken / max(count, 1) for taken, count in zip(leverages, counts, strict=True))
+        return cls(points, curves)
+
+
+@dataclass(frozen=True, eq=False)
+class Inliers:
+    """Which observations take part, and the noise scales they were judged by.
+
+    Attributes:
+        points: (N,), curves: (M,) bool. point_scale, curve_scale: factors on the stated sigmas.
+        point_sigmas, curve_sigmas: how many standard deviations each residual is long; infinite where the estimate
+            cannot show the observation.
+        degrees_of_freedom: spare equations that the scales rest on; infinite where they are the stated ones.
+    """
+
+    points: Mask
+    curves: Mask
+    point_scale: float
+    curve_scale: float
+    point_sigmas: Array
+    curve_sigmas: Array
+    degrees_of_freedom: float = np.inf
+
+    def same_as(self, other: Inliers, relative: float = 1e-2) -> bool:
+        """Whether nothing worth another solve changed: scales by no more than `relative`, and rows by none, or by a few
+        of very many where that is no strict comparison.
+        """
+        changed = np.count_nonzero(self.points != other.points) + np.count_nonzero(self.curves != other.curves)
+        few = SAME * (len(self.points) + len(self.curves)) ** 0.5 if relative >= SAME else 0.0
+        return bool(
+            changed <= few
+            and abs(self.point_scale - other.point_scale) <= relative * other.point_scale
+            and abs(self.curve_scale - other.curve_scale) <= relative * other.curve_scale
+        )
+
+    def same_rows(self, other: Inliers) -> bool:
+        """Whether the same observations take part."""
+        return np.array_equal(self.points, other.points) and np.array_equal(self.curves, other.curves)
+
+    def with_rows_of(self, other: Inliers) -> Inliers:
+        """The same with the rows that others have."""
+        return replace(self, points=other.points, curves=other.curves)
+
+    @classmethod
+    def at(
+        cls,
+        points: Array,
+        curves: Array,
+        redundancy: Redundancy,
+        options: Options,
+        usual: tuple[float, float] | None = None,
+    ) -> Inliers:
+        """See `judge`; of lengths of points (N,) and of curves (M,) in their stated sigmas."""
+        noise = noise_of(EachLength(points), EachLength(curves), redundancy, options, usual)
+        return cls.by_noise(points, curves, noise)
+
+    @classmethod
+    def by_noise(cls, points: Array, curves: Array, noise: NoiseScales) -> Inliers:
+        """Of these lengths at a noise."""
+        p, c = noise.bounds
+        scales, relative = (noise.points, noise.curves), (points / noise.points, curves / noise.curves)
+        return cls(points <= p, curves <= c, *scales, *relative, noise.degrees_of_freedom)
+
+    def of_rows(self, points: Indices, curves: Indices) -> Inliers:
+        """Those of some of the observations, as if there were no others."""
+        sigmas = self.point_sigmas[points], self.curve_sigmas[curves]
+        both = Inliers(self.points[points], self.curves[curves], self.point_scale, self.curve_scale, *sigmas)
+        return replace(both, degrees_of_freedom=self.degrees_of_freedom)
+
+    def weighting(self, options: Options) -> Weighting:
+        """Of the observations at these noise scales."""
+        return Weighting(self.point_scale, self.curve_scale, options.loss, options.loss_scale)
+
+    @property
+    def scales(self) -> tuple[float, float]:
+        """Of points and of curves."""
+        return self.point_scale, self.curve_scale
+
+
+def relative_lengths(observations: Content, residuals: Residuals) -> tuple[Array, Array]:
+    """Lengths of the residuals of points and of curves in their stated sigmas; infinite where there is none."""
+    points, curves = residuals.lengths
+    points, curves = points / observations.points.sigma_px, curves / observations.curves.sigma_px
+    return np.fmin(points, np.inf, out=points), np.fmin(curves, np.inf, out=curves)  # NaN is infinite
+
+
+def visible_from(observations: Observations, residuals: Residuals) -> Inliers:
+    """Everything that a start can show, at the scale of its median residual: what the first solve works with."""
+    points, curves = relative_lengths(observations, residuals)
+    p, c = median_scales(points, curves)
+    return Inliers(np.isfinite(points), np.isfinite(curves), p, c, points / p, curves / c)
+
+
+def median_scales(points: Array, curves: Array) -> tuple[float, float]:
+    """Noise scales by the medians of lengths of points and of curves in their stated sigmas."""
+    both = (EachLength(points), _RAYLEIGH_MEDIAN), (EachLength(curves), _NORMAL_MEDIAN)
+    p, c = (_median_scale(lengths, median_of_one) for lengths, median_of_one in both)
+    return p, c
+
+
+def _median_scale(lengths: Lengths, median_of_one: float) -> float:
+    return max(lengths.middle() / median_of_one, _LEAST_SCALE_PX) if lengths.count else 1.0
+
+
+def _middle(lengths: Array) -> float:
+    """The median, of some of very many."""
+    some = lengths[:: max(1, len(lengths) // _ENOUGH)]  # its median is that of all within two hundredths
+    middle = len(some) // 2
+    return float(np.partition(some, middle)[middle]) if len(some) else 0.0
+
+
+def judge(
+    observations: Observations,
+    residuals: Residuals,
+    redundancy: Redundancy,
+    options: Options,
+    usual: tuple[float, float] | None = None,
+) -> Inliers:
+    """Noise scales and inliers at one estimate.
+
+    The median gives a first scale that half the data may not spoil, the spread of the inliers the final one: where the
+    noise has tails, these are more than lie within the bound by the first scale.
+
+    Args:
+        options: how far off an outlier is, and whether the stated sigmas hold (scale 1).
+        usual: scales of points and curves seen before; they count as much as a few spare equations do.
+    """
+    return Inliers.at(*relative_lengths(observations, residuals), redundancy, options, usual)
+
+
+class NoiseScales(NamedTuple):
+    """Noise scales of points and of curves, the length in them from which on an observation is an outlier, and the
+    spare equations that they rest on; infinite where they are the stated ones.
+    """
+
+    points: float
+    curves: float
+    reject_sigma: float
+    degrees_of_freedom: float
+
+    @property
+    def bounds(self) -> tuple[float, float]:
+        """Lengths in stated sigmas from which on points and curve observations are outliers."""
+        return self.points * self.reject_sigma, self.curves * self.reject_sigma
+
+
+class Lengths(Protocol):
+    """Lengths of residuals in their stated sigmas, or what was added up of them: of all that can be shown."""
+
+    @property
+    def count(self) -> int:
+        """How many there are."""
+
+    def middle(self) -> float:
+        """Their median; 0 of none."""
+
+    def within(self, bound: float) -> LengthSums:
+        """Of those that are no longer."""
+
+
+def noise_of(
+    points: Lengths,
+    curves: Lengths,
+    redundancy: Redundancy,
+    options: Options,
+    usual: tuple[float, float] | None = None,
+) -> NoiseScales:
+    """The noise that lengths show; see `judge`."""
+    if options.noise_scale == "stated":
+        return NoiseScales(1.0, 1.0, options.reject_sigma, np.inf)
+    floor = usual or (0.0, 0.0)
+    spare_of_all = 2.0 * redundancy.points * points.count + redundancy.curves * curves.count
+    reject_sigma = _as_rare(options.reject_sigma, spare_of_all + (USUAL_EQUATIONS if usual else 0.0))
+    point_spread = _spread(points, _RAYLEIGH_MEDIAN, reject_sigma, floor[0], 2.0 * redundancy.points)
+    curve_spread = _spread(curves, _NORMAL_MEDIAN, reject_sigma, floor[1], redundancy.curves)
+    spare = 2.0 * redundancy.points * point_spread.count, redundancy.curves * curve_spread.count
+    degrees = spare[0] + spare[1]
+    if usual is not None:
+        p, c = point_spread.scale_from(usual[0], spare[0]), curve_spread.scale_from(usual[1], spare[1])
+        degrees = max(degrees, 0.0) + USUAL_EQUATIONS
+    else:
+        p, c = (
+            point_spread.scale(spare[0], curve_spread, spare[1]),
+            curve_spread.scale(spare[1], point_spread, spare[0]),
+        )
+        if degrees < _LEAST_SPARE:
+            p, c, degrees = 1.0, 1.0, np.inf
+    return NoiseScales(p, c, reject_sigma, degrees)
+
+
+def _as_rare(sigmas: float, degrees: float) -> float:
+    """The length that is as rare among residuals over a scale that was estimated from so few spare equations as
+    `sigmas` is over a known one: (1 + length^2 / degrees)^(-degrees / 2) = exp(-sigmas^2 / 2), that of Student's t in
+    two dimensions. Where the stated sigmas are taken it is `sigmas`.
+    """
+    if degrees < _LEAST_SPARE:
+        return sigmas
+    return float(np.sqrt(degrees * np.expm1(min(sigmas**2 / degrees, _BEYOND))))
+
+
+@dataclass(frozen=True)
+class LengthSums:
+    """Number and sum of squares of the lengths within the rejection bound."""
+
+    count: int
+    squares: float
+
+    def scale(self, spare: float, other: LengthSums, other_spare: float) -> float:
+        """Their scale, when they bring so many spare equations: that of the other kind counts as much as a few."""
+        borrowed = min(_BORROWED, max(other_spare, 0.0))
+        variance = borrowed * other.squares / max(other_spare, 1.0)
+        return max(float(np.sqrt((self.squares + variance) / max(spare + borrowed, 1.0))), _LEAST_SCALE_PX)
+
+    def scale_from(self, usual: float, spare: float) -> float:
+        """Their scale, when the usual one counts as much as a few spare equations: few exact ones do not make it 0."""
+        return float(np.sqrt((self.squares + USUAL_EQUATIONS * usual**2) / (max(spare, 0.0) + USUAL_EQUATIONS)))
+
+
+class EachLength:
+    """Lengths one by one; infinite ones are of what cannot be shown."""
+
+    def __init__(self, lengths: Array) -> None:
+        finite = np.isfinite(lengths)
+        self._seen = lengths if finite.all() else lengths[finite]
+
+    @property
+    def count(self) -> int:
+        """How many there are."""
+        return len(self._seen)
+
+    def middle(self) -> float:
+        """Their median; 0 of none."""
+        return _middle(self._seen)
+
+    def within(self, bound: float) -> LengthSums:
+        """Of those that are no longer."""
+        count, squares = 0, 0.0
+        for first in range(0, len(self._seen), _BLOCK):
+            block = self._seen[first : first + _BLOCK]
+            inside = block[block <= bound]
+            count, squares = count + len(inside), squares + float(inside @ inside)
+        return LengthSums(count, squares)
+
+
+def _spread(lengths: Lengths, median_of_one: float, reject_sigma: float, least: float, degrees: float) -> LengthSums:
+    """Of the lengths that the scale they have keeps.
+
+    Args:
+        least: a scale that theirs is no smaller than. degrees: spare equations of each.
+    """
+    first = _median_scale(lengths, median_of_one)
+    spread = lengths.within(reject_sigma * max(first, least))
+    for _ in range(_MOST_WIDER):
+        if degrees <= 0.0 or not spread.count:
+            break
+        wider = lengths.within(reject_sigma * float(np.sqrt(spread.squares / (degrees * spread.count))))
+        if not spread.count < wider.count <= (1.0 + _TAIL) * spread.count:
+            break
+        spread = wider
+    return spread

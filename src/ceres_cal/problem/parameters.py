@@ -1,0 +1,336 @@
+"""Which numbers are free, fixed, shared or under a prior: the one owner of the solver's layout.
+
+The solver sees one block per camera with its free intrinsics (in the order of `intrinsic_names`, coefficients scaled to
+be of order one) and one 6-vector (rotation vector, translation) per free station and per placement.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from ceres_cal.base.arrays import Array, Indices
+from ceres_cal.base.cached import cached_property
+from ceres_cal.base.errors import InputError
+from ceres_cal.base.transforms import Pose, Poses, chained, inverted
+from ceres_cal.base.typed import take_types
+from ceres_cal.observations import Observations, Prior
+from ceres_cal.observations.sights import SightKey
+from ceres_cal.problem.structure import Structure, Tolerance
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.lens import Lens, lens_class, make_lens
+
+AUTO = "auto"
+"""The lens that the data ask for: which it is, a calibration says in its options (`calibration.lens_choice`)."""
+PAPERS_POWERS = (2, 3)
+_OF_POWERS = "radial"  # the lens that powers stand for where none is named
+OF_PIXELS = ("phi", "aspect", "cx", "cy")
+"""The intrinsics that every camera has, in the order of the solver's vector; skew comes behind the coefficients."""
+# Views that tell an aspect and a skew beside the lens: no test decides there (halves of a set whose pixels are 0.2 %
+# higher than wide were 3 sd of phi apart, one with them and one without).
+_ENOUGH_VIEWS = 8
+_LARGEST = 2**31 - 1  # whole number that Ceres counts with
+# Standard deviations that somebody may mean: a bound below takes every observation out, one above takes out none.
+_SIGMAS = (1e-3, 1e9)
+LOSSES = ("trivial", "huber", "soft_l1", "cauchy", "tukey")
+
+
+@dataclass(frozen=True)
+class Options:
+    """What to solve for and how.
+
+    Attributes:
+        lens: one of `scene.lens.LENSES`, or "auto": the one that the data ask for. powers: of a lens that leaves the
+            choice, as "radial" does, which powers alone stand for; () for (2, 3), of "spline" for as many as the
+            residuals ask for from there on (`calibration.lens_growing`).
+        coefficients: names of those of the lens that are solved for, the others are 0; None: all.
+        free_principal_point: else it is held at the image centre, or where `fixed` says.
+        free_aspect, free_skew: whether fy / fx and the lean of the pixels' columns are free; else 1 and 0, or what
+            `fixed` says. Those of a "spline" whose powers are open are free from eight views on, unless `fixed`.
+        usual_camera: whether a principal point that nobody states is taken to lie near the middle of its image, as is
+            usual (`priors.USUAL_CENTRE`); where the data say otherwise it is left out.
+        terms: of the lens, besides those that it always has: names of its `more_terms`.
+        fixed: numbers held, by name: phi, aspect, cx, cy (px), skew and the lens's coefficients in the units of the
+            files.
+            They hold for every camera.
+        priors: what is known beforehand, besides the observations' own.
+        tolerances: target -> how far it may have been built from its drawing.
+        dimensions: lengths of targets that are solved for, "target/dimension" such as "field/field_length_m": from what
+            a prior says of them, or from the target as drawn. Those that a prior is about are among them.
+        as_built: of a target without a tolerance "estimate" how far it was, from what repeats over the views (what it
+            is, a calibration says in its tolerances), or take it "as drawn".
+        loss: robust loss of each observation: one of LOSSES. loss_scale: where it starts to bend, in standard
+            deviations; from half to double of 2.5 the squared error changes by under a tenth.
+        reject_sigma: observations farther off than this many standard deviations are taken out and listed. At half of 5
+            good ones go, and the squared error of boards grows by a quarter; at double of it, with 20 % outliers over a
+            field, by three quarters.
+        noise_scale: "estimate" the factor on the stated sigmas of points and curves from the residuals, or "stated".
+        closed_form_only: stop at the paper's own method (radial fit, four points, max-norm lambda): a baseline to
+            compare with, not a calibration.
+        max_iterations: of each solve. threads: of the solver; 0 chooses.
+    """
+
+    lens: str = AUTO
+    powers: tuple[int, ...] = ()
+    coefficients: tuple[str, ...] | None = None
+    free_principal_point: bool = True
+    free_aspect: bool = False
+    free_skew: bool = False
+    terms: tuple[str, ...] = ()
+    usual_camera: bool = True
+    fixed: Mapping[str, float] = field(default_factory=dict)
+    priors: tuple[Prior, ...] = ()
+    tolerances: Mapping[str, Tolerance] = field(default_factory=dict)
+    dimensions: tuple[str, ...] = ()
+    loss: str = "huber"
+    loss_scale: float = 2.5
+    reject_sigma: float = 5.0
+    noise_scale: str = "estimate"
+    as_built: str = "as drawn"
+    closed_form_only: bool = False
+    max_iterations: int = 100
+    threads: int = 0
+
+    def __post_init__(self) -> None:
+        take_types(self)
+        if self.lens == AUTO and self.powers:
+            object.__setattr__(self, "lens", _OF_POWERS)
+        if self.lens != AUTO:
+            lens_class(self.lens)
+            left_open = () if lens_class(self.lens).set_at_start else PAPERS_POWERS
+            object.__setattr__(self, "powers", tuple(self.powers) or left_open)
+        elif self.terms:
+            raise InputError("terms are of a lens that is named: leave them out, or name it")
+        if self.loss not in LOSSES:
+            raise InputError(f"unknown loss {self.loss!r}: choose one of {', '.join(LOSSES)}")
+        if self.noise_scale not in ("estimate", "stated"):
+            raise InputError(f"noise_scale must be 'estimate' or 'stated', not {self.noise_scale!r}")
+        if self.as_built not in ("estimate", "as drawn"):
+            raise InputError(f"as_built must be 'estimate' or 'as drawn', not {self.as_built!r}")
+        stated = (prior.dimension for prior in self.priors if prior.dimension)
+        object.__setattr__(self, "dimensions", tuple(dict.fromkeys((*self.dimensions, *stated))))
+        names = self.intrinsic_names  # which refuses unknown terms, too
+        if unknown := [name for name in self.coefficients or () if name not in names[len(OF_PIXELS) : -1]]:
+            raise InputError(f"cannot solve for {unknown[0]!r}: {self._which} has {', '.join(names)}")
+        for name, value in self.fixed.items():
+            if name not in names:
+                raise InputError(f"cannot fix {name!r}: {self._which} has {', '.join(names)}")
+            if not np.isfinite(value):
+                raise InputError(f"cannot fix {name} at {value}: give a finite number")
+        if self.reject_sigma == np.inf:  # as far as anything counts, which files can hold
+            object.__setattr__(self, "reject_sigma", _SIGMAS[1])
+        for name in ("loss_scale", "reject_sigma"):
+            if not _SIGMAS[0] <= getattr(self, name) <= _SIGMAS[1]:
+                least, most = _SIGMAS
+                raise InputError(f"{name} must be {least:g} to {most:g} sigmas, not {getattr(self, name)}")
+        if not self.max_iterations > 0:
+            raise InputError(f"max_iterations must be above 0, not {self.max_iterations}")
+        if self.threads < 0:
+            raise InputError(f"threads must be 0 (to choose) or above, not {self.threads}")
+        for name in ("max_iterations", "threads"):
+            if getattr(self, name) > _LARGEST:
+                raise InputError(f"{name} must be {_LARGEST} at most, not {getattr(self, name):.3g}")
+
+    @property
+    def _which(self) -> str:
+        return "a lens that is still to be chosen (name it)" if self.lens == AUTO else f"the {self.lens} lens"
+
+    @cached_property
+    def held(self) -> Mapping[str, float]:
+        """What `fixed` holds, and at 0 the coefficients that are not solved for."""
+        if self.coefficients is None:
+            return self.fixed
+        names = self._unset.names
+        return {**{name: 0.0 for name in names if name not in self.coefficients}, **self.fixed}
+
+    @cached_property
+    def intrinsic_names(self) -> tuple[str, ...]:
+        """What the camera can be told of beforehand: of a lens that is still to be chosen no coefficients."""
+        return (*OF_PIXELS, "skew") if self.lens == AUTO else intrinsic_names(self.blank_lens)
+
+    @cached_property
+    def blank_lens(self) -> Lens:
+        """The chosen lens with its fixed coefficients; the others are 0."""
+        lens = self._unset
+        return lens.with_values([self.fixed.get(name, 0.0) for name in lens.names]) if self.fixed else lens
+
+    def with_first_power(self, views: int) -> Options:
+        """These options with an aspect and a skew, what displaces by the first power, of a lens whose powers are left
+        open, where so many views tell them.
+        """
+        if self.powers or views < _ENOUGH_VIEWS:
+            return self
+        return replace(self, free_aspect="aspect" not in self.fixed, free_skew="skew" not in self.fixed)
+
+    @property
+    def _unset(self) -> Lens:
+        """The chosen lens with all coefficients 0."""
+        return make_lens(self.lens, self.powers or PAPERS_POWERS, terms=self.terms)
+
+
+def intrinsic_names(lens: Lens) -> tuple[str, ...]:
+    """Names of a camera's intrinsics in the order of the solver's vector."""
+    return (*OF_PIXELS, *lens.names, "skew")
+
+
+def unit_px(camera: Camera) -> float:
+    """Half the image diagonal: the unit of radius in which the solver's coefficients are of order one."""
+    return 0.5 * float(np.hypot(*camera.image_size))
+
+
+def intrinsics_vector(camera: Camera) -> Array:
+    """The solver's numbers of a camera, (4 + coefficients + 1,)."""
+    scaled = np.asarray(camera.lens.values) * camera.lens.scales(unit_px(camera))
+    return np.array([camera.phi, camera.aspect, *camera.principal_point, *scaled, camera.skew])
+
+
+def intrinsics_scales(camera: Camera) -> Array:
+    """What a camera's numbers in the files' units are multiplied with to become the solver's."""
+    return np.concatenate([np.ones(4), camera.lens.scales(unit_px(camera)), np.ones(1)])
+
+
+def with_intrinsics(camera: Camera, vector: Array) -> Camera:
+    """The camera with the solver's numbers put in."""
+    phi, aspect, cx, cy = (float(v) for v in vector[:4])
+    lens = camera.lens.with_values(vector[4:-1] / camera.lens.scales(unit_px(camera)))
+    return replace(camera, phi=phi, aspect=aspect, principal_point=(cx, cy), lens=lens, skew=float(vector[-1]))
+
+
+@dataclass(frozen=True)
+class Station:
+    """One fixed pose of a camera over the field."""
+
+    camera: str
+    cam_from_world: Pose
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A value for everything the solve is about: cameras (at no particular pose), stations, placements, by name."""
+
+    cameras: Mapping[str, Camera]
+    stations: Mapping[str, Station]
+    placements: Mapping[str, Pose]
+    """world_from_target of each placement."""
+    structure: Structure
+    """The targets as built."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "placements", Poses.of(self.placements))  # which costs nothing from then on
+
+    def station_name(self, name: str | None) -> str:
+        """The name of a station; without one, that of the only one there is.
+
+        Raises:
+            InputError: no such station, or no name where there are several.
+        """
+        if name is None and len(self.stations) == 1:
+            return next(iter(self.stations))
+        if name is None or name not in self.stations:
+            raise InputError(f"station {name!r} is not there: there are {', '.join(map(repr, self.stations))}")
+        return name
+
+    def camera_at(self, station: str, placement: str | None = None) -> Camera:
+        """The station's camera in the world, or in the frame of a placement (its cam_from_world is cam_from_target)."""
+        pose = self.stations[station].cam_from_world
+        if placement is not None:
+            pose = pose @ self.placements[placement]
+        return self.cameras[self.stations[station].camera].at(pose)
+
+    def pose_stack(self, keys: Sequence[SightKey]) -> Array:
+        """cam_from_frame of each sight as [R t], (S, 3, 4)."""
+        stations = self._station_stack(keys)
+        return chained(stations, Poses.of(self.placements).of_names([key.placement for key in keys]))
+
+    def with_placements(self, keys: Sequence[SightKey], cam_from_target: Array) -> Estimate:
+        """The estimate with the placement of each key where its station sees it, cam_from_target (S, 3, 4)."""
+        names = [key.placement for key in keys if key.placement is not None]
+        stations = self._station_stack(keys)
+        moved = chained(inverted(stations), cam_from_target)
+        return replace(self, placements=Poses.of(self.placements).updated(names, moved))
+
+    def _station_stack(self, keys: Sequence[SightKey]) -> Array:
+        """cam_from_world of each sight, (S, 3, 4); (3, 4) where one station has them all."""
+        names = [key.station for key in keys]
+        poses = {name: self.stations[name].cam_from_world for name in dict.fromkeys(names)}
+        if len(poses) == 1:
+            return poses[names[0]].matrix
+        return Poses.of(poses).of_names(names)
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Which numbers the solver may move.
+
+    Attributes:
+        free: camera -> indices into its intrinsics vector.
+        stations, placements: names of the poses that are free.
+    """
+
+    free: Mapping[str, Indices]
+    stations: frozenset[str]
+    placements: frozenset[str]
+
+    @property
+    def size(self) -> int:
+        """Number of free numbers."""
+        return sum(len(f) for f in self.free.values()) + 6 * (len(self.stations) + len(self.placements))
+
+    def holding(self, camera: str, number: int) -> Layout:
+        """The layout with one of a camera's intrinsics held."""
+        return replace(self, free={**self.free, camera: self.free[camera][self.free[camera] != number]})
+
+    def of(self, keys: Iterable[SightKey]) -> Layout:
+        """The layout of a problem with these sights alone: no placement that they do not show is free."""
+        return replace(self, placements=self.placements & {key.placement for key in keys})
+
+
+def make_layout(observations: Observations, options: Options) -> Layout:
+    """The layout of a calibration: everything free but what the options fix and what nothing can tell."""
+    names = intrinsic_names(options.blank_lens)
+    held = {*options.held, *options.blank_lens.set_at_start}
+    if not options.free_principal_point:
+        held |= {"cx", "cy"}
+    if not options.free_aspect:
+        held |= {"aspect"}
+    if not options.free_skew:
+        held |= {"skew"}
+    free = np.array([i for i, name in enumerate(names) if name not in held], dtype=np.int64)
+    views = observations.shown_views
+    return Layout(
+        dict.fromkeys(observations.cameras, free),
+        frozenset(view.station for view in views) - anchored_stations(observations),
+        frozenset(view.placement for view in views if view.placement is not None),
+    )
+
+
+def anchored_stations(observations: Observations) -> frozenset[str]:
+    """One station of each group that no view ties to the world: its camera frame serves as the world.
+
+    Boards alone tell poses among themselves only; holding one station removes that freedom.
+    """
+    views = observations.shown_views
+    times = Counter([view.placement for view in views])
+    group = {view.station: view.station for view in views}
+    first_seen: dict[str, str] = {}
+    tied: set[str] = set()
+
+    def root(name: str) -> str:
+        while group[name] != name:
+            name = group[name]
+        return name
+
+    for view in views:
+        if view.placement is None:
+            tied.add(view.station)
+        elif times[view.placement] > 1:
+            group[root(view.station)] = root(first_seen.setdefault(view.placement, view.station))
+    tied_groups = {root(name) for name in tied}
+    anchors: dict[str, str] = {}
+    for name in group:
+        if root(name) not in tied_groups:
+            anchors.setdefault(root(name), name)
+    return frozenset(anchors.values())

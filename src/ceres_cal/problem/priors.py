@@ -1,0 +1,146 @@
+"""What is known beforehand, all of it in one form: a normal distribution of some numbers together.
+
+A tape-measured height, a tolerance of the target as built and the posterior of an earlier calibration differ in nothing
+but their keys. Where an information matrix has null directions nothing is known, and nothing is inverted: the residual
+of a prior is root (x - mean) with root^T root = information.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from ceres_cal.base.arrays import Array
+from ceres_cal.base.errors import InputError
+from ceres_cal.base.transforms import rotation_log
+from ceres_cal.observations import Observations, Prior
+from ceres_cal.problem.information import Information, Key, pose_keys
+from ceres_cal.problem.parameters import Estimate, Options, intrinsic_names
+from ceres_cal.problem.quantities import intrinsic_keys, values_of
+from ceres_cal.problem.structure import Structure
+from ceres_cal.scene.camera import Camera
+from ceres_cal.scene.lens import Lens
+
+USUAL_CENTRE = 0.015
+"""Of the image's diagonal, 24 px of 1600: the standard deviation of either coordinate of principal points about the
+middle of pictures that were not cropped."""
+_QUANTITIES = {"principal_point": ("cx", "cy"), "height_m": ("height",), "position_m": ("x", "y", "height")}
+
+
+@dataclass(frozen=True, eq=False)
+class GaussianPrior:
+    """A normal distribution of some intrinsics, stations and structure numbers.
+
+    Attributes:
+        information: about its K numbers. mean: (K,) in the units of the keys; 0 for a turn.
+        rotations: station -> rotation (3, 3) of cam_from_world from which its turns are counted.
+        is_usual: whether nobody stated it: it is what is usual, and gives way to data that say otherwise.
+    """
+
+    information: Information
+    mean: Array
+    rotations: Mapping[str, Array] = field(default_factory=dict)
+    is_usual: bool = False
+
+    @classmethod
+    def about(cls, information: Information, estimate: Estimate) -> GaussianPrior:
+        """What is known around an estimate."""
+        turning = {key.owner for key in information.keys if key.kind == "station" and key.unit == "rad"}
+        rotations = {name: estimate.stations[name].cam_from_world.rotation for name in turning}
+        return cls(information, values_of(estimate, information.keys), rotations)
+
+    @property
+    def keys(self) -> tuple[Key, ...]:
+        return self.information.keys
+
+    def given(self, keys: Collection[Key]) -> GaussianPrior:
+        """What it says of those of its numbers that are among the keys, with all others held at their mean."""
+        return self._with(self.information.given(self.information.among(keys)))
+
+    def without(self, keys: Collection[Key]) -> GaussianPrior:
+        """The prior with some numbers integrated out: nothing is known of them any more."""
+        return self._with(self.information.without(keys)) if set(keys) & set(self.keys) else self
+
+    def _with(self, information: Information) -> GaussianPrior:
+        return replace(self, information=information, mean=self.mean[self.information.columns(information.keys)])
+
+    def offsets(self, estimate: Estimate) -> Array:
+        """(K,) estimate less mean, in the units of the keys."""
+        off = values_of(estimate, self.keys) - self.mean
+        for name, rotation in self.rotations.items():
+            turn = rotation_log(estimate.stations[name].cam_from_world.rotation @ rotation.T)
+            for key, angle in zip(pose_keys("station", name)[3:], turn.tolist(), strict=True):
+                if key in self.keys:
+                    off[self.information.columns([key])] = angle
+        return off
+
+    def residuals(self, estimate: Estimate) -> Array:
+        """(R,) root (x - mean), in standard deviations."""
+        return np.asarray(self.information.root @ self.offsets(estimate))
+
+
+def gather_priors(
+    observations: Observations,
+    options: Options,
+    structure: Structure,
+    carried: GaussianPrior | None = None,
+    cameras: Mapping[str, Camera] | None = None,
+) -> tuple[GaussianPrior, ...]:
+    """Everything that is known beforehand: an old posterior, the priors of observations and options, and tolerances.
+
+    Args:
+        cameras: where their lenses are not those of the options.
+
+    Raises:
+        InputError: a prior names a camera, a station or a quantity that is not there.
+    """
+    lenses = {name: camera.lens for name, camera in (cameras or {}).items()}
+    stated = []
+    for prior in dict.fromkeys((*observations.priors, *options.priors)):  # what is said twice counts once
+        observations.require_owner(prior)
+        if not (prior.is_open or prior.curve):  # which are among the tolerances
+            stated.append(stated_prior(prior, lenses.get(prior.name, options.blank_lens)))
+    if carried:
+        return (carried, *stated, *tolerances(structure, carried.keys))
+    known = {key for prior in stated for key in prior.keys}
+    usual = usual_centres(observations, known) if options.usual_camera else ()
+    return (*stated, *usual, *tolerances(structure))
+
+
+def stated_prior(prior: Prior, lens: Lens) -> GaussianPrior:
+    """A prior that somebody stated, number by number.
+
+    Raises:
+        InputError: the lens has no such number.
+    """
+    if prior.owner == "target":
+        sigma = {Key.of_structure(prior.dimension, "dimension"): prior.sigma[0]}
+        return GaussianPrior(Information.of_sigmas(sigma), np.array(prior.value))
+    names = intrinsic_names(lens)
+    if prior.owner == "camera" and prior.quantity not in (*names, "principal_point"):
+        raise InputError(f"prior on camera {prior.name!r}: it has no {prior.quantity!r}, only {', '.join(names)}")
+    wanted = _QUANTITIES.get(prior.quantity, (prior.quantity,))
+    every = intrinsic_keys(prior.name, lens) if prior.owner == "camera" else pose_keys("station", prior.name)
+    keys = {key.quantity: key for key in every}
+    sigmas = {keys[quantity]: sigma for quantity, sigma in zip(wanted, prior.sigma, strict=True)}
+    return GaussianPrior(Information.of_sigmas(sigmas), np.asarray(prior.value, dtype=float))
+
+
+def usual_centres(observations: Observations, stated: Collection[Key]) -> Iterator[GaussianPrior]:
+    """Principal points near the middle of their images, but for those that somebody stated."""
+    for name, size in observations.cameras.items():
+        keys = [Key("camera", name, quantity, "px") for quantity in ("cx", "cy")]
+        if not set(keys) & set(stated):
+            sigma_px = USUAL_CENTRE * float(np.hypot(*size))
+            centre = 0.5 * (np.array(size, dtype=float) - 1.0)
+            yield GaussianPrior(Information.of_sigmas(dict.fromkeys(keys, sigma_px)), centre, is_usual=True)
+
+
+def tolerances(structure: Structure, known: Collection[Key] = ()) -> Iterator[GaussianPrior]:
+    """How far the targets may have been built from their drawings; not of numbers that are known already."""
+    stated = dict(zip(structure.keys[: structure.own], structure.sigma_m.tolist(), strict=False))
+    sigmas = {key: sigma for key, sigma in stated.items() if key not in set(known)}
+    if sigmas:
+        yield GaussianPrior(Information.of_sigmas(sigmas), np.zeros(len(sigmas)))

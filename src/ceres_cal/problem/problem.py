@@ -1,0 +1,162 @@
+"""The one least-squares problem: everything about it but the place where it stands."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, Protocol
+
+import numpy as np
+
+from ceres_cal.base.arrays import Array, Indices, Mask
+from ceres_cal.base.cached import cached_property
+from ceres_cal.observations.sights import SightKey, Sights
+from ceres_cal.problem.information import Information
+from ceres_cal.problem.parameters import OF_PIXELS, Estimate, Layout, Options
+from ceres_cal.problem.priors import GaussianPrior
+from ceres_cal.problem.quantities import free_keys, intrinsic_keys
+from ceres_cal.scene.lens import Lens
+
+_CONVEX = ("trivial", "huber", "soft_l1")
+
+
+@dataclass(frozen=True)
+class Weighting:
+    """How residuals become costs.
+
+    Attributes:
+        point_scale, curve_scale: noise scales, factors on the stated sigmas.
+        loss, loss_scale: robust loss of each observation, its scale in standard deviations.
+    """
+
+    point_scale: float = 1.0
+    curve_scale: float = 1.0
+    loss: str = "huber"
+    loss_scale: float = 2.5
+
+    @property
+    def scales(self) -> tuple[float, float]:
+        """Noise scales of points and of curves."""
+        return self.point_scale, self.curve_scale
+
+    @property
+    def is_convex(self) -> bool:
+        """Whether the loss has one minimum."""
+        return self.loss in _CONVEX
+
+
+class Elsewhere(Protocol):
+    """Observations of the world that are not at hand: they answer with sums."""
+
+    @property
+    def equations(self) -> int:
+        """How many measured numbers they are."""
+
+    def cost(self, run: Any, problem: Problem, estimate: Estimate) -> Any:
+        """What Ceres sees of them: its `owners` say by kind and name which numbers it depends on."""
+
+    def normals(self, problem: Problem, estimate: Estimate) -> Mapping[SightKey, Mapping[int, Array]]:
+        """Their normal equations by sight and kind, see `problem.reduced`."""
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """What is minimised, over what, under what was known before.
+
+    Attributes:
+        sights: the observations that take part. layout: the numbers that are free.
+        priors: all that is known beforehand; of numbers that are held they say nothing.
+        elsewhere: more observations of the world, which are not at hand.
+        smoothness: camera -> standard deviations (px) of its lens's `roughness`; its loose ones where it is not named.
+        weighting: of the observations. options: iterations and threads.
+        feet: (M,) where on its track each curve observation's foot is sought first (see `residuals`), by row.
+    """
+
+    sights: Sights
+    layout: Layout
+    priors: tuple[GaussianPrior, ...] = ()
+    weighting: Weighting = field(default_factory=Weighting)
+    options: Options = field(default_factory=Options)
+    feet: Array | None = None
+    smoothness: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    elsewhere: Elsewhere | None = None
+
+    @cached_property
+    def private(self) -> frozenset[str | None]:
+        """Free placements that a single sight shows: each can be eliminated by itself."""
+        return self.layout.placements & self.sights.seen_once
+
+    def priors_at(self, estimate: Estimate) -> list[GaussianPrior]:
+        """What the priors and the smoothness of lenses say of numbers that are free."""
+        return [*self.stated_at(estimate), *self._smooth_at(estimate)]
+
+    def stated_at(self, estimate: Estimate) -> list[GaussianPrior]:
+        """What the priors say of numbers that are free, with those that are held at their mean."""
+        if not self.priors:
+            return []
+        free = set(free_keys(estimate, self.layout, self.layout.placements))  # of placements nothing is known before
+        restricted = [prior.given(free) for prior in self.priors]
+        return [prior for prior in restricted if prior.keys]
+
+    def _smooth_at(self, estimate: Estimate) -> Iterator[GaussianPrior]:
+        """What its smoothness says of each lens, where no posterior says so already."""
+        for name, camera in estimate.cameras.items():
+            if not (forms := camera.lens.roughness):
+                continue
+            keys = {key.quantity: key for key in intrinsic_keys(name, camera.lens)}
+            free = {key for number, key in enumerate(keys.values()) if number in self.layout.free[name]}
+            sigmas = self.smoothness.get(name, tuple(form.loose for form in forms))
+            for form, sigma in zip(forms, sigmas, strict=True):
+                own = tuple(keys[quantity] for quantity in form.names)
+                if free & set(own) and not self.knows_lens(name, camera.lens):
+                    whole = GaussianPrior(Information(own, form.matrix / sigma**2), np.zeros(len(own)))
+                    yield whole.given(free)
+
+    def knows_lens(self, camera: str, lens: Lens) -> bool:
+        """Whether a posterior states a camera's lens in every direction: how smooth it is, is in there."""
+        rough = {name for form in lens.roughness for name in form.names}
+        return bool(rough) and rough <= self._stated_whole.get(camera, frozenset())
+
+    @cached_property
+    def _stated_whole(self) -> dict[str, frozenset[str]]:
+        """Camera -> the coefficients of its lens, where a prior states these in every direction."""
+        stated: dict[str, frozenset[str]] = {}
+        for prior in self.priors:
+            for name in {key.owner for key in prior.keys if key.kind == "camera"}:
+                of_camera = [key for key in prior.keys if key[:2] == ("camera", name)]
+                own = [key for key in of_camera if key.quantity not in (*OF_PIXELS, "skew")]
+                if own and prior.information.given(own).known_rank == len(own):
+                    stated[name] = frozenset(key.quantity for key in own) | stated.get(name, frozenset())
+        return stated
+
+    @property
+    def equations(self) -> int:
+        """Measured numbers: two of each point, one of each curve observation."""
+        return self.sights.equations + (self.elsewhere.equations if self.elsewhere else 0)
+
+    def unknowns(self, estimate: Estimate) -> int:
+        """Number of free numbers that use up observations: what is known beforehand does not."""
+        known = sum(len(prior.information.root) for prior in self.priors_at(estimate) if not prior.is_usual)
+        return max(self.layout.size + len(estimate.structure.values) - known, 0)
+
+    def weighted(self, weighting: Weighting) -> Problem:
+        """The same with other weights."""
+        return replace(self, weighting=weighting)
+
+    def used(self, points: Mask, curves: Mask) -> Problem:
+        """The problem of these rows of the observations alone."""
+        return replace(self, sights=self.sights.used(points, curves))
+
+    def of_rows(self, points: Indices, curves: Indices) -> Problem:
+        """The problem of some of the observations, in their order, as if there were no others."""
+        sights = self.sights.renumbered(points, curves)
+        return replace(self, sights=sights, layout=self.layout.of(sights.keys))
+
+    def of_sights(self, numbers: Indices) -> Problem:
+        """The problem of some of the sights: no placement that they do not show is free."""
+        sights = self.sights.take(numbers)
+        return replace(self, sights=sights, layout=self.layout.of(sights.keys))
+
+    def holding(self, camera: str, number: int) -> Problem:
+        """The problem with one of a camera's intrinsics held, by its place in the solver's vector."""
+        return replace(self, layout=self.layout.holding(camera, number))

@@ -1,0 +1,298 @@
+"""What observations and priors say of every number, where an estimate stands: J^T W J, nothing moved (design, 6).
+
+Every sight gives its compressed normal equations once; placements that one station sees are eliminated, the rest is
+added up over what is shared, in the coordinates of `problem.information`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import reduce
+from operator import add
+
+import numpy as np
+
+from ceres_cal import kernels
+from ceres_cal.base.arrays import Array, Indices
+from ceres_cal.base.cached import cached_property
+from ceres_cal.base.errors import SolutionError
+from ceres_cal.base.spread import known_inverses
+from ceres_cal.base.threads import parts_of, run_parts
+from ceres_cal.observations.sights import SightKey, Sights
+from ceres_cal.problem.costs import NORMAL_NS, kernel_loss
+from ceres_cal.problem.information import Information, Key, columns_by_owner, pose_keys, sigma_limits
+from ceres_cal.problem.parameters import Estimate, intrinsics_scales
+from ceres_cal.problem.problem import Problem
+from ceres_cal.problem.quantities import free_keys, from_placement, from_station
+from ceres_cal.problem.residuals import camera_optics, curve_columns, point_columns, starting_feet
+
+_ROUNDING = 1e-13  # of a sum over a sight's rows
+_BATCH = 250_000  # numbers of normal equations worked on at once: they stay where the processor is quick
+
+
+@dataclass(frozen=True, eq=False)
+class Eliminated:
+    """Private placements of one station: their own information, and how they follow the shared numbers.
+
+    Attributes:
+        names: (S). own: (S, 6, 6) information about each with everything shared held; inverses: (S, 6, 6) of that,
+            over what is known.
+        gains: (S, 6, K); a step d of the shared numbers `keys` (K) takes each placement along by -gains d.
+    """
+
+    names: tuple[str, ...]
+    own: Array
+    inverses: Array
+    gains: Array
+    keys: tuple[Key, ...]
+
+    @property
+    def ranks(self) -> Array:
+        """(S,) directions of each that its own observations determine."""
+        return np.asarray(np.einsum("sij,sji->s", self.own, self.inverses))
+
+
+@dataclass(frozen=True, eq=False)
+class ReducedInformation:
+    """J^T W J of everything shared, private placements eliminated.
+
+    Attributes:
+        points, curves: what the observations of either kind say. priors: what was known before.
+        stated: that part of the priors which somebody stated, or an earlier calibration found.
+        eliminated: the private placements, by station.
+        point_leverage, curve_leverage: equations of either kind that private placements take up by themselves.
+    """
+
+    points: Information
+    curves: Information
+    priors: Information
+    stated: Information
+    eliminated: tuple[Eliminated, ...]
+    point_leverage: float
+    curve_leverage: float
+
+    @cached_property
+    def shared(self) -> Information:
+        """All of it together."""
+        return self.points + self.curves + self.priors
+
+    @property
+    def leverages(self) -> tuple[float, float]:
+        """Equations of points and of curves that the free numbers take up: the traces of the hat matrix."""
+        covariance = self.shared.inverse
+        return (
+            self.point_leverage + float(np.sum(covariance * self.points.matrix)),
+            self.curve_leverage + float(np.sum(covariance * self.curves.matrix)),
+        )
+
+
+def information(problem: Problem, estimate: Estimate) -> ReducedInformation:
+    """What the observations and priors say of the free intrinsics, stations, placements and structure.
+
+    Each observation counts with its robust weight rho'. For a placement to be eliminated rightly it must be at its
+    best, as it is after a solve.
+
+    Raises:
+        SolutionError: an observation cannot be projected from there.
+    """
+    return _InformationSums(problem, estimate).result()
+
+
+def normals_of(sight: Sights, problem: Problem, estimate: Estimate) -> dict[int, Array]:
+    """Normal equations (K, K) of a single sight by kind: of points (0) and of curves (1), where there are any. K is
+    [free intrinsics in the units of the files | structure | left perturbation of the pose: turn, shift].
+
+    Raises:
+        SolutionError: an observation cannot be projected.
+    """
+    kinds = enumerate(sight.by_kind)
+    return {kind: normals_with_residuals(own, problem, estimate)[0, :-1, :-1] for kind, own in kinds if own.equations}
+
+
+def normals_with_residuals(sights: Sights, problem: Problem, estimate: Estimate) -> Array:
+    """Normal equations (S, K + 1, K + 1) of one camera's sights, each by itself, as in `normals_of`; the last row is
+    that of the residuals.
+
+    Raises:
+        SolutionError: an observation cannot be projected.
+    """
+    return _KernelNormals(sights, problem, estimate).of(0, len(sights))
+
+
+def owned_columns(keys: Sequence[Key]) -> dict[tuple[str, str], Indices]:
+    """(kind, owner) -> where its keys are, those of the structure under ("structure", "")."""
+    columns = {owner: np.array(at, dtype=np.int64) for owner, at in columns_by_owner(keys).items()}
+    structure = [column for column, key in enumerate(keys) if key.is_structure]
+    return columns | {("structure", ""): np.array(structure, dtype=np.int64)}
+
+
+def steps_of(
+    key: SightKey, pose: Array, estimate: Estimate, columns: Mapping[tuple[str, str], Indices]
+) -> tuple[Array, Indices]:
+    """What steps of the shared numbers do to those of a sight (see `normals_of`), (K, P), and which numbers they are.
+
+    Args:
+        pose: (3, 4) cam_from_frame. columns: see `owned_columns`.
+    """
+    world, nothing = estimate.stations[key.station].cam_from_world, np.empty(0, dtype=np.int64)
+    at = [columns.get(("camera", key.camera), nothing), columns["structure", ""]]
+    lead = len(at[0]) + len(at[1])
+    steps = [np.eye(lead + 6)[:, :lead]]
+    if (station := ("station", key.station)) in columns:
+        at.append(columns[station])
+        steps.append(np.vstack([np.zeros((lead, 6)), from_station(pose[None], world)[0]]))
+    if (placement := ("placement", str(key.placement))) in columns and key.placement is not None:
+        at.append(columns[placement])
+        steps.append(np.vstack([np.zeros((lead, 6)), from_placement(pose[None], world)[0]]))
+    return np.hstack(steps), np.concatenate(at)
+
+
+class _InformationSums:
+    """The sums of one pass over the sights."""
+
+    def __init__(self, problem: Problem, estimate: Estimate) -> None:
+        self._problem, self._estimate = problem, estimate
+        self._keys = free_keys(estimate, problem.layout, problem.private)
+        self._columns = owned_columns(self._keys)
+        size = len(self._keys)
+        self._matrices, self._leverages = np.zeros((2, size, size)), np.zeros(2)  # of points, of curves
+
+    def result(self) -> ReducedInformation:
+        """Everything that the problem says."""
+        sights, private = self._problem.sights, self._problem.private
+        alone = sights.numbers(placements=private)
+        eliminated = []
+        for name in dict.fromkeys(sights.keys[number].station for number in alone):
+            own = sights.take(sights.numbers(station=name, placements=private))
+            eliminated.append(self._eliminate(own))
+        for number in np.delete(np.arange(len(sights)), alone):
+            sight = sights[int(number)]
+            for pose, normals in self._normals(sight):
+                self._add(sight.key, pose[0], {kind: normal[0] for kind, normal in normals.items()})
+        if self._problem.elsewhere is not None:
+            for key, kinds in self._problem.elsewhere.normals(self._problem, self._estimate).items():
+                self._add(key, self._estimate.pose_stack([key])[0], kinds)
+        points, curves = (Information(self._keys, 0.5 * (matrix + matrix.T)) for matrix in self._matrices)
+        priors = [prior.information for prior in self._problem.priors_at(self._estimate)]
+        known = reduce(add, priors, Information.nothing(self._keys))
+        every = self._problem.stated_at(self._estimate)
+        stated = reduce(add, (prior.information for prior in every if not prior.is_usual), Information.nothing())
+        return ReducedInformation(points, curves, known, stated, tuple(eliminated), *self._leverages.tolist())
+
+    def _owned(self, kind: str, name: str) -> Indices:
+        return self._columns.get((kind, name), np.empty(0, dtype=np.int64))
+
+    def _normals(self, sights: Sights) -> Iterator[tuple[Array, dict[int, Array]]]:
+        """cam_from_frame (n, 3, 4) of a camera's sights, and normal equations (n, K, K) by kind: of points (0) and of
+        curves (1), where there are any; in batches. K is [free intrinsics in the units of the files | structure | left
+        perturbation of the pose: turn, shift].
+        """
+        kernel_of = {
+            kind: _KernelNormals(own, self._problem, self._estimate)
+            for kind, own in enumerate(sights.by_kind)
+            if own.equations
+        }
+        poses = self._estimate.pose_stack(sights.keys)
+        size = len(self._problem.layout.free[sights.keys[0].camera]) + len(self._estimate.structure.values) + 6
+        batch = max(1, _BATCH // size**2)
+        for first in range(0, len(sights), batch):
+            last = min(first + batch, len(sights))
+            yield poses[first:last], {kind: one.of(first, last)[:, :-1, :-1] for kind, one in kernel_of.items()}
+
+    def _eliminate(self, sights: Sights) -> Eliminated:
+        """The private placements of one station; what is left of their sights is added to the sums."""
+        key = sights.keys[0]
+        world = self._estimate.stations[key.station].cam_from_world
+        lead = np.concatenate([self._owned("camera", key.camera), self._owned("structure", "")])
+        station = self._owned("station", key.station)
+        stacks = []
+        for poses, normals in self._normals(sights):
+            chain = from_placement(poses, world)
+            back = np.swapaxes(chain, 1, 2)  # the chain is orthogonal
+            whole = reduce(add, normals.values())
+            own = back @ whole[:, -6:, -6:] @ chain
+            inverse = known_inverses(own, _limits(own))
+            covariance = chain @ inverse @ back
+            follows = covariance @ whole[:, -6:, :-6]
+            self._add_reduced(lead, normals, covariance, follows)
+            gain = back @ follows
+            if len(station):  # the placement makes up for whatever its station does
+                gain = np.concatenate([gain, back @ from_station(poses, world)], axis=2)
+            stacks.append((own, inverse, gain))
+        own, inverse, gain = (np.concatenate(parts) for parts in zip(*stacks, strict=True))
+        names = tuple(str(key.placement) for key in sights.keys)
+        return Eliminated(names, own, inverse, gain, tuple(self._keys[i] for i in np.concatenate([lead, station])))
+
+    def _add_reduced(self, lead: Indices, normals: dict[int, Array], covariance: Array, follows: Array) -> None:
+        """V^T N V of each kind, with V how a sight's numbers follow the shared ones, summed over the sights.
+
+        Args:
+            covariance: (S, 6, 6) of each pose with everything shared held. follows: (S, 6, K) less what V has for it.
+        """
+        rows = 6 * len(follows)
+        flat = follows.reshape(rows, len(lead))
+        for kind, normal in normals.items():
+            coupling = normal[:, -6:, :-6]
+            reduced = np.sum(normal[:, :-6, :-6], axis=0) - coupling.reshape(rows, len(lead)).T @ flat
+            if len(normals) > 1:  # of all kinds together the placements are at their best, not of each
+                left = coupling - normal[:, -6:, -6:] @ follows
+                reduced -= flat.T @ left.reshape(rows, len(lead))
+            self._matrices[kind][np.ix_(lead, lead)] += reduced
+            self._leverages[kind] += float(np.sum(normal[:, -6:, -6:] * covariance))
+
+    def _add(self, key: SightKey, pose: Array, normals: Mapping[int, Array]) -> None:
+        """What a sight that nothing is eliminated from says, added to the sums."""
+        steps, everywhere = steps_of(key, pose, self._estimate, self._columns)
+        for kind, normal in normals.items():
+            self._matrices[kind][np.ix_(everywhere, everywhere)] += steps.T @ normal @ steps
+
+
+def _limits(own: Array) -> Array:
+    """(S, 6) sigmas beyond which a placement's number is unknown: what remains of a turn about the middle of rings, in
+    sums over all of their rows, is rounding of its other turns.
+    """
+    turns, shifts = np.max(np.diagonal(own, axis1=1, axis2=2).reshape(-1, 2, 3), axis=2).T
+    largest = np.repeat(np.column_stack([turns, shifts]), 3, axis=1)
+    return np.asarray(np.minimum(sigma_limits(pose_keys("placement", "")), (_ROUNDING * largest + 1e-300) ** -0.5))
+
+
+class _KernelNormals:
+    """The normal equations of one camera's sights, as the kernels give them."""
+
+    def __init__(self, sights: Sights, problem: Problem, estimate: Estimate) -> None:
+        camera = estimate.cameras[sights.keys[0].camera]
+        free, structure, weighting = problem.layout.free[sights.keys[0].camera], estimate.structure, problem.weighting
+        offsets = len(structure.offsets)
+        units = np.ones(len(free) + offsets + 7)
+        units[: len(free)] = intrinsics_scales(camera)[free]
+        self._size, self._chain = len(units), structure.chain(len(free), 7)
+        self._rows = (len(sights.points) + len(sights.curve_pixels)) / len(sights)
+        self._arguments = (
+            camera_optics(camera),
+            kernels.Unknowns(free, offsets),
+            point_columns(sights, structure, weighting.point_scale),
+            curve_columns(sights, structure, starting_feet(sights, estimate, problem.feet), weighting.curve_scale),
+            kernel_loss(weighting),
+            estimate.pose_stack(sights.keys),
+            units,
+        )
+
+    def of(self, first: int, last: int) -> Array:
+        """(n, K + 1, K + 1) of the sights from one number to another, the residuals' row last.
+
+        Raises:
+            SolutionError: an observation cannot be projected.
+        """
+        normals = np.empty((last - first, self._size, self._size))
+
+        def part(begin: int, end: int) -> bool:
+            return kernels.sight_normals(first + begin, first + end, *self._arguments, normals[begin:end])
+
+        if not all(run_parts(part, parts_of(last - first, int(self._rows * (last - first)), NORMAL_NS))):
+            raise SolutionError(
+                "an observation cannot be projected where the solve ended: no uncertainty can be given: choose another "
+                "lens (for wide ones kannala-brandt or spline), free what is held of this one, or leave out what lies "
+                "nearest to the image's corners"
+            )
+        return normals if self._chain is None else self._chain.T @ normals @ self._chain

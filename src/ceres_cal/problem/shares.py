@@ -1,0 +1,256 @@
+"""Very many observations of the world in shares, each of which answers with sums.
+
+A share is some of the rows, in memory or in files, and is asked where it is: by this process, or by a worker that has
+it. What it answers does not grow with its rows: a compressed block (design, section 6), normal equations, a histogram
+of residuals. It keeps nothing that an answer depends on but its rows, so one that is lost is made again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ceres_cal.base.arrays import AnyArray, Array, Indices, Mask
+from ceres_cal.observations import Observations
+from ceres_cal.observations.columns import Curves, FileRows, Points, View, read_rows, rows_of
+from ceres_cal.observations.files import Content
+from ceres_cal.observations.sights import SightKey, Sights, sights_of
+from ceres_cal.problem.costs import Run, SightCost
+from ceres_cal.problem.noise import relative_lengths
+from ceres_cal.problem.parameters import Estimate, Layout
+from ceres_cal.problem.problem import Problem, Weighting
+from ceres_cal.problem.reduced import normals_of
+from ceres_cal.problem.residuals import residuals
+from ceres_cal.problem.sums import CompressedBlocks, Histogram, Looked, SightNormals, Used, compressed
+from ceres_cal.scene.targets import Target
+
+# Of the bounds of outliers: longer residuals are remembered, so that bounds may move.
+_FAR = 0.5
+_ROWS = 1 << 19  # of a share: what is made of them for an answer takes some 100 MB
+
+
+class ShareRequest(NamedTuple):
+    """What a share needs to know of a problem to answer.
+
+    Attributes:
+        estimate, layout, weighting: of the problem. judged_at: where residuals say which rows take part, and its name.
+        bounds: of points and of curve observations, the lengths in stated sigmas from which on they do not.
+        feet_along: places, by name, at each of which feet were sought from those before: from the last, all others are.
+    """
+
+    estimate: Estimate
+    layout: Layout
+    weighting: Weighting
+    judged_at: tuple[str, Estimate]
+    bounds: tuple[float, float]
+    feet_along: tuple[tuple[str, Estimate], ...]
+
+
+@dataclass(frozen=True, eq=False)
+class _RowBounds:
+    """What decides which rows take part at a place.
+
+    Attributes:
+        name: of the place. bounds: that were asked for. far: rows of points and of curve observations beyond a share of
+            them, and their lengths in stated sigmas. sums: (2, 3) of the others, see `Used`.
+    """
+
+    name: str
+    bounds: tuple[float, float]
+    far: Sequence[tuple[Indices, Array]]
+    sums: Array
+
+    def will_do(self, asked: ShareRequest) -> bool:
+        """Whether other bounds in the same place need nothing else."""
+        return self.name == asked.judged_at[0] and all(
+            now >= _FAR * then for now, then in zip(asked.bounds, self.bounds, strict=True)
+        )
+
+    def taking_part(self, content: Content, asked: ShareRequest) -> tuple[Mask, Mask]:
+        """(n,) of points and (m,) of curve observations."""
+        points, curves = np.ones(len(content.points), dtype=bool), np.ones(len(content.curves), dtype=bool)
+        for mask, bound, (rows, lengths) in zip((points, curves), asked.bounds, self.far, strict=True):
+            mask[rows[~(lengths <= bound)]] = False
+        return points, curves
+
+
+def _sums(lengths_px: Array, sigma_px: Array) -> tuple[float, float, float]:
+    """How many there are, and the sums of squares."""
+    return float(len(lengths_px)), float(lengths_px @ lengths_px), float(sigma_px @ sigma_px)
+
+
+# ---- a share --------------------------------------------------------------------------------------------------------
+
+
+@dataclass(eq=False)
+class Share:
+    """Consecutive rows of points and of curve observations.
+
+    Attributes:
+        targets: of all. views: that it shows, the first of them with the number `first_view`. first_rows: of points and
+            of curve observations. points, curves: columns by name. left_out: (n,) of points, (m,) of curve
+            observations: True for what does not count; None where all of them do.
+    """
+
+    targets: Mapping[str, Target]
+    views: tuple[View, ...]
+    first_view: int
+    first_rows: tuple[int, int]
+    points: Mapping[str, AnyArray | FileRows]
+    curves: Mapping[str, AnyArray | FileRows]
+    left_out: tuple[Mask, Mask] | None = None
+
+    def __post_init__(self) -> None:
+        self._feet: tuple[str, NDArray[np.float32]] | None = None  # and the name of where they are
+        self._judged: _RowBounds | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**vars(self), "_feet": None, "_judged": None}
+
+    def _content(self) -> Content:
+        points, curves = (
+            {name: read_rows(column) for name, column in columns.items()} for columns in (self.points, self.curves)
+        )
+        for columns in (points, curves):
+            columns["view"] = columns["view"] - np.int32(self.first_view)
+        return Content(self.targets, {}, self.views, Points(**points), Curves(**curves))
+
+    def _loaded(self) -> tuple[Content, Sights]:
+        """What it holds, and the sights of the world in it."""
+        content = self._content()
+        sights = sights_of(content)
+        sights = sights.take(sights.numbers(placements=(None,)))
+        return content, sights if self.left_out is None else sights.used(*(~mask for mask in self.left_out))
+
+    def _feet_of(self, content: Content, sights: Sights, asked: ShareRequest) -> Array:
+        """(m,) where the search for feet starts, known from before or found again: no answer depends on which."""
+        names = [name for name, _ in asked.feet_along]
+        known = self._feet if self._feet is not None and self._feet[0] in names else None
+        feet = None if known is None else known[1].astype(float)
+        for name, estimate in asked.feet_along[names.index(known[0]) + 1 if known else 0 :]:
+            kept = residuals(content, sights, estimate, feet).feet.astype(np.float32)
+            self._feet, feet = (name, kept), kept.astype(float)
+        assert feet is not None
+        return feet
+
+    def _lengths(self, content: Content, sights: Sights, asked: ShareRequest) -> tuple[Array, Array]:
+        """(n,) and (m,) lengths of the residuals where the rows are judged, in stated sigmas; what decides which take
+        part is remembered.
+        """
+        name, estimate = asked.judged_at
+        there = residuals(content, sights, estimate, self._feet_of(content, sights, asked))
+        lengths, sums, far = relative_lengths(content, there), [], []
+        columns = content.points, content.curves
+        for column, px, own, bound in zip(columns, there.lengths, lengths, asked.bounds, strict=True):
+            rows = np.flatnonzero(~(own <= _FAR * bound))
+            far.append((rows, own[rows]))
+            sums.append(_sums(np.delete(px, rows), np.delete(column.sigma_px, rows)))
+        self._judged = _RowBounds(name, asked.bounds, far, np.array(sums))
+        return lengths
+
+    def _judged_by(self, content: Content, sights: Sights, asked: ShareRequest) -> _RowBounds:
+        """What decides which rows take part, from before where that will do."""
+        known = self._judged
+        if known is None or not known.will_do(asked):
+            self._lengths(content, sights, asked)
+        assert self._judged is not None
+        return self._judged
+
+    # ---- answers ----------------------------------------------------------------------------------------------------
+
+    def looked(self, asked: ShareRequest) -> Looked:
+        """What the residuals are like where the rows are judged."""
+        content, sights = self._loaded()
+        points, curves = self._lengths(content, sights, asked)
+        there, (p, c) = _rows_in(content, sights), asked.bounds
+        view = np.concatenate([content.points.view, content.curves.view])
+        inside = np.concatenate([points <= p, curves <= c])
+        relative = np.concatenate([points / asked.weighting.point_scale, curves / asked.weighting.curve_scale])[inside]
+        count, size = np.where(np.arange(len(view)) < len(points), 2, 1), len(self.views)
+        return Looked(
+            Histogram.of(points),
+            Histogram.of(curves),
+            self.first_view + np.arange(size),
+            np.bincount(view[inside], count[inside], size),
+            np.asarray(np.bincount(view[inside], relative**2, size), dtype=float),
+            np.bincount(view[there & ~inside], minlength=size),
+        )
+
+    def blocks(self, asked: ShareRequest, numbers: Mapping[tuple[str, str], Array]) -> CompressedBlocks:
+        """Compressed blocks at some numbers, by kind and name of what owns them."""
+        answers: dict[SightKey, Array] = {}
+        for sight, problem in self._problems(asked):
+            cost = SightCost(Run(), sight, problem, asked.estimate)
+            rows = cost.block([numbers[owner] for owner in owners_of(sight.key, cost.slots)])
+            if rows is None:
+                return CompressedBlocks(None)
+            answers[sight.key] = compressed(rows)
+        return CompressedBlocks(answers)
+
+    def normals(self, asked: ShareRequest) -> SightNormals:
+        """Normal equations of the rows that take part, at the estimate."""
+        return SightNormals(
+            {sight.key: normals_of(sight, problem, asked.estimate) for sight, problem in self._problems(asked)}
+        )
+
+    def used(self, asked: ShareRequest) -> Used:
+        """Which rows take part, and how far off the others are."""
+        content, sights = self._loaded()
+        judged = self._judged_by(content, sights, asked)
+        world = np.split(_rows_in(content, sights_of(content)), [len(content.points)])
+        sums, rows, sigmas = judged.sums.copy(), [], []
+        for kind, column in enumerate((content.points, content.curves)):
+            far, lengths = judged.far[kind]
+            inside, sigma_px = lengths <= asked.bounds[kind], column.sigma_px[far]
+            sums[kind] += _sums((lengths * sigma_px)[inside], sigma_px[inside])
+            out = ~inside & world[kind][far]
+            rows.append(self.first_rows[kind] + far[out])
+            sigmas.append(lengths[out])
+        return Used(sums, (rows[0], rows[1]), (sigmas[0], sigmas[1]))
+
+    def _problems(self, asked: ShareRequest) -> Iterator[tuple[Sights, Problem]]:
+        """Each sight with the rows that take part, and its problem."""
+        content, sights = self._loaded()
+        part = sights.used(*self._judged_by(content, sights, asked).taking_part(content, asked))
+        feet = self._feet_of(content, sights, asked)
+        problem = Problem(part, asked.layout, (), asked.weighting, feet=feet)
+        return ((sight, problem) for sight in part)
+
+
+def _rows_in(content: Content, sights: Sights) -> Mask:
+    """(n + m,) the rows that the sights of the world show."""
+    rows = np.zeros(len(content.points) + len(content.curves), dtype=bool)
+    world = sights.take(sights.numbers(placements=(None,)))
+    rows[world.point_rows] = rows[len(content.points) + world.curve_rows] = True
+    return rows
+
+
+def owners_of(key: SightKey, slots: Sequence[int]) -> list[tuple[str, str]]:
+    """What owns the numbers that a sight of the world depends on: its camera (0), station (1), structure (3)."""
+    every = {0: ("camera", key.camera), 1: ("station", key.station), 3: ("structure", "")}
+    return [every[slot] for slot in slots]
+
+
+def cut(observations: Observations, left_out: tuple[Mask, Mask] | None = None) -> Iterator[Share]:
+    """The observations of targets that lie in the world, in shares of whole views."""
+    points, curves = observations.points, observations.curves
+    for first, last in _ranges(observations):
+        (p, q), (c, d) = ((int(ends[first]), int(ends[last])) for ends in observations.ends)
+        own = [
+            {name: rows_of(array, start, stop) for name, array in vars(column).items()}
+            for column, start, stop in ((points, p, q), (curves, c, d))
+        ]
+        out = None if left_out is None else (left_out[0][p:q], left_out[1][c:d])
+        yield Share(observations.targets, observations.views[first:last], first, (p, c), own[0], own[1], out)
+
+
+def _ranges(observations: Observations) -> list[tuple[int, int]]:
+    """First view and the one after the last of each share."""
+    before = observations.ends[0] + observations.ends[1]
+    stops = np.searchsorted(before, np.arange(_ROWS, int(before[-1]), _ROWS))
+    return list(pairwise(dict.fromkeys([0, *stops.tolist(), len(observations.views)])))

@@ -1,0 +1,374 @@
+"""The target as built: how far painted lines, points and boards lie from where they should, as numbers under a sigma.
+
+One vector for everything observed, shared by all frames and cameras: for each segment its offset to the left, for each
+arc its centre's x and y and its radius, for each point its x and y, for each board its warp: two bows, a twist and two
+waves; all in metres, 0 is the nominal target. Behind them come dimensions of targets that are not known, such as a
+field's length: each moves the offsets of many features at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+
+from ceres_cal.base.arrays import Array, Indices, Indices32, Mask, distinct
+from ceres_cal.base.cached import cached_property
+from ceres_cal.base.errors import InputError
+from ceres_cal.base.typed import take_types
+from ceres_cal.observations.sights import Sights
+from ceres_cal.problem.information import Key
+from ceres_cal.scene.curves import Curve
+from ceres_cal.scene.targets import Arc, Segment, Target, target_from_spec
+
+Kind = Literal["lines", "points", "warp"]
+"""What a tolerance speaks of."""
+_NONE = -1
+WARP = ("bow.x", "bow.y", "twist", "wave.x", "wave.y")
+"""What the warp of a board is made of: see `bends_of`."""
+
+
+@dataclass(frozen=True)
+class Tolerance:
+    """Standard deviations of a target as built; 0 means exactly as drawn.
+
+    Attributes:
+        lines_m: of the offset of each segment, and of each arc's centre and radius.
+        points_m: of each point's x and y.
+        warp_m: of each of WARP, where it is largest: a board's bow along each side, its twist, a wave along each side.
+        curve_m: name of a curve -> the same as lines_m, of that one in place of it.
+    """
+
+    lines_m: float = 0.0
+    points_m: float = 0.0
+    warp_m: float = 0.0
+    curve_m: Mapping[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        take_types(self)
+        for name, value in ({**vars(self), **self.curve_m}).items():
+            if name != "curve_m" and not (np.isfinite(value) and value >= 0.0):
+                raise InputError(f"tolerance {name} must be a number of metres from 0 on, not {value}")
+
+
+@dataclass(frozen=True, eq=False)
+class Built:
+    """A target as built: where its points (P, 3) lie, m, and its tracks (3, C, 3, 3) as `Target.tracks` has them."""
+
+    target: Target
+    points: Array
+    tracks: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Structure:
+    """The corrections of all targets.
+
+    Attributes:
+        names: (Z) "target/feature" or "target/feature.x": what each number moves; the last D are dimensions,
+            "target/dimension". values: (Z,) offsets, m, and lengths of dimensions, m. sigma_m: (Z,) tolerance of each;
+            infinite of a dimension, which has a prior, or none.
+        point_slots: (P, 2 + W) which offset moves each point of all targets: x, y and each of WARP; -1 for none.
+        bends: (P, W) how much of each of them a point gets, along +z.
+        track_slots: (T, 3) which offset moves each track: of a segment the offset, of an arc x, y and radius.
+            These three are empty where nothing moves at all.
+        slopes: (Q, D) by how much a dimension moves each of the Q offsets: the numbers' own, and those of features that
+            dimensions alone move. drawn_m: (D,) the dimensions of the targets as drawn.
+    """
+
+    names: tuple[str, ...]
+    values: Array
+    sigma_m: Array
+    point_slots: Indices32
+    bends: Array
+    track_slots: Indices32
+    slopes: Array = field(default_factory=lambda: np.empty((0, 0)))
+    drawn_m: Array = field(default_factory=lambda: np.empty(0))
+
+    @property
+    def own(self) -> int:
+        """How many of the numbers are offsets."""
+        return len(self.names) - len(self.drawn_m)
+
+    @property
+    def dimensions(self) -> dict[str, float]:
+        """Name and length, m, of each dimension that is among the numbers."""
+        return dict(zip(self.names[self.own :], self.values[self.own :].tolist(), strict=True))
+
+    @cached_property
+    def keys(self) -> tuple[Key, ...]:
+        """(Z) of the numbers."""
+        kinds = ["structure"] * self.own + ["dimension"] * len(self.drawn_m)
+        return tuple(Key.of_structure(name, kind) for name, kind in zip(self.names, kinds, strict=True))
+
+    @cached_property
+    def sizes_m(self) -> Array:
+        """(Z,) natural sizes: tolerances, and the dimensions as drawn."""
+        return np.concatenate([self.sigma_m[: self.own], self.drawn_m])
+
+    @property
+    def offsets(self) -> Array:
+        """(Q,) m."""
+        if not len(self.drawn_m):
+            return self.values
+        offsets = self.slopes @ (self.values[self.own :] - self.drawn_m)
+        offsets[: self.own] += self.values[: self.own]
+        return np.asarray(offsets)
+
+    @cached_property
+    def mixing(self) -> Array | None:
+        """(Q, Z) derivatives of the offsets by the numbers; None where these are the offsets."""
+        if not len(self.drawn_m):
+            return None
+        return np.hstack([np.eye(len(self.slopes))[:, : self.own], self.slopes])
+
+    def chain(self, before: int, behind: int) -> Array | None:
+        """(before + Q + behind, before + Z + behind) the same among other numbers, which stay what they are."""
+        if self.mixing is None:
+            return None
+        rows, columns = self.mixing.shape
+        whole = np.zeros((before + rows + behind, before + columns + behind))
+        whole[:before, :before], whole[before + rows :, before + columns :] = np.eye(before), np.eye(behind)
+        whole[before : before + rows, before : before + columns] = self.mixing
+        return whole
+
+    def with_values(self, values: Array) -> Structure:
+        """The same corrections with other numbers."""
+        return replace(self, values=np.array(values, dtype=float)) if len(self.values) else self
+
+    def carrying(self, *others: Structure) -> Structure:
+        """The same corrections with the numbers that others have for them; as drawn where those have none."""
+        known = dict(zip(self.names[self.own :], self.drawn_m.tolist(), strict=True))
+        for other in others:
+            known |= zip(other.names, other.values.tolist(), strict=True)
+        return self.with_values(np.array([known.get(name, 0.0) for name in self.names]))
+
+    def redrawn(self) -> Structure:
+        """The same of targets that are drawn with the dimensions as they are here."""
+        return replace(self, drawn_m=self.values[self.own :].copy())
+
+    def points(self, sights: Sights) -> Array:
+        """(N, 3) where the observed points of the sights lie, m."""
+        return self._points(sights.points, sights.point_index)
+
+    def tracks(self, sights: Sights) -> Array:
+        """(T, 3, 3) the tracks of all targets as built."""
+        return self._tracks(sights.tracks, sights.is_arc)
+
+    def built_into(self, sights: Sights) -> Sights:
+        """The sights of targets that were drawn as they are built."""
+        if not len(self.values):
+            return sights
+        return replace(sights, points=self.points(sights), tracks=self.tracks(sights))
+
+    def built(self, targets: Mapping[str, Target]) -> dict[str, Built]:
+        """Every target as built; `targets` are those that the corrections were made for, in that order."""
+        points = np.concatenate([target.point_array for target in targets.values()])
+        tracks = np.concatenate([target.tracks.reshape(-1, 3, 3) for target in targets.values()])
+        is_arc = np.concatenate([np.tile(target.is_arc, 3) for target in targets.values()])
+        points, tracks = self._points(points, np.arange(len(points))), self._tracks(tracks, is_arc)
+        built = {}
+        for name, target in targets.items():
+            own, points = np.split(points, [len(target.points)])
+            curves, tracks = np.split(tracks, [3 * len(target.curves)])
+            built[name] = Built(target, own, curves.reshape(3, -1, 3, 3))
+        return built
+
+    def _points(self, points: Array, feature: Indices) -> Array:
+        if not len(self.values):
+            return points
+        moved = np.append(self.offsets, 0.0)[self.point_slots[feature]]  # slot -1 is the 0 at the end
+        bow = np.sum(moved[:, 2:] * self.bends[feature], axis=1)
+        return np.asarray(points + np.column_stack([moved[:, :2], bow]))
+
+    def _tracks(self, given: Array, is_arc: Mask) -> Array:
+        if not len(self.values):
+            return given
+        moved = np.append(self.offsets, 0.0)[self.track_slots]
+        tracks = given.copy()
+        straight = ~is_arc
+        along = tracks[straight, 1, :2]
+        length = np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-300)
+        tracks[straight, 0, :2] += moved[straight, :1] * np.column_stack([-along[:, 1], along[:, 0]]) / length
+        tracks[is_arc, 0, :2] += moved[is_arc, :2]
+        tracks[is_arc, 1, 0] += moved[is_arc, 2]
+        tracks[is_arc, 2, 1] += moved[is_arc, 2]
+        return tracks
+
+
+EXACT = Structure(
+    (),
+    np.empty(0),
+    np.empty(0),
+    np.empty((0, 2 + len(WARP)), dtype=np.int32),
+    np.empty((0, len(WARP))),
+    np.empty((0, 3), dtype=np.int32),
+)
+"""All targets as drawn."""
+
+
+def make_structure(
+    targets: Mapping[str, Target], tolerances: Mapping[str, Tolerance], dimensions: Collection[str] = ()
+) -> Structure:
+    """The corrections that the tolerances free, all 0, and dimensions, "target/dimension", as drawn.
+
+    Raises:
+        InputError: a tolerance or a dimension names a target that is not there, a dimension that it does not have or
+            that moves nothing, or a warp of a target that does not bow.
+    """
+    for name in tolerances:
+        if name not in targets:
+            raise InputError(f"a tolerance names target {name!r}: there are {', '.join(map(repr, targets))}")
+    if all(tolerance == Tolerance() for tolerance in tolerances.values()) and not dimensions:
+        return EXACT
+    every = [of for name, target in targets.items() for of in _tolerated(name, target, tolerances)]
+    names = [name for name, sigma_m in every if sigma_m > 0.0]
+    sigmas = [sigma_m for _, sigma_m in every if sigma_m > 0.0]
+    others = [name for name, sigma_m in every if not sigma_m > 0.0] if dimensions else []
+    drawn_m, slopes = dimension_slopes((*names, *others), targets, dimensions)
+    for name, column in zip(dimensions, slopes.T, strict=True):
+        if not np.any(column):
+            raise InputError(f"no line or point lies elsewhere with another {name}: it cannot be solved for")
+    moved = np.any(slopes != 0.0, axis=1) | (np.arange(len(slopes)) < len(names))
+    place = {name: row for row, name in enumerate(np.array([*names, *others])[moved].tolist())}
+    return Structure(
+        (*names, *dimensions),
+        np.array([*np.zeros(len(names)), *drawn_m]),
+        np.array([*sigmas, *np.full(len(drawn_m), np.inf)]),
+        *_slots(targets, place),
+        slopes[moved],
+        drawn_m,
+    )
+
+
+def _tolerated(name: str, target: Target, tolerances: Mapping[str, Tolerance]) -> Iterator[tuple[str, float]]:
+    """Everything of a target that may be offset, and its tolerance, in the order of the solver's numbers."""
+    tolerance = tolerances.get(name, Tolerance())
+    for curve_name, curve in target.curves.items():
+        sigma_m = tolerance.curve_m.get(curve_name, tolerance.lines_m)
+        yield from ((f"{name}/{curve_name}{part}", sigma_m) for part in _parts_of(curve))
+    if tolerance.warp_m > 0.0 and not target.bows:
+        raise InputError(
+            f"a warp is for checkerboards and boards like them: target {name!r}, of kind {target.kind!r}, does not bow"
+        )
+    yield from ((f"{name}/{part}", tolerance.warp_m) for part in WARP)
+    for point_name in target.points:
+        yield from ((f"{name}/{point_name}.{axis}", tolerance.points_m) for axis in "xy")
+
+
+def _parts_of(curve: Curve) -> tuple[str, ...]:
+    return (".x", ".y", ".radius") if isinstance(curve, Arc) else ("",)
+
+
+def _slots(targets: Mapping[str, Target], place: Mapping[str, int]) -> tuple[Indices32, Array, Indices32]:
+    """Point slots, bends and track slots, by the place of each offset."""
+    point_slots, bends, track_slots = [], [], []
+    for name, target in targets.items():
+        curves = []
+        for curve_name, curve in target.curves.items():
+            slots = [place.get(f"{name}/{curve_name}{part}", _NONE) for part in _parts_of(curve)]
+            curves.append(slots + [_NONE] * (3 - len(slots)))
+        track_slots += curves * 3  # the paint's centre and both edges move together
+        warp = [place.get(f"{name}/{part}", _NONE) for part in WARP]
+        for point_name in target.points:
+            point_slots.append([place.get(f"{name}/{point_name}.{axis}", _NONE) for axis in "xy"] + warp)
+        bends.append(bends_of(target))
+    return (
+        np.array(point_slots, dtype=np.int32).reshape(-1, 2 + len(WARP)),
+        np.concatenate(bends),
+        np.array(track_slots, dtype=np.int32).reshape(-1, 3),
+    )
+
+
+def numbers_by_kind(structure: Structure, targets: Mapping[str, Target]) -> dict[tuple[str, Kind], Indices]:
+    """(target, kind) -> which of the structure's numbers are of it, where there are any."""
+    numbers: dict[tuple[str, Kind], Indices] = {}
+    if not structure.names:
+        return numbers
+    points = np.cumsum([0, *(len(target.points) for target in targets.values())])
+    curves = 3 * np.cumsum([0, *(len(target.curves) for target in targets.values())])
+    for place, name in enumerate(targets):
+        own = structure.point_slots[points[place] : points[place + 1]]
+        tracks = structure.track_slots[curves[place] : curves[place + 1]]
+        kinds: tuple[tuple[Kind, Indices32], ...] = (("lines", tracks), ("points", own[:, :2]), ("warp", own[:, 2:]))
+        every = {
+            (name, kind): distinct(slots[(slots >= 0) & (slots < structure.own)]).astype(np.int64)
+            for kind, slots in kinds
+        }
+        numbers |= {of: slots for of, slots in every.items() if len(slots)}
+    return numbers
+
+
+def bends_of(target: Target) -> Array:
+    """(N, W) of a board, x and y from -1 to 1 between its edges: 1 - x^2, 1 - y^2, x y and what is odd along a side,
+    x (1 - x^2) and y (1 - y^2) with 1 as their largest; 0 where it does not bow.
+    """
+    if not target.bows or not target.points:
+        return np.zeros((len(target.points), len(WARP)))
+    flat = target.point_array[:, :2]
+    half = 0.5 * np.ptp(flat, axis=0)
+    across = (flat - flat.min(axis=0) - half) / half
+    bows = 1.0 - across**2
+    return np.column_stack([bows, across[:, 0] * across[:, 1], 1.5 * np.sqrt(3.0) * across * bows])
+
+
+_STEP = 1e-3  # of a dimension: features move in proportion
+
+
+def dimensions_of(targets: Mapping[str, Target]) -> dict[str, float]:
+    """The lengths, m, of all targets, as "target/dimension"."""
+    return {f"{name}/{one}": length for name, target in targets.items() for one, length in target.dimensions.items()}
+
+
+def dimension_slopes(
+    offsets: Sequence[str], targets: Mapping[str, Target], dimensions: Collection[str]
+) -> tuple[Array, Array]:
+    """Lengths (D,) of dimensions, m, and how they move features: (Q, D) metres of each offset per metre.
+
+    Raises:
+        InputError: a dimension that no target has.
+    """
+    place, known = {name: row for row, name in enumerate(offsets)}, dimensions_of(targets)
+    columns = np.zeros((len(offsets), len(dimensions)))
+    for column, name in enumerate(dimensions):
+        if name not in known:
+            raise InputError(f"there is no dimension {name!r} to be solved for: there are {', '.join(known) or 'none'}")
+        target, _, dimension = name.partition("/")
+        spec = targets[target].spec
+        other = target_from_spec({**spec, dimension: (1.0 + _STEP) * known[name]}, target)
+        for feature, moved_m in _differences(target, targets[target], other):
+            if feature in place:
+                columns[place[feature], column] = moved_m / (_STEP * known[name])
+    return np.array([known[name] for name in dimensions]), columns
+
+
+def features_of(target: Target, dimension: str) -> frozenset[str]:
+    """The points and curves that lie elsewhere with another value of a dimension."""
+    other = redrawn(target, {dimension: (1.0 + _STEP) * target.dimensions[dimension]})
+    moved = (name for name, moved_m in _differences("", target, other) if moved_m != 0.0)
+    return frozenset(name[1:].partition(".")[0] for name in moved)
+
+
+def redrawn(target: Target, lengths_m: Mapping[str, float]) -> Target:
+    """A target with other dimensions."""
+    return target_from_spec({**target.spec, **lengths_m}, "target") if lengths_m else target
+
+
+def _differences(name: str, target: Target, other: Target) -> Iterator[tuple[str, float]]:
+    """By how much each number of one target's structure brings it to another, m."""
+    for feature, curve in target.curves.items():
+        there = other.curves[feature]
+        if isinstance(curve, Arc) and isinstance(there, Arc):
+            x, y = np.subtract(there.centre, curve.centre)[:2]
+            yield f"{name}/{feature}.x", float(x)
+            yield f"{name}/{feature}.y", float(y)
+            yield f"{name}/{feature}.radius", there.radius_m - curve.radius_m
+        elif isinstance(curve, Segment) and isinstance(there, Segment):
+            x, y = np.subtract(curve.end, curve.start)[:2] / curve.length_m
+            yield f"{name}/{feature}", float(np.subtract(there.start, curve.start)[:2] @ (-y, x))
+    for feature, place in target.points.items():
+        x, y = np.subtract(other.points[feature], place)[:2]
+        yield f"{name}/{feature}.x", float(x)
+        yield f"{name}/{feature}.y", float(y)

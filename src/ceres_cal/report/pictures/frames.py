@@ -1,0 +1,111 @@
+"""Which photograph shows what: frames by their names, what lies in them, and what was observed there."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ceres_cal.base.arrays import Mask
+from ceres_cal.base.errors import InputError
+from ceres_cal.base.words import frame_of
+from ceres_cal.calibration import Calibration
+from ceres_cal.observations import Columns, Observations
+from ceres_cal.report.pictures.model import Model, model_seen
+from ceres_cal.report.pictures.overlay import TAKEN_OUT, USED, Marks
+
+Shown = tuple[tuple[str, str | None], ...]
+"""Target and placement of each thing that a frame shows."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One photograph: its frame's name, the station that took it, what it shows, and numbers of its views."""
+
+    name: str
+    station: str
+    shown: Shown
+    views: tuple[int, ...] = ()
+
+
+def frames_of(observations: Observations) -> tuple[Frame, ...]:
+    """The frames of each station, in the order of their views."""
+    rows_of: dict[tuple[str, str], list[int]] = {}
+    for number, view in enumerate(observations.views):
+        rows_of.setdefault((view.frame, view.station), []).append(number)
+    return tuple(
+        Frame(
+            name,
+            station,
+            tuple((view.target, view.placement) for view in map(observations.views.__getitem__, rows)),
+            tuple(rows),
+        )
+        for (name, station), rows in rows_of.items()
+    )
+
+
+def frame_by_name(calibration: Calibration, station: str, name: str) -> Frame:
+    """What a photograph shows as far as the calibration alone tells: what lies in the world, and the board or rings
+    whose placement has the photograph's name.
+
+    Raises:
+        InputError: there is neither.
+    """
+    movable = [target for target, one in calibration.targets.items() if one.movable]
+    shown: list[tuple[str, str | None]] = [(target, None) for target in calibration.targets if target not in movable]
+    if name in calibration.placements and len(movable) == 1:
+        shown.append((movable[0], name))
+    if not shown:
+        raise InputError(
+            f"there is nothing to draw into {name!r}: the calibration has no field, and no one board placed under that "
+            "name: give the observations, which say what each frame shows"
+        )
+    return Frame(name, station, tuple(shown))
+
+
+def photographs_by_frame(images: Iterable[Path]) -> dict[str, Path]:
+    """Image files by their stem, which is their frame's name.
+
+    Raises:
+        InputError: two images of one stem.
+    """
+    by_frame: dict[str, Path] = {}
+    for path in images:
+        if by_frame.setdefault(frame_of(path), path) != path:
+            raise InputError(f"{path}: has the same name as {by_frame[frame_of(path)]}: give the images of one folder")
+    return by_frame
+
+
+def model_of(calibration: Calibration, frame: Frame, height_m: float = 0.0) -> Model:
+    """The calibration's model of a frame.
+
+    Raises:
+        InputError: the calibration does not know the frame's station, or a target or placement of it.
+    """
+    known: tuple[tuple[str, Mapping[str, object], Sequence[str | None]], ...] = (
+        ("station", calibration.stations, [frame.station]),
+        ("target", calibration.targets, [target for target, _ in frame.shown]),
+        ("placement", calibration.placements, [placement for _, placement in frame.shown]),
+    )
+    for kind, names, wanted in known:
+        for name in wanted:
+            if name is not None and name not in names:
+                raise InputError(f"frame {frame.name!r}: the calibration has no {kind} {name!r}")
+    return model_seen(calibration.estimate, calibration.targets, frame.station, frame.shown, height_m)
+
+
+def marks_of(calibration: Calibration, observations: Observations, frame: Frame) -> tuple[Marks, ...]:
+    """What was observed in a frame: what took part and, where the calibration was made from these observations, what
+    was taken out.
+    """
+    both: tuple[Columns, Columns] = observations.points, observations.curves
+    inliers: Sequence[Mask] = [np.ones(len(columns), dtype=bool) for columns in both]
+    if observations.digest == calibration.digest:
+        inliers = calibration.inlier_masks(observations)
+    here = [np.isin(columns.view, frame.views) for columns in both]
+    pixels = np.concatenate([columns.pixels[rows] for columns, rows in zip(both, here, strict=True)])
+    used = np.concatenate([mask[rows] for mask, rows in zip(inliers, here, strict=True)])
+    marks = Marks(pixels[used], "observed", USED), Marks(pixels[~used], "taken out", TAKEN_OUT, crosses=True)
+    return tuple(one for one in marks if len(one.pixels))

@@ -1,0 +1,246 @@
+"""Straightened images: what a camera without distortion would have seen from the same place.
+
+The straight image's camera is a pinhole on square pixels that looks the same way. It can show less than half a sphere,
+and what lies far off the axis is stretched ever more: therefore an angle of view that is never exceeded.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ceres_cal.base.arrays import Array, Mask
+from ceres_cal.base.errors import InputError
+from ceres_cal.base.transforms import Pose
+from ceres_cal.report.pictures.warp import Warp, make_warp, require_size
+from ceres_cal.scene.camera import Camera, in_image
+from ceres_cal.scene.lens import Brown
+
+WIDEST_DEG = 150.0
+MOST_STRETCH = 4.0
+_LEAST_DEG, _MOST_DEG = 1.0, 175.0
+_BORDER_STEP_PX = 0.25
+_RIM_STEPS = 20_000
+_HALVINGS = 60
+_ANGLE_STEP = 1e-6
+_ENDLESS = 1e12  # a stretch that no limit is meant to forbid
+_ROUGHLY = 2000  # places of the outline, for the search
+_GRID, _ROUNDS, _SHRINK = 9, 24, 0.6
+_ASPECTS = np.linspace(-1.2, 1.2, _GRID)  # logarithms
+_COUNTED = 100_000  # pixels of a photograph, about, of which it is told whether they are shown
+
+
+@dataclass(frozen=True, eq=False)
+class Straight:
+    """How photographs of one camera are straightened.
+
+    Attributes:
+        camera: the straight image's own: a pinhole at the photograph's pose. What it projects and locates holds in
+            the straight image.
+        warp: makes the images.
+        share: of the photograph's pixels, that the straight image shows.
+        limit_deg: angle off the axis from which on nothing is shown, because the lens has no answer there or draws
+            pixels out too much, or for `angle_deg`; None where the photograph ends before.
+    """
+
+    camera: Camera
+    warp: Warp
+    share: float
+    limit_deg: float | None
+
+    @property
+    def view_deg(self) -> tuple[float, float]:
+        """Angles of view across and down, between the image's edges."""
+        edges = np.array([[-0.5, -0.5], np.array(self.camera.image_size) - 0.5])
+        low, high = np.degrees(np.arctan((edges - self.camera.principal_point) / self.camera.phi))
+        return float(high[0] - low[0]), float(high[1] - low[1])
+
+
+def straighten(
+    camera: Camera,
+    *,
+    whole: bool = False,
+    size: tuple[int, int] | None = None,
+    phi: float | None = None,
+    angle_deg: float | None = None,
+) -> Straight:
+    """How to straighten a camera's photographs.
+
+    Args:
+        camera: any lens, with the pose that the straight image's camera shall have.
+        whole: everything that the photograph shows, with black around it; else the largest upright rectangle in which
+            every pixel shows something (OpenCV's alpha 1 and 0, but the pixels stay square).
+        size: (width, height) px of the straight image; the photograph's by default.
+        phi: instead of a size: the focal length, px; the camera's own keeps the scale in the middle.
+        angle_deg: what is farther than half of it off the axis is left out: whatever the lens, a straight image ends
+            before 180 degrees. None: 150 and, of a rectangle, as far as pixels are not drawn out more than 4 times as
+            in the middle. What lies close to where a lens folds is nothing but that.
+
+    Raises:
+        InputError: an image without pixels or too large, or nothing within the angle.
+    """
+    if angle_deg is not None and not _LEAST_DEG <= angle_deg <= _MOST_DEG:
+        raise InputError(f"the angle of view must be {_LEAST_DEG:g} to {_MOST_DEG:g} degrees, not {angle_deg:g}")
+    if phi is not None and not (np.isfinite(phi) and phi > 0.0):
+        raise InputError(f"phi must be above 0 px, not {phi:g}")
+    wanted = camera.image_size if size is None else size
+    require_size(wanted, "ask for another size")
+    stretch = np.inf if whole or angle_deg is not None else MOST_STRETCH
+    region = _region(camera, _last_angle(camera, np.radians(0.5 * (angle_deg or WIDEST_DEG)), stretch))
+    aspect = wanted[0] / wanted[1] if phi is None else None
+    box = _box(region) if whole else _largest_rectangle(region, aspect)
+    new_phi, new_size = _scaled(box, wanted, phi, whole=whole)
+    require_size(new_size, "ask for another phi, a size or another angle of view")
+    centre = 0.5 * (np.array(new_size) - 1.0) - new_phi * 0.5 * (box[0] + box[1])
+    straight = Camera(new_size, new_phi, (centre[0], centre[1]), Brown(), 1.0, camera.cam_from_world)
+    optics = camera.at(Pose.identity())
+
+    def places(pixels: Array) -> Array:
+        across = (pixels - centre) / new_phi
+        there = optics.project(np.column_stack([across, np.ones(len(across))]))
+        there[np.hypot(across[:, 0], across[:, 1]) > region.slope] = np.nan
+        return there
+
+    warp = make_warp(new_size, camera.image_size, places)
+    return Straight(straight, warp, _share_shown(camera, straight, region.slope), region.limit_deg)
+
+
+def _scaled(box: Array, wanted: tuple[int, int], phi: float | None, *, whole: bool) -> tuple[float, tuple[int, int]]:
+    """Focal length and (width, height) of an image of a box (2, 2) at depth 1: its low and high corner."""
+    across, down = box[1] - box[0]
+    if phi is None:
+        return float(min(wanted[0] / across, wanted[1] / down)), wanted
+    extent = np.array([across, down]) * phi
+    count = np.ceil(extent - 1e-6) if whole else np.floor(extent + 1e-6)
+    return float(phi), (int(count[0]), int(count[1]))
+
+
+def _share_shown(camera: Camera, straight: Camera, slope: float) -> float:
+    """The share of the photograph's pixels, of every few, whose centres fall into the straight image."""
+    width, height = camera.image_size
+    step = max(1, int(np.sqrt(width * height / _COUNTED)))
+    grid = np.meshgrid(np.arange(0.0, width, step), np.arange(0.0, height, step))
+    there = _at_depth_1(camera, np.column_stack([part.ravel() for part in grid]), slope)
+    return float(np.mean(in_image(there * straight.phi + straight.principal_point, straight.image_size)))
+
+
+# ---- what a photograph shows of the plane at depth 1 ----------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class _Region:
+    """The part of the plane at depth 1 that a photograph shows, without holes.
+
+    Attributes:
+        slope: distance from the axis beyond which nothing is shown. limit_deg: the same as an angle; None where the
+            photograph ends before.
+        outline: (Q, 2) places along its border, without order.
+    """
+
+    camera: Camera
+    slope: float
+    limit_deg: float | None
+    outline: Array
+
+    def holds(self, places: Array) -> Mask:
+        """(N,) whether the photograph shows these places (N, 2)."""
+        pixels = self.camera.at(Pose.identity()).project(np.column_stack([places, np.ones(len(places))]))
+        near = np.hypot(places[:, 0], places[:, 1]) <= self.slope
+        return np.asarray(near & in_image(pixels, self.camera.image_size))
+
+
+def _at_depth_1(camera: Camera, pixels: Array, slope: float) -> Array:
+    """Where the rays of pixels (N, 2) meet the plane at depth 1, (N, 2); NaN beyond the slope."""
+    rays = camera.rays(pixels)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        there = rays[:, :2] / np.where(rays[:, 2:] > 0.0, rays[:, 2:], np.nan)
+        there[np.hypot(there[:, 0], there[:, 1]) > slope] = np.nan
+    return np.asarray(there)
+
+
+def _region(camera: Camera, angle: float) -> _Region:
+    slope = float(np.tan(angle))
+    border = _at_depth_1(camera, _border(camera.image_size), slope)
+    turn = np.linspace(0.0, 2.0 * np.pi, _RIM_STEPS, endpoint=False)
+    rim = slope * (1.0 - 1e-9) * np.column_stack([np.cos(turn), np.sin(turn)])
+    pixels = camera.at(Pose.identity()).project(np.column_stack([rim, np.ones(len(rim))]))
+    rim = rim[in_image(pixels, camera.image_size)]
+    outline = np.concatenate([border[np.isfinite(border[:, 0])], rim])
+    if not len(outline):
+        raise InputError(
+            f"no pixel of the camera looks to within {np.degrees(angle):.1f} degrees of its axis: "
+            "its principal point lies far outside of the image"
+        )
+    return _Region(camera, slope, float(np.degrees(angle)) if len(rim) else None, outline)
+
+
+def _last_angle(camera: Camera, most_rad: float, most_stretch: float) -> float:
+    """The angle off the axis, up to `most_rad`, to which the lens has answers and draws nothing out more than that.
+
+    Measured along the image's x axis: lenses are the same all around, but for Brown's decentring.
+    """
+
+    def answers(angle: float) -> bool:
+        angles = np.array([angle - _ANGLE_STEP, angle])
+        rays = np.column_stack([np.sin(angles), np.zeros(2), np.cos(angles)])
+        measured = float(np.diff(camera.lens.distort(rays, camera.phi)[:, 0])[0])  # NaN where there is no answer
+        return camera.phi * float(np.diff(np.tan(angles))[0]) <= min(most_stretch, _ENDLESS) * measured
+
+    low, high = 0.0, most_rad
+    if answers(high):
+        return high
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if answers(middle) else (low, middle)
+    return low
+
+
+def _border(size: tuple[int, int]) -> Array:
+    """Pixels (N, 2) along the border of an image, half a pixel outside of its outermost centres."""
+    width, height = size
+    x = np.linspace(-0.5, width - 0.5, int(width / _BORDER_STEP_PX) + 1)
+    y = np.linspace(-0.5, height - 0.5, int(height / _BORDER_STEP_PX) + 1)
+    sides = [np.column_stack([x, np.full(len(x), end)]) for end in (-0.5, height - 0.5)]
+    sides += [np.column_stack([np.full(len(y), end), y]) for end in (-0.5, width - 0.5)]
+    return np.concatenate(sides)
+
+
+def _box(region: _Region) -> Array:
+    """(2, 2) the low and the high corner around all of it."""
+    return np.array([region.outline.min(axis=0), region.outline.max(axis=0)])
+
+
+def _largest_rectangle(region: _Region, aspect: float | None) -> Array:
+    """(2, 2) the low and the high corner of the largest upright rectangle inside; `aspect` is width over height.
+
+    Around a centre the rectangle grows until it meets the outline: its half height is the smallest of
+    max(|dx| / aspect, |dy|) over the outline. Centre and aspect are sought on a grid that closes in on the best.
+    """
+    rough = region.outline[:: max(1, len(region.outline) // _ROUGHLY)]
+    low, high = _box(region)
+    best = np.append(0.5 * (low + high), 0.0)
+    reach = np.append(0.5 * (high - low), 0.0 if aspect is not None else _ASPECTS[-1])
+    fixed = 1.0 if aspect is None else aspect
+    for _ in range(_ROUNDS):
+        steps = [np.linspace(-1.0, 1.0, _GRID) * r if r > 0.0 else np.zeros(1) for r in reach]
+        tried = best + np.stack(np.meshgrid(*steps, indexing="ij"), axis=-1).reshape(-1, 3)
+        tried = tried[region.holds(tried[:, :2])]
+        if len(tried):
+            aspects = fixed * np.exp(tried[:, 2])
+            areas = aspects * _half_height(rough, tried[:, :2], aspects) ** 2
+            best = tried[np.argmax(areas)]
+        reach = _SHRINK * reach
+    aspects = np.array([fixed * np.exp(best[2])])
+    half = _half_height(region.outline, best[None, :2], aspects)[0] * np.array([aspects[0], 1.0])
+    return np.array([best[:2] - half, best[:2] + half])
+
+
+def _half_height(outline: Array, centres: Array, aspects: Array) -> Array:
+    """(N,) of the rectangles around centres (N, 2) that touch the outline."""
+    return np.array(
+        [
+            np.min(np.maximum(np.abs(outline[:, 0] - x) / aspect, np.abs(outline[:, 1] - y)))
+            for (x, y), aspect in zip(centres, aspects, strict=True)
+        ]
+    )

@@ -1,0 +1,326 @@
+"""Very many observations of the world: some of them decide what there is, all of them say where the numbers are.
+
+A part goes all the way of a calibration: the lens, what does not belong as a whole, targets as built. From its end,
+which is off by the standard deviations of a part, all observations are judged and solved for together, in shares that
+answer with sums (`shares`): here, or wherever an `Engine` has them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+from uuid import uuid4
+
+import numpy as np
+
+from ceres_cal.base.arrays import Array, Indices, Mask, distinct
+from ceres_cal.observations import Observations
+from ceres_cal.observations.sights import SightKey
+from ceres_cal.problem.bundle import Progress, solve
+from ceres_cal.problem.engines import Engine, InProcess, OnWorkers
+from ceres_cal.problem.noise import SAME, Inliers, NoiseScales, Redundancy, noise_of, relative_lengths
+from ceres_cal.problem.parameters import Estimate, Layout
+from ceres_cal.problem.problem import Problem, Weighting
+from ceres_cal.problem.reduced import information
+from ceres_cal.problem.residuals import residuals
+from ceres_cal.problem.shared_cost import SharedObservations, of_world
+from ceres_cal.problem.shares import Share, ShareRequest, cut
+from ceres_cal.problem.sums import Histogram, Looked, Used
+from ceres_cal.robust.competing import Explanation
+from ceres_cal.robust.robust import RobustSolution
+
+# Observations of the part, and views of it at least.
+_PART, _FEWEST_VIEWS = 300_000, 200
+# Relative change of the cost at which a solve of all ends: sums in another order end elsewhere by its root.
+_TO_THE_LAST = 1e-17
+_STANDING_OUT = 12  # views besides, of the largest residuals and of most outliers each
+_MOST_ROUNDS = 8
+_AT_REST = 1e-2  # relative change of a noise scale that is no change, as in `robust`
+
+
+@dataclass(frozen=True, eq=False)
+class Subset:
+    """Some of the observations: all that are not of the world, and whole views of it.
+
+    Attributes:
+        rows: of its points and of its curve observations among all. gone: (n + m,) what does not belong, as a whole.
+    """
+
+    observations: Observations
+    rows: tuple[Indices, Indices]
+    gone: Mask | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Settled:
+    """Where all observations were solved for.
+
+    Attributes:
+        end: of the part there. used: what takes part of the world. explanations: with all their rows.
+    """
+
+    observations: Observations
+    end: RobustSolution
+    used: Used
+    explanations: tuple[Explanation, ...]
+
+
+class Bulk:
+    """Very many observations, and the engine that asks them."""
+
+    def __init__(self, observations: Observations, client: Any = None) -> None:
+        self.observations, self._client = observations, client
+        self._engines: list[InProcess | OnWorkers] = []
+        self._left_out = None
+        if observations.copies.are_there:
+            points, curves = observations.copies.originals
+            self._left_out = ~points, ~curves
+        self._engine = self._engine_without(self._left_out)
+        views = observations.views
+        self._world = np.array([view.placement is None for view in views])
+        self.keys = tuple({SightKey(v.camera, v.station, None): None for v in views if v.placement is None})
+
+    def _engine_without(self, left_out: tuple[Mask, Mask] | None) -> Engine:
+        shares = list(cut(self.observations, left_out))
+        engine = InProcess(shares) if self._client is None else OnWorkers(self._client, shares)
+        self._engines.append(engine)
+        return engine
+
+    def close(self) -> None:
+        """Let all shares go, wherever they are."""
+        for engine in self._engines:
+            engine.close()
+
+    # ---- the part that decides --------------------------------------------------------------------------------------
+
+    def part(self, besides: Indices | None = None) -> Subset:
+        """Views of the world, evenly, and these besides; everything that is not of the world."""
+        counts = np.diff(self.observations.ends[0]) + np.diff(self.observations.ends[1])
+        shown = np.flatnonzero(self._world & (counts > 0))
+        most = min(max(_FEWEST_VIEWS, len(shown) * _PART // int(counts[shown].sum())), len(shown))
+        chosen = ~self._world
+        chosen[shown[np.linspace(0, len(shown) - 1, most).astype(np.int64)]] = True
+        chosen[besides if besides is not None else shown[:0]] = True
+        step = max(1, int(counts[chosen & self._world].sum()) // (2 * _PART))
+        rows = [
+            np.concatenate(
+                [np.arange(ends[v], ends[v + 1], step if self._world[v] else 1) for v in np.flatnonzero(chosen)]
+            )
+            for ends in self.observations.ends
+        ]
+        return Subset(self.observations.part(*rows), (rows[0], rows[1]))
+
+    def standing_out(self, end: RobustSolution) -> Indices:
+        """Views whose residuals are the largest at a solution of a part, and those with most outliers."""
+        looked = self.look(self._engine, end.solution.estimate, end.problem.weighting, _bounds(end))[1]
+        spare = np.maximum(looked.equations, 1.0)
+        above = (looked.squares / spare - 1.0) * np.sqrt(spare) * (looked.equations > 0)
+        worst = [looked.view[np.argsort(-by, kind="stable")[:_STANDING_OUT]] for by in (above, looked.beyond)]
+        return distinct(np.concatenate(worst))
+
+    # ---- all of them ------------------------------------------------------------------------------------------------
+
+    def settled(
+        self,
+        part: Subset,
+        problem: Problem,
+        end: RobustSolution,
+        explanations: Sequence[Explanation],
+        progress: Callable[[Progress], None] | None,
+    ) -> Settled:
+        """All observations judged and solved for, from the end of a part.
+
+        Args:
+            problem: of all of the part.
+        """
+        every = tuple(replace(one, rows=self._rows_of(one, part)) for one in explanations)
+        taken = [(mine.rows, one.rows) for mine, one in zip(explanations, every, strict=True) if one.is_taken]
+        gone, engine = np.zeros(len(part.observations.points) + len(part.observations.curves), dtype=bool), self._engine
+        if taken:
+            gone = np.any([mine for mine, _ in taken], axis=0)
+            engine = self._engine_without(self._also(np.any([rows for _, rows in taken], axis=0)))
+        rounds = _SumRounds(self, engine, replace(part, gone=gone), problem, end, progress)
+        return Settled(self.observations, rounds.end(), rounds.used(), every)
+
+    def _rows_of(self, explanation: Explanation, part: Subset) -> Mask:
+        """(N + M,) all observations of a whole of which the part has some."""
+        few, split = part.observations, len(part.observations.points)
+        masks = []
+        for is_curve, (own, column) in enumerate(
+            ((few.points, self.observations.points), (few.curves, self.observations.curves))
+        ):
+            rows = np.flatnonzero(explanation.rows[split:] if is_curve else explanation.rows[:split])
+            features, views = distinct(own.feature[rows]), np.zeros(len(self._world), dtype=bool)
+            views[own.view[rows]] = True
+            if np.count_nonzero(views & self._world) > 1:  # a feature in all frames
+                shown = {(few.views[v].station, few.views[v].target) for v in np.flatnonzero(views)}
+                views = np.array([(view.station, view.target) in shown for view in few.views]) & self._world
+            masks.append(views[column.view] & np.isin(column.feature, features))
+        return np.concatenate(masks)
+
+    def _also(self, rows: Mask) -> tuple[Mask, Mask]:
+        """What does not count: copies, and these rows (N + M,)."""
+        points, curves = np.split(rows, [len(self.observations.points)])
+        return (points, curves) if self._left_out is None else (points | self._left_out[0], curves | self._left_out[1])
+
+    def look(
+        self, engine: Engine, estimate: Estimate, weighting: Weighting, bounds: tuple[float, float],
+        along: tuple[tuple[str, Estimate], ...] = (),
+    ) -> tuple[str, Looked]:  # fmt: skip
+        """What residuals are like at an estimate, which is given a name. along: where feet were sought before."""
+        here = uuid4().hex, of_world(estimate)
+        blank = Layout({}, frozenset(), frozenset())
+        return here[0], engine.ask(Share.looked, ShareRequest(here[1], blank, weighting, here, bounds, (*along, here)))
+
+
+@dataclass(frozen=True, eq=False)
+class _BulkResiduals:
+    """Residuals at an estimate: the name of the shares' ones, what these are like, and the lengths of the part's, in
+    stated sigmas.
+    """
+
+    name: str
+    estimate: Estimate
+    looked: Looked
+    lengths: tuple[Array, Array]
+    placed: tuple[Mask, Mask]
+
+    def noise(self, redundancy: Redundancy, problem: Problem) -> NoiseScales:
+        """What they say of the noise."""
+        return noise_of(*self._histograms, redundancy, problem.options)
+
+    def inside(self, noise: NoiseScales) -> tuple[int, int]:
+        """How many points and curve observations are no outliers."""
+        points, curves = self._histograms
+        return points.within(noise.bounds[0]).count, curves.within(noise.bounds[1]).count
+
+    @property
+    def _histograms(self) -> tuple[Histogram, Histogram]:
+        own = [Histogram.of(lengths[mask]) for lengths, mask in zip(self.lengths, self.placed, strict=True)]
+        return self.looked.points + own[0], self.looked.curves + own[1]
+
+
+class _SumRounds:
+    """The rounds of all observations: judged, solved for, until the same ones take part."""
+
+    def __init__(
+        self, bulk: Bulk, engine: Engine, part: Subset, problem: Problem, end: RobustSolution,
+        progress: Callable[[Progress], None] | None,
+    ) -> None:  # fmt: skip
+        self._bulk, self._engine, self._part, self._few = bulk, engine, part, part.observations
+        self._problem, self._progress = problem, progress
+        placed = np.flatnonzero([key.placement is not None for key in problem.sights.keys])
+        self._core = problem.sights.take(placed)
+        masks = np.zeros(len(self._few.points), dtype=bool), np.zeros(len(self._few.curves), dtype=bool)
+        masks[0][self._core.point_rows] = masks[1][self._core.curve_rows] = True
+        self._placed, self._before = masks, end
+        self._along: tuple[tuple[str, Estimate], ...] = ()
+        self._seen = self._look(end.solution.estimate, _bounds(end), end.problem.weighting)
+
+    def _look(self, estimate: Estimate, bounds: tuple[float, float], weighting: Weighting) -> _BulkResiduals:
+        name, looked = self._bulk.look(self._engine, estimate, weighting, bounds, self._along)
+        self._along = (*self._along, (name, of_world(estimate)))
+        self._there = residuals(self._few, self._problem.sights, estimate)
+        points, curves = relative_lengths(self._few, self._there)
+        if self._part.gone is not None:
+            gone = np.split(self._part.gone, [len(points)])
+            points, curves = np.where(gone[0], np.inf, points), np.where(gone[1], np.inf, curves)
+        return _BulkResiduals(name, estimate, looked, (points, curves), self._placed)
+
+    def _judged(self, noise: NoiseScales) -> Problem:
+        """The problem of what takes part, judged at the last estimate."""
+        seen, options = self._seen, self._problem.options
+        points, curves = noise.bounds
+        inside = seen.lengths[0] <= points, seen.lengths[1] <= curves
+        equations = 2 * seen.looked.points.within(points).count + seen.looked.curves.within(curves).count
+        judged_at = seen.name, of_world(seen.estimate)
+        judged = SharedObservations(self._engine, self._bulk.keys, equations, judged_at, noise.bounds, self._along)
+        weighting = Weighting(noise.points, noise.curves, options.loss, options.loss_scale)
+        return replace(
+            self._problem,
+            sights=self._core.used(*inside),
+            weighting=weighting,
+            feet=self._there.feet,
+            smoothness=self._before.problem.smoothness,
+            elsewhere=judged,
+        )
+
+    def end(self) -> RobustSolution:
+        """The end of the rounds, with what all observations say there."""
+        unknowns = self._problem.unknowns(self._seen.estimate)
+        rounds, solution = 0, self._before.solution
+        noise = self._noise(Redundancy.by_count(sum(self._seen.looked.equations), unknowns))
+        while rounds < _MOST_ROUNDS:
+            problem = self._judged(noise)
+            solution, rounds = solve(problem, self._seen.estimate, self._progress, precision=_TO_THE_LAST), rounds + 1
+            inside = self._seen.inside(noise)
+            self._seen = self._look(solution.estimate, noise.bounds, problem.weighting)
+            redundancy = Redundancy.by_count(problem.equations, unknowns)
+            before, noise = noise, self._noise(redundancy)
+            if _alike(noise, before) and _same_rows(self._seen.inside(noise), inside):
+                break
+        assert isinstance(problem.elsewhere, SharedObservations)
+        here = replace(problem.elsewhere, feet_along=self._along)  # else shares would seek those of before again
+        reduced = information(replace(problem, elsewhere=here), solution.estimate)
+        counts = self._seen.inside(noise)
+        points, curves = (
+            1.0 - own / max(n, 1) for own, n in zip(reduced.leverages, (2 * counts[0], counts[1]), strict=True)
+        )
+        self.noise = self._noise(Redundancy(points, curves))
+        inliers = Inliers.by_noise(*self._seen.lengths, self.noise)
+        problem = replace(
+            problem,
+            sights=self._problem.used(inliers.points, inliers.curves).sights,
+            feet=self._there.feet,
+            elsewhere=None,
+        )
+        return RobustSolution(problem, solution, inliers, self._there, self._before.rounds + rounds, reduced)
+
+    def _noise(self, redundancy: Redundancy) -> NoiseScales:
+        return self._seen.noise(redundancy, self._problem)
+
+    def used(self) -> Used:
+        """What takes part at the end, of the world."""
+        judged = self._judged(self.noise)
+        assert isinstance(judged.elsewhere, SharedObservations)
+        used = self._engine.ask(Share.used, judged.elsewhere.asked(judged, self._seen.estimate)) + self._used_here()
+        (p, c), (far_p, far_c) = used.rows, used.sigmas
+        first, then = np.argsort(p), np.argsort(c)
+        return Used(used.sums, (p[first], c[then]), (far_p[first], far_c[then]))
+
+    def _used_here(self) -> Used:
+        """The same of what is not of the world."""
+        sums, rows, sigmas = [], [], []
+        columns = self._few.points, self._few.curves
+        each = zip(
+            columns,
+            self._seen.lengths,
+            self._placed,
+            self.noise.bounds,
+            self._there.lengths,
+            self._part.rows,
+            strict=True,
+        )
+        for column, lengths, placed, bound, px, row in each:
+            inside = placed & (lengths <= bound)
+            sums.append((np.count_nonzero(inside), np.sum(px[inside] ** 2), np.sum(column.sigma_px[inside] ** 2)))
+            rows.append(row[placed & ~inside])
+            sigmas.append(lengths[placed & ~inside])
+        return Used(np.array(sums, dtype=float), (rows[0], rows[1]), (sigmas[0], sigmas[1]))
+
+
+def _bounds(end: RobustSolution) -> tuple[float, float]:
+    """Lengths in stated sigmas from which on observations are outliers, about."""
+    sigmas = end.problem.options.reject_sigma
+    return sigmas * end.inliers.point_scale, sigmas * end.inliers.curve_scale
+
+
+def _alike(noise: NoiseScales, before: NoiseScales) -> bool:
+    """Whether no scale changed."""
+    return all(abs(now - then) <= _AT_REST * then for now, then in zip(noise[:2], before[:2], strict=True))
+
+
+def _same_rows(now: tuple[int, int], before: tuple[int, int]) -> bool:
+    """Whether about as many take part."""
+    return all(abs(one - other) <= SAME * other**0.5 for one, other in zip(now, before, strict=True))

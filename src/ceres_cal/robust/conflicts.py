@@ -1,0 +1,352 @@
+"""Wald's test of what is stated: how far everything else is from it.
+
+With C the covariance of some numbers x, P what their priors say of them and z = sum P_j (x - mean_j) their slope,
+everything else says M = C^-1 - P and stands at x + M^-1 z; a prior j is d = x + M^-1 z - mean_j away from that, with
+covariance M^-1 + P_j^-1, and the squared distance is Fisher's F. A number that is held is a prior without width, z the
+slope of the cost along it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import reduce
+from operator import add
+from typing import NamedTuple
+
+import numpy as np
+
+from ceres_cal.base.arrays import Array
+from ceres_cal.base.errors import CalibrationError
+from ceres_cal.base.numerical import numerical
+from ceres_cal.base.tails import log_f_tail
+from ceres_cal.observations import Observations
+from ceres_cal.problem.bundle import solve
+from ceres_cal.problem.costs import robust_weights
+from ceres_cal.problem.information import Information, Key
+from ceres_cal.problem.parameters import Estimate
+from ceres_cal.problem.priors import GaussianPrior
+from ceres_cal.problem.problem import Problem
+from ceres_cal.problem.quantities import moved, natural_sizes, values_of
+from ceres_cal.problem.reduced import ReducedInformation, information
+from ceres_cal.problem.residuals import residuals
+from ceres_cal.robust.robust import RobustSolution, solve_robustly
+from ceres_cal.robust.stated import (
+    LEVEL,
+    Conflict,
+    Statement,
+    WaldTest,
+    contradicted,
+    contradicting,
+    grouped,
+    statements,
+)
+
+LARGEST_FREEDOM = 1e6
+"""Degrees of freedom that count as infinitely many."""
+_LEAST_TOLD = 1e-7  # of what is known of a number, the share that others must bring to speak of it
+_STATED = 1e-14  # eigenvalue, at unit diagonal, from which on a direction counts as stated
+# Of a standard deviation, and at most of a number's natural size, to either side, for the slope of the cost along what
+# is held.
+_STEP, _MOST_STEP = 0.1, 1e-3
+
+
+class Rest(NamedTuple):
+    """What everything else says of a statement's numbers: a step from an estimate, and how well that is known."""
+
+    estimate: Estimate
+    step: Array
+    information: Information
+    freedom: float
+
+
+def linear_rest(statement: Statement, end: RobustSolution, observations: Observations) -> Rest:
+    """By the linear picture where the problem with the statement was solved."""
+    estimate, freedom = end.solution.estimate, min(end.inliers.degrees_of_freedom, LARGEST_FREEDOM)
+    if statement.priors:
+        reduced = end.reduced or information(end.problem, estimate)
+        stated = reduce(add, (prior.information for prior in statement.priors), Information.nothing(statement.keys))
+        at = reduced.shared.columns(stated.keys)
+        slope = np.zeros(len(stated.keys))
+        for prior in statement.priors:
+            slope[stated.columns(prior.keys)] += prior.information.matrix @ prior.offsets(estimate)
+        matrix, step = _beside(reduced.shared.inverse[np.ix_(at, at)], stated.matrix, slope)
+        rest = Information(stated.keys, matrix)
+    else:
+        freed = statement.left_out(end.problem, estimate)
+        rest = information(freed, estimate).shared.marginal(statement.keys)
+        slope = -_slopes(end.problem, observations, estimate, rest)
+        step = rest.inverse @ slope
+    # It swells the noise that the rest is measured by, as far as the linear picture goes.
+    noise = max(freedom - float(slope @ step), 1.0) / freedom if end.inliers.degrees_of_freedom < np.inf else 1.0
+    return Rest(estimate, step, Information(rest.keys, rest.matrix / noise), freedom)
+
+
+def _beside(covariance: Array, stated: Array, slope: Array) -> tuple[Array, Array]:
+    """M = C^-1 - P and the step M^-1 z, both 0 where M is lost in rounding beside P."""
+    root, back = _roots(stated, _LEAST_TOLD)
+    share, turned = np.linalg.eigh(root.T @ covariance @ root)
+    share = np.clip(share, 1e-300, None)
+    told = share < 1.0 - _LEAST_TOLD
+    root, back, rest = root @ turned[:, told], back @ turned[:, told], 1.0 / share[told] - 1.0
+    return np.asarray(root * rest @ root.T), np.asarray(back @ (back.T @ slope / rest))
+
+
+def _roots(stated: Array, least: float) -> tuple[Array, Array]:
+    """(n, k) R and B with R R^T = P and B^T R = 1, over what is stated by more than the least at unit diagonal."""
+    size = np.sqrt(np.where(np.diagonal(stated) > 0.0, np.diagonal(stated), 1.0))[:, None]
+    values, vectors = np.linalg.eigh(stated / size / size.T)
+    kept = values > least
+    vectors, root = vectors[:, kept], np.sqrt(values[kept])
+    return size * vectors * root, vectors / root / size
+
+
+def _slopes(problem: Problem, observations: Observations, estimate: Estimate, rest: Information) -> Array:
+    """Derivative of the cost by what is held, everything else where it is."""
+    weighting = problem.weighting
+    sigmas = (
+        weighting.point_scale * observations.points.sigma_px[:, None],
+        weighting.curve_scale * observations.curves.sigma_px,
+    )
+
+    def standardised(there: Estimate) -> tuple[Array, Array]:
+        seen = residuals(observations, problem.sights, there, problem.feet)
+        return np.nan_to_num(seen.points / sigmas[0]), np.nan_to_num(seen.curves / sigmas[1])
+
+    points, curves = standardised(estimate)
+    weights = robust_weights(weighting, np.concatenate([np.sum(points**2, axis=1), curves**2]))
+    points, curves = points * weights[: len(points), None], curves * weights[len(points) :]
+    slopes, sizes = [], natural_sizes(estimate, rest.keys)
+    for number, stated in enumerate(np.diagonal(rest.matrix)):
+        if not stated > 0.0:  # the rest says nothing of it
+            slopes.append(0.0)
+            continue
+        step = np.zeros(len(rest.keys))
+        step[number] = min(_STEP / np.sqrt(stated), _MOST_STEP * sizes[number])
+        above, below = (standardised(moved(estimate, rest.keys, sign * step)) for sign in (1.0, -1.0))
+        change = np.sum(points * (above[0] - below[0])) + curves @ (above[1] - below[1])
+        slopes.append(float(change) / (2.0 * step[number]))
+    return np.array(slopes)
+
+
+def rest_at(statement: Statement, end: RobustSolution) -> Rest:
+    """Where a problem without the statement was solved."""
+    estimate = end.solution.estimate
+    reduced = end.reduced or information(end.problem, estimate)
+    freedom = min(end.inliers.degrees_of_freedom, LARGEST_FREEDOM)
+    return Rest(estimate, np.zeros(len(statement.keys)), reduced.shared.marginal(statement.keys), freedom)
+
+
+def worst_test(statement: Statement, rest: Rest) -> WaldTest:
+    """The test of what is farthest off of a statement."""
+    if not statement.priors:
+        off = values_of(rest.estimate, statement.keys) + rest.step - statement.held
+        return _tested(off, None, rest)
+    tests = []
+    for prior in statement.priors:
+        at = rest.information.columns(prior.keys)
+        own = Rest(rest.estimate, rest.step[at], rest.information.marginal(prior.keys), rest.freedom)
+        tests.append(_tested(prior.offsets(rest.estimate) + own.step, prior.information, own))
+    return min(tests, key=lambda test: test.log_p)
+
+
+def _tested(off: Array, stated: Information | None, rest: Rest) -> WaldTest:
+    """The test of numbers that are off by so much; `stated` None: they were held."""
+    matrix = rest.information.matrix
+    squared = max(float(off @ matrix @ off), 0.0) if stated is None else _squared(off, stated.matrix, matrix)
+    own = np.zeros(len(off)) if stated is None else stated.spread.sd
+    others, keys = rest.information.spread.sd, rest.information.keys
+    with np.errstate(invalid="ignore"):
+        apart = np.nan_to_num(np.abs(off) / np.hypot(own, others))
+    worst = int(np.argmax(apart))
+    value = float(values_of(rest.estimate, [keys[worst]])[0] + rest.step[worst])
+    return WaldTest(
+        squared,
+        log_probability(squared, rest),
+        keys[worst],
+        (value - float(off[worst]), float(own[worst])),
+        (value, float(others[worst])),
+        float(apart[worst]),
+    )
+
+
+def _squared(off: Array, stated: Array, rest: Array) -> float:
+    """off^T (M^-1 + P^-1)^-1 off: where everything else, M, says nothing beside what is stated, P, it is 0 however far
+    off that seems.
+    """
+    root, back = _roots(stated, _STATED)
+    told, turn = np.linalg.eigh(back.T @ rest @ back)  # in directions in which each is stated to one
+    along = off @ root @ turn
+    return float(np.sum(np.where(told > _LEAST_TOLD, told / (1.0 + told), 0.0) * along**2))
+
+
+def log_probability(squared: float, rest: Rest) -> float:
+    """Natural logarithm of the probability of so large a squared distance."""
+    rank = max(rest.information.known_rank, 1)
+    return float(log_f_tail(squared / rank, rank, max(rest.freedom, 1.0)))
+
+
+# Probability of a linear picture from which on it is worth another solve: 2.5 sigma.
+_SUSPICIOUS = 0.0124
+_MOST = 4  # solves
+_RIVAL = 0.6  # of the largest squared distance: a statement as far off may be the wrong one instead
+
+
+@dataclass(frozen=True, eq=False)
+class Conflicts:
+    """What contradicts what, and how the numbers move with each of it.
+
+    Attributes:
+        every: the conflicts. shifts: (K,) each, of the keys (K) of what is shared: by how much everything moves when a
+            statement in conflict is left out.
+    """
+
+    every: tuple[Conflict, ...] = ()
+    keys: tuple[Key, ...] = ()
+    shifts: tuple[Array, ...] = ()
+
+
+@numerical("the test of what was stated")
+def find_conflicts(
+    problem: Problem, observations: Observations, end: RobustSolution, usual: tuple[float, float] | None = None
+) -> Conflicts:
+    """Everything stated that the rest contradicts, the worst first, each with those before it left out.
+
+    Args:
+        problem: of all the observations. end: its solution. usual: noise scales that were seen before.
+    """
+    every = tuple(statements(problem, observations, end.solution.estimate))
+    if not every:
+        return Conflicts()
+    reduced = end.reduced or information(end.problem, end.solution.estimate)
+    search = _ForwardSelection(problem, end, observations, usual, every)
+    while search.solves < _MOST and search.leave_out_the_worst():
+        pass
+    pairs = list(contradicting(every))
+    shifts = [*(_along(reduced, key, one.seen - one.stated) for key, one in pairs), *search.shifts]
+    return Conflicts((*(one for _, one in pairs), *search.conflicts()), reduced.shared.keys, tuple(shifts))
+
+
+def without_suspicious(problem: Problem, observations: Observations, end: RobustSolution) -> Problem:
+    """The problem without what is stated of cameras and looks wrong where it was solved: it may bend what is said of
+    others. Tolerances stay: a line that its own one does not hold is a line aside.
+    """
+    estimate = end.solution.estimate
+    for one in statements(problem, observations, estimate):
+        if one.kind in ("earlier", "tolerance"):
+            continue
+        if worst_test(one, linear_rest(one, end, observations)).log_p < np.log(_SUSPICIOUS):
+            problem = one.left_out(problem, estimate)
+    return problem
+
+
+def contradicted_by(
+    priors: Sequence[GaussianPrior], estimate: Estimate, posterior: Information, degrees_of_freedom: float
+) -> str | None:
+    """The prior that a solution without any of them contradicts most, in words; None where it contradicts none."""
+    known = set(posterior.keys)
+    groups = [one for one in grouped([prior.given(known) for prior in priors]) if one.kind == "prior" and one.keys]
+    freedom = min(degrees_of_freedom, LARGEST_FREEDOM)
+    rests = [Rest(estimate, np.zeros(len(one.keys)), posterior.marginal(one.keys), freedom) for one in groups]
+    tests = [worst_test(one, rest) for one, rest in zip(groups, rests, strict=True)]
+    number = min(range(len(tests)), key=lambda i: tests[i].log_p, default=-1)
+    if number < 0 or tests[number].log_p > np.log(LEVEL):
+        return None
+    return contradicted(groups[number], tests[number], True, ()).words
+
+
+def _along(reduced: ReducedInformation, key: Key, offset: float) -> Array:
+    """(K,) how everything free moves with one number that moves by so much."""
+    if key not in reduced.shared.keys:
+        return np.zeros(len(reduced.shared.keys))
+    covariance = reduced.shared.inverse
+    column = reduced.shared.columns([key])[0]
+    return np.asarray(covariance[:, column] / covariance[column, column] * offset)
+
+
+@dataclass(eq=False)
+class _ForwardSelection:
+    """Forward selection: the worst statement is left out, then the worst of the others.
+
+    Attributes:
+        problem, end: without what was left out. left: statements that are not judged yet.
+        out: those in conflict, their tests, and names of others that may be wrong in their place.
+        shifts: see `Conflicts`.
+    """
+
+    problem: Problem
+    end: RobustSolution
+    observations: Observations
+    usual: tuple[float, float] | None
+    every: tuple[Statement, ...]
+
+    def __post_init__(self) -> None:
+        self.left, self.solves = list(self.every), 0
+        self.out: list[tuple[Statement, WaldTest, Sequence[str]]] = []
+        self.shifts: list[Array] = []
+        self._level = float(np.log(LEVEL / len(self.every)))
+        self._first = self.end.reduced or information(self.end.problem, self.end.solution.estimate)
+
+    def leave_out_the_worst(self) -> bool:
+        """Judge the most suspicious statement; False where none is."""
+        tests = [worst_test(one, linear_rest(one, self.end, self.observations)) for one in self.left]
+        number = min(range(len(tests)), key=lambda i: tests[i].log_p, default=-1)
+        if number < 0 or tests[number].log_p > np.log(_SUSPICIOUS):
+            return False
+        suspect, test = self.left.pop(number), tests.pop(number)
+        rivals = [
+            (one, other)
+            for one, other in zip(self.left, tests, strict=True)
+            if one.kind != "usual" and other.squared > _RIVAL * test.squared
+        ]
+        freed = suspect.left_out(self.problem, self.end.solution.estimate)
+        after = None if suspect.kind == "earlier" else self._solved(freed)
+        self.solves += 1
+        test = test if after is None else self._confirmed(suspect, after)
+        if test.log_p > self._level:
+            return True
+        self.out.append((suspect, test, [one.name for one, _ in rivals]))
+        self.shifts += [_along(self._first, t.key, t.seen[0] - t.stated[0]) for _, t in rivals]
+        if after is not None:
+            start = GaussianPrior.about(Information.nothing(self._first.shared.keys), self.end.solution.estimate)
+            self.shifts.append(start.offsets(after.solution.estimate))
+            self.problem, self.end = freed, after
+        return True
+
+    def conflicts(self) -> list[Conflict]:
+        """What is in conflict still when all of it is left out: a wrong height may have made others look wrong."""
+        stated = [one for one in self.every if one.kind != "usual"]
+        alone = all(prior.is_usual for prior in self.problem.priors) and len(self.out) == len(stated)
+        found = []
+        for number, (statement, test, rivals) in enumerate(self.out):
+            if number < len(self.out) - 1 and statement.kind != "earlier":
+                test = worst_test(statement, rest_at(statement, self.end))
+            if test.log_p <= self._level:
+                found.append(contradicted(statement, test, alone, rivals))
+        return found
+
+    def _solved(self, problem: Problem) -> RobustSolution | None:
+        """The problem solved from where the last one ended; None where it cannot be."""
+        try:
+            after = solve_robustly(problem, self.observations, self.end.solution.estimate, self.usual)
+        except CalibrationError:  # quiet: the linear test decides
+            return None
+        return None if after.solution.failed else after
+
+    def _confirmed(self, statement: Statement, after: RobustSolution) -> WaldTest:
+        """The test where the problem without the statement was solved. In a bent valley the least squares themselves
+        say how far apart the two are: by how much they rise, over the same observations, when the statement is added.
+        """
+        rest = rest_at(statement, after)
+        test = worst_test(statement, rest)
+        without = after.problem.weighted(replace(after.problem.weighting, loss="trivial"))
+        bound = replace(without, priors=self.problem.priors, layout=self.problem.layout)
+        try:
+            least, most = solve(without, rest.estimate), solve(bound, self.end.solution.estimate)
+        except CalibrationError:  # quiet: the linear test decides
+            return test
+        rise = max(2.0 * (most.cost - least.cost), 0.0)  # of exact observations it is rounding
+        if rise >= test.squared or len(statement.priors) > 1:
+            return test
+        share = float(np.sqrt(rise / test.squared))
+        return test._replace(squared=rise, log_p=log_probability(rise, rest), sigmas=test.sigmas * share)

@@ -1,0 +1,76 @@
+"""Other minima of few observations: where a solve ends that begins at another phi.
+
+A floor seen by few points and lines may be explained from two places, by two lenses; a start cannot tell which of the
+minima is the least, nor that there are two.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import replace
+
+from ceres_cal.base.arrays import Array
+from ceres_cal.base.errors import CalibrationError
+from ceres_cal.observations import Observations
+from ceres_cal.problem.bundle import Solution, solve
+from ceres_cal.problem.information import Information
+from ceres_cal.problem.parameters import Estimate
+from ceres_cal.problem.problem import Problem
+from ceres_cal.problem.quantities import difference
+from ceres_cal.robust.robust import RobustSolution
+
+_FEW = 300  # equations from which on one minimum was seen: the cases mended had under 200
+_FACTORS = 0.7, 0.85, 1.15, 1.4  # on phi: the other valleys that were seen began within a sixth
+_MOST_ITERATIONS = 30  # of each: along a flat valley the solver creeps for hundreds that change nothing here
+# Share of what the normal equations say that another minimum costs at most: the same one, not quite reached, costs all.
+_OTHER = 0.25
+_LOWER = 1.0  # of twice the cost: rounding is less, and what is no lower than that is as likely
+
+
+def least_of_few(
+    problem: Problem, observations: Observations, end: RobustSolution
+) -> tuple[RobustSolution, tuple[Solution, ...]]:
+    """The end of all rounds in the least minimum that is found from there, and others, with what they cost beyond it;
+    where all observations are inliers.
+
+    Args:
+        problem: of all the observations. end: of its rounds.
+    """
+    count = end.problem.sights.equations
+    if count >= _FEW or count < problem.sights.equations:  # what was taken out belongs to the minimum it was judged in
+        return end, ()
+    least = solve(end.problem, end.solution.estimate)
+    others = list(_elsewhere(end.problem, least.estimate))
+    lowest = min(others, key=lambda one: one.cost, default=least)
+    if 2.0 * (least.cost - lowest.cost) > _LOWER:
+        others.append(least)
+        least = solve(end.problem, lowest.estimate)
+        end = replace(end.moved_to(least.estimate, observations, problem), reduced=None)
+    return end, tuple(replace(one, cost=one.cost - least.cost) for one in others)
+
+
+def shifts_to(
+    others: Sequence[Solution], estimate: Estimate, information: Information, half_width: float
+) -> list[Array]:
+    """(K,) from the estimate to each other minimum that costs no more than 95 % intervals reach.
+
+    Args:
+        others: with what they cost beyond the estimate. information: by the model, about the K numbers.
+        half_width: standard deviations from the middle to an end of an interval.
+    """
+    shifts = [(one, difference(one.estimate, estimate, information.keys)) for one in others]
+    return [d for one, d in shifts if 2.0 * one.cost < min(half_width**2, _OTHER * float(d @ information.matrix @ d))]
+
+
+def _elsewhere(problem: Problem, estimate: Estimate) -> Iterator[Solution]:
+    """Where solves end that begin with other phis; the same minimum may come again."""
+    short = replace(problem.options, max_iterations=min(_MOST_ITERATIONS, problem.options.max_iterations))
+    for name in [name for name, numbers in problem.layout.free.items() if 0 in numbers]:
+        for factor in _FACTORS:
+            camera = estimate.cameras[name]
+            start = replace(estimate, cameras={**estimate.cameras, name: replace(camera, phi=factor * camera.phi)})
+            with suppress(CalibrationError):  # quiet: nothing is seen from there, so no minimum is
+                solution = solve(replace(problem, options=short), start, is_near=False)
+                if not solution.failed:
+                    yield solution

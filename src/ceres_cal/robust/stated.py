@@ -1,0 +1,202 @@
+"""What is stated of a problem's numbers beforehand, each for itself, and how one of it is contradicted in words."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+
+from ceres_cal.base.arrays import Array
+from ceres_cal.base.tails import log_chi2_tail
+from ceres_cal.base.words import two_digits
+from ceres_cal.observations import Observations
+from ceres_cal.problem.information import Key
+from ceres_cal.problem.parameters import Estimate, Options
+from ceres_cal.problem.priors import GaussianPrior
+from ceres_cal.problem.problem import Problem
+from ceres_cal.problem.quantities import intrinsic_keys, values_of
+
+LEVEL = 1e-3
+"""Probability of a conflict where everything stated is right, over all that is stated: a conflict takes a calibration's
+word back, so it is as rare as a coin that falls on one side ten times."""
+_FACTORS = {1e3: "mm", 1e2: "cm", 1.0 / 0.3048: "feet", 1.0 / 0.0254: "inches", 1e-3: "km"}
+_STATED = {"prior": "stated", "usual": "usual", "fixed": "held", "tolerance": "drawn", "earlier": "known"}
+_NEAR = 0.1  # relative: how near a unit must bring the two to be the likely cause
+
+
+@dataclass(frozen=True)
+class Conflict:
+    """Something known beforehand that everything else contradicts.
+
+    Attributes:
+        kind: "prior", "usual" (what nobody stated), "fixed", "tolerance", "earlier" (the posterior of an earlier
+            calibration) or "priors" (two of them contradict each other). owner, quantity, unit: of the number.
+        stated, stated_sd: what was known; the sd of what was fixed is 0.
+        seen, seen_sd: what everything else says, or the other of two priors.
+        sigmas: how far they are apart, in standard deviations of their difference.
+        words: all of it in one line.
+    """
+
+    kind: str
+    owner: str
+    quantity: str
+    unit: str
+    stated: float
+    stated_sd: float
+    seen: float
+    seen_sd: float
+    sigmas: float
+    words: str
+
+
+class WaldTest(NamedTuple):
+    """One prior of a statement, or what it holds, against the rest.
+
+    Attributes:
+        squared: distance, in variances. log_p: natural logarithm of its probability.
+        key: the number that is farthest off, with its mean and sd as stated and as the rest has it; sigmas: how far.
+    """
+
+    squared: float
+    log_p: float
+    key: Key
+    stated: tuple[float, float]
+    seen: tuple[float, float]
+    sigmas: float
+
+
+@dataclass(frozen=True, eq=False)
+class Statement:
+    """Priors on the same numbers, or numbers that are held (no prior)."""
+
+    kind: str
+    keys: tuple[Key, ...]
+    priors: tuple[GaussianPrior, ...]
+    held: Array
+
+    @property
+    def name(self) -> str:
+        """How messages name it."""
+        if self.kind == "earlier":
+            return "the earlier calibration"
+        names = " and ".join(key.quantity for key in self.keys)
+        return f"the {_STATED[self.kind]} {names} of {self.keys[0].whose}"
+
+    def left_out(self, problem: Problem, estimate: Estimate) -> Problem:
+        """The problem without it."""
+        if self.priors:
+            rest = [prior.without(self.keys) if is_plain(prior) else prior for prior in problem.priors]
+            return replace(problem, priors=tuple(prior for prior in rest if prior.keys))
+        camera = estimate.cameras[self.keys[0].owner]
+        every = intrinsic_keys(self.keys[0].owner, camera.lens)
+        freed = np.union1d(problem.layout.free[self.keys[0].owner], [every.index(key) for key in self.keys])
+        return replace(problem, layout=replace(problem.layout, free={**problem.layout.free, self.keys[0].owner: freed}))
+
+
+def is_plain(prior: GaussianPrior) -> bool:
+    """Whether each number is stated by itself: not a posterior."""
+    matrix = prior.information.matrix
+    return bool(np.count_nonzero(matrix) == np.count_nonzero(np.diagonal(matrix)))
+
+
+def statements(problem: Problem, observations: Observations, estimate: Estimate) -> Iterator[Statement]:
+    """Everything stated of a problem's numbers, and what is held by name; a tolerance that was estimated is none."""
+    tolerances = problem.options.tolerances
+    for one in grouped(problem.stated_at(estimate)):
+        if one.kind != "tolerance" or one.keys[0].owner in tolerances:
+            yield one
+    yield from _held(problem.options, observations, estimate)
+
+
+def grouped(priors: Sequence[GaussianPrior]) -> Iterator[Statement]:
+    """Priors that have a number in common together, tolerances one by one."""
+    groups: list[Statement] = []
+    nothing = np.empty(0)
+    for prior in (one for one in priors if one.keys):
+        if prior.is_usual:
+            yield Statement("usual", prior.keys, (prior,), nothing)
+        elif not is_plain(prior):
+            yield Statement("earlier", prior.keys, (prior,), nothing)
+        elif prior.keys[0].kind == "structure":
+            yield from (Statement("tolerance", (key,), (prior.given([key]),), nothing) for key in prior.keys)
+        else:
+            others = [group for group in groups if set(group.keys) & set(prior.keys)]
+            groups = [group for group in groups if group not in others]
+            together = (*(one for group in others for one in group.priors), prior)
+            keys = tuple(dict.fromkeys(key for one in together for key in one.keys))
+            groups.append(Statement("prior", keys, together, nothing))
+    yield from groups
+
+
+def _held(options: Options, observations: Observations, estimate: Estimate) -> Iterator[Statement]:
+    """What the options hold by name, the principal point as one."""
+    for name in observations.cameras:
+        every = {key.quantity: key for key in intrinsic_keys(name, estimate.cameras[name].lens)}
+        centre = [q for q in ("cx", "cy") if not options.free_principal_point or q in options.fixed]
+        others = [[quantity] for quantity in options.fixed if quantity not in centre]
+        for quantities in ([centre] if centre else []) + others:
+            keys = tuple(every[quantity] for quantity in quantities)
+            yield Statement("fixed", keys, (), values_of(estimate, keys))
+
+
+def stated_value(prior: GaussianPrior, key: Key) -> tuple[float, float]:
+    """Mean and standard deviation of one number."""
+    column = prior.information.columns([key])[0]
+    return float(prior.mean[column]), float(prior.information.spread.sd[column])
+
+
+def number_text(value: float, sd: float, key: Key) -> str:
+    """3.000 ± 0.005 m; of a number that is held its value alone."""
+    unit = "" if key.unit == "1" else f" {key.unit}"
+    if sd == 0.0:
+        return f"{value:g}{unit}"
+    spread = two_digits(sd)
+    places = len(spread.partition(".")[2])
+    text = f"{value:.4g}" if "e" in spread else f"{value:.{places}f}"
+    return f"{text} ± {spread}{unit}"
+
+
+def contradicted(statement: Statement, test: WaldTest, alone: bool, rivals: Sequence[str]) -> Conflict:
+    """A statement in conflict, in words.
+
+    Args:
+        alone: whether nothing but observations stands against it. rivals: names of other statements that may be wrong
+            in its place.
+    """
+    key, who = test.key, "the observations alone say" if alone else "everything else says"
+    about = f"{_STATED[statement.kind]} {key.quantity} of {key.whose}, {number_text(*test.stated, key)}"
+    apart = f"{who} {number_text(*test.seen, key)}, {two_digits(test.sigmas)} sigmas apart"
+    if statement.kind == "usual":
+        words = f"the {about}: {apart}: is the picture a part of another? What is usual was left out"
+        return Conflict(statement.kind, key.owner, key.quantity, key.unit, *test.stated, *test.seen, test.sigmas, words)
+    advice = f"{_in_another_unit(test)}correct or remove it{''.join(f', or else {one}' for one in rivals)}"
+    words = f"the {about}: {apart}: {advice}"
+    return Conflict(statement.kind, key.owner, key.quantity, key.unit, *test.stated, *test.seen, test.sigmas, words)
+
+
+def contradicting(statements: Sequence[Statement]) -> Iterator[tuple[Key, Conflict]]:
+    """Two priors of one number that exclude each other, whatever the observations say, with that number."""
+    every = [(s, key) for s in statements if len(s.priors) > 1 for key in s.keys]
+    for statement, key in every:
+        known = [stated_value(prior, key) for prior in statement.priors if key in prior.keys]
+        for one, other in combinations(known, 2):
+            sigmas = abs(one[0] - other[0]) / float(np.hypot(one[1], other[1]))
+            if log_chi2_tail(sigmas**2, 1.0) <= np.log(LEVEL):
+                words = (
+                    f"two priors contradict each other: {key.quantity} of {key.whose} is stated as "
+                    f"{number_text(*one, key)} and as {number_text(*other, key)}, {two_digits(sigmas)} sigmas apart: "
+                    "correct or remove one"
+                )
+                yield key, Conflict("priors", key.owner, key.quantity, key.unit, *one, *other, sigmas, words)
+
+
+def _in_another_unit(test: WaldTest) -> str:
+    """The likely cause, where the two agree in another unit."""
+    if test.key.unit != "m" or not test.seen[0]:
+        return ""
+    ratio = test.stated[0] / test.seen[0]
+    units = [unit for factor, unit in _FACTORS.items() if abs(ratio / factor - 1.0) < _NEAR]
+    return f"is it in {units[0]}? Give metres; " if units else ""

@@ -1,0 +1,202 @@
+"""Geometry that cannot be: a camera under the floor that it sees from above, or what it sees behind it.
+
+A flat scene fits as well when its picture is mirrored: its columns h1 and h2 of R are mirrored, and r3 = h1 x h2 turns
+round, so that the camera stands as far under the floor as it stood above. Exchanged axes and y upwards are mirrored
+pictures, too, turned about the principal point; residuals tell nothing of any of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from ceres_cal.base.arrays import Array, distinct
+from ceres_cal.base.errors import SolutionError
+from ceres_cal.observations import Observations
+from ceres_cal.observations.sights import Sights
+from ceres_cal.problem.noise import Inliers
+from ceres_cal.problem.parameters import Estimate
+from ceres_cal.problem.problem import Problem
+from ceres_cal.problem.residuals import Residuals
+from ceres_cal.robust.competing import Explanation
+from ceres_cal.robust.robust import RobustSolution
+from ceres_cal.scene.camera import Camera
+
+# The principal point decides where it lies so much nearer to one centre than to the other, that of the image turned
+# over its diagonal; it is a tenth of their distance from its own in the tests' scenes.
+_NEARER = 0.5
+_LARGEST_M = 50.0  # of a target that somebody holds before a camera, from its origin
+_BELOW = 0.5  # of the camera's height over the floor: noise sinks a board by centimetres
+
+
+def require_possible(observations: Observations, sights: Sights, estimate: Estimate, residuals: Residuals) -> None:
+    """Raise SolutionError where a station cannot stand where it does.
+
+    Only a floor is asked that lies in the world: boards are seen from either side, a wall stands upright, a ceiling is
+    above the origin. Give what is seen from below in coordinates whose z points to the camera.
+
+    Args:
+        sights: of all the observations, as the solve took them.
+    """
+    _require_handy(observations)
+    for station, sight in sights.of_world.items():
+        camera = estimate.camera_at(station)
+        floor_m = _floor_m(_places_of_world(observations, sight))
+        if floor_m is not None and camera.position[2] <= min(floor_m, 0.0):
+            raise SolutionError(
+                f"station {station!r}: the camera stands {floor_m - camera.position[2]:.2f} m under the floor that it "
+                f"sees: {_cause(camera)}, or left and right are exchanged in the labels: correct the observations"
+            )
+        _require_ahead(station, sight, residuals)
+        if floor_m is not None:
+            _require_above(floor_m - _BELOW * (camera.position[2] - floor_m), observations, estimate)
+
+
+def _require_handy(observations: Observations) -> None:
+    """Raise SolutionError where nobody could hold a target before a camera: boards alone fit in any unit."""
+    for name, target in observations.targets.items():
+        reach_m = float(np.max(np.linalg.norm(target.places, axis=1)))
+        if target.movable and reach_m > _LARGEST_M:
+            raise SolutionError(
+                f"target {name!r} reaches {reach_m:.0f} m from its origin: give its dimensions in metres"
+            )
+
+
+def _require_above(least_m: float, observations: Observations, estimate: Estimate) -> None:
+    """Raise SolutionError where most placements of a target lie so deep under the floor that its size is wrong."""
+    for name, target in observations.targets.items():
+        placed = dict.fromkeys(v.placement for v in observations.shown_views if v.target == name and v.placement)
+        tops = [float(np.max(estimate.placements[one].transform(target.places)[:, 2])) for one in placed]
+        if target.movable and 2 * np.count_nonzero(np.array(tops) < least_m) > len(tops):
+            raise SolutionError(
+                f"target {name!r} lies up to {-min(tops):.0f} m under the floor: its dimensions are too large, or not "
+                "in metres"
+            )
+
+
+def _require_ahead(station: str, sight: Sights, residuals: Residuals) -> None:
+    """Raise SolutionError where the station has most of what it saw behind it, or beyond its lens."""
+    points, curves = residuals.lengths
+    lengths = np.concatenate([points[sight.point_rows], curves[sight.curve_rows]])
+    behind = np.count_nonzero(~np.isfinite(lengths))
+    if 2 * behind > len(lengths):
+        raise SolutionError(
+            f"station {station!r}: {behind} of the {len(lengths)} observations it has of the world lie behind the "
+            "camera or beyond its lens: check labels and target dimensions"
+        )
+
+
+def _places_of_world(observations: Observations, sight: Sights) -> Array:
+    """(P, 3) m of what a sight shows of targets that nobody put there: its points, starts and ends of its lines, and
+    of its arcs the centre and a quarter.
+    """
+    world = np.array([not observations.targets[view.target].movable for view in observations.views])
+    points = sight.points[world[observations.points.view[sight.point_rows]]]
+    tracks = sight.tracks[distinct(sight.track_index[world[observations.curves.view[sight.curve_rows]]])]
+    return np.concatenate([points, *(tracks[:, 0] + along for along in (0.0, tracks[:, 1], tracks[:, 2]))])
+
+
+def _floor_m(places: Array) -> float | None:
+    """Height of the lowest place, where they lie about level; None where they stand upright, or on a line."""
+    if len(places) < 3:
+        return None
+    _, sizes, axes = np.linalg.svd(places - places.mean(axis=0), full_matrices=False)
+    level = abs(axes[2, 2]) > np.sqrt(0.5) and sizes[1] > 1e-6 * sizes[0]
+    return float(places[:, 2].min()) if level else None
+
+
+def _cause(camera: Camera) -> str:
+    """Which mirrored picture it may be: of an image that is not square the principal point tells swapped axes."""
+    width, height = camera.image_size
+    sizes = np.array([[width, height], [height, width]])
+    off, other = np.linalg.norm(camera.principal_point - (sizes - 1.0) / 2.0, axis=1)
+    if other < _NEARER * off:
+        return "x and y are swapped (its principal point is where that puts it)"
+    swapped = "x and y are swapped" + (", image_size too" if off < _NEARER * other else "")
+    return f"the image is mirrored, or {swapped}, or y points upwards"
+
+
+# Of the image's diagonal, 24 px of 1600: half of a camera's observations farther off is no calibration, while a lens
+# that is too simple stays below a few pixels. Nothing changes from half to double.
+_NO_FIT = 0.015
+# Of the image's diagonal, 240 px of 1600: lenses are mounted within some hundredths, unless a picture was cropped.
+_OFF_CENTRE = 0.15
+# Share of a side that observations of an image usually reach beyond.
+_UNFILLED = 0.9
+# Of the image's diagonal: three standard deviations of usual principal points (`priors.USUAL_CENTRE`).
+_UNUSUAL = 0.045
+
+
+def require_fits(end: RobustSolution, problem: Problem) -> None:
+    """Raise SolutionError where the solve failed, or its end explains too little."""
+    if end.solution.failed:
+        raise SolutionError(f"the solve failed ({end.solution.termination}): check labels and target dimensions")
+    points, curves = end.residuals.lengths
+    for name, camera in end.solution.estimate.cameras.items():
+        own = problem.sights.of_camera(name)
+        limit_px = _NO_FIT * float(np.hypot(*camera.image_size))
+        met = np.count_nonzero(points[own.point_rows] <= limit_px)  # NaN is not
+        met += np.count_nonzero(curves[own.curve_rows] <= limit_px)
+        if 2 * met < len(own.point_rows) + len(own.curve_rows):
+            raise SolutionError(
+                f"camera {name!r}: the best solution misses half of its observations by more than {limit_px:.0f} px: "
+                "check labels, target dimensions and which lens it is"
+            )
+
+
+def all_shown(camera: Camera, sights: Sights) -> bool:
+    """Whether the lens folds nowhere inside of what was observed: the camera's sights `about` it."""
+    places = (sights.pixels, sights.curve_pixels)
+    return all(bool(np.all(camera.lens.shows(pixels, camera.phi))) for pixels in places)
+
+
+def require_usable(end: RobustSolution, problem: Problem, explanations: Sequence[Explanation]) -> tuple[str, ...]:
+    """Warnings about the solution; SolutionError where it must not be used."""
+    warnings = []
+    for name, camera in end.solution.estimate.cameras.items():
+        width, height = camera.image_size
+        off_px = float(np.hypot(*(camera.principal_point - 0.5 * (np.array(camera.image_size) - 1.0))))
+        own = end.problem.sights.of_camera(name)
+        reach = np.concatenate([own.pixels, own.curve_pixels]).max(axis=0, initial=0.0)
+        if off_px > _OFF_CENTRE * np.hypot(width, height) or _is_of_smaller(camera, reach, off_px):
+            warnings.append(
+                f"camera {name!r}: its principal point lies {off_px:.0f} px from the middle of its image of {width} x "
+                f"{height} px, of which observations reach {reach[0]:.0f} x {reach[1]:.0f}: "
+                "is image_size that of the pictures, and are pixels counted from their top-left corner?"
+            )
+        if not camera.folds:
+            continue
+        fold, corner = camera.lens.monotone_radius(camera.phi), camera.corner_radius
+        where = f"camera {name!r}: the solved {camera.lens.kind} lens folds {fold:.0f} px from the principal point"
+        observed = end.problem.sights.of_camera(name).about(camera)
+        if not camera.lens.may_fold or not all_shown(camera, observed):
+            raise SolutionError(
+                f"{where}, inside the image (corner at {corner:.0f} px): "
+                "choose fewer or other coefficients, or observe nearer to the corners"
+            )
+        warnings.append(
+            f"{where}: from there to the corner ({corner:.0f} px) pixels have no answer; "
+            f"observations reach {observed.reach_px:.0f} px"
+        )
+    return (*warnings, *_lost(end.inliers, problem, explanations))
+
+
+def _is_of_smaller(camera: Camera, reach: Array, off_px: float) -> bool:
+    """Whether the principal point suits an image that ends where the observations do, not the stated one."""
+    size = np.array(camera.image_size, dtype=float)
+    other_px = float(np.hypot(*(camera.principal_point - 0.5 * reach)))
+    return bool(
+        np.any(reach < _UNFILLED * size) and off_px > _UNUSUAL * np.hypot(*size) and other_px < _NEARER * off_px
+    )
+
+
+def _lost(inliers: Inliers, problem: Problem, explanations: Sequence[Explanation]) -> Iterator[str]:
+    """Sights most of whose observations were taken out one by one: they were not understood, whatever the rest says."""
+    used = np.concatenate([inliers.points, inliers.curves])
+    for one in explanations:
+        used |= one.rows & one.is_taken
+    shares = problem.sights.used_share(used[: len(inliers.points)], used[len(inliers.points) :])
+    for number in np.flatnonzero(shares < 0.5):
+        out = f"{100.0 * (1.0 - shares[number]):.0f} % of its observations were taken out"
+        yield f"{problem.sights.keys[number]}: {out}: check its labels, do not use its pose"
