@@ -40,7 +40,8 @@ def target_from_spec(spec: Any, where: str) -> Target:
     """
     kind = spec.get("kind") if isinstance(spec, dict) else None
     if not isinstance(kind, str) or kind not in TARGET_KINDS:
-        raise InputError(f"{where}: unknown kind {kind!r}: choose one of {', '.join(TARGET_KINDS)}")
+        missing = '; its description has no "kind"' if kind is None else ""
+        raise InputError(f"{where}: unknown kind {kind!r}: choose one of {', '.join(TARGET_KINDS)}{missing}")
     with naming(where):
         return TARGET_KINDS[kind].from_spec(spec, where)
 
