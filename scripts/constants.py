@@ -73,7 +73,7 @@ def _of(module: str, names: str, *figures: str) -> list[Constant]:
 DECIDING: tuple[Constant, ...] = (
     *_of("problem.parameters", "Options.loss_scale Options.reject_sigma", "calibrate", "diagnose"),
     *_of("problem.ranges", "PHI_RANGE _BUILT _REDRAWN", "calibrate"),
-    *_of("observations.copies", "_SIGMA_RATIO _FAR", "calibrate"),
+    *_of("observations.bounds", "_SIGMA_RATIO _FAR", "calibrate"),
     *_of("robust.usable", "_NO_FIT _OFF_CENTRE", "calibrate"),
     *_of("calibration.calibrating", "_SAYS_LESS", "calibrate"),
     *_of("calibration.lens_forms", "AS_GOOD ALIKE CLEARLY", "lens"),
@@ -83,7 +83,7 @@ DECIDING: tuple[Constant, ...] = (
     *_of("calibration.lens_comparison", "_TOGETHER", "lens"),
     *_of("posterior.roughness", "AGREES", "lens"),
     *_of("calibration.outcome", "_RESTING", "calibrate"),
-    *_of("observations.copies", "_LARGE_M", "calibrate"),
+    *_of("observations.bounds", "_LARGE_M", "calibrate"),
     *_of("robust.robust", "_AT_REST _ENOUGH_PLACEMENTS _MUCH_LESS", "calibrate"),
     *_of("robust.robust", "_AT_REST_AGAIN", "refit"),
     *_of("problem.noise", "_LEAST_SPARE _BORROWED", "calibrate"),

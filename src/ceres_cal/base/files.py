@@ -20,7 +20,7 @@ from typing import IO, Any, Literal, TypeVar
 import msgspec
 
 from ceres_cal.base.errors import InputError
-from ceres_cal.base.words import note
+from ceres_cal.base.written import note
 
 T = TypeVar("T")
 Units = Literal["metres, radians, pixels"]

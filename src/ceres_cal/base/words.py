@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from contextvars import ContextVar
+from collections.abc import Sequence
 from pathlib import PurePath
 
 DASH = "\N{EN DASH}"
@@ -118,24 +116,3 @@ def printable(text: str) -> str:
 def frame_of(image: str | PurePath) -> str:
     """What the frame of an image is called: its name without folder and ending."""
     return printable(PurePath(image).stem)
-
-
-_noted: ContextVar[list[str] | None] = ContextVar("noted", default=None)
-
-
-@contextmanager
-def noting() -> Iterator[list[str]]:
-    """The files that are written while it lasts, as they come."""
-    files: list[str] = []
-    token = _noted.set(files)
-    try:
-        yield files
-    finally:
-        _noted.reset(token)
-
-
-def note(path: object) -> None:
-    """That a file is in its place."""
-    files = _noted.get()
-    if files is not None:
-        files.append(str(path))

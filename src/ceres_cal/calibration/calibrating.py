@@ -16,7 +16,7 @@ from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.outcome import came_out, of_all, of_closed_form, resting_phi, unknown_phi
 from ceres_cal.effects.dependence import Scatter, measure_scatter
 from ceres_cal.observations import Observations
-from ceres_cal.observations.copies import unfilled
+from ceres_cal.observations.bounds import unfilled
 from ceres_cal.observations.sights import Sights, gather_sights
 from ceres_cal.observations.thinning import is_bulk
 from ceres_cal.posterior.assess import assess, with_doubts, with_other_lenses, with_roughness

@@ -1,4 +1,7 @@
-"""The lenses that are compared."""
+"""The lenses that are compared.
+
+Which of several lenses is the simplest that is as good as the best.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Warnings of what the observations leave open: phi that they do not tell, or that rests on what is usual."""
+"""What came out of a solve, as a calibration that is not assessed yet.
+
+Warnings of what the observations leave open: phi that they do not tell, or that rests on what is usual.
+"""
 
 from __future__ import annotations
 

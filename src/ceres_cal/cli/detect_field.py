@@ -164,18 +164,18 @@ def _require_fitting(args: FieldArguments) -> None:
 
 
 @dataclass(frozen=True)
-class _Start:
+class _FieldStart:
     start: Camera | Clicks | Auto
     camera: str
     station: str
     target: Target | None
 
 
-def _start(args: FieldArguments) -> _Start:
+def _start(args: FieldArguments) -> _FieldStart:
     camera = args.camera or "camera"
     if args.start is None:
         start = _auto(args.facing, None) if args.auto else _corners(args.corner)
-        return _Start(start, camera, args.station or camera, None)
+        return _FieldStart(start, camera, args.station or camera, None)
     from ceres_cal.calibration import FORMAT, Calibration
     from ceres_cal.detect.photographs.clicks import load_clicks
     from ceres_cal.detect.photographs.known import is_painted
@@ -183,13 +183,13 @@ def _start(args: FieldArguments) -> _Start:
     if json_object(args.start).get("format") != FORMAT:
         if args.auto:
             raise InputError(f"{args.start}: with --auto only a calibration is of use: leave out --auto, or the file")
-        return _Start(load_clicks(args.start), camera, args.station or camera, None)
+        return _FieldStart(load_clicks(args.start), camera, args.station or camera, None)
     calibration = Calibration.load(args.start)
     posed = calibration.station(args.station)
     station = args.station or next(iter(calibration.stations))
     fields = [target for target in calibration.targets.values() if is_painted(target)]
     name = args.camera or calibration.estimate.stations[station].camera
-    return _Start(
+    return _FieldStart(
         _auto(args.facing, posed) if args.auto else posed, name, station, fields[0] if len(fields) == 1 else None
     )
 

@@ -1,4 +1,7 @@
-"""What a diagnosis finds: the cause by name, how large, how sure."""
+"""What a diagnostic is: a kind of finding with its test and its words; and what it is asked about.
+
+What a diagnosis finds: the cause by name, how large, how sure.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Diagnostics of the observations: wrong labels, shifted points, noise larger than stated, neighbours that agree."""
+"""Diagnostics of the observations: wrong labels, shifted points, noise larger than stated, neighbours that agree.
+
+Observations that the calibration was not made from: whether it holds on them, and boards that it does not know.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,12 @@
-"""Alternatives to a model, a family of each kind, and what the equations say of each: sums over those it moves."""
+"""Score tests of many alternatives at once: their columns against the residuals, beyond what the free numbers take up.
+
+An alternative is a group of equations that some columns move: one line of the field, one frame, everything after a
+frame. With X its columns beyond the free numbers and r the residuals, both in standard deviations, r'X (X'X)^-1 X'r
+over the mean square of what is left is Fisher's F where the noise is normal, and -(X'X)^-1 X'r is the amount that would
+mend it. Of those that the residuals speak for the strongest is chosen first, then what it leaves (forward selection).
+
+Alternatives to a model, a family of each kind, and what the equations say of each: sums over those it moves.
+"""
 
 from __future__ import annotations
 

@@ -1,9 +1,16 @@
-"""Errors that go together along a curve, or over a board, within one view or over all views of a sight.
+"""What the residuals say of the errors' dependence, as one covariance of everything shared (a sandwich).
+
+First what goes together within a view, then whether views scatter as that says (`effects/between.py`). In
+directions in which the model knows everything shared to one (root root^T its covariance) the observations, of
+information A, have a score of covariance C = M - P with P the priors: with S = root^T A and B = S root they say
+A + S^T (C^-1 - B^-1) S instead of A. Priors are as certain as they were; what nothing tells stays unknown.
+
+Errors that go together along a curve, or over a board, within one view or over all views of a sight.
 
 Their covariance falls off with the distance d on the target like exp(-d / l), and over boards, which bend smoothly,
-also like exp(-(d / l)^2 / 2). The likelihood of a grid of lengths l and shares (`likelihood`) weighs them against
-independent errors, and the covariance of the scores is averaged over all (the best alone would be too sure of itself).
-Whether there is anything to look for is asked first (`score_test`).
+also like exp(-(d / l)^2 / 2). The likelihood of a grid of lengths l and shares (`effects/likelihood.py`) weighs them
+against independent errors, and the covariance of the scores is averaged over all (the best alone would be too sure of
+itself). Whether there is anything to look for is asked first, by score tests.
 """
 
 from __future__ import annotations

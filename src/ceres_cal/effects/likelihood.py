@@ -1,4 +1,10 @@
-"""Is there any correlation to look for? Score tests at three lengths, which cost no likelihood.
+"""The restricted likelihood of correlated errors (Patterson and Thompson, Biometrika 58, 1971), over a grid.
+
+The covariance of a strand's residuals is R = s^2 [(1 - a) 1 + a exp(-d / l)]. One set of eigenvectors serves all shares
+a of a length l, and all strands of one shape. Private placements are eliminated, and what all other rows and the priors
+say of the shared numbers is a prior here.
+
+Is there any correlation to look for? Score tests at three lengths, which cost no likelihood.
 
 That of a share a of nothing is r' K r with K = exp(-d / l) - 1, against its expectation -tr(K H) and its variance under
 independent errors, of which the fit took up the part H = U U'. Summed over the strands of one shape first, r r' and H

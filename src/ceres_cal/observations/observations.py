@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike
 from ceres_cal.base.arrays import Indices, Mask
 from ceres_cal.base.cached import cached_property
 from ceres_cal.base.errors import InputError, naming
+from ceres_cal.observations.bounds import odd_sizes, require_alike, stray_pixels
 from ceres_cal.observations.columns import (
     Alone,
     Columns,
@@ -33,7 +34,7 @@ from ceres_cal.observations.columns import (
     taken,
     view_label,
 )
-from ceres_cal.observations.copies import Copies, find_copies, odd_sizes, require_alike, stray_pixels
+from ceres_cal.observations.copies import Copies, find_copies
 from ceres_cal.observations.files import Content, header_of, read_content, write_content
 from ceres_cal.observations.from_points import gathered
 from ceres_cal.scene.targets import Target

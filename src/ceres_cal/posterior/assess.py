@@ -1,4 +1,8 @@
-"""The last step of a calibration: what is known of its numbers, and what to do where phi ran away."""
+"""The last step of a calibration: what is known of its numbers, and what to do where phi ran away.
+
+The posterior with what may be otherwise in it: statements in conflict, wholes that may not belong, other minima,
+lenses rougher than their model, and other lenses.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,15 @@
-"""Cells of the image, and whether residuals of different sights agree in them: what a lens leaves behind.
+"""By how much numbers are off where a lens is rougher than its model follows.
+
+What a lens that is too smooth leaves displaces an image in the same way in all views: no number of views makes that
+less. Bumps along the radius and over the image are columns X beside the free numbers; their coefficients scatter by tau
+(px). With P what all free numbers leave, the residuals r say u = X^T P r of them, and
+
+    Cov u = kappa V + tau^2 V V,    V = X^T P X,
+
+kappa for what goes together within a view. The restricted likelihood of tau, of each kind of bumps, says how rough the
+lens is. By what the free numbers take up of them they are off.
+
+Cells of the image, and whether residuals of different sights agree in them: what a lens leaves behind.
 
 What goes together within a sight alone, as a bent board or a blurred frame has it, is no lens, and does not count: only
 products of different sights do.

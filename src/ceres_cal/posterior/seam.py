@@ -1,4 +1,7 @@
-"""How two cameras stand to each other: baseline and angle, with standard deviations."""
+"""The seam between two cameras: by how much they may, and do, disagree about what both of them see.
+
+How two cameras stand to each other: baseline and angle, with standard deviations.
+"""
 
 from __future__ import annotations
 

@@ -13,8 +13,8 @@ from ceres_cal.base.arrays import Array, median
 from ceres_cal.base.cached import cached_property
 from ceres_cal.base.errors import InputError
 from ceres_cal.base.words import two_digits
+from ceres_cal.posterior.image import ImageMap, image_map
 from ceres_cal.posterior.maps import FieldGrid, FieldMap, PointSpread, field_map, spread_of_points
-from ceres_cal.posterior.other_lenses import ImageMap, image_map
 from ceres_cal.posterior.posterior import Posterior
 from ceres_cal.posterior.seam import RigPair, rig_pairs, seam_map
 from ceres_cal.posterior.weak import Verdict, WeakDirection, ratio_sd, unknown_placements, verdicts, weak_directions

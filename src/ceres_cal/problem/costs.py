@@ -1,4 +1,7 @@
-"""What Ceres calls: the last answer is kept, and an exception ends the solve instead of travelling through C++."""
+"""Cost functions of the observations: compressed sights, eliminated placements.
+
+What Ceres calls: the last answer is kept, and an exception ends the solve instead of travelling through C++.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +30,7 @@ class Run:
     history: list[float] = field(default_factory=list)
 
 
-class Evaluation(NamedTuple):
+class CostValue(NamedTuple):
     """The residuals (N,) in a place, and the flat Jacobians (N, size) of each block there."""
 
     at: Array
@@ -41,7 +44,7 @@ class CachedCost(pyceres.CostFunction):
     def __init__(self, run: Run) -> None:
         super().__init__()
         self._run = run
-        self._known: Evaluation | None = None
+        self._known: CostValue | None = None
 
     def Evaluate(self, parameters: Sequence[Array], residuals: Array, jacobians: Sequence[Array] | None) -> bool:
         try:
@@ -61,7 +64,7 @@ class CachedCost(pyceres.CostFunction):
             self._accept()
         return True
 
-    def _evaluated(self, at: Array, parameters: Sequence[Array]) -> Evaluation | None:
+    def _evaluated(self, at: Array, parameters: Sequence[Array]) -> CostValue | None:
         """The answer in a place, whole and by blocks; None where an observation cannot be projected from there.
 
         For every cost function to say: pyceres' own class has a metaclass that none with abstract methods can join.
@@ -115,7 +118,7 @@ class SightCost(CachedCost):
             return None
         return np.column_stack([*(each.reshape(self.num_residuals(), -1) for each in known.jacobians), known.residuals])
 
-    def _evaluated(self, at: Array, parameters: Sequence[Array]) -> Evaluation | None:
+    def _evaluated(self, at: Array, parameters: Sequence[Array]) -> CostValue | None:
         numbers, jacobians = [kernels.NOTHING, *self._poses, kernels.NOTHING], [kernels.NOTHING] * 4
         rows, mixing = self.num_residuals(), self._structure.mixing
         for place, slot in enumerate(self.slots):
@@ -129,7 +132,7 @@ class SightCost(CachedCost):
         )  # fmt: skip
         if mixing is not None:
             jacobians[_STRUCTURE] = (jacobians[_STRUCTURE].reshape(rows, -1) @ mixing).reshape(-1)
-        return Evaluation(at, residuals, [jacobians[slot] for slot in self.slots]) if answered else None
+        return CostValue(at, residuals, [jacobians[slot] for slot in self.slots]) if answered else None
 
 
 def kernel_loss(weighting: Weighting) -> kernels.Loss:
@@ -192,13 +195,13 @@ class EliminatedCost(CachedCost):
         self.set_num_residuals(self._size + 1)
         self.set_parameter_block_sizes([size for size in sizes if size])
 
-    def _evaluated(self, at: Array, parameters: Sequence[Array]) -> Evaluation | None:
+    def _evaluated(self, at: Array, parameters: Sequence[Array]) -> CostValue | None:
         last = self._eliminated(at, _LEFT_TO_THE_COMPLEMENT)
         if last is None:
             return None
         self._last = last
         sizes = np.cumsum(self.parameter_block_sizes()[:-1])
-        return Evaluation(at, last.residuals, [part.reshape(-1) for part in np.split(last.jacobian, sizes, axis=1)])
+        return CostValue(at, last.residuals, [part.reshape(-1) for part in np.split(last.jacobian, sizes, axis=1)])
 
     def _accept(self) -> None:
         self._accepted = self._last

@@ -1,4 +1,9 @@
-"""Names of the numbers that a calibration is about, each with an owner and a unit.
+"""Information with named keys: what is known of some numbers together, the inverse of a covariance if there is one.
+
+Information adds up; numbers that are held are struck out, numbers that are not asked about are integrated out. Nothing
+is inverted where nothing is known.
+
+Names of the numbers that a calibration is about, each with an owner and a unit.
 
 Intrinsics are in the units of the files. A pose has a position in the world (m) and three turns (rad): of a station
 about the camera's own axes (x right, y down, z forward), of a placement about the target's own. Turns are small angles

@@ -9,7 +9,7 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array
 from ceres_cal.base.transforms import Pose, left_jacobian, rotation_exp, rotation_log, skew
-from ceres_cal.problem.costs import CachedCost, Evaluation, Run
+from ceres_cal.problem.costs import CachedCost, CostValue, Run
 from ceres_cal.problem.information import STATION_QUANTITIES, columns_by_owner
 from ceres_cal.problem.parameters import Estimate, Layout, intrinsic_names, intrinsics_scales
 from ceres_cal.problem.priors import GaussianPrior
@@ -73,12 +73,12 @@ class PriorCost(CachedCost):
         self.set_num_residuals(len(self._root))
         self.set_parameter_block_sizes([part.size for part in self._parts])
 
-    def _evaluated(self, at: Array, parameters: Sequence[Array]) -> Evaluation:
+    def _evaluated(self, at: Array, parameters: Sequence[Array]) -> CostValue:
         off, blocks = -self._mean, list(zip(self._parts, parameters, strict=True))
         for part, block in blocks:
             off[part.columns] += part.values(block)
         slopes = [(self._root[:, part.columns] @ part.slopes(block)).reshape(-1) for part, block in blocks]
-        return Evaluation(at, self._root @ off, slopes)
+        return CostValue(at, self._root @ off, slopes)
 
 
 def _parts(

@@ -1,4 +1,7 @@
-"""How what a camera shows moves with its numbers: exactly, by the loops of the solve."""
+"""The numbers behind the keys: their values in an estimate, their natural sizes, and steps along them.
+
+How what a camera shows moves with its numbers: exactly, by the loops of the solve.
+"""
 
 from __future__ import annotations
 

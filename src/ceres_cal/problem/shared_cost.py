@@ -10,7 +10,7 @@ import numpy as np
 from ceres_cal.base.arrays import Array, Indices
 from ceres_cal.base.transforms import Poses
 from ceres_cal.observations.sights import SightKey
-from ceres_cal.problem.costs import CachedCost, Evaluation, Run
+from ceres_cal.problem.costs import CachedCost, CostValue, Run
 from ceres_cal.problem.engines import Engine
 from ceres_cal.problem.parameters import Estimate
 from ceres_cal.problem.problem import Problem
@@ -73,7 +73,7 @@ class SharedCost(CachedCost):
         self.set_num_residuals(rows)
         self.set_parameter_block_sizes(list(sizes.values()))
 
-    def _evaluated(self, at: Array, parameters: Sequence[Array]) -> Evaluation | None:
+    def _evaluated(self, at: Array, parameters: Sequence[Array]) -> CostValue | None:
         numbers = {owner: at[columns] for owner, columns in self._columns.items()}
         blocks = self._judged.engine.ask(Share.blocks, self._asked, numbers).of
         if blocks is None:
@@ -82,7 +82,7 @@ class SharedCost(CachedCost):
         for key, block in blocks.items():
             columns, rows = self._columns_of(key), slice(row, row + len(block))
             jacobian[rows, columns], residuals[rows], row = block[:, :-1], block[:, -1], row + len(block)
-        return Evaluation(at, residuals, [jacobian[:, columns].reshape(-1) for columns in self._columns.values()])
+        return CostValue(at, residuals, [jacobian[:, columns].reshape(-1) for columns in self._columns.values()])
 
     def _columns_of(self, key: SightKey) -> Indices:
         """Columns of the numbers that a sight depends on."""

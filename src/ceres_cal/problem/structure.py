@@ -4,6 +4,8 @@ One vector for everything observed, shared by all frames and cameras: for each s
 arc its centre's x and y and its radius, for each point its x and y, for each board its warp: two bows, a twist and two
 waves; all in metres, 0 is the nominal target. Behind them come dimensions of targets that are not known, such as a
 field's length: each moves the offsets of many features at once.
+
+The lengths that targets are drawn by, and how another value of one moves points and curves.
 """
 
 from __future__ import annotations

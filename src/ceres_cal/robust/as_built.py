@@ -8,6 +8,8 @@ A board's offsets are not solved for with all the rest: a lens that is too simpl
 displacements of the image explain has no say in them (a module that is cut off; Liu, Bayarri and Berger, Bayesian
 Analysis 4, 2009). The few of a field, which nothing but its cameras together tell, are. The posterior has them under
 their sigmas like any tolerance.
+
+Dimensions of targets that are not known: where their solve starts, and which of them nothing measures.
 """
 
 from __future__ import annotations

@@ -1,4 +1,13 @@
-"""What is said of a whole that may not belong: how far it lies aside, how surely, and what else may be."""
+"""Competing explanations: the same observations without a line that may not belong, as a whole.
+
+A line that lies aside as a whole outvotes the others: the fit goes half of the way towards it, no row of it is an
+outlier, and good rows elsewhere become some. So it is asked of each curve in each frame, of each feature over all
+frames, of each frame and of each placement, whether the rest is better explained without it. The linear model at the
+end of all rounds names a few suspects (see `offsets`), a solve without each of them tells what the rest says of it, and
+the more probable explanation wins.
+
+What is said of a whole that may not belong: how far it lies aside, how surely, and what else may be.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,9 @@
-"""Wald's test of what is stated: how far everything else is from it.
+"""What was known beforehand against what everything else says: stated numbers, held ones, tolerances, an old posterior.
+
+The linear picture of it (Wald's test, below) stands at residuals that a wrong prior has swollen or thrown out as
+outliers. What looks suspicious in it is solved again without the prior and judged there, at the noise there.
+
+Wald's test of what is stated: how far everything else is from it.
 
 With C the covariance of some numbers x, P what their priors say of them and z = sum P_j (x - mean_j) their slope,
 everything else says M = C^-1 - P and stands at x + M^-1 z; a prior j is d = x + M^-1 z - mean_j away from that, with

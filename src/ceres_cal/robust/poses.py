@@ -2,6 +2,11 @@
 
 Each has its own minimum of the cost. Which is the lower one can only be told by trying both; they are tried where they
 compete, that is, where perspective is too weak to have decided at the start.
+
+Boards that the start lost: posed again once the camera is known.
+
+A start that is far off leaves most of a board's corners outside the rejection bound, and what is rejected pulls no
+more. With the lens solved from the other boards, four good corners pose a lost one by consensus.
 """
 
 from __future__ import annotations

@@ -1,4 +1,6 @@
-"""Geometry that cannot be: a camera under the floor that it sees from above, or what it sees behind it.
+"""May a solution be used? Whether it explains the observations, its lens folds, and nothing was lost on the way.
+
+Geometry that cannot be: a camera under the floor that it sees from above, or what it sees behind it.
 
 A flat scene fits as well when its picture is mirrored: its columns h1 and h2 of R are mirrored, and r3 = h1 x h2 turns
 round, so that the camera stands as far under the floor as it stood above. Exchanged axes and y upwards are mirrored

@@ -1,6 +1,11 @@
 """Observations that belong, or not, as a whole.
 
 A curve in one frame, a feature over all frames of a static camera; a frame of a static camera, a placement.
+
+Which observations are looked at where it is asked whether some do not belong, as a whole.
+
+The answer rests on a few rows of a few views: of those that stand out, and of others, evenly. So of very many
+observations a part is asked, with all rows of the views that stand out.
 """
 
 from __future__ import annotations

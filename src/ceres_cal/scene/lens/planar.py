@@ -1,4 +1,8 @@
-"""Maps along a radius with value 0 and slope 1 at 0, polynomials and their ratios: their end, and their inverse."""
+"""Lenses that move the points of a plane: rays become points of it, and a smooth map takes these to where they are
+measured, along the radius by a profile and across it by little.
+
+Maps along a radius with value 0 and slope 1 at 0, polynomials and their ratios: their end, and their inverse.
+"""
 
 from __future__ import annotations
 

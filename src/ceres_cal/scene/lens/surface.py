@@ -1,4 +1,12 @@
-"""Quintic B-splines along a radius, with value and slope 0 at the axis and straight on beyond the last knot."""
+"""A surface over the picture: cubic B-splines on a grid, which follow what no term of a lens does, as smooth as the
+data say (`effects/smoothness.py`).
+
+Polynomials that are long enough to do that bend where nothing was observed; here each place is displaced by the sixteen
+nodes around it, and beyond the observations by no more than a smooth continuation (thin plates; Wahba, Spline Models
+for Observational Data, SIAM 1990).
+
+Quintic B-splines along a radius, with value and slope 0 at the axis and straight on beyond the last knot.
+"""
 
 from __future__ import annotations
 
