@@ -21,6 +21,7 @@ from ssl_settings_file import settings
 
 from ceres_cal.base.errors import CalibrationError
 from ceres_cal.base.files import write_json
+from ceres_cal.base.words import printable
 from ceres_cal.calibration import Calibration
 from ceres_cal.calibration.calibrating import calibrate
 from ceres_cal.cli import main as cli
@@ -226,7 +227,9 @@ def read(words: list[str]) -> int:
     try:
         loaded = READERS[words[0]](path)
     except CalibrationError as error:
-        if not str(error).startswith((f"{path}", f"{path.parent}:")):  # a model of several files goes by its folder
+        # A model of several files goes by its folder, or by the file of it that is wrong.
+        named, folder = (" ".join(printable(str(one)).split()) for one in (path, path.parent))  # as one line has it
+        if not str(error).startswith((named, f"{folder}:", f"{folder}/")):
             raise AssertionError(f"a refusal that does not name its file: {error}") from None
         raise
     if not round_trip(loaded, path):

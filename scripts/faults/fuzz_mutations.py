@@ -38,7 +38,10 @@ def mutated(name: str, content: bytes, rng: Rng) -> bytes:
     """The content of a file of this name, with one to three changes of a kind that knows what it is."""
     kinds = next((kinds for endings, kinds in _KINDS if name.endswith(endings)), (bytes_changed,))
     kind = bytes_changed if rng.random() < 0.15 else one_of(kinds, rng)
-    return bytes(kind(content, rng))
+    try:
+        return bytes(kind(content, rng))
+    except (ValueError, zipfile.BadZipFile):  # a change came before, after which it is no such file any more
+        return bytes_changed(content, rng)
 
 
 # ---- bytes ----------------------------------------------------------------------------------------------------------

@@ -118,7 +118,7 @@ def format_options(given: Mapping[str, str], forms: Sequence[ExportFormat] | Seq
         try:
             plain = str(parse_length(text, flag(name), "mm")) if name.endswith("_mm") else text
             options[name] = msgspec.convert(plain, types[name], strict=False)
-        except msgspec.ValidationError:
+        except (msgspec.ValidationError, UnicodeEncodeError):  # a word that is no UTF-8 is none of those either
             raise InputError(f"{flag(name)}: {text!r} is not the number or word that it takes") from None
     return options
 
