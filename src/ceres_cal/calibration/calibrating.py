@@ -22,9 +22,9 @@ from ceres_cal.observations.thinning import is_bulk
 from ceres_cal.posterior.assess import assess, with_doubts, with_other_lenses, with_roughness
 from ceres_cal.posterior.posterior import Posterior
 from ceres_cal.problem.bundle import Progress
-from ceres_cal.problem.parameters import AUTO, Estimate, Layout, Options, make_layout
+from ceres_cal.problem.parameters import AUTO, Estimate, Layout, Options
 from ceres_cal.problem.priors import gather_priors
-from ceres_cal.problem.problem import Problem
+from ceres_cal.problem.problem import Problem, problem_of
 from ceres_cal.problem.ranges import require_possible_numbers
 from ceres_cal.problem.reduced import ReducedInformation, information
 from ceres_cal.problem.residuals import residuals
@@ -43,9 +43,6 @@ if TYPE_CHECKING:
     from ceres_cal.robust.bulk import Bulk, Settled, Subset
 
 
-# Share of the standard deviation of usual principal points: observations that say as much need nothing usual. Half and
-# double leave ordinary fields and boards, whose share is under a tenth, as they are.
-_SAYS_LESS = 0.5
 # Share of a dimension by which it may come out another than drawn without a second solve from there, whose start and
 # outliers are those of the right drawing; and how many there may be.
 _REDRAWN, _MOST_DRAWINGS = 0.005, 4
@@ -173,52 +170,18 @@ def _part(bulk: Bulk, options: Options) -> Subset:
     part, given = bulk.part(), options if options.lens != AUTO else papers(options)
     few, sights = part.observations, gather_sights(part.observations)
     start = initialise(few, sights, given)
-    priors = gather_priors(few, given, start.estimate.structure)
-    problem = Problem(sights, make_layout(few, given), priors, options=given)
+    problem = problem_of(few, sights, given, start.estimate)
     return bulk.part(bulk.standing_out(solve_robustly(problem, few, start.estimate, is_near=start.is_near)))
 
 
 def _of_lens(
     start: Start, observations: Observations, sights: Sights, options: Options, watched: Watched
 ) -> Calibration:
-    """With a lens that is named, and what is usual of cameras where the observations say less."""
-    options = options.with_first_power(len(sights))
-
-    def solved(given: Options) -> Calibration:
-        priors = gather_priors(observations, given, start.estimate.structure)
-        problem = Problem(sights, make_layout(observations, given), priors, options=given)
-        if given.closed_form_only:
-            return of_closed_form(start, observations, problem)
-        return solved_from(start, observations, problem, watched=watched)
-
-    if not options.usual_camera:
-        return solved(options)
-    try:
-        alone = solved(replace(options, usual_camera=False))
-    except CalibrationError:
-        # quiet: with what is usual it is solved for or the failure is told; what rests on that is a warning
-        return solved(options)
-    if _says_centres(alone, observations, options):
-        return alone
-    try:
-        calibration = solved(options)
-    except CalibrationError:  # quiet: the observations alone determine it, with their own standard deviations
-        return alone
-    unusual = [one.words for one in calibration.conflicts if one.kind == "usual"]
-    return replace(alone, warnings=(*alone.warnings, *unusual)) if unusual else calibration
-
-
-def _says_centres(calibration: Calibration, observations: Observations, options: Options) -> bool:
-    """Whether observations say more about principal points than what is usual of cameras does."""
-    if calibration.posterior is None:
-        return True
-    known = calibration.posterior.information
-    for prior in gather_priors(observations, options, calibration.estimate.structure):
-        keys = [key for key in prior.keys if prior.is_usual and key in known.keys]
-        sd, usual = known.marginal(keys).spread.sd, prior.information.marginal(keys).spread.sd
-        if not np.all(sd < _SAYS_LESS * usual):
-            return False
-    return True
+    """With a lens that is named."""
+    problem = problem_of(observations, sights, options, start.estimate)
+    if options.closed_form_only:
+        return of_closed_form(start, observations, problem)
+    return solved_from(start, observations, problem, watched=watched)
 
 
 def _without_priors(observations: Observations, options: Options) -> Calibration | None:

@@ -28,7 +28,6 @@ from ceres_cal.calibration.lens_kinds import Candidate, Kind
 from ceres_cal.calibration.lens_seen import (
     MOST_ROUNDS,
     InlierRows,
-    problem_of,
     profiles_of,
     require_groups,
     seen_through,
@@ -38,6 +37,7 @@ from ceres_cal.observations.sights import Sights, gather_sights
 from ceres_cal.observations.thinning import thinned
 from ceres_cal.posterior.roughness import cells_of
 from ceres_cal.problem.parameters import Estimate, Options
+from ceres_cal.problem.problem import problem_of
 from ceres_cal.robust.robust import RobustSolution, solve_robustly
 from ceres_cal.start.initialise import initialise
 

@@ -17,10 +17,10 @@ from ceres_cal.base.errors import DegenerateError
 from ceres_cal.problem.parameters import AUTO, OF_PIXELS, PAPERS_POWERS, Options
 from ceres_cal.scene.lens import LENSES, Lens, make_lens
 
+TANGENTIAL = "tangential"  # the terms that displace so
 PAPER = "radial 2,3"
 """The lens that wins ties."""
 _ANY_PHI = 100.0
-_BEFORE = 2  # coefficients along the radius come before decentring, which is smaller: as OpenCV has them
 _PROJECTION = 2  # coefficients that a projection of its own is worth
 
 
@@ -44,30 +44,25 @@ def candidates(options: Options) -> list[Options]:
             powers = [lens.powers]
         return [replace(options, powers=one) for one in powers]
     by_order = [name for _, name in sorted(zip(lens.orders, lens.names, strict=True)) if name not in options.fixed]
-    names = [name for name in by_order if name not in _tangential(lens)]
-    also = tuple(name for name in by_order if name in _tangential(lens) and name not in options.held)
-    counts = range(1, len(names) + 1)
-    shorter = [replace(options, coefficients=(*names[:n], *(also if n >= _BEFORE else ()))) for n in counts]
+    names = [name for name in by_order if name not in lens.tangential]
+    also = tuple(name for name in lens.tangential if name not in options.held)
+    shorter = [replace(options, coefficients=(*names[:n], *also)) for n in range(1, len(names) + 1)]
     if all(label_of(one) != label_of(options) for one in shorter):
         shorter.append(options)
     return shorter
 
 
-def _tangential(lens: Lens | type[Lens]) -> tuple[str, ...]:
-    """Names of its coefficients that displace tangentially, which it has or may have."""
-    return lens.decentring or lens.more_terms.get("tangential", ())
-
-
 def label_of(options: Options) -> str:
-    """How a lens is called: "radial 2,3" or "brown k1 k2 p1 p2"."""
+    """How a lens is called: "radial 2,3", decentred or not, or "brown k1 k2 p1 p2"."""
     if powers := options.blank_lens.powers:
-        return " ".join([options.lens, ",".join(map(str, powers)), *options.terms])
+        terms = (term for term in options.terms if term != TANGENTIAL)
+        return " ".join([options.lens, ",".join(map(str, powers)), *terms])
     return " ".join([options.lens, *(name for name in options.blank_lens.names if name not in options.held)])
 
 
 def coefficients_of(options: Options) -> int:
-    """How many coefficients of the lens are free."""
-    return len(set(options.blank_lens.names) - set(options.held))
+    """How many coefficients of the lens are free, but for decentring, of which the usual size is known."""
+    return len(set(options.blank_lens.names) - set(options.held) - set(options.blank_lens.tangential))
 
 
 def size_of(options: Options) -> int:
@@ -117,16 +112,13 @@ class Form:
 
 @cache
 def forms_of(kind: str) -> tuple[Form, ...]:
-    """Every sensible lens of a kind, with decentring terms and without, the longest first: all others are this one with
-    coefficients at 0.
+    """Every sensible lens of a kind, with its decentring, the longest first: all others are this one with coefficients
+    at 0.
     """
     lens = LENSES[kind]
     powers = tuple(sorted({power for trial in lens.trial_powers for power in trial}))
-    terms = tuple(term for term, names in lens.more_terms.items() if names == _tangential(lens))
-    longest, plain = Options(lens=kind, powers=powers, terms=terms), Options(lens=kind, powers=powers)
-    bare = tuple(name for name in plain.blank_lens.names if name not in _tangential(lens))
-    starts = [longest, *([replace(plain, coefficients=bare)] if _tangential(lens) else [])]
-    every = {(form := Form.among(one)).label: form for start in starts for one in candidates(start)}
+    longest = Options(lens=kind, powers=powers, terms=tuple({TANGENTIAL} & {*lens.more_terms}))
+    every = {(form := Form.among(one)).label: form for one in candidates(longest)}
     return tuple(sorted(every.values(), key=lambda one: -len(one.names)))
 
 

@@ -11,12 +11,11 @@ from contextlib import suppress
 from dataclasses import replace
 
 from ceres_cal.base.errors import CalibrationError
-from ceres_cal.calibration.lens_seen import problem_of
 from ceres_cal.observations import Observations
 from ceres_cal.posterior.roughness import AGREES, agreement
 from ceres_cal.problem.bundle import Progress
 from ceres_cal.problem.parameters import Estimate, Options
-from ceres_cal.problem.problem import Problem
+from ceres_cal.problem.problem import Problem, problem_of
 from ceres_cal.robust.robust import RobustSolution, solve_robustly
 from ceres_cal.robust.usable import all_shown
 from ceres_cal.scene.lens import make_lens

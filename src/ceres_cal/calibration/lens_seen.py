@@ -17,9 +17,8 @@ from ceres_cal.effects.left_out import group_normals
 from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import Sights, gather_sights
 from ceres_cal.problem.bundle import solve
-from ceres_cal.problem.parameters import Estimate, Options, make_layout
-from ceres_cal.problem.priors import gather_priors
-from ceres_cal.problem.problem import Problem
+from ceres_cal.problem.parameters import Estimate, Options
+from ceres_cal.problem.problem import Problem, problem_of
 from ceres_cal.problem.residuals import Residuals, residuals
 from ceres_cal.robust.robust import RobustSolution, solve_robustly
 from ceres_cal.start.initialise import LensProfile, edge_over
@@ -34,12 +33,6 @@ _FEWEST_PLACEMENTS = 8  # with fewer the features of each are held out one by on
 
 class FewGroupsError(DegenerateError):
     """There is too little to hold out: nothing tells lenses apart."""
-
-
-def problem_of(observations: Observations, sights: Sights, options: Options, estimate: Estimate) -> Problem:
-    """What is minimised, before anything was weighed."""
-    priors = gather_priors(observations, options, estimate.structure)
-    return Problem(sights, make_layout(observations, options), priors, options=options)
 
 
 def profiles_of(estimate: Estimate, sights: Sights) -> dict[str, LensProfile]:

@@ -19,6 +19,7 @@ from ceres_cal.problem.charts import Chart, ChartedCost, chart_of
 from ceres_cal.problem.costs import ROWS_WORTH_A_THREAD, EliminatedCost, Run, SightCost
 from ceres_cal.problem.parameters import Estimate, Layout, Station, intrinsics_vector, with_intrinsics
 from ceres_cal.problem.prior_cost import PriorCost
+from ceres_cal.problem.priors import USUAL_BENDS
 from ceres_cal.problem.problem import Problem, Weighting
 
 _AT_REST = 10  # iterations
@@ -147,7 +148,7 @@ def _assemble(run: Run, problem: Problem, estimate: Estimate) -> _Assembly:
     if problem.elsewhere is not None:
         more = problem.elsewhere.cost(run, problem, estimate)
         assembly.costs.append((more, [blocks.owned_by(*owner) for owner in more.owners]))
-    for prior in problem.priors_at(estimate):
+    for prior in problem.priors_of(estimate):
         prior_cost = PriorCost(run, prior, estimate, layout)
         assembly.costs.append((prior_cost, [blocks.owned_by(*owner) for owner in prior_cost.owners]))
     return assembly
@@ -234,7 +235,8 @@ def solve(
     for cost, arrays in assembly.costs:
         own = [charts.get(id(array)) for array in arrays]
         if arrays:
-            ceres.add_residual_block(ChartedCost(run, cost, own) if any(own) else cost, None, arrays)
+            loss = pyceres.CauchyLoss(USUAL_BENDS) if getattr(cost, "is_usual", False) else None
+            ceres.add_residual_block(ChartedCost(run, cost, own) if any(own) else cost, loss, arrays)
     assembly.blocks.change(charts, Chart.moved)
     settings = _solver_options(problem, assembly, precision)
     settings.callbacks = [_Watcher(run, progress, precision)]
@@ -296,7 +298,7 @@ def _rests(history: Sequence[float]) -> bool:
 
 def _require_enough(problem: Problem, estimate: Estimate) -> None:
     unknowns = problem.layout.size + len(estimate.structure.values)
-    known = unknowns - problem.unknowns(estimate)
+    known = sum(len(prior.information.root) for prior in problem.priors_of(estimate))
     if problem.equations + known < unknowns:
         raise DegenerateError(
             f"{problem.equations + known} measured numbers (two a point, one a curve observation or prior) "

@@ -29,9 +29,6 @@ PAPERS_POWERS = (2, 3)
 _OF_POWERS = "radial"  # the lens that powers stand for where none is named
 OF_PIXELS = ("phi", "aspect", "cx", "cy")
 """The intrinsics that every camera has, in the order of the solver's vector; skew comes behind the coefficients."""
-# Views that tell an aspect and a skew beside the lens: no test decides there (halves of a set whose pixels are 0.2 %
-# higher than wide were 3 sd of phi apart, one with them and one without).
-_ENOUGH_VIEWS = 8
 _LARGEST = 2**31 - 1  # whole number that Ceres counts with
 # Standard deviations that somebody may mean: a bound below takes every observation out, one above takes out none.
 _SIGMAS = (1e-3, 1e9)
@@ -48,10 +45,12 @@ class Options:
             residuals ask for from there on (`calibration.lens_growing`).
         coefficients: names of those of the lens that are solved for, the others are 0; None: all.
         free_principal_point: else it is held at the image centre, or where `fixed` says.
-        free_aspect, free_skew: whether fy / fx and the lean of the pixels' columns are free; else 1 and 0, or what
-            `fixed` says. Those of a "spline" whose powers are open are free from eight views on, unless `fixed`.
-        usual_camera: whether a principal point that nobody states is taken to lie near the middle of its image, as is
-            usual (`priors.USUAL_CENTRE`); where the data say otherwise it is left out.
+        free_aspect, free_skew: whether fy / fx and the lean of the pixels' columns are free, with nothing known of them
+            (True), or held (False) at 1 and 0 or what `fixed` says. None: free under what is usual of cameras, and held
+            without that.
+        usual_camera: whether what is usual of cameras is taken to hold of numbers that nobody states: a principal point
+            near the middle of its image, square pixels, little decentring (`priors.usual_cameras`), under
+            distributions with heavy tails that give way to observations.
         terms: of the lens, besides those that it always has: names of its `more_terms`.
         fixed: numbers held, by name: phi, aspect, cx, cy (px), skew and the lens's coefficients in the units of the
             files.
@@ -77,8 +76,8 @@ class Options:
     powers: tuple[int, ...] = ()
     coefficients: tuple[str, ...] | None = None
     free_principal_point: bool = True
-    free_aspect: bool = False
-    free_skew: bool = False
+    free_aspect: bool | None = None
+    free_skew: bool | None = None
     terms: tuple[str, ...] = ()
     usual_camera: bool = True
     fixed: Mapping[str, float] = field(default_factory=dict)
@@ -156,14 +155,6 @@ class Options:
         """The chosen lens with its fixed coefficients; the others are 0."""
         lens = self._unset
         return lens.with_values([self.fixed.get(name, 0.0) for name in lens.names]) if self.fixed else lens
-
-    def with_first_power(self, views: int) -> Options:
-        """These options with an aspect and a skew, what displaces by the first power, of a lens whose powers are left
-        open, where so many views tell them.
-        """
-        if self.powers or views < _ENOUGH_VIEWS:
-            return self
-        return replace(self, free_aspect="aspect" not in self.fixed, free_skew="skew" not in self.fixed)
 
     @property
     def _unset(self) -> Lens:
@@ -294,10 +285,9 @@ def make_layout(observations: Observations, options: Options) -> Layout:
     held = {*options.held, *options.blank_lens.set_at_start}
     if not options.free_principal_point:
         held |= {"cx", "cy"}
-    if not options.free_aspect:
-        held |= {"aspect"}
-    if not options.free_skew:
-        held |= {"skew"}
+    for name, free in (("aspect", options.free_aspect), ("skew", options.free_skew)):
+        if not (options.usual_camera if free is None else free):
+            held |= {name}
     free = np.array([i for i, name in enumerate(names) if name not in held], dtype=np.int64)
     views = observations.shown_views
     return Layout(

@@ -67,6 +67,7 @@ class PriorCost(CachedCost):
 
     def __init__(self, run: Run, prior: GaussianPrior, estimate: Estimate, layout: Layout) -> None:
         super().__init__(run)
+        self.is_usual = prior.is_usual
         self._root, self._mean = prior.information.root, prior.mean
         parts = dict(_parts(prior, estimate, layout))
         self._parts, self.owners = list(parts.values()), list(parts)

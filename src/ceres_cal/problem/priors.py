@@ -26,6 +26,12 @@ from ceres_cal.scene.lens import Lens
 USUAL_CENTRE = 0.015
 """Of the image's diagonal, 24 px of 1600: the standard deviation of either coordinate of principal points about the
 middle of pictures that were not cropped."""
+# Standard deviations of fy / fx about 1, of the lean of the pixels' columns, which lithography draws upright, and of
+# either decentring coefficient. Of the public cameras tried, fy / fx is up to 0.6 % off and p1 and p2 are up to 1e-3.
+_USUAL_ASPECT, _USUAL_SKEW, _USUAL_DECENTRING = 1e-3, 3e-5, 5e-4
+# Where Cauchy's loss of what is usual bends, in standard deviations: Student's t with 3 degrees of freedom. A picture
+# that was cropped or squeezed is as far from usual as it likes, at the cost of a few residuals.
+USUAL_BENDS = 2.0
 _QUANTITIES = {"principal_point": ("cx", "cy"), "height_m": ("height",), "position_m": ("x", "y", "height")}
 
 
@@ -36,7 +42,8 @@ class GaussianPrior:
     Attributes:
         information: about its K numbers. mean: (K,) in the units of the keys; 0 for a turn.
         rotations: station -> rotation (3, 3) of cam_from_world from which its turns are counted.
-        is_usual: whether nobody stated it: it is what is usual, and gives way to data that say otherwise.
+        is_usual: whether nobody stated it: it is what is usual of cameras, under a distribution with heavy tails, which
+            gives way to observations that say otherwise.
     """
 
     information: Information
@@ -80,6 +87,22 @@ class GaussianPrior:
         """(R,) root (x - mean), in standard deviations."""
         return np.asarray(self.information.root @ self.offsets(estimate))
 
+    def weighted_at(self, estimate: Estimate) -> GaussianPrior:
+        """The normal distribution that pulls as much at an estimate: what is usual counts with Cauchy's weight."""
+        if not self.is_usual:
+            return self
+        weight = 1.0 / (1.0 + float(np.sum(self.residuals(estimate) ** 2)) / USUAL_BENDS**2)
+        return self._times(weight)
+
+    def loosened(self, factor: float) -> GaussianPrior:
+        """With standard deviations so many times as large, where it is usual: beside observations that are off by as
+        much more than their noise.
+        """
+        return self._times(factor**-2) if self.is_usual else self
+
+    def _times(self, weight: float) -> GaussianPrior:
+        return replace(self, information=replace(self.information, matrix=weight * self.information.matrix))
+
 
 def gather_priors(
     observations: Observations,
@@ -105,7 +128,7 @@ def gather_priors(
     if carried:
         return (carried, *stated, *tolerances(structure, carried.keys))
     known = {key for prior in stated for key in prior.keys}
-    usual = usual_centres(observations, known) if options.usual_camera else ()
+    usual = usual_cameras(observations, options, known, lenses) if options.usual_camera else ()
     return (*stated, *usual, *tolerances(structure))
 
 
@@ -128,14 +151,26 @@ def stated_prior(prior: Prior, lens: Lens) -> GaussianPrior:
     return GaussianPrior(Information.of_sigmas(sigmas), np.asarray(prior.value, dtype=float))
 
 
-def usual_centres(observations: Observations, stated: Collection[Key]) -> Iterator[GaussianPrior]:
-    """Principal points near the middle of their images, but for those that somebody stated."""
+def usual_cameras(
+    observations: Observations, options: Options, stated: Collection[Key], lenses: Mapping[str, Lens]
+) -> Iterator[GaussianPrior]:
+    """What is usual of cameras, but for what somebody stated or set free: a principal point near the middle of its
+    image, square pixels, a lens that is little decentred.
+    """
+    freed = {"aspect": options.free_aspect, "skew": options.free_skew}
     for name, size in observations.cameras.items():
-        keys = [Key("camera", name, quantity, "px") for quantity in ("cx", "cy")]
-        if not set(keys) & set(stated):
-            sigma_px = USUAL_CENTRE * float(np.hypot(*size))
-            centre = 0.5 * (np.array(size, dtype=float) - 1.0)
-            yield GaussianPrior(Information.of_sigmas(dict.fromkeys(keys, sigma_px)), centre, is_usual=True)
+        lens = lenses.get(name, options.blank_lens)
+        keys = {key.quantity: key for key in intrinsic_keys(name, lens) if key not in stated and not freed.get(key[2])}
+        centre = 0.5 * (np.array(size, dtype=float) - 1.0)
+        for names, mean, sigma in (
+            (("cx", "cy"), centre, USUAL_CENTRE * float(np.hypot(*size))),
+            (("aspect",), np.ones(1), _USUAL_ASPECT),
+            (("skew",), np.zeros(1), _USUAL_SKEW),
+            (lens.tangential, np.zeros(len(lens.tangential)), _USUAL_DECENTRING),
+        ):
+            if names and keys.keys() >= set(names):
+                information = Information.of_sigmas(dict.fromkeys([keys[one] for one in names], sigma))
+                yield GaussianPrior(information, mean, is_usual=True)
 
 
 def tolerances(structure: Structure, known: Collection[Key] = ()) -> Iterator[GaussianPrior]:

@@ -10,10 +10,11 @@ import numpy as np
 
 from ceres_cal.base.arrays import Array, Indices, Mask
 from ceres_cal.base.cached import cached_property
+from ceres_cal.observations import Observations
 from ceres_cal.observations.sights import SightKey, Sights
 from ceres_cal.problem.information import Information
-from ceres_cal.problem.parameters import OF_PIXELS, Estimate, Layout, Options
-from ceres_cal.problem.priors import GaussianPrior
+from ceres_cal.problem.parameters import OF_PIXELS, Estimate, Layout, Options, make_layout
+from ceres_cal.problem.priors import GaussianPrior, gather_priors
 from ceres_cal.problem.quantities import free_keys, intrinsic_keys
 from ceres_cal.scene.lens import Lens
 
@@ -86,9 +87,13 @@ class Problem:
         """Free placements that a single sight shows: each can be eliminated by itself."""
         return self.layout.placements & self.sights.seen_once
 
-    def priors_at(self, estimate: Estimate) -> list[GaussianPrior]:
-        """What the priors and the smoothness of lenses say of numbers that are free."""
+    def priors_of(self, estimate: Estimate) -> list[GaussianPrior]:
+        """The priors and the smoothness of lenses, of numbers that are free."""
         return [*self.stated_at(estimate), *self._smooth_at(estimate)]
+
+    def priors_at(self, estimate: Estimate) -> list[GaussianPrior]:
+        """What these say at an estimate: what is usual counts less, the farther off it is."""
+        return [prior.weighted_at(estimate) for prior in self.priors_of(estimate)]
 
     def stated_at(self, estimate: Estimate) -> list[GaussianPrior]:
         """What the priors say of numbers that are free, with those that are held at their mean."""
@@ -160,3 +165,9 @@ class Problem:
     def holding(self, camera: str, number: int) -> Problem:
         """The problem with one of a camera's intrinsics held, by its place in the solver's vector."""
         return replace(self, layout=self.layout.holding(camera, number))
+
+
+def problem_of(observations: Observations, sights: Sights, options: Options, estimate: Estimate) -> Problem:
+    """What is minimised, before anything was weighed."""
+    priors = gather_priors(observations, options, estimate.structure)
+    return Problem(sights, make_layout(observations, options), priors, options=options)

@@ -300,9 +300,7 @@ class _ForwardSelection:
             return False
         suspect, test = self.left.pop(number), tests.pop(number)
         rivals = [
-            (one, other)
-            for one, other in zip(self.left, tests, strict=True)
-            if one.kind != "usual" and other.squared > _RIVAL * test.squared
+            (one, other) for one, other in zip(self.left, tests, strict=True) if other.squared > _RIVAL * test.squared
         ]
         freed = suspect.left_out(self.problem, self.end.solution.estimate)
         after = None if suspect.kind == "earlier" else self._solved(freed)
@@ -320,8 +318,7 @@ class _ForwardSelection:
 
     def conflicts(self) -> list[Conflict]:
         """What is in conflict still when all of it is left out: a wrong height may have made others look wrong."""
-        stated = [one for one in self.every if one.kind != "usual"]
-        alone = all(prior.is_usual for prior in self.problem.priors) and len(self.out) == len(stated)
+        alone = all(prior.is_usual for prior in self.problem.priors) and len(self.out) == len(self.every)
         found = []
         for number, (statement, test, rivals) in enumerate(self.out):
             if number < len(self.out) - 1 and statement.kind != "earlier":

@@ -23,7 +23,7 @@ LEVEL = 1e-3
 """Probability of a conflict where everything stated is right, over all that is stated: a conflict takes a calibration's
 word back, so it is as rare as a coin that falls on one side ten times."""
 _FACTORS = {1e3: "mm", 1e2: "cm", 1.0 / 0.3048: "feet", 1.0 / 0.0254: "inches", 1e-3: "km"}
-_STATED = {"prior": "stated", "usual": "usual", "fixed": "held", "tolerance": "drawn", "earlier": "known"}
+_STATED = {"prior": "stated", "fixed": "held", "tolerance": "drawn", "earlier": "known"}
 _NEAR = 0.1  # relative: how near a unit must bring the two to be the likely cause
 
 
@@ -32,7 +32,7 @@ class Conflict:
     """Something known beforehand that everything else contradicts.
 
     Attributes:
-        kind: "prior", "usual" (what nobody stated), "fixed", "tolerance", "earlier" (the posterior of an earlier
+        kind: "prior", "fixed", "tolerance", "earlier" (the posterior of an earlier
             calibration) or "priors" (two of them contradict each other). owner, quantity, unit: of the number.
         stated, stated_sd: what was known; the sd of what was fixed is 0.
         seen, seen_sd: what everything else says, or the other of two priors.
@@ -116,9 +116,9 @@ def grouped(priors: Sequence[GaussianPrior]) -> Iterator[Statement]:
     groups: list[Statement] = []
     nothing = np.empty(0)
     for prior in (one for one in priors if one.keys):
-        if prior.is_usual:
-            yield Statement("usual", prior.keys, (prior,), nothing)
-        elif not is_plain(prior):
+        if prior.is_usual:  # which gives way by itself
+            continue
+        if not is_plain(prior):
             yield Statement("earlier", prior.keys, (prior,), nothing)
         elif prior.keys[0].kind == "structure":
             yield from (Statement("tolerance", (key,), (prior.given([key]),), nothing) for key in prior.keys)
@@ -169,9 +169,6 @@ def contradicted(statement: Statement, test: WaldTest, alone: bool, rivals: Sequ
     key, who = test.key, "the observations alone say" if alone else "everything else says"
     about = f"{_STATED[statement.kind]} {key.quantity} of {key.whose}, {number_text(*test.stated, key)}"
     apart = f"{who} {number_text(*test.seen, key)}, {two_digits(test.sigmas)} sigmas apart"
-    if statement.kind == "usual":
-        words = f"the {about}: {apart}: is the picture a part of another? What is usual was left out"
-        return Conflict(statement.kind, key.owner, key.quantity, key.unit, *test.stated, *test.seen, test.sigmas, words)
     advice = f"{_in_another_unit(test)}correct or remove it{''.join(f', or else {one}' for one in rivals)}"
     words = f"the {about}: {apart}: {advice}"
     return Conflict(statement.kind, key.owner, key.quantity, key.unit, *test.stated, *test.seen, test.sigmas, words)

@@ -24,6 +24,16 @@ struct Making {
     double unit;
 };
 
+// Brown's decentring of a point (a, b): where it moves to, and the derivatives of that, which are symmetric.
+struct Decentring {
+    double p1 = 0.0, p2 = 0.0;
+    double x(double a, double b) const { return 2.0 * p1 * a * b + p2 * (3.0 * a * a + b * b); }
+    double y(double a, double b) const { return p1 * (a * a + 3.0 * b * b) + 2.0 * p2 * a * b; }
+    double xx(double a, double b) const { return 2.0 * p1 * b + 6.0 * p2 * a; }
+    double xy(double a, double b) const { return 2.0 * p1 * a + 2.0 * p2 * b; }
+    double yy(double a, double b) const { return 6.0 * p1 * b + 2.0 * p2 * a; }
+};
+
 class Lens {
   public:
     Lens() = default;

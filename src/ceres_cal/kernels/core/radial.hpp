@@ -1,4 +1,4 @@
-// The paper's lens: see radial.py. Form: its powers.
+// The paper's lens: see radial.py. Form: the place of p1 among the intrinsics, 0 for none, and its powers.
 #pragma once
 
 #include <algorithm>
@@ -13,7 +13,8 @@ namespace ceres_cal {
 class Radial final : public Lens {
   public:
     explicit Radial(const Making& from)
-        : powers_(from.form.values, from.form.values + from.form.count),
+        : powers_(from.form.values + 1, from.form.values + from.form.count),
+          tangential_(static_cast<int>(from.form[0])),
           unit_(from.unit),
           phi_(from.intrinsics[0]),
           aspect_(from.intrinsics[1]) {
@@ -25,6 +26,7 @@ class Radial final : public Lens {
         for (size_t k = 0; k < powers_.size(); ++k)
             dense_[static_cast<size_t>(powers_[k]) - 1] += from.intrinsics[4 + static_cast<int>(k)];
         limit_ = growing_until(dense_.data(), static_cast<int>(dense_.size()), FAR);
+        if (tangential_ > 0) across_ = {from.intrinsics[tangential_], from.intrinsics[tangential_ + 1]};
     }
 
     // s (1 + c_2 s + ...) = phi |u| / unit solved for the radius s, in half image diagonals.
@@ -39,14 +41,17 @@ class Radial final : public Lens {
         double worst = 1.0;
         for (int step = 0; step < STEPS && !(worst < CLOSE); ++step) worst = newton_step(n);
         int bad = worst < CLOSE ? 0 : 1;
+        const Decentring across = across_;
         each(n, [&](int i) {
             const double u = u_[i], v = v_[i], m = m_[i], s = s_[i], z = rays.z[i], iz = 1.0 / z;
             const double per_slope = 1.0 / slope_[i];
             const double stretch = unit_ * s / m;  // px per unit of the ideal point
             const double bend = (phi_ * per_slope - stretch) / (m * m);
-            const double xx = (stretch + bend * u * u) * iz, xy = bend * u * v * iz, yy = (stretch + bend * v * v) * iz;
+            const double xx = (stretch + bend * u * u + phi_ * across.xx(u, v)) * iz;
+            const double xy = (bend * u * v + phi_ * across.xy(u, v)) * iz;
+            const double yy = (stretch + bend * v * v + phi_ * across.yy(u, v)) * iz;
             per_slope_[i] = per_slope;
-            image.x[i] = stretch * u, image.y[i] = stretch * v;
+            image.x[i] = stretch * u + phi_ * across.x(u, v), image.y[i] = stretch * v + phi_ * across.y(u, v);
             image.xx[i] = xx, image.xy[i] = xy, image.yx[i] = xy, image.yy[i] = yy;
             image.xz[i] = -(xx * u + xy * v), image.yz[i] = -(xy * u + yy * v);
             bad += !((z > 0.0) & (slope_[i] > 0.0) & (s < limit_));
@@ -57,7 +62,11 @@ class Radial final : public Lens {
     void differentiate(const Rows& rows) override {
         const int n = rows.n;
         double *x = rows.x(0), *y = rows.y(0);
-        each(n, [&](int i) { x[i] = u_[i] * per_slope_[i], y[i] = aspect_ * v_[i] * per_slope_[i]; });
+        const Decentring across = across_;
+        each(n, [&](int i) {
+            const double u = u_[i], v = v_[i];
+            x[i] = u * per_slope_[i] + across.x(u, v), y[i] = aspect_ * (v * per_slope_[i] + across.y(u, v));
+        });
         for (size_t k = 0; k < powers_.size(); ++k) {
             const int row = 4 + static_cast<int>(k), power = static_cast<int>(powers_[k]);
             x = rows.x(row), y = rows.y(row);
@@ -67,6 +76,12 @@ class Radial final : public Lens {
                 for (int j = 0; j < power; ++j) d *= s_[i];
                 x[i] = d * u_[i], y[i] = aspect_ * d * v_[i];
             });
+        }
+        for (int k = 0; k < 2 && tangential_ > 0; ++k) {
+            const Decentring one = {k == 0 ? phi_ : 0.0, k == 1 ? phi_ : 0.0};
+            x = rows.x(tangential_ + k), y = rows.y(tangential_ + k);
+            rows.shown[tangential_ + k] = true;
+            each(n, [&](int i) { x[i] = one.x(u_[i], v_[i]), y[i] = aspect_ * one.y(u_[i], v_[i]); });
         }
     }
 
@@ -95,6 +110,8 @@ class Radial final : public Lens {
     }
 
     std::vector<double> powers_, dense_;
+    int tangential_;
+    Decentring across_;
     double unit_, phi_, aspect_, limit_ = 0.0;
     Lane u_, v_, m_, ideal_, s_, value_, slope_, per_slope_;
 };

@@ -133,6 +133,11 @@ class Lens(ABC):
         return frozenset()
 
     @property
+    def tangential(self) -> tuple[str, ...]:
+        """Those of its coefficients that displace tangentially."""
+        return tuple(name for name in (*self.decentring, *self.more_terms.get("tangential", ())) if name in self.names)
+
+    @property
     def listed(self) -> dict[str, float]:
         """The other coefficients."""
         return {name: value for name, value in self.coefficients.items() if name not in self.nodes}
