@@ -142,7 +142,8 @@ def _of_any_lens(observations: Observations, sights: Sights, options: Options, w
         return _of_lens(start, observations, sights, papers(options), watched)
 
     def solved(one: Chosen) -> Calibration:
-        return _of_lens(one.start, observations, sights, one.options, watched)
+        named = replace(one.options, priors=options.priors)  # which lenses were compared without
+        return _of_lens(one.start, observations, sights, named, watched)
 
     chosen = choose_lens(observations, options, start)
     calibration, chosen = chosen.first_solved(solved, papers(options), start)

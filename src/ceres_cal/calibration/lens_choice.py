@@ -33,15 +33,18 @@ from ceres_cal.calibration.lens_forms import (
 )
 from ceres_cal.calibration.lens_kinds import Candidate, Kind
 from ceres_cal.calibration.lens_seen import FewGroupsError, InlierRows
-from ceres_cal.observations import Observations
+from ceres_cal.observations import Observations, Prior
 from ceres_cal.posterior.other_lenses import OtherLenses
-from ceres_cal.problem.parameters import Estimate, Options
+from ceres_cal.problem.parameters import OF_PIXELS, Estimate, Options
 from ceres_cal.start.initialise import Start
 
 _T = TypeVar("_T")
 _BROKEN = "solved for, it leaves more than the equations of a longer lens had it"
 _EXPLAINED = "takes out observations that another lens explains"
 _LEAST_PROBABILITY = 0.02  # of another lens that counts: all that have less make no difference
+# Stated numbers of which lenses are compared knowing little, and how much of their size: enough to stay in the middle
+# of a valley along phi that frontal views leave open.
+_VAGUE, _VAGUE_SHARE = (*OF_PIXELS, "principal_point", "height_m", "position_m"), 0.1
 _LEAST_SHARE = 0.25  # of the observations: where fewer took part, what other lenses say by chance makes no difference
 
 
@@ -193,12 +196,22 @@ def choose_lens(observations: Observations, options: Options, start: Start) -> C
         options: their lens is not looked at. start: of everything, with whatever lens.
     """
     as_good = AS_GOOD_BESIDE_LENGTHS if options.dimensions else AS_GOOD
+    by_themselves = replace(options, priors=tuple(map(_loosely, options.priors)))
+    observations = replace(observations, priors=tuple(map(_loosely, observations.priors)))
     try:
-        seen, kinds, share = compared_kinds(observations, options, start.estimate)
+        seen, kinds, share = compared_kinds(observations, by_themselves, start.estimate)
         return _among(seen, share, as_good, start, kinds).outcome
     except CalibrationError as error:  # reads: "..." beside the paper's lens, why no other was compared
         failed = "" if isinstance(error, FewGroupsError) else str(error)
         return Chosen(papers(options), start, LensChoice(PAPER, (TriedLens(PAPER, 2, failed=failed),), 0, 0.0))
+
+
+def _loosely(prior: Prior) -> Prior:
+    """What was stated of a camera or a station, said so vaguely that no lens wins by taking up what is wrong with it."""
+    if prior.owner == "target" or prior.quantity not in _VAGUE:
+        return prior
+    least = _VAGUE_SHARE * max(map(abs, prior.value))
+    return replace(prior, sigma=tuple(max(sigma, least) for sigma in prior.sigma))
 
 
 def _shorter(tried: Sequence[Candidate], best: Candidate | None) -> list[Candidate]:

@@ -40,9 +40,9 @@ _UNKNOWN = (
 )
 # Times the standard deviation of phi without what is usual of principal points: what rests on it is said.
 _RESTING = 1.5
-_USUAL = (
-    "camera {!r}: phi, and what goes with it, rests on its principal point lying near the middle of the image, as is "
-    "usual: by the observations alone its standard deviation is {}: show tilted views, or state the principal point"
+USUAL = (
+    "camera {!r}: phi, and what goes with it, rests on what is usual of cameras, a principal point near the middle of "
+    "the image, square pixels and little decentring: without that its standard deviation is {}"
 )
 
 
@@ -56,7 +56,7 @@ def unknown_phi(end: RobustSolution, posterior: Posterior) -> Iterator[str]:
 
 
 def resting_phi(end: RobustSolution, problem: Problem) -> Iterator[str]:
-    """Warnings of cameras whose phi rests on where principal points usually lie."""
+    """Words about cameras whose phi rests on what is usual."""
     estimate, reduced = end.solution.estimate, end.reduced
     usual = [prior for prior in problem.priors_at(estimate) if prior.is_usual]
     if reduced is None or not usual:
@@ -70,7 +70,7 @@ def resting_phi(end: RobustSolution, problem: Problem) -> Iterator[str]:
             at = reduced.shared.columns([key])[0]
             sd, alone = reduced.shared.spread.sd[at], without.spread.sd[at]
             if alone > _RESTING * sd:
-                yield _USUAL.format(name, _share_text(alone / estimate.cameras[name].phi))
+                yield USUAL.format(name, _share_text(alone / estimate.cameras[name].phi))
 
 
 def _share_text(share: float) -> str:
